@@ -91,6 +91,18 @@ def covariances(quats, scales):
     return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * scales.astype(np.float64)), rotation)
 
 
+def quaternion_of(rotation):
+    """Return w x y z of a rotation (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    lower = [
+        [xx + yy + zz, 0, 0, 0],
+        [zy - yz, xx - yy - zz, 0, 0],
+        [xz - zx, yx + xy, yy - xx - zz, 0],
+        [yx - xy, zx + xz, zy + yz, zz - xx - yy],
+    ]
+    return np.linalg.eigh(np.array(lower))[1][:, -1]
+
+
 def disturbed(model, rng, sigma=1e-3):
     """Return the model with normal noise on every value."""
 

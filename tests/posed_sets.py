@@ -4,6 +4,7 @@ import json
 import struct
 
 import numpy as np
+from checked import quaternion_of
 from PIL import Image
 
 from csplat_render.camera import intrinsics, look_at, relative_to
@@ -75,18 +76,6 @@ def write_transforms(folder, missing=(), up=(0, 0, 1), at=(0, 0, 0)):
     (folder / "transforms.json").write_text(json.dumps(document))
 
 
-def quaternion(rotation):
-    """Return w x y z of a rotation (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    lower = [
-        [xx + yy + zz, 0, 0, 0],
-        [zy - yz, xx - yy - zz, 0, 0],
-        [xz - zx, yx + xy, yy - xx - zz, 0],
-        [yx - xy, zx + xz, zy + yz, zz - xx - yy],
-    ]
-    return np.linalg.eigh(np.array(lower))[1][:, -1]
-
-
 MODELS = {"PINHOLE": 1, "FULL_OPENCV": 6}
 
 
@@ -96,7 +85,7 @@ def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, wi
     folder.mkdir(parents=True, exist_ok=True)
     K = shots[0].K
     parameters = parameters or [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    poses = [(*quaternion(c.viewmat[:3, :3]), *c.viewmat[:3, 3]) for c in shots]
+    poses = [(*quaternion_of(c.viewmat[:3, :3]), *c.viewmat[:3, 3]) for c in shots]
     names = [f"im {i:03}.png" for i in range(len(shots))]
     if text:
         words = " ".join(str(float(p)) for p in parameters)

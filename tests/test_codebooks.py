@@ -56,7 +56,7 @@ def squared_distances(points, entries):
 
 
 def distortion(points, weights, entries, index):
-    """Weighted mean of the squared distances of the points from their entries."""
+    """Return the weighted mean of squared distances of points from their entries."""
     squares = ((points.astype(np.float64) - entries[index]) ** 2).sum(1)
     return float((squares * weights).sum() / weights.sum(dtype=np.float64))
 
@@ -97,23 +97,13 @@ def test_shift_keeps_every_partial_sum_below_the_bound(largest):
     assert kmeans._divide(points, shift - 1).max() ** 2 * 45 * 1.5 > kmeans._EXACT / 4
 
 
-@pytest.mark.parametrize("entry_count", [2, 300])
+@pytest.mark.parametrize("entry_count", [2, 300, kmeans._PRODUCT_COLUMNS + 3])  # the last has a second block of columns
 def test_search_for_another_entry_skips_the_own_one(entry_count):
     points = np.random.default_rng(6).integers(-9, 10, (entry_count, 4)).astype(np.int32)
     points[-1] = points[0]
-    assert_others_are_found(points, slice(None))
-
-
-def test_search_for_another_entry_skips_the_own_one_in_a_second_block_of_columns():
-    points = np.random.default_rng(6).integers(-9, 10, (kmeans._PRODUCT_COLUMNS + 3, 4)).astype(np.int32)
-    points[-1] = points[0]
-    assert_others_are_found(points, np.r_[0:50, kmeans._PRODUCT_COLUMNS - 50 : len(points)])
-
-
-def assert_others_are_found(points, rows):
-    """Compare what is found for some of the points with a search in the matrix of all distances."""
+    rows = np.unique(np.r_[0 : min(300, entry_count), max(0, entry_count - 53) : entry_count])
     expected = squared_distances(points[rows], points)
-    expected[np.arange(len(expected)), np.arange(len(points))[rows]] = 10**6
+    expected[np.arange(len(rows)), rows] = 10**6
     index, error = search_nearest(points, points, other=True)
     np.testing.assert_array_equal(expected.argmin(1), index[rows])
     np.testing.assert_array_equal(expected.min(1), error[rows])
@@ -210,7 +200,7 @@ def test_weights_matter_by_ratio_only():
     np.testing.assert_array_equal(first[1], second[1])
 
 
-def test_weights_of_zero_alone_mean_equal_weights():
+def test_weights_of_only_zeros_are_equal_weights():
     points, _ = blobs()
     first = cluster(points, ones(points), 30, seed=0, iterations=3)
     second = cluster(points, 0 * ones(points), 30, seed=0, iterations=3)
@@ -219,7 +209,7 @@ def test_weights_of_zero_alone_mean_equal_weights():
 
 
 @pytest.mark.parametrize("positive", [0, 1, 5, 20])
-def test_few_positive_weights_leave_no_unused_entry(positive):
+def test_few_positive_weights_give_no_unused_entry(positive):
     points, _ = blobs(500)
     weights = np.zeros(500, np.float32)
     weights[:positive] = 2.0
@@ -254,14 +244,14 @@ def test_points_beyond_the_exact_norm_are_clustered_on_a_coarser_lattice():
     assert distortion(large, weights, entries, index) < 2.0 * 9 * 2000.0**2
 
 
-def test_progress_counts_to_the_end():
+def test_progress_is_reported_to_the_end():
     points, weights = blobs(500)
     calls = []
     cluster(points, weights, 8, seed=0, iterations=3, progress=lambda done, of: calls.append((done, of)))
     assert [(i, 5) for i in range(1, 6)] == calls
 
 
-def test_rejects_what_is_out_of_range():
+def test_invalid_arguments_are_refused():
     points, weights = blobs(50)
     for bad in (weights[:-1], -weights, weights * np.inf, weights * np.nan):
         with pytest.raises(InputError, match="weights"):
@@ -290,7 +280,7 @@ def test_ranks_follow_frequency_and_keep_the_order_of_equals():
 
 # The same bytes at any thread count.
 def digest(threads=None):
-    """SHA-256 over clusters of two kinds of search; also run by the subprocess below."""
+    """Return a SHA-256 of clusters by two kinds of search; the subprocess below calls it, too."""
     points, weights = blobs(1500, 45, 150, 12.0)
     state = hashlib.sha256()
     for near_groups, scale in ((0, 1), (6, 1), (0, 300)):
@@ -301,7 +291,7 @@ def digest(threads=None):
 
 
 @pytest.mark.slow
-def test_neither_our_threads_nor_those_of_blas_change_the_bytes():
+def test_threads_of_csplat_and_blas_do_not_change_the_bytes():
     program = (
         "import runpy, sys; from csplat.encoder import kmeans\n"
         f"digest = runpy.run_path({__file__!r})['digest']\n"
@@ -309,26 +299,17 @@ def test_neither_our_threads_nor_those_of_blas_change_the_bytes():
         "kmeans._openblas = lambda: None  # its threads cannot be set\n"
         "print(digest())"
     )
-    run = subprocess.run(
-        [sys.executable, "-c", program],
-        env={
-            **os.environ,
-            "OPENBLAS_NUM_THREADS": "2",
-            "OMP_NUM_THREADS": "2",
-            "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-        },
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=300,
-    )
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    command = [sys.executable, "-c", program]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
     expected = digest(1)
     assert expected == digest(2) == digest(5)
     assert [expected, expected] == run.stdout.split()
 
 
 @pytest.mark.slow
-def test_blas_keeps_its_own_thread_count():
+def test_the_thread_count_of_blas_is_restored():
     control = kmeans._openblas()
     if control is None:
         pytest.skip("NumPy's BLAS here is not an OpenBLAS whose threads can be set")
@@ -353,7 +334,7 @@ def exact(difference, matrices, weights):
     return np.einsum("nic,nij,njc->n", difference, matrices, difference) * weights
 
 
-def test_errors_are_those_of_the_matrices():
+def test_errors_agree_with_the_matrices():
     points, matrices, metric, _ = scene()
     np.testing.assert_allclose(exact(points, matrices, metric.weights), metric.errors(points, slice(None)), rtol=1e-5)
     rows = np.array([5, 3, 3])
@@ -361,20 +342,20 @@ def test_errors_are_those_of_the_matrices():
     np.testing.assert_allclose(expected, metric.errors(points[rows], rows), rtol=1e-5)
 
 
-def test_the_first_parts_keep_their_matrices():
+def test_the_first_coefficients_keep_their_matrices():
     points, matrices, metric, _ = scene()
     expected = exact(points[:, :2], matrices[:, :2, :2], metric.weights)
     np.testing.assert_allclose(expected, metric.first(2).errors(points[:, :2], slice(None)), rtol=1e-5)
 
 
-def test_reassign_finds_the_best_where_all_are_tried():
+def test_reassigning_over_all_entries_finds_the_best():
     points, matrices, metric, entries = scene()
     errors = np.stack([exact(points - entry, matrices, np.ones(len(points))) for entry in entries], axis=1)
     found = reassign_by_metric(points, metric, entries, np.zeros(len(points), np.int64), 2, candidates=len(entries))
     np.testing.assert_allclose(errors.min(axis=1), errors[np.arange(len(points)), found], rtol=1e-4)
 
 
-def test_refine_makes_errors_smaller_and_leaves_no_dead_entry():
+def test_refining_reduces_errors_without_unused_entries():
     points, _, metric, entries = scene()
     start = np.linalg.norm((points[:, None] - entries).reshape(len(points), len(entries), -1), axis=2).argmin(axis=1)
     moved, index = refine_by_metric(points, metric, entries, start, 1)
@@ -384,7 +365,7 @@ def test_refine_makes_errors_smaller_and_leaves_no_dead_entry():
     assert len(moved) == len(np.unique(moved.reshape(len(moved), -1), axis=0))
 
 
-def test_does_not_depend_on_threads():
+def test_refining_does_not_depend_on_threads():
     points, _, metric, entries = scene(3000, 5, 3, 200)
     start = np.zeros(len(points), np.int64)
     one, two = (refine_by_metric(points, metric, entries, start, threads) for threads in (1, 2))
@@ -392,7 +373,7 @@ def test_does_not_depend_on_threads():
     np.testing.assert_array_equal(one[1], two[1])
 
 
-def test_entries_stay_where_their_points_weigh_nothing():
+def test_entries_of_points_without_weight_do_not_move():
     points, _, metric, entries = scene(50, 2, 1, 5)
     silent = ErrorMetric(np.zeros(50, np.float32), np.zeros_like(metric.triangles))
     moved, _ = refine_by_metric(points, silent, entries, np.arange(50) % 5, 1)
@@ -400,7 +381,7 @@ def test_entries_stay_where_their_points_weigh_nothing():
 
 
 def few_shapes(make_model, count=2500, kinds=12, seed=0, degree=1, **fields):
-    """A model whose splats have a few shapes, up to size and a little noise."""
+    """Return a model of a few shapes, which vary in size and a little noise."""
     rng = np.random.default_rng(seed)
     kind = rng.integers(0, kinds, count)
     quats = normalise_quats(rng.normal(size=(kinds, 4)))[kind] + rng.normal(0, 0.01, (count, 4))
@@ -410,7 +391,7 @@ def few_shapes(make_model, count=2500, kinds=12, seed=0, degree=1, **fields):
 
 
 def seen_more(model, seed=1):
-    """Weights and matrices as cameras might give them."""
+    """Return random weights and matrices."""
     rng = np.random.default_rng(seed)
     roots = rng.normal(size=(len(model), 6, 3))
     matrices = roots @ roots.transpose(0, 2, 1)
@@ -429,7 +410,7 @@ def books(data):
     ("tile_splats", "escapes"), [(65536, None), (65536, 0.3), (65536, 0.0), (500, 0.0), (500, None)]
 )
 @pytest.mark.parametrize("matrices", [False, True])
-def test_comes_back_smaller_and_within_stated_errors(make_model, matrices, tile_splats, escapes):
+def test_shape_codebooks_make_files_smaller_within_declared_errors(make_model, matrices, tile_splats, escapes):
     model = few_shapes(make_model, 1200)
     importance = seen_more(model) if matrices else None
     options = {"sh_coding": "none", "tile_splats": tile_splats}
@@ -440,7 +421,7 @@ def test_comes_back_smaller_and_within_stated_errors(make_model, matrices, tile_
     assert [result.report.options["shape_codebook_size"]] == [book.size for book in books(result.data)]
 
 
-def test_stands_beside_codebooks_of_colour(make_model):
+def test_codebooks_of_shapes_and_colours_may_be_combined(make_model):
     model = few_shapes(make_model, 1000, degree=2)
     for coding in ("codebook", "scalar"):
         result, decoded = encoded(model, sh_coding=coding, shape_codebook_size=32)
@@ -449,8 +430,8 @@ def test_stands_beside_codebooks_of_colour(make_model):
 
 
 @pytest.mark.parametrize("count", [0, 1, 5, 60, 1000])
-def test_is_never_larger_than_without(make_model, count):
-    model = make_model(count, 1)  # random shapes: nothing to gain
+def test_a_shape_codebook_never_makes_a_file_larger(make_model, count):
+    model = make_model(count, 1)  # random shapes gain nothing
     plain, _ = encoded(model)
     result, _ = encoded(model, shape_codebook_size=4096)
     assert len(result.data) <= len(plain.data) + len('"shape_codebook_size":4096,')  # it records the requested options
@@ -468,7 +449,7 @@ def test_splats_of_one_shape_share_an_entry(make_model):
     assert np.abs(trace[0][result.source_index] - trace[1]).max() <= 0.5 * step * (1 + 1e-6)
 
 
-def test_no_entry_is_dead_and_frequent_ones_come_first(make_model):
+def test_no_entry_is_unused(make_model):
     model = few_shapes(make_model, 1500, kinds=40)
     result, decoded = encoded(model, seen_more(model), shape_codebook_size=120, sh_coding="none")
     (book,) = books(result.data)
@@ -478,7 +459,7 @@ def test_no_entry_is_dead_and_frequent_ones_come_first(make_model):
     assert counts.max() > 1
 
 
-def test_what_weighs_more_is_served_better(make_model):
+def test_important_shapes_have_smaller_errors(make_model):
     model = make_model(3000, 0)
     heavy = np.arange(3000) % 10 == 0
     importance = Importance(np.ones(3000), np.where(heavy, 1.0, 1e-4))
@@ -492,7 +473,7 @@ def test_what_weighs_more_is_served_better(make_model):
     assert np.median(relative[chosen]) < 0.8 * np.median(relative[~chosen])
 
 
-def test_huge_scales_leave_their_tile_without(make_model):
+def test_huge_scales_only_affect_their_tile(make_model):
     model = few_shapes(make_model, 1200)
     scales = model.scales.copy()
     scales[17] = 3e8
@@ -500,7 +481,7 @@ def test_huge_scales_leave_their_tile_without(make_model):
     assert books(result.data)
 
 
-def test_the_scene_of_a_draft_has_the_decoded_shapes(make_model):
+def test_the_scene_of_a_plan_has_the_decoded_shapes(make_model):
     draft = EncodePlan.of(few_shapes(make_model, degree=0), EncodeOptions(shape_codebook_size=16))
     result = encode_tiles(draft).write()
     decoded = csplat.decode(result.data)
@@ -508,16 +489,15 @@ def test_the_scene_of_a_draft_has_the_decoded_shapes(make_model):
         np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
 
 
-def test_matrices_that_do_not_fit_are_refused(make_model):
+def test_invalid_matrices_are_refused(make_model):
     model = few_shapes(make_model, 200)
     for bad in (np.ones((200, 20)), np.ones((199, 21)), np.ones((200, 21), int), np.full((200, 21), np.nan)):
+        importance = Importance(np.ones(200), None, None, bad)
         with pytest.raises(InputError, match="shape matrices"):
-            encode_with_report(
-                model, EncodeOptions(shape_codebook_size=4), importance=Importance(np.ones(200), None, None, bad)
-            )
+            encode_with_report(model, EncodeOptions(shape_codebook_size=4), importance=importance)
 
 
-def test_axes_of_covariances_come_back():
+def test_axes_are_recovered_from_covariances():
     rng = np.random.default_rng(0)
     quats, scales = normalise_quats(rng.normal(size=(300, 4)).astype(np.float32)), rng.normal(0, 1, (300, 3))
     covariances, sizes = unit_covariances(quats.T, scales.T)
@@ -529,7 +509,7 @@ def test_axes_of_covariances_come_back():
     np.testing.assert_allclose(np.sort(scales - sizes[:, None], axis=1), np.sort(found.T, axis=1), atol=1e-3)
 
 
-#: SHA-256 of files with codebooks of both kinds, made with an importance and without.
+#: Prints the SHA-256 of files with both kinds of codebooks, with an importance and without.
 DIGEST = """
 import hashlib, sys
 import numpy as np
@@ -561,10 +541,10 @@ if __name__ == "__main__":
 
 
 @pytest.mark.slow
-def test_same_bytes_at_any_number_of_threads(tmp_path):
+def test_the_number_of_threads_does_not_change_the_bytes(tmp_path):
     program = tmp_path / "digest.py"
     program.write_text(DIGEST)
-    blas = "1" if (os.cpu_count() or 1) > 1 else "2"  # another number than here
+    blas = "1" if (os.cpu_count() or 1) > 1 else "2"  # another number than in this process
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": blas, "OMP_NUM_THREADS": blas}
     environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
     done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
@@ -572,7 +552,7 @@ def test_same_bytes_at_any_number_of_threads(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_javascript_decoder_reads_them_too(make_model):
+def test_the_javascript_decoder_reads_shape_codebooks(make_model):
     if shutil.which("node") is None:
         absent("the JavaScript decoder needs Node.js, which is not installed")
     model = few_shapes(make_model, 600, degree=2)

@@ -30,14 +30,14 @@ from csplat_render.metric_kernels import (
 from csplat_render.metrics import PSNR_CAP, Scores, flip, psnr, score_view, ssim
 
 
-def pictures(seed=0, height=30, width=41, noise=0.1):
+def two_images(seed=0, height=30, width=41, noise=0.1):
     rng = np.random.default_rng(seed)
     a = rng.random((height, width, 3), np.float32)
     return a, np.clip(a + noise * rng.standard_normal(a.shape), 0.0, 1.0).astype(np.float32)
 
 
 def slow_ssim(a, b):
-    """Pixel by pixel: the full 11×11 window, zeros beyond the border."""
+    """Compute SSIM pixel by pixel with the full 11×11 window, and zeros beyond the border."""
     g = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
     window = np.outer(g, g) / np.outer(g, g).sum()
     values = []
@@ -58,30 +58,30 @@ def test_psnr_of_a_known_error():
     assert math.isclose(20.0, psnr(a, a + 0.1))
 
 
-def test_equal_pictures_score_the_cap():
-    a, _ = pictures()
+def test_equal_images_have_the_largest_psnr():
+    a, _ = two_images()
     assert PSNR_CAP == psnr(a, a)
     assert PSNR_CAP == psnr(a, a + np.float32(1e-9))
     assert math.isclose(1.0, ssim(a, a))
 
 
-def test_pictures_are_clipped_first():
-    a, b = pictures()
+def test_images_are_clipped():
+    a, b = two_images()
     over = np.where(b == 1.0, 7.0, b)
     assert psnr(a, b) == psnr(a, over)
 
 
-def test_ssim_is_the_sum_over_the_window_written_out():
-    a, b = pictures(height=14, width=17)
+def test_ssim_agrees_with_explicit_sums():
+    a, b = two_images(height=14, width=17)
     assert math.isclose(slow_ssim(a, b), ssim(a, b), rel_tol=1e-12)
 
 
-def test_ssim_of_a_picture_smaller_than_the_window():
-    a, b = pictures(height=3, width=2)
+def test_ssim_of_an_image_smaller_than_the_window_agrees():
+    a, b = two_images(height=3, width=2)
     assert math.isclose(slow_ssim(a, b), ssim(a, b), rel_tol=1e-12)
 
 
-def test_the_error_is_pooled_and_the_mean_stands_beside_it():
+def test_errors_are_pooled_and_a_mean_psnr_is_reported():
     zero = np.zeros((4, 4, 3))
     scores = Scores.of([score_view(zero, zero + 0.1), score_view(zero, zero + 0.01)])
     assert np.allclose([20.0, 40.0], [one.psnr for one in scores.each])
@@ -94,13 +94,13 @@ def test_the_error_is_pooled_and_the_mean_stands_beside_it():
     assert scores.lpips is None
 
 
-def test_views_of_different_sizes_weigh_by_their_pixels():
+def test_views_are_weighted_by_their_pixels():
     wide = score_view(np.zeros((1, 3, 3)), np.full((1, 3, 3), 0.1))
     one = score_view(np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
     assert math.isclose(-10.0 * math.log10(0.01 * 3 / 4), Scores.of([wide, one]).psnr)
 
 
-def test_an_empty_background_inflates_psnr_by_what_covered_pixels_tell():
+def test_psnr_of_covered_pixels_excludes_the_background():
     reference, image = np.ones((10, 10, 3)), np.ones((10, 10, 3))
     reference[:5], image[:5] = 0.5, 0.6
     covered = np.zeros((10, 10), bool)
@@ -112,8 +112,8 @@ def test_an_empty_background_inflates_psnr_by_what_covered_pixels_tell():
     assert {"psnr", "psnr_mean", "psnr_worst", "ssim", "cover"} <= scores.as_json().keys()
 
 
-def test_refuses_what_cannot_be_compared():
-    a, b = pictures()
+def test_incomparable_images_are_refused():
+    a, b = two_images()
     for reference, image in ((a, b[1:]), (a[..., 0], b[..., 0]), ((a * 255).astype(np.uint8), b), (a * np.nan, b)):
         with pytest.raises(InputError):
             psnr(reference, image)
@@ -130,12 +130,12 @@ def noise_pair(height, width, dtype=np.float64):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 40), (11, 11), (37, 21), (120, 160)])
-def test_the_mean_equals_its_twin(size):
+def test_mean_ssim_equals_its_twin(size):
     x, y = noise_pair(*size)
     assert mean_ssim(x, y) == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
 
 
-def test_flat_and_equal_pictures():
+def test_mean_ssim_of_flat_and_equal_images_is_exact():
     x, y = np.full((30, 20, 3), 0.5), np.full((30, 20, 3), 0.7)
     assert mean_ssim(x, x) == pytest.approx(1.0, abs=1e-12)
     assert mean_ssim(x, y) == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
@@ -143,7 +143,7 @@ def test_flat_and_equal_pictures():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_both_passes_make_the_window(dtype):
+def test_both_passes_of_the_blur_equal_the_window(dtype):
     x, _ = noise_pair(24, 17, dtype)
     flat = x.reshape(24, 51)
     taps = WINDOW[RADIUS:].astype(dtype)
@@ -168,7 +168,7 @@ def test_the_number_of_threads_does_not_change_ssim():
     assert found[0] == found[1]
 
 
-def test_flip_is_zero_for_equal_pictures_and_grows():
+def test_flip_is_0_for_equal_images_and_grows():
     pytest.importorskip("flip_evaluator", reason="an optional package: pip install 'csplat[flip]'")
     a = np.random.default_rng(0).random((40, 50, 3)).astype(np.float32)
     assert 0.0 == flip(a, a)
@@ -176,18 +176,18 @@ def test_flip_is_zero_for_equal_pictures_and_grows():
     assert flip(a, 0.95 * a) == flip(a.astype(np.float64), (0.95 * a).astype(np.float64))
 
 
-def test_black_against_white_differs_fully():
+def test_flip_of_black_and_white_is_nearly_1():
     pytest.importorskip("flip_evaluator", reason="an optional package: pip install 'csplat[flip]'")
     black = np.zeros((30, 30, 3))
     assert flip(black, black + 1.0) > 0.9
 
 
-def test_refuses_pictures_that_differ_in_shape():
+def test_flip_refuses_images_of_different_shapes():
     with pytest.raises(InputError, match="FLIP"):
         flip(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
 
 
-def test_an_absent_package_is_named(monkeypatch):
+def test_an_absent_flip_package_is_named(monkeypatch):
     def absent(name):
         raise ImportError(name)
 
@@ -209,7 +209,7 @@ def random_weights():
 
 
 @pytest.mark.area(name="rasteriser")
-def test_the_published_pictures_have_their_published_distances(data_dir):
+def test_lpips_of_the_published_images_agrees(data_dir):
     Image = pytest.importorskip("PIL.Image", reason="reading PNG files needs pillow: pip install 'csplat[render]'")
     folder = data_dir / "lpips"
     distance = load_lpips(folder / "lpips_alex.npz")
@@ -225,7 +225,7 @@ def test_the_published_pictures_have_their_published_distances(data_dir):
 
 
 @pytest.mark.area(name="rasteriser")
-def test_the_distance_is_symmetric_positive_and_grows(random_weights):
+def test_lpips_is_symmetric_and_positive_and_grows(random_weights):
     rng = np.random.default_rng(1)
     a = rng.random((48, 40, 3))
     noise = rng.standard_normal(a.shape)
@@ -234,7 +234,7 @@ def test_the_distance_is_symmetric_positive_and_grows(random_weights):
     assert np.isclose(near, random_weights(a + 0.02 * noise, a), rtol=1e-4)
 
 
-def test_weights_survive_their_file(tmp_path, random_weights):
+def test_weights_are_saved_and_loaded(tmp_path, random_weights):
     save_lpips(tmp_path / "w.npz", random_weights)
     back = load_lpips(tmp_path / "w.npz")
     for name in ("kernels", "biases", "heads"):
@@ -242,7 +242,7 @@ def test_weights_survive_their_file(tmp_path, random_weights):
             assert (a == b).all()
 
 
-def test_the_environment_and_the_cache_name_weights(tmp_path, monkeypatch, random_weights):
+def test_weights_are_found_by_environment_and_cache(tmp_path, monkeypatch, random_weights):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("CSPLAT_LPIPS", raising=False)
     (tmp_path / "csplat").mkdir()
@@ -253,7 +253,7 @@ def test_the_environment_and_the_cache_name_weights(tmp_path, monkeypatch, rando
     assert load_lpips().source == str(tmp_path / "other.npz")
 
 
-def test_absent_weights_are_said_to_be_absent(tmp_path, monkeypatch):
+def test_absent_weights_are_an_error(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.delenv("CSPLAT_LPIPS", raising=False)
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)  # torch is absent
@@ -261,16 +261,14 @@ def test_absent_weights_are_said_to_be_absent(tmp_path, monkeypatch):
         load_lpips()
 
 
-def test_without_torch_its_cache_is_not_looked_for(monkeypatch):
+def test_without_torch_its_cache_is_ignored(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)
     assert load_torch_lpips() is None
 
 
 @pytest.mark.area(name="torch")
-def test_torch_files_hold_the_same_weights(tmp_path, random_weights):
-    torch = pytest.importorskip(
-        "torch", reason="its cache is read where torch is installed: pip install 'csplat[train]'"
-    )
+def test_weights_of_torch_files_are_equal(tmp_path, random_weights):
+    torch = pytest.importorskip("torch", reason="reading its cache needs torch: pip install 'csplat[train]'")
     checkpoints = tmp_path / "checkpoints"
     checkpoints.mkdir()
     backbone = {}
@@ -288,7 +286,7 @@ def test_torch_files_hold_the_same_weights(tmp_path, random_weights):
     assert random_weights(a, a * 0.9) == found(a, a * 0.9)
 
 
-def test_refuses_what_is_no_weights_file(tmp_path, random_weights):
+def test_invalid_files_of_weights_are_refused(tmp_path, random_weights):
     (tmp_path / "text.npz").write_text("no zip file")
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
     for name in ("text.npz", "other.npz", "absent.npz"):
@@ -298,7 +296,7 @@ def test_refuses_what_is_no_weights_file(tmp_path, random_weights):
         Lpips(random_weights.kernels[::-1], random_weights.biases, random_weights.heads, "wrong")
 
 
-def test_refuses_pictures_that_are_too_small_or_differ(random_weights):
+def test_lpips_refuses_small_or_different_images(random_weights):
     a = np.zeros((40, 40, 3))
     assert random_weights(np.zeros((31, 31, 3)), np.ones((31, 31, 3))) > 0.0
     for x, y in ((a, a[1:]), (a[:30], a[:30]), (a[..., 0], a[..., 0]), (a.astype(np.uint8), a.astype(np.uint8))):
@@ -307,7 +305,7 @@ def test_refuses_pictures_that_are_too_small_or_differ(random_weights):
 
 
 SHAPES_AND_STRIDES = [
-    # picture, kernel (height, width, in, out), stride, padding
+    # image, kernel (height, width, in, out), stride, padding
     ((13, 11, 3), (5, 3, 3, 4), 1, 2),
     ((13, 11, 3), (5, 3, 3, 4), 4, 2),
     ((13, 11, 3), (5, 3, 3, 4), 2, 0),
@@ -322,9 +320,8 @@ SHAPES_AND_STRIDES = [
 def convolution_case(picture, kernel, seed=0):
     rng = np.random.default_rng(seed)
     weights = rng.standard_normal(kernel) / np.sqrt(np.prod(kernel[:3]))
-    return (
-        array.astype(np.float32) for array in (rng.standard_normal(picture), weights, rng.standard_normal(kernel[3]))
-    )
+    arrays = (rng.standard_normal(picture), weights, rng.standard_normal(kernel[3]))
+    return (array.astype(np.float32) for array in arrays)
 
 
 @pytest.mark.area(name="rasteriser")
@@ -340,19 +337,12 @@ def test_the_convolution_equals_its_twin(picture, kernel, stride, padding):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize(("stride", "padding"), [(1, 2), (4, 2), (2, 0)])
-def test_the_twin_is_the_sum_written_out(stride, padding):
+def test_the_twin_agrees_with_explicit_sums(stride, padding):
     x, kernel, bias = convolution_case((13, 11, 3), (5, 3, 3, 4))
     padded = np.pad(x, ((padding, padding), (padding, padding), (0, 0))).astype(np.float64)
     rows, columns = (padded.shape[0] - 5) // stride + 1, (padded.shape[1] - 3) // stride + 1
-    expected = np.array(
-        [
-            [
-                np.einsum("hwi,hwio->o", padded[r * stride :][:5, c * stride :][:, :3], kernel.astype(np.float64))
-                for c in range(columns)
-            ]
-            for r in range(rows)
-        ]
-    )
+    windows = [[padded[r * stride :][:5, c * stride :][:, :3] for c in range(columns)] for r in range(rows)]
+    expected = np.einsum("rchwi,hwio->rco", np.array(windows), kernel.astype(np.float64))
     np.testing.assert_allclose(convolve_twin(x, kernel, bias, stride, padding), expected + bias, atol=1e-12)
 
 

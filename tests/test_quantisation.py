@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from checked import covariances, measure_errors
+from checked import covariances, measure_errors, quaternion_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -123,17 +123,6 @@ def test_equivalent_shapes_get_the_same_canonical_form(order, sign):
     second = canonicalise_shape(again.astype(np.float32), scales[:, list(order)])
     np.testing.assert_allclose(second[0], first[0], atol=2e-6)
     np.testing.assert_array_equal(second[1], first[1])
-
-
-def quaternion_of(rotation: np.ndarray) -> np.ndarray:
-    symmetric = np.zeros((4, 4))
-    r = rotation
-    symmetric[0] = [r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]
-    symmetric[1, 1:] = [r[0, 0] - r[1, 1] - r[2, 2], r[1, 0] + r[0, 1], r[0, 2] + r[2, 0]]
-    symmetric[2, 2:] = [r[1, 1] - r[0, 0] - r[2, 2], r[2, 1] + r[1, 2]]
-    symmetric[3, 3] = r[2, 2] - r[0, 0] - r[1, 1]
-    full = np.triu(symmetric) + np.triu(symmetric, 1).T
-    return np.linalg.eigh(full)[1][:, -1]
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -61,7 +61,7 @@ def one_splat(alpha=0.5, scale=-2.0, colour=(1.0, 0.5, 0.25), mean=(0.0, 0.0, 0.
 
 
 def scene(count=400, degree=3, seed=0):
-    """A random scene of splats of all shapes, none of them degenerate."""
+    """Return random splats of all shapes without degenerate ones."""
     rng = np.random.default_rng(seed)
     quats = rng.standard_normal((count, 4))
     return SplatModel(
@@ -86,11 +86,11 @@ def assert_same_render(model, view, **options):
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_random_scenes_look_like_the_twins(degree):
+def test_renders_of_random_scenes_agree_with_the_twin(degree):
     assert_same_render(scene(degree=degree, seed=degree), camera(70, 53), background=(0.3, 0.6, 0.1))
 
 
-def test_antialiased_pictures_look_like_the_twins():
+def test_antialiased_renders_agree_with_the_twin():
     model = scene(count=300)
     model = replace(model, scales=model.scales - 2, antialiased=True)
     view = camera(64, 48, 40.0)
@@ -99,7 +99,7 @@ def test_antialiased_pictures_look_like_the_twins():
 
 
 @pytest.mark.slow
-def test_the_sample_looks_like_the_twins(sample_path):
+def test_renders_of_the_sample_agree_with_the_twin(sample_path):
     model = read_ply(sample_path)
     centre = np.median(model.means, axis=0)
     spread = float(np.quantile(np.abs(model.means - centre), 0.9))
@@ -112,7 +112,7 @@ def test_the_sample_looks_like_the_twins(sample_path):
 
 
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox60k_noreg"])
-def test_shared_scenes_look_like_the_twins(data_dir, name):
+def test_renders_of_shared_scenes_agree_with_the_twin(data_dir, name):
     path, cameras = data_dir / "ply" / f"{name}.ply", data_dir / "psnr_cameras" / f"{name}.json"
     if not (path.exists() and cameras.exists()):
         pytest.skip(f"{name} is absent")
@@ -122,13 +122,13 @@ def test_shared_scenes_look_like_the_twins(data_dir, name):
 
 
 def test_one_splat_has_the_values_worked_out_by_hand():
-    # σ = 0.5 at distance 4 with a focal length of 80 pixels: 10 pixels, and 0.3 of dilation.
+    # σ = 0.5 at distance 4 with a focal length of 80 pixels is 10 pixels; the dilation is 0.3.
     view = camera(65, 49, 80.0)
     result = render(one_splat(alpha=0.5, scale=math.log(0.5)), view)
     variance = 100.0 + DILATION
     for dx, dy in [(0, 0), (5, 0), (0, 7), (-12, 9)]:
         alpha = 0.5 * math.exp(-0.5 * (dx * dx + dy * dy) / variance)
-        x, y = 32 + dx, 24 + dy  # the centre of the picture is the centre of a pixel
+        x, y = 32 + dx, 24 + dy  # the centre of the image is the centre of a pixel
         np.testing.assert_allclose(result.rgb[y, x], np.array([1.0, 0.5, 0.25]) * alpha, atol=1e-6)
         assert result.alpha[y, x] == pytest.approx(alpha, abs=1e-6)
         assert result.depth[y, x] == pytest.approx(4.0 * alpha, abs=1e-5)
@@ -139,7 +139,7 @@ def test_one_splat_has_the_values_worked_out_by_hand():
     assert result.alpha[24, 32 - math.floor(reach) - 1] == 0.0
 
 
-def test_a_needle_lies_where_its_rotation_says():
+def test_a_needle_is_rotated():
     half = math.sqrt(0.5)
     turned = (half, 0.0, 0.0, half)  # 90° about z: x becomes y, which points down
     picture = render(one_splat(scale=(-1.0, -6.0, -6.0), quat=turned), camera()).alpha
@@ -161,7 +161,7 @@ def test_the_background_shines_through():
     assert result.rgb[24, 32, 2] == pytest.approx(0.25 * (1 - left) + 0.3 * left, abs=1e-6)
 
 
-def test_the_nearer_splat_covers_the_farther_and_equal_depths_go_by_index():
+def test_splats_are_drawn_by_depth_then_by_index():
     red, blue = one_splat(0.9, -1.0, (1, 0, 0), (0, 0, 0.5)), one_splat(0.9, -1.0, (0, 0, 1), (0, 0, -0.5))
     names = ("means", "quats", "scales", "opacities", "sh0", "shN")
     both = SplatModel(**{name: np.concatenate([getattr(red, name), getattr(blue, name)]) for name in names})
@@ -183,22 +183,21 @@ def test_a_pixel_is_finished_before_transmittance_falls_below_the_limit():
 
 
 @pytest.mark.parametrize("mode", ["standard", "fast", "exact"])
-def test_spherical_harmonics_can_be_cut_off(mode):
+def test_higher_sh_bands_can_be_ignored(mode):
     model = scene(count=50)
     flat = replace(model, shN=np.zeros((50, 0, 3), np.float32))
-    np.testing.assert_array_equal(
-        render(model, camera(), sh_degree=0, mode=mode).rgb, render(flat, camera(), mode=mode).rgb
-    )
+    cut, bare = render(model, camera(), sh_degree=0, mode=mode), render(flat, camera(), mode=mode)
+    np.testing.assert_array_equal(cut.rgb, bare.rgb)
 
 
-def test_the_fast_mode_stays_near_the_standard_one():
+def test_the_fast_mode_is_close_to_the_standard_one():
     model = scene(count=2000)
     standard, fast = render(model, camera()).rgb, render(model, camera(), mode="fast").rgb
     error = math.sqrt(np.mean((standard - fast) ** 2))
     assert 0.0 < error < 0.02
 
 
-def test_any_number_of_threads_gives_the_same_bits():
+def test_the_number_of_threads_does_not_change_a_bit():
     model = scene(count=3000)
     view = camera(100, 75)
     rng = np.random.default_rng(0)
@@ -214,7 +213,7 @@ def test_any_number_of_threads_gives_the_same_bits():
             np.testing.assert_array_equal(a, b)
 
 
-def test_buffers_of_earlier_pictures_do_not_show():
+def test_earlier_renders_do_not_influence_later_ones():
     rasteriser = Rasteriser()
     large, small = scene(count=3000), scene(count=20, degree=1, seed=5)
     rasteriser.forward(large, camera(200, 150))
@@ -223,7 +222,7 @@ def test_buffers_of_earlier_pictures_do_not_show():
 
 
 @pytest.mark.parametrize("mode", ["standard", "fast"])
-def test_slices_of_depth_one_after_the_other_give_the_same_bits(mode):
+def test_rendering_in_slices_of_depth_gives_the_same_bits(mode):
     model, view, behind = scene(), camera(70, 53), (0.3, 0.6, 0.1)
     rasteriser = Rasteriser(mode, gradients=False)
     wanted = rasteriser.forward(model, view, background=behind)
@@ -238,7 +237,7 @@ def test_slices_of_depth_one_after_the_other_give_the_same_bits(mode):
         np.testing.assert_array_equal(getattr(wanted, name), getattr(found, name))
 
 
-def test_tiles_that_a_splat_may_touch_are_no_fewer_than_it_touches():
+def test_the_estimated_number_of_tiles_is_an_upper_bound():
     rasteriser = Rasteriser(gradients=False)
     model, view = scene(), camera(70, 53)
     seen, drawn = rasteriser.find_visible(model, view), rasteriser.forward(model, view)
@@ -263,7 +262,7 @@ def test_results_belong_to_the_caller():
     np.testing.assert_array_equal(before, first)
 
 
-def test_rejects_arrays_that_do_not_fit():
+def test_invalid_arrays_and_options_are_refused():
     model = scene(count=5)
     bad = UncheckedSplats(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
     with pytest.raises(InputError, match="quats has shape"):
@@ -282,7 +281,7 @@ def test_rejects_arrays_that_do_not_fit():
         render(model, camera(), threads=0)
 
 
-def test_the_twin_takes_what_the_rasteriser_takes():
+def test_the_twin_accepts_the_same_arguments():
     model = scene(count=30)
     assert render_exact(model, camera()).rgb.dtype == np.float64
     assert render(model, camera(), mode="exact").drawn == 30
@@ -292,7 +291,7 @@ W, H = 50, 37
 
 
 def assert_survives(arrays, view, *, antialiased=False):
-    """Render forward and backward in both dtypes: finite, alike, and like the twin."""
+    """Render forward and backward in both dtypes; assert finite results that agree with the twin."""
     found = []
     rng = np.random.default_rng(1)
     weights = rng.standard_normal((view.H, view.W, 3)), *rng.standard_normal((2, view.H, view.W))
@@ -326,20 +325,20 @@ def assert_gradients_agree(found):
     [(0.0, -13.8, -13.8), (0.0, 0.0, -13.8), (4.0, -9.8, -9.8), (4.0, 4.0, -9.8), (9.0, -4.8, -4.8)],
     ids=["needle", "disc", "large needle", "large disc", "huge needle"],
 )
-def test_an_anisotropy_of_a_million(scales, antialiased):
+def test_splats_with_an_anisotropy_of_a_million_survive(scales, antialiased):
     arrays = extreme_splats(scales=scales)
     assert_gradients_agree(assert_survives(arrays, facing(), antialiased=antialiased))
 
 
 @pytest.mark.area(name="rasteriser")
-def test_the_camera_inside_splats():
+def test_splats_around_the_camera_survive():
     arrays = extreme_splats(scales=(1.0, 0.5, 0.2))
     assert_gradients_agree(assert_survives(arrays, facing(distance=0.0)))
 
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("near", [1e-30, 1e-6, 0.2, 3.0])
-def test_splats_at_the_near_plane_and_behind_it(near):
+def test_splats_at_and_behind_the_near_plane_survive(near):
     arrays = extreme_splats(count=80)
     arrays["means"][:, 2] = np.concatenate([np.float32(near) * np.linspace(0.5, 2.0, 40), np.linspace(-4.0, 4.0, 40)])
     found = assert_survives(arrays, facing(near=near, distance=0.0))
@@ -348,7 +347,7 @@ def test_splats_at_the_near_plane_and_behind_it(near):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("log_scale", [-60.0, 60.0, 88.0, -88.0, 3e38, -3e38])
-def test_extreme_log_scales(log_scale):
+def test_extreme_log_scales_survive(log_scale):
     for axes in ((1, 1, 1), (1, 0, 0), (1, 1, 0)):
         arrays = extreme_splats()
         arrays["scales"][:] = np.where(axes, np.float32(log_scale), arrays["scales"])
@@ -360,7 +359,7 @@ def test_extreme_log_scales(log_scale):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("alpha", [0.0, 1.0])
-def test_alpha_zero_and_one(alpha):
+def test_alphas_of_0_and_1_survive(alpha):
     found = assert_survives(extreme_splats(opacities=alpha), facing())
     assert (found[0][0].alpha.max() > 0.0) == (alpha > 0.0)
     assert_gradients_agree(found)
@@ -368,13 +367,13 @@ def test_alpha_zero_and_one(alpha):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("focal", [1e-6, 1e-2, 1e4, 1e9])
-def test_tiny_and_huge_focal_lengths(focal):
+def test_tiny_and_huge_focal_lengths_survive(focal):
     assert_survives(extreme_splats(), facing(focal=focal))
 
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("distance", [1e-20, 1e20, 1e37])
-def test_far_and_large_scenes(distance):
+def test_scenes_of_any_size_survive(distance):
     arrays = extreme_splats()
     arrays["means"] *= np.float32(distance)
     arrays["scales"] += np.float32(math.log(distance))
@@ -382,7 +381,7 @@ def test_far_and_large_scenes(distance):
 
 
 @pytest.mark.area(name="rasteriser")
-def test_zero_and_huge_quaternions():
+def test_quaternions_of_any_length_survive():
     arrays = extreme_splats()
     arrays["quats"][::3] = 0.0
     arrays["quats"][1::3] *= np.float32(1e30)
@@ -397,7 +396,7 @@ def test_zero_and_huge_quaternions():
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_rows_that_hold_nan_are_left_out_and_counted(name, bad):
+def test_non_finite_rows_are_ignored_and_counted(name, bad):
     arrays = extreme_splats(count=30)
     clean = {key: value[3:].copy() for key, value in arrays.items()}
     arrays[name].reshape(30, -1)[:3, -1] = bad
@@ -408,7 +407,7 @@ def test_rows_that_hold_nan_are_left_out_and_counted(name, bad):
 
 
 @pytest.mark.area(name="rasteriser")
-def test_an_empty_scene_shows_the_background():
+def test_an_empty_scene_renders_as_the_background():
     for degree in (0, 3):
         arrays = extreme_splats(count=0, degree=degree)
         assert_survives(arrays, facing())
@@ -418,7 +417,7 @@ def test_an_empty_scene_shows_the_background():
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (1, 100), (333, 1)])
-def test_pictures_of_any_size(width, height):
+def test_renders_of_any_size_survive(width, height):
     assert_survives(extreme_splats(), facing(width=width, height=height))
 
 
@@ -438,15 +437,15 @@ def test_too_many_intersections_are_refused(monkeypatch):
 
 
 @pytest.mark.area(name="rasteriser")
-def test_warming_up_says_nothing_once_all_is_compiled():
+def test_warming_up_again_is_silent():
     warm_up()
-    said = []
-    assert warm_up(said.append) < 5.0
-    assert len(said) in (0, 2)
+    messages = []
+    assert warm_up(messages.append) < 5.0
+    assert len(messages) in (0, 2)
 
 
 def most(errors):
-    """The largest error; printed."""
+    """Print and return the largest error."""
     error = max(errors.values())
     print(f"relative error {error:.1e}")
     return error
@@ -454,7 +453,7 @@ def most(errors):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize(("degree", "antialiased"), [(0, False), (1, True), (2, False), (3, False), (3, True)])
-def test_gradients_are_the_finite_differences_of_the_twin(degree, antialiased):
+def test_gradients_agree_with_finite_differences_of_the_twin(degree, antialiased):
     arrays, weights = random_splats(3, degree, seed=degree), random_gradients(VIEW, seed=1)
     options = {"background": (0.2, 0.5, 0.7), "antialiased": antialiased}
     picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
@@ -468,7 +467,7 @@ def test_gradients_are_the_finite_differences_of_the_twin(degree, antialiased):
 @pytest.mark.area(name="torch")
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_gradients_are_those_of_autograd(degree, antialiased):
+def test_gradients_agree_with_autograd(degree, antialiased):
     pytest.importorskip("torch", reason="autograd is that of torch: pip install 'csplat[train]'")
     from torch_twin import autograd_gradients
 
@@ -482,7 +481,7 @@ def test_gradients_are_those_of_autograd(degree, antialiased):
 
 
 @pytest.mark.area(name="rasteriser")
-def test_float32_gradients_are_those_of_float64_on_the_sample(sample_path):
+def test_float32_gradients_agree_with_float64_on_the_sample(sample_path):
     model = read_ply(sample_path)
     (view,) = virtual_cameras(model, 1, 160, 120)
     flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
@@ -492,7 +491,7 @@ def test_float32_gradients_are_those_of_float64_on_the_sample(sample_path):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox120k"])
-def test_float32_gradients_are_those_of_float64_on_shared_scenes(data_dir, name):
+def test_float32_gradients_agree_with_float64_on_shared_scenes(data_dir, name):
     path, cameras = data_dir / "ply" / f"{name}.ply", data_dir / "psnr_cameras" / f"{name}.json"
     if not (path.exists() and cameras.exists()):
         pytest.skip(f"{name} is absent")
@@ -517,7 +516,7 @@ def test_float32_gradients_survive_adversarial_splats(name, case):
 
 
 @pytest.mark.area(name="rasteriser")
-def test_no_gradient_reaches_what_is_clamped_capped_or_out_of_view():
+def test_clamped_capped_or_invisible_values_have_no_gradient():
     arrays = random_splats(4, 0, seed=3)
     arrays["means"][:] = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, -50.0], [90.0, 0.0, 0.0]]
     arrays["scales"][:] = -0.5
@@ -535,7 +534,7 @@ def test_no_gradient_reaches_what_is_clamped_capped_or_out_of_view():
 
 
 @pytest.mark.area(name="rasteriser")
-def test_the_gradient_ignores_the_length_of_a_quaternion():
+def test_gradients_ignore_the_length_of_a_quaternion():
     arrays = random_splats(6, 0, seed=4)
     weights = random_gradients(VIEW, seed=4)
     found = []
@@ -549,7 +548,7 @@ def test_the_gradient_ignores_the_length_of_a_quaternion():
 
 
 @pytest.mark.area(name="rasteriser")
-def test_bands_that_were_not_rendered_have_no_gradient():
+def test_ignored_sh_bands_have_no_gradient():
     arrays = random_splats(6, 3, seed=5)
     rasteriser = Rasteriser(dtype=np.float64)
     rasteriser.forward(UncheckedSplats(**arrays), VIEW, sh_degree=1)

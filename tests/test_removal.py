@@ -1,4 +1,4 @@
-"""The contribution of splats to renders: the removal pass against its twin, and colours fitted to renders."""
+"""The error of pruning each splat, against its twin, and colours fitted to renders."""
 
 from dataclasses import dataclass, replace
 
@@ -46,12 +46,10 @@ def relative(found, expected):
     return np.abs(found - expected) / np.maximum(expected, 1e-12)
 
 
-# the pass
-
-
+# Pruning errors.
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_the_pass_agrees_with_taking_splats_away_one_by_one(antialiased):
+def test_pruning_errors_agree_with_removing_splats_one_by_one(antialiased):
     model = replace(scene(30), antialiased=antialiased)
     behind = (0.2, 0.5, 0.9)
     expected = pruning_error_exact(model, views(2), np.arange(30), background=behind, transmittance_min=0.0)
@@ -63,21 +61,21 @@ def test_the_pass_agrees_with_taking_splats_away_one_by_one(antialiased):
 
 
 @pytest.mark.parametrize("name", ["plane3", "lego60k", "fox60k_noreg"])
-def test_the_pass_agrees_on_real_scenes(data_dir, name):
+def test_pruning_errors_agree_on_shared_scenes(data_dir, name):
     path = data_dir / "ply" / f"{name}.ply"
     if not path.exists():
         pytest.skip(f"{name} is absent")
     camera = load_cameras(data_dir / "psnr_cameras" / f"{name}.json")[1]
-    assert_the_pass_agrees(read_ply(path), replace(camera, K=np.diag([0.1, 0.1, 1.0]) @ camera.K, W=64, H=48))
+    assert_pruning_errors_agree(read_ply(path), replace(camera, K=np.diag([0.1, 0.1, 1.0]) @ camera.K, W=64, H=48))
 
 
 @pytest.mark.slow
-def test_the_pass_agrees_on_the_sample(sample_path):
+def test_pruning_errors_agree_on_the_sample(sample_path):
     source = read_ply(sample_path)
-    assert_the_pass_agrees(source, virtual_cameras(source, 1, 64, 48)[0])
+    assert_pruning_errors_agree(source, virtual_cameras(source, 1, 64, 48)[0])
 
 
-def assert_the_pass_agrees(source, camera):
+def assert_pruning_errors_agree(source, camera):
     model = source.select(slice(0, None, max(1, len(source) // 500)))
     found = measure_pruning_error(model, [camera], transmittance_min=0.0)
     rows = np.argsort(-found.error)[:120:40]
@@ -88,7 +86,7 @@ def assert_the_pass_agrees(source, camera):
 
 
 @pytest.mark.slow
-def test_finished_pixels_are_all_that_it_leaves_out():
+def test_only_finished_pixels_are_left_out():
     model = scene(count=60)
     model = replace(model, opacities=np.full(60, 0.97, np.float32), scales=model.scales + np.float32(1.0))
     exact = pruning_error_exact(model, views(1), np.arange(60))
@@ -97,17 +95,16 @@ def test_finished_pixels_are_all_that_it_leaves_out():
     assert np.corrcoef(found, exact)[0, 1] > 0.999
 
 
-def test_the_picture_is_that_of_the_renderer():
+def test_renders_of_the_measurement_equal_those_of_the_renderer():
     model, seen = scene(count=200), []
-    measure_pruning_error(
-        model, views(2), background=(0.1, 0.2, 0.3), on_render=lambda _n, picture: seen.append(picture)
-    )
+    behind = (0.1, 0.2, 0.3)
+    measure_pruning_error(model, views(2), background=behind, on_render=lambda _n, picture: seen.append(picture))
     for camera, picture in zip(views(2), seen, strict=True):
-        np.testing.assert_allclose(picture, render(model, camera, background=(0.1, 0.2, 0.3)).rgb, atol=2e-5)
+        np.testing.assert_allclose(picture, render(model, camera, background=behind).rgb, atol=2e-5)
 
 
 @pytest.mark.area(name="rasteriser")
-def test_error_and_product_are_what_removal_adds_to_a_wrong_picture():
+def test_error_and_product_predict_the_change_against_other_references():
     model = scene(count=30)
     wanted = [render(scene(count=30, seed=1), camera, mode="exact").rgb for camera in views(2)]
     found = measure_pruning_error(model, views(2), references=wanted, dtype=np.float64)
@@ -123,7 +120,7 @@ def test_error_and_product_are_what_removal_adds_to_a_wrong_picture():
 
 
 @pytest.mark.area(name="rasteriser")
-def test_bands_and_weights_are_those_of_a_single_splat():
+def test_bands_and_weights_of_a_single_splat_are_exact():
     model = scene(count=1)
     camera = views(1)[0]
     found = measure_pruning_error(model, [camera], dtype=np.float64)
@@ -136,7 +133,7 @@ def test_bands_and_weights_are_those_of_a_single_splat():
         assert found.bands[0, 1] == pytest.approx(float(np.sum((with_band - without) ** 2)), rel=1e-4)
 
 
-def test_a_hidden_splat_and_one_out_of_view_are_unseen():
+def test_a_splat_out_of_view_is_unseen():
     model = scene(count=3)
     far = model.means.copy()
     far[2] = 100.0
@@ -147,7 +144,7 @@ def test_a_hidden_splat_and_one_out_of_view_are_unseen():
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_threads_change_nothing(threads):
+def test_the_number_of_threads_does_not_change_the_result(threads):
     model = scene(count=300)
     found, other = measure_pruning_error(model, views(2), threads=threads), measure_pruning_error(model, views(2))
     for name in ("error", "squared_weight", "bands"):
@@ -156,9 +153,9 @@ def test_threads_change_nothing(threads):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_splats_at_a_slant_lose_no_row(antialiased):
+def test_slanted_needles_lose_no_row(antialiased):
     model = scene(count=30, seed=4)
-    scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (30, 1))  # needles: most rows of their boxes are empty
+    scales = np.tile(np.float32([-0.5, -6.0, -6.0]), (30, 1))  # needles, which leave most rows of their boxes empty
     model = replace(model, scales=scales, antialiased=antialiased)
     expected = pruning_error_exact(model, views(1), np.arange(30), transmittance_min=0.0)
     found = measure_pruning_error(model, views(1), dtype=np.float64, transmittance_min=0.0)
@@ -167,20 +164,20 @@ def test_splats_at_a_slant_lose_no_row(antialiased):
 
 
 @pytest.mark.parametrize("name", [name for name, _ in adversarial()])
-def test_totals_of_adversarial_splats_are_finite(name):
+def test_errors_of_adversarial_splats_are_finite(name):
     case = dict(adversarial())[name]
     assert_finite(case.arrays, case.view, antialiased=case.antialiased)
 
 
 @pytest.mark.parametrize("log_scale", [-60.0, 60.0, 88.0, -88.0, 3e38, -3e38])
-def test_totals_of_tiny_and_huge_splats_are_finite(log_scale):
+def test_errors_of_tiny_and_huge_splats_are_finite(log_scale):
     assert_finite(extreme_splats(scales=log_scale), facing())
     assert_finite(extreme_splats(scales=(log_scale, -2.0, -2.0)), facing())
 
 
 @pytest.mark.parametrize("field", ["sh0", "shN"])
 @pytest.mark.parametrize("size", [1e12, 1e25, 3e38])
-def test_totals_of_colours_beyond_all_measure_are_finite(field, size):
+def test_errors_of_huge_colours_are_finite(field, size):
     arrays = extreme_splats()
     arrays[field] = np.where(arrays[field] > 0.0, size, -size).astype(np.float32)
     assert_finite(arrays, facing())
@@ -188,7 +185,7 @@ def test_totals_of_colours_beyond_all_measure_are_finite(field, size):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_rows_that_hold_nan_are_unseen_and_change_nothing(field, bad):
+def test_non_finite_rows_are_unseen_and_change_nothing(field, bad):
     arrays = extreme_splats(count=30)
     clean = measured({name: value[3:] for name, value in arrays.items()}, facing())
     arrays[field].reshape(30, -1)[:3, -1] = bad
@@ -199,7 +196,7 @@ def test_rows_that_hold_nan_are_unseen_and_change_nothing(field, bad):
 
 
 def measured(arrays, view, *, antialiased=False):
-    """Measure what a `SplatModel` would refuse."""
+    """Measure arrays that a `SplatModel` would refuse."""
     degree = sh_degree_of(arrays["shN"].shape[1])
     return measure_pruning_error(Loose(**arrays, sh_degree=degree, antialiased=antialiased), [view])
 
@@ -221,7 +218,7 @@ class Loose(UncheckedSplats):
         return len(self.means)
 
 
-def test_parts_add_up():
+def test_errors_of_groups_of_views_add_up():
     model, cameras = scene(count=50), views(3)
     whole = measure_pruning_error(model, cameras)
     parts = measure_pruning_error(model, cameras[:1]) + measure_pruning_error(model, cameras[1:])
@@ -230,21 +227,19 @@ def test_parts_add_up():
     np.testing.assert_array_equal(whole.seen, parts.seen)
 
 
-def test_no_camera_and_too_few_references_are_refused():
+def test_missing_cameras_or_references_are_refused():
     with pytest.raises(InputError, match="camera"):
         measure_pruning_error(scene(), [])
     with pytest.raises(InputError, match="1 reference images, expected one for each of 2"):
         measure_pruning_error(scene(), views(2), references=[np.zeros((30, 40, 3))])
 
 
-# colours
-
-
+# Colours.
 def coefficients(model):
     return np.concatenate([model.sh0[:, None], model.shN], axis=1)
 
 
-def test_the_operator_and_its_transpose_belong_together():
+def test_the_operator_is_symmetric():
     model = scene(count=80)
     operator = ColourOperator(model, views(2))
     rng = np.random.default_rng(3)
@@ -258,7 +253,7 @@ def test_the_operator_and_its_transpose_belong_together():
     assert across == pytest.approx(np.sum(x * images[1], dtype=np.float64), rel=1e-3, abs=1e-3 * length)
 
 
-def test_the_gradient_is_that_of_finite_differences_and_the_diagonal_that_of_the_matrix():
+def test_gradient_and_diagonal_agree_with_finite_differences():
     model = replace(scene(count=40), sh0=np.full((40, 3), 1.5, np.float32))  # bright: nothing is clamped
     wanted = [np.full((30, 40, 3), 0.4, np.float32)] * 2
     operator, x = ColourOperator(model, views(2)), coefficients(model)
@@ -273,7 +268,7 @@ def test_the_gradient_is_that_of_finite_differences_and_the_diagonal_that_of_the
         assert after - before == pytest.approx(expected, rel=2e-3, abs=1e-3)
 
 
-def test_fitting_finds_the_colours_that_pictures_were_made_of():
+def test_fitting_recovers_the_colours_of_renders():
     model = scene(count=25, degree=1)
     model = replace(model, sh0=model.sh0 * np.float32(0.2) + np.float32(1.0), shN=model.shN * np.float32(0.3))
     cameras = views(12)
@@ -286,7 +281,7 @@ def test_fitting_finds_the_colours_that_pictures_were_made_of():
     assert true < 2e-3 * errors[0]
 
 
-def test_what_is_not_seen_stays():
+def test_colours_of_unseen_splats_are_kept():
     model, cameras = scene(count=40), views(2)
     means = model.means.copy()
     means[5] = 50.0
@@ -297,7 +292,7 @@ def test_what_is_not_seen_stays():
     assert np.abs(x - coefficients(model)).max() > 0.01
 
 
-def test_views_that_do_not_fit_the_cache_give_the_same_colours():
+def test_views_beyond_the_cache_give_the_same_colours():
     model, cameras = scene(count=60), views(3)
     wanted = [np.full((30, 40, 3), 0.5, np.float32)] * 3
     kept, _ = fit_colours(model, cameras, wanted, steps=3)
@@ -306,7 +301,7 @@ def test_views_that_do_not_fit_the_cache_give_the_same_colours():
 
 
 @pytest.mark.parametrize("opacity", [0.05, 0.3, 0.97])
-def test_leaving_out_what_has_no_weight_changes_no_bit(opacity):
+def test_trimming_splats_without_weight_changes_no_bit(opacity):
     model = scene(count=400)
     model = replace(model, opacities=np.full(400, opacity, np.float32), scales=model.scales + np.float32(0.5))
     drawing, x = Contributions(), coefficients(model)
@@ -326,13 +321,13 @@ def test_leaving_out_what_has_no_weight_changes_no_bit(opacity):
         np.testing.assert_array_equal(expected, actual)
 
 
-def test_a_fit_of_colours_beyond_all_measure_ends_without_nan():
+def test_a_fit_of_huge_colours_is_finite():
     model = scene(count=40)
     model = replace(model, sh0=np.full((40, 3), 1e30, np.float32))
     x, _ = fit_colours(model, views(2), [np.full((30, 40, 3), 0.5, np.float32)] * 2)
     assert np.isfinite(x).all()
 
 
-def test_as_many_pictures_as_cameras_are_wanted():
+def test_a_wrong_number_of_references_is_refused():
     with pytest.raises(InputError, match="2 cameras and 1 reference images"):
         fit_colours(scene(), views(2), [np.zeros((30, 40, 3), np.float32)])

@@ -1,4 +1,4 @@
-"""Sensitivity against finite differences of the exact twin; what never shows; files that belong to a scene."""
+"""Sensitivity against finite differences of the exact twin, files of sensitivities, and the command."""
 
 import json
 from dataclasses import replace
@@ -13,7 +13,8 @@ from csplat.ply import read_ply, write_ply
 
 pytest.importorskip("numba", reason="the renderer wants the extra [render]")
 
-from command_line import change_views, invoke
+from checked import covariances, quaternion_of
+from command_line import call, change_views, invoke
 
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.reference_rasteriser import Decisions, render_exact
@@ -49,7 +50,7 @@ def cameras(count=2, size=(40, 32)):
 
 
 class Loose:
-    """Arrays in float64 that can be changed: a `SplatModel` holds float32."""
+    """Mutable float64 arrays of a model."""
 
     def __init__(self, model):
         for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
@@ -57,7 +58,7 @@ class Loose:
 
 
 def derivatives(model, camera, change):
-    """d picture / d parameter, [H, W, 3], by central differences with all comparisons held fast."""
+    """Return d render / d parameter, [H, W, 3], by central differences with all comparisons fixed."""
     decisions = Decisions()
     render_exact(Loose(model), camera, antialiased=model.antialiased, decisions=decisions)
     pictures = []
@@ -70,35 +71,15 @@ def derivatives(model, camera, change):
 
 
 def bend(splats, row, i, j, step):
-    """Add a step to one entry of the covariance over its trace, and to its mirror image."""
-    w, x, y, z = splats.quats[row] / np.linalg.norm(splats.quats[row])
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    covariance = R @ np.diag(np.exp(2 * splats.scales[row])) @ R.T
+    """Add a step, relative to the trace, to an entry of the covariance and its mirror entry."""
+    (covariance,) = covariances(splats.quats[row][None], splats.scales[row][None])
     trace = np.trace(covariance)
     change = np.zeros((3, 3))
     change[i, j] = change[j, i] = step * trace
     values, axes = np.linalg.eigh(covariance + change)
     axes[:, 0] *= np.linalg.det(axes)
     splats.scales[row] = 0.5 * np.log(values)
-    splats.quats[row] = quaternion(axes)
-
-
-def quaternion(R):
-    K = np.array(
-        [
-            [R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
-            [0, R[0, 0] - R[1, 1] - R[2, 2], R[0, 1] + R[1, 0], R[0, 2] + R[2, 0]],
-            [0, 0, R[1, 1] - R[0, 0] - R[2, 2], R[1, 2] + R[2, 1]],
-            [0, 0, 0, R[2, 2] - R[0, 0] - R[1, 1]],
-        ]
-    )
-    return np.linalg.eigh(K, UPLO="U")[1][:, -1]
+    splats.quats[row] = quaternion_of(axes)
 
 
 ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
@@ -106,7 +87,7 @@ ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_shape_and_opacity_are_those_of_finite_differences(antialiased):
+def test_shape_and_opacity_agree_with_finite_differences(antialiased):
     model, views = small_scene(3, antialiased=antialiased), cameras()
     found = measure_sensitivity(model, views, dtype=np.float64)
     pixels = sum(view.W * view.H for view in views)
@@ -117,7 +98,7 @@ def test_shape_and_opacity_are_those_of_finite_differences(antialiased):
                 slope = derivatives(model, view, lambda s, step, i=i, j=j, row=row: bend(s, row, i, j, step))
                 sizes[e] += np.abs(slope).sum()
                 net[e] += abs(slope.sum())
-                squares += (slope**2).sum() / (1 if i == j else 2)  # a pair of entries moved, each by half of it
+                squares += (slope**2).sum() / (1 if i == j else 2)  # two mirror entries share an off-diagonal change
         np.testing.assert_allclose(sizes.max() / pixels, found.shape[row], rtol=2e-5)
         np.testing.assert_allclose(net.max() / pixels, found.shape_net[row], rtol=2e-5)
         np.testing.assert_allclose(squares / pixels, found.shape_squares[row], rtol=2e-5)
@@ -133,7 +114,7 @@ def test_shape_and_opacity_are_those_of_finite_differences(antialiased):
 
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("antialiased", [False, True])
-def test_the_matrix_of_the_shape_predicts_what_a_small_error_costs(antialiased):
+def test_the_matrix_of_a_shape_predicts_the_error_of_a_small_change(antialiased):
     model, view = small_scene(antialiased=antialiased), cameras(1)
     found = measure_sensitivity(model, view, dtype=np.float64)
     rows, columns = np.triu_indices(6)
@@ -152,7 +133,7 @@ def test_the_matrix_of_the_shape_predicts_what_a_small_error_costs(antialiased):
 
 
 @pytest.mark.area(name="rasteriser")
-def test_colour_is_that_of_finite_differences():
+def test_colour_agrees_with_finite_differences():
     model, views = small_scene(3), cameras()
     found = measure_sensitivity(model, views, dtype=np.float64, metric=True)
     pixels = sum(view.W * view.H for view in views)
@@ -171,13 +152,13 @@ def test_colour_is_that_of_finite_differences():
                 squares[k] = max(squares[k], sum((slope**2).sum() for slope in slopes))
         np.testing.assert_allclose(largest / pixels, found.colour[row], rtol=1e-5)
         np.testing.assert_allclose(squares / pixels, found.metric[row][diagonal], rtol=1e-4)
-    # The basis functions of a band add up to the same in every direction.
+    # The squares of a band's basis functions add up to the same value in every direction.
     sums = found.metric[:, diagonal].sum(axis=1) * 4 * np.pi / 9
     np.testing.assert_allclose(found.colour_squares, sums, rtol=1e-5)
 
 
 @pytest.mark.area(name="rasteriser")
-def test_means_are_nearly_those_of_finite_differences():
+def test_means_agree_roughly_with_finite_differences():
     model, views = small_scene(degree=0), cameras()
     found = measure_sensitivity(model, views, dtype=np.float64)
     pixels = sum(view.W * view.H for view in views)
@@ -189,25 +170,24 @@ def test_means_are_nearly_those_of_finite_differences():
                 splats.means[row, axis] += step
 
             squares += sum((derivatives(model, view, change) ** 2).sum() for view in views)
-        np.testing.assert_allclose(
-            squares / pixels, found.means_squares[row], rtol=0.2
-        )  # the size that changes is left out
+        # The sensitivity ignores the change of size.
+        np.testing.assert_allclose(squares / pixels, found.means_squares[row], rtol=0.2)
 
 
-def test_cancels_nothing_within_a_view():
+def test_nothing_cancels_within_a_view():
     found = measure_sensitivity(small_scene(40), cameras())
     assert (found.shape >= found.shape_net * (1 - 1e-6)).all()
     assert (found.shape > 1.5 * found.shape_net).any()
 
 
-def test_does_not_depend_on_threads():
+def test_the_number_of_threads_does_not_change_the_result():
     model, views = small_scene(300, 3), cameras(3)
     one, two = (measure_sensitivity(model, views, metric=True, threads=threads) for threads in (1, 2))
     for name in ("colour", "opacity", "shape", "shape_net", "shape_metric", "means_squares", "metric", "views"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name), name)
 
 
-def test_what_no_view_sees_has_none():
+def test_unseen_splats_have_no_sensitivity():
     model = small_scene(10)
     away = np.where(np.arange(10)[:, None] < 3, np.float32(100.0), model.means)
     found = measure_sensitivity(replace(model, means=away), cameras())
@@ -216,7 +196,7 @@ def test_what_no_view_sees_has_none():
     assert 0.0 == max(found.colour[:3].max(), found.shape[:3].max(), found.opacity[:3].max())
 
 
-def test_wants_a_camera():
+def test_no_cameras_are_refused():
     with pytest.raises(InputError, match="camera"):
         measure_sensitivity(small_scene(), [])
 
@@ -234,7 +214,7 @@ def stored(tmp_path):
     return path, model, found
 
 
-def test_a_file_gives_back_what_was_written(stored):
+def test_a_file_is_written_and_read(stored):
     path, model, found = stored
     read = read_sensitivity(path, model)
     assert ("cameras", 2) == (read.source, read.view_count)
@@ -248,14 +228,14 @@ def test_a_file_gives_back_what_was_written(stored):
     np.testing.assert_allclose(1.0, importance.sh_metric[:, rows == columns].mean(axis=1), rtol=1e-3)
 
 
-def test_views_say_how_precise_splats_have_to_be(stored):
+def test_blocks_follow_from_the_sensitivities(stored):
     path, model, found = stored
     curvatures = read_sensitivity(path, model).importance().blocks
     np.testing.assert_allclose(curvatures.means, found.means_squares / 3.0, rtol=1e-5)
     np.testing.assert_allclose(curvatures.shapes, found.shape_metric / 3.0, rtol=1e-4, atol=1e-9)
 
 
-def test_virtual_views_do_not_say_it_inside_of_surroundings(stored):
+def test_virtual_views_in_surroundings_give_no_blocks(stored):
     path, model, _ = stored
     read = read_sensitivity(path, model)
     far = np.linspace(0.0, 20.0 * np.pi, len(model), dtype=np.float32)[:, None]
@@ -293,8 +273,8 @@ def test_damaged_files_are_refused(stored):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("packed", [False, True], ids=["as written", "deflated"])
-def test_no_flipped_bit_ends_in_a_traceback(tmp_path, packed):
-    """Some of those in the directory at the end of the archive are tried, and fewer of those in the arrays."""
+def test_flipped_bits_are_refused_or_read(tmp_path, packed):
+    # Bits of the archive's directory at a small stride, bits of the arrays at a large one.
     model, path = small_scene(1, 1), tmp_path / "one.npz"
     with path.open("wb") as stream:
         write_sensitivity(stream, model, measure_sensitivity(model, cameras(), metric=True), "cameras")
@@ -327,7 +307,7 @@ def test_no_flipped_bit_ends_in_a_traceback(tmp_path, packed):
         ("colour", np.full(30, np.nan, np.float32)),
     ],
 )
-def test_arrays_that_are_no_sensitivities_are_refused(stored, name, array):
+def test_invalid_arrays_are_refused(stored, name, array):
     path, model, _ = stored
     with np.load(path) as file:
         arrays = dict(file)
@@ -336,7 +316,7 @@ def test_arrays_that_are_no_sensitivities_are_refused(stored, name, array):
         read_sensitivity(path, model)
 
 
-def test_never_seen_splats_weigh_a_little(stored):
+def test_unseen_splats_have_a_small_weight(stored):
     path, model, _ = stored
     away = np.where(np.arange(30)[:, None] < 3, np.float32(100.0), model.means)
     model = replace(model, means=away)
@@ -360,29 +340,26 @@ def camera_file(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_measures_what_encode_takes(tmp_path, camera_file):
+def test_encode_uses_the_file_of_the_command(tmp_path, camera_file):
     model = small_scene(400, 1)
     away = np.where(np.arange(400)[:, None] < 40, np.float32(100.0), model.means)
     model = replace(model, means=away)
     ply, npz, out, index = (tmp_path / name for name in ("s.ply", "s.npz", "s.csplat", "s.npy"))
     write_ply(ply, model)
-    done = invoke("sensitivity", ply, npz, "--cameras", camera_file, "--json", "--quiet")
-    assert 0 == done.exit_code, done.stderr
-    facts = json.loads(done.stdout)
+    facts = json.loads(call("sensitivity", ply, npz, "--cameras", camera_file, "--json", "--quiet").stdout)
     assert (400, 3, "cameras") == (facts["splats"], facts["views"], facts["source"])
     unseen = facts["unseen"]
     assert 40 <= unseen < 400
-    assert 1 == invoke("sensitivity", ply, npz, "--cameras", camera_file).exit_code  # not without --force
+    call("sensitivity", ply, npz, "--cameras", camera_file, status=1)  # not without --force
     encoded = encode_file(str(ply), str(out), EncodeOptions(), importance=npz, prune_unseen=True, source_index=index)
     assert 400 - unseen == encoded.report.splat_count
     assert set(range(400)) - set(np.load(index).tolist()) >= set(range(40))
-    checked = invoke("verify", out, "--source", ply, "--source-index", index)
-    assert 0 == checked.exit_code, checked.stderr
+    call("verify", out, "--source", ply, "--source-index", index)
 
 
 @pytest.fixture
 def seen_in_part(tmp_path):
-    """A PLY of opaque splats, of which few views see a part."""
+    """A PLY of opaque splats that a few views see only in part."""
     rng = np.random.default_rng(0)
     means = rng.standard_normal((400, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -393,17 +370,17 @@ def seen_in_part(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_makes_views_where_there_are_none_and_says_how_long_it_takes(tmp_path, seen_in_part, monkeypatch):
+def test_the_command_places_virtual_views_and_announces_the_time(tmp_path, seen_in_part, monkeypatch):
     monkeypatch.setattr("csplat_tools.views.view_sets.render_seconds", lambda *_, **__: 1.0)
     change_views(monkeypatch, 20, (48, 36))
     done = invoke("sensitivity", seen_in_part, tmp_path / "s.npz")
     assert 0 == done.exit_code, done.stderr
     assert "20 virtual views" in done.stderr
-    assert "this takes about 2 to 4 minutes here" in done.stderr  # 36 pictures: 16 more check
+    assert "this takes about 2 to 4 minutes here" in done.stderr  # 36 renders: 16 more check
 
 
 @pytest.mark.slow
-def test_pruning_says_how_much_of_it_other_views_would_have_seen(tmp_path, seen_in_part, monkeypatch):
+def test_pruning_reports_the_share_that_other_views_see(tmp_path, seen_in_part, monkeypatch):
     npz, out = tmp_path / "s.npz", tmp_path / "o.csplat"
     change_views(monkeypatch, 2, None)
     invoke("sensitivity", seen_in_part, npz)
@@ -414,7 +391,7 @@ def test_pruning_says_how_much_of_it_other_views_would_have_seen(tmp_path, seen_
     assert "left out" not in invoke("encode", seen_in_part, out, "--importance", npz, "--force", "-q").stderr
 
 
-def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
+def test_invalid_options_are_refused(tmp_path, sample_path, camera_file):
     out = tmp_path / "out.npz"
     assert 2 == invoke("sensitivity", sample_path, out, "--cameras", camera_file, "--data", tmp_path).exit_code
     assert 2 == invoke("sensitivity", sample_path, "-").exit_code
@@ -424,10 +401,9 @@ def test_mistakes_get_one_line(tmp_path, sample_path, camera_file):
     assert 1 == len(done.stderr.splitlines())
 
 
-def test_cameras_that_see_nothing_are_refused(tmp_path, camera_file):
+def test_cameras_without_splats_in_view_are_refused(tmp_path, camera_file):
     model = small_scene(20, 1)
     write_ply(tmp_path / "s.ply", replace(model, means=model.means + np.float32(1000.0)))
-    done = invoke("sensitivity", tmp_path / "s.ply", tmp_path / "s.npz", "--cameras", camera_file, "-q")
-    assert 1 == done.exit_code
+    done = call("sensitivity", tmp_path / "s.ply", tmp_path / "s.npz", "--cameras", camera_file, "-q", status=1)
     assert "no view shows any splat" in done.stderr
     assert not (tmp_path / "s.npz").exists()

@@ -1,6 +1,6 @@
-"""The rasteriser's equations once more, in plain torch: what autograd makes of them is what gradients ought to be.
+"""The rasteriser's equations in plain torch, for gradients by autograd.
 
-Every splat at every pixel, float64, nothing clever: for a dozen splats and some hundred pixels.
+It evaluates every splat at every pixel in float64, for a dozen splats and some hundred pixels.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ def autograd_gradients(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     antialiased: bool = False,
 ) -> tuple[Array, dict[str, Array]]:
-    """A picture, and autograd's gradients of the sum of its colours, alpha and depth times weights.
+    """Return a render, and autograd's gradients of the weighted sum of its colours, alpha and depth.
 
     Args:
-        arrays: the six of the splats, float64.
+        arrays: the six arrays of the splats, float64.
         view: the camera.
         weights: [H, W, 3], [H, W], [H, W].
-        background: behind everything.
-        antialiased: scale opacities by what the dilation added.
+        background: colour of the background.
+        antialiased: compensate opacities for the dilation.
     """
     splats = {name: torch.tensor(array, requires_grad=True) for name, array in arrays.items()}
     pictures = render_torch(splats, view, background, antialiased)
@@ -49,7 +49,7 @@ def autograd_gradients(
 def render_torch(
     splats: dict[str, Tensor], view: Camera, background: tuple[float, float, float], antialiased: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Colours, alpha and depth of a picture."""
+    """Return colours, alpha and depth."""
     centre, covariance, opacity, colour, depth = _project(splats, view, antialiased)
     ys, xs = torch.meshgrid(torch.arange(view.H) + 0.5, torch.arange(view.W) + 0.5, indexing="ij")
     offset = torch.stack([xs, ys], -1).double() - centre[:, None, None]  # splat, row, column, xy
@@ -60,13 +60,13 @@ def render_torch(
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]])
     seen = (after >= TRANSMITTANCE_MIN).double().cumprod(0)
     weight = seen * alpha * before
-    left = 1.0 - weight.sum(0)  # equals the product of 1 − alpha over what was seen
+    left = 1.0 - weight.sum(0)  # equals the product of 1 − alpha over the drawn splats
     rgb = torch.einsum("nhw,nc->hwc", weight, colour) + left[..., None] * torch.tensor(background, dtype=torch.float64)
     return rgb, 1.0 - left, torch.einsum("nhw,n->hw", weight, depth)
 
 
 def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tuple[Tensor, ...]:
-    """Centre, covariance, opacity, colour and depth of what is in front, nearest first."""
+    """Return centre, covariance, opacity, colour and depth of splats beyond the near plane, nearest first."""
     R, t = torch.tensor(view.viewmat[:3, :3]), torch.tensor(view.viewmat[:3, 3])
     z = (splats["means"] @ R.T + t)[:, 2]
     order = torch.argsort(z.detach().float(), stable=True)
@@ -102,7 +102,7 @@ def _clamped(tangent: Tensor, focal: float, centre: float, size: int) -> Tensor:
 
 
 def _rotation(quats: Tensor) -> Tensor:
-    """Columns are a splat's axes: the images of x, y, z under q v q⁻¹."""
+    """Return matrices whose columns are the splats' axes: the images of x, y, z under q v q⁻¹."""
     w, v = quats[:, :1], quats[:, 1:]
     length = quats.norm(dim=1, keepdim=True)
     w, v = w / length, v / length
