@@ -626,7 +626,7 @@ def test_a_scene_is_tuned_to_its_own_renders_with_a_report_page(capture, tmp_pat
     assert "Measured on 8 renders of the source" in shown
     assert "<h2>Tuning</h2>" in shown
     assert "<h2>Training</h2>" not in shown
-    assert ["source", "before tuning", "file"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", shown)[:9]
+    assert ["the source", "before tuning", "file"] * 3 == re.findall("<figcaption>(.*?)</figcaption>", shown)[:9]
     compared = json.loads(call("compare", capture / "scene.ply", out, "--json").stdout)
     assert compared["psnr"] == pytest.approx(facts["scores"]["file"]["psnr"], abs=1e-4)
 
