@@ -37,7 +37,7 @@ SIZE = 32
 QUICK = {"max_splats": 80, "sh_degree": 1, "iterations": 60, "refine_start": 20, "refine_every": 10, "log_every": 20}
 
 
-def photographs(make_model, *, alpha: bool = True) -> DataSet:
+def training_images(make_model, *, alpha: bool = True) -> DataSet:
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))
     rasteriser = Rasteriser(gradients=False)
     shots = []
@@ -58,7 +58,7 @@ def make_data():
 
     def make(make_model, *, alpha: bool = True) -> DataSet:
         if alpha not in cache:
-            cache[alpha] = photographs(make_model, alpha=alpha)
+            cache[alpha] = training_images(make_model, alpha=alpha)
         return cache[alpha]
 
     return make
