@@ -32,8 +32,7 @@ from csplat_selftest.fuzzing.decoder_targets import (
     missing_others,
 )
 from csplat_selftest.fuzzing.edges import Edges
-from csplat_selftest.fuzzing.file_targets import PlyTarget
-from csplat_selftest.fuzzing.ply_damage import Ply
+from csplat_selftest.fuzzing.file_targets import Ply, PlyTarget
 
 pytestmark = pytest.mark.slow  # together: tests of the fuzzer
 

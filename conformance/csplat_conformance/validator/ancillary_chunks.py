@@ -184,9 +184,7 @@ _ROUNDING = 1.0 + 2.0**-20  # SER-2
 def check_declared_bounds(payload: Payload, index: Index) -> None:
     """Check SERR: SER-1 to SER-4, and SER-5 as far as possible without the source."""
     log = payload.log
-    head = payload.structure(
-        _spec.unpack_stated_errors_head, _spec.STATED_ERRORS_HEAD_SIZE, _spec.STATED_ERRORS_HEAD_OFFSETS, "head"
-    )
+    head = payload.structure(_spec.StatedErrorsHead, "head")
     stated = head.record
     unlisted = stated.error_flags & ~sum(_spec.ERROR_FLAG_NAMES)
     if unlisted:
@@ -198,12 +196,7 @@ def check_declared_bounds(payload: Payload, index: Index) -> None:
     last = 0
     for i in range(stated.record_count):
         name = _spec.MEASURE_NAMES.get(payload.view[payload.at] if payload.left else 0, str(i))
-        record = payload.structure(
-            _spec.unpack_stated_error_record,
-            _spec.STATED_ERROR_RECORD_SIZE,
-            _spec.STATED_ERROR_RECORD_OFFSETS,
-            f"record[{name}]",
-        )
+        record = payload.structure(_spec.StatedErrorRecord, f"record[{name}]")
         measure = record.record.measure
         if measure not in _spec.MEASURE_NAMES:
             log.add_field("SER-1", record, "measure", f"{measure} is not in the registry")

@@ -83,7 +83,7 @@ def read_records(view: memoryview, end: int, log: ViolationLog) -> Index:
         log: receives the violations.
     """
     start = _spec.HEADER_SIZE
-    head = read_record(view, _spec.unpack_index_head, _spec.INDEX_HEAD_OFFSETS, start, "index")
+    head = read_record(view, _spec.IndexHead, start, "index")
     record = head.record
     index = Index(head, record.sh_degree if record.sh_degree <= _spec.SH_DEGREE_MAX else None)
     kinds = ("attribute", "codebook", "extra", "directory", "tile")
@@ -142,7 +142,7 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: Vio
     for i in range(_count_fitting(index, at, end, count, index.size_of("attribute"))):
         attribute = view[at]
         name = f"attribute[{_spec.ATTRIBUTE_NAMES.get(attribute, attribute)}]"
-        placed = read_record(view, _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_OFFSETS, at, name)
+        placed = read_record(view, _spec.AttributeRecord, at, name)
         log.check_reserved(placed)
         if count == len(expected) and index.degree is not None and attribute != expected[i]:
             log.add_field("ATT-1", placed, "attribute", f"{attribute}, expected {expected[i]} in place {i}")
@@ -212,7 +212,7 @@ def _read_codebooks(view: memoryview, at: int, end: int, index: Index, log: Viol
     for _ in range(_count_fitting(index, at, end, index.head.record.codebook_count, index.size_of("codebook"))):
         identity = int.from_bytes(view[at : at + 2], "little")
         name = f"codebook[{identity}]"
-        placed = read_record(view, _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_OFFSETS, at, name)
+        placed = read_record(view, _spec.CodebookRecord, at, name)
         log.check_reserved(placed)
         if identity <= last:
             log.add_field("CBR-1", placed, "codebook_id", f"{identity} after {last}, expected ascending ids")
@@ -247,7 +247,7 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
 def _read_extras(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> int:
     names: set[str] = set()
     for i in range(_count_fitting(index, at, end, index.head.record.extra_count, index.size_of("extra"))):
-        placed = read_record(view, _spec.unpack_extra_record, _spec.EXTRA_RECORD_OFFSETS, at, f"extra[{i}]")
+        placed = read_record(view, _spec.ExtraRecord, at, f"extra[{i}]")
         record = placed.record
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
             log.add_field("RES-2", placed, "dtype", f"{record.dtype} is not in the registry")
@@ -343,9 +343,7 @@ def read_directory(view: memoryview, at: int, end: int, index: Index, log: Viola
     for _ in range(min(count, max(0, (end - at) // size))):
         record = _spec.unpack_directory_record(view, at)
         name = _chunk_name(record, [chunk.name for chunk in chunks])
-        placed = read_record(
-            view, _spec.unpack_directory_record, _spec.DIRECTORY_RECORD_OFFSETS, at, f"directory[{name}]"
-        )
+        placed = read_record(view, _spec.DirectoryRecord, at, f"directory[{name}]")
         log.check_reserved(placed)
         chunks.append(check_chunk_size(log, Chunk(name, record.type, record.flags, placed, record.id, record.layer)))
         _check_type(log, placed)
@@ -468,7 +466,7 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, log: ViolationLog) 
     stored, computed = chunk.record.record.crc, zlib.crc32(view[at:end])
     if stored != computed:
         log.add("CHK-1", at, chunk.name, f"{chunk.record.path('crc')} is {stored:#010x}, computed {computed:#010x}")
-    header = read_record(view, _spec.unpack_chunk_header, _spec.CHUNK_HEADER_OFFSETS, at, f"{chunk.name}/header")
+    header = read_record(view, _spec.ChunkHeader, at, f"{chunk.name}/header")
     log.check_reserved(header)
     payload_size = chunk.size - _spec.CHUNK_HEADER_SIZE
     for key, expected in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
@@ -546,7 +544,7 @@ def _tile_size(view: memoryview, at: int, end: int, index: Index) -> int:
 
 
 def _read_tile(view: memoryview, at: int, number: int, index: Index, log: ViolationLog) -> Tile:
-    placed = read_record(view, _spec.unpack_tile_record, _spec.TILE_RECORD_OFFSETS, at, f"tile[{number}]")
+    placed = read_record(view, _spec.TileRecord, at, f"tile[{number}]")
     log.check_reserved(placed)
     tile = Tile(number, placed)
     if placed.record.level:
@@ -582,7 +580,7 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
     for i in range(tile.record.record.layer_count):
         layer = view[at]
         name = f"{tile.record.name}.layer[{layer}]"
-        placed = read_record(view, _spec.unpack_layer_record, _spec.LAYER_RECORD_OFFSETS, at, name)
+        placed = read_record(view, _spec.LayerRecord, at, name)
         log.check_reserved(placed)
         if i == 0 and layer != _spec.LAYER_GEOMETRY:
             log.add_field("TIL-2", placed, "layer", f"the first is {layer}, expected {_spec.LAYER_GEOMETRY}")

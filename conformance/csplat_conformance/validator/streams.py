@@ -57,7 +57,7 @@ def read_stream(
         UnreadableError: the payload ends within the stream.
     """
     log = payload.log
-    head = payload.structure(_spec.unpack_stream_head, _spec.STREAM_HEAD_SIZE, _spec.STREAM_HEAD_OFFSETS, what)
+    head = payload.structure(_spec.StreamHead, what)
     sound = _check_counts(log, head, count, width_max)
     sound &= _check_transforms(log, head)
     sound &= _check_packed(log, head, sound)

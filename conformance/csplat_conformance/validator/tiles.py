@@ -69,7 +69,7 @@ class TileChecker:
         log = self.log
         if chunk.layer >= _spec.ANCILLARY_ID_MIN:
             return  # ANC-2
-        head = payload.structure(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS, "head")
+        head = payload.structure(_spec.TileHead, "head")
         if head.record.layer != chunk.layer:
             log.add_field("TLE-1", head, "layer", f"{head.record.layer}, expected {chunk.layer} by its record")
         if chunk.layer not in _spec.LAYER_NAMES or not 1 <= self.tile.count <= _spec.TILE_SPLATS_MAX:
@@ -120,9 +120,7 @@ class TileChecker:
 
     def _read_sparse(self, payload: Payload, name: str, attribute: int) -> None:
         """Check SPA-1 to SPA-3 and the clauses of SIGNED."""
-        params = payload.structure(
-            _spec.unpack_sparse_params, _spec.SPARSE_PARAMS_SIZE, _spec.SPARSE_PARAMS_OFFSETS, f"{name}.params"
-        )
+        params = payload.structure(_spec.SparseParams, f"{name}.params")
         exponent, announced, count = params.record.exponent, params.record.present_count, self.tile.count
         sound = self.check_step(params, exponent, attribute)
         if not 1 <= announced <= count:
@@ -172,12 +170,7 @@ class TileChecker:
         count, width_max = self.tile.count, _spec.CODING_WIDTH_MAX[coding]
         rows: I64 | None
         if coding == _spec.CODING_MORTON:
-            params = payload.structure(
-                _spec.unpack_morton_params,
-                _spec.MORTON_PARAMS_SIZE,
-                _spec.MORTON_PARAMS_OFFSETS,
-                f"{name}.params",
-            )
+            params = payload.structure(_spec.MortonParams, f"{name}.params")
             bits = params.record.bits
             if not 1 <= bits <= _spec.MORTON_BITS_MAX:
                 self.log.add_field("MOR-1", params, "bits", f"{bits}, expected 1 to {_spec.MORTON_BITS_MAX}")
@@ -208,9 +201,7 @@ class TileChecker:
             )
 
     def _read_raw(self, payload: Payload, name: str, number: int) -> None:
-        params = payload.structure(
-            _spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS, f"{name}.params"
-        )
+        params = payload.structure(_spec.RawParams, f"{name}.params")
         if params.record.column != number:
             self.log.add_field("RAW-1", params, "column", f"{params.record.column}, expected {number}")
         width_max = _spec.CODING_WIDTH_MAX[_spec.CODING_RAW]
@@ -222,7 +213,7 @@ class TileChecker:
 
 def read_block_head(payload: Payload, name: str) -> BlockHead:
     """Read the head of a block or of an escape block."""
-    return payload.structure(_spec.unpack_block_head, _spec.BLOCK_HEAD_SIZE, _spec.BLOCK_HEAD_OFFSETS, name)
+    return payload.structure(_spec.BlockHead, name)
 
 
 def read_columns(
@@ -253,9 +244,7 @@ def read_columns(
 
 def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
     """Read lattice parameters; return the exponent, and whether LAT-1, or LAT-2 if it is fixed, holds."""
-    params = payload.structure(
-        _spec.unpack_lattice_params, _spec.LATTICE_PARAMS_SIZE, _spec.LATTICE_PARAMS_OFFSETS, name
-    )
+    params = payload.structure(_spec.LatticeParams, name)
     exponent = params.record.exponent
     if fixed and exponent:
         reader.log.add_field("LAT-2", params, "exponent", f"{exponent}, expected 0")
@@ -304,9 +293,7 @@ def _read_codebook_block(reader: TileChecker, payload: Payload, name: str, attri
     Raises:
         UnreadableError: the number of remaining streams is unknown.
     """
-    params = payload.structure(
-        _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS, f"{name}.params"
-    )
+    params = payload.structure(_spec.CodebookParams, f"{name}.params")
     identity = params.record.codebook_id
     book, columns = _find_book(reader, params, attribute)
     if first_attribute(book) == attribute:
@@ -475,7 +462,7 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
     log = payload.log
     book = index.codebooks.get(chunk.identity)
     layers = () if book is None else range(book.record.band_first, book.record.band_last + 1)
-    head = payload.structure(_spec.unpack_codebook_head, _spec.CODEBOOK_HEAD_SIZE, _spec.CODEBOOK_HEAD_OFFSETS, "head")
+    head = payload.structure(_spec.CodebookHead, "head")
     for key, expected in (("codebook_id", chunk.identity), ("layer", chunk.layer)):
         found = getattr(head.record, key)
         if found != expected:

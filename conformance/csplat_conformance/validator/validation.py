@@ -142,7 +142,7 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
         else:
             log.add("HDR-11", 0, "header.magic", f"{magic.hex(' ')} is not the magic", _spec.ERROR_MAGIC)
         return None
-    header = read_record(view, _spec.unpack_header, _spec.HEADER_OFFSETS, 0, "header")
+    header = read_record(view, _spec.Header, 0, "header")
     record = header.record
     if magic != _spec.MAGIC:
         log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, expected {_spec.MAGIC.hex(' ')}")

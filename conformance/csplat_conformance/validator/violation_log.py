@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, Final, Generic, TypeVar
 
 from csplat import _spec
@@ -153,15 +155,21 @@ class ViolationLog:
         self.unread.append(Unread(name, reason))
 
 
-_Unpack = Callable[[memoryview, int], T]
-
-
 class UnreadableError(Exception):
     """Raised if a wrong length or type makes the position of the rest unknown; the violation was already added."""
 
 
-def read_record(view: memoryview, unpack: _Unpack[T], places: dict[str, int], at: int, name: str) -> PlacedRecord[T]:
+@cache
+def _layout(kind: str) -> tuple[Callable[[memoryview, int], Any], int, dict[str, int]]:
+    """Return the unpacking function, the size in bytes and the field offsets of a structure by its class name."""
+    name = re.sub(r"(?<!^)(?=[A-Z])", "_", kind)
+    upper = name.upper()
+    return getattr(_spec, f"unpack_{name.lower()}"), getattr(_spec, f"{upper}_SIZE"), getattr(_spec, f"{upper}_OFFSETS")
+
+
+def read_record(view: memoryview, kind: type[T], at: int, name: str) -> PlacedRecord[T]:
     """Read a structure that is known to fit into the data."""
+    unpack, _, places = _layout(kind.__name__)
     return PlacedRecord(unpack(view, at), at, name, places)
 
 
@@ -205,10 +213,10 @@ class Payload:
         self.at += size
         return at
 
-    def structure(self, unpack: _Unpack[T], size: int, places: dict[str, int], what: str) -> PlacedRecord[T]:
+    def structure(self, kind: type[T], what: str) -> PlacedRecord[T]:
         """Read the next structure, named after the chunk and `what`, and check its reserved fields."""
-        at = self.take(size, what)
-        placed = read_record(self.view, unpack, places, at, f"{self.name}/{what}")
+        at = self.take(_layout(kind.__name__)[1], what)
+        placed = read_record(self.view, kind, at, f"{self.name}/{what}")
         self.log.check_reserved(placed)
         return placed
 
