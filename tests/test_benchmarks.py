@@ -177,6 +177,12 @@ def test_the_table_and_the_plot_come_from_the_results_alone(tmp_path, capsys):
     assert "cannot be read" in capsys.readouterr().err
 
 
+def test_a_pattern_that_matches_no_case_is_refused(suite, tmp_path, capsys):
+    status, found = run(suite, tmp_path, "--only", "smal*")
+    assert (1, None) == (status, found)
+    assert "--only is 'smal*', expected a pattern of some of 'fast', 'splat'" in capsys.readouterr().err
+
+
 def test_known_rows_are_not_measured_again(suite, tmp_path, capsys):
     run(suite, tmp_path, "--only", "spl*")
     first = (tmp_path / "out.json").read_text()

@@ -6,12 +6,13 @@ import os
 import shlex
 import shutil
 import sys
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from csplat.errors import CsplatError
+from csplat.errors import CsplatError, InputError
 from csplat_bench.pages import write_pages
 from csplat_bench.protocol import Setup
 from csplat_bench.results import Results, read_results
@@ -43,7 +44,7 @@ def run(
     suite: Annotated[str, typer.Argument(metavar="SUITE", help="A name of `list`, or a TOML file.")],
     *,
     scenes: Annotated[str, typer.Option(help="Scenes or PLY files, separated by commas. Default: the suite's.")] = "",
-    only: Annotated[str, typer.Option(help="Patterns of case names, separated by commas. Default: all.")] = "",
+    only: Annotated[list[str], typer.Option(help="Pattern of case names; may be repeated. Default: all.")] = [],
     again: Annotated[bool, typer.Option("--again", help="Measure these scenes and cases again.")] = False,
     out: Annotated[Path | None, typer.Option(help="Results. Default: out/bench/SUITE.json.")] = None,
     work: Annotated[Path, typer.Option(help="Folder for made scenes, trainings and files.")] = OUT / "bench",
@@ -61,13 +62,17 @@ def run(
     by = f" --csplat {shlex.quote(csplat)}" if csplat else ""
     results = Results(path, chosen, f"python -m csplat_bench run {chosen.name}{by}")
     note(f"{results.machine}, {results.document['versions']}")
-    names, patterns = _listed(scenes) or list(chosen.scenes), _listed(only)
+    names = [word.strip() for word in scenes.split(",") if word.strip()] or list(chosen.scenes)
+    for pattern in only:
+        if not any(fnmatchcase(case.name, pattern) for case in chosen.cases):
+            known = ", ".join(repr(case.name) for case in chosen.cases)
+            raise InputError(f"--only is {pattern!r}, expected a pattern of some of {known}")
     if chosen.subject in SCENE_FINDERS:
         names = SCENE_FINDERS[chosen.subject](setup, names)
     if again:
         for name in names:
-            results.forget(scene_name(name), chosen.cases_on(scene_name(name), patterns))
-    fine = run_suite(chosen, SUBJECTS[chosen.subject], setup, results, names, patterns)
+            results.forget(scene_name(name), chosen.cases_on(scene_name(name), only))
+    fine = run_suite(chosen, SUBJECTS[chosen.subject], setup, results, names, only)
     print(markdown_table(mark_beaten(results.rows), chosen.columns))
     raise typer.Exit(0 if fine else 1)
 
@@ -126,10 +131,6 @@ def pages(
 def figures(result: _ResultFile) -> None:
     """Write figures.json of the encoder conformance suite from the results of `run encoder_inputs`."""
     note(f"wrote {write_figures(read_results(result)['rows'])}")
-
-
-def _listed(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",") if word.strip()]
 
 
 def main(words: list[str] | None = None) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from subprocess import CalledProcessError
+from subprocess import CalledProcessError, SubprocessError
 from typing import Any
 
 from csplat.errors import CsplatError
@@ -69,7 +69,7 @@ def _take_turns(
         for case in list(active):
             try:
                 values = measure(case)
-            except (CsplatError, OSError, CalledProcessError) as error:
+            except (CsplatError, OSError, SubprocessError) as error:
                 active.remove(case)
                 absent = isinstance(error, AbsentError)
                 note(f"{scene} {case.name} {'is left out' if absent else 'failed'}: {_last_line(error)}")
