@@ -1,4 +1,4 @@
-"""Encoders: functions that make a file of a scene, registered by the key with which a case asks for them.
+"""Encoders: functions that make a file of a scene, registered by the key that selects them in a case.
 
 command = "encode --preset fast"    # csplat's command line, in a process of its own
 bytes_per_splat = 4                 # with command: --target-size, by the number of splats
@@ -53,7 +53,7 @@ Encoder = Callable[[Setup, Scene, Case, Path], MadeFile]
 
 
 def make_file(setup: Setup, scene: Scene, case: Case, folder: Path) -> MadeFile:
-    """Make a file of a scene in a folder, as a case asks for.
+    """Make a file of a scene in a folder by the encoder of a case.
 
     Raises:
         InputError: the case names no encoder.

@@ -100,7 +100,7 @@ class Results:
         write_json(self.path, self.document)
 
     def _digest(self, case: Case) -> str:
-        """Return a digest of everything that a row depends on besides its scene."""
+        """Return a digest of the settings that a row depends on."""
         text = json.dumps([self._options, case.settings], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()[:8]
 
@@ -129,7 +129,7 @@ def describe() -> tuple[str, dict[str, str]]:
 
 
 def rounded(value: Any) -> Any:
-    """Return a value whose floats have no more digits than they deserve."""
+    """Return a value with all floats rounded to six significant digits."""
     if isinstance(value, dict):
         return {key: rounded(one) for key, one in value.items()}
     if isinstance(value, list):
