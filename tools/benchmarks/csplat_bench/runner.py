@@ -37,8 +37,9 @@ def run_suite(
         missing = [case for case in cases if not results.is_known(scene, case)]
         if not missing:
             continue
-        # A ratio is that of one turn: all cases are measured in the same turns.
-        cases = cases if suite.ratio else missing
+        # A ratio is that of one turn: cases with the same reference are measured in the same turns.
+        references = {case.get("reference", case.name) for case in missing}
+        cases = [case for case in cases if case.get("reference", case.name) in references]
         note(f"{suite.name} {scene}: {len(cases)} cases")
         try:
             with subject(setup, place, cases) as measure:
