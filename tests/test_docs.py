@@ -158,6 +158,18 @@ def test_commands_in_readme_and_guides_are_valid():
         command.make_context(name, words, resilient_parsing=False)
 
 
+def test_options_on_result_pages_exist():
+    from typer.main import get_command
+
+    group = get_command(app)
+    commands = [group.get_command(None, name) for name in group.list_commands(None)]
+    options = {option for command in commands for parameter in command.params for option in parameter.opts}
+    for path in (DOCS / "results").glob("*.md"):
+        prose = re.sub(r"<!-- table.*?<!-- end -->", "", path.read_text("utf-8"), flags=re.DOTALL)
+        words = " ".join(re.findall(r"`([^`]+)`", prose)).split()
+        assert set() == {word for word in words if word.startswith("--")} - options, path.name
+
+
 @pytest.mark.slow
 def test_python_examples_run(sample_path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
