@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, encode_with_report
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.formats import detect_format, open_scene, read_all
 from csplat.lint import Finding, refuse
 from csplat.model import MAX_SH_DEGREE, SplatModel
@@ -17,7 +18,7 @@ from csplat.out_of_core import ResourceNeeds, encode_scene, estimate_needs
 from csplat.ply.column_names import dropped_columns
 from csplat.system import default_memory_bytes
 from csplat.types import Progress
-from csplat_tools.console import note
+from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
 from csplat_tools.scene_files import (
     CHEAP_TO_REOPEN,
@@ -321,3 +322,44 @@ def encode_file(
     return EncodedFile(
         model, outcome.result.report, outcome, read.findings, read.size_bytes, time.perf_counter() - start
     )
+
+
+def format_cost(found: CostEstimate) -> str:
+    """Format the cost of an encoding as a line."""
+    needs = found.needs
+    where = "in memory" if needs.in_memory else f"on the disk, {counted(needs.workers, 'process', 'processes')}"
+    return (
+        f"{counted(found.count, 'splat')} of SH degree {found.sh_degree}, {where}: about"
+        f" {format_estimate(found.seconds)}, {format_bytes(needs.memory_bytes)} of memory,"
+        f" {format_bytes(needs.disk_bytes)} of disk; the file about {format_bytes(found.file_bytes)}"
+    )
+
+
+def format_declared_errors(errors: Mapping[str, tuple[float, float]]) -> list[str]:
+    """Format declared errors, maximum and RMS by measure, as a table; return nothing if there are none."""
+    names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
+    rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
+    return [format_table(("stated error", "max", "rms"), rows)] * bool(rows)
+
+
+def format_encoding(encoded: EncodedFile, psnr: float | None, source: str, output: str) -> str:
+    """Format counts, time, sizes and quality of an encoding as a line.
+
+    Args:
+        encoded: the outcome.
+        psnr: PSNR of small renders, dB; `None`: not measured.
+        source, output: names of the files.
+    """
+    report = encoded.report
+    per_splat = f" ({report.size_bytes / report.splat_count:.2f} bytes per splat)" if report.splat_count else ""
+    ratio = encoded.source_bytes / report.size_bytes
+    splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
+    sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
+    quality, found = "", None if encoded.outcome is None else encoded.outcome.report.get("psnr")
+    if psnr is not None:
+        quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
+    elif found is not None:
+        quality = f", PSNR {found:.2f} dB"
+    elif encoded.outcome is not None and len(encoded.source) and "-" not in (source, output):
+        quality = f"; `csplat compare {source} {output}` shows how it looks"
+    return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -22,12 +22,13 @@ from urllib.parse import unquote
 
 from csplat import __version__
 from csplat.encoder import EncodeOptions
-from csplat.errors import CsplatError, InputError, StoreError, missing_package
+from csplat.errors import CsplatError, InputError, StoreError, counted, missing_package
 from csplat.formats import detect_format
 from csplat.remote_store import is_url, open_store
 from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 from csplat_tools.batches.batch_scenes import Task
 from csplat_tools.batches.journal import Record
+from csplat_tools.console import format_bytes, format_estimate, format_seconds, format_table
 from csplat_tools.encode_file import OutOfCoreOptions, estimate_cost
 from csplat_tools.scene_files import FOLDER_NAMES, size_on_disk
 
@@ -91,6 +92,36 @@ class PlannedJob:
     is_done: bool
     seconds: float | None
     memory_bytes: int
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the job, JSON-compatible."""
+        return {
+            "path": self.job.task.source,
+            "output": self.job.task.output,
+            "command": list(self.job.words),
+            "done": self.is_done,
+            "splats": None if self.file is None else self.file.splats,
+            "source_bytes": None if self.file is None else self.file.size_bytes,
+            "seconds": self.seconds,
+            "memory_bytes": self.memory_bytes,
+        }
+
+
+def format_plan(planned: Sequence[PlannedJob]) -> str:
+    """Format planned work as a table, with the total time."""
+    rows = []
+    for one in planned:
+        seen = one.file
+        splats = "?" if seen is None or seen.splats is None else f"{seen.splats:,}"
+        size = "cannot be read" if seen is None else format_bytes(seen.size_bytes)
+        seconds = "?" if one.seconds is None else format_seconds(one.seconds)
+        work = ("nothing: done", "") if one.is_done else (seconds, format_bytes(one.memory_bytes))
+        rows.append((one.job.task.source, one.job.task.output, splats, size, *work))
+    left = [one for one in planned if not one.is_done]
+    known = [one.seconds for one in left if one.seconds is not None]
+    took = f"{format_estimate(sum(known))}, one after the other" if len(known) == len(left) else "the time is unknown"
+    table = format_table(("scene", "output", "splats", "size", "time", "memory"), rows, left=2)
+    return f"{table}\n{counted(len(left), 'scene')} to do of {len(planned)}, {took}"
 
 
 #: Reserves memory while a scene's command runs: called with a number of bytes, it yields options for the command.

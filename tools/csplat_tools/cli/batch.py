@@ -16,23 +16,11 @@ from csplat_tools.batches.batch_run import Batch, BatchStep, plan_batch
 from csplat_tools.batches.batch_run import batch as run_batch
 from csplat_tools.batches.batch_scenes import starting_points
 from csplat_tools.batches.journal import JOURNAL
-from csplat_tools.batches.scene_job import CommandLineError, PlannedJob
+from csplat_tools.batches.scene_job import CommandLineError, format_plan
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.error_lines import EXIT_FAILED
-from csplat_tools.cli.shared_options import (
-    Dask,
-    DryRun,
-    Force,
-    HelpAll,
-    Json,
-    Memory,
-    Quiet,
-    Report,
-    checked,
-    parse_bytes,
-    refuse_together,
-)
-from csplat_tools.console import format_bytes, format_estimate, format_seconds, format_table, note, step_progress
+from csplat_tools.console import format_seconds, note, step_progress
 
 _SHOWN_MAX = 50  # failures listed on standard error; the page lists all
 
@@ -55,14 +43,14 @@ def batch(
     workers: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="Scenes at a time. Default: one per core.")
     ] = None,
-    memory: Memory = None,
-    dask: Dask = None,
-    dry_run: DryRun = False,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    memory: shared.Memory = None,
+    dask: shared.Dask = None,
+    dry_run: shared.DryRun = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Run a command on many scenes.
 
@@ -79,8 +67,8 @@ def batch(
       csplat batch list.jsonl encoded --workers 4 --memory 16GB
     """
     out, words = Output(force, report, as_json, quiet), tuple(line or ("encode",))
-    refuse_together({"--dask": dask}, {"--workers": workers, "--memory": memory, "--dry-run": dry_run})
-    memory_bytes = checked(parse_bytes, memory)
+    shared.refuse_together({"--dask": dask}, {"--workers": workers, "--memory": memory, "--dry-run": dry_run})
+    memory_bytes = shared.checked(shared.parse_bytes, memory)
     out.check(inputs=(scenes,))
     points = starting_points(Path(scenes)) if Path(scenes).is_dir() else []
     if points:
@@ -88,7 +76,7 @@ def batch(
     try:
         if dry_run:
             planned = plan_batch(scenes, folder, words, ending=ending, match=match, workers=workers)
-            out.publish(_planned_json(planned), _planned_text(planned))
+            out.publish([one.as_json() for one in planned], format_plan(planned))
             return
         with step_progress("batch", _words(), quiet=out.quiet) as progress:
             done = run_batch(
@@ -129,36 +117,3 @@ def _print_failures(done: Batch) -> None:
         note(f"failed: {one.path}: {one.error}" + (f" ({one.code})" if one.code not in one.error else ""))
     if len(done.failures) > _SHOWN_MAX:
         note(f"and {len(done.failures) - _SHOWN_MAX} more: {done.folder / JOURNAL}")
-
-
-def _planned_json(planned: list[PlannedJob]) -> list[dict[str, object]]:
-    return [
-        {
-            "path": one.job.task.source,
-            "output": one.job.task.output,
-            "command": list(one.job.words),
-            "done": one.is_done,
-            "splats": None if one.file is None else one.file.splats,
-            "source_bytes": None if one.file is None else one.file.size_bytes,
-            "seconds": one.seconds,
-            "memory_bytes": one.memory_bytes,
-        }
-        for one in planned
-    ]
-
-
-def _planned_text(planned: list[PlannedJob]) -> str:
-    """Return a table of the planned work, and the total time."""
-    rows = []
-    for one in planned:
-        seen = one.file
-        splats = "?" if seen is None or seen.splats is None else f"{seen.splats:,}"
-        size = "cannot be read" if seen is None else format_bytes(seen.size_bytes)
-        seconds = "?" if one.seconds is None else format_seconds(one.seconds)
-        work = ("nothing: done", "") if one.is_done else (seconds, format_bytes(one.memory_bytes))
-        rows.append((one.job.task.source, one.job.task.output, splats, size, *work))
-    left = [one for one in planned if not one.is_done]
-    known = [one.seconds for one in left if one.seconds is not None]
-    took = f"{format_estimate(sum(known))}, one after the other" if len(known) == len(left) else "the time is unknown"
-    table = format_table(("scene", "output", "splats", "size", "time", "memory"), rows, left=2)
-    return f"{table}\n{counted(len(left), 'scene')} to do of {len(planned)}, {took}"

@@ -4,62 +4,34 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from csplat.disk_files import read_array
 from csplat.errors import InputError, counted
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import (
-    Background,
-    Cameras,
-    Data,
-    Force,
-    HelpAll,
-    Json,
-    ModeOption,
-    Quiet,
-    Report,
-    TestEvery,
-    ViewOptions,
-    require_one,
-)
-from csplat_tools.console import format_bytes, format_table
+from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM
-from csplat_tools.inspect.comparison import AttributeErrors
+from csplat_tools.inspect.text_reports import format_comparison
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import OpenedScene, open_scenes
-from csplat_tools.views import Split, describe_views
+from csplat_tools.views import Split
 
 if TYPE_CHECKING:
-    from csplat_tools.inspect.comparison import Comparison
+    pass
 
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
-
-_PAIRING = {
-    "index": "pairs from the source index",
-    "order": "pairs by their order",
-    "search": "pairs found within the stated errors",
-}
-_SCORE_EXPLANATIONS = {
-    "psnr": "of the squared error over all views; at 30 dB people see a difference, at 40 they hardly do",
-    "psnr_mean": "mean of the views' own",
-    "psnr_worst": "of the view that came out worst",
-    "psnr_covered": "of the pixels alone that show more than the background",
-    "ssim": "likeness of structure, 1 at best",
-    "lpips": "distance as a trained network sees it, 0 at best",
-    "cover": "share of the pixels that show more than the background",
-}
 
 
 def compare(
     a: Annotated[str, typer.Argument(metavar="A", help="The source, in any format.")],
     b: Annotated[str, typer.Argument(metavar="B", help="The scene that was made from it.")],
-    cameras: Cameras = None,
-    data: Data = None,
-    background: Background = None,
+    cameras: shared.Cameras = None,
+    data: shared.Data = None,
+    background: shared.Background = None,
     split: Annotated[
         Split, typer.Option(metavar="PART", show_default=False, help="test or train images. Default: test.")
     ] = "test",
@@ -67,19 +39,19 @@ def compare(
         str | None, typer.Option(metavar="FOLDER", help="Write renders of A, B, and differences.")
     ] = None,
     lpips: Annotated[
-        str | None, typer.Option(metavar="FILE.npz", help="Compute LPIPS with these weights, or auto.")
+        str | None, typer.Option(metavar="FILE.npz", help="Weights of LPIPS, or auto. Default: none.")
     ] = None,
-    mode: ModeOption = "standard",
-    test_every: TestEvery = None,
+    mode: shared.ModeOption = "standard",
+    test_every: shared.TestEvery = None,
     source_index: Annotated[
         str | None,
         typer.Option(metavar="FILE.npy", hidden=True, help="File of `encode --source-index`: pairs of splats."),
     ] = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Compare a scene with its source: sizes, errors, and renders.
 
@@ -98,8 +70,8 @@ def compare(
     import csplat_tools
 
     out = Output(force, report, as_json, quiet)
-    views = ViewOptions(cameras, data, background, test_every)
-    require_one({"--split": split != "test", "--test-every": test_every}, {"--data": data})
+    views = shared.ViewOptions(cameras, data, background, test_every)
+    shared.require_one({"--split": split != "test", "--test-every": test_every}, {"--data": data})
     out.check(inputs=(a, b, *views.inputs, source_index, None if lpips == "auto" else lpips))
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")
@@ -127,79 +99,6 @@ def compare(
             mode=mode, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), progress=progress,
         )  # fmt: skip
-    out.publish(compared.as_json(), _format(compared, Path(a).name, Path(b).name))
+    out.publish(compared.as_json(), format_comparison(compared, Path(a).name, Path(b).name))
     if pictures is not None:
         out.remark(f"{counted(len(compared.quality.each), 'file')} in {pictures}")
-
-
-def _format(compared: Comparison, a: str, b: str) -> str:
-    parts = [_sizes(compared, a, b)]
-    if compared.attributes is None:
-        parts.append("the errors of splats are unknown: `encode --source-index` writes the pairs of splats")
-    else:
-        parts.append(_attributes(compared.attributes))
-    parts.append(_quality(compared))
-    if compared.image_scores is not None:
-        parts.append(_format_image_scores(compared.image_scores))
-    parts.append(f"{compared.seconds:.1f} s")
-    return "\n\n".join(parts)
-
-
-def _sizes(compared: Comparison, a: str, b: str) -> str:
-    rows = []
-    for name, one in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
-        count = one.count
-        per_splat = f"{one.size_bytes / count:.2f}" if count else "-"
-        rows.append((name, one.size_bytes, count, one.metadata_model.sh_degree, per_splat))
-    table = format_table(("", "bytes", "splats", "SH", "bytes/splat"), rows)
-    ratio = compared.ratio
-    return f"{table}\nB is {ratio:.2f} times smaller than A" if ratio >= 1.0 else f"{table}\nB is larger than A"
-
-
-def _attributes(attributes: AttributeErrors) -> str:
-    rows = [(name, f"{largest:.4g}", f"{rms:.4g}") for name, (largest, rms) in attributes.errors.items()]
-    remark = _PAIRING[attributes.pairing]
-    if attributes.unmatched:
-        remark += f"; {counted(attributes.unmatched, 'splat')} of B without one in A"
-    return format_table(("error", "max", "rms"), rows) + f"\n{remark}"
-
-
-def _quality(compared: Comparison) -> str:
-    quality = compared.quality
-    values = {
-        "psnr": f"{quality.psnr:.2f} dB",
-        "psnr_mean": f"{quality.psnr_mean:.2f} dB",
-        "psnr_worst": f"{quality.psnr_worst:.2f} dB",
-        "psnr_covered": None if quality.psnr_covered is None else f"{quality.psnr_covered:.2f} dB",
-        "ssim": None if quality.ssim is None else f"{quality.ssim:.5f}",
-        "lpips": None if quality.lpips is None else f"{quality.lpips:.5f}",
-        "cover": None if quality.cover is None else f"{100.0 * quality.cover:.1f} %",
-    }
-    rows = [(name, text) for name, text in values.items() if text is not None]
-    views = describe_views(len(quality.each), compared.cameras)
-    head, *others = format_table(("pictures", views), rows).splitlines()
-    lines = [head, *(f"{line}  {_SCORE_EXPLANATIONS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
-    lines += _ignored(compared)
-    if compared.a.metadata_model.antialiased != compared.b.metadata_model.antialiased:
-        lines.append(
-            f"only {'A' if compared.a.metadata_model.antialiased else 'B'} is antialiased, and was rendered so"
-        )
-    return "\n".join(lines)
-
-
-def _format_image_scores(scores: dict[str, Any]) -> str:
-    rows = []
-    for name, digits in (("psnr", 2), ("psnr_mean", 2), ("psnr_covered", 2), ("ssim", 5), ("lpips", 5)):
-        a, b = scores["a"][name], scores["b"][name]
-        if a is not None and b is not None:
-            rows.append((name, f"{a:.{digits}f}", f"{b:.{digits}f}", f"{b - a:+.{digits}f}"))
-    header = (f"against {scores['a']['views']} {scores['split']} photographs", "A", "B", "B - A")
-    return format_table(header, rows)
-
-
-def _ignored(compared: Comparison) -> list[str]:
-    return [
-        f"{counted(count, 'splat')} of {name} with NaN or infinities, not drawn"
-        for name, count in zip("AB", (compared.ignored, compared.quality.ignored), strict=True)
-        if count
-    ]

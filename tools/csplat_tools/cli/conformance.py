@@ -27,17 +27,9 @@ from csplat_conformance.encoders import PSNR_MIN, EncoderSuiteOptions, run_encod
 from csplat_conformance.encoders.encoder_suite import TIMEOUT_SECONDS as ENCODER_SECONDS
 from csplat_conformance.encoders.render_checks import RenderScore
 from csplat_conformance.tolerance import EXACT
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.error_lines import EXIT_FAILED
-from csplat_tools.cli.shared_options import (
-    Force,
-    HelpAll,
-    Json,
-    Quiet,
-    Report,
-    checked,
-    refuse_together,
-)
 from csplat_tools.console import note, print_data
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
@@ -84,11 +76,11 @@ def decoder(
     jobs: _Jobs = None,
     timeout: _Timeout = None,
     junit: _Junit = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Test a decoder with the test vectors.
 
@@ -110,9 +102,11 @@ def decoder(
     clauses = [one for one in patterns if _CLAUSE.fullmatch(one)]
     names = [one for one in patterns if one not in clauses]
     # A renderer alone is tested at L4 alone.
-    levels = checked(parse_levels, level or ("3" if render_program is None else "4"))
+    levels = shared.checked(parse_levels, level or ("3" if render_program is None else "4"))
     seconds = _seconds(timeout, TIMEOUT_SECONDS)
-    options = checked(DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=seconds, jobs=jobs, by=by)
+    options = shared.checked(
+        DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=seconds, jobs=jobs, by=by
+    )
     with out.bar() as bar:
         if program is None and render_program is None:
             result = run_builtin(options, _moved(bar))
@@ -140,11 +134,11 @@ def encoder(
     folder: Annotated[
         str | None, typer.Option("--write-inputs", metavar="FOLDER", help="Write the inputs, run nothing.")
     ] = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Test an encoder with reference scenes.
 
@@ -164,7 +158,7 @@ def encoder(
       csplat conformance encoder --write-inputs inputs
     """
     out = Output(force, report, as_json, quiet)
-    refuse_together(
+    shared.refuse_together(
         {"--write-inputs": folder},
         {
             "--cmd": program, "--level": level, "--min-psnr": min_psnr, "--keep": keep, "--timeout": timeout,
@@ -176,7 +170,7 @@ def encoder(
         made = write_inputs(_checked_folder(folder, force=out.force), _joined(filters))
         out.publish(made, f"{counted(len(made['inputs']), 'input')} in {folder}")
         return
-    levels = tuple(f"L{number}" for number in checked(parse_levels, level or "4"))
+    levels = tuple(f"L{number}" for number in shared.checked(parse_levels, level or "4"))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
     render_score, reason = _render_scorer(levels, quiet=out.quiet)
     least = PSNR_MIN if min_psnr is None else min_psnr

@@ -13,21 +13,8 @@ from csplat.editing.transform import DEFAULT_AXES
 from csplat.errors import counted
 from csplat.formats import assume_format
 from csplat.model import UNSPECIFIED
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import (
-    Force,
-    HelpAll,
-    Json,
-    Quiet,
-    ReadAs,
-    Report,
-    ShDegree,
-    Up,
-    parse_axes,
-    parse_numbers,
-    parse_overrides,
-    parse_sh_degree,
-)
 from csplat_tools.console import format_bytes, format_table, note
 from csplat_tools.convert_file import Filters, convert_file, format_rows
 from csplat_tools.file_streams import STANDARD_STREAM
@@ -43,8 +30,8 @@ def convert(
     translate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Move, scene units.")] = None,
     crop: Annotated[str | None, typer.Option(metavar="NUMBERS", help="Keep a box (6 numbers) or sphere (4).")] = None,
     drop_floaters: Annotated[bool, typer.Option("--drop-floaters", help="Drop splats far from others.")] = False,
-    up: Up = None,
-    sh_degree: ShDegree = None,
+    up: shared.Up = None,
+    sh_degree: shared.ShDegree = None,
     no_loss: Annotated[bool, typer.Option("--no-loss", help="Refuse if anything would be lost.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Report losses and size, write nothing.")] = False,
     to_axes: Annotated[
@@ -60,12 +47,12 @@ def convert(
         int,
         typer.Option(min=0, metavar="N", hidden=True, show_default=False, help="Level of streamed SOG. Default: 0."),
     ] = 0,
-    read_as: ReadAs = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    read_as: shared.ReadAs = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Convert a scene to another format, and change it.
 
@@ -83,8 +70,8 @@ def convert(
     out = Output(force, report, as_json, quiet)
     if output == STANDARD_STREAM:
         raise typer.BadParameter("OUT cannot be standard output: name a file")
-    filters, overrides = _filters(to_axes, rotate, scale, translate, crop), parse_overrides(up, axes)
-    filters = replace(filters, drop_floaters=drop_floaters, sh_degree=parse_sh_degree(sh_degree))
+    filters, overrides = _filters(to_axes, rotate, scale, translate, crop), shared.parse_overrides(up, axes)
+    filters = replace(filters, drop_floaters=drop_floaters, sh_degree=shared.parse_sh_degree(sh_degree))
     folder = Path(output).parent
     is_new_folder = Path(output).name == "meta.json" and not folder.exists()  # SOG as a folder
     if not dry_run and not Path(output).is_dir():
@@ -119,13 +106,13 @@ def _filters(
     """
     if scale is not None and not (math.isfinite(scale) and scale > 0.0):
         raise typer.BadParameter(f"--scale is {scale:g}, expected a number above 0")
-    turn, offset = parse_numbers("--rotate", rotate, 3), parse_numbers("--translate", translate, 3)
-    region = parse_numbers("--crop", crop, 6, 4)
+    turn, offset = shared.parse_numbers("--rotate", rotate, 3), shared.parse_numbers("--translate", translate, 3)
+    region = shared.parse_numbers("--crop", crop, 6, 4)
     is_box = region is not None and len(region) == 6
     if region is not None and not is_box and region[3] <= 0.0:
         raise typer.BadParameter(f"--crop has a radius of {region[3]:g}, expected one above 0")
     return Filters(
-        to_axes=None if to_axes is None else parse_axes(to_axes),
+        to_axes=None if to_axes is None else shared.parse_axes(to_axes),
         rotate=None if turn is None else (turn[0], turn[1], turn[2]),
         scale=scale,
         translate=None if offset is None else (offset[0], offset[1], offset[2]),
@@ -135,11 +122,11 @@ def _filters(
 
 
 def formats(
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """List the formats that are read and written.
 

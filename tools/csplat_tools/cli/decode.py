@@ -6,19 +6,8 @@ from typing import Annotated
 
 import typer
 
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output, default_output
-from csplat_tools.cli.shared_options import (
-    Force,
-    HelpAll,
-    Json,
-    MaxSplats,
-    Quiet,
-    Report,
-    ShDegree,
-    Up,
-    parse_overrides,
-    parse_sh_degree,
-)
 from csplat_tools.convert_file import decode_file
 from csplat_tools.file_streams import check_name
 
@@ -28,15 +17,15 @@ def decode(
     output: Annotated[
         str | None, typer.Argument(metavar="OUT.ply", help="The file to write, or -. Default: IN.ply.")
     ] = None,
-    up: Up = None,
-    sh_degree: ShDegree = None,
+    up: shared.Up = None,
+    sh_degree: shared.ShDegree = None,
     absolute: Annotated[bool, typer.Option("--absolute", help="Add the origin to positions, as doubles.")] = False,
-    max_splats: MaxSplats = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    max_splats: shared.MaxSplats = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Turn a .csplat file into a PLY for any 3DGS viewer.
 
@@ -49,7 +38,7 @@ def decode(
       csplat decode scene.csplat - | gzip > scene.ply.gz
     """
     out, output = Output(force, report, as_json, quiet), default_output(output, source, ".ply")
-    overrides, sh_degree = parse_overrides(up), parse_sh_degree(sh_degree)
+    overrides, sh_degree = shared.parse_overrides(up), shared.parse_sh_degree(sh_degree)
     out.check(output, inputs=(source,))
     check_name(output, ".ply", "decode", source)
     with out.bar() as progress:

@@ -9,48 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions
-from csplat.errors import counted
 from csplat.formats import assume_format
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.up_estimate import estimate_up
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output, default_output
-from csplat_tools.cli.shared_options import (
-    Data,
-    Force,
-    HelpAll,
-    HiddenBackground,
-    HiddenCameras,
-    HiddenDask,
-    HiddenDryRun,
-    HiddenEffort,
-    HiddenKeep,
-    HiddenKeepExtra,
-    HiddenMemory,
-    Json,
-    MaxPsnrDrop,
-    Preset,
-    Quiet,
-    ReadAs,
-    Report,
-    ShDegree,
-    SourceIndexOutput,
-    TargetPsnr,
-    TargetSize,
-    Up,
-    ViewOptions,
-    check_range,
-    checked,
-    parse_bytes,
-    parse_decibels,
-    parse_overrides,
-    refuse_together,
-    require_one,
-    take_estimated_up,
-)
-from csplat_tools.console import format_bytes, format_estimate, format_table, note
+from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
     EncodeFunction,
@@ -58,6 +24,9 @@ from csplat_tools.encode_file import (
     OutOfCoreOptions,
     encode_file,
     estimate_cost,
+    format_cost,
+    format_declared_errors,
+    format_encoding,
 )
 from csplat_tools.file_streams import check_name, source_path
 from csplat_tools.inspect.comparison import ESTIMATE_SIZE, ESTIMATE_SPLATS_MAX, estimate_psnr
@@ -89,7 +58,7 @@ class _TargetSearch:
     max_error: str | None
     no_prune: bool
     effort: int | None
-    views: ViewOptions
+    views: shared.ViewOptions
     importance: str | None
 
     @property
@@ -111,7 +80,7 @@ class _TargetSearch:
         from csplat_tools.optimise.targets import Target, parse_max_error  # imports names of the renderer
 
         bounds = {} if self.max_error is None else parse_max_error(self.max_error, unit_metres)
-        return Target(self.psnr, parse_bytes(self.size), self.max_psnr_drop, self.keep, bounds)
+        return Target(self.psnr, shared.parse_bytes(self.size), self.max_psnr_drop, self.keep, bounds)
 
 
 def encode(
@@ -119,50 +88,49 @@ def encode(
     output: Annotated[
         str | None, typer.Argument(metavar="OUT.csplat", help="The file to write, or -. Default: IN.csplat.")
     ] = None,
-    preset: Preset = "balanced",
-    sh_degree: ShDegree = None,
-    target_psnr: TargetPsnr = None,
-    target_size: TargetSize = None,
-    max_psnr_drop: MaxPsnrDrop = None,
+    preset: shared.Preset = "balanced",
+    sh_degree: shared.ShDegree = None,
+    target_psnr: shared.TargetPsnr = None,
+    target_size: shared.TargetSize = None,
+    max_psnr_drop: shared.MaxPsnrDrop = None,
     max_error: Annotated[str | None, typer.Option(metavar="NAME=MAX", help="Largest errors. Default: none.")] = None,
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
-    data: Data = None,
-    up: Up = None,
+    data: shared.Data = None,
+    up: shared.Up = None,
     attribute_psnr: Annotated[
         float | None, typer.Option(metavar="DB", hidden=True, help="PSNR of each attribute. Default: by preset.")
     ] = None,
-    keep: HiddenKeep = None,
-    effort: HiddenEffort = None,
-    cameras: HiddenCameras = None,
-    background: HiddenBackground = None,
+    keep: shared.HiddenKeep = None,
+    effort: shared.HiddenEffort = None,
+    cameras: shared.HiddenCameras = None,
+    background: shared.HiddenBackground = None,
     importance: Annotated[
         str | None, typer.Option(metavar="FILE", hidden=True, help="File of `csplat sensitivity`, or .npy weights.")
     ] = None,
-    source_index: SourceIndexOutput = None,
-    memory: HiddenMemory = None,
+    source_index: shared.SourceIndexOutput = None,
+    memory: shared.HiddenMemory = None,
     resume: Annotated[bool, typer.Option("--resume", hidden=True, help="Go on from OUT.csplat.work.")] = False,
-    dask: HiddenDask = None,
-    dry_run: HiddenDryRun = False,
-    keep_extra: HiddenKeepExtra = False,
+    dask: shared.HiddenDask = None,
+    dry_run: shared.HiddenDryRun = False,
+    keep_extra: shared.HiddenKeepExtra = False,
     unit_metres: Annotated[
         float | None, typer.Option(metavar="METRES", hidden=True, help="Length of a scene unit. Default: unknown.")
     ] = None,
     antialiased: Annotated[
-        bool | None,
-        typer.Option("--antialiased/--no-antialiased", hidden=True, help="Trained with mip-splatting."),
-    ] = None,
+        bool, typer.Option("--antialiased", hidden=True, help="The scene was trained with mip-splatting.")
+    ] = False,
     licence: Annotated[
         str | None, typer.Option(metavar="TEXT", hidden=True, help="Licence of the scene. Default: none.")
     ] = None,
     threads: Annotated[
         int | None, typer.Option(metavar="N", min=1, hidden=True, help="Threads. Default: one per core.")
     ] = None,
-    read_as: ReadAs = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    read_as: shared.ReadAs = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Compress a trained 3DGS scene.
 
@@ -178,33 +146,32 @@ def encode(
       csplat encode scene.ply scene.csplat --target-size 5MB --no-prune
     """
     out, output = Output(force, report, as_json, quiet), default_output(output, source, ".csplat")
-    views = ViewOptions(cameras, data, background)
+    views = shared.ViewOptions(cameras, data, background)
     precision = {"--target-psnr": target_psnr, "--target-size": target_size, "--max-psnr-drop": max_psnr_drop}
     rendered = {**precision, "--keep": keep}
     targets = {**rendered, "--max-error": max_error}
     whole = {**targets, "--importance": importance, "--source-index": source_index}
     out_of_core = {"--memory": memory, "--resume": resume, "--dask": dask, "--dry-run": dry_run}
-    refuse_together(rendered)
-    refuse_together({"--attribute-psnr": attribute_psnr}, precision)
-    refuse_together({"--keep": keep}, {"--no-prune": no_prune, "--importance": importance})
-    refuse_together({"--effort": effort}, {"--no-prune": no_prune})
-    refuse_together(out_of_core, whole)
-    require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
-    require_one({"--no-prune": no_prune}, {**precision, "--max-error": max_error})
-    require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
-    require_one({"--background": background}, {"--cameras": cameras, "--data": data})
-    check_range("--effort", effort, 1, 9)
-    options = checked(
+    shared.refuse_together(rendered)
+    shared.refuse_together({"--attribute-psnr": attribute_psnr}, precision)
+    shared.refuse_together({"--keep": keep}, {"--no-prune": no_prune, "--importance": importance})
+    shared.refuse_together({"--effort": effort}, {"--no-prune": no_prune})
+    shared.refuse_together(out_of_core, whole)
+    shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
+    shared.require_one({"--no-prune": no_prune}, {**precision, "--max-error": max_error})
+    shared.require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
+    shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
+    shared.check_range("--effort", effort, 1, 9)
+    options = shared.checked(
         EncodeOptions, preset=preset, sh_degree=sh_degree, attribute_psnr=attribute_psnr, keep_extra=keep_extra,
         threads=threads,
     )  # fmt: skip
-    search = _TargetSearch(
-        parse_decibels(target_psnr, "--target-psnr"), target_size, parse_decibels(max_psnr_drop, "--max-psnr-drop"),
-        keep, max_error, no_prune, effort, views, importance,
-    )  # fmt: skip
-    checked(search.target, 1.0)  # errors of the target that do not depend on the scene
-    overrides = parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased, licence=licence)
-    scale = OutOfCoreOptions(parse_bytes(memory), resume=resume, cluster=dask)
+    psnr = shared.parse_decibels(target_psnr, "--target-psnr")
+    drop = shared.parse_decibels(max_psnr_drop, "--max-psnr-drop")
+    search = _TargetSearch(psnr, target_size, drop, keep, max_error, no_prune, effort, views, importance)
+    shared.checked(search.target, 1.0)  # errors of the target that do not depend on the scene
+    overrides = shared.parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased or None, licence=licence)
+    scale = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, cluster=dask)
     with out.bar() as progress, assume_format(read_as):
         if dry_run:
             _publish_estimate(source, options, scale, out)
@@ -235,14 +202,15 @@ def _publish(
     out.print_findings(encoded.findings)
     for line in encoded.report.notes:
         note(line)
-    out.remark(*(() if encoded.outcome is None else encoded.outcome.lines), *_declared_errors(encoded))
+    out.remark(*(() if encoded.outcome is None else encoded.outcome.lines))
+    out.remark(*format_declared_errors(encoded.report.errors))
     if progress is not None:
         progress("eight small renders", 0.0)
     psnr = None if out.quiet else _psnr(encoded, threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
     if not out.quiet and encoded.outcome is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
-        take_estimated_up(estimate_up(encoded.source), out, given=up, shown=False)
-    out.remark(_summary(encoded, psnr, source, output))
+        shared.take_estimated_up(estimate_up(encoded.source), out, given=up, shown=False)
+    out.remark(format_encoding(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 
 
@@ -250,14 +218,7 @@ def _publish_estimate(source: str, options: EncodeOptions, scale: OutOfCoreOptio
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local:
         found = estimate_cost(local, options, scale)
-    needs = found.needs
-    where = "in memory" if needs.in_memory else f"on the disk, {counted(needs.workers, 'process', 'processes')}"
-    text = (
-        f"{counted(found.count, 'splat')} of SH degree {found.sh_degree}, {where}: about"
-        f" {format_estimate(found.seconds)}, {format_bytes(needs.memory_bytes)} of memory,"
-        f" {format_bytes(needs.disk_bytes)} of disk; the file about {format_bytes(found.file_bytes)}"
-    )
-    out.publish(found.as_json(), text)
+    out.publish(found.as_json(), format_cost(found))
 
 
 def _encode_to_target(
@@ -294,33 +255,9 @@ def _encode_to_target(
     return EncoderOutcome(made.result, "target", made.report.as_json(), made.report.lines())
 
 
-def _declared_errors(encoded: EncodedFile) -> list[str]:
-    errors = encoded.report.errors
-    names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
-    rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
-    return [format_table(("stated error", "max", "rms"), rows)] * bool(rows)
-
-
 def _psnr(encoded: EncodedFile, threads: int | None) -> float | None:
     """Return an approximate PSNR in dB; `None` if it is known already, or if measuring it would take long."""
     outcome = encoded.outcome
     if outcome is None or outcome.report.get("psnr") is not None or find_spec("numba") is None:
         return None
     return estimate_psnr(encoded.source, outcome.result.data, threads=threads)
-
-
-def _summary(encoded: EncodedFile, psnr: float | None, source: str, output: str) -> str:
-    """Return the last line: counts, time, sizes and quality."""
-    report = encoded.report
-    per_splat = f" ({report.size_bytes / report.splat_count:.2f} bytes per splat)" if report.splat_count else ""
-    ratio = encoded.source_bytes / report.size_bytes
-    splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
-    sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
-    quality, found = "", None if encoded.outcome is None else encoded.outcome.report.get("psnr")
-    if psnr is not None:
-        quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
-    elif found is not None:
-        quality = f", PSNR {found:.2f} dB"
-    elif encoded.outcome is not None and len(encoded.source) and "-" not in (source, output):
-        quality = f"; `csplat compare {source} {output}` shows how it looks"
-    return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

@@ -54,70 +54,54 @@ _OS_ADVICE = {
 }
 _EMPTY_PHRASES = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in typer's messages
 
-_CROP = "is part of --crop now: six numbers are a box, four are a sphere"
-_OUTPUT = "is gone: the output is the last argument, as in `csplat encode IN OUT`"
-_ENCODER = "is an argument of csplat.EncodeOptions in Python now"
-_DATA_SET = "is an argument of csplat_tools.DataOptions in Python now"
-_VIEWS = "is an argument of csplat_tools.find_view_set in Python now"
-_TRAINING = "is an argument of csplat_tools.training.training_run.run_training in Python now"
-_UNSEEN = "is an argument of encode_file and run_finetuning in Python now"
-#: Options of earlier versions, and where to find what they did. They are refused in this way for one version.
+_IN_PYTHON = "is an argument of {} in Python now"
+#: Options of earlier versions that went, and where to find what they did. They are refused in this way for one version.
 RENAMED_OPTIONS = {
+    **dict.fromkeys(
+        ("--max-classes", "--deflate-level", "--attribute-psnr", "--threads", "--seed"),
+        _IN_PYTHON.format("csplat.EncodeOptions"),
+    ),
+    **dict.fromkeys(("--size", "--test-every", "--near"), _IN_PYTHON.format("csplat_tools.DataOptions")),
+    **dict.fromkeys(
+        ("--views", "--view-size", "--validation-count", "--split", "--background"),
+        _IN_PYTHON.format("csplat_tools.find_view_set"),
+    ),
+    **dict.fromkeys(("--modes", "--iterations"), _IN_PYTHON.format("csplat_tools.SweepOptions")),
+    **dict.fromkeys(("--amplify", "--memory"), _IN_PYTHON.format("csplat_tools.compare")),
+    **dict.fromkeys(("--thumbnails", "--no-thumbnails"), _IN_PYTHON.format("csplat_tools.batch")),
+    **dict.fromkeys(("--previews", "--preview-every", "--lpips-weights"), _IN_PYTHON.format("csplat_trainer.Outputs")),
+    **dict.fromkeys(
+        ("--matrices", "--no-matrices"), _IN_PYTHON.format("csplat_tools.optimise.scene_sensitivity.measure_scene")
+    ),
+    "--plot": _IN_PYTHON.format("csplat_tools.training.training_run.run_training"),
+    "--keep-unseen": _IN_PYTHON.format("csplat_tools.training.tuning_run.run_finetuning"),
+    "--prune-unseen": _IN_PYTHON.format("csplat_tools.encode_file.encode_file"),
+    **dict.fromkeys(("-o", "--output"), "is gone: the output is the last argument, as in `csplat encode IN OUT`"),
+    **dict.fromkeys(("--crop-box", "--crop-sphere"), "is part of --crop now: six numbers are a box, four a sphere"),
+    **dict.fromkeys(("--verbose", "-v"), "is gone: --json and --junit have a result for each check"),
+    "-j": "is called --jobs now",
     "--aside": "is validation_count of csplat_tools.find_view_set in Python now",
-    "--grades": "is max_classes of csplat.EncodeOptions in Python now",
-    "--keep-all": "is called --no-prune now",
-    "--max-loss": "is called --max-psnr-drop now",
-    "-o": _OUTPUT,
-    "--output": _OUTPUT,
-    "--set": "is gone: EncodeOptions, FinetuneOptions, SimplifyOptions and TrainOptions take such settings in Python",
-    "--images": "is part of the data set's path now, as in SET/images_4",
-    "--crop-box": _CROP,
-    "--crop-sphere": _CROP,
+    "--axes": "is an option of `csplat convert`, and coordinate_system of scenes in Python",
+    "--checkpoint-every": "is gone: checkpoints are written every 1,000 steps",
     "--clause": "is part of --filter now, as in --filter 'HDR-*'",
     "--exact": "is exact of csplat_conformance.decoder_suite.DecoderSuiteOptions in Python now",
-    "--verbose": "is gone: --json and --junit have a result for each check",
-    "-v": "is gone: --json and --junit have a result for each check",
-    "-j": "is called --jobs now",
-    "--checkpoint-every": "is gone: checkpoints are written every 1,000 steps",
-    "--max-classes": _ENCODER,
-    "--deflate-level": _ENCODER,
-    "--attribute-psnr": _ENCODER,
-    "--seed": "is an argument of EncodeOptions, FinetuneOptions and SimplifyOptions in Python now",
-    "--threads": "is an argument of EncodeOptions and SimplifyOptions in Python now",
-    "--size": _DATA_SET,
-    "--test-every": _DATA_SET,
-    "--near": _DATA_SET,
-    "--views": _VIEWS,
-    "--view-size": _VIEWS,
-    "--validation-count": _VIEWS,
-    "--split": _VIEWS,
-    "--background": _VIEWS,
-    "--axes": "is an option of `csplat convert`, and coordinate_system of scenes in Python",
-    "--strict": "is an argument of csplat.read in Python now; `csplat lint` lists defects",
-    "--prune-unseen": _UNSEEN,
-    "--keep-unseen": _UNSEEN,
-    "--importance": "is an option of `csplat encode`, and an argument of run_finetuning in Python",
-    "--source-index": "is an option of encode, finetune, verify and compare; in Python also of csplat_tools.simplify",
-    "--work": "is gone: the working folder is OUT.work; encode_file takes another one in Python",
-    "--memory": "is an argument of csplat_tools.compare and verify_file in Python now",
-    "--amplify": "is amplification of csplat_tools.compare in Python now",
-    "--lpips": "is an option of `csplat compare`, and an argument of csplat_tools.tradeoff's settings in Python",
-    "--plots": "is write_plots of csplat_tools.tradeoffs in Python now; -o PAGE.html has the plots",
-    "--modes": "is an argument of csplat_tools.SweepOptions in Python now",
-    "--iterations": "is an argument of csplat_tools.SweepOptions in Python now",
-    "--matrices": "is an argument of csplat_tools.measure_sensitivity in Python now",
-    "--no-matrices": "is an argument of csplat_tools.measure_sensitivity in Python now",
-    "--lambda": "is byte_cost of FinetuneOptions in Python, and an option of `csplat finetune`",
-    "--lr-factor": "is FinetuneOptions.scaled in Python now",
-    "--lpips-weights": _TRAINING,
-    "--plot": _TRAINING,
-    "--previews": _TRAINING,
-    "--preview-every": _TRAINING,
-    "--preset": "is an option of `csplat encode`: encode the scene first",
-    "--sh-degree": "is gone here: `csplat convert --sh-degree` writes a scene with fewer bands",
     "--from": "is an option of encode and convert: convert the scene first",
-    "--thumbnails": "is gone: the page has thumbnails if the render extra is installed",
-    "--no-thumbnails": "is thumbnails of csplat_tools.batch in Python now",
+    "--grades": "is max_classes of csplat.EncodeOptions in Python now",
+    "--images": "is part of the data set's path now, as in SET/images_4",
+    "--importance": "is an option of `csplat encode`, and an argument of run_finetuning in Python",
+    "--keep-all": "is called --no-prune now",
+    "--lambda": "is an option of `csplat finetune`, and byte_cost of FinetuneOptions in Python",
+    "--lpips": "is an option of `csplat compare`, and an argument of read_setting and run_finetuning in Python",
+    "--lr-factor": "is FinetuneOptions.scaled in Python now",
+    "--max-loss": "is called --max-psnr-drop now",
+    "--no-antialiased": "is antialiased of scenes in Python now",
+    "--plots": "is gone: -o PAGE.html has the plots",
+    "--preset": "is an option of `csplat encode`: encode the scene first",
+    "--set": "is gone: EncodeOptions, FinetuneOptions, SimplifyOptions and TrainOptions take such settings in Python",
+    "--sh-degree": "is gone here: `csplat convert --sh-degree` writes a scene with fewer bands",
+    "--source-index": "is an option of encode, finetune, verify and compare",
+    "--strict": "is an argument of csplat.read in Python now; `csplat lint` lists defects",
+    "--work": "is gone: the working folder is OUT.work",
 }
 
 

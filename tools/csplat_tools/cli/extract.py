@@ -8,8 +8,8 @@ import typer
 
 from csplat.errors import counted
 from csplat.splat_file import open as opened
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import Force, HelpAll, Json, Quiet, Report, parse_numbers
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import check_name, csplat_file, whole_output
 
@@ -20,11 +20,11 @@ def extract(
     ],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write, or -.")],
     box: Annotated[str, typer.Option(metavar="X,Y,Z,X,Y,Z", help="Two corners, scene units.")],
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Cut a box out of a file, tile by tile.
 
@@ -39,7 +39,7 @@ def extract(
       csplat extract s3://bucket/city.csplat part.csplat --box 0,0,0,9,9,9
     """
     out = Output(force, report, as_json, quiet)
-    corners = parse_numbers("--box", box, 6)
+    corners = shared.parse_numbers("--box", box, 6)
     assert corners is not None
     out.check(output, inputs=(source,))
     check_name(output, ".csplat", "extract", source)

@@ -7,35 +7,8 @@ from typing import Annotated
 import typer
 
 from csplat.encoder import EncodeOptions
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import (
-    CHECKPOINT_EVERY,
-    Checkpoint,
-    Data,
-    Force,
-    HelpAll,
-    HiddenBackground,
-    HiddenCameras,
-    HiddenShDegree,
-    Json,
-    Keep,
-    Page,
-    Preset,
-    Quiet,
-    Report,
-    Resume,
-    SourceIndexOutput,
-    TargetPsnr,
-    TargetSize,
-    ViewOptions,
-    checked,
-    is_same_file,
-    parse_bytes,
-    parse_decibels,
-    parse_share,
-    refuse_together,
-    require_one,
-)
 from csplat_tools.encode_file import read_degree
 from csplat_tools.file_streams import check_name
 from csplat_tools.optional_packages import require_trainer
@@ -45,30 +18,30 @@ from csplat_tools.scene_files import MetadataOverrides, read_source
 def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write.")],
-    data: Data = None,
+    data: shared.Data = None,
     itself: Annotated[bool, typer.Option("--self", help="Tune to the scene's own renders.")] = False,
-    preset: Preset = "balanced",
-    keep: Keep = None,
-    target_size: TargetSize = None,
-    target_psnr: TargetPsnr = None,
+    preset: shared.Preset = "balanced",
+    keep: shared.Keep = None,
+    target_size: shared.TargetSize = None,
+    target_psnr: shared.TargetPsnr = None,
     iterations: Annotated[
         int, typer.Option(metavar="N", min=1, show_default=False, help="Largest number of steps. Default: 1,000.")
     ] = 1_000,
     byte_cost: Annotated[
         float | None, typer.Option("--lambda", metavar="COST", help="Loss per bit and splat. Default: 1e-4.")
     ] = None,
-    page: Page = None,
-    sh_degree: HiddenShDegree = None,
-    cameras: HiddenCameras = None,
-    background: HiddenBackground = None,
-    source_index: SourceIndexOutput = None,
-    checkpoint: Checkpoint = None,
-    resume: Resume = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    page: shared.Page = None,
+    sh_degree: shared.HiddenShDegree = None,
+    cameras: shared.HiddenCameras = None,
+    background: shared.HiddenBackground = None,
+    source_index: shared.SourceIndexOutput = None,
+    checkpoint: shared.Checkpoint = None,
+    resume: shared.Resume = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Compress a scene, and tune the values in the file.
 
@@ -84,17 +57,17 @@ def finetune(
       csplat finetune scene.ply scene.csplat --self
     """
     out = Output(force, report, as_json, quiet)
-    views, psnr = ViewOptions(cameras, data, background), parse_decibels(target_psnr, "--target-psnr")
+    views, psnr = shared.ViewOptions(cameras, data, background), shared.parse_decibels(target_psnr, "--target-psnr")
     if data is None and not itself:
         raise typer.BadParameter("expected --data or --self")
-    refuse_together({"--data": data, "--self": itself})
+    shared.refuse_together({"--data": data, "--self": itself})
     by_psnr = {"--target-psnr": target_psnr}
-    refuse_together(by_psnr, {"--target-size": target_size})
-    refuse_together(by_psnr, {"--keep": keep, "--checkpoint": checkpoint, "--resume": resume})
-    refuse_together({"--lambda": byte_cost}, {"--target-size": target_size, **by_psnr})
-    require_one({"--background": background}, {"--cameras": cameras, "--data": data})
-    parse_share(keep)
-    size_bytes = checked(parse_bytes, target_size)
+    shared.refuse_together(by_psnr, {"--target-size": target_size})
+    shared.refuse_together(by_psnr, {"--keep": keep, "--checkpoint": checkpoint, "--resume": resume})
+    shared.refuse_together({"--lambda": byte_cost}, {"--target-size": target_size, **by_psnr})
+    shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
+    shared.parse_share(keep)
+    size_bytes = shared.checked(shared.parse_bytes, target_size)
     require_trainer(plots=page is not None)
     from csplat_tools.training import tuning_run as tuning
     from csplat_tools.training.tuning_report import format_tuning_report
@@ -102,9 +75,11 @@ def finetune(
     from csplat_trainer.tuning.tuning_options import FinetuneOptions
 
     cost = tuning.RATE_WEIGHT[itself] if byte_cost is None else byte_cost
-    options = checked(FinetuneOptions, iterations=iterations, byte_cost=cost).scaled(tuning.LEARNING_FACTOR[itself])
+    options = shared.checked(FinetuneOptions, iterations=iterations, byte_cost=cost).scaled(
+        tuning.LEARNING_FACTOR[itself]
+    )
     encoding = EncodeOptions(preset, sh_degree=sh_degree, shape_codebook_size=tuning.SHAPE_ENTRIES)
-    replaces = is_same_file(checkpoint, resume)  # a checkpoint may replace the one that the run goes on from
+    replaces = shared.is_same_file(checkpoint, resume)  # a checkpoint may replace the one that the run goes on from
     named = {"--source-index": source_index, "--page": page}
     if replaces:
         out.check(inputs=(source, *views.inputs), named={"--checkpoint": checkpoint}, force=True)
@@ -119,7 +94,7 @@ def finetune(
         around = views.find(read.model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=kept_back)
         around.read_images()
         result = tuning.run_finetuning(
-            read.model, around, output, encoding, options, Outputs(checkpoint, CHECKPOINT_EVERY, resume=resume),
+            read.model, around, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
             keep=keep, source_index=source_index, size_bytes=size_bytes, psnr=psnr, page=page, quiet=out.quiet,
         )  # fmt: skip
     out.remark(format_tuning_report(result))

@@ -9,9 +9,9 @@ import typer
 from csplat import formats
 from csplat.errors import InputError
 from csplat.lint import Finding
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.error_lines import EXIT_FAILED
-from csplat_tools.cli.shared_options import Force, HelpAll, Json, KeepExtra, Quiet, Report, ShDegree, parse_sh_degree
 from csplat_tools.console import format_table
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, source_path, write_model
 from csplat_tools.scene_files import findings_as_json, without_extra_columns
@@ -20,13 +20,13 @@ from csplat_tools.scene_files import findings_as_json, without_extra_columns
 def lint(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, another of `csplat formats`, or -.")],
     fix: Annotated[str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY if that is safe.")] = None,
-    keep_extra: KeepExtra = False,
-    sh_degree: ShDegree = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    keep_extra: shared.KeepExtra = False,
+    sh_degree: shared.ShDegree = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """List the defects of a PLY, each with its count.
 
@@ -40,7 +40,7 @@ def lint(
       csplat lint scene.ply --fix clean.ply
       csplat lint scene.ply --json | jq '.findings[].id'
     """
-    out, sh_degree = Output(force, report, as_json, quiet), parse_sh_degree(sh_degree)
+    out, sh_degree = Output(force, report, as_json, quiet), shared.parse_sh_degree(sh_degree)
     out.check(fix, inputs=(source,))
     if fix is not None:
         check_name(fix, ".ply", "--fix", source)

@@ -9,8 +9,8 @@ import typer
 from csplat.editing.merge import merge as merged
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError, counted
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import Force, HelpAll, Json, Preset, Quiet, Report
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, csplat_file, whole_output
 
@@ -21,12 +21,12 @@ def merge(
         typer.Argument(metavar="A.csplat B.csplat ...", help="Files in the order of their splats; URLs, or one -."),
     ],
     target: Annotated[str, typer.Option("--output", "-o", metavar="OUT.csplat", help="The file to write, or -.")],
-    preset: Preset = "balanced",
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    preset: shared.Preset = "balanced",
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Join files into one.
 

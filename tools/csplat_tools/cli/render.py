@@ -10,23 +10,8 @@ import typer
 
 from csplat.errors import counted
 from csplat_render.up_estimate import estimate_up
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import (
-    Background,
-    Force,
-    HelpAll,
-    Json,
-    ModeOption,
-    Quiet,
-    Report,
-    SceneArgument,
-    ViewOptions,
-    check_range,
-    parse_overrides,
-    parse_size,
-    require_one,
-    take_estimated_up,
-)
 from csplat_tools.console import note
 from csplat_tools.file_streams import STANDARD_STREAM, check_name
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
@@ -39,19 +24,19 @@ _OTHER_FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
 
 
 def render(
-    source: SceneArgument,
+    source: shared.SceneArgument,
     output: Annotated[
         str, typer.Argument(metavar="OUT", help="A folder for PNG files; or NAME.mp4, .webp, .gif, .png: a film.")
     ],
     cameras: Annotated[str | None, typer.Option(metavar="FILE.json", help="Cameras, in a format listed above.")] = None,
     data: Annotated[str | None, typer.Option(metavar="DATA", help="Cameras of a data set's test images.")] = None,
-    background: Background = None,
+    background: shared.Background = None,
     size: Annotated[str | None, typer.Option(metavar="WxH", help="Pixels. Default: cameras', or 640x480.")] = None,
     up: Annotated[str | None, typer.Option(metavar="-y|X,Y,Z", help="Axis of --orbit. Default: the scene's.")] = None,
     orbit: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="N cameras around or along. Default: none.")
     ] = None,
-    mode: ModeOption = "standard",
+    mode: shared.ModeOption = "standard",
     fps: Annotated[
         float, typer.Option(metavar="RATE", show_default=False, help="Frames per second. Default: 25.")
     ] = DEFAULT_FPS,
@@ -59,11 +44,11 @@ def render(
         bool, typer.Option("--depth", hidden=True, help="Write NAME.depth.npy, float32, scene units.")
     ] = False,
     alpha: Annotated[bool, typer.Option("--alpha", hidden=True, help="Write NAME.alpha.png.")] = False,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Render a scene to PNG files, or to a film.
 
@@ -80,16 +65,16 @@ def render(
       csplat render scene.ply views --cameras test.json --background white
     """
     out = Output(force, report, as_json, quiet)
-    film, views = is_film(output), ViewOptions(cameras, data, background)
+    film, views = is_film(output), shared.ViewOptions(cameras, data, background)
     if (cameras, orbit, data) == (None, None, None):
         raise typer.BadParameter("expected cameras: --orbit 120 for a path around the scene, or --cameras, or --data")
     if output == STANDARD_STREAM or Path(output).suffix.lower() in _OTHER_FILMS:
         raise typer.BadParameter(f"OUT is {output}, expected a folder, or a film: NAME.mp4, .webp, .gif or .png")
     if film and (depth or alpha):
         raise typer.BadParameter("--depth and --alpha require a folder, not a film")
-    check_range("--fps", fps, 0.1, MAX_FPS)
-    require_one({"--up": up}, {"--orbit": orbit})
-    pixels, overrides = None if size is None else parse_size(size), parse_overrides(up)
+    shared.check_range("--fps", fps, 0.1, MAX_FPS)
+    shared.require_one({"--up": up}, {"--orbit": orbit})
+    pixels, overrides = None if size is None else shared.parse_size(size), shared.parse_overrides(up)
     out.check(output if film else None, inputs=(source, *views.inputs))
     if not film:
         check_name(output, ".webp", "render", source)
@@ -102,7 +87,7 @@ def render(
         shots = find_cameras(model, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
         if orbit is not None:
-            take_estimated_up(estimate_up(model), out, given=up)
+            shared.take_estimated_up(estimate_up(model), out, given=up)
         write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, force=out.force,

@@ -1,6 +1,7 @@
 """Arguments and options that several commands share, and parsers of their values.
 
-Help texts are one line at 80 columns: what the option does, its unit, its default.
+Help texts are one line at 80 columns: what the option does, its unit, its default. Parsers raise `typer.BadParameter`
+if a value is invalid.
 """
 
 from __future__ import annotations
@@ -82,15 +83,15 @@ SourceIndexInput = Annotated[
 
 # Views; the hidden ones are for commands that rarely need them
 _cameras = typer.Option("--cameras", metavar="FILE.json", help="Test views. Default: virtual ones.")
-_background = typer.Option("--background", metavar="R,G,B", help="Background colour. Default: the training's.")
+_background = typer.Option("--background", metavar="R,G,B", help="Background. Default: the training's.")
 Cameras = Annotated[str | None, _cameras]
 HiddenCameras = Annotated[str | None, hidden(_cameras)]
-Data = Annotated[str | None, typer.Option(metavar="DATA", help="Images of the training. Default: none.")]
+Data = Annotated[str | None, typer.Option(metavar="DATA", help="Data set of the training. Default: none.")]
 Background = Annotated[str | None, _background]
 HiddenBackground = Annotated[str | None, hidden(_background)]
 TestEvery = Annotated[int | None, typer.Option(metavar="N", hidden=True, help="Hold out every Nth image. Default: 8.")]
 ModeOption = Annotated[
-    Mode, typer.Option(metavar="MODE", show_default=False, help="exact, standard or fast. Default: standard.")
+    Mode, typer.Option(metavar="MODE", show_default=False, help="exact, standard, fast. Default: standard.")
 ]
 
 # Encoding, training, tuning
@@ -271,9 +272,6 @@ def parse_overrides(up: str | None, axes: str | None = None, **others: Any) -> M
         up: the up direction, see `parse_up`.
         axes: the axes, see `parse_axes`.
         others: other fields of `MetadataOverrides`.
-
-    Raises:
-        typer.BadParameter: the direction or the axes are invalid.
     """
     return MetadataOverrides(
         None if axes is None else parse_axes(axes), up=None if up is None else parse_up(up), **others
@@ -281,11 +279,7 @@ def parse_overrides(up: str | None, axes: str | None = None, **others: Any) -> M
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """Parse width and height from `640x480`.
-
-    Raises:
-        typer.BadParameter: the text is not a size.
-    """
+    """Parse width and height from `640x480`."""
     found = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text.strip())
     if found is None:
         raise typer.BadParameter(f"a size is {text!r}, expected width and height in pixels, as 640x480")
@@ -308,9 +302,6 @@ def parse_numbers(option: str, text: str | None, *counts: int) -> tuple[float, .
         option: the option, for the message.
         text: its value.
         counts: valid numbers of numbers.
-
-    Raises:
-        typer.BadParameter: the text is something else.
     """
     if text is None:
         return None
@@ -325,11 +316,7 @@ def parse_numbers(option: str, text: str | None, *counts: int) -> tuple[float, .
 
 
 def parse_colour(text: str) -> tuple[float, float, float]:
-    """Parse red, green and blue, 0 to 1, from `1,0.5,0`, `black` or `white`.
-
-    Raises:
-        typer.BadParameter: the text is not a colour.
-    """
+    """Parse red, green and blue, 0 to 1, from `1,0.5,0`, `black` or `white`."""
     if text.lower() in _NAMED_COLOURS:
         return _NAMED_COLOURS[text.lower()]
     try:
@@ -343,11 +330,7 @@ def parse_colour(text: str) -> tuple[float, float, float]:
 
 
 def parse_up(text: str) -> Direction:
-    """Parse a direction from `y`, `-y`, or `0,-1,0.1`, and return it at unit length.
-
-    Raises:
-        typer.BadParameter: the text is not a direction.
-    """
+    """Parse a direction from `y`, `-y`, or `0,-1,0.1`, and return it at unit length."""
     found = re.fullmatch(r"([+-]?)([xyz])", text.strip().lower())
     if found is not None:
         x, y, z = ((-1.0 if found[1] == "-" else 1.0) * (found[2] == axis) + 0.0 for axis in "xyz")
@@ -367,41 +350,25 @@ def up_word(axis: Direction) -> str:
 
 
 def parse_axes(text: str) -> str:
-    """Check axes: three letters, the directions of +x, +y and +z.
-
-    Raises:
-        typer.BadParameter: the text is not such axes.
-    """
+    """Check axes: three letters, the directions of +x, +y and +z."""
     checked(check_axes, text)
     return text
 
 
 def parse_sh_degree(degree: int | None) -> int | None:
-    """Check an SH degree: 0 to 3.
-
-    Raises:
-        typer.BadParameter: it is out of this range.
-    """
+    """Check an SH degree: 0 to 3."""
     return check_range("--sh-degree", degree, 0, MAX_SH_DEGREE)
 
 
 def check_range(option: str, value: N, low: float, high: float) -> N:
-    """Return the value of an option.
-
-    Raises:
-        typer.BadParameter: it is out of its range.
-    """
+    """Return the value of an option."""
     if value is not None and not low <= value <= high:
         raise typer.BadParameter(f"{option} is {value:g}, expected {low:g} to {high:g}")
     return value
 
 
 def parse_share(keep: float | None) -> float | None:
-    """Check the share of splats to keep: above 0, at most 1.
-
-    Raises:
-        typer.BadParameter: it is out of this range.
-    """
+    """Check the share of splats to keep: above 0, at most 1."""
     if keep is not None and not 0.0 < keep <= 1.0:
         raise typer.BadParameter(f"--keep is {keep:g}, expected a share above 0, at most 1")
     return keep
@@ -413,11 +380,7 @@ def is_same_file(a: str | None, b: str | None) -> bool:
 
 
 def parse_decibels(text: str | None, option: str) -> float | None:
-    """Parse a finite number of decibels: `0.3`, `0.3dB`, `0.3 dB`; return `None` for `None`.
-
-    Raises:
-        typer.BadParameter: the text is not a number of decibels.
-    """
+    """Parse a finite number of decibels: `0.3`, `0.3dB`, `0.3 dB`; return `None` for `None`."""
     if text is None:
         return None
     number = text.strip()

@@ -2,37 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
-from csplat.errors import counted
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import (
-    Cameras,
-    Data,
-    Effort,
-    Force,
-    HelpAll,
-    Json,
-    Keep,
-    MaxPsnrDrop,
-    Quiet,
-    Report,
-    SceneArgument,
-    TargetPsnr,
-    Up,
-    ViewOptions,
-    check_range,
-    checked,
-    parse_decibels,
-    parse_overrides,
-    refuse_together,
-    require_one,
-)
-from csplat_tools.console import format_table
 from csplat_tools.file_streams import check_name, write_model
+from csplat_tools.inspect.text_reports import format_simplification
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import load_model
 
@@ -42,20 +19,20 @@ _PASSES = (20.0, 45.0)
 
 
 def simplify(
-    source: SceneArgument,
+    source: shared.SceneArgument,
     output: Annotated[str, typer.Argument(metavar="OUT.ply", help="The PLY to write, or -.")],
-    keep: Keep = None,
-    target_psnr: TargetPsnr = None,
-    max_psnr_drop: MaxPsnrDrop = None,
-    effort: Effort = None,
-    cameras: Cameras = None,
-    data: Data = None,
-    up: Up = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    keep: shared.Keep = None,
+    target_psnr: shared.TargetPsnr = None,
+    max_psnr_drop: shared.MaxPsnrDrop = None,
+    effort: shared.Effort = None,
+    cameras: shared.Cameras = None,
+    data: shared.Data = None,
+    up: shared.Up = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Prune splats that no render needs, and refit the others.
 
@@ -70,10 +47,10 @@ def simplify(
       csplat simplify scene.ply small.ply --max-psnr-drop 0.3dB --data capture
     """
     out = Output(force, report, as_json, quiet)
-    views, overrides = ViewOptions(cameras, data), parse_overrides(up)
-    refuse_together({"--keep": keep, "--target-psnr": target_psnr, "--max-psnr-drop": max_psnr_drop})
-    require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
-    check_range("--effort", effort, 1, 9)
+    views, overrides = shared.ViewOptions(cameras, data), shared.parse_overrides(up)
+    shared.refuse_together({"--keep": keep, "--target-psnr": target_psnr, "--max-psnr-drop": max_psnr_drop})
+    shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
+    shared.check_range("--effort", effort, 1, 9)
     require_renderer()
     import csplat_tools
     from csplat_tools.optimise.pruning_order import SimplifyOptions
@@ -81,8 +58,11 @@ def simplify(
     from csplat_tools.views import shrink_cameras
     from csplat_tools.views.view_sets import total_render_seconds
 
-    psnr, drop = parse_decibels(target_psnr, "--target-psnr"), parse_decibels(max_psnr_drop, "--max-psnr-drop")
-    checked(Target, psnr=psnr, max_psnr_drop=drop, keep=keep)  # before anything is read
+    psnr, drop = (
+        shared.parse_decibels(target_psnr, "--target-psnr"),
+        shared.parse_decibels(max_psnr_drop, "--max-psnr-drop"),
+    )
+    shared.checked(Target, psnr=psnr, max_psnr_drop=drop, keep=keep)  # before anything is read
     options = SimplifyOptions() if effort is None else SimplifyOptions(effort=effort)
     out.check(output, inputs=(source, *views.inputs))
     check_name(output, ".ply", "simplify", source)
@@ -102,35 +82,5 @@ def simplify(
             model, keep=keep, psnr=psnr, max_psnr_drop=drop, views=around, options=options, progress=progress
         )
     write_model(output, result.model, absolute=False)
-    out.remark(*_lines(result.report))
+    out.remark(*format_simplification(result.report))
     out.publish(result.report)
-
-
-def _lines(report: Mapping[str, Any]) -> list[str]:
-    removed, views = report["removed"], report["views"]
-    before, after = report["splats_before"], report["splats"]
-    pruned = (
-        f"{removed['invisible']} too faint to be drawn, {removed['unseen']} unseen,"
-        f" {removed['least_error']} that renders need least"
-    )
-    size = f"{views['size'][0]}x{views['size'][1]}"
-    unseen = f"{100.0 * report['unseen_share']:.1f} % of the splats were seen by none"
-    lines = [
-        f"{before:,} -> {counted(after, 'splat')} ({100.0 * after / before:.1f} %); pruned: {pruned}",
-        f"measured in {counted(views['used'], 'view')} of {size}, checked in {views['check']} others; {unseen}",
-    ]
-    rows = [("the other views, before the fit", f"{report['check_psnr_pruned']:.2f}")]
-    rows.append(("the other views, fitted", f"{report['check_psnr']:.2f}"))
-    if "validation_psnr" in report:
-        rows.append(("validation views", f"{report['validation_psnr']:.2f}"))
-    if "psnr" in report:
-        rows.append((f"{report['test_views']['views']} test views", f"{report['psnr']:.2f}"))
-    if "photographs" in report:
-        scores = report["photographs"]
-        rows.append(("held-out photographs, source", f"{scores['source']:.2f}"))
-        rows.append(("held-out photographs", f"{scores['psnr']:.2f}"))
-    lines.append(format_table(("PSNR", "dB"), rows))
-    if report["zero_bands"]:
-        shares = [f"{band}: {100.0 * count / after:.0f} %" for band, count in report["zero_bands"].items()]
-        lines.append(f"splats without SH band {', '.join(shares)}")
-    return lines

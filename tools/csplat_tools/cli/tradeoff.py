@@ -6,19 +6,8 @@ from typing import Annotated
 
 import typer
 
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import (
-    Cameras,
-    Data,
-    Force,
-    HelpAll,
-    Json,
-    Preset,
-    Quiet,
-    Report,
-    ViewOptions,
-    checked,
-)
 from csplat_tools.console import note
 from csplat_tools.optional_packages import prepare_renderer, require_images, require_plots, require_renderer
 from csplat_tools.tradeoffs.sweep_options import SweepOptions, parse_sweep
@@ -34,16 +23,16 @@ def tradeoff(
     what: Annotated[
         str, typer.Option(metavar="GROUPS", show_default=False, help="Files to make, see above. Default: usual.")
     ] = "usual",
-    preset: Preset = SweepOptions.preset,
-    cameras: Cameras = None,
-    data: Data = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    preset: shared.Preset = SweepOptions.preset,
+    cameras: shared.Cameras = None,
+    data: shared.Data = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
-    """Measure size against quality for many ways to encode a scene.
+    """Measure size against quality of many encodings.
 
     Groups of --what, with values after `=` and colons between them:
       presets, strategies
@@ -61,7 +50,7 @@ def tradeoff(
       csplat tradeoff scene.ply --data photographs --what usual,finetune
     """
     out = Output(force, report, as_json, quiet)
-    options, views = checked(parse_sweep, what, preset=preset), ViewOptions(cameras, data)
+    options, views = shared.checked(parse_sweep, what, preset=preset), shared.ViewOptions(cameras, data)
     out.check(inputs=(source, *views.inputs), named={"-o": page})
     if page is not None:
         require_plots()

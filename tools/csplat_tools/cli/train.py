@@ -8,31 +8,8 @@ from typing import Annotated
 import typer
 
 from csplat.encoder import EncodeOptions
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.cli.shared_options import (
-    CHECKPOINT_EVERY,
-    Checkpoint,
-    Force,
-    HelpAll,
-    HiddenUp,
-    Json,
-    Page,
-    Quiet,
-    Report,
-    Resume,
-    SmallPreset,
-    TargetPsnr,
-    TargetSize,
-    TestEvery,
-    checked,
-    is_same_file,
-    parse_bytes,
-    parse_decibels,
-    parse_overrides,
-    parse_share,
-    parse_size,
-    refuse_together,
-)
 from csplat_tools.file_streams import check_name
 from csplat_tools.optional_packages import require_trainer
 from csplat_tools.views import DataOptions
@@ -55,19 +32,19 @@ def train(
     iterations: Annotated[
         int, typer.Option(metavar="N", show_default=False, help="Training steps. Default: 7,000.")
     ] = _DEFAULT.iterations,
-    preset: SmallPreset = None,
+    preset: shared.SmallPreset = None,
     keep: Annotated[float | None, typer.Option(metavar="SHARE", help="Share in OUT.csplat. Default: 0.8.")] = None,
-    target_size: TargetSize = None,
-    target_psnr: TargetPsnr = None,
+    target_size: shared.TargetSize = None,
+    target_psnr: shared.TargetPsnr = None,
     device: Annotated[
         str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, or cuda: a GPU. Default: cpu.")
     ] = "cpu",
-    page: Page = None,
-    up: HiddenUp = None,
+    page: shared.Page = None,
+    up: shared.HiddenUp = None,
     size: Annotated[
         str | None, typer.Option(metavar="WxH", hidden=True, help="Scale images, pixels. Default: unscaled.")
     ] = None,
-    test_every: TestEvery = None,
+    test_every: shared.TestEvery = None,
     background: Annotated[
         str,
         typer.Option(metavar="COLOUR", hidden=True, show_default=False, help=f"{_BACKGROUNDS}. Default: auto."),
@@ -78,13 +55,13 @@ def train(
     antialiased: Annotated[
         bool, typer.Option("--antialiased", hidden=True, help="Train with the mip-splatting filter.")
     ] = False,
-    checkpoint: Checkpoint = None,
-    resume: Resume = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    checkpoint: shared.Checkpoint = None,
+    resume: shared.Resume = None,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Train a scene from posed images.
 
@@ -100,15 +77,15 @@ def train(
       csplat train lego lego.ply --checkpoint run.npz --resume run.npz
     """
     out = Output(force, report, as_json, quiet)
-    to_file, psnr = Path(output).suffix == ".csplat", parse_decibels(target_psnr, "--target-psnr")
+    to_file, psnr = Path(output).suffix == ".csplat", shared.parse_decibels(target_psnr, "--target-psnr")
     targets = {"--keep": keep, "--target-size": target_size, "--target-psnr": target_psnr}
-    refuse_together(targets)
+    shared.refuse_together(targets)
     for name, value in {"--preset": preset, **targets}.items():
         if value is not None and not to_file:
             raise typer.BadParameter(f"{name} is for files, expected OUT.csplat")
-    parse_share(keep)
-    size_bytes, overrides = checked(parse_bytes, target_size), parse_overrides(up)
-    data = DataOptions(source, None if size is None else parse_size(size), test_every=test_every)
+    shared.parse_share(keep)
+    size_bytes, overrides = shared.checked(shared.parse_bytes, target_size), shared.parse_overrides(up)
+    data = DataOptions(source, None if size is None else shared.parse_size(size), test_every=test_every)
     require_trainer(plots=page is not None)
     from csplat_tools.training.training_run import run_training, run_training_to_file, tuning_after, tuning_checkpoint
     from csplat_tools.training.tuning_report import format_tuning_report
@@ -122,17 +99,17 @@ def train(
         left = max(1, size_bytes // SPLAT_BYTES)
         max_splats = max_splats or round(left / _KEEP)
         share = min(1.0, left / max_splats)
-    options = checked(
+    options = shared.checked(
         TrainOptions, max_splats=max_splats or TrainOptions.max_splats, sh_degree=sh_degree, iterations=iterations,
         seed=seed, device=device, background=background, antialiased=antialiased, final_share=share,
     )  # fmt: skip
-    replaces = is_same_file(checkpoint, resume)
+    replaces = shared.is_same_file(checkpoint, resume)
     tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and psnr is None else None
     written = {} if replaces else {"--checkpoint": checkpoint, "the checkpoint of the tuning": tuned}
     out.check(output, inputs=(source, resume), named={"--page": page, **written})
     if not to_file:
         check_name(output, ".ply", "train", source)
-    files = Outputs(checkpoint, CHECKPOINT_EVERY, resume=resume)
+    files = Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume)
     if not to_file:
         out.publish(run_training(data, output, options, files, overrides=overrides, page=page, quiet=out.quiet))
         return

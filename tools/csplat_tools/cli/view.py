@@ -13,19 +13,8 @@ import typer
 from csplat.decoder import decode_scene
 from csplat.encoder import PresetName
 from csplat.errors import counted
+from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output, default_output
-from csplat_tools.cli.shared_options import (
-    Force,
-    HelpAll,
-    Json,
-    Quiet,
-    Report,
-    SceneArgument,
-    Up,
-    check_range,
-    parse_overrides,
-    take_estimated_up,
-)
 from csplat_tools.console import format_bytes, note
 from csplat_tools.file_streams import check_name, write_bytes
 from csplat_tools.present import viewer_page
@@ -45,8 +34,8 @@ _PRESETS: tuple[PresetName, PresetName] = ("fast", "balanced")  # for `view`, fo
 
 
 def view(
-    source: SceneArgument,
-    up: Up = None,
+    source: shared.SceneArgument,
+    up: shared.Up = None,
     cameras: _Cameras = None,
     port: Annotated[
         int, typer.Option(metavar="PORT", show_default=False, help="Port of the server. Default: any free one.")
@@ -55,11 +44,11 @@ def view(
         str, typer.Option(metavar="ADDRESS", show_default=False, help="0.0.0.0: any machine. Default: this one.")
     ] = "127.0.0.1",
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Print the address only.")] = False,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Show a scene in the browser.
 
@@ -73,9 +62,9 @@ def view(
       csplat view scene.csplat --no-browser --port 8000
     """
     out = Output(force, report, as_json, quiet)
-    check_range("--port", port, 0, _PORT_MAX)
+    shared.check_range("--port", port, 0, _PORT_MAX)
     out.check(inputs=(source, cameras))
-    wishes = page_parameters(cameras, parse_overrides(up))
+    wishes = page_parameters(cameras, shared.parse_overrides(up))
     with ExitStack() as stack:
         with out.bar() as progress:
             scene = stack.enter_context(open_viewer_scene(source, preset=_PRESETS[0], progress=progress))
@@ -96,17 +85,17 @@ def view(
 
 
 def export_html(
-    source: SceneArgument,
+    source: shared.SceneArgument,
     output: Annotated[
         str | None, typer.Argument(metavar="PAGE.html", help="The file to write, or -. Default: SCENE.html.")
     ] = None,
-    up: Up = None,
+    up: shared.Up = None,
     cameras: _Cameras = None,
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Write an HTML page that contains a scene and its viewer.
 
@@ -119,7 +108,7 @@ def export_html(
       csplat export-html scene.csplat scene.html --cameras views.json
     """
     out, output = Output(force, report, as_json, quiet), default_output(output, source, ".html")
-    wishes = page_parameters(cameras, parse_overrides(up))
+    wishes = page_parameters(cameras, shared.parse_overrides(up))
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
     with out.bar() as progress, open_viewer_scene(source, preset=_PRESETS[1], progress=progress) as scene:
@@ -140,11 +129,11 @@ def export_html(
 
 def export_element(
     output: Annotated[str, typer.Argument(metavar="OUT.js", help="The file to write, or -.")],
-    force: Force = False,
-    report: Report = None,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    _all: HelpAll = False,
+    force: shared.Force = False,
+    report: shared.Report = None,
+    as_json: shared.Json = False,
+    quiet: shared.Quiet = False,
+    _all: shared.HelpAll = False,
 ) -> None:
     """Write the viewer as a script, for scenes in your own pages.
 
@@ -175,7 +164,7 @@ def _scene_parameters(scene: ViewerScene, cameras: str | None, up: str | None, o
         notes: list[str] = []
         wishes = page_parameters(cameras, report=notes, origin=scene.header.origin)
         out.remark(*notes)
-    return wishes | estimated_up_parameters(take_estimated_up(scene.seems_up, out, given=up))
+    return wishes | estimated_up_parameters(shared.take_estimated_up(scene.seems_up, out, given=up))
 
 
 def _encoded(scene: ViewerScene, preset: str) -> list[str]:
