@@ -37,6 +37,7 @@ from csplat_tools.optional_packages import prepare_renderer, require_renderer
 _OURS = "-m csplat_tools encode {ply} {out} --source-index {index} --quiet"
 #: Clauses of the specification, as opposed to names of checks: `HDR-*`, `LIM-1`.
 _CLAUSE = re.compile(r"[A-Z][A-Z0-9*?-]*")
+_TIMEOUT_RANGE = (0.1, 86_400)  # seconds, a day at most
 
 conformance = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
 
@@ -103,7 +104,7 @@ def decoder(
     names = [one for one in patterns if one not in clauses]
     # A renderer alone is tested at L4 alone.
     levels = shared.checked(parse_levels, level or ("3" if render_program is None else "4"))
-    seconds = _seconds(timeout, TIMEOUT_SECONDS)
+    seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or TIMEOUT_SECONDS
     options = shared.checked(
         DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=seconds, jobs=jobs, by=by
     )
@@ -174,7 +175,8 @@ def encoder(
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
     render_score, reason = _render_scorer(levels, quiet=out.quiet)
     least = PSNR_MIN if min_psnr is None else min_psnr
-    options = EncoderSuiteOptions(_joined(filters), levels, _seconds(timeout, ENCODER_SECONDS), least, jobs, kept)
+    seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or ENCODER_SECONDS
+    options = EncoderSuiteOptions(_joined(filters), levels, seconds, least, jobs, kept)
     ours = f"{shlex.quote(sys.executable)} {_OURS}"
     with out.bar() as bar:
         result = run_encoder(
@@ -212,12 +214,6 @@ def _publish(report: ConformanceReport, out: Output, junit: str | None, nothing:
         note(f"error: {nothing}")
     if not report.passed:
         raise typer.Exit(EXIT_FAILED)
-
-
-def _seconds(timeout: float | None, default: float) -> float:
-    if timeout is not None and not timeout > 0.0:
-        raise typer.BadParameter(f"--timeout is {timeout:g}, expected seconds, above 0")
-    return default if timeout is None else timeout
 
 
 def _joined(patterns: Sequence[str] | None) -> str | None:

@@ -134,16 +134,18 @@ def encode(
 ) -> None:
     """Compress a trained 3DGS scene.
 
-    The file declares its largest errors. Targets (--target-psnr,
-    --target-size, --max-psnr-drop, --keep) choose precision and prune
-    splats; all but --max-error require the render extra. --data and
-    --cameras are the views by which a target is measured.
+    The file declares its largest errors. --preset: fast for previews, balanced
+    for archives, small if size matters more than precision. One of
+    --target-psnr, --target-size, --max-psnr-drop (with --data) and --keep
+    chooses the precision and prunes splats, and requires the render extra;
+    --max-error limits errors of means, covariance, opacities, sh0 to sh3. Views
+    are virtual without --data or --cameras.
 
     Examples:
       csplat encode scene.ply scene.csplat
       csplat encode scene.ply scene.csplat --preset small --sh-degree 2
-      csplat encode scene.ply scene.csplat --target-psnr 40
       csplat encode scene.ply scene.csplat --target-size 5MB --no-prune
+      csplat encode scene.ply scene.csplat --max-error means=0.001,sh0=0.02
     """
     out, output = Output(force, report, as_json, quiet), default_output(output, source, ".csplat")
     views = shared.ViewOptions(cameras, data, background)
@@ -162,6 +164,7 @@ def encode(
     shared.require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
     shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
     shared.check_range("--effort", effort, 1, 9)
+    shared.parse_sh_degree(sh_degree)
     options = shared.checked(
         EncodeOptions, preset=preset, sh_degree=sh_degree, attribute_psnr=attribute_psnr, keep_extra=keep_extra,
         threads=threads,

@@ -78,7 +78,8 @@ def finetune(
     options = shared.checked(FinetuneOptions, iterations=iterations, byte_cost=cost).scaled(
         tuning.LEARNING_FACTOR[itself]
     )
-    encoding = EncodeOptions(preset, sh_degree=sh_degree, shape_codebook_size=tuning.SHAPE_ENTRIES)
+    degree = shared.parse_sh_degree(sh_degree)
+    encoding = EncodeOptions(preset, sh_degree=degree, shape_codebook_size=tuning.SHAPE_ENTRIES)
     replaces = shared.is_same_file(checkpoint, resume)  # a checkpoint may replace the one that the run goes on from
     named = {"--source-index": source_index, "--page": page}
     if replaces:

@@ -103,7 +103,7 @@ SmallPreset = Annotated[
 ]
 TargetPsnr = Annotated[str | None, typer.Option(metavar="DB", help="Least PSNR, e.g. 40dB. Default: none.")]
 TargetSize = Annotated[str | None, typer.Option(metavar="BYTES", help="Largest file, e.g. 5MB. Default: none.")]
-MaxPsnrDrop = Annotated[str | None, typer.Option(metavar="DB", help="Largest drop in --data. Default: none.")]
+MaxPsnrDrop = Annotated[str | None, typer.Option(metavar="DB", help="Largest PSNR drop. Default: none.")]
 _effort = typer.Option("--effort", metavar="1..9", help="Work for fewer bytes. Default: 3.")
 Effort = Annotated[int | None, _effort]
 HiddenEffort = Annotated[int | None, hidden(_effort)]
@@ -117,7 +117,7 @@ Checkpoint = Annotated[
 Resume = Annotated[
     str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from a checkpoint. Default: none.")
 ]
-_memory = typer.Option("--memory", metavar="BYTES", help="Memory limit, 8GB. Default: what is free.")
+_memory = typer.Option("--memory", metavar="BYTES", help="Memory limit, e.g. 8GB. Default: free.")
 Memory = Annotated[str | None, _memory]
 HiddenMemory = Annotated[str | None, hidden(_memory)]
 _dask = typer.Option("--dask", metavar="ADDRESS", help="Dask cluster, tcp://host:8786. Default: none.")

@@ -36,10 +36,10 @@ def simplify(
 ) -> None:
     """Prune splats that no render needs, and refit the others.
 
-    One of --keep, --target-psnr and --max-psnr-drop is required. Splats are
-    fitted to training views, validation views decide how many are kept, and
-    test views score the result. `csplat encode` with a target does the same
-    for the file that it writes. Requires the render extra.
+    Splats are fitted to training views, validation views decide how many are
+    kept, and test views score the result. --max-psnr-drop requires --data.
+    `csplat encode` with a target does the same for the file that it writes.
+    Requires the render extra.
 
     Examples:
       csplat simplify scene.ply half.ply --keep 0.5
@@ -51,6 +51,8 @@ def simplify(
     shared.refuse_together({"--keep": keep, "--target-psnr": target_psnr, "--max-psnr-drop": max_psnr_drop})
     shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
     shared.check_range("--effort", effort, 1, 9)
+    if (keep, target_psnr, max_psnr_drop) == (None, None, None):
+        raise typer.BadParameter("expected --keep, --target-psnr or --max-psnr-drop")
     require_renderer()
     import csplat_tools
     from csplat_tools.optimise.pruning_order import SimplifyOptions

@@ -68,13 +68,14 @@ def train(
     DATA is a NeRF-synthetic folder, a transforms.json or its folder, a COLMAP
     folder, or the folder of images in one of them (garden/images_4). The test
     images of the set, or every 8th image, are held out. OUT.csplat is tuned as
-    by `csplat finetune`, with --preset, --keep or a target.
+    by `csplat finetune`, with --preset, --keep or a target: one training, kept by
+    --checkpoint, makes files of several sizes.
 
     Examples:
       csplat train lego lego.ply --max-splats 10000
       csplat train garden/images_4 garden.ply --report garden.json
       csplat train lego lego.csplat --target-size 800KB --page lego.html
-      csplat train lego lego.ply --checkpoint run.npz --resume run.npz
+      csplat train lego small.csplat --resume run.npz --target-size 400KB
     """
     out = Output(force, report, as_json, quiet)
     to_file, psnr = Path(output).suffix == ".csplat", shared.parse_decibels(target_psnr, "--target-psnr")
