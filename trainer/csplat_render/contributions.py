@@ -90,8 +90,7 @@ class ProjectedView:
     @property
     def size_bytes(self) -> int:
         """Memory of the arrays in bytes."""
-        arrays = (self.rows, self.shape, self.box, self.basis, self.starts, self.ids, self.slots, self.first)
-        return sum(array.nbytes for array in arrays)
+        return sum(array.nbytes for array in vars(self).values() if isinstance(array, np.ndarray))
 
     def with_records(self, needed: Array) -> tuple[ProjectedView, Array]:
         """Drop pairs of splat and tile, and splats without any.

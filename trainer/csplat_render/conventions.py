@@ -89,17 +89,17 @@ class HasSplats(Protocol):
     """An object with the arrays of splats: a `SplatModel`, `UncheckedSplats`, or another one."""
 
     @property
-    def means(self) -> Array: ...  # noqa: D102 - as in Splats
+    def means(self) -> Array: ...  # noqa: D102 - as in `UncheckedSplats`
     @property
-    def quats(self) -> Array: ...  # noqa: D102 - as in Splats
+    def quats(self) -> Array: ...  # noqa: D102 - as in `UncheckedSplats`
     @property
-    def scales(self) -> Array: ...  # noqa: D102 - as in Splats
+    def scales(self) -> Array: ...  # noqa: D102 - as in `UncheckedSplats`
     @property
-    def opacities(self) -> Array: ...  # noqa: D102 - as in Splats
+    def opacities(self) -> Array: ...  # noqa: D102 - as in `UncheckedSplats`
     @property
-    def sh0(self) -> Array: ...  # noqa: D102 - as in Splats
+    def sh0(self) -> Array: ...  # noqa: D102 - as in `UncheckedSplats`
     @property
-    def shN(self) -> Array: ...  # noqa: D102, N802 - as in Splats
+    def shN(self) -> Array: ...  # noqa: D102, N802 - as in `UncheckedSplats`
 
 
 @dataclass(frozen=True, eq=False)

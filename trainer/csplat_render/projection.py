@@ -1,11 +1,17 @@
 """Projection of splats to ellipses on the image, and its gradient, in float64; spherical harmonics up to degree 3.
 
-Forward. Let R and t be the rotation and translation of the camera, c = R·mean + t the centre in camera coordinates,
-and J the Jacobian of the perspective at c, (j0, 0, j02; 0, j1, j12). With p and q the two rows of J·R, r_k the axes
-of the splat and s_k its standard deviations, the projected half-axes are u_k = s_k r_k·p and v_k = s_k r_k·q, and the
-covariance is Σ = (A, B; B, C) = (u·u, u·v; u·v, v·v) + dilation. Its determinant is computed as
-|u×v|² + dilation (u·u + v·v) + dilation², with (u×v)_k = s_i s_j r_k·(p×q): sums of squares, which are accurate
-however long and thin the splat is.
+Forward. With R and t the rotation and translation of the camera, r_k the axes of the splat and s_k its standard
+deviations:
+
+    c = R·mean + t = (x, y, z)                           centre in camera coordinates
+    J = (fx/z, 0, −fx x/z²; 0, fy/z, −fy y/z²)           Jacobian of the perspective, x/z and y/z clamped (`FOV_MARGIN`)
+    (p; q) = J R
+    u_k = s_k r_k·p,  v_k = s_k r_k·q                    projected half-axes
+    Σ = (A, B; B, C) = (u·u, u·v; u·v, v·v) + dilation   covariance on the image
+    det Σ = |u×v|² + dilation (u·u + v·v) + dilation²,  (u×v)_k = s_i s_j r_k·(p×q)
+
+The determinant is a sum of squares, which is accurate however long and thin the splat is. The code calls the entries of
+J other than 0 j0, j02, j1 and j12.
 
 Extent. A splat of opacity o is drawn within the ellipse dᵀ Σ⁻¹ d ≤ ρ², ρ² = 2 ln(o / alpha_min), whose half-width is
 ρ √A and whose half-height is ρ √C. At height y above its centre, its chord is

@@ -146,9 +146,8 @@ def survey_arrays(arrays: AttributeArrays, scale_count: int, statistics: RowStat
     columns = ColumnMap((), ("",) * scale_count, (), (), (), "", (), (), double=False)
     for start in range(0, len(arrays.means), _SAMPLE_ROWS):
         part = _part(arrays, slice(start, start + _SAMPLE_ROWS))
-        means, quats, scales = part.means.copy(), part.quats.copy(), part.scales.copy()
-        copy = AttributeArrays(means, quats, scales, part.opacities.copy(), part.sh0.copy(), part.shN.copy())
-        _repair(copy, columns, statistics, None)
+        copies = {name: array.copy() for name, array in vars(part).items() if name != "extra"}
+        _repair(AttributeArrays(**copies), columns, statistics, None)
 
 
 def with_half_floats(rows: Rows, findings: list[Finding]) -> Rows:
@@ -282,15 +281,8 @@ def _allocate(count: int, dtype: np.dtype[Any], columns: ColumnMap, *, keep_extr
 
 
 def _part(arrays: AttributeArrays, rows: slice) -> AttributeArrays:
-    return AttributeArrays(
-        arrays.means[rows],
-        arrays.quats[rows],
-        arrays.scales[rows],
-        arrays.opacities[rows],
-        arrays.sh0[rows],
-        arrays.shN[rows],
-        {name: column[rows] for name, column in arrays.extra.items()},
-    )
+    named = {name: array[rows] for name, array in vars(arrays).items() if name != "extra"}
+    return AttributeArrays(**named, extra={name: column[rows] for name, column in arrays.extra.items()})
 
 
 def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:

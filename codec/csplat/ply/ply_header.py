@@ -270,7 +270,7 @@ def _split_rows(lines: TextRows, elements: Sequence[PlyElement]) -> tuple[TextRo
         if element.has_lists or all(len(line) == width for line in lines[at : at + element.count]):
             taken = lines[at : at + element.count]
             if len(taken) < element.count:
-                raise _RowError(_truncated(element, len(taken)))
+                raise _RowError(truncated_finding(element.name, element.count, len(taken)))
             rows += taken
             at += element.count
             continue
@@ -295,6 +295,7 @@ def _split_rows(lines: TextRows, elements: Sequence[PlyElement]) -> tuple[TextRo
     return rows, oddities, rest
 
 
-def _truncated(element: PlyElement, present: int) -> Finding:
-    text = f"{element.count} rows of {element.name} are declared, {present} are present: copy or download it again"
-    return Finding("truncated", element.count - present, text, "error")
+def truncated_finding(name: str, declared: int, present: int) -> Finding:
+    """Report missing rows of an element."""
+    text = f"{declared} rows of {name} are declared, {present} are present: copy or download it again"
+    return Finding("truncated", declared - present, text, "error")

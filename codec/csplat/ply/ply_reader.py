@@ -35,7 +35,7 @@ from csplat.ply.columns import (
     with_half_floats,
 )
 from csplat.ply.comments import CommentMetadata, parse_comments, split_origin
-from csplat.ply.ply_header import SPLAT_ELEMENT, PlyHeader, parse_text_rows, read_ply_header
+from csplat.ply.ply_header import SPLAT_ELEMENT, PlyHeader, parse_text_rows, read_ply_header, truncated_finding
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
@@ -353,9 +353,7 @@ def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: A
         error: the error that plyfile raised.
     """
     if not header.is_text or error.message == _EARLY_END:
-        present, declared = error.row or 0, error.element.count
-        text = f"{declared} rows of {error.element.name} are declared, {present} are present: copy or download it again"
-        findings.append(Finding("truncated", declared - present, text, "error"))
+        findings.append(truncated_finding(error.element.name, error.element.count, error.row or 0))
         return None
     with path.open("rb") as stream:
         stream.seek(header.end)

@@ -26,7 +26,7 @@ from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8, U16
 
 _MAX_OFFSET = 1 << 40  # splats
-_KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")  # of the manifests; others than SOG have none of them
+_KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")  # a meta.json of another program has none of these
 _Range = tuple[int, int, int]  # file index, first splat, end
 
 
