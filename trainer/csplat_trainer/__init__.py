@@ -3,9 +3,9 @@
     >>> import csplat_trainer
     >>> found = csplat_trainer.train("capture")  # doctest: +SKIP
 
-The names load their modules on first use. `train` and `finetune` need numba only. torch is needed by
-`torch_rasteriser`, `gsplat_engine`, the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads
-checkpoints of gsplat and splatfacto.
+The names load their modules on first use. `train` and `finetune` require numba. `torch_rasteriser`, `gsplat_engine`,
+the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads checkpoints of gsplat and splatfacto,
+require torch.
 """
 
 from __future__ import annotations

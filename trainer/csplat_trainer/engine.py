@@ -23,13 +23,13 @@ _MAX_LOG_SCALE = 40.0  # largest log scale whose gradient Adam can square in flo
 
 
 class Engine(Protocol):
-    """A training engine: the numba kernels of the CPU, or gsplat's on a GPU."""
+    """A training engine, with numba kernels on the CPU or gsplat on a GPU."""
 
     screen: ScreenGradients | None
 
     @property
     def parameters(self) -> Parameters:
-        """The state of the optimisation, in the memory of the CPU."""
+        """The state of the optimisation, in CPU memory."""
         ...
 
     @parameters.setter
@@ -46,25 +46,25 @@ class Engine(Protocol):
         rng: Generator,
         gain: ImageGain | None = None,
     ) -> LossValue:
-        """Make one step of training on one image."""
+        """Make a training step on an image."""
         ...
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """Render the present state, [H, W, 3]."""
+        """Render the current state, [H, W, 3]."""
         ...
 
 
 class CpuEngine:
-    """A training engine in numba, which keeps its buffers from one step to the next.
+    """A training engine in numba, which reuses its buffers.
 
     Args:
         parameters: initial state; changed in place by `step`.
         options: weights of the loss, antialiasing, noise.
-        perceptual: a further term of the loss.
+        perceptual: an additional term of the loss.
 
     Attributes:
         parameters: the state of the optimisation.
-        screen: gradients on screen since it was last replaced, if the strategy needs them.
+        screen: gradients on screen since the last densification, if the strategy uses them.
     """
 
     def __init__(self, parameters: Parameters, options: TrainOptions, perceptual: PerceptualLoss | None = None) -> None:
@@ -87,12 +87,12 @@ class CpuEngine:
         rng: Generator,
         gain: ImageGain | None = None,
     ) -> LossValue:
-        """Make one step of training on one image.
+        """Make a training step on an image.
 
         Args:
             image: the image to fit.
-            background: [3], behind both.
-            degree: degree of the SH bands that are evaluated.
+            background: [3], background of image and render.
+            degree: active SH degree.
             rates: learning rate of each group of parameters.
             rng: source of the noise.
             gain: gain and bias of the image, if they are trained.
@@ -140,7 +140,7 @@ class CpuEngine:
         return value
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """Render the present state, [H, W, 3], into a buffer that the next render overwrites."""
+        """Render the current state, [H, W, 3], into a buffer that the next render overwrites."""
         return self._forward(camera, background, degree)
 
     def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
@@ -164,7 +164,7 @@ class CpuEngine:
 
 
 def _per_half_image(norms: F32, camera: Camera) -> F32:
-    """Convert gradient norms per pixel into norms per half an image, the unit of thresholds."""
+    """Convert gradient norms per pixel into norms per half an image, the unit of `grad_threshold`."""
     return norms * np.float32(0.5 * max(camera.W, camera.H))
 
 

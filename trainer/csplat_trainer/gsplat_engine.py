@@ -38,7 +38,7 @@ def gsplat_rasterization() -> Callable[..., Any]:
         InputError: there is no GPU, or the package is not installed.
     """
     if not torch.cuda.is_available():
-        raise InputError("device cuda: torch finds no GPU; --device cpu trains without one")
+        raise InputError("device cuda: torch finds no GPU; use --device cpu")
     try:
         from gsplat import rasterization
     except ImportError:
@@ -57,7 +57,7 @@ class GsplatEngine:
         device: `cuda`; tests use `cpu` and their own `rasterization`.
 
     Attributes:
-        screen: gradients on screen since it was last replaced, if the strategy needs them.
+        screen: gradients on screen since the last densification, if the strategy uses them.
     """
 
     def __init__(
@@ -98,18 +98,18 @@ class GsplatEngine:
         rng: Generator,
         gain: ImageGain | None = None,
     ) -> LossValue:
-        """Make one step of training on one image: see `CpuEngine.step`. Gains are not trained here."""
+        """Make a training step on an image, see `CpuEngine.step`; gains are not trained."""
         assert gain is None
         camera = image.camera
         photograph = self._upload(compose(image, background, np.empty((camera.H, camera.W, 3), np.float32)))
         rendered, info = self._draw(camera, background, degree)
         if self.screen is not None:
             info["means2d"].retain_grad()
-        if image.mask is not None:  # pixels that do not count equal the render
+        if image.mask is not None:  # pixels that do not count are set to the render
             counts = torch.from_numpy(image.mask).to(photograph.device)[..., None]
             photograph = torch.where(counts, photograph, rendered.detach())
         total, value = self._loss(rendered, photograph)
-        total.backward()  # type: ignore[no-untyped-call]  # torch leaves it so
+        total.backward()  # type: ignore[no-untyped-call]  # untyped in torch
         if self.screen is not None:
             self._gather(info, camera)
         self._adam(rates)
@@ -118,7 +118,7 @@ class GsplatEngine:
         return value
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
-        """Render the present state, [H, W, 3]."""
+        """Render the current state, [H, W, 3]."""
         with torch.no_grad():
             image: F32 = self._draw(camera, background, degree)[0].cpu().numpy()
         return image

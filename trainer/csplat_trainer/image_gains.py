@@ -1,8 +1,8 @@
-"""Per-image gain and bias, for images of one scene that were exposed differently.
+"""Per-image gain and bias, for images of one scene with different exposure.
 
-Renders are corrected before they are compared with an image, as in the code of "A Hierarchical 3D Gaussian
-Representation" (Kerbl et al. 2024, https://arxiv.org/abs/2406.12080). Corrections are trained together with the splats
-and stored in no file: on average they leave the scene as bright as the images are.
+Renders are corrected before the comparison with an image, as in the code of "A Hierarchical 3D Gaussian Representation"
+(Kerbl et al. 2024, https://arxiv.org/abs/2406.12080). Corrections are trained together with the splats, and are not
+part of the scene. Their mean is 0, so that the scene is as bright as the images.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from csplat.types import F32, F64
 
 _STATE = (4, 2, 3)  # state of an image: values, both of Adam's means, steps; [gain, bias]; channels
 _BETA1, _BETA2, _EPSILON = 0.9, 0.99, 1e-15
-_LIMIT = 1.0  # largest logarithm of a gain, and largest bias: images that differ by more are not of one scene
+_LIMIT = 1.0  # largest logarithm of a gain, and largest bias
 
 
 class ImageGains:
-    """Per-image gain and bias of the training images, and Adam's memory of them.
+    """Per-image gain and bias of the training images, with Adam's moments.
 
     Args:
         count: number of images.
@@ -39,12 +39,12 @@ class ImageGains:
         if len(stored):
             found = np.array(stored, np.float64)
             if found.size != state.size or not np.isfinite(found).all():
-                raise InputError(f"exposures of {len(found)} photographs are stored, wanted those of {count}")
+                raise InputError(f"the checkpoint has exposures of {len(found)} images, expected {count}")
             state = found.reshape(state.shape)
         self.values, self._first, self._second, self._steps = (state[:, part] for part in range(_STATE[0]))
 
     def as_json(self) -> list[list[float]]:
-        """Return the whole state, one list for each image."""
+        """Return the state, a list per image."""
         state = np.stack([self.values, self._first, self._second, self._steps], axis=1)
         return [row.ravel().tolist() for row in state]
 
@@ -85,10 +85,10 @@ class ImageGain:
 
         Args:
             render: [H, W, 3], as given to `apply`.
-            slope: [H, W, 3], gradient towards the result of `apply`; changed.
+            slope: [H, W, 3], gradient by the result of `apply`; overwritten.
 
         Returns:
-            The gradient towards the render, in the memory of `slope`.
+            The gradient by the render, in the memory of `slope`.
         """
         gain = np.exp(self.gains.values[self.number, 0])
         by_bias = slope.sum(axis=(0, 1), dtype=np.float64)

@@ -18,25 +18,25 @@ from csplat_render.camera import Camera
 from csplat_trainer.parameters import ParameterArrays
 from csplat_trainer.posed_images import PosedImage
 
-_OPACITY = 0.5  # of each initial splat
+_OPACITY = 0.5  # initial opacity
 _BATCH = 20_000  # points drawn at a time
 _BATCHES = 400  # largest number of batches
-_MASK = 0.02  # alpha from which a pixel belongs to the object
-_MISSES = 0.02  # fraction of the images that may miss a point of the hull: rounding to pixels
+_MASK = 0.02  # least alpha of pixels of the object
+_MISSES = 0.02  # fraction of the images that may miss a point of the hull, due to rounding to pixels
 _NEIGHBOURS = 3  # number of neighbours whose distance determines a splat's size
-_BOX_FRACTION = 0.9  # fraction of the middle camera's field of view at the distance of the focus
-_PHOTO_BOX = 1.5  # factor for photographs, which show the surroundings of their subject too
+_BOX_FRACTION = 0.9  # fraction of the median camera's field of view at the distance of the focus
+_PHOTO_BOX = 1.5  # half the box as a multiple of that distance, for images without alpha, which show surroundings
 
 
 @dataclass(frozen=True)
 class SceneExtent:
-    """Extent and focus of a scene according to its cameras.
+    """Extent and focus of a scene, estimated from its cameras.
 
     Attributes:
-        extent: 1.1 times the greatest distance of a camera from their centre (INRIA's unit of the
-            learning rate of the means), scene units.
+        extent: 1.1 times the largest distance of a camera from their centre (INRIA's unit of the learning rate of the
+            means), scene units.
         focus: [3], the point nearest to all lines of sight.
-        half: half the side of the box around `focus` in which splats may start, scene units.
+        half: half the side of the box around `focus` for initial splats, scene units.
     """
 
     extent: float
@@ -54,7 +54,7 @@ def measure_extent(images: Sequence[PosedImage]) -> SceneExtent:
     positions = np.array([camera.position for camera in cameras])
     axes = np.array([camera.viewmat[2, :3] for camera in cameras])
     spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).max()
-    # Least squares over the distances from the lines; the small term resolves parallel ones.
+    # Least squares over the distances from the lines; the small term makes it well-posed for parallel lines.
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     weight = 1e-3 * len(cameras)
     guess = (positions + axes * max(float(spread), 1e-6)).mean(axis=0)
@@ -66,7 +66,7 @@ def measure_extent(images: Sequence[PosedImage]) -> SceneExtent:
     if not any(image.has_alpha for image in images):
         half = distance * _PHOTO_BOX
     extent = 1.1 * float(spread)
-    if extent <= 0.0:  # one camera, or several in one place
+    if extent <= 0.0:  # all cameras in one place
         extent = max(distance, 1e-3)
     return SceneExtent(extent, focus, max(half, 1e-6))
 
@@ -90,24 +90,24 @@ def place_splats(
         count: number of splats.
         sh_degree: SH degree of the parameters; bands above 0 begin at zero.
         rng: source of random choices.
-        init: `points`, `hull`, `box`, or `auto` for the first of them that there is.
+        init: `points`, `hull`, `box`, or `auto` for the first that is possible.
         points: [P, 3], points of the scene, if the data set has any.
-        colours: [P, 3] in 0..1, their colours; `None`: the mean of the images there.
+        colours: [P, 3] in 0..1, their colours; `None`: mean colours from the images.
 
     Raises:
-        InputError: there are no points, or no masks, to start from; or points that are not finite.
+        InputError: there are no points or masks as required, or points are not finite.
     """
     have_points = points is not None and len(points) > 0
     have_masks = any(image.has_alpha for image in images)
     if init == "points" and not have_points:
-        raise InputError("the data set holds no points to start from: expected init='hull' or 'box'")
+        raise InputError("init='points' requires points, but the data set has none: expected init='hull' or 'box'")
     if init == "hull" and not have_masks:
-        raise InputError("the pictures have no alpha channel to make a hull of: expected init='points' or 'box'")
+        raise InputError("init='hull' requires images with alpha: expected init='points' or 'box'")
     if have_points and init in ("points", "auto"):
         assert points is not None
         bad = int(np.count_nonzero(~np.isfinite(points).all(axis=1)))
         if bad:
-            raise InputError(f"{bad} of the data set's {len(points)} points are NaN or infinite: wanted finite ones")
+            raise InputError(f"{bad} of the data set's {len(points)} points are NaN or infinite, expected finite ones")
         if not any(len(_pixels_at(image, points.astype(np.float64))[0]) for image in images):
             raise InputError(
                 f"no camera sees any of the data set's {len(points)} points, expected both in the same coordinates:"
@@ -123,7 +123,7 @@ def place_splats(
 
 
 def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: Generator) -> tuple[F64, F64]:
-    """Choose some of the points, or all of them and repeat some, with noise, if more are needed."""
+    """Choose some of the points; if more splats are needed than there are points, repeat some with noise."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
     means = points[chosen].astype(np.float64)
@@ -138,7 +138,7 @@ def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: G
 def _in_box(
     images: Sequence[PosedImage], scene: SceneExtent, count: int, rng: Generator, *, masked: bool
 ) -> tuple[F64, F64]:
-    """Find points that cameras see, inside the hull of the masks if requested, with the mean of their pixels."""
+    """Draw points that cameras see, inside the hull if `masked`, with the mean of their pixels."""
     found: list[F64] = []
     colours: list[F64] = []
     total = 0
@@ -154,7 +154,7 @@ def _in_box(
         total += int(keep.sum())
         if total >= count:
             break
-    if total == 0:  # inconsistent masks, or cameras that look elsewhere
+    if total == 0:  # inconsistent masks, or cameras without a common subject
         return scene.focus + scene.half * rng.uniform(-1.0, 1.0, (count, 3)), np.full((count, 3), 0.5)
     means, colour = np.concatenate(found), np.concatenate(colours)
     chosen = np.concatenate([np.arange(total), rng.integers(0, total, max(0, count - total))])[:count]
@@ -162,7 +162,7 @@ def _in_box(
 
 
 def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
-    """Return how many images see each point, in how many it falls on the object, and its mean colour there."""
+    """Return for each point the number of images that see it, and that see the object there, and the mean colour."""
     seen, hits = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     colour = np.zeros((len(points), 3))
     for image in images:
@@ -175,7 +175,7 @@ def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[n
 
 
 def _pixels_at(image: PosedImage, points: F64) -> tuple[NDArray[np.int64], F64]:
-    """Return the points that are inside an image, and its pixels there, RGBA in 0..1."""
+    """Return the indices of points inside an image, and its pixels there, RGBA in 0..1."""
     camera: Camera = image.camera
     V, K = camera.viewmat, camera.K
     x, y, z = (points @ V[axis, :3] + V[axis, 3] for axis in range(3))
@@ -206,7 +206,7 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Ge
 def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
     """Return the root mean square distance to the nearest three others, never 0.
 
-    If most points coincide with others, distances carry no information: they are set as if points filled the box.
+    If most points coincide with others, distances are those of points that fill the box evenly.
     """
     evenly = 2.0 * scene.half / max(1, len(points)) ** (1.0 / 3.0)
     if len(points) < 2:

@@ -1,6 +1,6 @@
 # torch may be absent:
 # pyright: reportMissingImports=false
-"""The photometric loss, L1 and SSIM in one pass, with its gradient; and LPIPS as a further term.
+"""The photometric loss, L1 and SSIM in one pass, with its gradient; and LPIPS as an additional term.
 
     loss = l1_weight · mean |x − y| + ssim_weight · (1 − mean SSIM(x, y))
 
@@ -9,10 +9,10 @@ the mean over all pixels and channels. With m1, m2 the blurred images, s11, s22,
 
     a = 2 m1 m2 + C1,  b = 2 s12 + C2,  c = m1² + m2² + C1,  d = s11 + s22 + C2,  ssim = a b / (c d)
 
-the gradient towards x is blur(∂/∂m1) + 2 x blur(∂/∂s11) + y blur(∂/∂s12), because the blur is its own transpose.
-Published weights of L1 and SSIM: 0.8 and 0.2 (INRIA), 1 and 0.2 (the study of simple strategies).
+the gradient by x is blur(∂/∂m1) + 2 x blur(∂/∂s11) + y blur(∂/∂s12), because the blur is its own transpose. Published
+weights of L1 and SSIM: 0.8 and 0.2 (INRIA), 1 and 0.2 (the study of simple strategies).
 
-LPIPS runs in torch, which is imported when the term is used: it needs the gradient that the renderer's metric lacks.
+LPIPS runs in torch, since the renderer's metric has no gradient; torch is imported on use.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class LossValue:
         loss: the weighted sum.
         l1: mean absolute difference.
         ssim: mean SSIM.
-        mse: mean squared difference of the pixels that count.
+        mse: mean squared difference over the pixels that count.
     """
 
     loss: float
@@ -64,11 +64,10 @@ class LossValue:
 
 
 class PhotometricLoss:
-    """L1 + SSIM against images of one size; its buffers are kept between calls.
+    """L1 + SSIM of images of one size; buffers are reused.
 
     Args:
-        height: height of the images, in pixels.
-        width: width of the images, in pixels.
+        height, width: size of the images, pixels.
         l1_weight: factor of the mean absolute difference.
         ssim_weight: factor of 1 − SSIM.
     """
@@ -89,11 +88,12 @@ class PhotometricLoss:
         Args:
             rendered: [H, W, 3], C-contiguous.
             photograph: [H, W, 3], C-contiguous.
-            mask: [H, W], pixels that count; for the others, `photograph` is set to `rendered`. `None`: all count.
+            mask: [H, W], pixels that count; the others of `photograph` are set to those of `rendered`. `None`: all
+                count.
 
         Returns:
-            The terms, and the gradient of `loss` towards `rendered`, [H, W, 3]: a buffer that the next
-            call overwrites. It is 0 for pixels that do not count.
+            The terms, and the gradient of `loss` by `rendered`, [H, W, 3], in a buffer that the next call overwrites.
+            It is 0 for pixels that do not count.
         """
         assert rendered.shape == self._shape == photograph.shape
         if mask is not None:
@@ -196,16 +196,10 @@ def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradie
 def photometric_loss_twin(
     rendered: F64, photograph: F64, l1_weight: float = 0.8, ssim_weight: float = 0.2
 ) -> tuple[LossValue, F64]:
-    """Compute `PhotometricLoss` the slow way: float64, whole images, one formula after the other.
-
-    Args:
-        rendered: [H, W, 3].
-        photograph: [H, W, 3].
-        l1_weight: factor of the mean absolute difference.
-        ssim_weight: factor of 1 − SSIM.
+    """Compute `PhotometricLoss` in float64 NumPy, for tests.
 
     Returns:
-        The terms, and the gradient of `loss` towards `rendered`, [H, W, 3].
+        The terms, and the gradient of `loss` by `rendered`, [H, W, 3].
     """
     x, y = rendered.astype(np.float64), photograph.astype(np.float64)
     m1, m2 = blur_twin(x), blur_twin(y)
@@ -214,7 +208,7 @@ def photometric_loss_twin(
     ssim = a * b / (c * d)
     by_square, by_product = -ssim / d, 2 * a / (c * d)
     by_mean = 2 * m2 * b / (c * d) - 2 * m1 * ssim / c - 2 * m1 * by_square - m2 * by_product
-    # The window is symmetric, so that the transpose of the blur is the blur.
+    # The window is symmetric, so the blur is its own transpose.
     ssim_gradient = blur_twin(by_mean) + 2 * x * blur_twin(by_square) + y * blur_twin(by_product)
     gradient = (l1_weight * np.sign(x - y) - ssim_weight * ssim_gradient) / x.size
     l1, mean_ssim, mse = float(np.abs(x - y).mean()), float(ssim.mean()), float(np.square(x - y).mean())
@@ -234,7 +228,7 @@ class PerceptualLoss:
     """LPIPS v0.1 with the AlexNet backbone (https://arxiv.org/abs/1801.03924).
 
     Args:
-        weights: weights of the five layers and of their differences.
+        weights: weights of the five layers and of their heads.
 
     Raises:
         InputError: torch is not installed.
@@ -254,7 +248,7 @@ class PerceptualLoss:
             return float(self._distance(self._tensor(first), self._tensor(second)))
 
     def gradient(self, rendered: F32, photograph: F32, weight: float) -> F32:
-        """Return the gradient of `weight` · LPIPS towards the rendered image, [H, W, 3]."""
+        """Return the gradient of `weight` · LPIPS by the rendered image, [H, W, 3]."""
         x = self._tensor(rendered).requires_grad_(requires_grad=True)
         (weight * self._distance(x, self._tensor(photograph))).backward()
         slope: F32 = x.grad[0].permute(1, 2, 0).contiguous().numpy()
@@ -262,7 +256,7 @@ class PerceptualLoss:
 
     def _tensor(self, image: F32) -> Any:
         if min(image.shape[:2]) < MIN_SIZE:
-            raise InputError(f"LPIPS wants pictures of at least {MIN_SIZE} pixels a side, found {image.shape[:2]}")
+            raise InputError(f"an image has {image.shape[:2]} pixels, expected at least {MIN_SIZE} per side for LPIPS")
         return _import_torch().from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)))[None].clone()
 
     def _distance(self, x: Any, y: Any) -> Any:

@@ -1,6 +1,6 @@
-"""Parameters of the splats that training changes, and Adam's memory of them.
+"""The trained parameters of splats, and Adam's moments.
 
-Opacities are logits here, and quaternions unit: each step ends by bringing them back to length 1.
+Opacities are logits. Each step normalises quaternions.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ ParameterArrays = dict[str, F32]
 GROUPS = ("means", "quats", "scales", "logits", "sh0", "shN")
 
 _BETA1, _EPSILON = 0.9, 1e-15
-_LOGIT_LIMIT = 14.0  # beyond it, alpha in float32 has few digits
-_BLOCK = 1 << 13  # values that a thread processes at a time
+_LOGIT_LIMIT = 14.0  # beyond, alpha has few digits in float32
+_BLOCK = 1 << 13  # values processed by a thread at a time
 
 
 @dataclass
@@ -31,10 +31,10 @@ class Parameters:
 
     Attributes:
         values: means [N, 3], quats [N, 4], scales [N, 3] (log), logits [N], sh0 [N, 3], shN [N, K, 3]; fine-tuning
-            has one more group, and the rows that its file holds.
+            has another group, and the rows of its file.
         first: Adam's running mean of the gradients, the same shapes.
         second: Adam's running mean of their squares.
-        step: number of steps that Adam has made.
+        step: number of Adam's steps.
         beta2: decay of the mean of squares in a step.
     """
 
@@ -59,7 +59,7 @@ class Parameters:
         return sigmoid(self.values["logits"])
 
     def forget(self, rows: NDArray[np.int64]) -> None:
-        """Clear Adam's memory of some splats."""
+        """Reset Adam's moments of some splats."""
         for name in GROUPS:
             self.first[name][rows] = 0.0
             self.second[name][rows] = 0.0
@@ -71,7 +71,7 @@ class Parameters:
                 part[name] = np.ascontiguousarray(part[name][rows])
 
     def append(self, values: ParameterArrays) -> None:
-        """Add splats, without any memory of Adam."""
+        """Add splats with zero moments."""
         for name in GROUPS:
             self.values[name] = np.concatenate([self.values[name], values[name]])
             for memory in (self.first, self.second):
@@ -79,7 +79,7 @@ class Parameters:
 
 
 def from_model(model: SplatModel, sh_degree: int) -> ParameterArrays:
-    """Return the parameters of a model's splats, with SH of another degree (cut, or zeros) if requested."""
+    """Return the parameters of a model's splats, with SH truncated or extended by zeros to a degree."""
     alpha = np.clip(model.opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
     coefficients = (sh_degree + 1) ** 2 - 1
     shN = np.zeros((len(model), coefficients, 3), np.float32)
@@ -109,13 +109,13 @@ def to_model(values: ParameterArrays, *, antialiased: bool = False) -> SplatMode
 
 
 def sigmoid(logits: F32) -> F32:
-    """Return the opacities of logits, computed in float64, rounded once."""
+    """Return the opacities of logits, computed in float64 and rounded once."""
     alpha: F32 = (1.0 / (1.0 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
     return alpha
 
 
 def adam_step(parameters: Parameters, gradients: ParameterArrays, rates: dict[str, float]) -> None:
-    """Make a step of Adam (no weight decay), then normalise quaternions and bound logits.
+    """Make a step of Adam without weight decay, then normalise quaternions and clip logits.
 
     Args:
         parameters: changed in place.
@@ -169,7 +169,7 @@ def _adam(
             slope = g[i]
             mean = b1 * m[i] + a1 * slope
             square = b2 * v[i] + a2 * slope * slope
-            # The memory of a splat that no image shows decays towards denormal numbers, which are slow.
+            # Moments of a splat that no image shows decay towards denormal numbers, which are slow.
             mean = mean if abs(mean) > tiny else np.float32(0.0)
             square = square if square > tiny else np.float32(0.0)
             m[i] = mean
@@ -179,7 +179,7 @@ def _adam(
 
 @relaxed_kernel
 def _constrain(quats: F32, logits: F32) -> None:
-    """Bring quaternions to unit length and logits into their bounds, one splat after the other."""
+    """Normalise quaternions and clip logits, splat by splat."""
     limit = np.float32(_LOGIT_LIMIT)
     for i in range(len(logits)):
         logits[i] = min(max(logits[i], -limit), limit)

@@ -1,4 +1,4 @@
-"""`PosedImage`, an image of a data set and its camera, kept as bytes and converted to float on demand; its scores."""
+"""`PosedImage`: an image of a data set with its camera, stored as bytes and converted to float on demand."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from csplat_render.scorer import ReferenceImage, Scorer
 
 @dataclass(frozen=True, eq=False)
 class UnreadPixels:
-    """Pixels that are read on first access, and then kept.
+    """Pixels that are read on first access and cached.
 
     Attributes:
         has_alpha: True if there is an alpha channel.
-        read: makes the array that `PosedImage` needs.
+        read: returns the array for `PosedImage`.
     """
 
     has_alpha: bool
@@ -39,10 +39,10 @@ class UnreadPixels:
 
 @dataclass(frozen=True, eq=False)
 class UnreadMask:
-    """A mask that is read on first access, and then kept.
+    """A mask that is read on first access and cached.
 
     Attributes:
-        read: makes the array that `PosedImage` needs.
+        read: returns the array for `PosedImage`.
     """
 
     read: Callable[[], Mask]
@@ -55,17 +55,16 @@ class UnreadMask:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """One view of a data set.
+    """An image of a data set with its camera.
 
     Attributes:
         camera: its camera; W and H are those of the image.
-        source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not
-            premultiplied) alpha; or pixels that are not read yet.
-        masked: [H, W], True for pixels that count in training and scores; or a mask that is not read yet. `None`: all
-            of them count.
+        source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not premultiplied) alpha; or
+            unread pixels.
+        masked: [H, W], True for pixels that count in training and scores; or an unread mask. `None`: all count.
 
     Raises:
-        InputError: the pixels or the mask have another shape or dtype.
+        InputError: pixels have another shape or dtype.
     """
 
     camera: Camera
@@ -78,7 +77,7 @@ class PosedImage:
 
     @property
     def pixels(self) -> U8:
-        """Pixels of the image. They are read on first access.
+        """Pixels of the image, read on first access.
 
         Raises:
             InputError: the file is damaged.
@@ -90,16 +89,16 @@ class PosedImage:
 
     @property
     def mask(self) -> Mask | None:
-        """Pixels that count; `None`: all of them. A mask is read on first access.
+        """Mask of the pixels that count, read on first access; `None`: all of them.
 
         Raises:
-            InputError: the file is damaged, or no pixel counts.
+            InputError: the file is damaged, has another size, or no pixel counts.
         """
         mask = self.masked.mask if isinstance(self.masked, UnreadMask) else self.masked
         if mask is not None and (mask.dtype != np.bool_ or mask.shape != (self.camera.H, self.camera.W)):
-            raise InputError(f"a mask is {mask.dtype} {list(mask.shape)}, wanted bool, of its picture's size")
+            raise InputError(f"a mask is {mask.dtype} {list(mask.shape)}, expected bool and the size of its image")
         if mask is not None and not mask.any():
-            raise InputError(f"the mask of {self.camera.image} hides all of it: leave the picture out")
+            raise InputError(f"the mask of {self.camera.image} hides all of it: remove the image")
         return mask
 
     @property
@@ -108,28 +107,23 @@ class PosedImage:
         return self.source.has_alpha if isinstance(self.source, UnreadPixels) else self.source.shape[2] == 4
 
     def at(self, rows: NDArray[np.int64], columns: NDArray[np.int64]) -> F64:
-        """Return some pixels, RGBA in 0..1, [M, 4]; alpha is 1 if there is none."""
+        """Return some pixels, RGBA in 0..1, [M, 4]; alpha is 1 without an alpha channel."""
         values = self.pixels[rows, columns].astype(np.float64) / 255.0
         return values if self.has_alpha else np.concatenate([values, np.ones((len(values), 1))], axis=1)
 
     def _check(self, pixels: U8) -> None:
         shape = (self.camera.H, self.camera.W)
         if pixels.dtype != np.uint8 or pixels.ndim != 3 or pixels.shape[2] not in (3, 4):
-            raise InputError(f"a picture is {pixels.dtype} {list(pixels.shape)}, wanted uint8 [H, W, 3 or 4]")
+            raise InputError(f"an image is {pixels.dtype} {list(pixels.shape)}, expected uint8 [H, W, 3 or 4]")
         if pixels.shape[:2] != shape:
-            raise InputError(f"a picture has {pixels.shape[:2]} pixels, its camera {shape} (height, width)")
+            raise InputError(f"an image has {pixels.shape[:2]} pixels, expected {shape} (height, width of its camera)")
 
 
 def compose(image: PosedImage, background: F32, out: F32) -> F32:
-    """Convert an image to floats, in front of a background.
-
-    Args:
-        image: the image to compose.
-        background: [3], the colour behind it.
-        out: [H, W, 3] float32, overwritten.
+    """Convert an image to floats, in front of a background, [3].
 
     Returns:
-        `out`.
+        `out`, [H, W, 3] float32, overwritten.
     """
     _compose(np.ascontiguousarray(image.pixels), background, out)
     return out
@@ -138,7 +132,7 @@ def compose(image: PosedImage, background: F32, out: F32) -> F32:
 def halve(image: PosedImage) -> PosedImage:
     """Return the image at half its width and height: each pixel is the mean of four, weighted by their alpha.
 
-    A last odd row or column is left out. A pixel counts if all four do; if none would, or the image is one
+    A last odd row or column is dropped. A pixel counts if all four do. If no pixel would count, or the image is one
     pixel wide or high, it is returned unchanged.
     """
     camera = image.camera
@@ -182,11 +176,11 @@ def image_scorer(
     threads: int | None = None,
     origin: Sequence[float] | None = None,
 ) -> Scorer:
-    """Return a scorer on images of a data set; each is composed when it is needed.
+    """Return a scorer on images of a data set; each is composed on use.
 
     Args:
         images: at least one.
-        background: red, green, blue, behind renders and behind images that have an alpha channel.
+        background: background colour of renders, and of images with an alpha channel.
         mode, threads, origin: as in `Scorer`.
     """
     colour = np.asarray(background, np.float32)
@@ -209,11 +203,11 @@ def evaluate(
     Args:
         render: renders a camera's view, [H, W, 3].
         images: at least one.
-        background: [3], behind images that have an alpha channel; `render` uses the same.
+        background: [3], background of images with an alpha channel; `render` uses the same.
         lpips: the perceptual distance, or `None`.
 
     Returns:
-        The fields of `csplat_render.metrics.Scores` for all images together.
+        The JSON of `csplat_render.metrics.Scores` over all images.
     """
     scorer = image_scorer(images, background)
     each = [scorer.score(number, render(camera), lpips=lpips) for number, camera in enumerate(scorer.cameras)]
@@ -227,5 +221,4 @@ def _reference_image(image: PosedImage, background: F32) -> ReferenceImage:
 
 
 def _pixel_count(image: PosedImage) -> int:
-    """Return the number of pixels that count."""
     return image.camera.W * image.camera.H if image.mask is None else int(image.mask.sum())

@@ -1,27 +1,27 @@
 """Sensitivity of renders to each splat, attribute by attribute, measured from training cameras or virtual ones.
 
-The sensitivity of a parameter p is S(p) = Σ_i |∂E_i/∂p| / Σ_i P_i over the views i, E_i the sum of the red, green and
-blue of view i, P_i its pixels; that of a group of parameters is its maximum (Niedermayr, Stumpfegger, Westermann,
-"Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024). For colours that is what counts.
-For opacity and shape the pixels of one view cancel in E_i: a splat that grows brightens here what it darkens there. So
-magnitudes are taken here before pixels and channels are added; the published figure is reported as well.
+The sensitivity of a parameter p is S(p) = Σ_i |∂E_i/∂p| / Σ_i P_i over the views i, with E_i the sum of the red, green
+and blue of view i, and P_i its number of pixels; that of a group of parameters is its maximum (Niedermayr, Stumpfegger,
+Westermann, "Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024). This suits colours. For
+opacity and shape the pixels of one view cancel in E_i: a growing splat brightens some pixels and darkens others. So
+magnitudes are taken here before pixels and channels are summed; the published quantity is computed as well.
 
 Sums of squares instead of magnitudes are the diagonal of the Gauss–Newton matrix: the squared error that a small error
-of the parameter adds to the renders. They are the weights of k-means, whose errors are squared too.
+of the parameter adds to the renders. They are the weights of k-means, which minimises squared errors.
 
-At a pixel, let s_c be the derivative of channel c towards the exponent of a splat, and t = ∂exponent/∂(Σ / γ²), a
-symmetric matrix, with Σ the splat's covariance and γ² its trace. With Σ2 the covariance on the render, M the linearised
+At a pixel, let s_c be the derivative of channel c by the exponent of a splat, and t = ∂exponent/∂(Σ / γ²), a symmetric
+matrix, with Σ the splat's covariance and γ² its trace. With Σ2 the covariance on the render, M the linearised
 perspective and d the distance of the pixel from the centre,
 
     t = h hᵀ + C,  h = γ/√2 · Mᵀ Σ2⁻¹ d
 
-C is 0 except in the antialiased mode, whose opacity depends on the covariance too. h is linear in d: `covariance_forms`
-computes its coefficients once per splat, `_moments` evaluates it at each pixel as (u, v, w) and adds up
+C is 0 except in antialiased mode, in which the opacity depends on the covariance, too. h is linear in d:
+`covariance_forms` computes its coefficients once per splat, `_moments` evaluates it at each pixel as (u, v, w) and sums
 
     Σ w, Σ w²                        w: the splat's weight at the pixel
     Σ s, Σ |s|, Σ s²                 s, |s|, s²: summed over channels
     Σ s t, Σ |s| |t|                 entries xx, yy, zz, xy, xz, yz of t
-    Σ s² |h|²                        squared derivative towards the centre, up to 2 / γ²
+    Σ s² |h|²                        squared derivative by the centre, up to 2 / γ²
     Σ s² t tᵀ                        21 entries: the Gauss–Newton matrix of the covariance
 """
 
@@ -71,7 +71,7 @@ from csplat_render.projection import (
 from csplat_render.rasteriser import Rasteriser
 
 _DIAGONAL = [0, 6, 11, 15, 18, 20]  # indices of the diagonal in a triangle of 6 by 6
-_MAX_SUM = 1e37  # largest value of a sum; float32 holds six of them
+_MAX_SUM = 1e37  # largest value of a sum, so that six of them fit float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,21 +79,21 @@ class Sensitivity:
     """Sensitivities and squared derivatives of a scene's renders, by splat and group of attributes.
 
     Attributes:
-        colour: [N] float64, S of the SH coefficients, sh0 among them: the largest of up to 48.
-        opacity: [N] float64, S of alpha, magnitudes added pixel by pixel and channel by channel.
-        shape: [N] float64, S of the covariance divided by its trace, the largest of 6 entries, added likewise.
+        colour: [N] float64, S of the SH coefficients including sh0: the largest of up to 48.
+        opacity: [N] float64, S of alpha, with magnitudes summed over pixels and channels.
+        shape: [N] float64, S of the covariance over its trace, the largest of 6 entries, summed likewise.
         opacity_net: [N] float64, S of alpha as published: pixels of a view cancel.
-        shape_net: [N] float64, the same of the covariance. All five are `None` if they were not requested.
-        colour_squares: [N] float64, squared derivatives of a pixel's channel towards the splat's colour in that
-            channel, summed over pixels and views, per pixel.
-        opacity_squares: [N] float64, the same of all three channels towards alpha.
-        shape_squares: [N] float64, towards all nine entries of the covariance divided by its trace.
-        means_squares: [N] float64, towards the three coordinates of the centre, per square scene unit; effects through
-            the viewing direction alone are left out.
-        shape_metric: [N, 21] float64, the Gauss-Newton matrix whose trace is `shape_squares`: the upper triangle, row
-            by row, over xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance divided by its trace.
+        shape_net: [N] float64, the same for the covariance. All five are `None` if they were not requested.
+        colour_squares: [N] float64, squared derivatives of a pixel's channel by the splat's colour in that channel,
+            summed over pixels and views, per pixel.
+        opacity_squares: [N] float64, the same of all three channels by alpha.
+        shape_squares: [N] float64, by all nine entries of the covariance over its trace.
+        means_squares: [N] float64, by the three coordinates of the centre, per square scene unit; effects through the
+            viewing direction are ignored.
+        shape_metric: [N, 21] float64, the Gauss–Newton matrix whose trace is `shape_squares`: the upper triangle, row
+            by row, over xx, yy, zz, √2 xy, √2 xz, √2 yz of the covariance over its trace.
         metric: [N, B (B + 1) / 2] float32, `colour_squares` with the basis functions of each view, B = (degree + 1)²:
-            the Gauss-Newton matrix of the SH coefficients of one channel, its upper triangle; None if it was not
+            the upper triangle of the Gauss–Newton matrix of the SH coefficients of one channel; `None` if it was not
             requested.
         views: [N] int64, number of views that saw the splat.
         view_count: number of views.
@@ -117,13 +117,13 @@ class Sensitivity:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """[N], which splats any view saw: the others have a colour sensitivity of 0."""
+        """[N] bool, True for splats that any view saw; the others have a colour sensitivity of 0."""
         seen: NDArray[np.bool_] = self.views > 0
         return seen
 
     @property
     def unseen_share(self) -> float:
-        """Share of the splats that no view saw."""
+        """Fraction of the splats that no view saw."""
         return 1.0 - float(self.seen.mean()) if len(self.views) else 0.0
 
 
@@ -143,19 +143,19 @@ def measure_sensitivity(
     Args:
         model: the scene.
         cameras: the views, at least one; relative to the scene's origin.
-        background: red, green, blue behind everything.
-        metric: compute the matrices of SH coefficients too: 2 B (B + 1) bytes per splat.
-        magnitudes: compute the sensitivities themselves; without them 112 + 12 B bytes per splat less.
-        dtype: dtype of pixels, float32 or float64 (which is for tests).
-        threads: number of threads; None for all. The result does not depend on it.
-        progress: called with the stage and the fraction done.
+        background: background colour.
+        metric: compute the matrices of SH coefficients, too, which take 2 B (B + 1) bytes per splat.
+        magnitudes: compute the sensitivities themselves, which take 112 + 12 B bytes per splat.
+        dtype: dtype of pixels, float32 or, for tests, float64.
+        threads: number of threads; `None` for all. The result does not depend on it.
+        progress: progress callback.
 
     Raises:
-        InputError: there is no camera.
+        InputError: there are no cameras.
         LimitError: a render has more than `rasteriser.MAX_INTERSECTIONS`.
     """
     if not cameras:
-        raise InputError("measuring sensitivity wants a camera at least")
+        raise InputError("measuring sensitivity requires at least one camera")
     drawing = _Derivatives(model, metric=metric, magnitudes=magnitudes, dtype=dtype, threads=threads)
     for number, camera in enumerate(cameras):
         drawing.add(camera, background)
@@ -233,7 +233,7 @@ class _Derivatives(Rasteriser):
 
 
 def _mean_over(sums: F64, pixels: int) -> F64:
-    """Divide the array in place and make it fit float32; sums that have overflowed float64 become 0. Return it."""
+    """Divide an array in place, limit it to float32, and return it; sums that overflowed float64 become 0."""
     sums /= pixels
     np.nan_to_num(sums, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     return np.clip(sums, -_MAX_SUM, _MAX_SUM, out=sums)
@@ -246,21 +246,12 @@ FORM_SIZE = 12
 @parallel_kernel()
 def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any, view: Any, antialiased: bool,
                      shape: Any, near: Any, forms: Any) -> None:  # fmt: skip
-    """Compute the forms that turn a place on a render into the exponent's derivative towards a splat's covariance.
-
-    With Σ2 the covariance on the render, M the linearised perspective and γ² the trace of the covariance Σ, the
-    exponent's derivative towards Σ / γ² is t = h hᵀ + C, h = γ/√2 · Mᵀ Σ2⁻¹ d, d the distance from the centre in
-    pixels. C is 0 but in the antialiased mode, whose opacity depends on the covariance too. Parallel over blocks.
+    """Compute the coefficients of h and C in the equations at the top of this module; parallel over blocks.
 
     Args:
-        means: see `project`, as the next two.
-        quats: see `project`.
-        scales: see `project`.
-        view: see `project`.
-        antialiased: see `project`.
-        shape: see `project`.
-        near: [N] float32, above 0 for splats that are drawn.
-        forms: [N, FORM] float64, written for splats that are drawn: the matrix of h, [3, 2] row by row; C, as xx yy zz
+        means, quats, scales, view, antialiased, shape: see `project`.
+        near: [N] float32, above 0 for drawn splats.
+        forms: [N, FORM_SIZE] float64, written for drawn splats: the matrix of h by d, [3, 2] row by row; C, as xx yy zz
             xy xz yz.
     """
     n = means.shape[0]
@@ -296,23 +287,20 @@ def covariance_forms(lane: int, lanes: int, means: Any, quats: Any, scales: Any,
                     A, B, C = A + u * u, B + u * v, C + v * v
                 bare, dilated = determinants(pq, r, s0, s1, s2, A + C)
                 if bare > COMPENSATION_MIN * dilated:
-                    # The logarithm of √(det Σ2 / det (Σ2 + dilation)), towards Σ2: half the difference of inverses.
+                    # Derivative of log √(det Σ2 / det (Σ2 + dilation)) by Σ2: half the difference of inverses.
                     da, db, dc = C / bare - a, -B / bare - b, A / bare - c
                     for e, (k, m) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
                         left, right = pq[k] * da + pq[3 + k] * db, pq[k] * db + pq[3 + k] * dc
                         forms[i, 6 + e] = half * (left * pq[m] + right * pq[3 + m])
 
 
-#: Numbers per record. With w the share of a pixel that is the splat's, s_c the derivative of channel c towards the
-#: exponent (that is, towards the logarithm of alpha), t the matrix of `covariance_forms`, |h|² of its first part: sums
-#: over pixels of w, w²; Σ s, Σ |s|, Σ s² over channels; Σ s · t (6 entries); Σ |s| · |t| (6); Σ s² · |h|²; Σ s² · t tᵀ
-#: (the upper triangle of 6 by 6).
+#: Numbers per record: the sums listed at the top of this module, in their order.
 DERIVATIVE_SUMS = 39
 
 _AREA = TILE * TILE
 
-# Offsets of the planes of a tile: transmittance, what lies behind by channel, the current splat's share of the pixel,
-# Σ s, Σ |s|, Σ s², positions about the centre of the tile.
+# Offsets of the planes of a tile: transmittance, colour behind the splat by channel, the splat's weight at the pixel,
+# Σ s, Σ |s|, Σ s², positions relative to the centre of the tile.
 _RED, _GREEN, _BLUE, _WEIGHT, _SLOPE, _SIZE, _SQUARE, _X, _Y = (_AREA * k for k in range(1, 10))
 _PLANES = 10
 
@@ -320,22 +308,13 @@ _PLANES = 10
 @parallel_kernel(relaxed=True)
 def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slots: Any, shape: Any, box: Any,
                     forms: Any, tiles_x: int, limits: Any, rgb: Any, records: Any) -> None:  # fmt: skip
-    """Compute one record for every splat and tile; parallel over tiles, vectorised over the 16 pixels of a row.
+    """Compute a record for every splat and tile; parallel over tiles, vectorised over the 16 pixels of a row.
 
     Args:
-        lane: see `blend_backward`.
-        lanes: see `blend_backward`.
-        starts: see `blend_backward`, as the next five.
-        used: see `blend_backward`.
-        ids: see `blend_backward`.
-        slots: see `blend_backward`.
-        shape: see `blend_backward`.
-        box: see `blend_backward`.
+        lane, lanes, starts, used, ids, slots, shape, box, tiles_x, limits: see `blend_backward`.
         forms: see `covariance_forms`.
-        tiles_x: see `blend_backward`, as the next.
-        limits: see `blend_backward`.
-        rgb: [H, W, 3], the image.
-        records: [intersections, SUMS], written.
+        rgb: [H, W, 3], the render.
+        records: [intersections, DERIVATIVE_SUMS], written.
     """
     height, width = rgb.shape[:2]
     planes = aligned_zeros(_PLANES * _AREA, limits)
@@ -399,9 +378,9 @@ def sum_derivatives(lane: int, lanes: int, starts: Any, used: Any, ids: Any, slo
 
 @relaxed_kernel
 def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
-    """Sum over the pixels of a tile for one splat: the equations at the top of this module, (u, v, w) being h.
+    """Sum over the pixels of a tile for one splat: the equations at the top of this module, with h = (u, v, w).
 
-    `form` holds the splat's row of `covariance_forms`, then h at the middle of the tile.
+    `form` contains the splat's row of `covariance_forms`, then h at the middle of the tile.
     """
     zero = form[0] - form[0]
     ax, ay, bx, by, cx, cy = form[0], form[1], form[2], form[3], form[4], form[5]
@@ -479,29 +458,25 @@ def _moments(body: Any, count: int, form: Any, sums: Any) -> None:
 def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, view: Any, degree: int, shape: Any,
              near: Any, offsets: Any, records: Any, colour: Any, net: Any, sizes: Any, squares: Any, metric: Any,
              shape_matrices: Any, views: Any) -> None:  # fmt: skip
-    """Add one view's sums for every splat; parallel over blocks of splats, records in one order.
+    """Add the sums of a view for every splat; parallel over blocks of splats, records in a fixed order.
 
     Args:
-        means: see `project`, as the next two.
-        opacities: see `project`.
-        scales: see `project`.
-        view: see `project`.
+        means, opacities, scales, view, shape: see `project`.
         degree: degree of the spherical harmonics.
-        shape: see `project`.
-        near: [N] float32, above 0 for splats that are drawn.
+        near: [N] float32, above 0 for drawn splats.
         offsets: [N + 1] int64, index of each splat's first record.
-        records: [intersections, SUMS].
-        colour: [N, B, 3] float32, added to: |derivative of the render's sum towards a coefficient|; [0, …] if neither
-            this nor the next two are needed.
-        net: [N, 7] float64, added to: the same towards alpha and the six entries of the covariance over its trace.
-        sizes: [N, 7] float64, added to: the same with magnitudes taken pixel by pixel and channel by channel.
-        squares: [N, 3] float64, added to: squared derivatives of the pixels' channels towards a colour (one channel of
-            it), alpha, and the centre.
-        metric: [N, B (B + 1) / 2] float32, added to: squared derivatives towards SH coefficients, of one channel, the
-            upper triangle of a matrix; [0, …] if it is not needed.
-        bends: [N, 21] float64, added to: squared derivatives of all channels towards the covariance over its trace, as
-            the upper triangle of a matrix over xx, yy, zz, √2 xy, √2 xz, √2 yz.
-        views: [N] int64, added to: 1 if the splat was seen.
+        records: [intersections, DERIVATIVE_SUMS].
+        colour: [N, B, 3] float32, incremented by |derivative of the render's sum by a coefficient|; [0, …] if this and
+            the next two are not requested.
+        net: [N, 7] float64, incremented by the same for alpha and the six entries of the covariance over its trace.
+        sizes: [N, 7] float64, incremented by the same with magnitudes taken per pixel and channel.
+        squares: [N, 3] float64, incremented by squared derivatives of the pixels' channels by a colour (one channel),
+            alpha, and the centre.
+        metric: [N, B (B + 1) / 2] float32, incremented by squared derivatives by SH coefficients of one channel, the
+            upper triangle of a matrix; [0, …] if not requested.
+        shape_matrices: [N, 21] float64, incremented by squared derivatives of all channels by the covariance over its
+            trace, the upper triangle of a matrix over xx, yy, zz, √2 xy, √2 xz, √2 yz.
+        views: [N] int64, incremented if the splat was seen.
     """
     n = means.shape[0]
     count = (degree + 1) * (degree + 1)

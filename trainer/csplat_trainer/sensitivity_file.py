@@ -1,4 +1,4 @@
-"""Sensitivities in a file: one array per group, and the scene they belong to. Requires only NumPy, no renderer."""
+"""Files of sensitivities: an array per group, and a digest of the scene. Requires NumPy, but not the renderer."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _FORMAT = "csplat sensitivity 1"
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _CHANNELS = 3.0
 _SHAPE = 6.0  # entries of a covariance
-_FLOOR = 0.01  # fraction of the median; weight of splats that no view shows, because other views may show them
+_FLOOR = 0.01  # weight of splats that no view shows, as a fraction of the median, since other views may show them
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +41,15 @@ class StoredSensitivity:
     """Contents of a sensitivity file.
 
     Attributes:
-        groups: [N] float32 by name, see `GROUPS`; a file holds all of them.
+        groups: [N] float32 by name, see `GROUPS`; a file has all of them.
         views: [N] int32, number of views that saw each splat.
         source: kind of views, one of `SOURCES`.
         view_count: number of views.
         missed_share: fraction of the splats that only held-out views saw; NaN if no views were held out.
-        shape_matrices: [N, 21] float32, upper triangles of the Gauss-Newton matrices of the covariance over its trace,
-            see `Sensitivity.shape_metric`, the mean of the diagonal being 1.
-        matrices: [N, K (K + 1) / 2] float16, upper triangles of the Gauss-Newton matrices of the SH bands 1 to d, the
-            mean of the diagonal being 1; or None.
+        shape_matrices: [N, 21] float32, upper triangles of the Gauss–Newton matrices of the covariance over its trace,
+            see `Sensitivity.shape_metric`, scaled to a mean diagonal of 1.
+        matrices: [N, K (K + 1) / 2] float16, upper triangles of the Gauss–Newton matrices of the SH bands 1 to d,
+            scaled likewise; or `None`.
     """
 
     groups: dict[str, NDArray[np.float32]]
@@ -64,14 +64,7 @@ class StoredSensitivity:
     def of(
         cls, model: SplatModel, found: Sensitivity, source: str = "virtual", missed_share: float = float("nan")
     ) -> StoredSensitivity:
-        """Gather the contents of a file of a scene's sensitivities.
-
-        Args:
-            model: the scene that was measured.
-            found: the measured sensitivities.
-            source: as the attribute, like the next.
-            missed_share: as the attribute.
-        """
+        """Return the contents of a file for the measured sensitivities of a scene."""
         return cls(
             {name: group.astype(np.float32) for name in GROUPS if (group := getattr(found, name)) is not None},
             found.views.astype(np.int32),
@@ -84,18 +77,18 @@ class StoredSensitivity:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """[N], which splats any view saw."""
+        """[N] bool, True for splats that any view saw."""
         return np.asarray(self.views > 0, np.bool_)
 
     def importance(self) -> Importance:
-        """Return the weights of squared errors that the encoder needs."""
+        """Return the importance for the encoder."""
         matrices = self.matrices, self.shape_matrices
         return Importance(
             self._floored("colour_squares"), self._floored("shape_squares"), *matrices, self._curvatures()
         )
 
     def _curvatures(self) -> GaussNewtonBlocks:
-        """Return the absolute curvatures by attribute, 0 for splats that no view shows."""
+        """Return the Gauss–Newton blocks by attribute, 0 for splats that no view shows."""
         opacity, shape, means = (self.groups[f"{name}_squares"] / _CHANNELS for name in ("opacity", "shape", "means"))
         return GaussNewtonBlocks(
             opacity, self.shape_matrices * (shape / _SHAPE)[:, None], means, self.groups["colour_squares"]
@@ -109,7 +102,7 @@ class StoredSensitivity:
 
 
 def scene_digest(model: SplatModel) -> str:
-    """SHA-256 of the arrays of a scene, in hexadecimal digits."""
+    """Return the SHA-256 of the arrays of a scene, in hexadecimal digits."""
     digest = hashlib.sha256()
     for name in _ARRAYS:
         array: NDArray[np.float32] = np.ascontiguousarray(getattr(model, name), "<f4")
@@ -121,15 +114,7 @@ def scene_digest(model: SplatModel) -> str:
 def write_sensitivity(
     stream: BinaryIO, model: SplatModel, found: Sensitivity, source: str, missed_share: float = float("nan")
 ) -> None:
-    """Write a file.
-
-    Args:
-        stream: the stream to write to.
-        model: the scene that was measured.
-        found: the measured sensitivities.
-        source: see `StoredSensitivity`.
-        missed_share: see `StoredSensitivity`.
-    """
+    """Write the measured sensitivities of a scene; `source` and `missed_share` as in `StoredSensitivity`."""
     stored = StoredSensitivity.of(model, found, source, missed_share)
     arrays: dict[str, Any] = dict(stored.groups)
     if stored.matrices is not None:
@@ -148,21 +133,17 @@ def write_sensitivity(
 
 
 def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
-    """Read a file that was made for a scene.
-
-    Args:
-        path: the file.
-        model: the scene.
+    """Read the sensitivities of a scene.
 
     Raises:
-        InputError: it is damaged, something else, or belongs to another scene.
-        OSError: it cannot be read.
+        InputError: the file is damaged, of another kind, or belongs to another scene.
+        OSError: the file cannot be read.
     """
     arrays = read_archive(path, "a file of sensitivities (`csplat sensitivity` makes them)")
     if str(arrays["format"]) != _FORMAT:
-        arrays.refuse(f"it says {str(arrays['format'])!r}, wanted {_FORMAT!r}")
+        arrays.refuse(f"its format is {str(arrays['format'])!r}, expected {_FORMAT!r}")
     if any(arrays[name].shape for name in ("scene", "source", "view_count", "missed_share")):
-        arrays.refuse("it has lists where single values are wanted")
+        arrays.refuse("it has lists, expected single values")
     try:
         found = StoredSensitivity(
             {name: arrays[name] for name in GROUPS},
@@ -178,14 +159,14 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
     matrices: list[NDArray[Any]] = [found.shape_matrices, *([] if found.matrices is None else [found.matrices])]
     kinds = {array.dtype.kind for array in (*found.groups.values(), *matrices)}
     if (kinds, found.views.dtype.kind, found.views.ndim) != ({"f"}, "i", 1):
-        arrays.refuse("its arrays hold other numbers, or none")
+        arrays.refuse("its arrays have unexpected types or shapes")
     if any(array.ndim != 2 or len(array) != len(found.views) for array in matrices):
-        arrays.refuse("it has matrices for other splats than it has views")
-    wanted = (len(model),)
-    if any(array.shape != wanted for array in (*found.groups.values(), found.views)):
-        raise InputError(f"{path} is about {len(found.views)} splats, the scene has {len(model)}")
+        arrays.refuse("its matrices and views are of different splats")
+    shape = (len(model),)
+    if any(array.shape != shape for array in (*found.groups.values(), found.views)):
+        raise InputError(f"{path} is of {len(found.views)} splats, but the scene has {len(model)}")
     if str(arrays["scene"]) != scene_digest(model):
-        raise InputError(f"{path} is about another scene: its splats differ from those of this one")
+        raise InputError(f"{path} belongs to another scene: its splats differ")
     if not all(np.isfinite(array).all() for array in (*found.groups.values(), *matrices)):
         arrays.refuse("it holds values that are not finite")
     return found

@@ -1,14 +1,14 @@
-"""Changes of the number and places of splats during training: MCMC, gradient-based densification, pruning.
+"""Changes of the number and positions of splats during training: MCMC, gradient-based densification, pruning.
 
 * "3DGS as Markov chain Monte Carlo", Kheradmand et al. 2024, https://arxiv.org/abs/2404.09591. A dead splat moves onto
-  a live one, and both (all n, if several move there) get the opacity and the scales that leave the render as it was,
-  as nearly as n equal splats can; noise then separates them.
+  a live one. All n splats there get the opacity and the scales that change the render least; noise then separates
+  them.
 * Densification of the first publication, Kerbl et al. 2023, section 5, https://arxiv.org/abs/2308.04079. A splat whose
-  position on screen has a large gradient is cloned if it is small and split in two if it is large; the transparent are
-  pruned, and opacities are reset from time to time so that floaters die.
-* Pruning of the splats that images need least: the exact squared change of the renders if a splat alone were absent.
-  Splats in the same place are each needed little, and together much: so few are pruned at once, and the others are
-  trained before they are measured again.
+  position on screen has a large gradient is cloned if it is small and split in two if it is large. Transparent splats
+  are pruned, and opacities are reset from time to time so that floaters die.
+* Pruning of the splats with the least pruning error, the exact squared change of the renders if only this splat is
+  removed. Overlapping splats have small errors each, but a large one together, so few are pruned at once, and the
+  others are trained before they are measured again.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ from csplat_trainer.posed_images import PosedImage
 
 _MAX_SHARE = 51  # largest number of splats in one place, as in the paper's code
 _BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])
-_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # the paper's gate: noise for nearly transparent splats only
+_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # the paper's gate, which limits noise to nearly transparent splats
 _MAX_NOISE = 1.0  # standard deviations per step; the paper's noise moves large splats out of small scenes
-_GATE_OFF = 0.1  # opacity from which the gate is below 1e-4
+_GATE_OFF = 0.1  # opacity above which the gate is below 1e-4
 
 
 def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int:
@@ -43,7 +43,7 @@ def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int
         rng: source of random choices.
 
     Returns:
-        Number of splats that were moved.
+        Number of moved splats.
     """
     alphas = parameters.alphas
     dead = np.flatnonzero(alphas <= dead_opacity)
@@ -59,7 +59,7 @@ def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int
 
 
 def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, rng: Generator) -> int:
-    """Add splats at the places of others, which are chosen by opacity, up to a cap.
+    """Add splats at the positions of others, chosen by opacity, up to a cap.
 
     Args:
         parameters: changed in place.
@@ -69,28 +69,28 @@ def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, r
         rng: source of random choices.
 
     Returns:
-        Number of splats that were added.
+        Number of added splats.
     """
     count = len(parameters)
-    wanted = min(cap, max(count + 1, int(factor * count))) - count
-    if wanted <= 0 or count == 0:
+    added = min(cap, max(count + 1, int(factor * count))) - count
+    if added <= 0 or count == 0:
         return 0
     alphas = parameters.alphas
-    sources = _draw_by_opacity(alphas, np.arange(count), wanted, rng)
+    sources = _draw_by_opacity(alphas, np.arange(count), added, rng)
     _share_among(parameters, sources, alphas, dead_opacity)
     parameters.append({name: parameters.values[name][sources] for name in GROUPS})
-    return wanted
+    return added
 
 
 def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
-    """Return opacity and scale of n equal splats in one place that look like one (equation 9 of the MCMC paper).
+    """Return opacity and scale of n equal splats that look like one (equation 9 of the MCMC paper).
 
     Args:
-        alphas: opacity of the one.
+        alphas: opacity of the one splat.
         counts: n, at most 51.
 
     Returns:
-        Opacities of each of the n, and factors of their standard deviations.
+        Opacities of the n splats, and factors of their standard deviations.
     """
     shared = 1.0 - (1.0 - alphas) ** (1.0 / counts)
     # The paper's double sum, summed over its outer index: sum_i C(i - 1, k) = C(n, k + 1).
@@ -121,11 +121,11 @@ def _share_among(parameters: Parameters, sources: I64, alphas: F32, least: float
 def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
     """Move splats at random inside their own shapes, transparent ones more.
 
-    The paper's noise, covariance · normal · gate · strength, but along no axis wider than the splat.
+    This is the paper's noise, covariance · normal · gate · strength, limited to the splat's size along each axis.
 
     Args:
-        parameters: the means change, in place.
-        strength: the noise's factor times the learning rate of the means.
+        parameters: the means are changed in place.
+        strength: `noise` times the learning rate of the means.
         normals: [N, 3], standard normal numbers.
     """
     v = parameters.values
@@ -155,19 +155,19 @@ def _noise(
         m0 = np.float32(means[i, 0] + (r00 * l0 + r01 * l1 + r02 * l2))
         m1 = np.float32(means[i, 1] + (r10 * l0 + r11 * l1 + r12 * l2))
         m2 = np.float32(means[i, 2] + (r20 * l0 + r21 * l1 + r22 * l2))
-        if np.isfinite(m0) and np.isfinite(m1) and np.isfinite(m2):  # a splat as wide as float32 is not moved
+        if np.isfinite(m0) and np.isfinite(m1) and np.isfinite(m2):  # huge splats may overflow float32
             means[i, 0], means[i, 1], means[i, 2] = m0, m1, m2
 
 
-_SPLIT_SIZE = 0.01  # fraction of the extent: larger splats are split, smaller ones cloned
-_SPLIT_SHRINK = 1.6  # factor by which the halves of a split are smaller
+_SPLIT_SIZE = 0.01  # fraction of the extent; larger splats are split, smaller ones cloned
+_SPLIT_SHRINK = 1.6  # divisor of the scales of a split
 _RESET_ALPHA = 0.01  # opacity after a reset
 _MAX_LOG_SCALE = 60.0  # log scale up to which offsets of a split fit float32
 
 
 @dataclass
 class ScreenGradients:
-    """Mean norm of the gradient towards each splat's position on screen, over the renders that show it.
+    """Mean norm of the gradient by each splat's position on screen, over the renders that show it.
 
     Attributes:
         total: [N] float64.
@@ -179,11 +179,11 @@ class ScreenGradients:
 
     @classmethod
     def none(cls, splats: int) -> ScreenGradients:
-        """Return the sums before the first render."""
+        """Return sums of no renders."""
         return cls(np.zeros(splats), np.zeros(splats, np.int64))
 
     def add(self, norms: F32, drawn: NDArray[np.bool_]) -> None:
-        """Add one render's norms, for the splats that it shows."""
+        """Add the norms of a render, for the splats that it shows."""
         self.total[drawn] += norms[drawn]
         self.count[drawn] += 1
 
@@ -202,7 +202,7 @@ def densify(
     dead_opacity: float,
     rng: Generator,
 ) -> int:
-    """Clone and split splats whose gradient is above a threshold, strongest first up to the cap; prune dead ones.
+    """Clone and split splats whose gradient is above a threshold, largest first up to the cap; prune dead ones.
 
     Args:
         parameters: changed in place.
@@ -241,7 +241,7 @@ def densify(
 
 
 def reset_opacities(parameters: Parameters) -> None:
-    """Make every splat nearly transparent: training restores those that the images need."""
+    """Make every splat nearly transparent; training restores those that the images need."""
     logit = np.float32(np.log(_RESET_ALPHA / (1.0 - _RESET_ALPHA)))
     np.minimum(parameters.values["logits"], logit, out=parameters.values["logits"])
     for memory in (parameters.first, parameters.second):
@@ -265,7 +265,7 @@ def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
     return first, second
 
 
-_PRUNING_VIEWS = 32  # largest number of views, spread over all, in which the pruning error is measured
+_PRUNING_VIEWS = 32  # largest number of views in which the pruning error is measured, evenly spread
 
 
 def prune_least_needed(
@@ -276,12 +276,12 @@ def prune_least_needed(
     *,
     antialiased: bool,
 ) -> None:
-    """Prune the splats that images need least.
+    """Prune the splats with the least pruning error.
 
     Args:
         parameters: changed in place.
         images: the training images.
-        background: [3], behind the splats.
+        background: [3], background colour.
         count: number of splats to keep.
         antialiased: apply the mip-splatting filter.
     """

@@ -2,8 +2,8 @@
 # pyright: reportMissingImports=false
 """Checkpoints of gsplat's simple_trainer, of nerfstudio's splatfacto and of INRIA's trainer, read as scenes.
 
-All are pickles of torch; nothing in them is run: `weights_only` admits tensors, containers and plain numbers alone.
-What they leave out, such as whether a scene was trained antialiased, is in the files of their trainers.
+All are pickles of torch. No code in them is run: `weights_only` admits only tensors, containers and plain numbers. Some
+facts, such as antialiased training, are not in the checkpoint, but in other files of the trainer.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from csplat.ply.columns import AttributeArrays, RowStatistics, choose_thickness,
 from csplat.ply.comments import CommentMetadata, split_origin
 from csplat.scene_source import SceneSource, join_blocks, source_from_model
 
-_MAGICS = (b"PK\x03\x04", b"\x80")  # of a zip, and of a pickle, which torch wrote before 1.6
+_MAGICS = (b"PK\x03\x04", b"\x80")  # a zip, or a pickle as written by torch before 1.6
 _NAMED = 5  # names in a message
-#: Values that INRIA's `GaussianModel.capture` returns after the SH degree in use (scene/gaussian_model.py).
+#: Values returned by INRIA's `GaussianModel.capture` after the active SH degree (scene/gaussian_model.py).
 _INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
 _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto's tensors; else the top level does
-#: gsplat writes a file for each GPU, which has a part of the splats (simple_trainer.py).
+#: gsplat writes a file per GPU with a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
 _FILTER = "filter_3D"
 _NAMES = {
@@ -56,7 +56,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     models = [one.model for one in parts]
     degrees = sorted({one.sh_degree for one in models})
     if len(degrees) > 1:
-        raise InputError(f"{path.name}: files of other GPUs beside it are of SH degree {degrees[0]} and {degrees[1]}")
+        raise InputError(f"{path.name}: the files of its GPUs have SH degrees {degrees[0]} and {degrees[1]}")
     model, counts = join_blocks(models[0], models), RowStatistics()
     for part in parts:
         survey_arrays(part.arrays, part.scale_count, counts)
@@ -75,9 +75,9 @@ class _CheckpointPart(NamedTuple):
 
     Attributes:
         model: the splats, with means in float32.
-        arrays: as the file has them: opacities are logits; means are float64 if the file's are.
-        scale_count: scales of a splat: 2 of discs.
-        findings: what was noticed.
+        arrays: the arrays of the file: opacities are logits; means may be float64.
+        scale_count: scales per splat; 2 for discs.
+        findings: lint findings.
     """
 
     model: SplatModel
@@ -87,10 +87,10 @@ class _CheckpointPart(NamedTuple):
 
 
 def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
-    """The files of all GPUs of a run of gsplat, of which one is named.
+    """Return the files of all GPUs of a run of gsplat, given one of them.
 
     Raises:
-        InputError: one is missing.
+        InputError: a file is missing.
     """
     named = _RANK.fullmatch(path.name)
     if named is None:
@@ -104,11 +104,11 @@ def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
     if absent:
         missing = ", ".join(f"{named['run']}{rank}{named['ending']}" for rank in absent[:_NAMED])
         raise InputError(
-            f"{path.name} has the splats of one GPU of several, expected those of the others beside it: no {missing}"
+            f"{path.name} has the splats of one of several GPUs, expected the others' files next to it: no {missing}"
         )
     paths = [found[rank] for rank in sorted(found)]
     if len(paths) == 1:
-        text = "the splats of GPU 0: all there are, if no other trained"
+        text = "the splats of GPU 0; complete if no other GPU was used"
         return paths, [Finding("ranks", 1, text, "note", usual=True)]
     text = f"the splats of {len(paths)} GPUs, from {', '.join(one.name for one in paths)}"
     return paths, [Finding("ranks", len(paths), text, "note")]
@@ -119,22 +119,22 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
     kind = detect_content(path, head)
     if not head.startswith(_MAGICS):
         reason = "it begins with" if kind is None else f"it is {kind.title}, and begins with"
-        raise InputError(f"{path.name} is no checkpoint of torch: {reason} {head[:8]!r}")
+        raise InputError(f"{path.name} is not a checkpoint of torch: {reason} {head[:8]!r}")
     try:
         import torch
     except ModuleNotFoundError as error:
         raise InputError(f"{path.name} is a checkpoint of torch: {missing_package(error, extra='train')}") from None
     try:
         with _plain_numbers(torch), warnings.catch_warnings(action="ignore"):
-            # Mapped: of a checkpoint of splatfacto two thirds are Adam's memory.
+            # Memory-mapped, since two thirds of a checkpoint of splatfacto are Adam's moments.
             content = torch.load(path, map_location="cpu", weights_only=True, mmap=zipfile.is_zipfile(path))
     except OSError:
         raise
     except Exception as error:  # noqa: BLE001 -- an unpickler raises whatever a damaged file makes of it
         if isinstance(error, pickle.UnpicklingError) and "eights only" in str(error):
-            reason = "holds objects of a program, which could do anything: save tensors alone, as state_dict gives them"
-        else:  # torch's message goes on for twenty lines
-            reason = "is no whole checkpoint of torch: copy it again, or save its splats as PLY where it was trained"
+            reason = "contains objects that could run code: save only tensors, as from state_dict"
+        else:  # torch's message has twenty lines
+            reason = "is a truncated or damaged checkpoint of torch: copy it again, or export its splats as PLY"
         raise InputError(f"{path.name} {reason}") from None
     try:
         return _model_of(content, path.stat().st_size, sh_degree)
@@ -143,9 +143,9 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
 
 
 def _plain_numbers(torch: Any) -> Any:
-    """Let numbers of NumPy through, which the schedules of splatfacto leave among learning rates."""
+    """Admit NumPy scalars, which the schedules of splatfacto store among learning rates."""
     if tuple(map(int, torch.__version__.split(".")[:2])) < (2, 6):
-        return nullcontext()  # it has no names for what older versions of NumPy wrote
+        return nullcontext()  # cannot name the types that older versions of NumPy wrote
     make = np.float64(0.0).__reduce__()[0]
     kinds = [type(np.dtype(kind)) for kind in (np.float64, np.float32)]
     return torch.serialization.safe_globals([make, (make, "numpy.core.multiarray.scalar"), np.dtype, *kinds])
@@ -156,7 +156,7 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
     if inria is not None:
         return _checked_part(inria, size, sh_degree)
     if not isinstance(content, Mapping):
-        raise InputError(f"it holds a {type(content).__name__}, wanted a checkpoint of gsplat, splatfacto or INRIA")
+        raise InputError(f"it holds a {type(content).__name__}, expected a checkpoint of gsplat, splatfacto or INRIA")
     if isinstance(content.get("splats"), Mapping):
         return _checked_part(content["splats"], size, sh_degree)
     holder = next((content[name] for name in _HOLDERS if isinstance(content.get(name), Mapping)), content)
@@ -164,7 +164,7 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
     models = _models_in(named)
     if len(models) > 1:
         shown = ", ".join(f"{prefix}* ({_count(named[prefix + 'means'])})" for prefix in models[:_NAMED])
-        raise InputError(f"it holds {len(models)} models of splats, expected one: {shown}; save one of them alone")
+        raise InputError(f"it holds {len(models)} models of splats, expected one: {shown}; save only one of them")
     if not models:
         names = ", ".join(map(str, list(content)[:_NAMED]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
@@ -178,7 +178,7 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
 
 
 def _inria_tensors(content: object) -> dict[str, Any] | None:
-    """The splats of a checkpoint of INRIA's trainer: what `capture` returned, and the iteration."""
+    """Return the splats of a checkpoint of INRIA's trainer, a pair of `capture`'s result and the iteration."""
     captured = content[0] if isinstance(content, tuple) and len(content) == 2 else None
     if not isinstance(captured, tuple) or len(captured) <= len(_INRIA) or not hasattr(captured[1], "numel"):
         return None
@@ -186,9 +186,9 @@ def _inria_tensors(content: object) -> dict[str, Any] | None:
 
 
 def _models_in(named: Mapping[str, Any]) -> list[str]:
-    """Return the prefix of the tensors' names of each model of splats.
+    """Return the name prefix of the tensors of each model of splats.
 
-    It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, and empty in a state_dict alone.
+    It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, and empty in a bare state_dict.
     """
     prefixes = [name.removesuffix("means") for name in named if name == "means" or name.endswith(".means")]
     return [one for one in prefixes if f"{one}scales" in named or f"{one}quats" in named]
@@ -200,17 +200,17 @@ def _count(means: Any) -> str:
 
 
 def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -> _CheckpointPart:
-    """The splats of tensors, none of which has more numbers than the file has bytes: one may be said to be many."""
+    """Return the splats of tensors; refuse expanded tensors that are larger than the file."""
     for name in _NAMES.values():
         numbers = getattr(splats.get(name), "numel", None)
         if name in splats and (numbers is None or numbers() > size):
-            raise InputError(f"{name} is no tensor that the file can hold")
+            raise InputError(f"{name} is not a tensor, or larger than the file")
     shN = splats.get("shN")
-    if shN is not None and shN.ndim == 3:  # others are refused below
+    if shN is not None and shN.ndim == 3:  # other shapes are refused below
         degree = math.isqrt(shN.shape[1] + 1) - 1
         if degree > MAX_SH_DEGREE and (degree + 1) ** 2 - 1 == shN.shape[1]:
             if sh_degree is None:
-                raise InputError(f"shN is of {too_many_bands(degree)}")
+                raise InputError(f"shN has {too_many_bands(degree)}")
             splats = {**splats, "shN": shN[:, : (MAX_SH_DEGREE + 1) ** 2 - 1]}
     findings = []
     splats = {name: _array(value) if name in _NAMES.values() else value for name, value in splats.items()}
@@ -219,9 +219,9 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
     if scales is not None and is_flat:
         third = np.full((len(scales), 1), choose_thickness(scales) if len(scales) else 0.0, np.float32)
         splats["scales"] = np.concatenate([scales, third], axis=1)
-        findings.append(Finding("flat-scales", 1, "scales are two of a splat: the splats are discs (2DGS)", "note"))
+        findings.append(Finding("flat-scales", 1, "splats have two scales: they are discs (2DGS)", "note"))
     if _FILTER in splats:
-        text = f"{_FILTER} of Mip-Splatting is left out, and not fused: save the scene as PLY, of which it is"
+        text = f"{_FILTER} of Mip-Splatting is ignored, not fused: export the scene as PLY, which fuses it"
         findings.append(Finding("filter-3d", 1, text, "repair"))
     model = replace(from_gsplat(splats), flat=is_flat)
     arrays = AttributeArrays(
@@ -231,7 +231,7 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
 
 
 def _array(value: Any) -> Any:
-    """An array of a tensor: float64 if it is, else float32."""
+    """Return a tensor as an array: float64 if it is, else float32."""
     if hasattr(value, "detach"):
         value = value.detach().cpu()
         value = (value.double() if str(value.dtype) == "torch.float64" else value.float()).numpy()

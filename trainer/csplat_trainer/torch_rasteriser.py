@@ -32,17 +32,17 @@ def render(
     antialiased: bool = False,
     sh_degree: int | None = None,
 ) -> Tensor:
-    """Render splats; gradients flow back to each of the six tensors.
+    """Render splats, with gradients by each of the six tensors.
 
     Args:
-        means: [N, 3], all float32 or all float64 (then everything is computed in float64), on the CPU.
+        means: [N, 3]. All tensors are on the CPU, and all float32 or all float64, which is the type of computations.
         quats: [N, 4], w x y z, of any length.
         scales: [N, 3], logarithms.
         opacities: [N], alpha.
         sh0: [N, 3].
         shN: [N, K, 3].
         camera: the camera to render from.
-        background: red, green, blue behind the splats.
+        background: background colour.
         antialiased: apply the mip-splatting low-pass filter.
         sh_degree: highest degree of the SH bands; `None`: that of `shN`.
 
@@ -55,15 +55,15 @@ def render(
     tensors = (means, quats, scales, opacities, sh0, shN)
     for name, tensor in zip(_GROUPS, tensors, strict=True):
         if tensor.device.type != "cpu":
-            raise InputError(f"{name} is on device {tensor.device.type}, wanted cpu")
+            raise InputError(f"{name} is on device {tensor.device.type}, expected cpu")
         if tensor.dtype != means.dtype or tensor.dtype not in (torch.float32, torch.float64):
-            raise InputError(f"{name} is {tensor.dtype}, wanted all float32 or all float64")
-    image: Tensor = _Render.apply(*tensors, camera, background, antialiased, sh_degree)  # type: ignore[no-untyped-call]  # torch leaves it so
+            raise InputError(f"{name} is {tensor.dtype}, expected all float32 or all float64")
+    image: Tensor = _Render.apply(*tensors, camera, background, antialiased, sh_degree)  # type: ignore[no-untyped-call]  # untyped in torch
     return image
 
 
 class _Render(Function):
-    """The autograd function; its context keeps the rasteriser, whose buffers hold the state for backward."""
+    """The autograd function; its context owns the rasteriser with the state for backward."""
 
     @staticmethod
     def forward(ctx: Any, *inputs: Any) -> Tensor:

@@ -1,4 +1,4 @@
-"""Checkpoints of training: everything a run needs to continue as if it had not stopped, or with other options."""
+"""Checkpoints of training, from which a run continues exactly, or with other options."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ class TrainingCheckpoint:
     """A training run between two steps.
 
     Attributes:
-        iteration: number of steps made.
-        parameters: parameters of the splats, with Adam's memory.
+        iteration: number of steps so far.
+        parameters: parameters of the splats, with Adam's moments.
         rng_state: state of the random generator, JSON-compatible.
         queue: indices of the images that remain in this epoch.
         options: options of the run, as a dictionary.
         log: log so far.
-        origin: point that the means are relative to.
+        origin: the point that means are relative to.
     """
 
     iteration: int
@@ -70,13 +70,13 @@ def load_checkpoint(path: str | Path) -> TrainingCheckpoint:
     """Read a checkpoint.
 
     Raises:
-        InputError: the file is not a checkpoint, or was written by another version.
-        OSError: it cannot be read.
+        InputError: the file is not a checkpoint, or is of another version.
+        OSError: the file cannot be read.
     """
     stored = read_archive(path, "a checkpoint of csplat train")
     facts = stored.facts()
     if facts.get("version") != _VERSION:
-        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
+        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, expected {_VERSION}")
     stored.check(facts, _FACTS)
     parts = [{name: stored[f"{kind}_{name}"] for name in GROUPS} for kind in ("values", "first", "second")]
     _check(path, parts)
@@ -92,7 +92,7 @@ def load_checkpoint(path: str | Path) -> TrainingCheckpoint:
 
 
 def _origin(path: str | Path, facts: dict[str, Any]) -> tuple[float, float, float]:
-    """Return the origin of a checkpoint; older versions store none, and had 0."""
+    """Return the origin of a checkpoint; 0 if it has none, as in older versions."""
     try:
         x, y, z = (float(value) for value in facts.get("origin", (0.0, 0.0, 0.0)))
     except (TypeError, ValueError):
@@ -117,18 +117,20 @@ def _check(path: str | Path, parts: list[ParameterArrays]) -> None:
         for name, shape in shapes.items():
             array = part[name]
             if array.shape != shape or array.dtype != np.float32 or not np.isfinite(array).all():
-                raise InputError(f"{path}: {name} is {array.dtype} {list(array.shape)}, wanted finite float32 {shape}")
+                raise InputError(
+                    f"{path}: {name} is {array.dtype} {list(array.shape)}, expected finite float32 {shape}"
+                )
 
 
 def fit_to_options(parameters: Parameters, options: TrainOptions, rng: Generator) -> Parameters:
-    """Adapt the parameters of a checkpoint to other options: another number of splats, another SH degree.
+    """Adapt the parameters of a checkpoint to another number of splats and another SH degree.
 
-    If there are too many splats, those of least opacity times area of their two longer axes are pruned. If
-    there are too few for a fixed count, splats are added as by growth. SH bands are cut off, or added as zeros.
+    If there are too many splats, those with the least opacity times area of the two longer axes are pruned. If there
+    are too few for a fixed count, splats are added as by growth. SH bands are truncated, or extended by zeros.
 
     Args:
         parameters: parameters of a checkpoint; changed in place.
-        options: options of the run that continues.
+        options: options of the continued run.
         rng: source of random choices.
 
     Returns:
@@ -145,12 +147,12 @@ def fit_to_options(parameters: Parameters, options: TrainOptions, rng: Generator
 
 
 def _fit_degree(part: ParameterArrays, degree: int) -> None:
-    wanted = (degree + 1) ** 2 - 1
+    coefficients = (degree + 1) ** 2 - 1
     old = part["shN"]
-    if old.shape[1] == wanted:
+    if old.shape[1] == coefficients:
         return
-    fitted = np.zeros((len(old), wanted, 3), np.float32)
-    common = min(wanted, old.shape[1])
+    fitted = np.zeros((len(old), coefficients, 3), np.float32)
+    common = min(coefficients, old.shape[1])
     fitted[:, :common] = old[:, :common]
     part["shN"] = fitted
 

@@ -1,4 +1,4 @@
-"""`train`: from images to splats."""
+"""`train`: train splats on images."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
 from csplat_trainer.training_report import TrainingStep, peak_memory, save_image, side_by_side
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-_COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # random: background of evaluations
+_COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # background colours of evaluations
 _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
-_KEPT_AT_ONCE = 0.85  # fraction of the splats that a late pruning keeps
+_KEPT_AT_ONCE = 0.85  # fraction of the splats kept by a late pruning
 _STEPS_BETWEEN = 100  # steps after each late pruning
 _LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
-_FIRST_FRACTION = 0.5  # fraction of the cap: initial number of splats of mcmc without points
+_FIRST_FRACTION = 0.5  # initial number of splats of mcmc without points, as a fraction of the cap
 
 
 def train(
@@ -55,15 +55,14 @@ def train(
 ) -> TrainResult:
     """Train splats on images, as `csplat train` does; requires the packages of the render extra.
 
-    The same images, options and library versions give the same splats on the same machine, at
-    any number of threads.
+    The same images, options and library versions give the same splats on the same machine, at any number of threads.
 
     Args:
         data: a data set, or its path for `load`: a folder, or a `transforms.json`.
         options: options of the training.
-        outputs: checkpoints and early renders.
-        progress: called every `log_every` steps with the stage and the fraction of it that is done, 0 to 1.
-        on_step: called then with the progress of the run.
+        outputs: checkpoints and previews.
+        progress: progress callback, called every `log_every` steps.
+        on_step: called at the same time with the progress of the run.
 
     Returns:
         The scene, the log, and scores on the test images.
@@ -74,7 +73,7 @@ def train(
         >>> csplat.write_ply("scene.ply", found.model)  # doctest: +SKIP
 
     Raises:
-        InputError: there is no image, an option does not suit the data, or a file is damaged or of another kind.
+        InputError: there are no images, an option does not fit the data, or a file is damaged or of another kind.
     """
 
     def show(now: TrainingStep) -> None:
@@ -100,7 +99,7 @@ class _TrainingRun:
 
     def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs) -> None:
         if not data.train:
-            raise InputError("there is no picture to train on")
+            raise InputError("there are no images to train on")
         data.read()
         self._data, self._options, self._outputs = data, options, outputs
         self._scene = measure_extent(data.inliers)
@@ -120,13 +119,13 @@ class _TrainingRun:
         self._engine = _engine(
             parameters, replace(options, scale_weight=extent_factor * options.scale_weight), self._lpips
         )
-        self._behind = _COLOURS.get(options.background, data.background)
-        self._background = np.array(self._behind, np.float32)
+        self._colour = _COLOURS.get(options.background, data.background)
+        self._background = np.array(self._colour, np.float32)
 
     def run(self, show: Callable[[TrainingStep], None]) -> TrainResult:
         options, outputs = self._options, self._outputs
         window = _Window()
-        spent = float(self._log["seconds"])  # before the run was resumed
+        spent = float(self._log["seconds"])  # by runs before a resume
         begin, first = time.perf_counter(), self._iteration
         if first and not any(map(options.prunings_left, range(first + 1, options.iterations + 1))):
             self._prune_late(show)
@@ -186,7 +185,7 @@ class _TrainingRun:
         self._queue = [index for index in checkpoint.queue if index < len(self._data.train)]
         self._log |= checkpoint.log
         shift = np.subtract(checkpoint.origin, self._data.origin)
-        if shift.any():  # the data set has another origin, from other cameras
+        if shift.any():  # the data set has another origin, since its cameras differ
             means = checkpoint.parameters.values["means"]
             checkpoint.parameters.values["means"] = (means + shift).astype(np.float32)
         return fit_to_options(checkpoint.parameters, options, self._rng)
@@ -195,7 +194,7 @@ class _TrainingRun:
         if not self._queue:
             self._queue = self._rng.permutation(len(self._data.train)).tolist()
         number = self._queue.pop()
-        image = self._picture(number)
+        image = self._image(number)
         background = self._background
         if self._options.background == "random":
             background = self._rng.random(3, dtype=np.float32)
@@ -207,8 +206,8 @@ class _TrainingRun:
         self._log["losses"].append(float(f"{value.loss:.6g}"))
         return value.loss, value.mse
 
-    def _picture(self, number: int) -> PosedImage:
-        """Return a training image, at half its size in the first steps if so requested."""
+    def _image(self, number: int) -> PosedImage:
+        """Return a training image, at half its size in the first steps if requested."""
         if not self._options.is_half_size(self._iteration):
             self._halved.clear()
             return self._data.train[number]
@@ -239,27 +238,27 @@ class _TrainingRun:
         self._engine.parameters = parameters
 
     def _prune(self, times: int) -> None:
-        """Prune splats, so that the given number of equal prunings reaches the final fraction."""
+        """Make the first of a number of equal prunings towards the final fraction."""
         options, parameters = self._options, self._engine.parameters
-        wanted = options.final_share * self._log.setdefault("splats_before_thinning", len(parameters))
-        count = len(parameters) * math.pow(wanted / len(parameters), 1.0 / times) if times > 1 else wanted
-        left = max(1, round(count))
-        if left >= len(parameters):
+        final = options.final_share * self._log.setdefault("splats_before_thinning", len(parameters))
+        count = len(parameters) * math.pow(final / len(parameters), 1.0 / times) if times > 1 else final
+        kept_count = max(1, round(count))
+        if kept_count >= len(parameters):
             return
-        prune_least_needed(parameters, self._data.train, self._background, left, antialiased=options.antialiased)
+        prune_least_needed(parameters, self._data.train, self._background, kept_count, antialiased=options.antialiased)
         self._engine.parameters = parameters
         if self._engine.screen is not None:
             self._engine.screen = ScreenGradients.none(len(parameters))
 
     def _prune_late(self, show: Callable[[TrainingStep], None]) -> None:
-        """Prune splats after the usual steps, each time followed by some steps at the last learning rates."""
+        """Prune splats after the last step of a resumed run, each time followed by steps at the last learning rates."""
         count = len(self._engine.parameters)
-        wanted = max(1, round(self._options.final_share * self._log.get("splats_before_thinning", count)))
-        if wanted >= count:
+        final = max(1, round(self._options.final_share * self._log.get("splats_before_thinning", count)))
+        if final >= count:
             return
         spent, begin = float(self._log["seconds"]), time.perf_counter()
         degree = self._options.active_degree(self._iteration)
-        times = math.ceil(math.log(wanted / count) / math.log(_KEPT_AT_ONCE))
+        times = math.ceil(math.log(final / count) / math.log(_KEPT_AT_ONCE))
         for left in range(times, 0, -1):
             self._prune(left)
             window = _Window()
@@ -327,7 +326,7 @@ class _TrainingRun:
 
     def _model(self) -> SplatModel:
         model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
-        metadata = {TRAINING: self._data.trained_on(self._behind).as_json()}
+        metadata = {TRAINING: self._data.trained_on(self._colour).as_json()}
         if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
             metadata[VIEW] = _first_view([image.camera for image in self._data.train])
         model = replace(model, metadata=metadata, origin=self._data.origin)
@@ -360,7 +359,7 @@ def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:
 
 
 def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:
-    """Return the weights of LPIPS if they are found; a loss that needs them raises otherwise."""
+    """Return the weights of LPIPS; `None` if they are absent and not required."""
     try:
         return load_lpips(outputs.lpips_weights)
     except InputError:
@@ -371,12 +370,12 @@ def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:
 
 def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None) -> Engine:
     if options.device == "cpu":
-        wanted = options.lpips_weight > 0.0 and lpips is not None
-        return CpuEngine(parameters, options, PerceptualLoss(lpips) if wanted and lpips is not None else None)
+        perceptual = PerceptualLoss(lpips) if options.lpips_weight > 0.0 and lpips is not None else None
+        return CpuEngine(parameters, options, perceptual)
     if options.lpips_weight > 0.0:
-        raise InputError("the perceptual loss runs on the CPU alone: wanted --device cpu, or no --lpips-weight")
+        raise InputError("the perceptual loss requires --device cpu: omit --lpips-weight on other devices")
     if options.lr_exposure > 0.0:
-        raise InputError("exposures are learnt on the CPU alone: wanted --device cpu, or no lr_exposure")
+        raise InputError("gains of images require --device cpu: omit lr_exposure on other devices")
     try:
         from csplat_trainer.gsplat_engine import GsplatEngine
     except ImportError:

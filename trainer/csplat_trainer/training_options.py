@@ -1,4 +1,4 @@
-"""`TrainOptions`, checked once; the files that a run writes, and its result."""
+"""`TrainOptions`; the files that a run reads and writes, and its result."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from typing import Any, Literal, get_args
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 
-#: How splats are added and removed: `mcmc` grows to the cap and moves dead splats, with noise and
-#: regularisation; `fixed` starts at the cap and moves dead splats; `gradient` clones, splits and
-#: prunes; `none` keeps the initial splats.
+#: Strategies of adding and removing splats: `mcmc` grows to the cap and moves dead splats, with noise and
+#: regularisation; `fixed` starts at the cap and moves dead splats; `gradient` clones, splits and prunes; `none` keeps
+#: the initial splats.
 Strategy = Literal["mcmc", "fixed", "gradient", "none"]
 Loss = Literal["inria", "study", "l1"]
 Init = Literal["auto", "points", "hull", "box"]
@@ -29,9 +29,9 @@ DEVICES: tuple[Device, ...] = get_args(Device)
 class TrainOptions:
     """Options of training. The defaults suit thousands to a hundred thousand splats on a CPU.
 
-    They are the usual ones but for the learning rates of means and of the higher SH bands (twice
-    those of the first publication), the noise (the same in scene units) and the weight of the mean
-    opacity (0.003 for 0.01): Lego with 10,000 splats gained 1.1 dB in 7,000 steps.
+    They differ from the usual ones in the learning rates of means and higher SH bands (twice those of the first
+    publication), the noise (the same in scene units) and the weight of the mean opacity (0.003 instead of 0.01): Lego
+    with 10,000 splats gained 1.1 dB in 7,000 steps.
 
     Attributes:
         max_splats: largest number of splats.
@@ -39,17 +39,17 @@ class TrainOptions:
         iterations: training steps, one image each.
         seed: seed of every random choice.
         device: `cpu` (numba) or `cuda` (the gsplat package).
-        strategy: how splats are added and removed: `mcmc`, `fixed`, `gradient` or `none`.
-        init: initial places of splats: at the data set's points, inside the visual hull of the alpha
-            masks, anywhere in the scene's box, or (`auto`) the first of these that there is.
+        strategy: strategy of adding and removing splats: `mcmc`, `fixed`, `gradient` or `none`.
+        init: initial positions of splats: at the data set's `points`, inside the visual `hull` of the alpha masks,
+            anywhere in the scene's `box`, or (`auto`) the first of these that is possible.
         initial_splats: initial number of splats; 0: the strategy decides.
-        final_share: fraction of the splats that is kept at the end: once they no longer move, those that images need
-            least are pruned, a few at a time. 1: all are kept.
-        background: colour behind the splats, and behind images that have an alpha channel. `auto`: white
-            if any has one, else black; `random`: another one at each step, scored in front of white.
+        final_share: final fraction of the splats: when the strategy has ended, splats of low importance are pruned, a
+            few at a time. 1: all are kept.
+        background: background colour of splats, and of images with an alpha channel. `auto`: white if most images have
+            one, else black; `random`: another one at each step, evaluated on white.
         antialiased: train with the mip-splatting low-pass filter.
         loss: `inria` 0.8 L1 + 0.2 (1 − SSIM), `study` L1 + 0.2 (1 − SSIM), `l1` L1 alone.
-        lpips_weight: weight of a perceptual term, LPIPS-Alex; 0: none. Needs torch and the weights.
+        lpips_weight: weight of a perceptual term, LPIPS-Alex, which requires torch and the weights; 0: none.
         lr_means: initial learning rate of the means, as a fraction of the scene's extent; falls exponentially to
             `lr_means_final`.
         lr_means_final: final learning rate of the means.
@@ -58,30 +58,30 @@ class TrainOptions:
         lr_opacities: learning rate of the logits of opacity.
         lr_sh0: learning rate of the base colour.
         lr_shN: learning rate of the higher SH coefficients.
-        lr_exposure: learning rate of a gain and a bias per image and channel, for images that were exposed
-            differently; they are stored in no scene. Falls exponentially to a twentieth; 0: they are not trained.
-        lr_decay: the other rates fall to this fraction, along half a cosine from `refine_stop` (unless
-            that is 1) to the end.
-        half_size: fraction of the iterations, at the start, that train on images of half the width and height,
-            while splats are few and inaccurate.
-        sh_interval: steps before each next SH degree; 0: a fifteenth of the iterations, at most 1000.
+        lr_exposure: learning rate of a gain and a bias per image and channel, for images of different exposure; they
+            are not part of the scene. Falls exponentially to a twentieth; 0: they are not trained.
+        lr_decay: the other rates fall to this fraction, along half a cosine from `refine_stop` (unless that is 1) to
+            the end.
+        half_size: fraction of the iterations, at the start, that train on images of half the width and height, while
+            splats are few and inaccurate.
+        sh_interval: steps per SH degree; 0: a fifteenth of the iterations, at most 1000.
         opacity_weight: weight of the mean opacity in the loss (mcmc and fixed).
         scale_weight: weight of the mean standard deviation in the loss (mcmc and fixed).
         noise: noise of the positions, as a multiple of their learning rate (mcmc and fixed).
-        dead_opacity: splats below this are moved (mcmc, fixed) or removed (gradient).
+        dead_opacity: splats below this opacity are moved (mcmc, fixed) or removed (gradient).
         refine_start: first step after which the strategy may act.
-        refine_stop: fraction of the iterations after which it no longer acts.
+        refine_stop: fraction of the iterations after which the strategy ends.
         refine_every: steps between its actions.
-        growth: factor by which mcmc grows each time; 0: 1.05, or the factor that reaches the cap halfway
-            to `refine_stop` if that is larger.
-        grad_threshold: gradient densifies splats whose mean gradient on screen, in pixels of half
-            an image, is above this.
-        eval_every: steps between evaluations on the test views; 0: at the end alone.
+        growth: growth factor of mcmc per action; 0: 1.05, or a larger factor that reaches the cap halfway to
+            `refine_stop`.
+        grad_threshold: `gradient` densifies splats whose mean gradient on screen, in pixels of half an image, is above
+            this.
+        eval_every: steps between evaluations on the test views; 0: only at the end.
         eval_views: test views of an evaluation; 0: all of them.
         log_every: steps between entries of the log.
 
     Raises:
-        InputError: a value is out of its range.
+        InputError: a value is out of range.
     """
 
     max_splats: int = 20_000
@@ -123,25 +123,25 @@ class TrainOptions:
 
     def __post_init__(self) -> None:
         if str(self.device) == "mps":
-            raise InputError("device mps is not supported: --device cpu runs on the same machine")
+            raise InputError("device mps is not supported: use --device cpu")
         for name, choices in _CHOICES.items():
             if getattr(self, name) not in choices:
-                raise InputError(f"{name} is {getattr(self, name)!r}, wanted one of {', '.join(choices)}")
+                raise InputError(f"{name} is {getattr(self, name)!r}, expected one of {', '.join(choices)}")
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):
-                raise InputError(f"{name} is {value}, wanted {low:g} to {high:g}")
+                raise InputError(f"{name} is {value}, expected {low:g} to {high:g}")
         if self.lr_means_final > self.lr_means:
-            raise InputError(f"lr_means_final is {self.lr_means_final:g}, wanted at most lr_means ({self.lr_means:g})")
+            raise InputError(f"lr_means_final is {self.lr_means_final:g}, expected at most lr_means, {self.lr_means:g}")
 
     @property
     def sh_every(self) -> int:
-        """Steps before each next SH degree."""
+        """Steps per SH degree."""
         return self.sh_interval or min(1000, max(1, self.iterations // 15))
 
     @property
     def refine_end(self) -> int:
-        """Last step after which splats may be moved, added or removed by the strategy."""
+        """Last step after which the strategy may act."""
         return int(self.refine_stop * self.iterations)
 
     def is_half_size(self, iteration: int) -> bool:
@@ -158,9 +158,9 @@ class TrainOptions:
         return self.strategy != "none" and due and self.refine_start <= iteration <= self.refine_end
 
     def prunings_left(self, iteration: int) -> int:
-        """Return the number of prunings left, including the one after this step; 0 if no pruning follows this step.
+        """Return the number of prunings left, including the one after this step; 0 if there is none after this step.
 
-        The last one happens when two fifths of the steps after the last move of splats are left.
+        The last one is followed by 40 % of the steps after the end of the strategy.
         """
         begin = min(self.refine_end, self.iterations - 1)
         steps = max(1, int(_PRUNING_FRACTION * (self.iterations - begin)))
@@ -169,7 +169,7 @@ class TrainOptions:
         return max(0, times + 1 - done) if self.final_share < 1.0 and rest == 0 and done > 0 else 0
 
     def growth_from(self, count: int) -> float:
-        """Return the factor by which a run that begins with `count` splats grows each time."""
+        """Return the growth factor per action of a run that starts with `count` splats."""
         if self.growth:
             return self.growth
         times = (self.refine_end // 2 - self.refine_start) // self.refine_every + 1
@@ -201,8 +201,8 @@ class TrainOptions:
 
 _GROWTH = 1.05  # growth factor of the MCMC paper
 _MAX_PRUNINGS = 10  # largest number of prunings
-_PRUNING_FRACTION = 0.6  # fraction of the steps after the last action of the strategy, over which prunings are spread
-_LAST_EXPOSURE = 0.05  # fraction of the learning rate of image gains that remains at the end
+_PRUNING_FRACTION = 0.6  # fraction of the steps after the end of the strategy over which prunings are spread
+_LAST_EXPOSURE = 0.05  # final fraction of the learning rate of image gains
 
 _CHOICES = {
     "device": DEVICES,
@@ -248,12 +248,12 @@ _RANGES: dict[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class Outputs:
-    """Files that a run reads and writes, besides its data set.
+    """Files that a run reads and writes, other than its data set.
 
     Attributes:
         checkpoint: file for checkpoints (each replaces the last), or `None`.
         checkpoint_every: steps between checkpoints; 0: only at the end.
-        previews: folder for early renders (image and render next to each other), or `None`.
+        previews: folder for previews (image and render side by side), or `None`.
         preview_every: steps between previews; 0: after 100, 200, 400, … steps and at the end.
         resume: checkpoint to continue from, or `None`.
         lpips_weights: file of the weights of LPIPS-Alex; `None`: see `csplat_render.lpips`.

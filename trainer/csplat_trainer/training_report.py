@@ -1,4 +1,4 @@
-"""Reports of a training run: progress, log, loss plot, early renders."""
+"""Reports of a training run: progress, loss plot, previews."""
 
 from __future__ import annotations
 
@@ -21,14 +21,12 @@ class TrainingStep:
     """Progress of a run.
 
     Attributes:
-        iteration: steps made.
-        iterations: steps in all.
+        iteration, iterations: number of steps so far, and of all steps.
         loss: mean over the steps since the last report.
-        psnr: PSNR of the training images since the last report, pooled, dB.
-        splat_count: splats at present.
-        sh_degree: SH degree that is trained at present.
-        seconds: time since the start.
-        seconds_left: remaining time at the present pace.
+        psnr: PSNR on the training images since the last report, pooled, dB.
+        splat_count: current number of splats.
+        sh_degree: active SH degree.
+        seconds, seconds_left: time since the start, and estimated remaining time.
     """
 
     iteration: int
@@ -47,19 +45,14 @@ def peak_memory() -> int | None:
         return None
     try:
         import resource
-    except ImportError:  # a build without it
+    except ImportError:  # some builds lack it
         return None
     most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return int(most) if sys.platform == "darwin" else int(most) * 1024
 
 
 def moving_average(values: Sequence[float], window: int) -> F64:
-    """Return the mean of each value and those before it, `window` of them at most.
-
-    Args:
-        values: in order of time.
-        window: at least 1.
-    """
+    """Return for each value the mean of the last `window` values."""
     sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, np.float64))])
     ends = np.arange(1, len(sums))
     starts = np.maximum(ends - window, 0)
@@ -68,13 +61,7 @@ def moving_average(values: Sequence[float], window: int) -> F64:
 
 
 def plot_loss(path: str | Path, losses: Sequence[float], title: str = "") -> None:
-    """Draw the loss over the steps, with its moving average, as a PNG.
-
-    Args:
-        path: path of the plot.
-        losses: loss of each step.
-        title: title above the plot.
-    """
+    """Plot the loss of each step, and its moving average, as a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -95,7 +82,7 @@ def plot_loss(path: str | Path, losses: Sequence[float], title: str = "") -> Non
 
 
 def side_by_side(*images: F32) -> F32:
-    """Return images of one height next to each other."""
+    """Concatenate images of the same height."""
     return np.concatenate(images, axis=1)
 
 

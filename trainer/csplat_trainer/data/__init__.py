@@ -1,4 +1,4 @@
-"""Data sets of posed images, in the usual layouts on disk: `load(path)`."""
+"""Data sets of posed images, in common layouts on disk: `load(path)`."""
 
 from csplat_trainer.data.dataset import DataSet
 from csplat_trainer.data.loader import load

@@ -3,8 +3,8 @@
     images/ images_2/ images_4/ images_8/     the same images, smaller and smaller
     sparse/0/{cameras,images,points3D}.{bin,txt}
 
-A `test.txt` next to the model, one name a line, lists the test images, `val.txt` and `train.txt` the others. A folder
-`masks` holds masks, black for pixels that do not count.
+A `test.txt` next to the model lists the test images, one name per line; `val.txt` and `train.txt` list the others. A
+folder `masks` contains masks, black for pixels that do not count.
 """
 
 from __future__ import annotations
@@ -34,20 +34,17 @@ from csplat_trainer.data.dataset import (
 from csplat_trainer.data.image_files import abbreviate, describe_masks_among, describe_missing, find_images, find_masks
 from csplat_trainer.data.lens import UNDISTORTER, Lens
 
-#: Folders with models in numbered folders, or with a model; the last is used only if there is no other.
+#: Folders with models in numbered subfolders, or with a model; the last one only if there is no other.
 _MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))
 _IMAGE_FOLDERS = ("images", "input", ".")
-_UNDISTORTED_FIRST = "distorted"  # convert.py of 3DGS: images/ belongs to sparse/0, input/ to this folder's model
+_UNDISTORTED_FIRST = "distorted"  # by convert.py of 3DGS: images/ belongs to sparse/0, input/ to this folder's model
 
 
 def find_model(folder: Path) -> tuple[Path, list[str]] | None:
-    """Find the sparse model of a set: the one of most images, if there are several.
-
-    Args:
-        folder: the set's.
+    """Find the sparse model in the folder of a set; of several the one with most images.
 
     Returns:
-        The model's folder, and a line that names the others if there are any; `None` if there is no model.
+        The model's folder, and a line that names other models, if any; `None` if there is no model.
     """
     for names in _MODEL_FOLDERS:
         inside = [folder / name for name in names if (folder / name).is_dir()]
@@ -60,17 +57,17 @@ def find_model(folder: Path) -> tuple[Path, list[str]] | None:
 def read_colmap(
     folder: Path, model: Path, size: tuple[int, int] | None, images: str | None, test_every: int
 ) -> UnreadDataSet:
-    """Read a COLMAP set, but for the pixels.
+    """Read a COLMAP set without the pixels.
 
     Args:
-        folder: the set's.
-        model: the sparse model's.
+        folder: folder of the set.
+        model: folder of the sparse model.
         size: requested size of the images; determines the folder of images.
-        images: the folder of images, by name; `None`: the smallest that is large enough.
+        images: name of the folder of images; `None`: the smallest that is large enough.
         test_every: see `split_every`; used if there are no lists of images.
 
     Raises:
-        InputError: a file is damaged, or no image is there.
+        InputError: a file is damaged, or no image exists.
     """
     cameras_path, images_path = _file(model, "cameras"), _file(model, "images")
     assert cameras_path is not None
@@ -80,13 +77,13 @@ def read_colmap(
     cameras = read_cameras(cameras_path, used)
     same = images_path.with_suffix(".txt")
     if same != images_path and same.is_file() and (there := count_images(same)) != len(registered):
-        what = f"{same.name} holds {counted(there, 'image')}, {images_path.name} {len(registered)}"
+        what = f"{same.name} has {counted(there, 'image')}, {images_path.name} {len(registered)}"
         report.append(f"{what}: {images_path.name} is read")
     other = cameras_path.with_suffix(".txt")
     if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other, used)):
-        report.append(f"{other.name} holds other cameras than {cameras_path.name}, which is read")
+        report.append(f"{other.name} has other cameras than {cameras_path.name}, which is read")
     if not registered:
-        raise InputError(f"{images_path} holds no images")
+        raise InputError(f"{images_path} has no images")
     for image in registered:
         if image.camera not in cameras:
             raise InputError(f"{images_path}: {image.name} has camera {image.camera}, which {cameras_path} lacks")
@@ -112,7 +109,7 @@ def read_colmap(
 
 
 def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> list[ColmapImage]:
-    """Leave out images that are there again with the same pose and camera.
+    """Drop repeated images with the same pose and camera.
 
     Raises:
         InputError: an image has two poses or cameras.
@@ -121,9 +118,7 @@ def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> 
     for image in registered:
         other = first.setdefault(PurePosixPath(image.name).as_posix(), image)
         if other.camera != image.camera or (other.viewmat != image.viewmat).any():
-            raise InputError(
-                f"{path}: {image.name} is there twice, with different poses or cameras; expected each once"
-            )
+            raise InputError(f"{path}: {image.name} occurs twice, with different poses or cameras; expected each once")
     if len(first) < len(registered):
         report.append(f"{path.name}: {counted(len(registered) - len(first), 'image')} twice: read once")
     return list(first.values())
@@ -134,7 +129,7 @@ def _is_model(folder: Path) -> bool:
 
 
 def _file(model: Path, name: str) -> Path | None:
-    """Find a file of the model, binary before text; an empty one does not count if there is another."""
+    """Find a file of the model, binary before text, and empty ones last."""
     there = [path for path in (model / f"{name}.bin", model / f"{name}.txt") if path.is_file()]
     return next((path for path in there if path.stat().st_size), there[0] if there else None)
 
@@ -148,9 +143,9 @@ def _largest(models: list[Path], folder: Path) -> tuple[Path, list[str]]:
     if len(models) == 1:
         return models[0], []
     counts = [_count(model) for model in models]
-    best = max(range(len(models)), key=counts.__getitem__)  # of equal ones the first
-    said = [f"{counts[i]}" if counts[i] >= 0 else "no whole list of images" for i in range(len(models))]
-    others = ", ".join(f"{_relative(models[i], folder)} has {said[i]}" for i in range(len(models)) if i != best)
+    best = max(range(len(models)), key=counts.__getitem__)  # the first of equal ones
+    words = [f"{counts[i]}" if counts[i] >= 0 else "a damaged list of images" for i in range(len(models))]
+    others = ", ".join(f"{_relative(models[i], folder)} has {words[i]}" for i in range(len(models)) if i != best)
     chosen = _relative(models[best], folder)
     return models[best], [
         f"there are {len(models)} models: {chosen} is read, with {counted(max(counts), 'image')}; {others}"
@@ -158,7 +153,7 @@ def _largest(models: list[Path], folder: Path) -> tuple[Path, list[str]]:
 
 
 def _count(model: Path) -> int:
-    """Count the images of a model; -1 if that is damaged."""
+    """Return the number of images of a model; -1 if it is damaged."""
     path = _file(model, "images")
     try:
         return -1 if path is None else count_images(path)
@@ -167,7 +162,7 @@ def _count(model: Path) -> int:
 
 
 def _folders(folder: Path, model: Path, images: str | None) -> tuple[str, ...]:
-    """Name the folders to look for images in."""
+    """Return the folders to search for images."""
     if images is not None:
         if not (folder / images).is_dir():
             raise InputError(f"{folder} has no folder {images}")
@@ -177,7 +172,7 @@ def _folders(folder: Path, model: Path, images: str | None) -> tuple[str, ...]:
 
 
 def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
-    """Return True if cameras are the same up to the digits that text omits."""
+    """Return True if cameras are equal up to the precision of text files."""
 
     def numbers(some: dict[int, Lens]) -> list[tuple[float, ...]]:
         return [(number, lens.width, lens.height, lens.fx, lens.cx) for number, lens in sorted(some.items())]
@@ -186,7 +181,7 @@ def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
 
 
 def _masks(folder: Path, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
-    """Find the masks of images; a folder of masks that fit none, or not all, is reported."""
+    """Find the masks of images, and report images without one."""
     names = list(images)
     masks = find_masks(folder, names)
     if masks is None:
@@ -196,12 +191,12 @@ def _masks(folder: Path, images: dict[str, Path], report: list[str]) -> dict[str
     without = [name for name in names if name not in masks.files]
     if without:
         share = f"{len(without)} of {counted(len(names), 'image')}"
-        report.append(f"{masks.folder.name}/ has none for {share}: all pixels of {without[0]} count")
+        report.append(f"{masks.folder.name}/ has no masks for {share}: all pixels of {without[0]} count")
     return masks.files
 
 
 def _points(model: Path, report: list[str]) -> tuple[F64, F32] | tuple[None, None]:
-    """Read the points of a model; 3DGS keeps them as a PLY, too."""
+    """Read the points of a model, or of the PLY that 3DGS writes."""
     path = _file(model, "points3D")
     if path is not None:
         return read_points(path)
@@ -280,10 +275,10 @@ def read_cameras(path: Path, used: Collection[int] | None = None) -> dict[int, L
 
     Args:
         path: the file; its suffix determines the form.
-        used: ids of the cameras to read: others may have any lens; `None`: all.
+        used: ids of the cameras to read; lenses of others are ignored. `None`: all.
 
     Raises:
-        InputError: the file is damaged, or holds a lens that cannot be undone here.
+        InputError: the file is damaged, or has a lens that is not supported.
     """
     cameras = {}
     if path.suffix == ".txt":
@@ -300,10 +295,10 @@ def read_cameras(path: Path, used: Collection[int] | None = None) -> dict[int, L
     for _ in range(data.count(24)):
         number, model, width, height = data.unpack("<iiQQ")
         name = _MODELS[model] if 0 <= model < len(_MODELS) else f"of number {model}"
-        # Other models are refused: their number of parameters does not matter.
+        # Other models are refused below, so their number of parameters does not matter.
         parameter_count = len(_LAYOUTS.get(name, "").split())
         values = [float(value) for value in data.unpack(f"<{parameter_count}d")]
-        if used is None or number in used or not parameter_count:  # the length of an unknown model is not known
+        if used is None or number in used or not parameter_count:  # the record size of an unknown model is unknown
             cameras[number] = _lens(name, float(width), float(height), values, f"{path}, camera {number}")
     data.end()
     return cameras
@@ -313,8 +308,8 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     """Read images.bin or images.txt; the keypoints of each image are skipped.
 
     Returns:
-        The images, and lines on what is unusual: the layout of the text; images without a finite pose, which are left
-        out; rotations that are not of unit length, which are normalised.
+        The images, and lines on unusual contents: the layout of the text; images without a finite pose, which are
+        dropped; rotations that are not of unit length, which are normalised.
 
     Raises:
         InputError: the file is damaged.
@@ -340,7 +335,7 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     finite = [one for one in found if np.isfinite(one[2]).all()]
     lost = [name for name, _, pose, _ in found if not np.isfinite(pose).all()]
     if lost:
-        notes.append(f"{path.name}: {counted(len(lost), 'image')} without a finite pose, left out: {abbreviate(lost)}")
+        notes.append(f"{path.name}: {counted(len(lost), 'image')} without a finite pose, dropped: {abbreviate(lost)}")
     lengths = [(float(np.linalg.norm(pose[:4])), name) for name, _, pose, _ in finite]
     other = [f"{name} has length {length:.4g}" for length, name in lengths if abs(length - 1.0) > _UNIT_TOLERANCE]
     if other:
@@ -358,14 +353,14 @@ def read_points(path: Path) -> tuple[F64, F32]:
     """Read points3D.bin or points3D.txt.
 
     Returns:
-        Points, [P, 3] float64, and their colours, [P, 3] float32 in 0..1. Points that are not
-        finite, or beyond float32, are left out.
+        Points, [P, 3] float64, and their colours, [P, 3] float32 in 0..1. Points that are not finite, or overflow
+        float32, are dropped.
     """
     points: list[tuple[float, ...]] = []
     if path.suffix == ".txt":
         for words, where in _lines(path):
             if len(words) < 7:
-                raise InputError(f"{where}: wanted id, position and colour")
+                raise InputError(f"{where}: expected id, position and colour")
             points.append(tuple(_numbers(words[1:7], where)))
     else:
         data = _BinaryFile(path)
@@ -400,7 +395,7 @@ class _BinaryFile:
         return values
 
     def count(self, smallest: int) -> int:
-        """The number of records that follow, each of at least `smallest` bytes."""
+        """Return the number of records that follow, each of at least `smallest` bytes."""
         count = int(self.unpack("<Q")[0])
         self._need(count * smallest)
         return count
@@ -411,12 +406,12 @@ class _BinaryFile:
             raise InputError(f"{self._path} ends within a name at byte {self._at}")
         name = self._data[self._at : end]
         if any(byte < ord(" ") for byte in name):
-            raise InputError(f"{self._path}: the name at byte {self._at} holds control characters")
+            raise InputError(f"{self._path}: the name at byte {self._at} has control characters")
         self._at = end + 1
         try:
             return name.decode("utf-8")
         except UnicodeDecodeError:
-            return name.decode("cp1252", "replace")  # COLMAP on Windows writes the bytes of the system's code page
+            return name.decode("cp1252", "replace")  # COLMAP on Windows writes in the system's code page
 
     def skip(self, size: int) -> None:
         self._need(size)
@@ -428,7 +423,7 @@ class _BinaryFile:
 
     def _need(self, size: int) -> None:
         if size > len(self._data) - self._at:
-            raise InputError(f"{self._path} ends at byte {len(self._data)}, wanted {size} more from byte {self._at}")
+            raise InputError(f"{self._path} ends at byte {len(self._data)}, expected {size} more from byte {self._at}")
 
 
 def _lines(path: Path) -> Iterator[tuple[list[str], str]]:
@@ -441,11 +436,11 @@ def _lines(path: Path) -> Iterator[tuple[list[str], str]]:
 def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     """Separate the lines of poses in images.txt from the lines of keypoints that follow them.
 
-    COLMAP writes two lines for each image. The second, empty or three numbers for each keypoint, is often omitted in
+    COLMAP writes two lines per image. The second, empty or with three numbers per keypoint, is often omitted in
     hand-written files with known poses.
 
     Returns:
-        The lines of poses, each with its place in the file; and a line for the report if any has no second one.
+        The lines of poses, each with its place in the file; and a line for the report if a second line is missing.
     """
     written = [
         (line, f"{path}, line {number}")
@@ -460,7 +455,7 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
         return [pair for pair in written[::2] if pair[0].strip()], []
     poses: list[tuple[str, str]] = []
     single = 0
-    expected = False  # whether a line of keypoints may follow
+    expected = False  # a line of keypoints may follow
     for line, where in written:
         if not _is_keypoints(line.split()):
             single += expected
@@ -474,7 +469,7 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
             expected = False
     if not single:
         return poses, []
-    return poses, [f"{path.name}: {counted(single, 'image')} without a line of keypoints, which may be left out"]
+    return poses, [f"{path.name}: {counted(single, 'image')} without a line of keypoints, which is optional"]
 
 
 def _is_keypoints(words: list[str]) -> bool:
@@ -493,7 +488,7 @@ def _is_pose(line: str) -> bool:
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
-    """Parse numbers, NaN among them, which C++ programs on Windows write as `-nan(ind)` and `1.#IND`."""
+    """Parse numbers, including NaN, which C++ programs on Windows write as `-nan(ind)` and `1.#IND`."""
     words = [_NO_NUMBER.sub("nan", word) for word in words]
     try:
         return [float(word) for word in words]
@@ -518,7 +513,7 @@ def _lens(model: str, width: float, height: float, values: list[float], where: s
     fx = named.pop("f", None)
     fx, fy = (named.pop("fx"), named.pop("fy")) if fx is None else (fx, fx)
     if not (width >= 1 and height >= 1 and fx > 0 and fy > 0 and np.isfinite(values).all()):
-        raise InputError(f"{where}: the lens {model} has a size or focal length that is no number above 0")
+        raise InputError(f"{where}: the lens {model} has a size or focal length that is not a number above 0")
     cx, cy = named.pop("cx"), named.pop("cy")
     k1, k2, k3, k4, k5, k6 = (named.get(f"k{i}", 0.0) for i in range(1, 7))
     tangential, prism = (named.get("p1", 0.0), named.get("p2", 0.0)), (named.get("sx1", 0.0), named.get("sy1", 0.0))
@@ -537,7 +532,7 @@ def _viewmat(pose: Sequence[float], where: str) -> F64:
     q, t = np.array(pose[:4], np.float64), np.array(pose[4:7], np.float64)
     length = float(np.linalg.norm(q))
     if not (np.isfinite(length) and length > 0.0):
-        raise InputError(f"{where}: the rotation is zero, or beyond what a number holds")
+        raise InputError(f"{where}: the rotation is zero or overflows")
     w, x, y, z = q / length
     viewmat = np.eye(4)
     viewmat[:3, :3] = [

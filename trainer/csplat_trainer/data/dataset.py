@@ -1,4 +1,4 @@
-"""Data sets, and what their readers share: shots that are not read yet, splits, straightened images, point clouds."""
+"""Data sets, and functions shared by their readers: unread shots, splits, undistorted images, point clouds."""
 
 from __future__ import annotations
 
@@ -26,28 +26,28 @@ from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
 from csplat_trainer.posed_images import PosedImage, UnreadMask, UnreadPixels
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-_NEAR_FRACTION = 0.03  # fraction of the cameras' distance from what they look at
+_NEAR_FRACTION = 0.03  # near plane as a fraction of the cameras' distance from their subject
 
 
 @dataclass(frozen=True, eq=False)
 class DataSet:
-    """Posed images to train on and to score with.
+    """Posed images for training, validation and tests.
 
     Attributes:
-        name: kind and place, for messages: `COLMAP set /data/garden`.
+        name: kind and path, for messages: `COLMAP set /data/garden`.
         train: training images, at least one.
-        test: test images, which are held out; none if the set is too small or names none.
-        points: [P, 3] float32, points of the scene, relative to `origin`; `None` if the set has none.
-        points_rgb: [P, 3] float32 in 0..1, their colours; `None` if they have none of their own.
-        report: lines on what was found, left out and changed.
-        coordinate_system: as in `SplatModel`, if there is a convention for this kind of set.
+        test: test images; none if the set is too small or specifies none.
+        points: [P, 3] float32, points of the scene, relative to `origin`, if any.
+        points_rgb: [P, 3] float32 in 0..1, their colours, if any.
+        report: lines on findings, omissions and changes.
+        coordinate_system: as in `SplatModel`, if this kind of set has a convention.
         up: up direction; `None` if neither the kind of set nor its cameras determine it.
-        test_every: every Nth image was held out; `None` if the set names its test images.
-        size: width and height that the images are scaled to; `None`: they are not.
-        images: the folder of images that was requested; `None`: the reader chose.
-        val: validation images that the set names; they are neither training nor test images.
-        origin: [3] float64, the point that points and cameras are relative to, in the coordinates of the set's files;
-            other than 0 if these lie so far from 0 that float32 would lose visible detail.
+        test_every: every Nth image is a test image; `None` if the set specifies its test images.
+        size: width and height that the images are scaled to; `None`: unchanged.
+        images: the requested folder of images; `None`: chosen by the reader.
+        val: validation images of the set, which are neither training nor test images.
+        origin: [3] float64, the point that points and cameras are relative to, in the coordinates of the set's files.
+            It differs from 0 if coordinates are so large that float32 would lose visible detail.
     """
 
     name: str
@@ -66,36 +66,32 @@ class DataSet:
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """Colour behind the splats: white if images have alpha, as in published tables; else black."""
+        """Background colour: white if at least half of the images have alpha, as in published tables; else black."""
         images = (*self.train, *self.test)
         return _WHITE if 2 * sum(image.has_alpha for image in images) >= len(images) else _BLACK
 
     def trained_on(self, background: tuple[float, float, float]) -> TrainingRecord:
-        """Return the record for a scene that was trained on this set.
-
-        Args:
-            background: red, green, blue behind the splats when the scene was scored.
-        """
+        """Return the record for a scene that was trained on this set and evaluated on a background colour."""
         return TrainingRecord(background, self.test_every, self.size, self.train[0].camera.near, self.images)
 
     @cached_property
     def outliers(self) -> list[PosedImage]:
-        """Images whose cameras are far away from all others (`camera_outliers`)."""
+        """Images whose cameras are far from all others (`camera_outliers`)."""
         images = [*self.train, *self.test, *self.val]
         outliers = camera_outliers(np.stack([image.camera.viewmat for image in images]), self.points)
         return [image for image, outlier in zip(images, outliers, strict=True) if outlier]
 
     @property
     def inliers(self) -> list[PosedImage]:
-        """Training images that determine the place of the scene: all except outliers, or all if there are no others."""
+        """Training images that determine the extent of the scene: all but outliers, or all if only outliers exist."""
         outliers = {id(image) for image in self.outliers}
         return [image for image in self.train if id(image) not in outliers] or self.train
 
     def read(self) -> None:
-        """Read all training and test images now: a damaged one is found before anything is done with the others.
+        """Read all training and test images, to find damaged ones early.
 
         Raises:
-            InputError: a file is no image, or is cut short.
+            InputError: a file is not an image, or is truncated.
         """
         for image in (*self.train, *self.test):
             _ = image.pixels, image.mask
@@ -103,14 +99,14 @@ class DataSet:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """An image of a data set that is not read yet, and its camera.
+    """An unread image of a data set, with its camera.
 
     Attributes:
         name: name of the image in the set's files.
         path: the image file.
         lens: lens of the camera.
         viewmat: [4, 4] float64, world to camera, OpenCV axes.
-        mask: path of an image that is black for pixels that do not count.
+        mask: path of the mask, an image that is black for pixels that do not count.
     """
 
     name: str
@@ -125,15 +121,11 @@ class UnreadDataSet:
     """Result of a reader: everything but the pixels.
 
     Attributes:
-        kind: kind of the set, as `Blender set`.
-        train: shots to train on.
-        test: shots that are held out.
+        kind: kind of the set, such as `Blender set`.
+        train, test, val: training, test and validation shots.
         points: [P, 3] float64 or `None`.
         points_rgb: [P, 3] float32 in 0..1 or `None`.
-        report: lines on what was found.
-        test_every: as in `DataSet`.
-        coordinate_system: as in `DataSet`.
-        val: validation shots.
+        report, test_every, coordinate_system: as in `DataSet`.
     """
 
     kind: str
@@ -150,12 +142,12 @@ class UnreadDataSet:
 def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
     """Return the near plane for a data set: a small fraction of the distance to the cameras' subject.
 
-    Scene units are arbitrary if poses were computed from images: the renderer's default, which is an upper limit
-    here, may be beyond the scene.
+    Poses that were computed from images have arbitrary units, so the renderer's default, which is an upper limit here,
+    may be beyond the scene.
 
     Args:
         shots: at least one; outliers are ignored.
-        points: [P, 3], points of the scene, if they are known.
+        points: [P, 3], points of the scene, if known.
     """
     viewmats = np.stack([shot.viewmat for shot in shots])
     viewmats = viewmats[~camera_outliers(viewmats, points)]
@@ -167,17 +159,17 @@ def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
 
 _SCANNET = "train_test_lists.json"  # of ScanNet++
 
-#: Names of lists, and what each is for.
+#: Roles by names of lists.
 ROLES = {"train": "training", "val": "validation", "test": "test"}
 
 
 def read_split_lists(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
-    """Read the files that list images: ScanNet++'s `train_test_lists.json`, or text with a name a line.
+    """Read the files that list images: ScanNet++'s `train_test_lists.json`, or text files with a name per line.
 
-    Text files are called `test.txt` or `test_list.txt`, and so for `val` and `train`.
+    Text files are called `test.txt` or `test_list.txt`, and likewise for `val` and `train`.
 
     Args:
-        folders: folders to look in; the first that has lists is used.
+        folders: folders to search; the first with lists is used.
 
     Returns:
         Lines by `train`, `val` and `test`, and the files' names.
@@ -201,7 +193,7 @@ def _read_scannet_lists(path: Path) -> dict[str, list[str]]:
     lists = {role: document.get(role) for role in ROLES} if isinstance(document, dict) else {}
     found = {role: names for role, names in lists.items() if isinstance(names, list)}
     if not found or not all(isinstance(name, str) for names in found.values() for name in names):
-        raise InputError(f"{path} holds no lists of names, expected train, val or test")
+        raise InputError(f"{path} has no lists of names, expected train, val or test")
     return found
 
 
@@ -211,7 +203,7 @@ def _list_files(folder: Path, role: str) -> list[Path]:
 
 
 def _names_in(line: str, known: Container[str]) -> list[str]:
-    """Return the names in a line of a list: the line, or its parts between commas, without quotes; no comments."""
+    """Return the names in a line of a list: the line, or its parts between commas, without quotes and comments."""
     line = line.strip()
     if line in known or normalise_name(line) in known:
         return [line]
@@ -221,12 +213,12 @@ def _names_in(line: str, known: Container[str]) -> list[str]:
 
 
 def split_every(shots: Sequence[Shot], every: int, report: list[str]) -> tuple[list[Shot], list[Shot]]:
-    """Hold out the first and then every Nth image, in the order of their names.
+    """Make the first and then every Nth image a test image, in the order of their names.
 
     Args:
         shots: all images.
-        every: N, usually 8; 0 holds out none.
-        report: a line is appended if any is held out.
+        every: N, usually 8; 0: no test images.
+        report: a line is appended if there are test images.
 
     Returns:
         Training images, test images.
@@ -235,11 +227,11 @@ def split_every(shots: Sequence[Shot], every: int, report: list[str]) -> tuple[l
         InputError: N is 1 or negative.
     """
     if every < 0 or every == 1:
-        raise InputError(f"a test image every {every} images, expected 2 or more, or 0 for none")
+        raise InputError(f"test_every is {every}, expected at least 2, or 0 for no test images")
     ordered = sorted(shots, key=lambda shot: shot.name)
     if every == 0 or len(ordered) < 2:
         return ordered, []
-    report.append(f"no split is named: every {every}th image is a test image")
+    report.append(f"the set specifies no split: every {every}th image is a test image")
     return [s for i, s in enumerate(ordered) if i % every], ordered[::every]
 
 
@@ -248,15 +240,15 @@ def split_listed(
 ) -> tuple[list[Shot], list[Shot], list[Shot]]:
     """Split images by lists of names.
 
-    A list that names none of the images is ignored. An image on two lists is a test image rather than a validation
-    image, and a validation image rather than a training image. An image on no list is a training image, unless
-    training images are listed: then it is left out.
+    A list that names none of the images is ignored. An image on several lists gets the role of the first of test,
+    validation, training. An image on no list is a training image, unless training images are listed; then it is
+    dropped.
 
     Args:
         shots: all images.
         lists: names, or lines of a file, by `train`, `val` and `test`, at least one of them.
-        where: the file that has the lists, for messages.
-        report: lines are appended on what each list names.
+        where: the file with the lists, for messages.
+        report: lines on each list are appended.
 
     Returns:
         Training, validation and test images.
@@ -276,39 +268,39 @@ def split_listed(
         report += notes
         missing = [name for name in names if name not in found]
         line = f"{where} names {counted(len(names), f'{word} image')}"
-        there = {0: "none of them is there", 1: "1 of them is there"}.get(len(found), f"{len(found)} of them are there")
-        report.append(f"{line}, {there}; missing: {abbreviate(missing)}" if missing else line)
+        report.append(f"{line}, of which {len(found)} exist; missing: {abbreviate(missing)}" if missing else line)
         heeded += [role] if found else []
         twice = [name for name in found.values() if name in roles]
         if twice:
             report.append(
-                f"{where}: {counted(len(twice), 'image')} on more than one list, no {word} images: {abbreviate(twice)}"
+                f"{where}: {counted(len(twice), 'image')} on several lists, not used as {word} images:"
+                f" {abbreviate(twice)}"
             )
         roles = {**dict.fromkeys(found.values(), role), **roles}
     unlisted = [shot.name for shot in shots if shot.name not in roles]
     if "train" not in heeded:
         roles |= dict.fromkeys(unlisted, "train")
     elif unlisted:
-        report.append(f"{where}: {counted(len(unlisted), 'image')} on no list, left out: {abbreviate(unlisted)}")
+        report.append(f"{where}: {counted(len(unlisted), 'image')} on no list, dropped: {abbreviate(unlisted)}")
     train, val, test = ([shot for shot in shots if roles.get(shot.name) == role] for role in ("train", "val", "test"))
     return train, val, test
 
 
-# Orientations of EXIF that swap width and height, and what undoes them: quarter turns, anticlockwise, then a flip.
+# EXIF orientations that swap width and height, and the inverse: quarter turns anticlockwise, then a flip.
 _ON_ITS_SIDE = {5: (1, True), 6: (-1, False), 7: (-1, True), 8: (1, False)}
 
 
 def open_shot(shot: Shot, head: ImageHeader, size: tuple[int, int] | None, near: float) -> PosedImage:
-    """Return the image of a shot, undistorted, RGBA if the file has transparency; pixels and mask are not read yet.
+    """Return the undistorted image of a shot, RGBA if the file has transparency; pixels and mask are read on access.
 
     Args:
         shot: the shot to convert.
         head: header of its file.
-        size: width and height of the image; `None`: the file's.
-        near: the camera's near plane, scene units.
+        size: width and height of the image; `None`: those of the file.
+        near: near plane of the camera, scene units.
 
     Raises:
-        InputError: the distortion of its lens cannot be undone.
+        InputError: the distortion of the lens cannot be undone.
     """
     width, height = shown_size(shot.path, head.size, shot.lens)
     lens = shot.lens.scaled(width, height)
@@ -324,7 +316,7 @@ def open_shot(shot: Shot, head: ImageHeader, size: tuple[int, int] | None, near:
 
 
 def shown_size(path: Path, size: tuple[int, int], lens: Lens) -> tuple[int, int]:
-    """Return width and height of an image: as stored, or turned by EXIF if its lens is that of the turned image.
+    """Return width and height of an image: as stored, or turned by EXIF if its lens fits the turned image.
 
     Args:
         path: the file.
@@ -338,15 +330,15 @@ def shown_size(path: Path, size: tuple[int, int], lens: Lens) -> tuple[int, int]
 
 
 def _fits_sideways(size: tuple[int, int], lens: Lens) -> bool:
-    """Return True if an image's sides agree better with its lens when they are swapped."""
+    """Return True if an image's aspect ratio fits its lens better with swapped sides."""
     width, height = size
     return abs(lens.width * width - lens.height * height) < abs(lens.width * height - lens.height * width)
 
 
 def _is_turned(image: Image.Image, lens: Lens) -> bool:
-    """Return True if EXIF lays an image on its side, and its lens is that of the image as it is shown.
+    """Return True if EXIF turns an image on its side, and its lens fits the turned image.
 
-    Programs that compute poses read pixels either as stored or as shown: the image size in their files tells which.
+    Programs that compute poses may use pixels as stored or as turned; the image size in their files shows which.
     """
     sideways = _fits_sideways(image.size, lens)
     return sideways and image.getexif().get(ExifTags.Base.Orientation) in _ON_ITS_SIDE
@@ -362,7 +354,7 @@ def _turn_upright(pixels: U8, image: Image.Image) -> U8:
 def _read_pixels(
     path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool, with_alpha: bool
 ) -> U8:
-    """Return the pixels of a file, straight, in the requested size; turned as EXIF specifies, or as they are stored."""
+    """Return the undistorted pixels of a file in the requested size, `turned` by EXIF or as stored."""
     with open_image(path) as stored:
         pixels = rgb_pixels(stored, path)
         if not with_alpha:
@@ -372,14 +364,14 @@ def _read_pixels(
     if lens.distorts:
         pixels = _undistort(pixels, lens, straight)
     if size is not None and size != (pixels.shape[1], pixels.shape[0]):
-        # Bicubic, as INRIA's loader; its negative lobes would push colours beyond a clipped alpha.
+        # Bicubic, like INRIA's loader; with alpha, its negative lobes would push colours beyond a clipped alpha.
         method = Image.Resampling.BICUBIC if pixels.shape[2] == 3 else Image.Resampling.HAMMING
         pixels = np.asarray(Image.fromarray(pixels).resize(size, method))
     return np.ascontiguousarray(pixels)
 
 
 def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> Mask:
-    """Return which pixels of an image count: its mask, which may be larger or smaller, is brighter than half there."""
+    """Return the pixels of an image that count, those with a mask brighter than half; the mask's size may differ."""
     sides = int(lens.width), int(lens.height)
     with open_image(path) as stored:
         values = mask_values(stored, path).values
@@ -395,7 +387,7 @@ def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | N
 
 
 def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
-    """Undistort an image, linearly between pixels, colours weighted by their alpha."""
+    """Undistort an image by linear interpolation, with colours weighted by their alpha."""
     height, width = pixels.shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y = distorted(u, v, lens, straight)
@@ -415,11 +407,11 @@ _GREY = 127.5
 
 
 def finite_points(points: F64, colours: F64) -> tuple[F64, F32]:
-    """Leave out points that are not finite or beyond float32.
+    """Drop points that are not finite or overflow float32.
 
     Args:
         points: [P, 3].
-        colours: [P, 3], 0 to 255; clipped to that.
+        colours: [P, 3], clipped to 0..255.
 
     Returns:
         Points, [P, 3] float64, and their colours, [P, 3] float32 in 0..1.
@@ -429,16 +421,16 @@ def finite_points(points: F64, colours: F64) -> tuple[F64, F32]:
 
 
 def read_point_cloud(path: Path) -> tuple[F64, F32]:
-    """Read the points of a PLY, with or without colours; without, all are grey.
+    """Read the points of a PLY; without colours, all are grey.
 
     Args:
-        path: the file: columns x, y, z; red, green, blue as bytes, 16-bit integers, or floats from 0 to 1.
+        path: the file, with columns x, y, z; red, green, blue as bytes, 16-bit integers, or floats from 0 to 1.
 
     Returns:
         As `finite_points`.
 
     Raises:
-        InputError: it is not a complete PLY, or has no points.
+        InputError: the file is not a complete PLY, or has no points.
     """
     findings: list[Finding] = []
     try:

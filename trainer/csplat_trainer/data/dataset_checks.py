@@ -1,4 +1,4 @@
-"""Checks of a data set's statements against its files: sizes, lenses, poses; and notes on how they were read."""
+"""Checks of a data set's consistency: sizes, lenses, poses; and notes on the interpretation of its files."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from csplat_trainer.data.image_pixels import ImageHeader, image_size, mask_value
 from csplat_trainer.data.lens import Lens, undistorted_lens
 
 _ROUNDING = 1.0  # pixels by which each side of a scaled-down image may be rounded
-_NEARLY = 0.02  # relative difference of scales across and down, beyond which an image is turned or a mask is wrong
-_MIDDLE = (0.25, 0.75)  # fractions of the image: principal points outside this range are reported
+_NEARLY = 0.02  # relative difference of both scales, beyond which an image is turned or a mask belongs to another
+_MIDDLE = (0.25, 0.75)  # fractions of the image; principal points outside this range are reported
 _SMALL_RANGE = 1.0 / 8.0  # fraction of the 16-bit range; 12-bit images use less
 _SAME = 1e-9  # relative difference of positions; coordinates of maps are a million times the distance of cameras
 _FEW = 4  # cameras; fewer need not have a common subject
 _AIMED = 0.98  # median cosine, see `convergence`
 _PARALLEL = 0.05  # least mean square across lines of sight that are not parallel
-_MEETING = 0.1  # fraction of the distance to a point; lines of sight that pass it nearer meet there
-_SHOTS, _POINTS = 64, 4096  # largest numbers of shots and points that are checked for visibility
+_MEETING = 0.1  # fraction of the distance to a point; lines of sight that pass it at less meet there
+_SHOTS, _POINTS = 64, 4096  # largest numbers of shots and points to check for visibility
 
 
 def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> None:
-    """Check that lenses are plausible, and that images have their cameras' sizes and masks their images'.
+    """Check that lenses are plausible, and that images fit their cameras and masks their images.
 
     Args:
         shots: all shots of a set.
         heads: headers of their image files.
 
     Raises:
-        InputError: something contradicts itself.
+        InputError: the set is inconsistent.
     """
     for lens in {shot.lens: None for shot in shots}:
         check_intrinsics((lens.fx, lens.fy), (lens.cx, lens.cy), (lens.width, lens.height), lens.source)
@@ -46,28 +46,28 @@ def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> Non
         lens, size = shot.lens, shown_size(shot.path, heads[shot.path].size, shot.lens)
         wanted = (lens.width, lens.height)
         if _aspect_mismatch(size, wanted) > _NEARLY >= _aspect_mismatch((size[1], size[0]), wanted):
-            source = f"which {lens.source} states" if lens.source else "its camera's"
-            remedy = "the sides are swapped: turn the images, or find poses of them as they are"
+            source = f"given by {lens.source}" if lens.source else "that of its camera"
+            remedy = "the sides are swapped: turn the images, or compute poses of the images as stored"
             raise _aspect_error(shot.path, size, wanted, source, remedy)
         if shot.mask is not None:
             mask_size = shown_size(shot.mask, image_size(shot.mask), lens)
             if _aspect_mismatch(mask_size, size) > _NEARLY:
                 remedy = "it is the mask of another image"
-                raise _aspect_error(shot.mask, mask_size, size, f"its image's ({shot.name})", remedy)
+                raise _aspect_error(shot.mask, mask_size, size, f"that of its image ({shot.name})", remedy)
 
 
 def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> list[str]:
-    """Report pixels, turns and masks that could mean something else.
+    """Report pixel formats, orientations and masks with more than one interpretation.
 
     Raises:
-        InputError: a file that is read is damaged.
+        InputError: a file is damaged.
     """
     notes = []
     for stored_as in sorted({head.stored_as for head in heads.values()} - {""}):
         files = [path for path, head in heads.items() if head.stored_as == stored_as]
         low, high, white = value_range(files[0])
         line = f"{counted(len(files), 'image')} of {stored_as}: 0 to {white:g} is read as black to white"
-        line += f"; the first, {files[0].name}, holds {low:g} to {high:g}"
+        line += f"; the first, {files[0].name}, has {low:g} to {high:g}"
         notes.append(line + (": scale them if that is too dark" if high < _SMALL_RANGE * white else ""))
     several = [head for head in heads.values() if head.frame_count > 1]
     if several:
@@ -78,26 +78,26 @@ def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) ->
     if misfits:
         (width, height), lens = sizes[misfits[0].path], misfits[0].lens
         notes.append(
-            f"{counted(len(misfits), 'image')} not of the shape of their cameras' ({misfits[0].path.name}: "
-            f"{width}×{height}, {lens.width:g}×{lens.height:g}): each side is scaled by itself, which suits squeezed "
-            "images; cropped ones need other intrinsics"
+            f"{counted(len(misfits), 'image')} with another aspect ratio than their cameras ({misfits[0].path.name}: "
+            f"{width}×{height}, {lens.width:g}×{lens.height:g}): each side is scaled separately, as for squeezed "
+            "images; cropped images require other intrinsics"
         )
     turned = [path for path, size in sizes.items() if size != heads[path].size]
     if turned:
         many = counted(len(turned), "image")
-        notes.append(f"{many} turned as EXIF says: their cameras' sizes are those of images as shown")
+        notes.append(f"{many} turned as EXIF specifies, since their cameras have the size of turned images")
     as_stored = [head for path, head in heads.items() if path not in turned and _turn_is_undecided(head)]
     if as_stored:
         notes.append(
             f"EXIF turns {counted(len(as_stored), 'image')} ({as_stored[0].path.name}: orientation "
-            f"{as_stored[0].orientation}): read as stored; if their poses are those of images as shown, turn the files"
+            f"{as_stored[0].orientation}): read as stored; if their poses are of turned images, turn the files"
         )
     mask = next((shot.mask for shot in shots if shot.mask is not None), None)
     if mask is not None:
         with open_image(mask) as image:
             taken_as = mask_values(image, mask).taken_as
         if taken_as:
-            notes.append(f"masks as {mask.name}: {taken_as}")
+            notes.append(f"masks such as {mask.name}: {taken_as}")
     return notes
 
 
@@ -112,7 +112,7 @@ def describe_lenses(shots: Sequence[Shot]) -> list[str]:
     wide = [straight for lens, straight in bent if lens.projection == "equidistant"]
     if wide:
         angle = min(2.0 * math.degrees(math.atan(0.5 * one.width / one.fx)) for one in wide)
-        notes.append(f"fisheye images are cut to what a pinhole shows: {angle:.0f} degrees across")
+        notes.append(f"fisheye images are cropped to the view of a pinhole: {angle:.0f} degrees across")
     off = [lens for lens in lenses if not _is_in_the_middle(lens)]
     if off:
         lens = off[0]
@@ -124,7 +124,7 @@ def describe_lenses(shots: Sequence[Shot]) -> list[str]:
 
 
 def describe_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | None) -> list[str]:
-    """Report cameras that are all at one place, see none of the points, or look like inverted poses.
+    """Report cameras that are all at one place, see none of the points, or seem to be inverted poses.
 
     Args:
         shots: all training and test images.
@@ -134,23 +134,23 @@ def describe_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
     places = np.stack([-shot.viewmat[:3, :3].T @ shot.viewmat[:3, 3] for shot in shots])
     spread = np.ptp(places, axis=0).max()
     if len(shots) > 1 and spread <= _SAME * (1.0 + np.abs(places).max()):
-        notes.append(f"all {len(shots)} cameras stand at one place: depth cannot be found from these images")
+        notes.append(f"all {len(shots)} cameras are at one place: these images do not determine depth")
     if points is not None and len(points):
         some_shots, some_points = shots[:: -(-len(shots) // _SHOTS)], points[:: -(-len(points) // _POINTS)]
         blind = [shot for shot in some_shots if not _sees_any(shot, some_points)]
         if 2 * len(blind) > len(some_shots):
             inverted = [replace(shot, viewmat=np.asarray(np.linalg.inv(shot.viewmat))) for shot in blind]
-            cause = "are the poses and the points of one scene?"
+            cause = "check that poses and points belong to the same scene"
             if 2 * sum(_sees_any(shot, some_points) for shot in inverted) > len(blind):
-                cause = "with inverted poses they would: the file holds the inverse of what it should"
+                cause = "with inverted poses they would: invert the poses in the file"
             what = f"{len(blind)} of {len(some_shots)} cameras ({blind[0].name}, …) see none of the points"
             return [*notes, f"{what}: {cause}"]
         return notes
     viewmats = np.stack([shot.viewmat for shot in shots])
     if len(shots) >= _FEW and _is_panorama(viewmats[~camera_outliers(viewmats)]):
         notes.append(
-            "all cameras look away from what they stand around, as in a panorama: if that is wrong, the poses are "
-            "inverted, or have other axes than files of this kind"
+            "all cameras look outwards, as in a panorama: if that is wrong, the poses are inverted, or have other axes"
+            " than files of this kind"
         )
     return notes
 
@@ -170,7 +170,7 @@ def _is_panorama(viewmats: NDArray[np.float64]) -> bool:
 
 
 def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
-    """Return True if a point lies in front of a camera, and within twice the width and height of its image."""
+    """Return True if a point is in front of a camera, and within twice the width and height of its image."""
     x, y, z = (points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]).T
     lens = shot.lens
     across, down = np.abs(x) * lens.fx <= lens.width * z, np.abs(y) * lens.fy <= lens.height * z
@@ -181,11 +181,11 @@ def _aspect_error(
     path: Path, size: tuple[int, int], wanted: tuple[float, float], source: str, remedy: str
 ) -> InputError:
     found, shape = f"{size[0]}×{size[1]}", f"{wanted[0]:g}×{wanted[1]:g}"
-    return InputError(f"{path} is {found} pixels, expected the shape of {shape}, {source}: {remedy}")
+    return InputError(f"{path} has {found} pixels, expected the aspect ratio of {shape}, {source}: {remedy}")
 
 
 def _aspect_mismatch(size: tuple[int, int], wanted: tuple[float, float]) -> float:
-    """Return how much more an image is scaled along one side than the other, relative; 0 if rounding explains it."""
+    """Return the relative difference of an image's scales along both sides; 0 if rounding explains it."""
     (low_x, high_x), (low_y, high_y) = (
         ((side - _ROUNDING) / (other + _ROUNDING), (side + _ROUNDING) / max(other - _ROUNDING, 0.5))
         for side, other in zip(size, wanted, strict=True)
@@ -202,6 +202,6 @@ def _is_in_the_middle(lens: Lens) -> bool:
 
 
 def _turn_is_undecided(head: ImageHeader) -> bool:
-    """Return True if EXIF turns an image and its camera's size leaves open whether the camera's program did so."""
+    """Return True if EXIF turns an image, and its camera's size does not show if poses are of the turned image."""
     width, height = head.size
     return head.orientation in (2, 3, 4) or (head.orientation in (5, 6, 7, 8) and width == height)

@@ -1,20 +1,18 @@
 r"""Find the image files that a data set names.
 
-Programs that write poses often run on another machine than the one with the images: names differ in separators,
-suffixes, case and folders. A name is first searched exactly as written. If that fails, it is matched more loosely, by
-one rule after the other, and every rule that was needed is reported:
+Poses are often computed on another machine, so names may differ in separators, suffixes, case and folders. A name is
+matched by these rules in order, and every rule but the first is reported when it is used:
 
 1. as written;
-2. `\` as `/`, without a drive letter and spaces around it;
+2. `\` as `/`, without a drive letter and surrounding spaces;
 3. as a URL: without `file:`, `%20` as a space;
 4. in another case or Unicode form;
 5. with another image suffix, or with one if there is none (Blender's names), in any case;
-6. without its leading folders, if rules 1 to 5 find nothing at all;
-7. in a folder below, if rule 6 finds nothing either.
+6. without its leading folders, if rules 1 to 5 match no name at all;
+7. in a folder below, if rule 6 matches none either.
 
-Rules 4 to 7 read names as rules 2 and 3 do.
-
-A name that fits two files is an error, and so are two names that fit one.
+Rules 4 to 7 also apply rules 2 and 3. A name that matches two files is an error, and so are two names that match one
+file.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ _Key = Callable[[str], str]
 
 
 class NoImagesError(InputError):
-    """Error: none of the images that a set names is there."""
+    """None of the images that a set names exists."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +45,9 @@ class FoundImages:
     """Image files of a data set.
 
     Attributes:
-        folder: that the names are relative to.
-        files: by the name as the set writes it, without those that are missing.
-        notes: a line for each rule that was needed.
+        folder: the folder that names are relative to.
+        files: existing files, by the name in the set.
+        notes: a line for each rule that was used.
     """
 
     folder: Path
@@ -58,34 +56,34 @@ class FoundImages:
 
 
 def normalise_name(name: str) -> str:
-    """Return a path with `/` between its parts, without `.`, empty parts, spaces around it and a drive letter."""
+    """Return a path with `/` between its parts, without `.`, empty parts, surrounding spaces and a drive letter."""
     return PurePosixPath(re.sub(r"^[A-Za-z]:(?=[\\/])", "", name.strip()).replace("\\", "/")).as_posix()
 
 
 def describe_missing(missing: Sequence[str], count: int, where: str) -> list[str]:
-    """Report missing images: one line, or none if all are there."""
+    """Return a line on missing images, or none if all exist."""
     if not missing:
         return []
-    return [f"{where}: {len(missing)} of {counted(count, 'image')} are missing and left out: {abbreviate(missing)}"]
+    return [f"{where}: {len(missing)} of {counted(count, 'image')} are missing and dropped: {abbreviate(missing)}"]
 
 
 def find_images(
     root: Path, names: Sequence[str], where: str, folders: Sequence[str], size: tuple[int, int] | None = None
 ) -> FoundImages:
-    """Find the images that a set names, in the first of some folders that holds any of them.
+    """Find the images that a set names, in the first of some folders that has any of them.
 
     Args:
         root: the folder of the set.
-        names: as the set writes them, at least one.
+        names: names in the set, at least one.
         where: the file that names them, for messages.
-        folders: to try, relative to `root`, in this order; `.` is `root` itself, and comes last where leading folders
-            of the names are left out. Each includes folders of smaller images next to it: `images` includes
+        folders: folders to try in this order, relative to `root`. `.` is `root` itself; it comes last when leading
+            folders of names are ignored. Each includes folders of smaller images next to it: `images` includes
             `images_2`, `images_4`, …
-        size: wanted width and height: the smallest of such folders that is large enough is taken; `None`: the first.
+        size: requested width and height, for which the smallest sufficient of such folders is used; `None`: the first.
 
     Raises:
-        NoImagesError: none of the images is there.
-        InputError: as `match_names`.
+        NoImagesError: none of the images exists.
+        InputError: as for `match_names`.
     """
     groups = {folder: _size_folders(root, folder) for folder in dict.fromkeys(folders)}
     for loose in (False, True):
@@ -98,7 +96,7 @@ def find_images(
     others = next((name for paths in groups.values() for path in paths for name in _images_below(path)), None)
     hint = f"; there are other images, such as {others}" if others else ""
     raise NoImagesError(
-        f"{where}: none of its {len(names)} images is there ({abbreviate(names[:1])}, …): looked in {tried}{hint}"
+        f"{where}: none of its {len(names)} images exists ({abbreviate(names[:1])}, …): searched {tried}{hint}"
     )
 
 
@@ -107,13 +105,13 @@ def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
 
     Args:
         root: the folder of the set.
-        names: of the images, as the set writes them.
+        names: names of the images in the set.
 
     Returns:
         The masks by names of images; `None` if there is no such folder.
 
     Raises:
-        InputError: as `match_names`.
+        InputError: as for `match_names`.
     """
     folder = next((folder for name in ("masks", "mask") for folder in _size_folders(root, name)[:1]), None)
     if folder is None:
@@ -131,12 +129,12 @@ def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
 
 
 def describe_masks_among(images: Sequence[Path]) -> list[str]:
-    """Report masks that lie next to the images: a line, or none if there are none."""
+    """Return a line on masks next to the images, or none if there are none."""
     stems = {path.stem for path in images}
     for name in _images_below(images[0].parent) if images else ():
         stem, path = PurePosixPath(_without_affix(name)).stem, PurePosixPath(name)
         if stem in stems and (stem != path.stem or path.parent.name.casefold() in ("mask", "masks")):
-            return [f"there are masks next to the images, such as {name}: they are read from a folder masks alone"]
+            return [f"masks next to the images, such as {name}, are ignored: put them into a folder masks"]
     return []
 
 
@@ -149,19 +147,19 @@ def _without_affix(name: str) -> str:
 def match_names(
     names: Iterable[str], known: Iterable[str], where: str, *, folders: bool = True
 ) -> tuple[dict[str, str], list[str]]:
-    """Match names that a file lists with names that are there, by the rules of this module.
+    """Match listed names with existing ones, by the rules of this module.
 
     Args:
-        names: as they are listed.
-        known: as they are there, with `/`.
-        where: what lists them, for messages.
+        names: listed names.
+        known: existing names, with `/`.
+        where: the file that lists them, for messages.
         folders: use rules 6 and 7.
 
     Returns:
-        Known names by listed ones, without those that are missing; and a line for each rule that was needed.
+        Existing names by listed ones, without missing ones; and a line for each rule that was used.
 
     Raises:
-        InputError: a name fits two known ones, or two names fit one.
+        InputError: a name matches two existing ones, or two names match one.
     """
     left, free = dict.fromkeys(names), dict.fromkeys(known)
     matched: dict[str, str] = {}
@@ -184,7 +182,7 @@ def match_names(
 
 
 def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
-    """Yield the rules in order: a description, and keys of listed and of known names, equal if names match."""
+    """Yield the rules in order: a description, and functions that map matching listed and known names to equal keys."""
 
     def decoded(name: str) -> str:
         return normalise_name(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
@@ -213,7 +211,7 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
         return lambda name: "/".join(parts(name)[-count:])
 
     yield "", [(_as_written, _as_written)]
-    yield "with / for \\, without spaces around it", [(normalise_name, normalise_name)]
+    yield "with / for \\, without surrounding spaces", [(normalise_name, normalise_name)]
     yield "as a URL", [(decoded, normalise_name)]
     yield "in another case", [(folded, folded)]
     yield "with another ending", [(unended, unended), (lambda name: folded(unended(name)),) * 2]
@@ -245,11 +243,11 @@ def _matched(
     for name in names:
         fitting = index.get(listed_key(name), [])
         if len(fitting) > 1:
-            raise InputError(f"{where}: {name} fits {len(fitting)} names: {abbreviate(sorted(fitting))}")
+            raise InputError(f"{where}: {name} matches {len(fitting)} files: {abbreviate(sorted(fitting))}")
         if fitting:
             other = taken.setdefault(fitting[0], name)
             if other != name:
-                raise InputError(f"{where}: {other} and {name} both fit {fitting[0]}")
+                raise InputError(f"{where}: {other} and {name} both match {fitting[0]}")
             found[name] = fitting[0]
     return found
 
@@ -259,12 +257,12 @@ def _only_lacks_ending(name: str, known: str) -> bool:
 
 
 def abbreviate(names: Sequence[str]) -> str:
-    """Return names for a message, the first few of them."""
+    """Return the first few names, for a message."""
     return ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
 
 
 def _size_folders(root: Path, folder: str) -> list[Path]:
-    """Find a folder and those of smaller images next to it, the largest images first; in another case if need be."""
+    """Find a folder, in any case, and those of smaller images next to it, the largest images first."""
     path = root / folder
     if folder == "." or not path.parent.is_dir():
         return [path] if path.is_dir() else []
@@ -295,10 +293,10 @@ def _is_large(found: FoundImages, size: tuple[int, int]) -> bool:
 
 
 def _images_below(folder: Path) -> Iterator[str]:
-    """Yield the images below a folder, sorted, relative to it, without hidden ones and those of macOS' archives."""
+    """Yield the sorted relative paths of images below a folder, without hidden ones and those of macOS' archives."""
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
         for name in sorted(files):
             is_image = name.lower().endswith(IMAGE_ENDINGS) and not name.startswith(".")
-            if is_image and Path(place, name).exists():  # no link to nowhere
+            if is_image and Path(place, name).exists():  # not a dangling link
                 yield Path(place, name).relative_to(folder).as_posix()

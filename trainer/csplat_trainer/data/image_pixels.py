@@ -1,6 +1,6 @@
-"""Image files: their headers, their pixels as RGB or RGBA in 8 bits, and the values of masks.
+"""Image files: headers, pixels as RGB or RGBA in 8 bits, and values of masks.
 
-Every pixel format that pillow opens is converted by its meaning, or refused by name:
+Every pixel format that pillow opens is converted, or refused by name:
 
 | stored as | read as |
 |---|---|
@@ -34,13 +34,13 @@ _CONVERTED = (*_WITH_ALPHA, "1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LAB"
 _GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
 _GREY_16_IN_32 = ("PNG", "PPM")  # formats whose 16-bit grey pillow stores in 32 bits
 _FLOAT = "F"
-_DEEP = ";16"  # in pillow's names of raw data of which it keeps the upper 8 bits
-_FLOAT_TOLERANCE = 1e-3  # of a range of 0 to 1, for files that were resampled
+_DEEP = ";16"  # in pillow's names of raw data, of which it keeps the upper 8 bits
+_FLOAT_TOLERANCE = 1e-3  # excess over the range of 0 to 1, for resampled files
 _WHITE_IS_ZERO, _IN_PLANES = 0, 2  # TIFF 6.0: PhotometricInterpretation, PlanarConfiguration
-_OPAQUE = 250  # least alpha that is 1 up to rounding
+_OPAQUE = 250  # least alpha that counts as 1
 _HEAD_SIZE = 64
 
-# Common image formats that pillow does not open: offset and value of their first bytes.
+# Common image formats that pillow does not open: offset and value of their magic numbers.
 _UNREAD = (
     (0, b"\x76\x2f\x31\x01", "an OpenEXR file, which is not read"),
     (0, b"#?", "a Radiance HDR file, which is not read"),
@@ -64,7 +64,7 @@ class ImageHeader:
         size: width and height as stored.
         stored_as: pixel format if its meaning is ambiguous: `16-bit grey`, `16-bit colours`, `floats`; else "".
         has_alpha: True if there is transparency.
-        orientation: orientation by EXIF, 1 to 8; 1 is upright. For a TIFF always 1: pillow turns it.
+        orientation: EXIF orientation, 1 to 8; 1 is upright. Always 1 for a TIFF, which pillow turns.
         frame_count: number of images in the file; the first is read.
     """
 
@@ -81,8 +81,8 @@ class MaskValues:
     """The values of a mask, 0..255.
 
     Attributes:
-        values: [H, W] uint8; pixels count from `MASK_THRESHOLD` on.
-        taken_as: how the file was understood if it is not black and white; else "".
+        values: [H, W] uint8; pixels of at least `MASK_THRESHOLD` count.
+        taken_as: interpretation of the file if it is not black and white; else "".
     """
 
     values: U8
@@ -91,10 +91,10 @@ class MaskValues:
 
 @contextmanager
 def open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image and read its header. Errors in the rest are reported in the same way.
+    """Open an image and read its header; errors of pillow within the context are converted.
 
     Raises:
-        InputError: the file is no image, or of a kind that is not read.
+        InputError: the file is not an image, or is damaged or not supported.
     """
     if path.suffix.lower() in _RAW:
         raise InputError(f"{path} is a camera's raw file, expected an image: develop it to PNG or JPEG")
@@ -111,11 +111,11 @@ def read_image_header(path: Path) -> ImageHeader:
     """Read the header of an image file; pixels are not decoded.
 
     Raises:
-        InputError: the file is no image, or its pixels are of a kind that is refused.
+        InputError: the file is not an image, or its pixel format is refused.
     """
     with open_image(path) as image:
         stored_as, has_alpha = _stored_as(image, path), _has_alpha(image)
-        # The plug-in for PNG would decode all pixels to find EXIF behind them; that for TIFF turns the image itself.
+        # For a PNG, image.getexif would decode all pixels to find EXIF after them. A TIFF is turned by pillow.
         orientation = 1
         if image.format != "TIFF":
             orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
@@ -125,18 +125,18 @@ def read_image_header(path: Path) -> ImageHeader:
 
 
 def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
-    """Find images whose alpha channel is redundant, as some exporters write.
+    """Find images with a redundant alpha channel, as written by some exporters.
 
-    Alpha is decoded until an image has some transparency: then alpha is kept for all images.
+    Images are decoded until one has some transparency.
 
     Args:
         heads: headers of the files of a set.
 
     Returns:
-        All images with an alpha channel if it is 1 all over all of them; else none.
+        All images with an alpha channel if it is 1 everywhere in all of them; else none.
 
     Raises:
-        InputError: a file that is read is damaged.
+        InputError: a file is damaged.
     """
     with_alpha = [head for head in heads if head.has_alpha]
     for head in with_alpha:
@@ -147,7 +147,7 @@ def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
 
 
 def image_size(path: Path) -> tuple[int, int]:
-    """Return width and height of an image file; its pixels are not read."""
+    """Return width and height of an image file."""
     with open_image(path) as image:
         return image.size
 
@@ -156,14 +156,14 @@ def rgb_pixels(image: Image.Image, path: Path) -> U8:
     """Decode an image.
 
     Args:
-        image: as opened.
+        image: the opened image.
         path: its file, for messages.
 
     Returns:
         [H, W, 3], or [H, W, 4] if the file has transparency.
 
     Raises:
-        InputError: pixels are of a kind that is refused, or floats lie beyond 0 to 1.
+        InputError: the pixel format is refused, or floats are outside 0 to 1.
     """
     _stored_as(image, path)
     if image.mode in _CONVERTED:
@@ -179,11 +179,11 @@ def rgb_pixels(image: Image.Image, path: Path) -> U8:
 def mask_values(image: Image.Image, path: Path) -> MaskValues:
     """Decode a mask: white for pixels that count.
 
-    If all colours are the same and alpha is not, alpha is the mask. If no pixel is brighter than half and there are at
-    most two values, 0 and another, as in masks of 0 and 1 and in label images, pixels other than 0 count.
+    If all colours are equal and alpha varies, alpha is the mask. If no pixel is brighter than half, and the values are
+    0 and one other, as in masks of 0 and 1 and in label images, pixels other than 0 count.
 
     Raises:
-        InputError: as `rgb_pixels`; or no pixel is brighter than half and there are more than two values.
+        InputError: as for `rgb_pixels`; or no pixel is brighter than half, and there are more than two values.
     """
     taken_as = ""
     if image.mode not in _CONVERTED:
@@ -193,14 +193,14 @@ def mask_values(image: Image.Image, path: Path) -> MaskValues:
         if _has_alpha(image) and values.min() == values.max():
             alpha = np.asarray(image.convert("RGBA"))[..., 3]
             if alpha.min() < alpha.max():
-                values, taken_as = alpha, "colours are alike all over: alpha is the mask"
+                values, taken_as = alpha, "all colours are equal: alpha is the mask"
     top = int(values.max())
     if 0 < top < MASK_THRESHOLD:
         found = np.unique(values)
         if len(found) > 2 or (len(found) == 2 and found[0] > 0):
             raise InputError(
-                f"{path} is a mask of values from {found[0]} to {top}, expected {MASK_THRESHOLD} or more where its "
-                "image counts"
+                f"{path} is a mask of values from {found[0]} to {top}, expected at least {MASK_THRESHOLD} for pixels"
+                " that count"
             )
         taken_as = f"values are {' and '.join(str(value) for value in found)}: {top} counts as white"
         values = np.where(values > 0, 255, 0).astype(np.uint8)
@@ -208,7 +208,7 @@ def mask_values(image: Image.Image, path: Path) -> MaskValues:
 
 
 def value_range(path: Path) -> tuple[float, float, float]:
-    """Return the least and the greatest value of an image as stored, and which value is read as white."""
+    """Return the least and the largest value of an image as stored, and the value of white."""
     with open_image(path) as image:
         white = 1.0 if image.mode == _FLOAT else 255.0 if image.mode in _CONVERTED else 65535.0
         stored = np.asarray(image)
@@ -223,12 +223,12 @@ def _stored_as(image: Image.Image, path: Path) -> str:
     """Return the pixel format if its meaning is ambiguous; else "".
 
     Raises:
-        InputError: they are of a kind that is refused.
+        InputError: the pixel format is refused.
     """
     if isinstance(image, TiffImagePlugin.TiffImageFile):
         bits = image.tag_v2.get(TiffImagePlugin.BITSPERSAMPLE, (1,))
         if image.tag_v2.get(TiffImagePlugin.PLANAR_CONFIGURATION) == _IN_PLANES and len(bits) > 1 and max(bits) > 8:
-            raise InputError(f"{path} holds {max(bits)} bits in planes of one colour each, expected RGB pixel by pixel")
+            raise InputError(f"{path} has {max(bits)} bits in planes of one colour each, expected interleaved RGB")
     if image.mode in _CONVERTED:
         tiles = image.tile if isinstance(image, ImageFile.ImageFile) else []
         return "16-bit colours" if any(_DEEP in str(tile[3]) for tile in tiles) else ""
@@ -236,8 +236,8 @@ def _stored_as(image: Image.Image, path: Path) -> str:
         return "16-bit grey"
     if image.mode == _FLOAT:
         return "floats"
-    kind = "grey of 32 bits or with a sign" if image.mode == "I" else f"pixels of the kind {image.mode}"
-    raise InputError(f"{path} holds {kind}, expected 8 or 16 bits without a sign: convert it to PNG")
+    kind = "grey of 32 bits or with a sign" if image.mode == "I" else f"pixels of format {image.mode}"
+    raise InputError(f"{path} has {kind}, expected unsigned 8 or 16 bits: convert it to PNG")
 
 
 def _unit_grey(image: Image.Image, path: Path) -> F64:
@@ -251,12 +251,12 @@ def _unit_grey(image: Image.Image, path: Path) -> F64:
         return 1.0 - values if inverted else values
     low, high = float(stored.min()), float(stored.max())
     if not (low >= -_FLOAT_TOLERANCE and high <= 1.0 + _FLOAT_TOLERANCE):
-        raise InputError(f"{path} holds floats from {low:g} to {high:g}, expected 0 to 1: scale them, or save as PNG")
+        raise InputError(f"{path} has floats from {low:g} to {high:g}, expected 0 to 1: scale them, or save as PNG")
     return np.clip(stored.astype(np.float64), 0.0, 1.0)
 
 
 def _grey_mask(image: Image.Image, path: Path) -> U8:
-    """Convert a mask of more than 8 bits to 8: labels and values up to 255 are kept, others are scaled."""
+    """Convert a mask of more than 8 bits to 8; labels and values up to 255 are kept, others are scaled."""
     stored = np.asarray(image)
     low, high = float(stored.min()), float(stored.max())
     if low >= 0.0 and high <= 255.0 and (image.mode != _FLOAT or high > 1.0):
@@ -267,7 +267,7 @@ def _grey_mask(image: Image.Image, path: Path) -> U8:
 
 
 def _refuse_by_name(path: Path) -> None:
-    """Refuse a file that pillow does not open, by the name of its format if its first bytes identify it."""
+    """Refuse a file that pillow does not open; name its format if its first bytes identify it."""
     try:
         with path.open("rb") as file:
             head = file.read(_HEAD_SIZE)

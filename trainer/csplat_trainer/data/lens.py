@@ -1,8 +1,8 @@
 """Lenses: the position of an undistorted image's pixel in the original, and the pinhole of the undistorted image.
 
-A lens maps directions (x, y), with z = 1 ahead, to the plane of the image in two steps: a projection (perspective,
-equidistant as fisheyes have it, or the FOV model), then a distortion, of OpenCV's form in all of them:
-https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html. COLMAP's models but the newest are special cases:
+A lens maps directions (x, y), with z = 1 ahead, to the image plane in two steps: a projection (perspective, equidistant
+for fisheyes, or the FOV model), then a distortion of OpenCV's form:
+https://docs.opencv.org/4.x/d9/d0c/group__calib3d.html. All but the newest models of COLMAP are special cases:
 https://github.com/colmap/colmap/blob/main/src/colmap/sensor/models.h.
 """
 
@@ -21,9 +21,9 @@ from csplat.types import F64
 _ZOOM_STEP = 0.005
 _MAX_ZOOM = 1.5
 _BORDER_POINTS = 65
-_RAY_POINTS = 33  # from the principal point to the border
-_RAYS = 9  # to each side
-#: Command that straightens images of every lens that COLMAP supports.
+_RAY_POINTS = 33  # points per ray from the principal point to the border
+_RAYS = 9  # rays to each side
+#: Command that undistorts images of every lens that COLMAP supports.
 UNDISTORTER = "`colmap image_undistorter --image_path IMAGES --input_path SPARSE --output_path OUT`"
 
 _SMALL = 1e-8  # radius below which a projection is its limit
@@ -34,15 +34,12 @@ class Lens:
     """A camera's lens, for images of one size.
 
     Attributes:
-        width: width of the images that the numbers apply to, pixels.
-        height: the same.
-        fx: focal length across, pixels.
-        fy: focal length down, pixels.
-        cx: principal point, pixels; the centre of the first pixel lies at 0.5.
-        cy: the same.
+        width, height: size of the images that the parameters apply to, pixels.
+        fx, fy: focal lengths, pixels.
+        cx, cy: principal point, pixels; the centre of the first pixel is at 0.5.
         radial: k1, k2, …: factors of r², r⁴, … in the radial polynomial.
         tangential: p1, p2.
-        divisor: k4, k5, k6 of OpenCV's rational model: as `radial`, of the polynomial that divides.
+        divisor: k4, k5, k6 of OpenCV's rational model: factors of the polynomial in the denominator.
         prism: sx1, sy1 of thin prisms.
         projection: projection that precedes the distortion.
         omega: parameter of the FOV model (Devernay and Faugeras 2001), radians.
@@ -64,7 +61,7 @@ class Lens:
     source: str = field(default="", compare=False)
 
     def scaled(self, width: int, height: int) -> Lens:
-        """The same lens for images of another size; each axis is scaled by itself."""
+        """Return the lens for images of another size; each axis is scaled separately."""
         x, y = width / self.width, height / self.height
         return replace(self, width=width, height=height, fx=self.fx * x, fy=self.fy * y, cx=self.cx * x, cy=self.cy * y)
 
@@ -79,11 +76,11 @@ class Lens:
 def undistorted_lens(lens: Lens) -> Lens:
     """Return the pinhole camera of a lens's undistorted images.
 
-    The focal lengths grow, in steps of half a per cent, until every pixel of the straight image lies within the
-    distorted one, and none twice: no pixel at the border is undefined. A fisheye's border is cut off.
+    The focal lengths grow in steps of 0.5 % until every pixel of the undistorted image maps into the distorted one, and
+    no two to the same place, so that no pixel is undefined. The border of a fisheye image is cut off.
 
     Raises:
-        InputError: no reasonable zoom achieves that: the parameters do not describe such a lens.
+        InputError: no reasonable zoom achieves this, so the parameters are implausible.
     """
     zoom = 1.0
     while zoom <= _MAX_ZOOM:
@@ -95,8 +92,8 @@ def undistorted_lens(lens: Lens) -> Lens:
     names = ("radial", "tangential", "divisor", "prism", "omega")
     found = ", ".join(f"{name} {getattr(lens, name)}" for name in names if np.any(getattr(lens, name)))
     raise InputError(
-        f"{where}the distortion ({found}) cannot be undone over the whole image: it folds, or reaches farther beyond "
-        f"the border than a zoom of {_MAX_ZOOM:g} cuts off; check its numbers, or use {UNDISTORTER}"
+        f"{where}the distortion ({found}) cannot be undone over the whole image: it folds, or requires a zoom of more"
+        f" than {_MAX_ZOOM:g} to hide the border; check its parameters, or use {UNDISTORTER}"
     )
 
 
@@ -104,8 +101,7 @@ def distorted(u: F64, v: F64, lens: Lens, straight: Lens) -> tuple[F64, F64]:
     """Return the positions of pixels of the undistorted image in the distorted one.
 
     Args:
-        u: horizontal pixel coordinates, of any shape.
-        v: vertical pixel coordinates, of the same shape.
+        u, v: horizontal and vertical pixel coordinates, of any shape.
         lens: lens of the original.
         straight: pinhole of the undistorted image.
     """
@@ -135,7 +131,7 @@ def _projection_factor(r: F64, lens: Lens) -> F64:
 
 
 def _polynomial(factors: tuple[float, ...], r2: F64) -> F64:
-    """Return factors[0] r² + factors[1] r⁴ + …, by Horner's rule; zeros at the end cost nothing."""
+    """Return factors[0] r² + factors[1] r⁴ + …, by Horner's rule, skipping zeros at the end."""
     last = max((i for i, factor in enumerate(factors) if factor != 0.0), default=0)
     total = r2 * (factors[last] if factors else 0.0)
     for factor in reversed(factors[:last]):
@@ -144,7 +140,7 @@ def _polynomial(factors: tuple[float, ...], r2: F64) -> F64:
 
 
 def _border(lens: Lens, count: int) -> tuple[F64, F64]:
-    """Return centres of pixels along the four sides, `count` of each."""
+    """Return `count` centres of pixels along each of the four sides."""
     u = np.linspace(0.5, lens.width - 0.5, count)
     v = np.linspace(0.5, lens.height - 0.5, count)
     ends_u, ends_v = np.repeat(u[[0, -1]], count), np.repeat(v[[0, -1]], count)
@@ -153,14 +149,14 @@ def _border(lens: Lens, count: int) -> tuple[F64, F64]:
 
 def _border_is_inside(lens: Lens, straight: Lens) -> bool:
     x, y = distorted(*_border(lens, _BORDER_POINTS), lens, straight)
-    margin = 0.5 - 1e-6  # up to half a pixel beyond the centres the border's colour is valid
+    margin = 0.5 - 1e-6  # colours are valid up to half a pixel beyond the outermost centres
     inside = (x >= 0.5 - margin) & (x <= lens.width - 0.5 + margin)
     inside &= (y >= 0.5 - margin) & (y <= lens.height - 0.5 + margin)
     return bool(inside.all())
 
 
 def _is_one_to_one(lens: Lens, straight: Lens) -> bool:
-    """Return True if the order of distances from the principal point is kept, which polynomials may violate."""
+    """Return True if distances from the principal point are monotonic, which polynomials may violate."""
     u, v = _border(lens, _RAYS)
     along = np.linspace(0.0, 1.0, _RAY_POINTS)[:, None]
     x, y = distorted(lens.cx + along * (u - lens.cx), lens.cy + along * (v - lens.cy), lens, straight)

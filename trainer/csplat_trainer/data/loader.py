@@ -1,4 +1,4 @@
-"""`load`: recognise a data set, read it, place it, and report what was found."""
+"""`load`: recognise a data set, read it, choose its origin and axes, and report findings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from csplat_trainer.data.transforms import read_blender, read_transforms
 _SET_LEVELS = 2  # folders above a folder of images that may be its data set
 _SETS = ("transforms_train.json", "transforms.json")
 _MAX_NAMED = 3  # folders in a message, at most
-_AGREES = math.cos(math.radians(30.0))  # least cosine of the usual up direction with that of the cameras
+_AGREES = math.cos(math.radians(30.0))  # least cosine between the conventional up direction and that of the cameras
 
 
 def load(
@@ -42,16 +42,16 @@ def load(
     |---|---|
     | `transforms_train.json` | NeRF-synthetic, made with Blender; RGBA |
     | `transforms.json` | instant-ngp, nerfstudio |
-    | `sparse/0/cameras.bin` or `.txt` | COLMAP, as Mip-NeRF 360, Tanks and Temples, Deep Blending are laid out |
+    | `sparse/0/cameras.bin` or `.txt` | COLMAP, such as Mip-NeRF 360, Tanks and Temples, Deep Blending |
 
-    Statements of the files are checked against their contents (`dataset_checks`), and images are undistorted (`lens`).
+    Files are checked for consistency (`dataset_checks`), and images are undistorted (`lens`).
 
     Args:
-        path: its folder, or the `transforms.json`, or a folder of images in it: `garden/images_4`.
-        size: width and height to which all images are scaled, each axis by itself; `None`: unchanged.
-        images: the folder of images, such as `images_4`; `None`: the set's own; for COLMAP sets with `size` the
+        path: its folder, its `transforms.json`, or a folder of images in it, such as `garden/images_4`.
+        size: width and height to which all images are scaled, each axis separately; `None`: unchanged.
+        images: the folder of images, such as `images_4`; `None`: that of the set; for COLMAP sets with `size` the
             smallest that is large enough.
-        test_every: every Nth image is held out if the set names no test images; 0: none.
+        test_every: every Nth image is a test image if the set specifies none; 0: no test images.
         near: near plane of the cameras, scene units; `None`: derived from the set.
 
     Returns:
@@ -64,10 +64,10 @@ def load(
     if images is None:
         path, images = find_image_folder(path)
     if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
-        raise InputError(f"pictures of {size[0]}×{size[1]} pixels, wanted 1 to {MAX_IMAGE_SIZE} each way")
+        raise InputError(f"size is {size[0]}×{size[1]}, expected 1 to {MAX_IMAGE_SIZE} pixels per side")
     found = _read(path, size, images, test_every)
     if not found.train:
-        raise InputError(f"{path} leaves no images to train on")
+        raise InputError(f"{path} has no training images")
     doubts = describe_poses([*found.train, *found.test], found.points)
     found, origin = choose_origin(found)
     shots = [*found.train, *found.test]
@@ -89,9 +89,9 @@ def load(
     report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
     masked = sum(shot.mask is not None for shot in shots)
     if masked:
-        report.append(f"masks hide parts of {counted(masked, 'image')}: they do not count")
+        report.append(f"masks hide parts of {counted(masked, 'image')}, which do not count")
     if opaque:
-        report.append(f"alpha is 1 all over {counted(len(opaque), 'image')}: they count as images without alpha")
+        report.append(f"alpha is 1 everywhere in {counted(len(opaque), 'image')}: it is ignored")
     report += [*describe_lenses(shots), *describe_images(shots, heads), *doubts]
     with_alpha = sum(heads[shot.path].has_alpha for shot in shots)
     if 0 < with_alpha < len(shots):
@@ -100,13 +100,15 @@ def load(
     training_paths = {shot.path for shot in found.train}
     both = sum(shot.path in training_paths for shot in found.test)
     if both:
-        report.append(f"{counted(both, 'test image')} used for training, too: they do not show what new views are like")
+        report.append(
+            f"{counted(both, 'test image')} used for training, too: scores do not show the quality of new views"
+        )
     if found.points is None and not any(image.has_alpha for image in train):
         report.append("there are no points: splats start anywhere in view")
     colours = found.points_rgb
     if colours is not None and len(colours) and (colours == colours[0]).all():
         shade = " ".join(f"{value:.3g}" for value in colours[0].tolist())
-        report.append(f"all points have the colour {shade}: splats start with the colours of the images there")
+        report.append(f"all points have the colour {shade}: initial colours are taken from the images instead")
         colours = None
     axes, up, axes_note = _choose_axes(found.coordinate_system, shots)
     data = DataSet(
@@ -154,16 +156,16 @@ def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | N
     """Return the axes of a set, its up direction, and a line for the report.
 
     Args:
-        custom: usual axes of sets of this kind. Some files have other coordinates: then the cameras determine up.
+        custom: conventional axes of sets of this kind. If files have other coordinates, the cameras determine up.
         shots: all shots of the set.
     """
     level, usual = estimate_up_of_cameras([shot.viewmat for shot in shots]), up_of_axes(custom)
     if level is None:
-        return custom, usual, "" if usual else "which way is up is not known: the cameras were held at all angles"
+        return custom, usual, "" if usual else "the up direction is unknown: the cameras were held at all angles"
     if usual is None:
         return custom, level.up, str(level)
     if sum(a * b for a, b in zip(usual, level.up, strict=True)) < _AGREES:
-        return UNSPECIFIED, level.up, f"{level}; sets of this kind mostly have other axes"
+        return UNSPECIFIED, level.up, f"{level}; sets of this kind usually have other axes"
     return custom, usual, ""
 
 
@@ -186,13 +188,13 @@ def _read(path: Path, size: tuple[int, int] | None, images: str | None, test_eve
         return replace(found, report=[*model[1], *found.report])
     else:
         raise InputError(
-            f"{path} is no data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
-            f"or sparse/0/cameras.bin (COLMAP), or a folder of images in such a set{_suggest_place(path)}"
+            f"{path} is not a data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
+            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{_suggest_place(path)}"
         )
     if model is not None:
-        found = replace(found, report=[*found.report, "there is a COLMAP model too, which is not read"])
+        found = replace(found, report=[*found.report, "there is also a COLMAP model, which is ignored"])
     if found.kind == "Blender set" and (path / "transforms.json").is_file():
-        found = replace(found, report=[*found.report, "there is a transforms.json too, which is not read"])
+        found = replace(found, report=[*found.report, "there is also a transforms.json, which is ignored"])
     return found
 
 
@@ -203,47 +205,37 @@ def _suggest_images(path: Path) -> str:
 
 
 def _suggest_place(path: Path) -> str:
-    """Return a hint where the data set may be instead, or ""."""
+    """Return a hint on the path of the data set, or ""."""
     folders = [*sorted(path.glob("*/")), *sorted(path.glob("*/*/"))]
     sets = [one for one in folders if _is_set(one)]
     if sets:
-        return (
-            "; "
-            + ", ".join(one.relative_to(path).as_posix() for one in sets[:_MAX_NAMED])
-            + " in it may be what you want"
-        )
+        return "; did you mean " + ", ".join(one.relative_to(path).as_posix() for one in sets[:_MAX_NAMED]) + " in it?"
     if (path / "database.db").is_file():
-        return "; it holds a database of COLMAP, but no model yet: run `colmap mapper`"
+        return "; it has a database of COLMAP, but no model yet: run `colmap mapper`"
     return ""
 
 
 Origin = tuple[float, float, float]
 
-_NEAR_SIZES = 256.0  # sizes of the scene; farther from 0, a step of float32 exceeds 1.5e-5 of that size
+_NEAR_SIZES = 256.0  # distance from 0, in sizes of the scene; beyond, a step of float32 exceeds 1.5e-5 of the size
 
 
 def choose_origin(found: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
-    """Choose an origin for a set, and measure its cameras and points from there.
+    """Choose an origin for a set, and return its cameras and points relative to it, and the origin.
 
-    The origin is 0 if the set lies around 0 or near it. Else it is the middle of the cameras, rounded to a power of
-    ten below the size of the scene: coordinates of maps (UTM, ECEF) are millions of metres, of which float32 holds
-    halves.
-
-    Args:
-        found: result of a reader.
-
-    Returns:
-        The set relative to the origin, and the origin.
+    The origin is 0 if the set is around 0 or near it. Else it is the middle of the cameras, rounded to a power of ten
+    below the size of the scene: coordinates of maps (UTM, ECEF) are millions of metres, with a resolution of 0.5 in
+    float32.
 
     Raises:
-        InputError: a camera's position exceeds float32.
+        InputError: a camera's position overflows float32.
     """
     shots = [*found.train, *found.test, *found.val]
     viewmats = np.stack([shot.viewmat for shot in shots])
     for shot in shots:
         if not np.abs(shot.viewmat[:3, 3]).max() < np.finfo(np.float32).max:
             far = float(np.abs(shot.viewmat[:3, 3]).max())
-            raise InputError(f"the camera of {shot.name} stands {far:.3g} units from 0, expected a place in the scene")
+            raise InputError(f"the camera of {shot.name} is {far:.3g} units from 0, expected a place in the scene")
     viewmats = viewmats[~camera_outliers(viewmats, found.points)]
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     middle = np.median(positions, axis=0)
@@ -261,14 +253,14 @@ def choose_origin(found: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
     train, test, val = ([_relative_to(shot, origin) for shot in part] for part in (found.train, found.test, found.val))
     points = None if found.points is None else found.points - origin
     words = " ".join(str(value).removesuffix(".0") for value in (x, y, z))
-    report = f"coordinates lie far from 0: the scene is measured from its origin, {words}"
+    report = f"coordinates are far from 0: the scene is relative to the origin {words}"
     return replace(found, train=train, test=test, val=val, points=points, report=[*found.report, report]), (x, y, z)
 
 
 def describe_outliers(data: DataSet) -> str:
-    """Name the cameras that are far away from all others, in a sentence; return "" if there are none.
+    """Return a sentence on the cameras that are far from all others; "" if there are none.
 
-    They remain training, validation or test images: a training image that shows nothing has no effect.
+    They keep their roles: a training image that shows nothing has no effect.
     """
     if not data.outliers:
         return ""
@@ -277,8 +269,8 @@ def describe_outliers(data: DataSet) -> str:
     nearest, usual = float(distances[: len(data.outliers)].min()), float(np.median(distances[len(data.outliers) :]))
     times = f", {nearest / usual:,.4g} times the usual distance" if usual > 0.0 else ""
     names = [str(image.camera.image) for image in data.outliers]
-    who = f"the camera of {names[0]} stands" if len(names) == 1 else f"the cameras of {abbreviate(names)} stand"
-    text = f"{who} {nearest:,.4g} units from the others{times}: not counted for the scene's extent; check the poses"
+    subject = f"the camera of {names[0]} is" if len(names) == 1 else f"the cameras of {abbreviate(names)} are"
+    text = f"{subject} {nearest:,.4g} units from the others{times}: ignored for the scene's extent; check the poses"
     tested = sum(image in data.test for image in data.outliers)
     return f"{text}, {counted(tested, 'test image')} will score badly" if tested else text
 
@@ -289,22 +281,22 @@ def _relative_to(shot: Shot, origin: F64) -> Shot:
     return replace(shot, viewmat=viewmat)
 
 
-_TURNED = 0.03  # least second eigenvalue of the cameras' right axes: cameras are turned to several sides
-_TILT_MAX = 20.0  # degrees; cameras that were held less level determine nothing
-_UNDECIDED = 0.1  # cosine with the cameras' mean up below which they look down: up is then opposite to their view
+_TURNED = 0.03  # least second eigenvalue of the cameras' right axes if cameras look in various directions
+_TILT_MAX = 20.0  # degrees; cameras held less level do not determine up
+_UNDECIDED = 0.1  # cosine with the cameras' mean up, below which they look down, and up is opposite to their view
 
 
 @dataclass(frozen=True)
 class UpEstimate:
-    """Up direction according to the cameras of a set.
+    """Up direction estimated from the cameras of a set.
 
     Attributes:
         up: unit length, in the scene's coordinates.
-        tilt_degrees: median error of the images: of their horizons against level ones, or, if `by_horizons` is False,
-            of the cameras' own up against this one. Some images taken with the camera on its side change little.
-        by_horizons: True if up is the direction in which the cameras' right axes point least: people hold cameras level
-            and look up and down. It requires cameras that are turned to several sides; otherwise up is the mean of
-            the cameras' own.
+        tilt_degrees: median angle between the images' horizons and level ones or, if `by_horizons` is False, between
+            the cameras' own up and this one. It is robust to some images in portrait orientation.
+        by_horizons: True if up is the direction in which the cameras' right axes point least, since cameras are mostly
+            held level. This requires cameras that look in various directions; otherwise up is the mean of the
+            cameras' own.
     """
 
     up: Direction
@@ -314,8 +306,8 @@ class UpEstimate:
     def __str__(self) -> str:
         """Return the estimate in words."""
         words = " ".join(f"{value:g}" for value in self.up)
-        how = "their horizons lie" if self.by_horizons else "their own up lies"
-        return f"up is {words} by the cameras: {how} within {self.tilt_degrees:.1f} degrees of that, for half of them"
+        what = "horizon" if self.by_horizons else "own up"
+        return f"up is {words} by the cameras: for half of them the {what} is within {self.tilt_degrees:.1f} degrees"
 
 
 def estimate_up_of_cameras(viewmats: Sequence[F64]) -> UpEstimate | None:

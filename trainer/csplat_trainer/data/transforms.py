@@ -50,14 +50,14 @@ _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHE
 
 
 def read_blender(folder: Path, images: str | None = None) -> UnreadDataSet:
-    """Read a set with `transforms_train.json` and, mostly, `transforms_test.json` next to it.
+    """Read a set with `transforms_train.json` and, usually, `transforms_test.json` and `transforms_val.json`.
 
     Args:
-        folder: the folder of the files. The images of `transforms_val.json` are validation images.
-        images: the folder of images, by name; `None`: from the files.
+        folder: the folder of the files.
+        images: name of the folder of images; `None`: from the files.
 
     Raises:
-        InputError: a file has another content than its name suggests, or no image is found.
+        InputError: a file has unexpected contents, or no image is found.
     """
     report: list[str] = []
     train_path = folder / "transforms_train.json"
@@ -81,10 +81,10 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> U
     Args:
         path: the file.
         test_every: see `split_every`; used if the file lists neither training, validation nor test images.
-        images: the folder of images, by name; `None`: from the file.
+        images: name of the folder of images; `None`: from the file.
 
     Raises:
-        InputError: the file has another content than its name suggests, or no image is found.
+        InputError: the file has unexpected contents, or no image is found.
     """
     document, report = _load(path), list[str]()
     shots = _shots(document, path, images, report)
@@ -104,7 +104,7 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> U
 
 
 def _check_distinct(shots: Sequence[Shot], folder: Path) -> None:
-    """Refuse files that are found for several names, as test/r_0 and train/r_0 if only r_0.png is there."""
+    """Refuse files that match several names, such as test/r_0 and train/r_0 if only r_0.png exists."""
     names: dict[Path, str] = {}
     for shot in shots:
         other = names.setdefault(shot.path, shot.name)
@@ -136,7 +136,7 @@ def _shots(
     key: str = "frames",
     needed: bool = True,
 ) -> list[Shot]:
-    """Read the frames of a file's document, without those that lack an image or a pose; if needed, one at least."""
+    """Read the frames of a document, without those that lack an image or a pose; if `needed`, at least one."""
     folder = path.parent
     frames = _frames(document, key, path, report, needed=needed)
     names = [frame.name for frame in frames]
@@ -165,7 +165,7 @@ def _shots(
 
 
 def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[str], *, needed: bool) -> list[_Frame]:
-    """Check frames, and leave out those that are marked as bad, have no pose, or are there again."""
+    """Check frames, and drop those that are marked as bad, have no pose, or are repeated."""
     frames = document.get(field)
     if not isinstance(frames, list) or (needed and not frames):
         raise InputError(f"{path} lists no {field}")
@@ -176,7 +176,7 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
             raise InputError(f"{path}, frame {number} has no file_path")
         name = frame["file_path"]
         if any(character < " " for character in name):
-            raise InputError(f"{path}, frame {number}: file_path holds control characters")
+            raise InputError(f"{path}, frame {number}: file_path has control characters")
         key = PurePosixPath(name).as_posix()
         if frame.get("is_bad") is True:
             bad.append(name)
@@ -184,38 +184,38 @@ def _frames(document: Mapping[str, Any], field: str, path: Path, report: list[st
             lost.append(name)
         elif "transform_matrix" not in frame and "transform_matrix_start" in frame:
             raise InputError(
-                f"{path}, frame {number} has no transform_matrix but two, of the start and the end of its exposure: "
-                "rolling shutters are not read"
+                f"{path}, frame {number} has no transform_matrix, but one for the start and one for the end of its"
+                " exposure: rolling shutters are not supported"
             )
         elif key not in good:
             good[key] = _Frame(name, number, frame)
         elif good[key].values.get("transform_matrix") == frame.get("transform_matrix"):
             twice.append(name)
         else:
-            raise InputError(f"{path}, frame {number}: {name} is there twice, with different poses; expected each once")
+            raise InputError(f"{path}, frame {number}: {name} occurs twice, with different poses; expected each once")
     for words, names in (("marked as bad", bad), ("without a finite pose", lost)):
         if names:
-            report.append(f"{path.name}: {counted(len(names), 'frame')} {words}, left out: {abbreviate(names)}")
+            report.append(f"{path.name}: {counted(len(names), 'frame')} {words}, dropped: {abbreviate(names)}")
     if twice:
-        report.append(f"{path.name}: {counted(len(twice), 'frame')} there twice, read once: {abbreviate(twice)}")
+        report.append(f"{path.name}: {counted(len(twice), 'frame')} repeated, read once: {abbreviate(twice)}")
     if needed and not good:
         raise InputError(f"{path}: none of its {len(frames)} frames has a pose")
     return list(good.values())
 
 
 def _is_lost(frame: Mapping[str, Any]) -> bool:
-    """Return True if a frame's pose is null, or holds a number that is not finite, as when tracking was lost."""
+    """Return True if a frame's pose is null, or has a number that is not finite, as when tracking was lost."""
     if "transform_matrix" not in frame:
         return False
     matrix = frame["transform_matrix"]
     try:
         return matrix is None or not np.isfinite(np.array(matrix, np.float64)).all()
     except (TypeError, ValueError, OverflowError):
-        return False  # other contents are reported later
+        return False  # invalid contents are reported later
 
 
 def _folders(names: Sequence[str], images: str | None) -> list[str]:
-    """Return the folders to search for images: that of the file's names, then its last part, then the usual ones."""
+    """Return the folders to search for images: that of the names, then its last part, then the usual ones."""
     if images is not None:
         return [images]
     own = PurePosixPath(normalise_name(names[0])).parent
@@ -223,7 +223,7 @@ def _folders(names: Sequence[str], images: str | None) -> list[str]:
 
 
 def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str, Path]:
-    """Find the masks of frames, as nerfstudio names them: black where the image does not count."""
+    """Find the masks of frames in `mask_path`, as in nerfstudio: black for pixels that do not count."""
     named: dict[str, str] = {}
     for frame in frames:
         mask = frame.values.get("mask_path")
@@ -233,7 +233,7 @@ def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str,
             named[frame.name] = mask
     if not named:
         if (path.parent / "masks").is_dir():
-            report.append(f"there is a folder masks, which {path.name} does not mention (mask_path): it is not read")
+            report.append(f"the folder masks is ignored, since {path.name} does not refer to it (mask_path)")
         return {}
     try:
         masks = list(dict.fromkeys(named.values()))
@@ -243,14 +243,14 @@ def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str,
     report += found.notes
     missing = next(((name, mask) for name, mask in named.items() if mask not in found.files), None)
     if missing is not None:
-        raise InputError(f"{path}: there is no mask {missing[1]!r}, which the frame of {missing[0]} names")
+        raise InputError(f"{path}: the mask {missing[1]!r} of {missing[0]} does not exist")
     return {name: found.files[mask] for name, mask in named.items()}
 
 
 def _points(
     document: Mapping[str, Any], shots: Sequence[Shot], path: Path, report: list[str]
 ) -> tuple[F64 | None, F32 | None]:
-    """Read the point cloud that nerfstudio's `ply_file_path` names, which has the coordinates of the cameras."""
+    """Read the point cloud of nerfstudio's `ply_file_path`, in the coordinates of the cameras."""
     name = document.get("ply_file_path")
     if name is None:
         return _points_next_to(shots, path.parent, report)
@@ -263,22 +263,22 @@ def _points(
     )
     cloud = next((candidate for candidate in candidates if candidate.is_file()), None)
     if cloud is None:
-        report.append(f"{path.name}: ply_file_path names {name}, which is not there: no points")
+        report.append(f"{path.name}: ply_file_path {name} does not exist: no points")
         return None, None
     report.append(f"points from {cloud.name}")
     return read_point_cloud(cloud)
 
 
 def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> tuple[F64 | None, F32 | None]:
-    """Read the points that 3DGS and its kin put next to a set of Blender's.
+    """Read the points that 3DGS and similar programs write next to a Blender set.
 
-    If images have transparency, points are not read: programs write random ones, and the silhouette is better.
+    If images have transparency, points are ignored: they are often random, and the visual hull is better.
     """
     cloud = next((path for name in _POINT_CLOUDS if (path := folder / name).is_file()), None)
     if cloud is None:
         return None, None
     if train and read_image_header(train[0].path).has_alpha:
-        report.append(f"{cloud.name} is not read: the images' transparency says where splats may start")
+        report.append(f"{cloud.name} is ignored: the images' transparency determines where splats start")
         return None, None
     report.append(f"points from {cloud.name}")
     return read_point_cloud(cloud)
@@ -294,7 +294,7 @@ def _listed(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
 
 
 def _plain(name: str, image: Path) -> str:
-    """Return a name as the file has it: without `./`, with its ending (Blender's sets leave it out)."""
+    """Return the name of an image without `./`, with the ending that Blender's sets omit."""
     return PurePosixPath(normalise_name(name)).with_name(image.name).as_posix()
 
 
@@ -306,25 +306,25 @@ def _load(path: Path) -> dict[str, Any]:
 
 
 def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
-    """Intrinsics: focal lengths or angles of view, for the size named or the file's own; and the distortion."""
+    """Return the lens: focal lengths or angles of view, for the given size or that of the file; and the distortion."""
     model = str(values.get("camera_model") or "").strip()
     fisheye = model.upper() in _FISHEYES or bool(values.get("is_fisheye"))
     if not fisheye and model.upper() not in PERSPECTIVES:
         raise InputError(
             f"{where}: camera_model is {model}, expected one of {', '.join(PERSPECTIVES[1:] + _FISHEYES)}: "
-            f"use {UNDISTORTER}, or what straightens images in the program that found the poses"
+            f"use {UNDISTORTER}, or undistort images in the program that computed the poses"
         )
     if "w" in values and "h" in values:
         width, height = finite_number(values, "w", where), finite_number(values, "h", where)
     else:
         width, height = (float(side) for side in image_size(image))
     if not (width >= 1.0 and height >= 1.0):
-        raise InputError(f"{where}: w and h are {width:g} and {height:g}, expected 1 or more")
+        raise InputError(f"{where}: w and h are {width:g} and {height:g}, expected at least 1")
     fx, fy = focal_lengths(values, width, height, where, fisheye=fisheye)
     cx, cy = finite_number(values, "cx", where, width / 2.0), finite_number(values, "cy", where, height / 2.0)
     k1, k2, k3, k4, k5, k6 = (finite_number(values, f"k{i}", where, 0.0) for i in range(1, 7))
     p1, p2 = finite_number(values, "p1", where, 0.0), finite_number(values, "p2", where, 0.0)
-    # OpenCV's rational model divides by k4 to k6, other programs multiply: only the model's name tells which.
+    # OpenCV's rational model divides by k4 to k6, other programs multiply; only the model's name distinguishes them.
     unsupported = {"k5": k5, "k6": k6} | ({"p1": p1, "p2": p2} if fisheye else {"k4": k4})
     strange = [f"{key} is {value:g}" for key, value in unsupported.items() if value != 0.0]
     if strange and (fisheye or model.upper() != _RATIONAL):

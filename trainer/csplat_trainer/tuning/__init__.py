@@ -1,4 +1,4 @@
-"""Quantisation-aware fine-tuning: what is rendered is what a decoder of the file will see."""
+"""Quantisation-aware fine-tuning: renders during the tuning are those of the decoded file."""
 
 from __future__ import annotations
 

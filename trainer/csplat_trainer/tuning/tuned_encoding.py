@@ -1,4 +1,4 @@
-"""`finetune`: a scene and views in, a tuned file out. The encoder decides once; then values are tuned and coded."""
+"""`finetune`: encode a scene, tune the values of the file to views, and code them with the same decisions."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ class TunedFile:
 
     Attributes:
         result: result of the encoder.
-        decoded: values that a decoder returns from it, which are the tuned ones, bit for bit.
-        plain: the file of the same decisions without tuning.
+        decoded: the decoded values, which are the tuned ones, bit for bit.
+        plain: the file with the same decisions before tuning.
         log: JSON-compatible: options, losses, evaluations on the validation views (`validations`), times.
-        seconds: duration of `encoding` and `tuning`.
+        seconds: time of `encoding` and `tuning`.
     """
 
     result: EncodeResult
@@ -59,7 +59,7 @@ class StageTimer:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time what happens inside."""
+        """Add the time of the context to a stage."""
         start = time.perf_counter()
         yield
         self.seconds[name] = round(self.seconds.get(name, 0.0) + time.perf_counter() - start, 3)
@@ -80,23 +80,22 @@ def finetune(
     progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[TuningStep], None] | None = None,
 ) -> TunedFile:
-    """Encode a scene, and optimise the values in the file for what a decoder shows; `csplat finetune` calls it.
+    """Encode a scene, and optimise the values of the file through its quantisers; `csplat finetune` calls it.
 
     The same scene, views and options give the same bytes on the same machine, at any number of threads.
 
     Args:
-        model: the splats that the file will hold.
-        views: the reference images: images of a data set, or renders of the scene itself (`renders_of`). From a data
-            set, the training images are used, in front of the background that the scene records.
-        encoding: options of the encoder; its threads apply to everything.
+        model: the splats of the file.
+        views: views with images of a data set, or with renders of the scene itself (`renders_of`). Of a data set, the
+            training images are used, in front of the background that the scene records.
+        encoding: options of the encoder; its number of threads applies to everything.
         options: options of the tuning.
-        size_bytes: largest size of the file, as far as the rate weight can bring it there; as in `tune`.
+        size_bytes: largest size of the file, as in `tune`; the file may be larger if lambda reaches its limit.
         importance: importance of the splats, as for the encoder; `None`: measured in the training views.
-        source: the scene that the splats were chosen from, if they are not all, and `origin` their indices in it.
-        origin: as for the encoder.
+        source, origin: the scene that the splats were chosen from, and their indices in it, if some were pruned.
         metadata: metadata about the tuning, in addition to the steps and the number of views.
         outputs: checkpoints.
-        progress: called with the stage and the fraction of it that is done, 0 to 1.
+        progress: progress callback.
         on_step: called with the progress of the tuning, every `log_every` steps.
 
     Examples:
@@ -107,9 +106,9 @@ def finetune(
         True
 
     Raises:
-        InputError: no view shows a splat, the size is too small for one, an option does not suit the scene, or a
+        InputError: no view shows a splat, the size is too small for one, an option does not fit the scene, or a
             checkpoint is of another run.
-        RuntimeError: the file does not hold the tuned values: a fault of csplat.
+        RuntimeError: the file does not hold the tuned values, which is a bug of csplat.
     """
     check_model("finetune", model)
     timer, encoding, options = StageTimer(), encoding or EncodeOptions(), options or FinetuneOptions()
@@ -132,7 +131,7 @@ def finetune(
     if size_bytes is not None:
         size_bytes -= len(coded.write(tuning_metadata(options.iterations)).data) - len(plain.data)
         if size_bytes < 1:
-            raise InputError("the size that is wanted has no room for what the file says of itself")
+            raise InputError("the target size is smaller than the metadata of the file")
 
     def show(now: TuningStep) -> None:
         if progress is not None:
@@ -155,17 +154,17 @@ def finetune(
 
 def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
     """Return the training images of a data set, in front of the background that the scene records."""
-    trained = TrainingRecord.of(model.metadata)
-    behind = data.background if trained is None else trained.background
+    record = TrainingRecord.of(model.metadata)
+    background = data.background if record is None else record.background
     shift = np.subtract(model.origin, data.origin)
     training = [TuningView(relative_to(shift, one.camera), one) for one in data.train]
-    return split_views(training, np.array(behind, np.float32))
+    return split_views(training, np.array(background, np.float32))
 
 
 def _measured(
     model: SplatModel, views: TuningViews, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
 ) -> Importance:
-    """Measure the importance of each splat for the training views."""
+    """Measure the importance of each splat in the training views."""
     cameras = [one.camera for one in views.train]
     found = measure_sensitivity(
         model, cameras, background=views.background, metric=True, magnitudes=False, threads=encoding.threads,
@@ -175,10 +174,10 @@ def _measured(
 
 
 def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
-    """Raise a `RuntimeError` unless the file holds the tuned values, bit for bit: no file would be better."""
+    """Raise a `RuntimeError` unless the file holds the tuned values, bit for bit."""
     places = np.empty(int(source_index.max()) + 1, np.int64)
     places[source_index] = np.arange(len(source_index))
     rows = places[result.source_index]
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         if not np.array_equal(getattr(decoded, name), getattr(seen, name)[rows]):
-            raise RuntimeError(f"the file holds other {name} than were tuned: a fault of csplat, please report it")
+            raise RuntimeError(f"{name} of the file differ from the tuned ones: a bug of csplat, please report it")

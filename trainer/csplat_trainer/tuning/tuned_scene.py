@@ -1,12 +1,12 @@
 """The state of fine-tuning: float values, their quantised form in the file, and the rate term of the loss.
 
-Straight through: images are rendered from the values that a decoder will return, and their gradients are applied to the
-values that were quantised, as if nothing lay between (Bengio et al. 2013, https://arxiv.org/abs/1308.3432). A
-codebook's entry gets the sum of the gradients of all splats that use it.
+Straight-through estimator: images are rendered from the decoded values, and their gradients are applied to the values
+before quantisation (Bengio et al. 2013, https://arxiv.org/abs/1308.3432). The gradient of a codebook entry is the sum
+of the gradients of all splats that use it.
 
-Rate: a stream's bytes lie near its order-0 entropy, so an integer n of a column costs about −log2 of its relative
-frequency in the column. The slope of that cost, from n − 1 to n + 1, pushes a value towards frequent integers, mostly
-zero; the images push back where it shows. Frequencies are counted again every few steps.
+Rate: the size of a stream is close to its order-0 entropy, so an integer n of a column costs about −log2 of its
+relative frequency in the column. The slope of this cost, from n − 1 to n + 1, moves values towards frequent integers,
+mostly zero, unless the images oppose it. Frequencies are counted again every few steps.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _ALPHAS = (1e-6, 1.0 - 1e-6)  # range of the opacities that logits are computed 
 
 
 class TunedScene:
-    """Values of a fixed quantisation, with Adam's memory, which gradients of renders update.
+    """Values of a fixed quantisation with Adam's moments, updated by gradients of renders.
 
     Args:
         fixed: the encoder's decisions.
@@ -60,12 +60,12 @@ class TunedScene:
         return FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
 
     def dequantise(self) -> tuple[DecodedValues, F32]:
-        """Return the values that a decoder will return, and the opacities before they were quantised."""
+        """Return the decoded values, and the opacities before quantisation."""
         values = self.free_values
         return self.fixed.dequantise(values), values.opacities
 
     def stream_values(self, seen: DecodedValues) -> StreamValues:
-        """Return the contents of the file's streams, as a decoder will return them."""
+        """Return the decoded contents of the file's streams."""
         sh = self.fixed.dequantise_sh_rows(self.parameters.values["shN"]) if self.fixed.book is not None else seen.shN
         if self.fixed.shapes is None:
             return StreamValues(seen.quats, seen.scales, self.parameters.values["sizes"], seen.opacities, seen.sh0, sh)
@@ -73,7 +73,7 @@ class TunedScene:
         return StreamValues(quats, scales, sizes, seen.opacities, seen.sh0, sh)
 
     def count(self, seen: DecodedValues, weight: float) -> RateTerm:
-        """Count the bits of the file's integers; `weight` is lambda, the rate weight: loss per bit and splat."""
+        """Count the bits of the file's integers; `weight` is lambda, loss per bit and splat."""
         return RateTerm.count(self.fixed, self.stream_values(seen), weight)
 
     def step(
@@ -85,7 +85,7 @@ class TunedScene:
             gradients: gradients of the loss.
             seen, alphas: the result of `dequantise`.
             rates: learning rate of each group.
-            costs: the rate term; `None` for no rate term.
+            costs: the rate term, if any.
         """
         quats, scales, sizes = self._by_shape(gradients)
         steps = {
@@ -113,7 +113,7 @@ class TunedScene:
         return rows
 
     def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:
-        """Return the gradients of the file's rotations and scales, and of the splats' own sizes."""
+        """Return the gradients of the file's rotations and scales, and of the splats' log-scale offsets."""
         shapes = self.fixed.shapes
         if shapes is None or self._shape_users is None:
             return gradients.quats, gradients.scales, np.zeros(0, np.float32)
@@ -139,7 +139,7 @@ def _values(start: FreeValues) -> ParameterArrays:
 
 
 def _users(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
-    """Return splats sorted by their entry, and the start of each entry, [size + 1]; escaped ones come last."""
+    """Return splats sorted by entry, escaped ones last, and the start of each entry, [size + 1]."""
     order = np.argsort(index, kind="stable")
     starts = np.searchsorted(index[order], np.arange(size + 1))
     return order.astype(np.int64), starts.astype(np.int64)
@@ -171,20 +171,20 @@ def sum_by_entry(lane: int, lanes: int, values: F32, order: I64, starts: I64, ou
 
 
 def sum_by_entry_twin(values: F32, order: I64, starts: I64, out: F32) -> None:
-    """Compute `sum_by_entry` the slow way."""
+    """Compute `sum_by_entry` in NumPy, for tests."""
     for entry in range(len(out)):
         out[entry] = values[order[starts[entry] : starts[entry + 1]]].sum(axis=0)
 
 
 _MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this
-_ROWS = 1 << 15  # rows of SH that are counted at a time: their integers take several times the memory of the values
-_MAX_SLOPE = 4.0  # bits per step; the frequencies of rare integers are too uncertain for more
+_ROWS = 1 << 15  # rows of SH to count at a time; their integers take several times the memory of the values
+_MAX_SLOPE = 4.0  # bits per step; frequencies of rare integers are too uncertain for larger slopes
 _ROOT2 = np.sqrt(2.0)
 
 
 @dataclass(frozen=True, eq=False)
 class StreamValues:
-    """Contents of a file's streams, as a decoder will return them: arrays as in `FreeValues`, on their lattices."""
+    """Decoded contents of a file's streams: arrays as in `FreeValues`, on their lattices."""
 
     quats: F32
     scales: F32
@@ -199,10 +199,9 @@ class RateTerm:
     """The rate term of the loss: bits of the file's integers, and their slopes by attribute.
 
     Attributes:
-        fixed: lattices.
-        weight: lambda, the rate weight: loss per bit and splat.
-        tables: by attribute, and quantisation class if there are several: slopes in bits per step,
-            [columns, 2 · 128 + 1].
+        fixed: the encoder's decisions, among them the lattices.
+        weight: lambda, loss per bit and splat.
+        tables: slopes in bits per step, [columns, 2 · 128 + 1], by attribute and quantisation class.
         bits: bits of all integers, by their order-0 entropy, without centres and indices, which hardly change.
     """
 
@@ -218,7 +217,7 @@ class RateTerm:
         Args:
             fixed: the encoder's decisions.
             stored: contents of the streams.
-            weight: lambda, the rate weight: loss per bit and splat.
+            weight: lambda, loss per bit and splat.
         """
         costs = cls(fixed, weight, {})
         plan = fixed.parameters
@@ -279,7 +278,7 @@ class RateTerm:
 
 @dataclass(frozen=True)
 class _ClassSteps:
-    """Consecutive rows with the same quantisation steps; all rows if there are no quantisation classes."""
+    """Consecutive rows with the same quantisation steps; all rows without quantisation classes."""
 
     rows: slice
     scale_step: float
@@ -317,7 +316,7 @@ def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
     """Return the slope of the cost of integers in bits per step, and the cost of all of them.
 
     Args:
-        parts: [n, C] integers each, one part at least: rows of the same C columns.
+        parts: at least one part of [n, C] integers: rows of the same C columns.
 
     Returns:
         [C, 257] float32, for the integers −128 to 128, and bits.
@@ -330,7 +329,7 @@ def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
         found = np.bincount(places.reshape(-1), minlength=width * size).reshape(width, size)
         counts = counts + found if len(counts) else found
     count = int(counts.sum(axis=1).max(initial=0))
-    # One more of each and a narrow blur: an integer that happens not to occur counts as rare.
+    # Counts + 1, slightly blurred: an integer that happens not to occur counts as rare.
     padded = np.pad(counts + 1.0, ((0, 0), (1, 1)), mode="edge")
     blurred = 0.25 * padded[:, :-2] + 0.5 * padded[:, 1:-1] + 0.25 * padded[:, 2:]
     bits = -np.log2(blurred / (count + size))
@@ -341,7 +340,7 @@ def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
 
 
 def colour_integers_of(seen: F32, step: float, shift: int) -> I32:
-    """Return Y, Co, Cg [..., 3] int32 of colours on their lattice [..., 3], as they are coded."""
+    """Return Y, Co, Cg [..., 3] int32, as coded, of colours on their lattice [..., 3]."""
     rgb = _integers(seen, step)
     red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     co = red - blue

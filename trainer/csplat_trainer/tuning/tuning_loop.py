@@ -1,7 +1,6 @@
 """`tune`: optimise the values of a fixed quantisation until renders of its file match the reference images.
 
-A target size is reached by lambda, the rate weight: loss per bit and splat. `RateController` adjusts it to the number
-of bits.
+For a target size, `RateController` adjusts lambda, the loss per bit and splat, to the number of bits.
 """
 
 from __future__ import annotations
@@ -44,12 +43,12 @@ class TuningStep:
     """Progress of a run.
 
     Attributes:
-        iteration, iterations: steps made, and in all.
+        iteration, iterations: number of steps so far, and of all steps.
         loss: mean over the steps since the last report.
         validation_psnr: PSNR of the last evaluation on the validation views, pooled, dB.
         best_psnr: the best so far.
         size_bytes: size of the file at that evaluation.
-        seconds, seconds_left: time since the start, and remaining time at the present pace.
+        seconds, seconds_left: time since the start, and estimated remaining time.
     """
 
     iteration: int
@@ -67,7 +66,7 @@ class TuningResult:
     """Result of a run.
 
     Attributes:
-        best_values: the values that scored best on the validation views, those of the start if none did.
+        best_values: the values with the best score on the validation views; perhaps the initial ones.
         log: JSON-compatible: options, losses, evaluations (`validations`), times.
     """
 
@@ -93,10 +92,9 @@ def tune(
 
     Args:
         fixed: the encoder's decisions.
-        views: the reference images of the file.
+        views: training and validation views.
         options: options of the tuning.
-        size_bytes: largest size of the file: the rate weight is then adjusted to keep to it, beginning with
-            `byte_cost`.
+        size_bytes: largest size of the file; lambda is adjusted to meet it, starting at `byte_cost`.
         progress: called every `log_every` steps.
         checkpoint: file for checkpoints, each of which replaces the last; `None`: none are written.
         checkpoint_every: steps between checkpoints; 0: only at the end.
@@ -114,7 +112,7 @@ def tune(
 
 @dataclass
 class _BestValues:
-    """The values of the best evaluation so far, and the number of later evaluations that count."""
+    """The values of the best evaluation so far, and the number of later evaluations without a gain."""
 
     values: FreeValues
     score: float
@@ -125,7 +123,7 @@ class _BestValues:
 
 @dataclass
 class _ImageBuffers:
-    """Loss and reference image for images of one size, kept from step to step."""
+    """Reusable loss and reference image for images of one size."""
 
     loss: PhotometricLoss
     reference: F32
@@ -161,7 +159,7 @@ class _TuningRun:
         """Continue from a checkpoint.
 
         Raises:
-            InputError: it is of a run with other views or options.
+            InputError: the checkpoint is of a run with other views or options.
         """
         if checkpoint.log["views"] != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
@@ -177,8 +175,8 @@ class _TuningRun:
         self._iteration = checkpoint.iteration
         self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
         self._log = checkpoint.log
-        for look in self._log["validations"]:
-            look.setdefault("size_bytes", 0)  # older checkpoints lack it if no size was requested
+        for validation in self._log["validations"]:
+            validation.setdefault("size_bytes", 0)  # older checkpoints lack it without a target size
         self._gains = ImageGains(len(self._views.train), self._log.get("exposures", ()))
         self._best = _BestValues(checkpoint.best_values, *checkpoint.best)
         self._controller = controller
@@ -215,12 +213,12 @@ class _TuningRun:
 
     @property
     def _has_converged(self) -> bool:
-        """True if evaluations have brought no gain for long enough."""
+        """True after `patience` evaluations without a gain."""
         assert self._best is not None
         return 0 < self._options.patience <= self._best.since
 
     def _step(self) -> float:
-        """Make a step on one image; return its loss before the step."""
+        """Make a step on one image, and return its loss before the step."""
         if not self._queue:
             self._queue = self._rng.permutation(len(self._views.train)).tolist()
         number = self._queue.pop()
@@ -238,8 +236,8 @@ class _TuningRun:
         shown = rendered if gain is None else gain.apply(rendered)
         value, slope = buffers.loss(shown, view.image(self._views.background, buffers.reference), view.mask)
         if not math.isfinite(value.loss):
-            if self._iteration == 1:  # before anything has moved
-                raise InputError("the scene's pictures are beyond float32: its colours are too large to be tuned")
+            if self._iteration == 1:  # values are still the initial ones
+                raise InputError("renders of the scene overflow float32: its colours are too large for tuning")
             raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
         if gain is not None:
             slope = gain.backward(rendered, slope)
@@ -249,7 +247,7 @@ class _TuningRun:
 
     @property
     def _byte_cost(self) -> float:
-        """Lambda at present, the rate weight: loss per bit and splat."""
+        """Current lambda, loss per bit and splat."""
         return self._options.byte_cost if self._controller is None else self._controller.byte_cost
 
     def _rates(self) -> dict[str, float]:
@@ -279,7 +277,7 @@ class _TuningRun:
         loss, error, count = 0.0, 0.0, 0
         for view in self._views.validation:
             buffers, rendered = self._buffers(view), self._render(seen, view)
-            if self._options.lr_exposure and id(view) in self._numbers:  # a training view, too
+            if self._options.lr_exposure and id(view) in self._numbers:  # also a training view
                 rendered = ImageGain(self._gains, self._numbers[id(view)], 0.0).apply(rendered)
             reference = view.image(self._views.background, buffers.reference)
             loss += buffers.loss(rendered, reference, view.mask)[0].loss / len(self._views.validation)
@@ -312,14 +310,14 @@ class _TuningRun:
 
     def _progress(self, window: list[float], left: float) -> TuningStep:
         assert self._best is not None
-        look = self._log["validations"][-1]
+        validation = self._log["validations"][-1]
         return TuningStep(
             self._iteration,
             self._options.iterations,
             sum(window) / max(1, len(window)),
-            look["psnr"],
+            validation["psnr"],
             self._best.psnr,
-            look["size_bytes"],
+            validation["size_bytes"],
             self._log["seconds"],
             left,
         )
@@ -366,22 +364,22 @@ class _TuningRun:
         }
 
 
-_TARGET_FRACTION = 0.6  # fraction of the steps after which the size should be reached; later ones hardly move a value
-_SIZE_MARGIN = 0.002  # fraction of the size that is left free: files grow between counts
-_GAIN, _MAX_CHANGE = 40.0, 0.5  # change of log(rate weight) per relative excess of bits, and its limit at each count
-_WEIGHT_RANGE = (1e-7, 1e-2)  # range of the rate weight
-# Smallest rate weight, as a fraction of the first: files grow while values move far, and a weight that had fallen to
-# almost 0 before would rise too late.
+_TARGET_FRACTION = 0.6  # fraction of the steps after which the size should be reached; later steps hardly move values
+_SIZE_MARGIN = 0.002  # fraction of the size left free, since files grow between counts
+_GAIN, _MAX_CHANGE = 40.0, 0.5  # change of log(lambda) per relative excess of bits, and its limit at each count
+_WEIGHT_RANGE = (1e-7, 1e-2)  # range of lambda
+# Smallest lambda, as a fraction of the first. Files grow while values move far, and a lambda near 0 would then rise too
+# late.
 _MIN_WEIGHT_FRACTION = 0.25
 
 
 @dataclass
 class RateController:
-    """A target size, and the rate weight that reaches it.
+    """Adjusts lambda to a target size.
 
     Attributes:
         size_bytes: largest size of the file.
-        byte_cost: lambda at present, the rate weight: loss per bit and splat.
+        byte_cost: current lambda, loss per bit and splat.
         first_bits: bits of the integers at the start of the run; 0: not known yet.
         goal_bits: bits of the integers of a file of that size, estimated from the last file.
     """
@@ -392,12 +390,12 @@ class RateController:
     goal_bits: float = 0.0
 
     def __post_init__(self) -> None:
-        # A weight of 0 would remain 0 under any factor.
+        # A lambda of 0 would remain 0 under any factor.
         self.byte_cost = min(max(self.byte_cost, _WEIGHT_RANGE[0]), _WEIGHT_RANGE[1])
 
     @property
     def is_exhausted(self) -> bool:
-        """True if the rate weight cannot be raised further."""
+        """True if lambda cannot be raised further."""
         return self.byte_cost >= _WEIGHT_RANGE[1]
 
     @classmethod
@@ -422,12 +420,12 @@ class RateController:
         return max(0.0, size_bytes / self.size_bytes - 1.0)
 
     def update(self, bits: float, done: float, first_cost: float) -> None:
-        """Adjust the rate weight to the present number of bits and the planned one.
+        """Adjust lambda to the current and the planned number of bits.
 
         Args:
-            bits: bits of the integers at present.
+            bits: current bits of the integers.
             done: fraction of the steps done.
-            first_cost: rate weight at the start of the run.
+            first_cost: lambda at the start of the run.
         """
         planned_bits = self.goal_bits + (self.first_bits - self.goal_bits) * max(0.0, 1.0 - done / _TARGET_FRACTION)
         by = min(max(_GAIN * (bits / max(planned_bits, 1.0) - 1.0), -_MAX_CHANGE), _MAX_CHANGE)
@@ -451,8 +449,8 @@ class FinetuneCheckpoint:
     """A run between two steps.
 
     Attributes:
-        iteration: number of steps made.
-        parameters: the values, with Adam's memory.
+        iteration: number of steps so far.
+        parameters: the values, with Adam's moments.
         rng_state: state of the random generator, JSON-compatible.
         queue: indices of the images that remain in this epoch.
         options: options of the run, as a dictionary.
@@ -500,26 +498,25 @@ def load_finetune(path: str | Path, fixed: FixedQuantisation) -> FinetuneCheckpo
     """Read a checkpoint of a fixed quantisation.
 
     Raises:
-        InputError: the file is not a checkpoint, was written by another version, or for another scene or other options
-            of the encoder.
-        OSError: it cannot be read.
+        InputError: the file is not a checkpoint, or is of another version, scene or encoder options.
+        OSError: the file cannot be read.
     """
     stored = read_archive(path, "a checkpoint of csplat finetune")
     facts = stored.facts()
     if facts.get("kind") != _KIND:
         stored.refuse("it is of another kind")
     if facts.get("version") != _VERSION:
-        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, wanted {_VERSION}")
+        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, expected {_VERSION}")
     stored.check(facts, _FACTS)
     if facts["frozen"] != fingerprint(fixed):
         raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
     if len(facts["best"]) != _BEST_COUNT or not all(isinstance(one, (int, float)) for one in facts["best"]):
-        stored.refuse(f"its best look is {facts['best']}")
+        stored.refuse(f"its best evaluation is {facts['best']}")
     parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
     best = FreeValues(*(stored[f"best_{name}"] for name in _FREE_VALUES))
     costs = {name.removeprefix("costs_"): array for name, array in stored.items() if name.startswith("costs_")}
     if any(table.ndim != 2 or table.dtype != np.float32 or not np.isfinite(table).all() for table in costs.values()):
-        stored.refuse("its costs are no tables of float32")
+        stored.refuse("its costs are not tables of float32")
     score, psnr, iteration, since = facts["best"]
     checkpoint = FinetuneCheckpoint(
         facts["iteration"],
@@ -537,7 +534,7 @@ def load_finetune(path: str | Path, fixed: FixedQuantisation) -> FinetuneCheckpo
 
 
 def fingerprint(fixed: FixedQuantisation) -> str:
-    """Return a digest of the encoder's decisions, and of the values that they were made for."""
+    """Return a digest of the encoder's decisions and of the initial values."""
     digest, start = hashlib.sha256(repr(fixed.parameters).encode()), fixed.start()
     index = () if fixed.book is None else (fixed.book.index,)
     for array in (fixed.source_index, *index, *(getattr(start, name) for name in _FREE_VALUES)):
@@ -555,4 +552,6 @@ def _check(path: str | Path, checkpoint: FinetuneCheckpoint, start: FreeValues) 
     for name, arrays in found.items():
         for array in arrays:
             if array.shape != shapes[name] or array.dtype != np.float32 or not np.isfinite(array).all():
-                raise InputError(f"{path}: {name} is {array.dtype} {list(array.shape)}, wanted float32 {shapes[name]}")
+                raise InputError(
+                    f"{path}: {name} is {array.dtype} {list(array.shape)}, expected float32 {shapes[name]}"
+                )

@@ -1,4 +1,4 @@
-"""`FinetuneOptions`, checked once."""
+"""`FinetuneOptions`."""
 
 from __future__ import annotations
 
@@ -25,18 +25,16 @@ class FinetuneOptions:
         lr_shN: learning rate of the higher SH coefficients.
         lr_entries: learning rate of the codebook's entries.
         lr_exposure: as in `TrainOptions`; 0: gains and biases of images are not trained.
-        byte_cost: lambda, the rate weight: loss per bit and splat; 0: the size of the file has no influence.
-        warm_up: steps in which Adam estimates the magnitude of gradients, and values hardly move.
-        decay: fraction of the learning rates that remains at the end. It is tiny, because values that still move
-            alternate between two integers.
+        byte_cost: lambda, loss per bit and splat; 0: the size of the file has no influence.
+        warm_up: steps of small learning rates, in which Adam estimates the magnitude of gradients.
+        decay: final fraction of the learning rates. It is tiny, since otherwise values alternate between two integers.
         validate_every: steps between evaluations on the validation views.
-        patience: evaluations without a gain after which a run ends early, once the learning rates have fallen to a
-            quarter: before, values fluctuate too much. With a size target, evaluations at which the file is still too
-            large do not count. 0: never.
+        patience: number of evaluations without a gain that end a run early; 0: never. Evaluations count only when the
+            learning rates have fallen to a quarter, since values fluctuate before, and when a target size is met.
         log_every: steps between entries of the log.
 
     Raises:
-        InputError: a value is out of its range.
+        InputError: a value is out of range.
     """
 
     iterations: int = 1_000
@@ -59,11 +57,11 @@ class FinetuneOptions:
 
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
-            raise InputError(f"loss is {self.loss!r}, wanted one of {', '.join(LOSSES)}")
+            raise InputError(f"loss is {self.loss!r}, expected one of {', '.join(LOSSES)}")
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):
-                raise InputError(f"{name} is {value}, wanted {low:g} to {high:g}")
+                raise InputError(f"{name} is {value}, expected {low:g} to {high:g}")
 
     def learning_rate_factor(self, iteration: int) -> float:
         """Return the factor of the learning rates at a step."""
@@ -76,12 +74,12 @@ class FinetuneOptions:
         return iteration > 0.5 * self.iterations and self.learning_rate_factor(iteration) <= _CALM
 
     def scaled(self, factor: float) -> FinetuneOptions:
-        """Return the same options with all learning rates times a factor."""
+        """Return the options with all learning rates multiplied by a factor."""
         rates = {name: getattr(self, name) * factor for name in _RANGES if name.startswith("lr_")}
         return replace(self, **rates)
 
 
-_CALM = 0.25  # factor of the learning rates from which evaluations without a gain count
+_CALM = 0.25  # factor of the learning rates; below it, evaluations without a gain count
 
 _RANGES: dict[str, tuple[float, float]] = {
     "iterations": (1, 10**7),

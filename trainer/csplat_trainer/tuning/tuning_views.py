@@ -1,4 +1,4 @@
-"""The views of fine-tuning: images of a data set, or renders of the source."""
+"""The views of fine-tuning, with images of a data set or renders of the source."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from csplat_render.camera import Camera
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.posed_images import PosedImage, compose
 
-_MAX_VALIDATION = 16  # largest number of validation views that are training views too
+_MAX_VALIDATION = 16  # largest number of validation views that are also training views
 _FLOAT16_MAX = np.float32(6e4)  # largest value for float16
 
 
@@ -27,7 +27,7 @@ class TuningView:
 
     Attributes:
         camera: relative to the scene's origin.
-        reference: the reference image: an image of a data set, or [H, W, 3] float16 or float32.
+        reference: an image of a data set, or a render, [H, W, 3] float16 or float32.
 
     Raises:
         InputError: the reference has another size than the camera's image.
@@ -39,11 +39,11 @@ class TuningView:
     def __post_init__(self) -> None:
         shape = (self.camera.H, self.camera.W, 3)
         if not isinstance(self.reference, PosedImage) and self.reference.shape != shape:
-            raise InputError(f"the reference image has shape {list(self.reference.shape)}, wanted {list(shape)}")
+            raise InputError(f"the reference image has shape {list(self.reference.shape)}, expected {list(shape)}")
 
     @property
     def mask(self) -> NDArray[np.bool_] | None:
-        """Pixels that count, [H, W]; `None`: all of them."""
+        """Mask of the pixels that count, [H, W]; `None`: all of them."""
         return self.reference.mask if isinstance(self.reference, PosedImage) else None
 
     def image(self, background: F32, out: F32) -> F32:
@@ -56,15 +56,15 @@ class TuningView:
 
 @dataclass(frozen=True, eq=False)
 class TuningViews:
-    """Training views, validation views, and the colour behind all of them.
+    """Training views, validation views, and their background.
 
     Attributes:
-        train: at least one.
-        validation: at least one; they are among `train` unless they are held out.
+        train: training views, at least one.
+        validation: validation views, at least one; they are also training views unless they are held out.
         background: [3].
 
     Raises:
-        InputError: one of the two is empty.
+        InputError: there are no training or no validation views.
     """
 
     train: Sequence[TuningView]
@@ -77,7 +77,7 @@ class TuningViews:
 
     @property
     def digest(self) -> str:
-        """Hash of the training cameras, the split and the background, which identifies these views."""
+        """Hash of the training cameras, the split and the background."""
         cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (one.camera for one in self.train)]
         identity = repr((cameras, len(self.validation), self.is_held_out, self.background.tolist()))
         return hashlib.sha256(identity.encode()).hexdigest()
@@ -91,15 +91,15 @@ class TuningViews:
 def split_views(views: Sequence[TuningView], background: F32, validation_count: int = 0) -> TuningViews:
     """Split views into training and validation views.
 
-    A scene fits the images that it was trained on better than others. If some of them are held out here, they score
-    worse with every step, whatever is gained elsewhere; so by default all are training views, and some of them are
-    validation views, too.
+    A scene fits its training images better than others. If some of them were held out, their scores would fall with
+    every step, whatever is gained on others. So by default all are training views, and some of them are validation
+    views, too.
 
     Args:
-        views: the views, in the order in which they were taken.
-        background: [3], behind all of them.
-        validation_count: number of validation views that are held out: images that the scene was not trained on, or
-            renders of it. 0: none.
+        views: the views, in the order of capture.
+        background: [3], their background.
+        validation_count: number of validation views to hold out, for images that the scene was not trained on, or
+            renders; 0: none.
 
     Raises:
         InputError: `validation_count` leaves no training view.
@@ -113,13 +113,13 @@ def split_views(views: Sequence[TuningView], background: F32, validation_count: 
 
 
 def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, threads: int | None) -> list[TuningView]:
-    """Return renders of a scene as views: the reference for its file if there are no images.
+    """Return renders of a scene as views, the reference for its file without images.
 
-    They are kept in float16, with a PSNR of at least 66 dB up to white; there are hundreds of them.
+    There are hundreds, so they are stored in float16: a PSNR of at least 66 dB up to white.
     """
     rasteriser = Rasteriser(gradients=False, threads=threads)
     views = []
     for camera in cameras:
-        seen = rasteriser.forward(source, camera, background=background, antialiased=source.antialiased).rgb
-        views.append(TuningView(camera, np.clip(seen, -_FLOAT16_MAX, _FLOAT16_MAX).astype(np.float16)))
+        render = rasteriser.forward(source, camera, background=background, antialiased=source.antialiased).rgb
+        views.append(TuningView(camera, np.clip(render, -_FLOAT16_MAX, _FLOAT16_MAX).astype(np.float16)))
     return views
