@@ -22,7 +22,7 @@ from csplat_trainer.data.image_files import IMAGE_ENDINGS, abbreviate
 from csplat_trainer.data.image_pixels import opaque_images, read_image_header
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
-_SET_LEVELS = 2  # folders above a folder of images that may be its data set
+_SET_LEVELS = 2  # how far the data set may be above its folder of images
 _SETS = ("transforms_train.json", "transforms.json")
 _MAX_NAMED = 3  # folders in a message, at most
 _AGREES = math.cos(math.radians(30.0))  # least cosine between the conventional up direction and that of the cameras
@@ -131,13 +131,13 @@ def load(
 
 
 def find_image_folder(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
-    """Return the folder of a data set, and the name of its folder of images if that is what `path` names.
+    """Split the path of a folder of images in a data set.
 
     Args:
-        path: a data set, or a folder of images without a data set of its own, which lies in the folder of one.
+        path: a data set, or a folder of images in one that is not itself a data set.
 
     Returns:
-        `garden` and `images_4` for `garden/images_4`; `path` and `None` for everything else.
+        `garden` and `images_4` for `garden/images_4`; otherwise `path` and `None`.
     """
     path = Path(path)
     files = (one for pattern in ("*", "*/*") for one in path.glob(pattern))
