@@ -128,7 +128,7 @@ def test_a_little_learning_keeps_splats_finite_and_lowers_the_loss(chains):
         assert_finite(learnt.trained)
         assert np.mean(learnt.losses[-10:]) < 0.98 * np.mean(learnt.losses[:10])
         if name == "exploded":
-            assert "colours are too large to be tuned" in learnt.tuned
+            assert "colours are too large for tuning" in learnt.tuned
         else:
             assert_finite(learnt.tuned)
 

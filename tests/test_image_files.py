@@ -47,8 +47,8 @@ NAMES = {
     "another ending": ("1.JPG", ["1.png"], "1.png", "with another ending"),
     "a version is no ending": ("v1.3", ["v1.png", "v1.2.png"], None, None),
     "a stem is no name": ("10", ["1.png", "100.png"], None, None),
-    "backslashes": ("a\\1.png", ["a/1.png"], "a/1.png", "with / for \\, without spaces around it"),
-    "a space at the end": ("a/1.png ", ["a/1.png"], "a/1.png", "with / for \\, without spaces around it"),
+    "backslashes": ("a\\1.png", ["a/1.png"], "a/1.png", "with / for \\, without surrounding spaces"),
+    "a space at the end": ("a/1.png ", ["a/1.png"], "a/1.png", "with / for \\, without surrounding spaces"),
     "a backslash in a name": ("a\\1.png", ["a\\1.png", "a/1.png"], "a\\1.png", None),
     "another case": ("img_1.png", ["IMG_1.PNG"], "IMG_1.PNG", "in another case"),
     "another case rather than another ending": ("1.JPG", ["1.jpg", "1.png"], "1.jpg", "in another case"),
@@ -152,7 +152,7 @@ def test_the_message_names_the_folders_that_were_tried(colmap_set):
     with pytest.raises(InputError) as raised:
         load(colmap_set)
     message = str(raised.value)
-    assert "none of its 9 images is there (other0.png, …)" in message
+    assert "none of its 9 images exists (other0.png, …)" in message
     assert f"looked in {colmap_set}/images, {colmap_set}/input, {colmap_set} itself" in message
     assert "there are other images, such as im 000.png" in message
 
@@ -189,7 +189,7 @@ def test_frames_without_images_are_left_out(tmp_path):
     (tmp_path / "images" / "0003.png").rename(tmp_path / "0003.png")
     data = load(tmp_path, test_every=0)
     assert 9 == len(data.train)
-    assert "transforms.json: 1 of 10 images are missing and left out: images/0003.png" in data.report
+    assert "transforms.json: 1 of 10 images are missing and dropped: images/0003.png" in data.report
 
 
 def test_training_and_test_images_must_be_different_files(tmp_path):
@@ -220,15 +220,15 @@ def test_masks_are_found_like_images(transforms):
     ]
     change_transforms(transforms, frames=frames)
     data = load(transforms)
-    assert "masks hide parts of 10 images: they do not count" in data.report
-    note = "10 names of transforms.json found with / for \\, without spaces around it"
+    assert "masks hide parts of 10 images, which do not count" in data.report
+    note = "10 names of transforms.json found with / for \\, without surrounding spaces"
     assert any(note in line for line in data.report)
 
 
 def test_a_link_to_nowhere_is_a_missing_image(colmap_set):
     (colmap_set / "images" / "im 003.png").unlink()
     (colmap_set / "images" / "im 003.png").symlink_to(colmap_set / "absent.png")
-    assert "images.bin: 1 of 9 images are missing and left out: im 003.png" in load(colmap_set).report
+    assert "images.bin: 1 of 9 images are missing and dropped: im 003.png" in load(colmap_set).report
 
 
 def test_masks_next_to_the_images_are_reported(colmap_set):
@@ -257,7 +257,7 @@ def test_masks_have_names_of_several_programs(colmap_set, name):
     (colmap_set / name).parent.mkdir()
     write_picture(colmap_set / name, cameras(9)[3])
     data = load(colmap_set)
-    assert "masks hide parts of 1 image: they do not count" in data.report
+    assert "masks hide parts of 1 image, which do not count" in data.report
     assert ["im 003.png"] == [picture.camera.image for picture in data.train if picture.masked is not None]
 
 
@@ -367,8 +367,8 @@ READ = {
 
 #: File, writer, and the text of the error.
 REFUSED = {
-    "float beyond 1": ("a.tif", saved((255 * RAMP).astype(np.float32)), "holds floats from 0 to 255, expected 0 to 1"),
-    "NaN": ("a.tif", saved(np.full((H, W), np.nan, np.float32)), "holds floats from nan to nan"),
+    "float beyond 1": ("a.tif", saved((255 * RAMP).astype(np.float32)), "has floats from 0 to 255, expected 0 to 1"),
+    "NaN": ("a.tif", saved(np.full((H, W), np.nan, np.float32)), "has floats from nan to nan"),
     "32-bit grey": ("a.tif", saved(UINT16.astype(np.int32)), "grey of 32 bits"),
     "signed 16 bits": ("a.tif", lambda p: tiff(p, (UINT16 // 2).astype(np.int16), 16, 2), "or with a sign"),
     "16-bit RGB in planes": (

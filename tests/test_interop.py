@@ -123,7 +123,7 @@ def test_sh_bands_above_the_requested_degree_are_left_out(no_torch, make_model):
     many = tensor(np.concatenate([splats["shN"], np.ones((5, 9, 3), np.float32)], axis=1))
     for said in ({"splats": {**splats, "shN": many}}, of_splatfacto({**splats, "shN": many})):
         no_torch(lambda *_, said=said, **__: said)
-        with pytest.raises(InputError, match=r"shN is of SH degree 4, expected at most 3: --sh-degree 3 of csplat"):
+        with pytest.raises(InputError, match=r"shN has SH degree 4, expected at most 3: --sh-degree 3 of csplat"):
             csplat.read(STORED["gsplat.pt"])
         for degree in (3, 1):
             read = csplat.read(STORED["gsplat.pt"], sh_degree=degree)
@@ -137,8 +137,8 @@ def test_a_checkpoint_without_splats_is_refused(no_torch, make_model):
         ([1], "it holds a list"),
         (([1, 2], 3), "it holds a tuple"),
         ({"model": 3}, "it holds model: neither"),
-        ({"splats": {**splats, "means": many}}, "means is no tensor that the file can hold"),
-        ({"splats": {**splats, "means": "many"}}, "means is no tensor"),
+        ({"splats": {**splats, "means": many}}, "means is not a tensor, or larger than the file"),
+        ({"splats": {**splats, "means": "many"}}, "means is not a tensor"),
         ({"splats": {**splats, "means": tensor(np.full((5, 3), np.inf))}}, "NaN or infinite"),
         ({"splats": {"means": splats["means"]}}, "no quats"),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
@@ -201,7 +201,7 @@ def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_pat
         one.text for one in report
     ]
     paths[1].unlink()
-    words = r"ckpt_29_rank2\.pt has the splats of one GPU of several, .*: no ckpt_29_rank1"
+    words = r"ckpt_29_rank2\.pt has the splats of one of several GPUs, .*: no ckpt_29_rank1"
     with pytest.raises(InputError, match=words):
         csplat.read(paths[2])
     paths[2].unlink()
@@ -250,7 +250,7 @@ def test_positions_in_doubles_get_an_origin(no_torch, make_model):
 def test_other_files_are_refused_before_torch_loads_them(no_torch, tmp_path):
     no_torch(lambda *_, **__: pytest.fail("it was loaded"))
     for data, says in (
-        (b"404: Not Found", "no checkpoint of torch: it begins with b'404: Not'"),
+        (b"404: Not Found", "not a checkpoint of torch: it begins with b'404: Not'"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS"),
     ):
         (tmp_path / "a.pt").write_bytes(data)
@@ -265,8 +265,8 @@ def test_other_files_are_refused_before_torch_loads_them(no_torch, tmp_path):
 
 def test_files_that_torch_cannot_load_are_refused(no_torch):
     for error, says in (
-        (pickle.UnpicklingError("Weights only load failed"), "holds objects of a program"),
-        (RuntimeError("PytorchStreamReader failed"), "is no whole checkpoint of torch"),
+        (pickle.UnpicklingError("Weights only load failed"), "contains objects that could run code"),
+        (RuntimeError("PytorchStreamReader failed"), "is a truncated or damaged checkpoint"),
     ):
 
         def load(*_, error=error, **__):
@@ -325,10 +325,10 @@ def test_learning_rates_may_be_scalars_of_numpy_1_or_2(torch, make_model):
 def test_invalid_tensors_are_refused(torch, make_model, tmp_path):
     splats = to_gsplat(make_model(5, 0), device="cpu")
     for values, message in (
-        ({**splats, "means": torch.zeros(1).expand(10**9, 3)}, "means is no tensor that the file can hold"),
+        ({**splats, "means": torch.zeros(1).expand(10**9, 3)}, "means is not a tensor, or larger than the file"),
         ({**splats, "means": torch.full((5, 3), torch.inf)}, "NaN or infinite"),
         ({**splats, "sh0": torch.zeros(5, 2)}, "sh0 has shape"),
-        (print, "holds objects of a program"),
+        (print, "contains objects that could run code"),
     ):
         (tmp_path / "a.pt").write_bytes(saved(torch, {"splats": values}))
         with pytest.raises(InputError, match=rf"^a\.pt[^\n]*{message}[^\n]*$"):

@@ -252,7 +252,7 @@ def test_virtual_views_in_surroundings_give_no_blocks(stored):
 
 def test_a_file_is_refused_for_another_scene(stored):
     path, model, _ = stored
-    with pytest.raises(InputError, match="30 splats, the scene has 29"):
+    with pytest.raises(InputError, match="of 30 splats, but the scene has 29"):
         read_sensitivity(path, model.select(np.arange(29)))
     with pytest.raises(InputError, match="another scene"):
         read_sensitivity(path, replace(model, sh0=model.sh0 + np.float32(0.5)))

@@ -181,7 +181,7 @@ def test_images_of_every_lens_model_are_undistorted(tmp_path):
         write_colmap(folder / "sparse", cameras(1), model, parameters, text=True, width=LENS_W, height=LENS_H)
         data = load(folder, test_every=0)
         assert_is_straight(data.train[0], model)
-        notes = [line for line in data.report if "distortion is undone" in line or "fisheye images are cut" in line]
+        notes = [line for line in data.report if "distortion is undone" in line or "fisheye images are cropped" in line]
         assert (0 if not lens.distorts else 2 if "FISHEYE" in model else 1) == len(notes)
 
     assert [] == failures({model: (model, values) for model, values in MODELS.items() if values}, check)
@@ -342,7 +342,7 @@ def test_the_focal_length_of_a_frame_overrides_the_angle_of_all(tmp_path):
 def test_an_image_whose_sides_are_swapped_is_refused(tmp_path):
     write_colmap_set(tmp_path)
     Image.new("RGB", (H, W)).save(tmp_path / "images" / "im 003.png")
-    found = r"im 003\.png is 32×48 pixels, expected the shape of 48×32"
+    found = r"im 003\.png is 32×48 pixels, expected the aspect ratio of 48×32"
     with pytest.raises(InputError, match=rf"{found}, which .*cameras\.bin, camera 7 states: the sides are swapped"):
         load(tmp_path)
 
@@ -351,7 +351,7 @@ def test_an_image_of_another_shape_than_its_camera_is_reported(tmp_path):
     write_colmap_set(tmp_path)
     Image.new("RGB", (W, 24)).save(tmp_path / "images" / "im 003.png")
     report = load(tmp_path).report
-    assert any("1 image not of the shape of their cameras' (im 003.png: 48×24, 48×32)" in line for line in report)
+    assert any("1 image with another aspect ratio than their cameras (im 003.png: 48×24, 48×32)" in line for line in report)
 
 
 def test_a_mask_of_another_shape_than_its_image_is_refused(tmp_path):
@@ -361,7 +361,7 @@ def test_a_mask_of_another_shape_than_its_image_is_refused(tmp_path):
     Image.new("L", (W // 2, H // 2), 255).save(tmp_path / "mask.png")
     assert load(tmp_path).train[0].mask.all()
     Image.new("L", (W, W), 255).save(tmp_path / "mask.png")
-    with pytest.raises(InputError, match=r"mask\.png is 48×48 pixels, expected the shape of 48×32, its image's"):
+    with pytest.raises(InputError, match=r"mask\.png is 48×48 pixels, expected the aspect ratio of 48×32, that of its image"):
         load(tmp_path)
 
 
@@ -398,7 +398,7 @@ def test_smaller_images_may_be_rounded_either_way(tmp_path):
     ):
         assert [] == notes(*size, of), size
     (line,) = notes(480, 324, (480, 320))
-    assert line.startswith("10 images not of the shape of their cameras' (0001.png: 480×324, 480×320)")
+    assert line.startswith("10 images with another aspect ratio than their cameras (0001.png: 480×324, 480×320)")
 
 
 def test_a_rotation_of_another_length_is_normalised_and_reported(tmp_path):
@@ -436,7 +436,7 @@ def test_invalid_cameras_and_poses_are_left_out(tmp_path, text):
     data = load(tmp_path, test_every=0)
     assert 8 == len(data.train)
     name = "images.txt" if text else "images.bin"
-    assert f"{name}: 1 image without a finite pose, left out: im 003.png" in data.report
+    assert f"{name}: 1 image without a finite pose, dropped: im 003.png" in data.report
 
 
 def test_doubtful_lenses_and_poses_are_reported(tmp_path):
@@ -447,7 +447,7 @@ def test_doubtful_lenses_and_poses_are_reported(tmp_path):
     report = load(tmp_path).report
     assert not any("see none of the points" in line for line in report)
     assert any("camera 7: the principal point is 6 4 in 48×32 pixels, far from the middle" in line for line in report)
-    assert any("all 9 cameras stand at one place" in line for line in report)
+    assert any("all 9 cameras are at one place" in line for line in report)
     inverse = [replace(shot, viewmat=np.linalg.inv(shot.viewmat)) for shot in shots]
     write_colmap(tmp_path / "sparse" / "0", inverse)
     line = "9 of 9 cameras (im 001.png, …) see none of the points: with inverted poses they would: the file holds"
@@ -458,8 +458,8 @@ def test_doubtful_lenses_and_poses_are_reported(tmp_path):
     ("change", "message"),
     [
         (lambda pose: pose, None),
-        (np.linalg.inv, "all 10 cameras stand at one place"),
-        (lambda pose: pose @ np.diag([1, -1, -1, 1]), "all cameras look away from what they stand around"),
+        (np.linalg.inv, "all 10 cameras are at one place"),
+        (lambda pose: pose @ np.diag([1, -1, -1, 1]), "all cameras look outwards"),
     ],
 )
 def test_poses_of_other_conventions_are_reported(tmp_path, change, message):
@@ -488,7 +488,7 @@ def test_points_of_one_colour_get_colours_of_the_images(tmp_path):
     file.write_text("1 0 0 0 0 0 0 1\n2 0.4 0.1 0.2 0 0 0 1\n")
     data = load(tmp_path)
     assert data.points_rgb is None
-    assert "all points have the colour 0 0 0: splats start with the colours of the images there" in data.report
+    assert "all points have the colour 0 0 0: initial colours are taken from the images instead" in data.report
     splats = place_splats(data.train, measure_extent(data.train), 2, 0, np.random.default_rng(0), points=data.points)
     colours = 0.5 + 0.28209479177387814 * splats["sh0"][np.argsort(splats["means"][:, 0])]
     assert colours[1, 1] > 0.1  # a green dot lies there, on black

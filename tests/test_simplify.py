@@ -101,7 +101,7 @@ def test_cameras_of_the_user_are_shrunk_and_every_eighth_is_a_validation_view(so
     assert small[0].K[0, 0] == pytest.approx(own[0].K[0, 0] * 59 / 200)
     views = views_of(own)
     assert (len(views.training), len(views.validation)) == (15, 2)
-    with pytest.raises(InputError, match="2 at least"):
+    with pytest.raises(InputError, match="at least 2"):
         find_sufficient_views(source, views_of(own[:1]), 0.3)
 
 

@@ -239,7 +239,7 @@ def test_images_without_alpha_start_in_a_box(make_data, make_model):
     result = train(data, TrainOptions(**QUICK))
     assert np.isfinite(result.model.means).all()
     assert (0.0, 0.0, 0.0) == TrainingRecord.of(result.model.metadata).background
-    with pytest.raises(InputError, match="no alpha channel"):
+    with pytest.raises(InputError, match="requires images with alpha"):
         train(data, TrainOptions(**QUICK, init="hull"))
     with pytest.raises(InputError, match="no points"):
         train(data, TrainOptions(**QUICK, init="points"))
