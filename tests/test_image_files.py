@@ -43,7 +43,7 @@ NAMES = {
     "as it is": ("a/1.png", ["a/1.png", "1.png", "A/1.PNG"], "a/1.png", None),
     "a dot": ("./a//1.png", ["a/1.png"], "a/1.png", None),
     "no ending": ("a/1", ["a/1.png"], "a/1.png", None),
-    "no ending, two files": ("a/1", ["a/1.png", "a/1.jpg"], "a/1 fits 2 names: a/1.jpg, a/1.png", None),
+    "no ending, two files": ("a/1", ["a/1.png", "a/1.jpg"], "a/1 matches 2 files: a/1.jpg, a/1.png", None),
     "another ending": ("1.JPG", ["1.png"], "1.png", "with another ending"),
     "a version is no ending": ("v1.3", ["v1.png", "v1.2.png"], None, None),
     "a stem is no name": ("10", ["1.png", "100.png"], None, None),
@@ -52,7 +52,7 @@ NAMES = {
     "a backslash in a name": ("a\\1.png", ["a\\1.png", "a/1.png"], "a\\1.png", None),
     "another case": ("img_1.png", ["IMG_1.PNG"], "IMG_1.PNG", "in another case"),
     "another case rather than another ending": ("1.JPG", ["1.jpg", "1.png"], "1.jpg", "in another case"),
-    "another case, two files": ("img_1.png", ["IMG_1.png", "Img_1.png"], "fits 2 names", None),
+    "another case, two files": ("img_1.png", ["IMG_1.png", "Img_1.png"], "matches 2 files", None),
     "another case and ending": ("img_1.jpg", ["IMG_1.PNG"], "IMG_1.PNG", "with another ending"),
     "another Unicode form": (NFD, [NFC], NFC, "in another case"),
     "a URL": ("a/my%20file.png", ["a/my file.png"], "a/my file.png", "as a URL"),
@@ -62,7 +62,7 @@ NAMES = {
     "an absolute path": ("/home/x/a/1.png", ["a/1.png", "1.png"], "a/1.png", "without leading folders"),
     "a folder more": ("photos/1.png", ["1.png"], "1.png", "without leading folders"),
     "a folder less": ("1.png", ["a/1.png"], "a/1.png", "in folders below"),
-    "a folder less, two files": ("1.png", ["a/1.png", "b/1.png"], "1.png fits 2 names: a/1.png, b/1.png", None),
+    "a folder less, two files": ("1.png", ["a/1.png", "b/1.png"], "1.png matches 2 files: a/1.png, b/1.png", None),
     "another folder": ("a/1.png", ["b/1.png"], None, None),
 }
 
@@ -70,7 +70,7 @@ NAMES = {
 def test_names_are_matched_loosely_only_without_an_exact_match():
     def check(case):
         listed, known, expected, words = case
-        if expected is not None and "fits" in expected:
+        if expected is not None and "matches" in expected:
             with pytest.raises(InputError, match=re.escape(expected)):
                 match_names([listed], known, "list.txt")
             return
@@ -87,7 +87,7 @@ def test_a_missing_name_is_not_searched_in_other_folders_if_others_are_found():
 
 
 def test_two_names_of_one_file_are_refused():
-    with pytest.raises(InputError, match=r"x: A\.png and A\.PNG both fit a\.png"):
+    with pytest.raises(InputError, match=r"x: A\.png and A\.PNG both match a\.png"):
         match_names(["A.png", "A.PNG"], ["a.png"], "x")
     assert {"1.png": "1.png"} == match_names(["1.jpg", "1.png"], ["1.png"], "x")[0]
 
@@ -153,7 +153,7 @@ def test_the_message_names_the_folders_that_were_tried(colmap_set):
         load(colmap_set)
     message = str(raised.value)
     assert "none of its 9 images exists (other0.png, …)" in message
-    assert f"looked in {colmap_set}/images, {colmap_set}/input, {colmap_set} itself" in message
+    assert f"searched {colmap_set}/images, {colmap_set}/input, {colmap_set} itself" in message
     assert "there are other images, such as im 000.png" in message
 
 
@@ -213,7 +213,10 @@ def test_masks_are_found_like_images(transforms):
     (transforms / "masks").mkdir()
     for i, camera in enumerate(cameras(10)):
         write_picture(transforms / "masks" / f"{i:04}.png", camera)
-    assert any("folder masks, which transforms.json does not mention" in line for line in load(transforms).report)
+    assert any(
+        "folder masks is ignored, since transforms.json does not refer to it" in line
+        for line in load(transforms).report
+    )
     frames = [
         {"file_path": f"images/{i:04}.png", "mask_path": f"masks\\{i:04}.png", "transform_matrix": matrix}
         for i, matrix in enumerate(POSES)
@@ -239,10 +242,10 @@ def test_masks_next_to_the_images_are_reported(colmap_set):
 def test_masks_that_fit_no_image_are_reported(colmap_set):
     (colmap_set / "masks").mkdir()
     write_picture(colmap_set / "masks" / "other.png", cameras(9)[0])
-    assert any("masks/ has none for 9 of 9 images" in line for line in load(colmap_set).report)
+    assert any("masks/ has no masks for 9 of 9 images" in line for line in load(colmap_set).report)
     write_picture(colmap_set / "masks" / "IM 003.png", cameras(9)[3])
     report = load(colmap_set).report
-    assert any("masks/ has none for 8 of 9 images: all pixels of im 000.png count" in line for line in report)
+    assert any("masks/ has no masks for 8 of 9 images: all pixels of im 000.png count" in line for line in report)
     assert any("1 name of masks/ found in another case: im 003.png is IM 003.png" in line for line in report)
 
 
@@ -374,7 +377,7 @@ REFUSED = {
     "16-bit RGB in planes": (
         "a.tif",
         lambda p: tiff(p, np.moveaxis(RGB.astype(np.uint16) * 257, 2, 0), 16, 1, channels=3, photometric=2, planes=2),
-        "holds 16 bits in planes",
+        "has 16 bits in planes",
     ),
     "float RGB": (
         "a.tif",
@@ -432,17 +435,13 @@ def test_a_set_reports_how_its_pixels_are_read(tmp_path):
             grey = np.asarray(image.convert("L"))
         Image.fromarray(grey.astype(np.uint16) * 16).save(path)
     (line,) = (line for line in load(tmp_path).report if "16-bit" in line)
-    assert line.startswith(
-        "10 images of 16-bit grey: 0 to 65535 is read as black to white; the first, 0001.png, holds 0"
-    )
+    assert line.startswith("10 images of 16-bit grey: 0 to 65535 is read as black to white; the first, 0001.png, has 0")
     assert line.endswith("scale them if that is too dark")
     for path in files:
         colours = np.ascontiguousarray((RGB.astype(">u2") << 4).astype(">u2"))
         png_16(path, colours)
     (line,) = (line for line in load(tmp_path).report if "16-bit" in line)
-    assert line.startswith(
-        "10 images of 16-bit colours: 0 to 255 is read as black to white; the first, 0001.png, holds"
-    )
+    assert line.startswith("10 images of 16-bit colours: 0 to 255 is read as black to white; the first, 0001.png, has")
     assert line.endswith("0 to 15: scale them if that is too dark")
     frames = [Image.new("RGB", (W, H), colour) for colour in ("red", "blue")]
     for path in files:
@@ -519,7 +518,7 @@ def test_masks_of_0_and_1_are_reported_and_grey_ones_refused(tmp_path):
     frames = frames_of(tmp_path)
     change_transforms(tmp_path, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
     data = load(tmp_path)
-    assert "masks as mask.png: values are 0 and 1: 1 counts as white" in data.report
+    assert "masks such as mask.png: values are 0 and 1: 1 counts as white" in data.report
     assert (data.train[0].mask == SHAPE).all()
     Image.fromarray(GREY // 4).save(tmp_path / "mask.png")
     with pytest.raises(InputError, match=r"mask\.png is a mask of values from 0 to 63, expected 128 or more"):

@@ -268,7 +268,7 @@ def split_listed(
         report += notes
         missing = [name for name in names if name not in found]
         line = f"{where} names {counted(len(names), f'{word} image')}"
-        report.append(f"{line}, of which {len(found)} exist; missing: {abbreviate(missing)}" if missing else line)
+        report.append(f"{line}, found {len(found)}; missing: {abbreviate(missing)}" if missing else line)
         heeded += [role] if found else []
         twice = [name for name in found.values() if name in roles]
         if twice:
