@@ -170,7 +170,7 @@ def test_images_of_one_name_in_two_folders_are_distinguished(colmap_set):
         (
             {"test": (6, 7), "val": (7, 8)},
             (6, 1, 2),
-            "1 image on several lists, not used as validation images: images/0007.png",
+            "on several lists, not used as validation images: images/0007.png",
         ),
         ({"train": range(10), "val": (2,), "test": (3,)}, (7, 1, 1), "not used as training images: images/0002.png"),
         ({"train": range(6), "test": (4,)}, (5, 0, 0), "names 1 test image, found 0"),
@@ -570,7 +570,7 @@ def test_outlier_cameras_are_reported_and_ignored(tmp_path):
     write_colmap_set(tmp_path)
     usual = load(tmp_path).train[0].camera.near
     for moved, words in (
-        ([3], "the camera of im 003.png stands"),
+        ([3], "the camera of im 003.png is"),
         ([3, 5], "the cameras of im 003.png, im 005.png are"),
         ([8], "1 test image will score badly"),
     ):
