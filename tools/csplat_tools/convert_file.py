@@ -105,9 +105,9 @@ def find_floaters(points: F64, sizes: F64) -> Mask:
         own = np.flatnonzero(octaves == octave)
         neighbours = np.zeros(len(own), np.int64)
         for step in np.ndindex(3, 3, 3):
-            wanted = _key(cells[own] + (np.array(step) - 1))
-            at = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-            neighbours += np.where(keys[at] == wanted, counts[at], 0)
+            expected = _key(cells[own] + (np.array(step) - 1))
+            at = np.minimum(np.searchsorted(keys, expected), len(keys) - 1)
+            neighbours += np.where(keys[at] == expected, counts[at], 0)
         found[own] = neighbours < _NEIGHBOURS_MIN
     return found
 

@@ -167,7 +167,7 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
             "and make the film with ffmpeg"
         )
     if fps > min(MAX_FPS, _TICKS[kind]):
-        raise InputError(f"{fps:g} frames per second, wanted {MAX_FPS:g} at most")
+        raise InputError(f"{fps:g} frames per second, expected at most {MAX_FPS:g}")
 
 
 def write_film(path: str, frames: Sequence[U8], fps: float) -> None:

@@ -101,13 +101,13 @@ class CpuEngine:
             The photometric loss before the step.
         """
         options, camera = self._options, image.camera
-        loss, photograph = self._loss_for(camera)
-        compose(image, background, photograph)
+        loss, target = self._loss_for(camera)
+        compose(image, background, target)
         rgb = self._forward(camera, background, degree)
         shown = rgb if gain is None else gain.apply(rgb)
-        value, slope = loss(shown, photograph, image.mask)
+        value, slope = loss(shown, target, image.mask)
         if self._perceptual is not None:
-            slope += self._perceptual.gradient(shown, photograph, options.lpips_weight)
+            slope += self._perceptual.gradient(shown, target, options.lpips_weight)
         if gain is not None:
             slope = gain.backward(rgb, slope)
         gradients = self._rasteriser.backward(slope)

@@ -101,14 +101,14 @@ class GsplatEngine:
         """Make a training step on an image, see `CpuEngine.step`; gains are not trained."""
         assert gain is None
         camera = image.camera
-        photograph = self._upload(compose(image, background, np.empty((camera.H, camera.W, 3), np.float32)))
+        target = self._upload(compose(image, background, np.empty((camera.H, camera.W, 3), np.float32)))
         rendered, info = self._draw(camera, background, degree)
         if self.screen is not None:
             info["means2d"].retain_grad()
         if image.mask is not None:  # pixels that do not count are set to the render
-            counts = torch.from_numpy(image.mask).to(photograph.device)[..., None]
-            photograph = torch.where(counts, photograph, rendered.detach())
-        total, value = self._loss(rendered, photograph)
+            counts = torch.from_numpy(image.mask).to(target.device)[..., None]
+            target = torch.where(counts, target, rendered.detach())
+        total, value = self._loss(rendered, target)
         total.backward()  # type: ignore[no-untyped-call]  # untyped in torch
         if self.screen is not None:
             self._gather(info, camera)

@@ -82,24 +82,24 @@ class PhotometricLoss:
         self._sums = np.zeros((height, 3), np.float64)
         self._gradient = np.empty(self._shape, np.float32)
 
-    def __call__(self, rendered: F32, photograph: F32, mask: NDArray[np.bool_] | None = None) -> tuple[LossValue, F32]:
+    def __call__(self, rendered: F32, target: F32, mask: NDArray[np.bool_] | None = None) -> tuple[LossValue, F32]:
         """Compare two images.
 
         Args:
             rendered: [H, W, 3], C-contiguous.
-            photograph: [H, W, 3], C-contiguous.
-            mask: [H, W], pixels that count; the others of `photograph` are set to those of `rendered`. `None`: all
+            target: [H, W, 3], C-contiguous.
+            mask: [H, W], pixels that count; the others of `target` are set to those of `rendered`. `None`: all
                 count.
 
         Returns:
             The terms, and the gradient of `loss` by `rendered`, [H, W, 3], in a buffer that the next call overwrites.
             It is 0 for pixels that do not count.
         """
-        assert rendered.shape == self._shape == photograph.shape
+        assert rendered.shape == self._shape == target.shape
         if mask is not None:
-            np.copyto(photograph, rendered, where=~mask[..., None])
+            np.copyto(target, rendered, where=~mask[..., None])
         flat = (self._shape[0], 3 * self._shape[1])
-        x, y = rendered.reshape(flat), photograph.reshape(flat)
+        x, y = rendered.reshape(flat), target.reshape(flat)
         gradient = self._gradient.reshape(flat)
         count = x.size
         l1_step = np.float32(self.l1_weight / count)
@@ -194,14 +194,14 @@ def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradie
 
 
 def photometric_loss_twin(
-    rendered: F64, photograph: F64, l1_weight: float = 0.8, ssim_weight: float = 0.2
+    rendered: F64, target: F64, l1_weight: float = 0.8, ssim_weight: float = 0.2
 ) -> tuple[LossValue, F64]:
     """Compute `PhotometricLoss` in float64 NumPy, for tests.
 
     Returns:
         The terms, and the gradient of `loss` by `rendered`, [H, W, 3].
     """
-    x, y = rendered.astype(np.float64), photograph.astype(np.float64)
+    x, y = rendered.astype(np.float64), target.astype(np.float64)
     m1, m2 = blur_twin(x), blur_twin(y)
     s11, s22, s12 = blur_twin(x * x) - m1 * m1, blur_twin(y * y) - m2 * m2, blur_twin(x * y) - m1 * m2
     a, b, c, d = 2 * m1 * m2 + C1, 2 * s12 + C2, m1 * m1 + m2 * m2 + C1, s11 + s22 + C2
@@ -247,10 +247,10 @@ class PerceptualLoss:
         with torch.no_grad():
             return float(self._distance(self._tensor(first), self._tensor(second)))
 
-    def gradient(self, rendered: F32, photograph: F32, weight: float) -> F32:
+    def gradient(self, rendered: F32, target: F32, weight: float) -> F32:
         """Return the gradient of `weight` · LPIPS by the rendered image, [H, W, 3]."""
         x = self._tensor(rendered).requires_grad_(requires_grad=True)
-        (weight * self._distance(x, self._tensor(photograph))).backward()
+        (weight * self._distance(x, self._tensor(target))).backward()
         slope: F32 = x.grad[0].permute(1, 2, 0).contiguous().numpy()
         return slope
 

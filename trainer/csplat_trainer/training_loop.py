@@ -303,9 +303,9 @@ class _TrainingRun:
         folder.mkdir(parents=True, exist_ok=True)
         image = (self._data.test or self._data.train)[0]
         size = (image.camera.H, image.camera.W, 3)
-        photograph = compose(image, self._background, np.empty(size, np.float32))
+        target = compose(image, self._background, np.empty(size, np.float32))
         rendered = self._engine.render(image.camera, self._background, degree)
-        save_image(folder / f"{self._iteration:06d}.png", side_by_side(photograph, rendered))
+        save_image(folder / f"{self._iteration:06d}.png", side_by_side(target, rendered))
 
     def _save(self) -> None:
         assert self._outputs.checkpoint is not None

@@ -1,1 +1,1 @@
-"""Train scenes from photographs, and tune files to look like photographs or the source."""
+"""Train scenes from images, and tune files by images or by renders of the source."""

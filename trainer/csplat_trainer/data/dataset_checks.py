@@ -44,11 +44,11 @@ def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> Non
         check_intrinsics((lens.fx, lens.fy), (lens.cx, lens.cy), (lens.width, lens.height), lens.source)
     for shot in shots:
         lens, size = shot.lens, shown_size(shot.path, heads[shot.path].size, shot.lens)
-        wanted = (lens.width, lens.height)
-        if _aspect_mismatch(size, wanted) > _NEARLY >= _aspect_mismatch((size[1], size[0]), wanted):
+        expected = (lens.width, lens.height)
+        if _aspect_mismatch(size, expected) > _NEARLY >= _aspect_mismatch((size[1], size[0]), expected):
             source = f"given by {lens.source}" if lens.source else "that of its camera"
             remedy = "the sides are swapped: turn the images, or compute poses of the images as stored"
-            raise _aspect_error(shot.path, size, wanted, source, remedy)
+            raise _aspect_error(shot.path, size, expected, source, remedy)
         if shot.mask is not None:
             mask_size = shown_size(shot.mask, image_size(shot.mask), lens)
             if _aspect_mismatch(mask_size, size) > _NEARLY:
@@ -178,21 +178,21 @@ def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
 
 
 def _aspect_error(
-    path: Path, size: tuple[int, int], wanted: tuple[float, float], source: str, remedy: str
+    path: Path, size: tuple[int, int], expected: tuple[float, float], source: str, remedy: str
 ) -> InputError:
-    found, shape = f"{size[0]}×{size[1]}", f"{wanted[0]:g}×{wanted[1]:g}"
+    found, shape = f"{size[0]}×{size[1]}", f"{expected[0]:g}×{expected[1]:g}"
     return InputError(f"{path} has {found} pixels, expected the aspect ratio of {shape}, {source}: {remedy}")
 
 
-def _aspect_mismatch(size: tuple[int, int], wanted: tuple[float, float]) -> float:
+def _aspect_mismatch(size: tuple[int, int], expected: tuple[float, float]) -> float:
     """Return the relative difference of an image's scales along both sides; 0 if rounding explains it."""
     (low_x, high_x), (low_y, high_y) = (
         ((side - _ROUNDING) / (other + _ROUNDING), (side + _ROUNDING) / max(other - _ROUNDING, 0.5))
-        for side, other in zip(size, wanted, strict=True)
+        for side, other in zip(size, expected, strict=True)
     )
     if max(low_x, low_y) <= min(high_x, high_y):
         return 0.0
-    across, down = size[0] / wanted[0], size[1] / wanted[1]
+    across, down = size[0] / expected[0], size[1] / expected[1]
     return max(across / down, down / across) - 1.0
 
 

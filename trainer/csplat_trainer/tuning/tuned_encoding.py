@@ -100,8 +100,8 @@ def finetune(
 
     Examples:
         >>> import csplat, csplat_trainer
-        >>> photographs = csplat_trainer.load("capture")  # doctest: +SKIP
-        >>> found = csplat_trainer.finetune(csplat.read_ply("scene.ply"), photographs)  # doctest: +SKIP
+        >>> data = csplat_trainer.load("capture")  # doctest: +SKIP
+        >>> found = csplat_trainer.finetune(csplat.read_ply("scene.ply"), data)  # doctest: +SKIP
         >>> len(found.data) < len(found.plain.data)  # doctest: +SKIP
         True
 
