@@ -15,7 +15,7 @@ from csplat import _spec
 from csplat_authoring.builder import build, chunk_records, repair
 from csplat_authoring.coders import Deflate, deflate_dynamic, deflate_fixed, deflate_stored
 from csplat_authoring.recipes import sound_recipes
-from csplat_authoring.recipes.deflate_streams import broken_streams, sound_streams
+from csplat_authoring.recipes.deflate_streams import invalid_streams, valid_streams
 from csplat_authoring.samples import attributes, rich_scene, scene, tile
 from csplat_authoring.scene import Attribute, Chunk, StatedErrors
 from csplat_conformance.manifest import load
@@ -460,7 +460,7 @@ def test_valid_deflate_streams_give_their_output():
         assert (case.output, len(case.coded)) == by_zlib(case.coded, size)
         assert (case.output, len(case.coded)) == by_validator(case.coded, size)
 
-    assert [] == failures(sound_streams(), check)
+    assert [] == failures(valid_streams(), check)
 
 
 def test_invalid_deflate_streams_are_refused_with_their_clause():
@@ -470,13 +470,13 @@ def test_invalid_deflate_streams_are_refused_with_their_clause():
             undo_coder(memoryview(case.coded), DEFLATE, len(case.output))
         assert case.clause == caught.value.clause
 
-    assert [] == failures(broken_streams(), check)
+    assert [] == failures(invalid_streams(), check)
 
 
 def damaged(count):
     """Yield streams with a few bits flipped, most of them in the header of the first block."""
     rng = random.Random(1)  # noqa: S311 - damage is no secret
-    cases = [case.coded for case in sound_streams() + broken_streams() if len(case.output) < SIZE]
+    cases = [case.coded for case in valid_streams() + invalid_streams() if len(case.output) < SIZE]
     text = bytes(rng.choice(b"aaaabbcdefgh") for _ in range(300))
     packers = [zlib.compressobj(9, zlib.DEFLATED, -15, 9, way) for way in (0, 2, 3, 4)]
     texts = [packer.compress(text) + packer.flush() for packer in packers]

@@ -300,7 +300,7 @@ def _no_side_chunks(_right: Wrong, _job: Any) -> tuple[None, None]:
     return None, None
 
 
-def _tail_of_inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> bytes:  # noqa: ARG001 - as the right one
+def _tail_of_inflate(_right: Wrong, coded: memoryview, size: int, at: int) -> bytes:  # noqa: ARG001 - the original's signature
     return zlib.decompressobj(-zlib.MAX_WBITS).decompress(coded, size).ljust(size, b"\0")
 
 

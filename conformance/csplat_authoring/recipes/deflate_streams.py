@@ -37,7 +37,7 @@ class DeflateCase:
 
 def valid_deflate_recipes() -> list[Recipe]:
     """Return recipes of valid streams."""
-    return [_valid(case, _scene(case)) for case in sound_streams()]
+    return [_valid(case, _scene(case)) for case in valid_streams()]
 
 
 def invalid_deflate_recipes() -> list[Recipe]:
@@ -46,7 +46,7 @@ def invalid_deflate_recipes() -> list[Recipe]:
         invalid_recipe(
             f"deflate_{case.name}", case.why, case.clause, "E_CODER", _scene(case), at=f"{_place(case)}.coded"
         )
-        for case in broken_streams()
+        for case in invalid_streams()
     ]
 
 
@@ -74,7 +74,7 @@ def _scene(case: DeflateCase) -> Scene:
     return scene(3, [tile(n=n, degree=3, changes=changes | {_SH3: signed(rows, replace(stream_coding, width=_WIDTH))})])
 
 
-def sound_streams() -> list[DeflateCase]:
+def valid_streams() -> list[DeflateCase]:
     """Return valid streams."""
     crossing = (18, 138, 18, 117, 2, 2, 16, 6)  # 255 zeros, 2, 2, and the 2 six times more
     literals = {7: 1, 8: 2, _LENGTH_3: 15, END_OF_BLOCK: 15} | {9 + i: 3 + i for i in range(12)}
@@ -184,7 +184,7 @@ def _copies() -> tuple[Deflate, bytes]:
     return stream, bytes(output)
 
 
-def broken_streams() -> list[DeflateCase]:
+def invalid_streams() -> list[DeflateCase]:
     """Return invalid streams."""
     return [*_counts(), *_codes(), *_lengths(), *_symbols()]
 

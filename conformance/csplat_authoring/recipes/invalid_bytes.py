@@ -112,7 +112,7 @@ def _full_runs(block: Block) -> Stream:
 
 
 def _arrays_beyond_budget() -> Recipe:
-    """Return a sound file of SH degree 3 whose arrays exceed the default budget; splats of a tile are all the same."""
+    """Return a valid file of SH degree 3 whose arrays exceed the default budget; all splats of a tile are equal."""
     tiles = _spec.BUDGET_BYTES // (_SPLAT_BYTES * _spec.TILE_SPLATS_MAX) + 1
     one = tile(1, 1, 0, {SCALES: signed([[-4, -5, -6]]), SH0: signed([[7, 8, 9]])})
     run = {attribute: replace(block, stream_coding=_full_runs(block)) for attribute, block in one.blocks.items()}

@@ -203,7 +203,7 @@ class SplatComparison(Protocol):
         ...
 
     def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, WorstSplat]:
-        """Return by measure which of the given splats, which have no partner, exceeds its bound most."""
+        """Return by measure the splat that exceeds its bound most, of the given splats without a partner."""
         ...
 
 

@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from csplat import _spec
 from csplat.disk_files import atomic_writer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.encoders.encoder_inputs import EncoderInput
-from csplat_conformance.fields import read_fields
+from csplat_conformance.fields import Field, read_fields
 from csplat_conformance.protocol import ProcessEnd, run_program
 
 #: The violated clause, or an empty string, and a line about the defect.
@@ -233,21 +232,17 @@ def _field_at(data: bytes, at: int) -> str:
         return ""
     for name, entry in fields.items():
         if entry.offset <= at < entry.offset + entry.size:
-            return _name_with_type(data, name)
+            return _name_with_type(data, fields, name)
     for name, (offset, size) in spans.items():
         if offset <= at < offset + size:
-            return f"the chunk {_name_with_type(data, f'directory[{name}]') if name.isdigit() else name}"
+            return f"the chunk {_name_with_type(data, fields, f'directory[{name}]') if name.isdigit() else name}"
     return ""
 
 
-def _name_with_type(data: bytes, name: str) -> str:
-    """Add the chunk type to the name of a directory record."""
-    if not name.startswith("directory["):
+def _name_with_type(data: bytes, fields: Mapping[str, Field], name: str) -> str:
+    """Add the chunk type to the name of a directory record or of one of its fields."""
+    record = name.partition(".")[0]
+    if not record.startswith("directory["):
         return name
-    head = _spec.unpack_index_head(data, _spec.HEADER_SIZE)
-    before = head.head_size + head.attribute_count * head.attribute_size
-    before += head.codebook_count * head.codebook_size + head.extra_count * head.extra_size
-    number = int(name.removeprefix("directory[").partition("]")[0])
-    place = _spec.HEADER_SIZE + before + number * head.directory_size
-    kind = _spec.unpack_directory_record(data, place).type.decode("ascii", "replace")
-    return f"{kind} ({name})"
+    at = fields[f"{record}.type"].offset
+    return f"{data[at : at + 4].decode('ascii', 'replace')} ({name})"

@@ -331,7 +331,7 @@ def _check_renders(
         scene: the decoded scene.
         pairs: the source splat of each decoded splat.
         size_bytes: size of the file.
-        alone: why only renders can check the file; empty if errors were verified.
+        alone: the reason why only renders can check the file; empty if errors were verified.
         checks: the checks to make.
     """
     if not case.renders or case.source is None:

@@ -54,8 +54,8 @@ SH_MAX, SH_PER_LARGEST = 0.3, 0.04
 # Signs of truncation.
 STEPS_MAX = 0.75  #: lattice steps; rounding causes 0.5, or 0.71 next to alpha 0 if it searches the nearest alpha
 ONE_SIDED = 0.95  #: fraction of the errors with one sign; 40 random signs are this one-sided once in 10^9 times
-_TRUNCATED_STEPS_MAX = 1.05  # lattice steps; truncation alone leaves at most 1
-_VALUES_MIN = 40  # different values, below which signs mean nothing
+_TRUNCATED_STEPS_MAX = 1.05  # lattice steps; truncation causes at most 1
+_VALUES_MIN = 40  # smallest number of distinct values for which signs are significant
 _ROWS_MAX = 4096  # splats to examine
 _SAME_ROTATION_MIN = 0.8  # smallest cosine of half the angle between rotations that are compared
 

@@ -293,7 +293,7 @@ CODES: Final[dict[str, str]] = {
     "SER-2": _spec.ERROR_VALUE,
     "SER-3": _spec.ERROR_STREAM,
     "SER-4": _spec.ERROR_VALUE,
-    "SER-5": "",  # no decoder can look: what the file alone shows of it has no code
+    "SER-5": "",  # decoders do not check it
     "STR-1": _spec.ERROR_STREAM,
     "STR-2": _spec.ERROR_STREAM,
     "STR-3": _spec.ERROR_STREAM,

@@ -16,7 +16,7 @@ _COMPARISONS: Final = {
     ast.Gt: (">", (">=", "<=")),
     ast.GtE: (">=", (">", "<")),
     ast.Eq: ("==", ("!=",)),
-    ast.NotEq: ("!=", ("==", "<", ">")),  # one side of a mismatch alone
+    ast.NotEq: ("!=", ("==", "<", ">")),  # only one direction of a mismatch
     ast.In: ("in", ("not in",)),
     ast.NotIn: (r"not\s+in", ("in",)),
     ast.Is: ("is", ("is not",)),
@@ -75,7 +75,7 @@ class _Module:
                     yield from self.inside(child)
 
     def of(self, node: ast.AST) -> Iterator[Mutant]:
-        """Yield what changes at this node itself."""
+        """Yield the mutants of this node itself."""
         match node:
             case ast.Compare():
                 operands = [node.left, *node.comparators]
@@ -166,7 +166,7 @@ _BINARY: Final = {
     ">": (">=", "<="),
     ">=": (">", "<"),
     "==": ("!=",),
-    "!=": ("==", "<", ">"),  # one side of a mismatch alone
+    "!=": ("==", "<", ">"),  # only one direction of a mismatch
     "&&": ("||",),
     "||": ("&&",),
     "+": ("-",),
