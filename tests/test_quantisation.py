@@ -53,7 +53,7 @@ def test_rotations_stay_legal_and_near(levels):
 def test_colours_stay_within_a_step_and_a_chroma_step(shift, scale):
     rgb = np.random.default_rng(shift).normal(0, scale, (3, 5000))
     columns = quantisation.colour_integers(rgb if scale > 1e6 else rgb.astype(np.float32), shift)
-    error = np.abs(quantisation.colour_lifted(columns, shift) - rgb)
+    error = np.abs(quantisation.lift_colour(columns, shift) - rgb)
     assert float(error.max()) <= 1.5 + 0.75 * 2**shift
 
 
@@ -62,7 +62,7 @@ def test_colours_stay_within_a_step_and_a_chroma_step(shift, scale):
 def test_without_a_shift_colours_stay_within_one_step(r, g, b):
     rgb = np.array([[r], [g], [b]], np.float64)
     columns = quantisation.colour_integers(rgb, 0)
-    assert float(np.abs(quantisation.colour_lifted(columns, 0) - rgb).max()) <= 1
+    assert float(np.abs(quantisation.lift_colour(columns, 0) - rgb).max()) <= 1
 
 
 def test_coarse_colours_are_multiples_on_the_same_lattice():

@@ -173,15 +173,15 @@ class FileWindow:
             StoreError, OSError: as in `Store.read`.
         """
         sizes = self.store.sizes
-        wanted = _missing(((at, at + size) for at, size in parts), self._here)
+        missing = _find_missing(((at, at + size) for at, size in parts), self._here)
         waiting: list[tuple[int, int]] = []
-        for start, stop in _missing(_joined(wanted, sizes.gap), self._here):
+        for start, stop in _find_missing(_join_ranges(missing, sizes.gap), self._here):
             for at in range(start, stop, sizes.request):
                 waiting.append((at, min(at + sizes.request, stop)))
                 if len(waiting) == sizes.at_once:
-                    self._take(waiting)
+                    self._read_ranges(waiting)
                     waiting = []
-        self._take(waiting)
+        self._read_ranges(waiting)
 
     def forget(self) -> None:
         """Discard all fetched parts except the head."""
@@ -190,15 +190,15 @@ class FileWindow:
         self.view[: len(self._head)] = self._head
         self._here = [(0, len(self._head))]
 
-    def _take(self, ranges: Sequence[tuple[int, int]]) -> None:
+    def _read_ranges(self, ranges: Sequence[tuple[int, int]]) -> None:
         if not ranges:
             return
         for (start, stop), data in zip(ranges, self.store.read(ranges), strict=True):
             self.view[start:stop] = data
-        self._here = _joined([*self._here, *ranges])
+        self._here = _join_ranges([*self._here, *ranges])
 
 
-def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
+def _join_ranges(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, int]]:
     """Sort ranges, and join ranges that are at most `gap` bytes apart."""
     runs: list[tuple[int, int]] = []
     for start, stop in sorted(ranges):
@@ -209,10 +209,10 @@ def _joined(ranges: Iterable[tuple[int, int]], gap: int = 0) -> list[tuple[int, 
     return runs
 
 
-def _missing(ranges: Iterable[tuple[int, int]], held: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Yield the parts of `ranges` that no range of `held` covers; `held` is sorted."""
+def _find_missing(ranges: Iterable[tuple[int, int]], present: Sequence[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Yield the parts of `ranges` that no range of `present` covers; `present` is sorted."""
     for start, stop in ranges:
-        for first, end in held:
+        for first, end in present:
             if start < end and first < stop:
                 if start < first:
                     yield start, first

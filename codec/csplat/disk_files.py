@@ -34,7 +34,7 @@ class BinaryWriter(Protocol):
         ...
 
 
-#: Byte order marks and their encodings. UTF-32 comes first, because its little-endian mark begins with UTF-16's.
+#: Byte order marks and their encodings. UTF-32 precedes UTF-16, because its little-endian mark begins with UTF-16's.
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -137,7 +137,7 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
     ) as folder:  # Windows: the copy may still be mapped
         own = getattr(file, "name", None)
         spool = Path(folder) / (name or (Path(own).name if isinstance(own, str) else "") or "data")
-        with _named(spool), spool.open("wb") as stream:
+        with _name_errors(spool), spool.open("wb") as stream:
             for part in _parts(file):
                 stream.write(part)
         yield spool
@@ -157,7 +157,7 @@ def _parts(file: Any) -> Iterator[memoryview]:
 
 
 @contextmanager
-def _named(path: str | os.PathLike[str]) -> Iterator[None]:
+def _name_errors(path: str | os.PathLike[str]) -> Iterator[None]:
     """Add the name of the file to errors that lack one."""
     try:
         yield
@@ -203,7 +203,10 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         OSError: the folder does not exist, is full or is not writable.
     """
     if Path(path).exists() and not Path(path).is_file():
-        with _named(path), Path(path).open("wb") as stream:  # not resolved: /dev/stdout may point to an unnamed pipe
+        with (
+            _name_errors(path),
+            Path(path).open("wb") as stream,
+        ):  # not resolved: /dev/stdout may point to an unnamed pipe
             yield stream
         return
     target = Path(path).resolve()

@@ -76,14 +76,14 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
         raise InputError(f"quats has shape {list(quats.shape)}, expected [{count}, 4]")
     if not np.isfinite(quats).all():
         raise InputError("quats contains NaN or infinity")
-    opacities = _reshaped("opacities", opacities, (count,), (count, 1))
+    opacities = _reshape("opacities", opacities, (count,), (count, 1))
     if form == "parameters":
         opacities = alpha_of_logits(opacities)
     elif (scales > 0.0).all():
         scales = np.log(scales.astype(np.float64)).astype(np.float32)
     else:
         raise InputError('scales are not all above 0: use form="parameters" for logarithms')
-    sh0 = _reshaped("sh0", sh0, (count, 3), (count, 1, 3))
+    sh0 = _reshape("sh0", sh0, (count, 3), (count, 1, 3))
     return SplatModel(means, normalise_quats(quats), scales, opacities, sh0, shN)
 
 
@@ -151,7 +151,7 @@ def _array(name: str, value: Any) -> F32:
         raise InputError(f"{name} is a {type(value).__name__}, expected an array or a tensor: {error}") from None
 
 
-def _reshaped(name: str, array: F32, shape: tuple[int, ...], also: tuple[int, ...]) -> F32:
+def _reshape(name: str, array: F32, shape: tuple[int, ...], also: tuple[int, ...]) -> F32:
     if array.shape not in (shape, also):
         raise InputError(f"{name} has shape {list(array.shape)}, expected {list(also)}")
     return array.reshape(shape)

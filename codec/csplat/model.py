@@ -100,7 +100,7 @@ class SplatModel:
         _check_opacities(self.opacities)
         _check_quats(self.quats)
         _check_extra(self.extra, n)
-        object.__setattr__(self, "origin", _checked_origin(self.origin))
+        object.__setattr__(self, "origin", _parse_origin(self.origin))
         if self.means_double is not None:
             _check_doubles(self.means, self.means_double, self.origin)
         if self.coordinate_system != UNSPECIFIED:
@@ -265,7 +265,7 @@ def _check_extra(extra: Mapping[str, NDArray[Any]], n: int) -> None:
             raise InputError(f"extra column {name!r} is {column.dtype}, expected integers or floats")
 
 
-def _checked_origin(origin: Sequence[float]) -> tuple[float, float, float]:
+def _parse_origin(origin: Sequence[float]) -> tuple[float, float, float]:
     try:
         x, y, z = (float(value) for value in origin)
     except (TypeError, ValueError):

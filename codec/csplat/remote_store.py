@@ -58,7 +58,7 @@ class RemoteStore(Store):
 
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
         self._fs, self._path = _file_system(url, options)
-        self._shown = _shown(url)
+        self._shown = _redact(url)
         names = self._fs.protocol
         self._web = not _WEB.isdisjoint((names,) if isinstance(names, str) else names)
         self._supports_ranges = not self._web
@@ -142,13 +142,13 @@ def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
     try:
         fs, path = url_to_fs(url, **options)
     except ImportError as error:  # fsspec's message names the package
-        raise InputError(f"{_shown(url)}: {error}; for HTTP and S3: pip install 'csplat[remote]'") from None
+        raise InputError(f"{_redact(url)}: {error}; for HTTP and S3: pip install 'csplat[remote]'") from None
     except (ValueError, TypeError) as error:
-        raise InputError(f"{_shown(url)}: {' '.join(str(error).split())}") from None
+        raise InputError(f"{_redact(url)}: {' '.join(str(error).split())}") from None
     return fs, path
 
 
-def _shown(url: str) -> str:
+def _redact(url: str) -> str:
     """Return a URL for messages, without passwords and signatures."""
     parts = urlsplit(url)
     if not parts.netloc:

@@ -96,8 +96,8 @@ class ChunkPrefetcher:
                 stop += 1
             if self._here:
                 self._window.forget()
-            wanted = [(one.offset, one.size) for one in extra]
-            self._window.fetch(wanted + [(one.offset, one.size) for one in self._records[place:stop]])
+            ranges = [(one.offset, one.size) for one in extra]
+            self._window.fetch(ranges + [(one.offset, one.size) for one in self._records[place:stop]])
             self._here = range(place, stop)
         return self._records[place]
 

@@ -75,6 +75,6 @@ def check_budget(
     if sum(counts) > limits.splats:
         raise LimitError("splats", sum(counts), limits.splats, offset=at, clause="LIM-1")
     splats = sum(counts) if at_once else max(counts, default=0)
-    wanted = splats * splat_bytes + table_bytes(header, tiles, degree, whole=whole)
-    if wanted > limits.bytes:
-        raise LimitError("bytes", wanted, limits.bytes, offset=at, clause="LIM-1")
+    size = splats * splat_bytes + table_bytes(header, tiles, degree, whole=whole)
+    if size > limits.bytes:
+        raise LimitError("bytes", size, limits.bytes, offset=at, clause="LIM-1")

@@ -220,7 +220,7 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
     if len(model) == 0:
         return SceneStatistics(0.0, 0.2, 0.01)
     points, reach = _reach(model.means)
-    largest = np.take(model.scales, _spread(len(model)), axis=0).max(axis=1)
+    largest = np.take(model.scales, _sample_rows(len(model)), axis=0).max(axis=1)
     size = float(np.exp(np.clip(np.median(largest), -80, 80))) / reach if reach else 1.0
     if contrast is None:
         contrast = _rms(*_contrast(model, points, reach))
@@ -320,13 +320,13 @@ def _on_grid(values: F32, grid: float) -> bool:
         return not np.fmod(values, np.float32(grid)).any()
 
 
-def _spread(count: int) -> NDArray[np.intp]:
+def _sample_rows(count: int) -> NDArray[np.intp]:
     return np.arange(0, count, max(1, count // _STATISTICS_SAMPLE))
 
 
 def _reach(means: F32) -> tuple[F64, float]:
     """Return a sample of the means, and the radius around their median that contains 80 % of them."""
-    points = np.take(means, _spread(len(means)), axis=0).astype(np.float64)
+    points = np.take(means, _sample_rows(len(means)), axis=0).astype(np.float64)
     distance = points - np.median(points, axis=0)
     top = float(np.abs(distance).max())
     return points, top and top * float(np.quantile(np.sqrt(np.square(distance / top).sum(axis=1)), _CORE))
@@ -341,7 +341,7 @@ def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, floa
     squares = weights = 0.0
     if len(model) <= _NEIGHBOUR_DISTANCE or not reach:
         return squares, weights
-    for rows in _neighbours(model.means, np.median(sample, axis=0), 2.0 * reach):
+    for rows in _neighbour_runs(model.means, np.median(sample, axis=0), 2.0 * reach):
         near, far = rows[:-_NEIGHBOUR_DISTANCE], rows[_NEIGHBOUR_DISTANCE:]
         weight = model.opacities[near].astype(np.float64) * model.opacities[far]
         colour = np.clip(model.sh0[near].astype(np.float64) - model.sh0[far], -10, 10)
@@ -350,7 +350,7 @@ def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, floa
     return squares, weights
 
 
-def _neighbours(means: F32, centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
+def _neighbour_runs(means: F32, centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
     """Return runs of splats in Morton order: all of a small scene, some of a large one."""
     codes = np.empty(len(means), np.int64)
     scale, top = np.float32(min(1.0 / reach, _CELLS_MAX)), (1 << _CODE_BITS) - 1

@@ -36,7 +36,7 @@ from csplat.encoder.sh_codebook import (
 from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequantise_shapes
 from csplat.encoder.splat_importance import (
     Importance,
-    checked_blocks,
+    get_blocks,
     sh_metric,
     shape_metric,
     shape_weights,
@@ -146,7 +146,7 @@ class EncodePlan:
             return cls._of_many(model, options, origin, progress)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_records(model, options)
-        blocks = checked_blocks(model, importance) if allow_classes else None
+        blocks = get_blocks(model, importance) if allow_classes else None
         parameters, classes = choose_classes(model, blocks, parameters, options)
         tiles = cut_scene(model, parameters, classes)
         shapes = None

@@ -324,12 +324,12 @@ def _deflate(raw: bytes, deflate: DeflateSettings) -> bytes:
     if deflate.library == "zlib":
         return _zlib(raw, min(deflate.level, 9), zlib.Z_DEFAULT_STRATEGY)
     if deflate.level <= _FASTEST_LEVEL:
-        return _quickest(raw)
+        return _deflate_fast(raw)
     # If only runs repeat, the accidental matches that libdeflate finds cost more than they save.
     return min(_libdeflate(raw, deflate.level), *(compress(raw) for compress in _WITHOUT_MATCHES), key=len)
 
 
-def _quickest(raw: bytes) -> bytes:
+def _deflate_fast(raw: bytes) -> bytes:
     """Compress with the method that is best on samples: fast matches, runs of one byte, or only Huffman codes."""
     methods: tuple[Callable[[bytes], bytes], ...] = (lambda data: _libdeflate(data, 1), *_WITHOUT_MATCHES)
     step = max(_SAMPLE, len(raw) // 4)

@@ -21,8 +21,8 @@ from csplat.encoder.pipeline import EncodedTiles, encode_tiles
 from csplat.encoder.quantisation import (
     canonicalise_shape,
     colour_integers,
-    colour_lifted,
     lattice_values,
+    lift_colour,
     quantise_colour,
     quantise_sh,
     quat_levels,
@@ -123,7 +123,7 @@ class FixedQuantisation:
         model, parameters = self.encode_plan.model, self.parameters
         sh = np.ascontiguousarray(model.shN[:, : parameters.sh_coefficients])
         if self.book is not None:
-            sh = np.concatenate([_entry_values(self.book.entries, parameters), sh[self.book.escaped]])
+            sh = np.concatenate([_dequantise_entries(self.book.entries, parameters), sh[self.book.escaped]])
         quats, scales, sizes = model.quats, model.scales, np.zeros(0, np.float32)
         if self.shapes is not None:
             shared, own = self.shapes.entries, self.shapes.escaped
@@ -160,7 +160,7 @@ class FixedQuantisation:
         shN, codebooks = np.zeros_like(model.shN), FileCodebooks(self.sh_plan)
         if self.book is not None:
             shN[self.book.escaped, :kept] = values.sh[self.book.size :]
-            codebooks = make_codebooks(self.sh_plan, self._requantised(self.book, values.sh), self.parameters)
+            codebooks = make_codebooks(self.sh_plan, self._requantise(self.book, values.sh), self.parameters)
         else:
             shN[:, :kept] = values.sh
         model = replace(model, means_double=None)
@@ -201,7 +201,7 @@ class FixedQuantisation:
         """Return decoded SH of all splats, [N, K, 3], of `FreeValues.sh`."""
         parameters = self.parameters
         if self.book is not None:
-            decoded = self._requantised(self.book, sh).dequantise(parameters)
+            decoded = self._requantise(self.book, sh).dequantise(parameters)
             decoded[self.book.escaped] = self._dequantise_escapes(self.book, sh)
             return decoded
         decoded = np.empty_like(sh)
@@ -214,7 +214,7 @@ class FixedQuantisation:
         """Return decoded SH of the rows of `FreeValues.sh`, [R, K, 3]."""
         if self.book is None:
             return self.dequantise_sh(sh)
-        entries = _entry_values(self._requantised(self.book, sh).entries, self.parameters)
+        entries = _dequantise_entries(self._requantise(self.book, sh).entries, self.parameters)
         return np.concatenate([entries, self._dequantise_escapes(self.book, sh)])
 
     def dequantise_shape_rows(self, values: FreeValues, decoded: DecodedValues) -> tuple[F32, F32, F32]:
@@ -248,8 +248,8 @@ class FixedQuantisation:
         by_splat[0][own], by_splat[1][own] = values.quats[size:], values.scales[size:]
         return ShapeCodebook(entries, self.shapes.index, summand), *by_splat
 
-    def _requantised(self, book: ShCodebook, sh: F32) -> ShCodebook:
-        return ShCodebook(_entry_integers(sh[: book.size], self.parameters), book.index)
+    def _requantise(self, book: ShCodebook, sh: F32) -> ShCodebook:
+        return ShCodebook(_quantise_entries(sh[: book.size], self.parameters), book.index)
 
 
 def fix_quantisation(
@@ -274,7 +274,7 @@ def fix_quantisation(
     parameters = replace(parameters, canonical=True)
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
     order = np.concatenate(rows).astype(np.int64)
-    plan = replace(_reordered(plan, order, [len(part) for part in rows]), parameters=parameters)
+    plan = replace(_reorder(plan, order, [len(part) for part in rows]), parameters=parameters)
     sh_plan, means = codebooks.sh_plan.select(order), plan.model.means
     low, high = np.empty_like(means), np.empty_like(means)
     for tile in plan.tiles:
@@ -282,7 +282,7 @@ def fix_quantisation(
     return FixedQuantisation(plan, sh_plan, source, low, high, _zero_coefficients(plan, sh_plan))
 
 
-def _reordered(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
+def _reorder(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
     """Put splats into tile order and canonical axis order, and drop the data that only an open SH coding needs."""
     model = plan.model.select(order)
     rotation, scales = canonicalise_shape(model.quats, model.scales)
@@ -317,13 +317,13 @@ def _zero_coefficients(plan: EncodePlan, sh_plan: ShCodingPlan) -> NDArray[np.bo
     return zero
 
 
-def _entry_values(entries: I32, parameters: CodingParameters) -> F32:
+def _dequantise_entries(entries: I32, parameters: CodingParameters) -> F32:
     """Dequantise the entries [3, K, size] of an SH codebook to float32 [size, K, 3]."""
-    rgb = colour_lifted(entries, parameters.chroma_shift).transpose(2, 1, 0)
+    rgb = lift_colour(entries, parameters.chroma_shift).transpose(2, 1, 0)
     return np.ascontiguousarray(rgb * parameters.sh_step, np.float32)
 
 
-def _entry_integers(values: F32, parameters: CodingParameters) -> I32:
+def _quantise_entries(values: F32, parameters: CodingParameters) -> I32:
     """Quantise values [size, K, 3] to the entries [3, K, size] of an SH codebook."""
     rgb = np.ascontiguousarray(values.transpose(2, 1, 0)) * np.float32(1.0 / parameters.sh_step)
     return colour_integers(rgb, parameters.chroma_shift).astype(np.int32, copy=False)

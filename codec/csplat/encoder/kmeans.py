@@ -362,17 +362,17 @@ def _relocate(
     """Move the cheapest entries, and all without weight, into the clusters with the largest errors, in place.
 
     K-means alone never moves an entry between distant clusters (Patanè and Russo, "The enhanced LBG algorithm"). Giving
-    up an entry costs about its weight times the squared distance to its nearest neighbour; splitting a cluster halves
-    its error at best. At most `most` entries with weight move, each to a point drawn from its new cluster.
+    up an entry costs about its weight times the squared distance to its nearest neighbour; splitting a cluster saves
+    about half of its error. At most `most` entries with weight move, each to a point drawn from its new cluster.
     """
     weight = np.bincount(index, w, len(entries)).astype(np.float64)
-    harm = np.bincount(index, w * error, len(entries))
+    errors = np.bincount(index, w * error, len(entries))
     loss = weight
     if most:
         loss = weight * search_nearest(entries, entries, 0, threads, other=True)[1]
-    cheap, worst = np.argsort(loss, kind="stable"), np.argsort(-harm, kind="stable")
+    cheap, worst = np.argsort(loss, kind="stable"), np.argsort(-errors, kind="stable")
     limit = max(most, int(np.count_nonzero(weight == 0)))
-    count = int(np.count_nonzero((loss[cheap] < harm[worst] / 2)[:limit]))
+    count = int(np.count_nonzero((loss[cheap] < errors[worst] / 2)[:limit]))
     if count:
         rows = np.flatnonzero(np.isin(index, worst[:count], kind="table"))
         keys = w[rows] * error[rows] / (1.0 - rng.random(len(rows)))

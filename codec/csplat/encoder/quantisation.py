@@ -154,7 +154,7 @@ def colour_integers(rgb: Floats, shift: int, coarse: I32 | None = None) -> Integ
     return np.stack([_round_multiples(rest, kind, coarse), co, cg])
 
 
-def colour_lifted(columns: Integers, shift: int) -> Integers:
+def lift_colour(columns: Integers, shift: int) -> Integers:
     """Return the R, G, B integers of Y, Co, Cg (spec 7.1), [3, ...]."""
     y, co, cg = columns
     co, cg = co << shift, cg << shift
@@ -187,7 +187,7 @@ def quantise_colour(rgb: F32, step: float, shift: int, coarse: int = 0) -> tuple
     tile_step = math.ldexp(step, exponent)
     real = np.float32 if exponent == 0 else np.float64
     columns = colour_integers(rgb * real(1.0 / tile_step), shift)
-    return columns, exponent, lattice_values(colour_lifted(columns, shift), tile_step)
+    return columns, exponent, lattice_values(lift_colour(columns, shift), tile_step)
 
 
 def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -> tuple[Integers, int, F32]:
@@ -216,7 +216,7 @@ def quantise_sh(source: F32, parameters: CodingParameters, coarse: I32 | None) -
         multiples = None if coarse is None else coarse[part]
         quantised = colour_integers(rgb * real(1.0 / step), parameters.chroma_shift, multiples)
         columns[:, :, part] = quantised
-        decoded[part] = lattice_values(colour_lifted(quantised, parameters.chroma_shift), step).transpose(2, 1, 0)
+        decoded[part] = lattice_values(lift_colour(quantised, parameters.chroma_shift), step).transpose(2, 1, 0)
     check_finite("shN", decoded)
     return columns, exponent, decoded
 

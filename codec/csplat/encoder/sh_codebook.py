@@ -21,7 +21,7 @@ from csplat.encoder.container import FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import signed_stream
 from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric
-from csplat.encoder.quantisation import colour_integers, colour_lifted, largest_exact, lattice_values, quantise_sh
+from csplat.encoder.quantisation import colour_integers, largest_exact, lattice_values, lift_colour, quantise_sh
 from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -71,7 +71,7 @@ class ShCodebook:
 
     def dequantise(self, parameters: CodingParameters) -> F32:
         """Return SH of all splats as decoded, [N, K, 3]; rows of escaped splats are undefined."""
-        rgb = np.ascontiguousarray(colour_lifted(self.entries, parameters.chroma_shift).transpose(2, 1, 0))
+        rgb = np.ascontiguousarray(lift_colour(self.entries, parameters.chroma_shift).transpose(2, 1, 0))
         return np.take(lattice_values(rgb, parameters.sh_step), self.index, axis=0, mode="clip")
 
 

@@ -210,7 +210,7 @@ def sh_metric(model: SplatModel, weights: F32 | None, importance: Floats | Impor
     if weights is None or not isinstance(importance, Importance) or importance.sh_metric is None:
         return None
     size = model.shN.shape[1]
-    metric = _checked_metric("SH matrices", weights, importance.sh_metric, size)
+    metric = _make_metric("SH matrices", weights, importance.sh_metric, size)
     rows, columns = np.triu_indices(size)
     triangles = metric.triangles.astype(np.float32) * np.float32(1.0 - _PLAIN_NORM_SHARE)
     triangles[:, rows == columns] += np.float32(_PLAIN_NORM_SHARE)
@@ -221,10 +221,10 @@ def shape_metric(weights: F32, importance: Floats | Importance | None) -> ErrorM
     """Return the metric of covariances divided by their trace, if known; see `sh_metric`."""
     if not isinstance(importance, Importance) or importance.shape_metric is None:
         return None
-    return _checked_metric("shape matrices", weights, importance.shape_metric, _SHAPE)
+    return _make_metric("shape matrices", weights, importance.shape_metric, _SHAPE)
 
 
-def checked_blocks(model: SplatModel, importance: Floats | Importance | None) -> GaussNewtonBlocks | None:
+def get_blocks(model: SplatModel, importance: Floats | Importance | None) -> GaussNewtonBlocks | None:
     """Return the Gauss-Newton blocks, if known.
 
     Raises:
@@ -309,7 +309,7 @@ def doubled_triangles(triangles: Floats) -> F64:
     return np.asarray(triangles * np.where(upper_i == upper_j, 1.0, 2.0), np.float64)
 
 
-def _checked_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorMetric:
+def _make_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorMetric:
     shape = (len(weights), size * (size + 1) // 2)
     if found.shape != shape or found.dtype.kind != "f":
         raise InputError(f"importance has {name} {found.dtype} {list(found.shape)}, expected floats {list(shape)}")
