@@ -782,7 +782,7 @@ def test_the_command_resumes(capture, tmp_path, monkeypatch):
     words = ("finetune", capture / "scene.ply", "--data", capture, "-q")
     short = tmp_path / "run.npz"
     with monkeypatch.context() as patch:
-        patch.setattr("csplat_tools.cli.finetune.CHECKPOINT_EVERY", 4)
+        patch.setattr("csplat_tools.cli.shared_options.CHECKPOINT_EVERY", 4)
         call(*words, tmp_path / "a.csplat", "--iterations", 6, "--checkpoint", short)
     call(*words, tmp_path / "b.csplat", "--iterations", 6, "--resume", short, "--checkpoint", short)
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()

@@ -11,10 +11,7 @@ from csplat.errors import InputError
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, mapped_csplat
-from csplat_tools.inspect.file_description import (
-    describe_file,
-    describe_other_format,
-)
+from csplat_tools.inspect.file_description import describe_file, describe_other_format
 from csplat_tools.inspect.text_reports import format_description
 from csplat_tools.optional_packages import prepare_renderer, require_images
 
