@@ -22,7 +22,7 @@ try {
     header,
     bounds: { center, radius },
   } = splats.userData.csplat;
-  const plain = { preBlurAmount: 0.3, blurAmount: 0 }; // Spark draws scenes as antialiased ones unless it is told otherwise
+  const plain = { preBlurAmount: 0.3, blurAmount: 0 }; // Spark draws every scene as antialiased by default
   scene.add(new SparkRenderer({ renderer, ...(header.antialiased ? {} : plain) }), splats);
   camera.position.copy(controls.target.fromArray(center)).add(new THREE.Vector3(0, radius, 3 * radius));
   renderer.setAnimationLoop(() => controls.update() | renderer.render(scene, camera));
