@@ -404,7 +404,7 @@ def test_the_script_is_written_once(tmp_path):
     assert 0 == done.exit_code, done.output
     assert out.read_bytes() == export_element()
     assert export_element().isascii()
-    said = re.search(r"needs nothing beside it, (\d+) kB, (\d+) kB with gzip", GUIDE)
+    said = re.search(r"self-contained script \((\d+) kB, (\d+) kB gzipped\)", GUIDE)
     assert [pytest.approx(int(kilobytes), rel=0.05) for kilobytes in said.groups()] == [
         len(data) / 1000 for data in (export_element(), gzip.compress(export_element()))
     ]
