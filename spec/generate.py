@@ -33,7 +33,6 @@ C_HEADER = ROOT / "codec" / "c" / "csplat.h"
 VERSIONED = ROOT / "codec" / "csplat" / "__init__.py"
 VERSION_LINES = {
     ROOT / "CITATION.cff": r"(?m)^(version: )\S+()$",
-    ROOT / "README.md": r"('csplat-)[^'-]+(-py3-none-any\.whl)",
     ROOT / "codec" / "c" / "CMakeLists.txt": r"(?m)^(project\(csplat VERSION )\S+( )",
     ROOT / "codec" / "js" / "package.json": r'(?m)^(  "version": ")[^"]+(",)$',
 }
