@@ -604,7 +604,7 @@ def test_a_file_that_decodes_differently_is_not_written(capture, tmp_path, monke
     monkeypatch.setattr("csplat_trainer.tuning.tuned_encoding.decode", wrong)
     out = tmp_path / "s.csplat"
     result = invoke("finetune", capture / "scene.ply", "--data", capture, out, *BRIEF)
-    assert "holds other sh0 than were tuned" in str(result.exception)
+    assert "sh0 of the file differ from the tuned" in str(result.exception)
     assert not out.exists()
 
 
@@ -798,7 +798,7 @@ def test_the_command_resumes(capture, tmp_path, monkeypatch):
         (("--self", "--background", "white"), "--background requires --cameras or --data"),
         (("--self", "--lr-factor", "1e9"), "--lr-factor is FinetuneOptions.scaled in Python now"),
         (("--self", "--lambda", "0", "--target-size", "1MB"), "--lambda and --target-size: give one of them"),
-        (("--self", "--lambda", "2"), "byte_cost is 2.0, wanted 0 to 1"),
+        (("--self", "--lambda", "2"), "byte_cost is 2.0, expected 0 to 1"),
     ],
 )
 def test_invalid_options_have_status_2(capture, tmp_path, words, message):

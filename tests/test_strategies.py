@@ -236,7 +236,7 @@ def test_given_cameras_decide_and_one_is_not_enough(shell):
     reduction = Reduction(sh_degree=1, distil=True)
     scene = stored(shell, encode_reduced(shell, reduction, views=views_of(cameras(9))))
     assert 8 == scene.options["reduced"]["views"]
-    with pytest.raises(InputError, match="no camera to judge"):
+    with pytest.raises(InputError, match="requires at least one camera"):
         encode_reduced(shell, reduction, views=views_of(cameras(1)))
 
 

@@ -241,7 +241,7 @@ def test_images_without_alpha_start_in_a_box(make_data, make_model):
     assert (0.0, 0.0, 0.0) == TrainingRecord.of(result.model.metadata).background
     with pytest.raises(InputError, match="requires images with alpha"):
         train(data, TrainOptions(**QUICK, init="hull"))
-    with pytest.raises(InputError, match="no points"):
+    with pytest.raises(InputError, match="requires points"):
         train(data, TrainOptions(**QUICK, init="points"))
 
 
