@@ -407,7 +407,7 @@ def test_a_batch_writes_the_bytes_of_the_loop(sample_path, tmp_path):
     )
     assert (5, 1) == (loop["done"], loop["failed"]) == (plain["done"], plain["failed"])
     assert 5 == again["done_before"]
-    assert killed["done"] < 5 or killed["seconds"] > 0.0
+    assert 3 <= killed["done"] <= 5
     assert 5 == resumed["done"] + resumed["done_before"]
 
 
