@@ -62,7 +62,7 @@ def glanced(monkeypatch):
     """Replace the PSNR estimate after encoding; return the sizes of its scenes, and the value to return."""
     seen = {"scenes": [], "psnr": None}
 
-    def glance(source, data, *, threads):  # noqa: ARG001  # as the function has them
+    def glance(source, data, *, threads):  # noqa: ARG001  # the signature of the replaced function
         seen["scenes"].append(len(source))
         return seen["psnr"]
 
@@ -469,7 +469,7 @@ def test_the_second_of_two_writers_of_a_name_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("links", [True, False])
 def test_a_name_that_was_taken_meanwhile_is_replaced_only_by_force(tmp_path, monkeypatch, links):
-    if not links:  # as FAT has it
+    if not links:  # a file system without hard links, such as FAT
 
         def refuse(*_):
             raise PermissionError(1, "Operation not permitted")

@@ -1,4 +1,4 @@
-"""Progress shown to a waiting user: when, how often, in which words. The clock is the test's own."""
+"""Progress display: when it is shown, how often, and its text. The tests control the clock."""
 
 import io
 import sys
@@ -36,14 +36,14 @@ def clock():
 
 
 def lines(display, clock, capsys, seconds):
-    """Return the lines printed within some seconds, with ten looks at the clock in each."""
+    """Return the lines printed within some seconds, with ten ticks per second."""
     for _ in range(round(seconds * 10)):
         clock.now += 0.1
         display.tick()
     return capsys.readouterr().err.splitlines()
 
 
-def test_without_a_terminal_there_is_a_line_every_ten_seconds(clock, capsys):
+def test_without_a_terminal_a_line_is_printed_every_ten_seconds(clock, capsys):
     display = Display(terminal=False, clock=clock)
     display.report("reading", 1.0)
     display.report("encoding", 0.0)
@@ -53,7 +53,7 @@ def test_without_a_terminal_there_is_a_line_every_ten_seconds(clock, capsys):
     assert 3 == len(lines(display, clock, capsys, 30))
 
 
-def test_work_that_tells_nothing_is_seen_to_go_on(clock, capsys):
+def test_work_without_reports_is_shown_as_working(clock, capsys):
     display = Display(terminal=False, clock=clock)
     assert ["working; 0:10 so far"] == lines(display, clock, capsys, 11)
     display.report("matching", 0.0)
@@ -62,7 +62,7 @@ def test_work_that_tells_nothing_is_seen_to_go_on(clock, capsys):
     assert ["preparing the renderer; 1:00 so far"] == lines(display, clock, capsys, 50)[-1:]
 
 
-def test_time_left_is_that_of_a_stage_that_began_anew(clock, capsys):
+def test_a_restarted_stage_estimates_its_own_time_left(clock, capsys):
     display = Display(terminal=False, clock=clock)
     display.report("tiles", 0.9)
     clock.now += 1000.0
@@ -73,19 +73,19 @@ def test_time_left_is_that_of_a_stage_that_began_anew(clock, capsys):
     assert "tiles 50 %, about 20 s left; 17:00 so far\n" == capsys.readouterr().err
 
 
-def test_a_stage_may_have_words_of_its_own(clock, capsys):
+def test_a_stage_may_have_its_own_text(clock, capsys):
     display = Display(terminal=False, clock=clock)
     with displayed(display), step_progress("training", lambda now: f"step {now.iteration}, 3 s left") as show:
         show(type("Step", (), {"iteration": 40, "iterations": 50})())
     assert ["training step 40, 3 s left; 0:10 so far"] == lines(display, clock, capsys, 11)
 
 
-def test_long_runs_say_soon_how_long_they_take(clock, capsys):
+def test_long_runs_announce_their_time(clock, capsys):
     def step(iteration):
         return type("Step", (), {"iteration": iteration, "iterations": 5000})()
 
     with step_progress("training", lambda _: "", clock=clock) as show:
-        for iteration in (1000, 1100, 1200):  # one that goes on
+        for iteration in (1000, 1100, 1200):  # a resumed run
             show(step(iteration))
             clock.now += 4.0
     assert "training takes about 2 to 5 minutes from here\n" == capsys.readouterr().err
@@ -112,7 +112,7 @@ def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
     assert "25 %, about 9 s left" in sys.stderr.getvalue()
 
 
-def test_what_is_said_takes_the_bars_away_first(clock, monkeypatch, capsys):
+def test_bars_are_removed_before_other_output(clock, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("TERM", "xterm")
     with displayed(Display(terminal=True, clock=clock)) as display:
@@ -124,12 +124,12 @@ def test_what_is_said_takes_the_bars_away_first(clock, monkeypatch, capsys):
         display.tick()
         note("a remark")
         assert sys.stderr.getvalue().endswith("a remark\n")
-    assert "data\n" == capsys.readouterr().out  # and not on standard error, where bars are
+    assert "data\n" == capsys.readouterr().out  # not on standard error, which has the bars
 
 
-def test_the_quiet_and_the_inner_ones_show_nothing_of_their_own():
-    with progress_bar(quiet=True) as tell:
-        assert tell is None
+def test_quiet_and_nested_displays_show_nothing():
+    with progress_bar(quiet=True) as progress:
+        assert progress is None
     with progress_bar() as outer, progress_bar() as inner, progress_bar(quiet=True) as silent:
         assert outer == inner
         assert silent is None

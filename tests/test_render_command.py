@@ -92,12 +92,12 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_pictures_take_the_names_of_the_photographs(ply, cameras, tmp_path):
+def test_renders_are_named_after_the_photographs(ply, cameras, tmp_path):
     call("render", ply, "--cameras", cameras, tmp_path / "out")
     assert ["left.png", "right.png"] == names(tmp_path / "out")
 
 
-def test_a_ball_is_red_in_the_middle_and_the_background_around_it(ply, cameras, tmp_path):
+def test_the_background_surrounds_the_scene(ply, cameras, tmp_path):
     call("render", ply, "--cameras", cameras, tmp_path / "out", "--background", "0,0,1")
     picture = pixels(tmp_path / "out" / "left.png")
     assert (48, 64, 3) == picture.shape
@@ -110,7 +110,7 @@ def test_a_ball_is_red_in_the_middle_and_the_background_around_it(ply, cameras, 
     assert [255, 255, 255] == pixels(tmp_path / "trained" / "left.png")[0, 0].tolist()
 
 
-def test_alpha_and_depth_lie_beside_the_picture(ply, cameras, tmp_path):
+def test_alpha_and_depth_are_written_next_to_the_render(ply, cameras, tmp_path):
     call("render", ply, "--cameras", cameras, tmp_path / "out", "--alpha", "--depth")
     assert ["left.alpha.png", "left.depth.npy", "left.png"] == names(tmp_path / "out")[:3]
     alpha, depth = pixels(tmp_path / "out" / "left.alpha.png"), np.load(tmp_path / "out" / "left.depth.npy")
@@ -121,7 +121,7 @@ def test_alpha_and_depth_lie_beside_the_picture(ply, cameras, tmp_path):
     assert 0.0 == depth[0, 0]
 
 
-def test_an_orbit_is_numbered_and_of_the_size_asked_for(ply, tmp_path):
+def test_renders_of_an_orbit_are_numbered_and_have_the_given_size(ply, tmp_path):
     call("render", ply, "--orbit", 3, "--size", "40x30", tmp_path / "out")
     assert ["0000.png", "0001.png", "0002.png"] == names(tmp_path / "out")
     picture = pixels(tmp_path / "out" / "0002.png")
@@ -129,14 +129,14 @@ def test_an_orbit_is_numbered_and_of_the_size_asked_for(ply, tmp_path):
     assert picture[15, 20, 0] > 200
 
 
-def test_an_orbit_with_cameras_leads_along_them(ply, cameras, tmp_path):
+def test_an_orbit_follows_cameras(ply, cameras, tmp_path):
     call("render", ply, "--orbit", 2, "--cameras", cameras, "--size", "64x48", tmp_path / "along")
     call("render", ply, "--orbit", 2, "--size", "64x48", tmp_path / "around")
     ball = {name: np.count_nonzero(pixels(tmp_path / name / "0001.png")[..., 0] > 128) for name in ("along", "around")}
-    assert 1.5 * ball["along"] < ball["around"]  # the cameras stand ten radii away: a small ball
+    assert 1.5 * ball["along"] < ball["around"]  # the cameras are ten radii away: the ball is small
 
 
-def test_a_csplat_file_shows_what_its_ply_shows(cameras, tmp_path, make_model):
+def test_a_csplat_file_renders_like_its_ply(cameras, tmp_path, make_model):
     model = make_model(300, 1)
     write_ply(tmp_path / "many.ply", model)
     (tmp_path / "many.csplat").write_bytes(encode(model, EncodeOptions(preset="fast")))
@@ -147,7 +147,7 @@ def test_a_csplat_file_shows_what_its_ply_shows(cameras, tmp_path, make_model):
     assert np.abs(a - b).mean() < 2.0
 
 
-def test_a_resized_camera_takes_the_same_picture(ply, cameras, tmp_path):
+def test_a_resized_camera_renders_the_same_view(ply, cameras, tmp_path):
     call("render", ply, "--cameras", cameras, tmp_path / "out", "--size", "128x96")
     picture = pixels(tmp_path / "out" / "left.png")
     assert (96, 128, 3) == picture.shape
@@ -183,8 +183,8 @@ def test_a_camera_file_of_another_program_is_reported(ply, tmp_path):
         "fy": 60,
     }
     (tmp_path / "inria.json").write_text(json.dumps([entry]))
-    told = call("render", ply, "--cameras", tmp_path / "inria.json", tmp_path / "out")
-    assert "cameras.json of INRIA: 1 camera" in told
+    messages = call("render", ply, "--cameras", tmp_path / "inria.json", tmp_path / "out")
+    assert "cameras.json of INRIA: 1 camera" in messages
     assert ["a.png"] == names(tmp_path / "out")
 
 
@@ -216,7 +216,7 @@ def test_without_the_extra_packages_one_line_says_what_to_install(ply, cameras, 
     assert line == refused("render", ply, "--cameras", cameras, tmp_path / "out")
 
 
-def test_a_report_never_takes_the_place_of_the_film(ply, tmp_path):
+def test_a_report_never_replaces_the_film(ply, tmp_path):
     film = tmp_path / "turn.webp"
     result = CliRunner().invoke(app, ["render", str(ply), str(film), "--orbit", "2", "--report", str(film)])
     assert 1 == result.exit_code
@@ -229,12 +229,12 @@ def test_names_that_are_not_unique_are_numbered():
 
 
 @pytest.mark.parametrize("image", ["../../evil.png", "..\\..\\evil.png", "/etc/evil.png", "C:\\evil.jpg"])
-def test_a_name_never_leads_out_of_the_folder(image):
+def test_names_stay_inside_the_folder(image):
     assert ["evil"] == image_names([image])
 
 
 @pytest.mark.parametrize("image", ["", "..", "/", "...png", ".png"])
-def test_a_name_of_nothing_becomes_a_number_or_stays_harmless(image):
+def test_empty_names_become_numbers_or_stay_harmless(image):
     (name,) = image_names([image])
     assert name in {"0000", "png"}
 
@@ -313,7 +313,7 @@ def frames_of(path):
 
 
 @pytest.mark.parametrize(("ending", "tolerance"), [("webp", 6.0), ("gif", 8.0), ("png", 0.0), ("apng", 0.0)])
-def test_a_film_shows_what_the_pictures_show(film_scene, pictures, tmp_path, ending, tolerance):
+def test_a_film_equals_the_renders(film_scene, pictures, tmp_path, ending, tolerance):
     film = tmp_path / f"turn.{ending}"
     done = invoke("render", film_scene, *ORBIT, film, "--fps", 20)
     assert (0, "") == (done.exit_code, done.stdout), done.stderr
@@ -333,7 +333,7 @@ def test_the_same_command_writes_the_same_film(film_scene, tmp_path):
 
 
 @pytest.mark.slow
-def test_an_mp4_shows_what_the_pictures_show_and_is_the_same_again(film_scene, tmp_path):
+def test_an_mp4_resembles_the_renders_and_is_reproducible(film_scene, tmp_path):
     av = pytest.importorskip("av", reason="MP4 needs PyAV: pip install 'csplat[film]'")
     words = ("render", film_scene, "--orbit", 3, "--size", "65x49", "--background", "0.9,0.2,0.1", "--fps", 12.5)
     for name in ("one.mp4", "two.mp4", "turn"):
@@ -387,13 +387,13 @@ def test_a_film_of_one_picture_is_a_picture(tmp_path):
         (("--size", "20000x10"), 1, "at most 16383 per side"),
     ],
 )
-def test_what_a_film_cannot_be_is_refused(film_scene, tmp_path, words, status, message):
+def test_invalid_films_are_refused(film_scene, tmp_path, words, status, message):
     refused = invoke("render", film_scene, "--orbit", 2, tmp_path / "turn.webp", *words)
     assert status == refused.exit_code
     assert message in " ".join(refused.stderr.split())
 
 
-def test_pictures_of_two_sizes_make_no_film():
+def test_renders_of_two_sizes_are_refused():
     with pytest.raises(InputError, match="the cameras have 2 sizes"):
         check_film("a.gif", [(4, 4), (5, 4)], 25.0)
 
@@ -410,7 +410,7 @@ def test_durations_do_not_drift():
     assert 10_000 == sum(_durations(300, 30.0, 100))
 
 
-def test_names_tell_films_from_folders():
+def test_names_distinguish_films_from_folders():
     assert [True, True, True, True, False, False] == [
         is_film(name) for name in ("a.webp", "b.GIF", "c.png", "d.mp4", "e", "f.mkv")
     ]

@@ -53,7 +53,7 @@ class _Commands(TyperGroup):
         if not how.get("standalone_mode", True):
             return super().main(*args, **how)
         try:
-            with report_errors():  # of printing help and versions
+            with report_errors():  # help and versions are printed outside of `invoke`
                 status = super().main(*args, **{**how, "standalone_mode": False})
         except UsageError as error:
             refuse_command_line(error)
