@@ -236,16 +236,12 @@ def flip(reference: NDArray[Any], image: NDArray[Any]) -> float:
         reference, image: [H, W, 3] floating, clipped to [0, 1].
 
     Raises:
-        InputError: the images differ in shape, or the package is not installed.
+        InputError: the images cannot be compared, or the package is not installed.
     """
-    if reference.shape != image.shape or reference.ndim != 3 or reference.shape[2] != 3:
-        raise InputError(
-            f"the images for FLIP have shapes {[*reference.shape]} and {[*image.shape]}, expected [H, W, 3] twice"
-        )
+    a, b = (array.astype(np.float32) for array in _clipped(reference, image))
     try:
         package: Any = importlib.import_module("flip_evaluator")
     except ImportError as error:
         raise InputError("FLIP requires flip-evaluator: pip install 'csplat[flip]'") from error
-    a, b = (np.ascontiguousarray(np.clip(array, 0.0, 1.0), np.float32) for array in (reference, image))
     _, mean, _ = package.evaluate(a, b, "LDR", applyMagma=False)
     return float(mean)

@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from csplat.model import SplatModel
+from csplat_render import metrics
 from csplat_render.blending import blend
 from csplat_render.camera import Camera
-from csplat_render.conventions import Array, UncheckedSplats
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.kernels import is_cached, on_compiling
+from csplat_render.metric_kernels import convolve
 from csplat_render.projection import project
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
 
 _IMAGE_SIZE = 16  # width and height of the render, pixels
@@ -61,9 +65,11 @@ def warm_up(
         if gradients:
             rasteriser.backward(np.ones_like(image.rgb))
         if simplify:
-            _warm_up_simplifying(camera)
-        if ssim or lpips:
-            _warm_up_metrics(image.rgb, ssim=ssim, lpips=lpips)
+            measure_pruning_error(SplatModel(**vars(_one_splat(np.float32))), [camera])
+        if ssim:
+            metrics.ssim(image.rgb, image.rgb)
+        if lpips:
+            convolve(image.rgb.astype(np.float32), np.ones((3, 3, 3, 4), np.float32), np.zeros(4, np.float32), 1, 1)
         for call in others:
             call()
     seconds = time.perf_counter() - started
@@ -75,25 +81,6 @@ def warm_up(
 def is_compiled() -> bool:
     """Return True if the kernels that project and blend splats are compiled, so a render starts at once."""
     return all(map(is_cached, (project, blend)))
-
-
-def _warm_up_simplifying(camera: Camera) -> None:
-    from csplat.model import SplatModel
-    from csplat_render.pruning_error import measure_pruning_error
-
-    measure_pruning_error(SplatModel(**vars(_one_splat(np.float32))), [camera])
-
-
-def _warm_up_metrics(image: Array, *, ssim: bool, lpips: bool) -> None:
-    if ssim:
-        from csplat_render import metrics
-
-        metrics.ssim(image, image)
-    if lpips:
-        from csplat_render.metric_kernels import convolve
-
-        kernel = np.ones((3, 3, 3, 4), np.float32)
-        convolve(image.astype(np.float32), kernel, np.zeros(4, np.float32), 1, 1)
 
 
 def _one_splat(dtype: Any) -> UncheckedSplats:
