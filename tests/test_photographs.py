@@ -183,7 +183,6 @@ def test_masked_pixels_are_not_scored(scene):
     scores = scorer.scores(scene)
     assert scorer.psnr(scene) == pytest.approx(scores.psnr) == pytest.approx(-10.0 * np.log10(expected), abs=1e-3)
     assert [mask.sum(), H * W] == [one.pixels for one in scores.each]
-    assert scorer.subset([0]).psnr(scene) == pytest.approx(-10.0 * np.log10(errors[0]), abs=1e-3)
 
 
 def test_an_origin_moves_the_camera_in_the_opposite_direction():

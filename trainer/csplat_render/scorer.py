@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Protocol
 
@@ -145,12 +145,6 @@ class Scorer:
     def psnr(self, model: SplatModel) -> float:
         """Return the PSNR of the error pooled over views, pixels and channels, dB."""
         return metrics.psnr_of_mse(self.pooled(self.errors(model)))
-
-    def subset(self, numbers: Sequence[int]) -> Scorer:
-        """Return a scorer of some of the views."""
-        pixels = None if self.pixels is None else [self.pixels[i] for i in numbers]
-        cameras, references = [self.cameras[i] for i in numbers], [self.references[i] for i in numbers]
-        return replace(self, cameras=cameras, references=references, pixels=pixels)
 
     def score(
         self, number: int, render: F32, *, ssim: bool = True, lpips: metrics.Distance | None = None
