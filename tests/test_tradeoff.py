@@ -35,8 +35,6 @@ from csplat_tools.tradeoffs.sweep_points import StageClock, SweepFailure, fetche
 from csplat_tools.tradeoffs.sweep_run import plan_points, reduction_command, target_command, tradeoff
 from csplat_tools.tradeoffs.tradeoff_report import (
     PLOTS,
-    check_plots,
-    draw_plot,
     format_tradeoff,
     label_marks,
     make_tradeoff_page,
@@ -345,7 +343,7 @@ def test_images_show_presets_and_the_front(measured):
 @pytest.mark.slow
 def test_plots_with_data_are_shown(swept, measured):
     assert len(PLOTS) == (swept[0] / "report.html").read_text().count('<figure class="plot">')
-    assert draw_plot("size-photographs", measured, inline=False) is None
+    assert PLOTS["size-photographs"](measured, "size-photographs", False) is None
 
 
 @pytest.mark.slow
@@ -357,7 +355,7 @@ def test_plots_of_a_page_use_its_colours(swept):
 
 @pytest.mark.slow
 def test_plots_are_deterministic(measured):
-    assert draw_plot("sh-layers", measured, inline=True) == draw_plot("sh-layers", measured, inline=True)
+    assert PLOTS["sh-layers"](measured, "sh-layers", True) == PLOTS["sh-layers"](measured, "sh-layers", True)
 
 
 @pytest.mark.slow
@@ -476,10 +474,9 @@ def test_a_scene_without_splats_is_swept(setting, make_model, monkeypatch):
     assert [None] * 3 == [one.bytes_per_source_splat for one in found.measured]
     assert {99.0} == {one.psnr for one in found.measured}
     assert "0 splats" in format_tradeoff(found)
-    assert "<svg" in draw_plot("size-quality", replace(found, points=found.points[:1]), inline=False)
-    monkeypatch.setattr(
-        "csplat_tools.tradeoffs.tradeoff_report.draw_plot", lambda *_, **_options: None
-    )  # takes a second
+    assert "<svg" in PLOTS["size-quality"](replace(found, points=found.points[:1]), "size-quality", False)
+    for name in PLOTS:
+        monkeypatch.setitem(PLOTS, name, lambda *_: None)  # drawing takes a second
     assert make_tradeoff_page(found).startswith("<!doctype html>")
 
 
@@ -527,10 +524,9 @@ def test_files_are_not_replaced_without_force(capture, tmp_path):
 def test_plots_are_written_for_light_and_dark_pages(measured, tmp_path, monkeypatch):
     plots = {name: PLOTS[name] for name in ("size-quality", "attribute-bytes", "sh-layers")}  # one of each kind
     monkeypatch.setattr("csplat_tools.tradeoffs.tradeoff_report.PLOTS", plots)
-    (tmp_path / "plots").mkdir()
     write_plots(str(tmp_path / "plots"), measured)
     with pytest.raises(InputError, match="exists: --force replaces it"):
-        check_plots(str(tmp_path / "plots"), force=False)
+        write_plots(str(tmp_path / "plots"), measured)
     written = {path.stem: path.read_text() for path in (tmp_path / "plots").iterdir()}
     assert {"size-quality", "attribute-bytes"} <= set(written)
     for text in written.values():  # light or dark by the reader's setting

@@ -321,7 +321,7 @@ def _conditions(tradeoff: Tradeoff) -> dict[str, str]:
 
 
 def _plots(tradeoff: Tradeoff, *names: str) -> str:
-    drawn = ((name, draw_plot(name, tradeoff, inline=True)) for name in names)
+    drawn = ((name, PLOTS[name](tradeoff, name, True)) for name in names)
     figures = [html.figure(text, _CAPTIONS.get(name, "")) for name, text in drawn if text is not None]
     return f'<div class="plots">{"".join(figures)}</div>' if len(names) > 1 else "".join(figures)
 
@@ -333,40 +333,19 @@ _CAPTIONS = {
 }
 
 
-def check_plots(folder: str | None, *, force: bool) -> None:
-    """Make the folder of the plots; refuse if they would replace files.
+def write_plots(folder: str, tradeoff: Tradeoff, *, force: bool = False) -> Sequence[str]:
+    """Write the plots for which the sweep has data, as SVG files, and return their paths.
 
     Raises:
-        InputError: one of the files exists.
+        InputError: one of the files exists, and not `force`.
         OSError: the folder cannot be made.
     """
-    if folder is not None:
-        make_output_folder(folder, [f"{name}.svg" for name in PLOTS], force=force)
-
-
-def write_plots(folder: str, tradeoff: Tradeoff) -> Sequence[str]:
-    """Write the plots for which the sweep has data, and return their paths."""
-    paths = []
-    for name in PLOTS:
-        text = draw_plot(name, tradeoff, inline=False)
-        if text is not None:
-            paths.append(f"{folder}/{name}.svg")
-            write_bytes(paths[-1], text.encode())
+    make_output_folder(folder, [f"{name}.svg" for name in PLOTS], force=force)
+    drawn = {f"{folder}/{name}.svg": draw(tradeoff, name, False) for name, draw in PLOTS.items()}
+    paths = [path for path, text in drawn.items() if text is not None]
+    for path in paths:
+        write_bytes(path, str(drawn[path]).encode())
     return paths
-
-
-def draw_plot(name: str, tradeoff: Tradeoff, *, inline: bool) -> str | None:
-    """Draw one of `PLOTS`.
-
-    Args:
-        name: name of the plot.
-        tradeoff: the sweep.
-        inline: for a page, in its text colour; else with colours and a background of its own.
-
-    Returns:
-        An SVG; `None` if the sweep has no data for it.
-    """
-    return PLOTS[name](tradeoff, name, inline)
 
 
 _WIDE, _HIGH = 7.0, 4.4  # width and height of a plot, inches of 100 pixels
@@ -479,7 +458,7 @@ def _scatter_plot(
     Args:
         tradeoff: the sweep.
         plot: name of the plot.
-        inline: as for `draw_plot`.
+        inline: for a page, in its text colour; else with a background of its own.
         x, y: values of a file; for `x`, `None` is its size, on a logarithmic axis.
         labels: labels of the axes; that of a size is made here.
         log_y: make the y axis logarithmic.
