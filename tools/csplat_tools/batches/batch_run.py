@@ -415,6 +415,8 @@ def _run_on_dask(job: SceneJob) -> tuple[Record, bool]:
 def _dask_result(future: Any, job: SceneJob) -> tuple[Record, bool]:
     try:
         record, worked = future.result()
+    except CommandLineError:
+        raise
     except (Exception, CancelledError) as error:  # noqa: BLE001  # any error of a task that the cluster gave up
         words = " ".join(str(error).split()) or type(error).__name__
         return replace(job.record, code="E_CLUSTER", error=words), True
