@@ -69,7 +69,7 @@ class ViewerPage:
         self.visit(self.site.url(VIEWER + query))
 
     def visit(self, url: str) -> None:
-        """Do the same with a page that lies elsewhere."""
+        """Do the same with a page at another address."""
         self._resize()
         self.page.goto(url)
         self.page.evaluate(_HEED_WHEEL)
@@ -83,14 +83,14 @@ class ViewerPage:
         return path
 
     def begin(self, data: bytes | None, name: str = "scene.csplat") -> str:
-        """Begin to show a scene, or one that is absent; `shown` on the page resolves when that is done."""
+        """Start to show a scene, or an absent one; `shown` on the page resolves at the end."""
         path = f"/{next(self._numbers)}/{name}"
         url = self.site.url(path) if data is None else self.site.add(path, data)
         self.page.evaluate("([url, name]) => void (window.shown = csplatViewer.show(url, name))", [url, name])
         return path
 
     def rest(self) -> None:
-        """Bring the page into the state of one that has just been loaded, its scene apart."""
+        """Reset the page to its state after loading, except for the scene."""
         self.page.bring_to_front()
         self._resize()
         self.page.emulate_media(reduced_motion="no-preference")
@@ -111,12 +111,12 @@ class ViewerPage:
         self.tab.until(expression)
 
     def settle(self) -> None:
-        """Wait until the camera has come to rest, and the picture with it."""
+        """Wait until camera and picture are at rest."""
         self.until("!csplatViewer.controls.frame && !csplatViewer.stage.moving")
         self.page.evaluate("csplatViewer.engine.settled()")
 
     def moved(self, act: Callable[[], object]) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the camera's pose before and after an action, which moves it: a browser may take a while to tell."""
+        """Return the camera's pose before and after an action that moves it; browsers may report events late."""
         before = self.pose
         self.page.evaluate("window.before = JSON.stringify(csplatViewer.rig.pose)")
         act()
@@ -126,12 +126,12 @@ class ViewerPage:
 
     @property
     def pose(self) -> dict[str, Any]:
-        """Pose of the camera."""
+        """The camera's pose."""
         return self.page.evaluate(_COPY.format("pose"))
 
     @property
     def home(self) -> dict[str, Any]:
-        """Pose of the first picture."""
+        """The camera's pose in the first picture."""
         return self.page.evaluate(_COPY.format("home"))
 
     @property
@@ -264,7 +264,7 @@ TYPES = {
 
 @dataclass
 class Tab:
-    """A page, and what it complained about.
+    """A page and its problems.
 
     Attributes:
         page: playwright's page.
@@ -285,7 +285,7 @@ class Tab:
 
 @dataclass(frozen=True)
 class Request:
-    """A request as the server saw it: path without query, the Range header or "", and what was answered."""
+    """A request to the server: path without query, the Range header or "", and the status of the answer."""
 
     method: str
     path: str
@@ -295,7 +295,7 @@ class Request:
 
 
 class Site:
-    """A static server on 127.0.0.1 with the viewer, the decoder, and whatever a test adds.
+    """A static server on 127.0.0.1 with the viewer, the decoder, and the files that a test adds.
 
     Attributes:
         requests: all that came, in order.
@@ -322,7 +322,7 @@ class Site:
             do_HEAD = do_GET
 
             def log_message(self, *_args: object) -> None:
-                """Stay quiet."""
+                """Log nothing."""
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05})
@@ -395,7 +395,7 @@ class Site:
 
 
 def absent(reason: str) -> None:
-    """Skip the test, or fail if nothing may be absent."""
+    """Skip the test, or fail if skipping is forbidden."""
     if os.environ.get("CI") == "true":
         pytest.fail(f"CI=true, and {reason}")
     pytest.skip(reason)

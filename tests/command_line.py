@@ -56,7 +56,7 @@ def change_options(patch: pytest.MonkeyPatch, place: str, **values: object) -> N
 
 
 def change_views(patch: pytest.MonkeyPatch, count: int, size: tuple[int, int]) -> None:
-    """Let commands place few, small virtual views, unless they want none."""
+    """Let commands place few, small virtual views if they place any."""
 
     def find(source, *, count: int | None, size: tuple[int, int] | None, few, small, **how):  # noqa: ARG001
         return find_view_set(source, count=count if count == 0 else few, size=small, **how)

@@ -25,12 +25,12 @@ pytest_plugins = ["chromium"]  # the fixtures `browser`, `tab` and `site`
 
 SHARED = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
 
-#: Programs and files of others: CONTRIBUTING.md describes how to fill it.
+#: External programs and files; CONTRIBUTING.md describes how to fill the folder.
 PEERS = Path(os.environ.get("CSPLAT_PEERS", ROOT / "out" / "peers")).absolute()
 
 
 def of_peers(name: str) -> Path:
-    """A file or folder of others; a test is skipped if it is absent."""
+    """An external file or folder; a test is skipped if it is absent."""
     if not (PEERS / name).exists():
         pytest.skip(f"{name} is absent ({PEERS}); CSPLAT_PEERS names the folder of others, see CONTRIBUTING.md")
     return PEERS / name
@@ -38,7 +38,7 @@ def of_peers(name: str) -> Path:
 
 T = TypeVar("T")
 
-#: Files whose tests take longest: pytest-xdist hands these out first, so that no worker ends up alone with one.
+#: Files with the longest tests: pytest-xdist starts them first, so that no worker is left with one at the end.
 LONGEST = (
     "test_finetune",
     "test_tradeoff",
@@ -55,7 +55,7 @@ OF_AN_AREA = re.compile(r"^pytestmark = (?:\[[^\]]*)?[^\n]*?" + AREA, re.MULTILI
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave out files of areas that are not asked for: importing them takes two seconds, and torch as much again."""
+    """Leave out files of areas that are not selected: importing them takes two seconds, and torch as much again."""
     expression = config.option.markexpr
     if collection_path.suffix != ".py" or "not area" not in expression:
         return None
@@ -83,7 +83,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in getattr(one, "keywords", ())
     ]
     if skipped:
-        terminalreporter.section(f"{len(skipped)} tests skipped that want shared scenes", sep="=")
+        terminalreporter.section(f"{len(skipped)} tests skipped for lack of shared scenes", sep="=")
         terminalreporter.line(
             f"They are absent ({SHARED}); CSPLAT_DATA names their folder. What they say of scenes that"
         )
@@ -122,7 +122,7 @@ def sample_path() -> Path:
 
 @pytest.fixture(scope="module")
 def small_views():
-    """Make virtual validation and test views small: for searches and reports whose figures nobody reads."""
+    """Make virtual validation and test views small, for searches and reports whose figures are not asserted."""
     from csplat_tools.views.virtual_views import VirtualViewSizes
 
     small = VirtualViewSizes(test=(8, 160, 120), validation=(12, 80, 60), extra=(12, 80, 60))
@@ -133,7 +133,7 @@ def small_views():
 
 @pytest.fixture
 def make_model():
-    """A function that makes a small random model: `make_model(count, degree, **fields)`."""
+    """Return a function for small random models: `make_model(count, degree, **fields)`."""
 
     def make(count: int = 10, degree: int = 3, seed: int = 0, **fields: object) -> SplatModel:
         rng = np.random.default_rng(seed)
@@ -156,9 +156,9 @@ def make_model():
 
 @pytest.fixture(scope="session")
 def trained_scene(once, tmp_path_factory):
-    """A scene that was trained for 300 steps on small photographs, see trained.py; its files are everybody's."""
-    pytest.importorskip("numba", reason="training wants the extra [render]")
-    pytest.importorskip("scipy", reason="data sets want the extra [render]")
+    """A scene trained for 300 steps on small photographs, see trained.py; all workers share its files."""
+    pytest.importorskip("numba", reason="training requires the extra [render]")
+    pytest.importorskip("scipy", reason="data sets require the extra [render]")
     from trained import make_trained, run_here
 
     return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained"), run_here))
@@ -166,7 +166,7 @@ def trained_scene(once, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tuned_file(once, trained_scene, tmp_path_factory):
-    """A file of the trained scene that was tuned for 100 steps; its files are everybody's."""
+    """A file of the trained scene, tuned for 100 steps; all workers share its files."""
     from trained import make_tuned, run_here
 
     return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene, run_here))
@@ -191,7 +191,7 @@ def search_at_loss(once):
 
 
 def _searched(once, name: str, **goal: float):
-    pytest.importorskip("numba", reason="targets want the extra [render]")
+    pytest.importorskip("numba", reason="targets require the extra [render]")
     import captures
 
     def find():
@@ -205,8 +205,8 @@ def _searched(once, name: str, **goal: float):
 @pytest.fixture(scope="session")
 def file_runs(once, tmp_path_factory):
     """Runs of `csplat train` to files, see trained.py."""
-    pytest.importorskip("numba", reason="training wants the extra [render]")
-    pytest.importorskip("scipy", reason="data sets want the extra [render]")
+    pytest.importorskip("numba", reason="training requires the extra [render]")
+    pytest.importorskip("scipy", reason="data sets require the extra [render]")
     from trained import FileRuns
 
     return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))

@@ -1,11 +1,11 @@
-"""Fuzz the decoders and the readers of PLY and other formats: damage with an eye for structure, checksums repaired.
+"""Fuzz the decoders and the readers of PLY and other formats with structured damage and repaired checksums.
 
 | target | must |
 |---|---|
 | decoder | decode within small limits, or refuse with a CsplatError (CNF-3) |
 | others | in JavaScript and C give the verdict and the arrays of the Python decoder |
-| validator | find something wrong exactly where the decoder refuses |
-| ply | give a sound model or an InputError, as lint says |
+| validator | report errors exactly where the decoder refuses ||
+| ply | give a sound model or an InputError, in agreement with lint ||
 | formats | give a sound model or an InputError |
 
 Anything else, a case that takes more than five seconds of processor time, or memory beyond the limit is a finding: it
@@ -57,7 +57,7 @@ NUMBER = re.compile(r"0x[0-9a-f]+|[0-9]+")
 
 
 class TooSlowError(BaseException):
-    """A case ran longer than it may. No Exception: nothing on the way may take it for an error of its own."""
+    """A case exceeded its time. Not an Exception, so that no handler on the way catches it."""
 
 
 def main() -> int:
@@ -101,7 +101,7 @@ def arguments() -> argparse.Namespace:
     args.target = args.target or ["decoder"]
     one = len(args.target) == 1 and args.target != ["all"]
     if args.replay and not (one and args.files):
-        parser.error("--replay wants one --target and files")
+        parser.error("--replay requires one --target and files")
     if args.files and not one:
         parser.error("files belong to one --target")
     if args.seconds is None and args.count is None:
@@ -117,7 +117,7 @@ def made(name, scratch=None):
 
 
 def replay(name, paths):
-    """Let a target read files as they are."""
+    """Let a target read unchanged files."""
     target, tally = made(name), Counter()
     signal.signal(signal.SIGPROF, too_slow)
     files = [file for path in paths for file in (sorted(path.iterdir()) if path.is_dir() else [path])]
@@ -153,7 +153,7 @@ def run(name, args):
 
 
 def covered(name, args, lines, scratch):
-    """Write which lines nothing reached; return what is known of the coverage, a line each."""
+    """Write the lines that nothing reached; return the lines of the report on coverage."""
     target = made(name, scratch)
     every = Edges(target.watched).all_lines()
     reached = [f"{len(lines & every):,} of {len(every):,} lines of functions"]
@@ -192,7 +192,7 @@ def gathered(args, processes, clocks, results, stop):
 
 
 def stuck(processes, clocks, findings):
-    """Kill workers that do not come back from a case, or have died in one; return how many."""
+    """Kill workers that hang or died in a case; return their number."""
     gone = 0
     for k, process in enumerate(processes):
         if process is None:
@@ -265,7 +265,7 @@ def work(k, name, args, clock, results, stop, scratch):
 
 
 def case(target, seed, number, seeds, grown, *, plain=False):
-    """Return case `number` of a seed, and whether its coverage is to be looked at."""
+    """Return case `number` of a seed, and whether its coverage is recorded."""
     rng = random.Random(f"{target.name} {seed} {number}")  # noqa: S311 - repeatable, no secret
     traced = not plain and rng.random() < TRACED_SHARE
     corpus = grown if grown and rng.random() < GROWN_SHARE else seeds
@@ -273,7 +273,7 @@ def case(target, seed, number, seeds, grown, *, plain=False):
 
 
 def attempt(target, data):
-    """Let the target read one file: (name for the tally, what is wrong or an empty string)."""
+    """Let the target read one file; return the name for the tally, and the finding or an empty string."""
     signal.setitimer(signal.ITIMER_PROF, SECONDS_PER_CASE)
     try:
         return target.attempt(data)
@@ -315,7 +315,7 @@ def saved(target, args, number, data, what, seeds):
 
 
 def minimised(target, data, what, seeds):
-    """Return the simplest file found that shows the same."""
+    """Return the simplest file found with the same finding."""
     if what.startswith(("more than", "resident")) or " holds " in what:
         return data
     candidates = target.smaller(data, seeds)

@@ -5,8 +5,8 @@ the fact, or the change makes no difference.
 
     python tests/mutate.py csplat.encoder --count 60         # 60 mutants chosen by --seed; run again to resume
     python tests/mutate.py csplat_trainer --select 'tuning/*' --jobs 2
-    python tests/mutate.py csplat.encoder csplat_trainer --table      # what became of them, in Markdown; runs nothing
-    python tests/mutate.py csplat.encoder --survivors        # after tests were added: again what was not caught
+    python tests/mutate.py csplat.encoder csplat_trainer --table      # the verdicts, in Markdown; runs nothing
+    python tests/mutate.py csplat.encoder --survivors        # after tests were added: again those that survived
     python tests/mutate.py csplat.encoder --suite ../older -m 'not benchmark'
                              # would the tests of another checkout catch what these tests do not?
 
@@ -186,7 +186,7 @@ def judge(tree: Tree, task: Task) -> Verdict:
 
 
 def _failed(tree: Tree, tests: Sequence[str]) -> dict[str, str]:
-    """Run tests in the present process; the first failure, or nothing."""
+    """Run tests in the present process; return the first failure, or nothing."""
     plugin = _Chosen(tests)
     status = tree.pytest(["-x", *dict.fromkeys(file_of(test) for test in tests)], plugin)
     passed = status in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED)  # ids may hold what is changed
@@ -260,7 +260,7 @@ class Suite:
         return cls(project, trees, mapped, Importers(project, packages), budget)
 
     def verdicts(self, package: Package, mutants: Sequence[Mutant]) -> Iterator[tuple[Mutant, Verdict]]:
-        """Yield what becomes of each mutant, in the order in which they are done."""
+        """Yield the verdict on each mutant, in the order of completion."""
         tasks = [self._task(package, mutant) for mutant in mutants]
         unreached = [task for task in tasks if not task.tests and not task.left_out]
         yield from ((task.mutant, Verdict(Fate.UNREACHED)) for task in unreached)
@@ -290,7 +290,7 @@ class Suite:
 
 
 class State:
-    """The mutants of a package and what became of them, kept in a file.
+    """The mutants of a package and their verdicts, stored in a file.
 
     Args:
         file: path of the file.
@@ -313,7 +313,7 @@ class State:
 
     @property
     def entries(self) -> list[dict[str, Any]]:
-        """The mutants and verdicts as they are kept."""
+        """Return mutants and verdicts in the form of the file."""
         entries: list[dict[str, Any]] = self.data["mutants"]
         return entries
 
@@ -327,7 +327,7 @@ class State:
         return [_mutant(one) for one in entries if not suite or suite not in one.get("suites", {})]
 
     def note(self, mutant: Mutant, verdict: Verdict, suite: str = "") -> None:
-        """Keep a verdict; the verdict of another suite is kept next to this one's."""
+        """Store a verdict; the verdict of another suite is stored next to this one's."""
         entry = next((one for one in self.entries if _mutant(one) == mutant), asdict(mutant))
         if suite:
             entry.setdefault("suites", {})[suite] = asdict(verdict)

@@ -99,7 +99,7 @@ class Project:
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer of a process, or why there is none, and its processor time with that of its children."""
+    """The answer of a process or the reason for its absence, and the processor time with its children's."""
 
     value: dict[str, Any] = field(default_factory=dict)
     failure: str = ""
@@ -120,7 +120,7 @@ class Tree:
         self.numba_cache = self._beside("numba")
 
     def refresh(self) -> None:
-        """Copy what differs from the sources and remove what is not among them; times of files are kept."""
+        """Copy files that differ from the sources and remove all others; times of files are preserved."""
         wanted = {name: self.project.root / name for name in self.project.files() if not _is_of_suite(name)}
         wanted |= {name: self.suite / name for name in Project.load(self.suite).files() if _is_of_suite(name)}
         for path in self.root.rglob("*"):
@@ -142,7 +142,7 @@ class Tree:
 
     @contextlib.contextmanager
     def changed(self, name: str, text: str) -> Iterator[None]:
-        """Replace the text of a file for the time of a `with` block."""
+        """Replace the text of a file within a `with` block."""
         target = self.root / name
         try:
             _remove_bytecode(target)
@@ -356,7 +356,7 @@ class Importers:
 
 
 class Recorder:
-    """A plugin of pytest that tells coverage which test or fixture runs, and notes how long each takes.
+    """A plugin of pytest that switches coverage to the running test or fixture, and records the time of each.
 
     Attributes:
         uses: fixtures that each test and each fixture uses.
@@ -425,7 +425,7 @@ class Recorder:
         return get
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """Note what became of a test."""
+        """Note the outcome of a test."""
         if report.failed:
             self.failed.add(report.nodeid)
         elif report.passed and report.when == "call":
@@ -490,7 +490,7 @@ class Map:
             arguments += ["-m", expression] if expression else []
             answer = tree.ask(lambda: _record(tree, packages, lines, arguments), _MAP_SECONDS)
             if answer.failure or answer.value["status"] not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
-                raise RuntimeError(f"the tests do not run on the unchanged tree, {tree.root}-log says why")
+                raise RuntimeError(f"the tests do not run on the unchanged tree, see {tree.root}-log")
             file.write_text(json.dumps({**answer.value, "seconds_of_map": answer.seconds}), encoding="utf-8")
         value = json.loads(file.read_text(encoding="utf-8"))
         parts = ("tests", "failed", "uses", "scopes", "seconds")
@@ -529,7 +529,7 @@ class Map:
         return list(tests)
 
     def limit(self, tests: Sequence[str]) -> float:
-        """Return after how many seconds tests are ended."""
+        """Return the time limit of tests in seconds."""
         parts = set(tests).union(*(self._closure(test) for test in tests))
         return _SLACK_SECONDS + _SLACK_FACTOR * self._sum(parts)
 
@@ -547,7 +547,7 @@ class Map:
         return self._data.contexts_by_lineno(str(self.root / file))
 
     def _closure(self, name: str) -> frozenset[str]:
-        """Return all that a test or a fixture uses, directly or not."""
+        """Return all fixtures that a test or a fixture uses, directly or not."""
         if name not in self._closures:
             used = frozenset(self.uses.get(name, ()))
             self._closures[name] = used  # ends the recursion when a name uses itself

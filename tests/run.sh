@@ -69,7 +69,7 @@ javascript() {
 
 SUMMARY=""
 
-# step NAME COMMAND...: run it in a subshell, whose CPU time is that of this step alone, whatever runs beside it.
+# step NAME COMMAND...: run it in a subshell, whose CPU time is that of this step alone, even while others run.
 step() {
     printf '\n== %s\n' "$1"
     (timed out/step.seconds "${@:2}")
@@ -100,7 +100,7 @@ cpu_seconds() {
     rm "$file"
 }
 
-# background NAME COMMAND...: run a step beside the following ones; `joined` waits for it and prints what it printed.
+# background NAME COMMAND...: run a step in parallel to the following ones; `joined` waits for it and prints its output.
 background() {
     BACKGROUND_NAME=$1
     (timed out/background.seconds "${@:2}") >out/background.log 2>&1 &

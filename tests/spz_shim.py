@@ -1,4 +1,4 @@
-"""The Python module of SPZ's repository, on csplat: so its own tests judge our reader, writer and turning.
+"""The Python module of SPZ's repository on top of csplat, for its own tests of our reader, writer and rotations.
 
 `test_format_spz.py` runs them, and lists which fail: functions without a counterpart in csplat are absent here.
 """
@@ -26,7 +26,7 @@ _QUARTER = axes_rotation("RUF", "RBU")  # between the two families of axes
 
 class PackOptions:
     version, from_coord = 4, UNSPECIFIED
-    sh1_bits, sh_rest_bits = 5, 4  # ours: 6 of all, whatever is said here
+    sh1_bits, sh_rest_bits = 5, 4  # ignored: ours are 6 bits
 
 
 class UnpackOptions:
@@ -42,7 +42,7 @@ def _flat(name, zeros=0):
 
 
 class GaussianCloud:
-    """Rotations are x y z w of any length, alphas are logits."""
+    """Return a model; rotations are x y z w of any length, alphas are logits."""
 
     positions, scales, rotations = _flat("positions"), _flat("scales", 3), _flat("rotations", 4)
     alphas, colors, sh = _flat("alphas", 1), _flat("colors", 3), _flat("sh")

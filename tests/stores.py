@@ -1,6 +1,6 @@
-"""Stores of files that are read in parts: in memory, and a web server and an S3 on this machine.
+"""Stores of files that are read in parts: in memory, a local web server and a local S3.
 
-All but the S3 can be made to misbehave.
+Memory and web server can be made to misbehave.
 """
 
 import io
@@ -31,15 +31,15 @@ def box_of(data, place):
 
 
 class FileSystem:
-    """Files in memory, behind the methods of fsspec's file systems.
+    """Files in memory with the interface of fsspec's file systems.
 
     Attributes:
         files: by name.
         protocol: one name, or several.
         ranges: whether it returns parts of files.
         cut_after: number of requests after which only half of a range is returned; `None`: never.
-        answer: is raised in place of any answer.
-        asked, sent: requests so far, and bytes that came of them.
+        answer: raised in place of any answer.
+        asked, sent: numbers of requests and of bytes sent.
     """
 
     async_impl = True
@@ -84,7 +84,7 @@ class FileSystem:
 
 
 class _Parts(io.RawIOBase):
-    """An open file of a `FileSystem`, which notices a server that sends more than a part."""
+    """An open file of a `FileSystem`, which refuses servers without ranges."""
 
     def __init__(self, system, name, size):
         self._system, self._name, self._size, self._at = system, name, size, 0
@@ -123,7 +123,7 @@ class Web:
 
     @contextmanager
     def serve(self):
-        """Yields the address, without a slash at its end."""
+        """Yield the address without a trailing slash."""
         handler = type("Handler", (_Handler,), {"web": self})
         with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
             server.daemon_threads = True
@@ -177,12 +177,12 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(body)
             web.sent += len(body)
         except ConnectionError:
-            pass  # whoever asked has enough
+            pass  # the client closed the connection
 
 
 @contextmanager
 def s3(files):
-    """Serve files by their keys in a bucket `scenes`; yields the options with which fsspec finds them."""
+    """Serve files by their keys in a bucket `scenes`; yield the storage options for fsspec."""
     import boto3
     from moto.server import ThreadedMotoServer
 
@@ -191,13 +191,8 @@ def s3(files):
     try:
         host, port = server.get_host_and_port()
         endpoint = f"http://{host}:{port}"
-        client = boto3.client(
-            "s3",
-            endpoint_url=endpoint,
-            aws_access_key_id=KEYS["key"],
-            aws_secret_access_key=KEYS["secret"],
-            region_name="us-east-1",
-        )
+        keys = {"aws_access_key_id": KEYS["key"], "aws_secret_access_key": KEYS["secret"]}
+        client = boto3.client("s3", endpoint_url=endpoint, region_name="us-east-1", **keys)
         client.create_bucket(Bucket="scenes")
         for key, data in files.items():
             client.put_object(Bucket="scenes", Key=key, Body=data)

@@ -37,7 +37,7 @@ FAST = ("encode", "--preset", "fast")
 
 @pytest.fixture
 def scenes(tmp_path, make_model):
-    """A folder of two scenes, one in a folder beneath, and a text that is named as one."""
+    """A folder with two scenes, one of them in a subfolder, and a text file named like a scene."""
     folder = tmp_path / "scenes"
     (folder / "sub").mkdir(parents=True)
     csplat.write_ply(folder / "a.ply", make_model(40, 1))
@@ -48,7 +48,7 @@ def scenes(tmp_path, make_model):
 
 @pytest.fixture
 def here(monkeypatch):
-    """No processes are started: one scene at a time, in this one."""
+    """Run one scene at a time in this process."""
     monkeypatch.setattr(batch_run, "Worker", InThisProcess)
     monkeypatch.setattr(InThisProcess, "ran", 0)
     return InThisProcess
@@ -62,9 +62,7 @@ def names(tasks):
     return [one.output for one in tasks]
 
 
-# selection of scenes
-
-
+# Selection of scenes.
 def test_a_folder_is_searched_and_keeps_its_paths(scenes):
     assert ["a.csplat", "sub/b.csplat", "text.csplat"] == names(find_tasks(str(scenes), "encode", ".csplat"))
     assert ["a.csplat"] == names(find_tasks(str(scenes), "encode", ".csplat", match="*.ply"))
@@ -75,13 +73,13 @@ def test_scenes_of_one_name_keep_their_endings(scenes):
     assert {"a.ply.csplat", "a.splat.csplat"} <= set(names(find_tasks(str(scenes), "encode", ".csplat")))
 
 
-def test_a_folder_that_is_a_scene_gives_it_its_name(scenes):
+def test_a_folder_that_is_a_scene_names_the_output(scenes):
     (scenes / "statue").mkdir()
     (scenes / "statue" / "meta.json").write_text("{}")
     assert "statue.csplat" in names(find_tasks(str(scenes), "encode", ".csplat"))
 
 
-def test_points_and_parts_of_what_trainers_write_are_no_scenes(scenes):
+def test_initial_points_and_parts_of_checkpoints_are_no_scenes(scenes):
     (scenes / "inria" / "point_cloud" / "iteration_30000").mkdir(parents=True)
     for name in ("inria/input.ply", "inria/point_cloud/iteration_30000/point_cloud.ply", "sub/input.ply"):
         (scenes / name).write_bytes(b"")
@@ -95,7 +93,7 @@ def test_points_and_parts_of_what_trainers_write_are_no_scenes(scenes):
     assert ["inria/input.ply"] == starting_points(scenes)
 
 
-def test_encode_leaves_its_own_files_out_and_decode_takes_no_others(scenes):
+def test_encode_skips_csplat_files_and_decode_takes_only_those(scenes):
     (scenes / "c.csplat").write_bytes(b"")
     assert "c.csplat" not in names(find_tasks(str(scenes), "encode", ".csplat"))
     assert ["c.ply"] == names(find_tasks(str(scenes), "decode", ".ply"))
@@ -136,23 +134,21 @@ def test_a_manifest_names_scenes_outputs_and_options(scenes, name, text, encodin
         ("", "no scene"),
     ],
 )
-def test_a_manifest_that_says_nothing_is_refused(tmp_path, text, message):
+def test_an_invalid_manifest_is_refused(tmp_path, text, message):
     (tmp_path / "list.jsonl").write_text(text)
     with pytest.raises(InputError, match=message):
         find_tasks(str(tmp_path / "list.jsonl"), "encode", ".csplat")
 
 
-def test_a_manifest_in_another_encoding_is_refused_in_a_line(tmp_path):
+def test_a_manifest_in_another_encoding_is_refused(tmp_path):
     (tmp_path / "list.csv").write_bytes("K\xf6ln.ply;;".encode("cp1252"))
     with pytest.raises(InputError, match=r"list\.csv is not a text file in UTF-8 \(byte 1 is 0xf6"):
         find_tasks(str(tmp_path / "list.csv"), "encode", ".csplat")
 
 
-# work that is done, and not done again
-
-
+# Repeated batches.
 @pytest.mark.usefixtures("here")
-def test_scenes_are_done_as_the_command_does_them_and_failures_are_listed(scenes, tmp_path):
+def test_files_equal_those_of_the_command_and_failures_are_listed(scenes, tmp_path):
     out = tmp_path / "out"
     done = run(scenes, out)
     assert ["text.splat"] == [Path(one.path).name for one in done.failures]
@@ -170,12 +166,12 @@ def test_scenes_are_done_as_the_command_does_them_and_failures_are_listed(scenes
     assert "E_INPUT" in page
 
 
-def test_nothing_is_done_twice_but_what_failed_or_changed(scenes, tmp_path, here, make_model):
+def test_only_failed_or_changed_scenes_are_repeated(scenes, tmp_path, here, make_model):
     out = tmp_path / "out"
     run(scenes, out)
     here.ran = 0
     again = run(scenes, out)
-    assert (1, {"a.csplat", "sub/b.csplat"}) == (here.ran, set(again.done_before))  # the text is tried again
+    assert (1, {"a.csplat", "sub/b.csplat"}) == (here.ran, set(again.done_before))  # the text file is tried again
     csplat.write_ply(scenes / "text.splat", make_model(5, 0))  # the content determines the format
     csplat.write_ply(scenes / "a.ply", make_model(41, 1))
     (out / "sub" / "b.csplat").unlink()
@@ -185,14 +181,14 @@ def test_nothing_is_done_twice_but_what_failed_or_changed(scenes, tmp_path, here
 
 
 @pytest.mark.usefixtures("here")
-def test_what_is_there_and_not_of_a_batch_stays(scenes, tmp_path):
+def test_files_of_others_are_kept(scenes, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "a.csplat").write_bytes(b"precious")
     assert "--force replaces it" in run(scenes, out).failures[0].error
     assert b"precious" == (out / "a.csplat").read_bytes()
     assert 1 == len(run(scenes, out, force=True).failures)
-    (out / "a.csplat").write_bytes(b"precious")  # a file of a batch that somebody changed is theirs
+    (out / "a.csplat").write_bytes(b"precious")  # a file of a batch that the user changed is the user's
     assert 2 == len(run(scenes, out).failures)
     assert b"precious" == (out / "a.csplat").read_bytes()
 
@@ -226,7 +222,7 @@ def test_a_dry_run_writes_nothing(scenes, tmp_path, here):
 
 
 @pytest.mark.usefixtures("here")
-def test_other_commands_take_their_turn(scenes, tmp_path):
+def test_other_commands_are_run(scenes, tmp_path):
     run(scenes, tmp_path / "out", match="*.ply")
     done = run(tmp_path / "out", tmp_path / "plys", ("decode", "--sh-degree", "0"))
     assert [("done", 40)] == [(one.state, one.splats) for one in done.records]
@@ -237,8 +233,8 @@ def test_other_commands_take_their_turn(scenes, tmp_path):
 
 @pytest.mark.area(name="remote")
 @pytest.mark.usefixtures("here")
-def test_a_scene_under_a_url_goes_to_a_url(scenes, tmp_path):
-    fsspec = pytest.importorskip("fsspec", reason="URLs want the extra [remote]")
+def test_scenes_may_be_read_from_and_written_to_urls(scenes, tmp_path):
+    fsspec = pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
     store = fsspec.filesystem("memory")
     store.pipe("/in/a.ply", (scenes / "a.ply").read_bytes())
     rows = [("memory://in/a.ply", "memory://out/a.csplat"), ("memory://in/a.ply", ""), ("memory://in/absent.ply", "")]
@@ -249,10 +245,8 @@ def test_a_scene_under_a_url_goes_to_a_url(scenes, tmp_path):
     assert store.cat("/out/a.csplat") == (tmp_path / "out" / "a.csplat").read_bytes()
 
 
-# the journal
-
-
-def test_a_half_line_is_no_line_and_the_next_one_is_whole(tmp_path):
+# The journal.
+def test_an_incomplete_line_of_the_journal_is_ignored(tmp_path):
     record = Record("a.ply", "a.csplat", FAST, "1", "done", sha256="0")
     with open_journal(tmp_path) as journal:
         journal.begin(["a.csplat", "b.csplat"])
@@ -270,15 +264,13 @@ def test_one_batch_at_a_time_writes_to_a_folder(tmp_path):
         pass
 
 
-# memory, and what is known beforehand
-
-
-def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
+# Memory and inspection.
+def test_scenes_wait_for_memory_or_are_refused():
     budget, order = MemoryBudget(100), []
     with budget.gate(60):
         thread = threading.Thread(target=lambda: [order.append("in") for _ in [budget.gate(50).__enter__()]])
         thread.start()
-        with budget.gate(40):  # does not wait for the one that does not fit
+        with budget.gate(40):  # does not wait for the thread
             order.append("first")
     thread.join()
     assert ["first", "in"] == order
@@ -286,19 +278,19 @@ def test_scenes_wait_for_memory_and_one_that_wants_all_of_it_is_refused():
         pass
     with MemoryBudget(10**9, has_option=True).gate(10**9 + 1) as options:
         assert ("--memory", str(10**9 - RENDERER_BYTES)) == options
-    with MemoryBudget(None, 100).gate(101) as options:  # nobody said so: it is tried alone
+    with MemoryBudget(None, 100).gate(101) as options:  # without an explicit limit it runs alone
         assert () == options
 
 
 @pytest.mark.usefixtures("here")
-def test_a_scene_that_wants_more_than_all_of_it_fails(scenes, tmp_path):
+def test_a_scene_beyond_the_memory_limit_fails(scenes, tmp_path):
     done = run(scenes, tmp_path / "out", ("convert",), ending=".ply", match="*.spz", memory_bytes=10**6)
     assert ["E_LIMIT"] == [one.code for one in done.failures]
     done = run(scenes, tmp_path / "out", match="*.ply", memory_bytes=10**6)  # the limit is passed on to encode
     assert ["E_INPUT"] == [one.code for one in done.failures]
 
 
-def test_a_look_knows_the_number_of_splats_and_the_content(scenes):
+def test_an_inspection_finds_splats_and_a_content_hash(scenes):
     found = inspect_scene(scenes / "sub" / "b.spz")
     assert (30, "spz") == (found.splats, found.format)
     assert inspect_scene(scenes / "text.splat").splats is None
@@ -311,7 +303,7 @@ def test_a_look_knows_the_number_of_splats_and_the_content(scenes):
     assert estimate_job("encode", SceneFile("", 0, 10**6, "")).memory_bytes > estimate_job("encode", found).memory_bytes
 
 
-def test_the_page_escapes_what_scenes_are_called(tmp_path):
+def test_the_page_escapes_names_of_scenes(tmp_path):
     record = Record("<b>.ply", "<b>.csplat", FAST, "1", "done", source_bytes=10, output_bytes=1, splats=1)
     failed = replace(record, state="failed", error="<i>", code="E_INPUT")
     page = make_batch_page([record, failed], tmp_path)
@@ -319,11 +311,9 @@ def test_the_page_escapes_what_scenes_are_called(tmp_path):
     assert "<i>" not in page
 
 
-# processes that end
-
-
+# Processes that end.
 @pytest.mark.slow
-def test_a_process_that_is_killed_is_told_and_replaced(scenes, tmp_path):
+def test_a_killed_worker_is_reported_and_replaced(scenes, tmp_path):
     os.mkfifo(tmp_path / "stuck.ply")
     worker = Worker()
     try:
@@ -338,7 +328,7 @@ def test_a_process_that_is_killed_is_told_and_replaced(scenes, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_journal_of_a_process_that_was_killed_is_read_and_goes_on(tmp_path):
+def test_the_journal_of_a_killed_process_is_continued(tmp_path):
     code = (
         "import os, signal, sys; from pathlib import Path; from csplat_tools.batches.journal import *\n"
         "with open_journal(Path(sys.argv[1])) as journal:\n"
@@ -353,9 +343,9 @@ def test_the_journal_of_a_process_that_was_killed_is_read_and_goes_on(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("here")
-def test_a_batch_that_is_interrupted_goes_on_where_it_ended(scenes, tmp_path, make_model):
+def test_an_interrupted_batch_is_continued(scenes, tmp_path, make_model):
     stuck, out = scenes / "stuck.ply", tmp_path / "out"
-    os.mkfifo(stuck)  # without a size: it comes last
+    os.mkfifo(stuck)  # without a size it comes last
     command = [sys.executable, "-m", "csplat_tools", "batch", str(scenes), str(out), "--workers", "1"]
     batch = subprocess.Popen(
         [*command, "--", *FAST],
@@ -363,7 +353,7 @@ def test_a_batch_that_is_interrupted_goes_on_where_it_ended(scenes, tmp_path, ma
         text=True,
         preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
     )
-    with stuck.open("wb"):  # waits for the process that reads it
+    with stuck.open("wb"):  # waits for the process to read it
         batch.send_signal(signal.SIGINT)
         batch.wait()
     assert 130 == batch.returncode
@@ -379,8 +369,8 @@ def test_a_batch_that_is_interrupted_goes_on_where_it_ended(scenes, tmp_path, ma
 
 @pytest.mark.slow
 @pytest.mark.area(name="dask")
-def test_a_cluster_gives_what_a_lost_machine_had_to_another(scenes, tmp_path, make_model):
-    distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
+def test_a_cluster_reassigns_the_scenes_of_a_lost_worker(scenes, tmp_path, make_model):
+    distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     stuck, whole = scenes / "stuck.ply", tmp_path / "whole.ply"
     os.mkfifo(stuck)
     csplat.write_ply(whole, make_model(7, 0))

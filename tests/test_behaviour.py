@@ -3,7 +3,7 @@
 import behaviour
 import pytest
 
-pytest.importorskip("numba", reason="renders want the extra [render]")
+pytest.importorskip("numba", reason="renders require the extra [render]")
 
 
 def check(group, record_property):

@@ -1,4 +1,4 @@
-"""The decoder in C: it compiles without a warning, reads and refuses what the vectors say, and its example runs."""
+"""The decoder in C: it compiles without a warning, passes the conformance suite, and its example runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def run(command, **options):
 
 
 def compiled(folder, name, *arguments):
-    """Compile for a program; its path."""
+    """Compile a program; return its path."""
     program = folder / name
     libraries = () if "-c" in arguments else ("-lz", "-lm")
     command = [COMPILER, *STRICT, f"-I{C}", *map(str, arguments), "-o", str(program), *libraries]
@@ -46,7 +46,7 @@ def compiled(folder, name, *arguments):
 
 @pytest.fixture(scope="module")
 def decoder(tmp_path_factory):
-    """The decoder that inflates by zlib."""
+    """The decoder that inflates with zlib."""
     return compiled(tmp_path_factory.mktemp("c"), "csplat.o", "-c", C / "csplat.c")
 
 
@@ -140,7 +140,7 @@ def test_the_webassembly_of_the_javascript_decoder_is_compiled_from_these_source
 
 
 @pytest.mark.slow
-def test_the_example_tells_what_is_in_a_file(decoder, tmp_path):
+def test_the_example_prints_the_contents_of_a_file(decoder, tmp_path):
     example = compiled(tmp_path, "example", decoder, C / "example.c")
     told = subprocess.run(
         [example, VECTORS / "valid" / "worked_example.csplat"], capture_output=True, text=True, check=True

@@ -1,4 +1,4 @@
-"""`csplat compare` and what it stands on: pairs of splats, and the one meaning of `psnr`."""
+"""`csplat compare`: pairs of splats, scores of renders, and the definition of `psnr`."""
 
 import json
 from dataclasses import replace
@@ -23,15 +23,15 @@ def renderer():
 
 @pytest.fixture
 def scene(make_model):
-    """A ball of splats of some size: it covers a picture from afar, so that no nearer views are tried."""
+    """A ball of splats that covers a view from afar, so that no nearer views are tried."""
     model = make_model(400, 1)
     distances = np.linalg.norm(model.means, axis=1, keepdims=True)
     return replace(model, means=model.means / distances, scales=model.scales * np.float32(0.3) - np.float32(1.5))
 
 
 @pytest.fixture
-def cameras(renderer):  # noqa: ARG001 -- a fixture cannot ask for another one by a mark
-    """Two small views of the cloud, and one of the empty space behind it."""
+def cameras(renderer):  # noqa: ARG001 -- a fixture cannot request another one by a mark
+    """Two small views of the scene, and one of empty space."""
     from csplat_render.camera import intrinsics, look_at
 
     K = intrinsics(64, 48, 60.0)
@@ -66,27 +66,23 @@ def call(*words):
     return result.stdout
 
 
-# a glance
-
-
+# Estimates.
 @pytest.mark.usefixtures("renderer")
-def test_a_glance_is_taken_at_no_scene_without_splats_or_with_too_many(scene):
+def test_no_psnr_is_estimated_without_splats_or_with_too_many(scene):
     data = encode(scene, EncodeOptions(preset="fast"))
     assert estimate_psnr(scene, data, splats_max=len(scene) - 1) is None
     assert estimate_psnr(scene.select(slice(0)), data) is None
 
 
 @pytest.mark.usefixtures("renderer")
-def test_a_glance_waits_for_no_compiler(scene, monkeypatch):
+def test_no_psnr_is_estimated_before_kernels_are_compiled(scene, monkeypatch):
     from csplat_render import warmup
 
     monkeypatch.setattr(warmup, "is_cached", lambda kernel: kernel is not warmup.blend)
     assert estimate_psnr(scene, encode(scene)) is None
 
 
-# pairs
-
-
+# Pairs.
 def test_a_source_index_pairs_shuffled_splats(scene):
     order = np.random.default_rng(1).permutation(len(scene))
     errors = attribute_errors(loaded(scene), loaded(scene.select(order)), order)
@@ -99,7 +95,7 @@ def test_a_wrong_source_index_is_refused(scene):
         attribute_errors(loaded(scene), loaded(scene), np.arange(3))
 
 
-def test_scenes_of_one_order_are_paired_by_it(scene):
+def test_scenes_in_the_same_order_are_paired_by_it(scene):
     moved = replace(scene, means=scene.means + np.float32(0.001))
     errors = attribute_errors(loaded(scene), loaded(moved))
     assert "order" == errors.pairing
@@ -112,7 +108,7 @@ def test_shuffled_splats_of_a_ply_are_not_paired(scene):
     assert attribute_errors(loaded(scene), loaded(scene.select(slice(0, 300)))) is None
 
 
-def test_splats_of_a_file_are_found_within_its_stated_errors(scene, tmp_path):
+def test_splats_of_a_file_are_paired_within_its_declared_errors(scene, tmp_path):
     result = encode_with_report(scene, EncodeOptions(preset="balanced"))
     path = tmp_path / "scene.csplat"
     path.write_bytes(result.data)
@@ -132,9 +128,7 @@ def test_both_kinds_of_file_are_read(scene, tmp_path):
     assert a.size_bytes == (tmp_path / "scene").stat().st_size
 
 
-# pictures
-
-
+# Renders.
 def test_a_scene_compared_with_itself_scores_99(scene, cameras):
     compared = compare_models(scene, scene, cameras)
     assert (99.0, 99.0, 99.0) == (compared.psnr, compared.psnr_mean, compared.psnr_worst)
@@ -143,7 +137,7 @@ def test_a_scene_compared_with_itself_scores_99(scene, cameras):
     assert 0.1 < compared.cover < 1.0
 
 
-def test_psnr_is_that_of_the_clipped_error_pooled_over_everything(scene, cameras):
+def test_psnr_is_pooled_over_clipped_errors_of_all_views(scene, cameras):
     from csplat_render import render
 
     other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
@@ -175,7 +169,7 @@ def test_errors_of_views_and_the_pooled_psnr_are_those_of_all_scores(scene, came
     assert judge.psnr(other) == pytest.approx(scores.psnr, rel=1e-12)
 
 
-def test_pictures_that_do_not_fit_into_memory_are_made_when_their_turn_comes(scene, cameras):
+def test_references_beyond_the_memory_are_rendered_again(scene, cameras):
     from csplat_render import scorer
 
     other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
@@ -191,18 +185,18 @@ def test_another_origin_changes_nothing(scene, cameras):
     assert compare_models(scene, moved, cameras).psnr > 90.0
 
 
-def test_views_are_shown_and_progress_is_told(scene, cameras):
-    shown, told = [], []
+def test_views_and_progress_are_passed_to_callbacks(scene, cameras):
+    shown, seen = [], []
     compare_models(
         scene,
         scene,
         cameras,
         lpips=lambda a, b: float(np.abs(a - b).max()),
         on_view=lambda number, a, b: shown.append((number, a.shape, b.shape)),
-        progress=lambda stage, done: told.append((stage, done)),
+        progress=lambda stage, done: seen.append((stage, done)),
     )
     assert [(n, (48, 64, 3), (48, 64, 3)) for n in range(3)] == shown
-    assert ("comparing", 1.0) == told[-1]
+    assert ("comparing", 1.0) == seen[-1]
 
 
 @pytest.mark.usefixtures("renderer")
@@ -212,7 +206,7 @@ def test_no_camera_is_refused(scene):
 
 
 @pytest.mark.usefixtures("renderer")
-def test_the_cameras_of_psnr_come_from_the_source_alone(scene):
+def test_the_cameras_of_psnr_only_depend_on_the_source(scene):
     cameras = comparison_cameras(scene)
     assert 8 == len(cameras)
     assert {(640, 480)} == {(camera.W, camera.H) for camera in cameras}
@@ -220,9 +214,7 @@ def test_the_cameras_of_psnr_come_from_the_source_alone(scene):
     assert all(np.array_equal(a.viewmat, b.viewmat) for a, b in zip(cameras, again, strict=True))
 
 
-# the command
-
-
+# The command.
 @pytest.fixture
 def files(scene, tmp_path):
     write_ply(tmp_path / "a.ply", scene)
@@ -230,7 +222,7 @@ def files(scene, tmp_path):
     return tmp_path / "a.ply", tmp_path / "b.csplat"
 
 
-def test_the_table_names_sizes_errors_and_quality(files, camera_file):
+def test_the_table_has_sizes_errors_and_scores(files, camera_file):
     text = call("compare", *files, "--cameras", camera_file)
     for word in ("a.ply", "times smaller", "covariance", "pairs found", "psnr_worst", "ssim", "cover", " dB", " s\n"):
         assert word in text
@@ -248,7 +240,7 @@ def test_json_has_psnr_at_the_top(files, camera_file):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("renderer", "small_views")
-def test_the_virtual_cameras_are_the_default_and_a_glance_sees_what_they_do(files, scene):
+def test_virtual_cameras_are_the_default_and_the_estimate_agrees(files, scene):
     from csplat_render.warmup import warm_up
 
     warm_up(gradients=False)
@@ -259,7 +251,7 @@ def test_the_virtual_cameras_are_the_default_and_a_glance_sees_what_they_do(file
     assert 10.0 < result["psnr"] < 90.0
 
 
-def test_pictures_are_written_side_by_side(files, camera_file, tmp_path):
+def test_renders_are_written_side_by_side(files, camera_file, tmp_path):
     from PIL import Image
 
     call("compare", *files, "--cameras", camera_file, "--pictures", tmp_path / "out")
@@ -272,7 +264,7 @@ def test_pictures_are_written_side_by_side(files, camera_file, tmp_path):
 
 
 @pytest.mark.usefixtures("renderer")
-def test_a_file_that_is_absent_is_one_line(files, tmp_path):
+def test_an_absent_file_is_reported(files, tmp_path):
     result = invoke("compare", files[0], tmp_path / "nothing.csplat")
     assert 1 == result.exit_code
     assert "nothing.csplat" in result.stderr

@@ -34,7 +34,7 @@ def named(name):
 
 
 def refusal(decode, vector):
-    """Return code, clause and offset of the error with which a vector is refused."""
+    """Return code, clause and offset of the error that refuses a vector."""
     with pytest.raises(csplat.CsplatError) as caught:
         decode(vector.data)
     return caught.value.code, caught.value.clause, caught.value.offset
@@ -86,7 +86,7 @@ def test_the_built_in_run_passes_every_vector_once_per_level():
     assert [] == report.failures
 
 
-def test_the_built_in_run_takes_a_pattern():
+def test_the_built_in_run_accepts_a_pattern():
     assert {vector.name for vector in VALID if vector.name.startswith("valid/codebook")} == {
         outcome.name for outcome in decoder_suite.run_builtin(DecoderSuiteOptions(pattern="valid/codebook*")).outcomes
     }
@@ -113,7 +113,7 @@ def test_vectors_stay_well_below_five_megabytes():
     assert sum(path.stat().st_size for path in VECTORS.rglob("*") if path.is_file()) < 1_600_000
 
 
-def test_repair_leaves_a_valid_file_as_it_is():
+def test_repair_leaves_a_valid_file_unchanged():
     for vector in VALID:
         assert vector.data == repair(vector.data)
 
@@ -137,7 +137,7 @@ def test_a_file_beyond_the_byte_budget_is_refused():
         csplat.decode(data, limits=Limits(bytes=1_000_000))
 
 
-def test_every_way_of_decoding_checks_the_whole_file():
+def test_every_decoding_function_checks_the_whole_file():
     ways = (
         lambda data: csplat.decode(data, threads=1),
         lambda data: csplat.decode(data, threads=2),
@@ -173,7 +173,7 @@ def test_an_accepted_broken_file_fails_the_run(monkeypatch):
     assert (Status.FAILED, "accepted", "QUA-2") == (failure.status, failure.message, failure.clauses[0])
 
 
-def test_ways_of_decoding_that_differ_fail_the_run(monkeypatch):
+def test_differing_decoding_functions_fail_the_run(monkeypatch):
     monkeypatch.setattr(csplat.decoder, "decode_integers", csplat.decoder.decode)
 
     report = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="invalid/quat_radicand"))
@@ -225,7 +225,7 @@ OF_MANY = {"extreme/codebook_of_65536", "extreme/codebooks_of_many_splats", FULL
 
 @pytest.fixture(scope="module")
 def valid():
-    """A function: the valid vectors that have fields of a structure, each with the places of these."""
+    """Return a function for the valid vectors with fields of a structure, and the places of these fields."""
     builts = [
         built_from((VECTORS / f"{recipe.name}.csplat").read_bytes()) if recipe.name in OF_MANY else build(recipe.scene)
         for recipe in sound_recipes()
@@ -251,7 +251,7 @@ def javascript():
         yield decoder
 
 
-def test_the_decoder_refuses_what_lies_beyond(beyond):
+def test_the_decoder_refuses_values_beyond_a_range(beyond):
     def check(pair):
         case, data = pair
         with pytest.raises(csplat.CsplatError) as caught:
@@ -263,7 +263,7 @@ def test_the_decoder_refuses_what_lies_beyond(beyond):
 
 
 @pytest.mark.slow
-def test_the_javascript_decoder_refuses_what_lies_beyond(beyond, javascript):
+def test_the_javascript_decoder_refuses_values_beyond_a_range(beyond, javascript):
     def check(pair):
         case, data = pair
         answer = javascript.ask(data)
@@ -274,7 +274,7 @@ def test_the_javascript_decoder_refuses_what_lies_beyond(beyond, javascript):
 
 
 @pytest.mark.slow
-def test_the_validator_finds_what_lies_beyond(beyond):
+def test_the_validator_finds_values_beyond_a_range(beyond):
     def check(pair):
         case, data = pair
         assert (case.rule.clause, case.rule.code) in {(one.clause, one.code) for one in validate(data).violations}

@@ -1,4 +1,4 @@
-"""The encoder suite: ours through it at every preset, what may be refused, and the command."""
+"""The encoder suite: our encoder at every preset, permitted refusals, inputs, and the command."""
 
 import contextlib
 import doctest
@@ -49,12 +49,12 @@ def invoke(*words):
 
 
 def program(code):
-    """A command line that runs some Python on {ply} and {out}, with the standard library alone, which starts soon."""
+    """Return a command line that runs Python code on {ply} and {out}; the standard library alone starts quickly."""
     return f"{shlex.quote(sys.executable)} -I -S -c {shlex.quote(code)} {{ply}} {{out}}"
 
 
 def copying(folder, name, change=lambda data: data):
-    """The command line of an encoder that copies what ours makes of an input, and its source index."""
+    """Return the command line of an encoder that copies our file of an input, and its source index."""
     (folder / "sound.ply").write_bytes(INPUTS[name].make())
     result = encode_with_report(csplat.read_ply(folder / "sound.ply"))
     (folder / "sound.csplat").write_bytes(change(result.data))
@@ -77,7 +77,7 @@ def test_pairs_are_found_however_the_file_is_ordered():
     assert (0, 0, len(source) - 60_000) == (found.strays, found.surplus, found.missing)
 
 
-def test_strays_and_surplus_are_told_apart():
+def test_strays_and_surplus_are_distinguished():
     source = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
     decoded = np.array([[0.1, 0, 0], [0.9, 0, 0], [1.1, 0, 0], [3, 0, 0]])
     found = pair_splats(source, decoded, 1.0)
@@ -103,7 +103,7 @@ def test_any_centre_can_be_paired():
 # Ours ----------------------------------------------------------------------------------------------
 @cache
 def made_of(ply, preset):
-    """The file that `csplat encode` makes of a PLY and its source index, both as bytes; or why it makes none."""
+    """Return the bytes of `csplat encode` for a PLY and of its source index, or the reason for a refusal."""
     with tempfile.TemporaryDirectory() as folder:
         source, out, index = (Path(folder) / name for name in ("in.ply", "out.csplat", "out.npy"))
         source.write_bytes(ply)
@@ -114,7 +114,7 @@ def made_of(ply, preset):
         return out.read_bytes(), index.read_bytes()
 
 
-#: Bytes of a PLY that is encoded once: whether a second run gives the same shows in the others.
+#: Bytes of a PLY that is encoded only once: the other inputs show whether a second run gives the same.
 LARGE = 20_000
 
 
@@ -133,7 +133,7 @@ def encoder_here(preset="balanced"):
     return run
 
 
-#: Inputs whose SH, tiles, columns or ranges take another way through the encoder with another preset.
+#: Inputs whose SH, tiles, columns or ranges reach other code of the encoder with another preset.
 PRESET_DEPENDENT = (
     "ordinary/degree_3",
     "ordinary/glossy",
@@ -171,7 +171,7 @@ def test_our_encoder_passes_at_other_presets(preset):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not HAS_RENDERER, reason="pictures want the extra [render]")
+@pytest.mark.skipif(not HAS_RENDERER, reason="pictures require the extra [render]")
 @pytest.mark.parametrize(("preset", "decibels"), [("fast", 34), ("balanced", 34), ("small", 31)])
 def test_our_encoder_keeps_the_picture(preset, decibels):
     names = ["ordinary/degree_3", "ordinary/needles_and_discs", "ordinary/glossy"]
@@ -184,7 +184,7 @@ def test_our_encoder_keeps_the_picture(preset, decibels):
 
 
 # Refusals ------------------------------------------------------------------------------------------
-def test_who_refuses_everything_passes_only_where_that_is_allowed():
+def test_refusing_everything_passes_only_where_that_is_allowed():
     refuses = program("import sys; sys.exit('error: not today')")
     report = run_encoder(refuses, EncoderSuiteOptions("*/empty,broken/nothing"))
     ordinary = run_encoder(refuses, EncoderSuiteOptions("ordinary/one_splat"))
@@ -203,7 +203,7 @@ def test_a_traceback_is_a_crash():
     ]
 
 
-def test_broken_inputs_must_not_be_taken():
+def test_broken_inputs_must_not_be_accepted():
     sound = csplat.encode(ENCODABLE["ordinary/one_splat"].source().to_model((0.0, 0.0, 0.0)))
 
     def take(_command, places, _seconds):
@@ -217,7 +217,7 @@ def test_broken_inputs_must_not_be_taken():
     assert ["accepted an input without splats"] * len(report.outcomes) == messages
 
 
-def test_a_child_that_is_left_behind_is_ended():
+def test_a_remaining_child_process_is_ended():
     lingering = program("import subprocess, sys; subprocess.Popen(['sleep', '600']); sys.exit('no')")
     ended = run_program(lingering, {"ply": "a", "out": "b"}, 30.0)
 
@@ -279,7 +279,7 @@ def test_failures_are_shown_with_their_clause(tmp_path):
         (("--level", "5"), "level is '5'"),
     ],
 )
-def test_wrong_words_are_one_line(words, message):
+def test_wrong_arguments_are_reported_in_one_line(words, message):
     result = invoke(*words)
 
     assert (2 if "--level" in words else 1) == result.exit_code
@@ -287,7 +287,7 @@ def test_wrong_words_are_one_line(words, message):
     assert 1 == len(result.stderr.strip().splitlines())
 
 
-def test_without_a_renderer_pictures_are_skipped_loudly(tmp_path, monkeypatch):
+def test_without_a_renderer_pictures_are_skipped_with_a_note(tmp_path, monkeypatch):
     def absent():
         raise InputError("this needs numba: pip install 'csplat[render]'")
 
@@ -304,21 +304,21 @@ def test_the_report_explains_itself():
 
 
 # Inputs --------------------------------------------------------------------------------------------
-def test_inputs_have_names_of_their_own_and_say_why():
+def test_inputs_have_unique_names_and_a_reason():
     assert len(all_inputs()) == len(INPUTS)
     assert {"ordinary", "nasty", "broken"} == {name.split("/")[0] for name in INPUTS}
     assert all(one.why for one in INPUTS.values())
 
 
-def test_ordinary_inputs_must_be_taken_and_broken_ones_refused():
+def test_ordinary_inputs_must_be_accepted_and_broken_ones_refused():
     for name, one in INPUTS.items():
         assert name.startswith("broken/") == one.must_refuse
         assert name.startswith("nasty/") == one.may_refuse
 
 
 @pytest.mark.area(name="suite")
-def test_an_input_is_the_scene_that_it_says(tmp_path):
-    # Written by hand there, read by our reader here: the two know nothing of each other.
+def test_an_input_equals_its_scene(tmp_path):
+    # Written there by hand, read here by our reader: the two share no code.
     def check(one):
         path = written(tmp_path, one.name)
         found, wanted = Source.of(csplat.read_ply(path, keep_extra=True)), one.source()
@@ -332,7 +332,7 @@ def test_an_input_is_the_scene_that_it_says(tmp_path):
     assert [] == failures([one for name, one in ENCODABLE.items() if name != DEGREE_4], check)
 
 
-def test_degree_4_is_nothing_that_our_reader_says(tmp_path):
+def test_our_reader_refuses_degree_4(tmp_path):
     one = ENCODABLE[DEGREE_4]
     (tmp_path / "in.ply").write_bytes(one.make())
     rows = plyfile.PlyData.read(tmp_path / "in.ply")["vertex"].data
@@ -344,7 +344,7 @@ def test_degree_4_is_nothing_that_our_reader_says(tmp_path):
         csplat.read_ply(tmp_path / "in.ply")
 
 
-def test_far_doubles_are_what_no_origin_brings_into_single_precision(tmp_path):
+def test_no_origin_brings_far_doubles_into_single_precision(tmp_path):
     model = csplat.read_ply(written(tmp_path, "nasty/far_doubles"))
     means = ENCODABLE["nasty/far_doubles"].source().means
 
@@ -359,7 +359,7 @@ def test_far_doubles_are_what_no_origin_brings_into_single_precision(tmp_path):
     ("name", "left_out"),
     [("nasty/not_a_number", 3), ("nasty/infinities", 4), ("nasty/infinite_scales", 4), ("nasty/beyond_float", 2)],
 )
-def test_rows_that_are_no_splats_are_not_in_the_source(name, left_out):
+def test_invalid_rows_are_not_in_the_source(name, left_out):
     # SRC-1
     assert 64 - left_out == len(ENCODABLE[name].source())
     assert {64} == {len(ENCODABLE[name].source()) for name in ("nasty/nan_normals", "nasty/nan_extra")}
@@ -404,7 +404,7 @@ OTHER_FORMATS = [
 
 
 @pytest.mark.area(name="suite")
-def test_inputs_show_what_lint_knows(tmp_path):
+def test_inputs_cause_every_finding_of_lint(tmp_path):
     found = set()
     for one in INPUTS.values():
         (tmp_path / "in.ply").write_bytes(one.make())
@@ -443,14 +443,14 @@ def test_broken_inputs_are_broken(tmp_path):
     assert [] == failures([one for one in INPUTS.values() if one.must_refuse], check)
 
 
-def test_another_quality_moves_what_is_wanted_of_all_pictures():
+def test_another_quality_moves_the_required_psnr_of_all_pictures():
     assert (30.0, 28.0, 32.0) == tuple(
         INPUTS[f"ordinary/{name}"].psnr_required(30.0) for name in ("degree_3", "needles_and_discs", "surfaces")
     )
     assert (25.0, 27.0) == tuple(INPUTS[f"ordinary/{name}"].psnr_required(25.0) for name in ("degree_3", "glossy"))
 
 
-def test_figures_beside_ones_own_are_those_of_the_inputs():
+def test_figures_for_comparison_are_those_of_the_inputs():
     # Written by `python -m csplat_bench figures`
     figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
 

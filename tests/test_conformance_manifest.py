@@ -63,7 +63,7 @@ def test_the_manifest_is_valid_by_its_schema():
         ("render/ellipsoids", {"views": [{"psnr": 40}]}),
     ],
 )
-def test_the_schema_refuses_what_a_manifest_must_not_hold(name, change):
+def test_the_schema_refuses_invalid_manifests(name, change):
     wrong = MANIFEST | {"vectors": [named(name) | change]}
 
     with pytest.raises(jsonschema.ValidationError):
@@ -156,14 +156,14 @@ def test_every_level_and_status_is_explained():
 
 # Features ------------------------------------------------------------------------------------------
 def blocks(scene):
-    """Yield attribute and block of everything in a scene, escapes too."""
+    """Yield the attribute and block of all data in a scene, escapes included."""
     for tile in scene.tiles:
         yield from tile.blocks.items()
         yield from ((_spec.ATTRIBUTE_EXTRA, block) for block in tile.extras)
 
 
 def streams(block):
-    """Yield how each stream of a block is coded."""
+    """Yield the coding of each stream of a block."""
     if block.indices:
         yield block.index_coding
     if block.coding != _spec.CODING_CODEBOOK or block.summands:
@@ -176,7 +176,7 @@ def ids(names, legal):
     return {value for value, name in names.items() if name in legal}
 
 
-def test_every_attribute_is_coded_in_every_way_it_may():
+def test_every_attribute_occurs_in_each_legal_coding():
     legal = {(a, c) for a, names in _spec.ATTRIBUTE_CODINGS.items() for c in ids(_spec.CODING_NAMES, names)}
 
     assert legal == {(attribute, block.coding) for scene in SCENES for attribute, block in blocks(scene)}
@@ -244,7 +244,7 @@ def spec():
 
 @pytest.fixture(scope="module")
 def row():
-    """A function: the numbers of the row of the example that begins so, a list for each splat."""
+    """Return a function for the numbers in the row of the example with a given beginning, a list for each splat."""
     part = GUIDE.split("### Stating errors")[1].split("So SERR states")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line[:1] == "|"]
     table = {cells[0]: [re.findall(r"-?\d+(?:\.\d+)?", cell) for cell in cells[1:]] for cells in rows}
@@ -289,7 +289,7 @@ def near(expected, found):
     np.testing.assert_allclose(np.array(found, np.float64), np.array(expected), rtol=0, atol=6e-8)
 
 
-def test_the_source_is_what_the_rows_say(row, source):
+def test_the_source_equals_the_rows_of_the_example(row, source):
     near(row("quaternion of the source"), source.quats)
     near(row("alpha of the source"), source.opacities[:, None])
 
@@ -306,13 +306,13 @@ def test_the_integers_are_those_of_annex_e(spec, row, source):
         assert row("opacities, integer")[j] == [math.floor(math.sqrt(float(source.opacities[j])) * ALPHAS + 0.5)]
 
 
-def test_the_values_are_what_a_decoder_gives(row, file):
+def test_the_values_equal_those_of_a_decoder(row, file):
     near(row("decoded quaternion"), file.quats)
     near(row("decoded alpha"), [[alpha] for alpha in file.opacities])
     near(row("decoded sh0"), file.sh0)
 
 
-def test_the_code_of_the_guide_states_what_the_guide_says(row, source, file):
+def test_the_code_of_the_guide_gives_the_stated_errors(row, source, file):
     code = re.search(r"### Stating errors.*?```python\n(.*?)```", GUIDE, re.DOTALL)[1]
     names = {"source": source, "file": file}
     exec(code, names)  # noqa: S102 - the text is the project's own
@@ -339,7 +339,7 @@ def test_clause_ids_are_unique():
 
 
 def test_every_must_ends_in_a_clause_id():
-    # A paragraph that demands something without an id could not be cited by an error.
+    # An error could not cite a paragraph that has a requirement and no id.
     body = TEXT.split("## 3 Terms")[1].split("## 10 Versioning")[0]
     body = re.sub(r"```.*?```", "", body, flags=re.DOTALL)
     sentences = re.findall(r"[^.\n|][^|]*?MUST(?: NOT)?\b[^|]*?(?:\[[A-Z]{3}-\d+\]|\n\n)", body)
@@ -392,7 +392,7 @@ def test_the_worked_example_explains_the_right_values():
     assert [[red, zero, zero], [red, zero, blue]] == floats["shN"]
 
 
-def test_annexes_are_what_the_recipes_make():
+def test_annexes_equal_the_output_of_the_recipes():
     assert TEXT == replace_generated(
         replace_generated(TEXT, "worked example", annex()), "clause map", clause_map(TEXT, load())
     )

@@ -52,7 +52,7 @@ needs_node = pytest.mark.skipif(
 
 VECTOR_LIST = load()
 
-# Our decoder's recorded answers by the protocol, with a fault to order; without imports that take long.
+# Recorded answers of our decoder by the protocol, with a selectable fault; no slow imports.
 FAULTY = """
 import json, os, pathlib, shutil, signal, struct, sys, time
 
@@ -120,7 +120,7 @@ RECORDED = (
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """A folder with the answers of our decoder: files of a vector, with its status and words as JSON next to them."""
+    """A folder with the answers of our decoder: files of a vector, with its status and output as JSON next to them."""
     folder = tmp_path_factory.mktemp("decoder")
     for vector in VECTOR_LIST:
         if vector.name in RECORDED:
@@ -136,7 +136,7 @@ def recorded(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def faulty(recorded):
-    """A function: the command line of our decoder with a fault."""
+    """Return a function for the command line of our decoder with a fault."""
     return lambda fault: f"{sys.executable} -I -S {recorded / 'decoder.py'} '{fault}' {{input}} {{outdir}}"
 
 
@@ -163,7 +163,7 @@ def test_the_javascript_decoder_passes_by_the_protocol():
 @needs_node
 @pytest.mark.slow
 @pytest.mark.area(name="suite")  # `decoder_processes --test codec/js/test/conformance.test.mjs` reads every vector, too
-def test_the_javascript_decoder_answers_every_vector_as_the_manifest_says():
+def test_the_javascript_decoder_answers_every_vector_by_the_manifest():
     with decoder_processes.JsDecoder() as decoder:
         judged = {
             vector.name: compare_answer(vector, decoder.ask(vector.data), tuple(PARTS), exact=True)
@@ -231,7 +231,7 @@ def test_a_fault_on_a_broken_file_has_an_outcome_of_its_own(faulty):
     assert [] == failures({fault: fault for fault in BROKEN_FAULTS}, check)
 
 
-def test_another_code_fails_where_exactness_is_asked_for(faulty):
+def test_another_code_fails_an_exact_run(faulty):
     report = run_command(faulty("refusal"), DecoderSuiteOptions(pattern="invalid/quat_radicand", exact=True))
 
     assert [Status.FAILED] == [outcome.status for outcome in report.outcomes]
@@ -283,7 +283,7 @@ def test_clauses_on_payloads_have_vectors_for_each_type_that_may_be_left_unread(
     assert {"META", "CAMS", "OPTS", "SERR"} == {one.error["optional"] for one in VECTOR_LIST if one.error} - {""}
 
 
-def test_what_is_wrong_about_the_frame_of_an_unread_chunk_has_to_be_refused(faulty):
+def test_a_broken_frame_of_an_unread_chunk_has_to_be_refused(faulty):
     names = ["metadata_crc", "stated_errors_crc", "chunk_flags_differ", "metadata_twice"]
     report = run_command(faulty("silent"), DecoderSuiteOptions(pattern=",".join(f"invalid/{name}" for name in names)))
 
@@ -312,12 +312,12 @@ def test_a_command_that_cannot_be_run_is_refused_at_once(command):
 
 
 @pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"timeout": 0}, {"jobs": 0}, {"by": "fast"}])
-def test_a_choice_that_makes_no_sense_is_refused(wrong):
+def test_contradictory_choices_are_refused(wrong):
     with pytest.raises(InputError):
         DecoderSuiteOptions(**wrong)
 
 
-def test_levels_decide_what_is_looked_at(faulty):
+def test_levels_select_the_checks(faulty):
     at_1 = run_command(faulty("rounding"), DecoderSuiteOptions(pattern="valid/quats", levels=(1,)))
     at_3 = run_command(faulty("rounding"), DecoderSuiteOptions(pattern="valid/quats", levels=(3,)))
 
@@ -363,7 +363,7 @@ def test_a_pattern_that_matches_nothing_is_named(choice, message):
         ("longer", "renderer", "61 bytes, expected 60"),
     ],
 )
-def test_the_class_says_how_near_floats_must_be(faulty, fault, by, message):
+def test_the_class_sets_the_tolerance_of_floats(faulty, fault, by, message):
     report = run_command(faulty(fault), DecoderSuiteOptions(pattern="valid/quats", by=by))
 
     assert [message in outcome.message for outcome in report.failures] == ([True] if message else [])
@@ -396,7 +396,7 @@ def test_the_command_writes_table_json_and_junit(faulty, tmp_path):
     assert 0 == invoke("--filter", "valid/quats", *reports, "--force").exit_code
 
 
-def test_one_report_may_go_to_standard_output():
+def test_one_report_may_be_written_to_standard_output():
     assert json.loads(invoke("--filter", "valid/quats", "--json").stdout)["passed"]
     assert invoke("--filter", "valid/quats", "--junit", "-").stdout.startswith("<?xml")
     assert 2 == invoke("--filter", "valid/quats", "--json", "--junit", "-").exit_code
@@ -426,7 +426,7 @@ def _recommended():
     return sorted(set(re.findall(r"--filter ('[^']+'|[\w/,*-]+)", text)))
 
 
-def test_what_the_guides_recommend_matches():
+def test_patterns_of_the_guides_match_vectors():
     """A word without quotes must mean the same to a shell."""
     names = [vector.name for vector in VECTOR_LIST] + [one.name for one in all_inputs()]
     names += [clause for vector in VECTOR_LIST for clause in vector.clauses]
@@ -440,7 +440,7 @@ def test_what_the_guides_recommend_matches():
     assert [] == failures({word: word for word in recommended}, check)
 
 
-def test_a_level_that_is_none_is_one_line():
+def test_an_invalid_level_is_reported_in_one_line():
     result = invoke("--level", "9")
 
     assert (2, 1) == (result.exit_code, len(result.stderr.splitlines()))
@@ -476,7 +476,7 @@ REPRESENTATIVES = ("HDR-6", "CHK-1", "JSN-1", "STR-3", "CBK-3", "TIL-7", "CNF-8"
 
 
 def failing(faults):
-    """Return the faults that no vector of their clause shows, or that leave the decoder wrong."""
+    """Return the faults that no vector of their clause reveals, or that leave the decoder changed."""
     rich = named("valid/rich")
     before = adapter.answer(rich.data)
 
@@ -511,7 +511,7 @@ def test_every_fault_finds_the_functions_that_it_replaces():
 
 
 def test_a_right_decoder_is_not_caught():
-    # The built-in run, in test_conformance.py, asks it about every vector.
+    # The built-in run in test_conformance.py tries every vector.
     nothing = DecoderFault("none", "", "CHK-1", lambda _: None)
 
     assert [] == list(find(nothing, covering("CHK-1", "HDR-2", "QUA-2")).failed)
@@ -537,7 +537,7 @@ def test_a_renderer_may_be_off_by_2_ulp_and_an_exact_decoder_by_none(ulps, by, f
 
 @in_depth
 def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector_on_chunks():
-    # CHK-6: frame and CRC of these chunks are looked at all the same.
+    # CHK-6: frame and CRC of these chunks are checked all the same.
     def frames(view, header, kind=_spec.CHUNK_STATED_ERRORS, *_):
         if record := header.chunk(kind):
             open_chunk(view, record, record.type, record.flags, "CHK-6")
@@ -568,14 +568,14 @@ def test_every_wrong_javascript_decoder_fails_a_vector_that_names_the_clause():
     assert [] == failures({f"{fault.clause} {fault.name}": fault for fault in JAVASCRIPT}, check)
 
 
-def test_every_edit_finds_what_it_changes():
+def test_every_edit_finds_its_target():
     def check(fault):
         edited_module(fault.plant)
 
     assert [] == failures({f"{fault.clause} {fault.name}": fault for fault in JAVASCRIPT}, check)
 
 
-def test_an_edit_that_finds_nothing_to_change_is_an_error():
+def test_an_edit_without_a_target_is_an_error():
     with pytest.raises(ValueError, match="expected once"):
         edited_module(ModuleEdit("container.mjs", {"another text": ""}))
 
@@ -592,7 +592,7 @@ def test_words_that_a_function_lacks_are_an_error():
         edited("read_sparse", {"another text": ""})(stack)
 
 
-def test_there_are_ten_faults_and_more():
+def test_there_are_at_least_ten_faults():
     assert len(PYTHON) >= 20
     assert len({fault.name for fault in PYTHON}) == len(PYTHON)
 

@@ -1,4 +1,4 @@
-"""L4: reference pictures, and renderers that come near enough or do not."""
+"""L4: reference pictures, and renderers within and beyond the tolerance."""
 
 import json
 import sys
@@ -17,12 +17,12 @@ from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_builtin, r
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.reference_renders import PSNR_CAP, psnr, read_png, write_png
 
-#: `make test` asks our decoder and rasteriser for these pictures by the command.
+#: `make test` renders these pictures with our decoder and rasteriser, by the command.
 pytestmark = pytest.mark.area(name="suite")
 
 RENDERED = [vector for vector in load() if vector.views]
 
-# Copies the picture that a camera asks for, with a fault to order; without imports that take long.
+# Copies the picture of a camera, with a selectable fault; no slow imports.
 COPIER = """
 import json, pathlib, sys
 
@@ -46,7 +46,7 @@ PICTURES = {
 
 @pytest.fixture(scope="module")
 def copier(tmp_path_factory):
-    """A function: the command line of a renderer of `render/ellipsoids` with a fault."""
+    """Return a function for the command line of a renderer of `render/ellipsoids` with a fault."""
     folder = tmp_path_factory.mktemp("renderer")
     (vector,) = [vector for vector in RENDERED if vector.name == "render/ellipsoids"]
     (folder / "cameras.json").write_text(json.dumps([view["camera"] for view in vector.views]))
@@ -68,7 +68,7 @@ def test_a_scene_is_seen_by_two_cameras_and_not_dark(vector):
         assert psnr(picture, np.zeros_like(picture)) < 25
 
 
-def test_our_renderer_comes_near_enough():
+def test_our_renderer_is_within_the_tolerance():
     report = run_builtin(DecoderSuiteOptions(pattern="render/*", levels=(4,)))
 
     assert report.passed
@@ -86,7 +86,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
+def test_a_faulty_renderer_is_below_the_required_psnr(mistake):
     name, change = MISTAKES[mistake]
     recipe = next(recipe for recipe in rendered_recipes() if recipe.name == name)
     made = expected(recipe.scene)
@@ -111,14 +111,14 @@ def test_a_mistaken_renderer_stays_below_what_is_wanted(mistake):
         ("status", Status.REFUSED, "exit status 1"),
     ],
 )
-def test_what_becomes_of_a_renderer(copier, fault, status, message):
+def test_each_fault_of_a_renderer_has_its_status(copier, fault, status, message):
     report = run_command(None, DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,)), render=copier(fault))
 
     assert {status} == {outcome.status for outcome in report.outcomes}
     assert all(message in outcome.message for outcome in report.outcomes)
 
 
-def test_without_a_renderer_pictures_are_skipped_loudly(monkeypatch):
+def test_without_a_renderer_pictures_are_skipped_with_a_note(monkeypatch):
     monkeypatch.setattr(reference_renders, "can_render", lambda: False)
     (outcome, _) = run_builtin(DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,))).outcomes
 
@@ -145,7 +145,7 @@ def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
 
 
 @pytest.mark.usefixtures("ellipsoids")
-def test_a_picture_that_looks_different_is_out_of_date(monkeypatch, capsys):
+def test_a_changed_picture_is_out_of_date(monkeypatch, capsys):
     assert 0 == recipes.main()
     right = recipes.reference_render
     monkeypatch.setattr(recipes, "reference_render", lambda *args: 255 - right(*args))
@@ -165,9 +165,9 @@ def test_pictures_survive_writing_and_reading():
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])
 def test_pictures_of_other_writers_are_read(tmp_path, mode):
-    image = pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
+    image = pytest.importorskip("PIL.Image", reason="pictures require the extra [render]")
     noise = np.random.default_rng(1).integers(0, 256, (40, 30, 3), np.uint8)
-    noise[10:] = np.arange(90, dtype=np.uint8).reshape(30, 3)  # so that the writer chooses every filter
+    noise[10:] = np.arange(90, dtype=np.uint8).reshape(30, 3)  # the writer then chooses every filter
     picture = image.fromarray(noise).convert(mode)
     picture.save(tmp_path / "a.png")
 

@@ -488,7 +488,7 @@ def test_the_smallest_sufficient_folder_of_images_is_read(tmp_path):
         load(tmp_path, images="images_8")
 
 
-def test_a_folder_of_images_stands_for_its_set(tmp_path, monkeypatch):
+def test_a_folder_of_images_may_be_given_for_its_set(tmp_path, monkeypatch):
     shots = cameras(9)
     for folder in ("images", "small/images_2"):
         for i, camera in enumerate(shots):

@@ -1,4 +1,4 @@
-"""The samples of codec/EMBEDDING.md, unchanged, and `<csplat-view>` in pages of others."""
+"""The unchanged samples of codec/EMBEDDING.md, and `<csplat-view>` in other pages."""
 
 import gzip
 import json
@@ -94,7 +94,7 @@ def model(request):
 @pytest.fixture(
     params=[
         "copied",
-        # As a user gets the package: npm alone decides which files it holds, and takes seconds.
+        # The package for users: npm alone decides which files it contains, and takes seconds.
         pytest.param("installed", marks=pytest.mark.area(name="engines")),
     ]
 )
@@ -130,7 +130,7 @@ def copy_decoder(folder):
 
 
 def install_decoder(folder):
-    """Install the package of the decoder as a user gets it: packed, without what is not shipped."""
+    """Install the package of the decoder from its packed form, without files that are not shipped."""
     npm = shutil.which("npm")
     if npm is None:
         absent("the package of the decoder needs npm, which is not installed")
@@ -183,7 +183,7 @@ def check_covariances(found, scene):
 
 
 def check_colours(found, scene):
-    pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+    pytest.importorskip("numba", reason="the renderer requires the extra [render]")
     from csplat_render import kernels, projection
 
     ways = directions(len(found))
@@ -247,13 +247,13 @@ def test_the_table_of_sizes_adds_up():
         assert sum(parts) == together == int(megabytes)
 
 
-def test_the_guide_shows_the_examples_as_they_are():
+def test_the_guide_contains_the_unchanged_examples():
     examples = ROOT / "tools" / "examples"
     for name in ("babylon", "playcanvas", "spark", "three"):
         assert f"```js\n{(examples / name).with_suffix('.mjs').read_text('utf-8')}```\n" in TEXT
 
 
-def test_links_lead_somewhere():
+def test_links_have_a_target():
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXT):
         assert (ROOT / "codec" / target).exists(), target
 
@@ -276,7 +276,7 @@ for (const type of ['load', 'error']) {
 
 @pytest.fixture
 def blog(tab, site, make_model):
-    """A function that opens a page with a text in it; scenes are /scene.csplat (60 splats) and /other.csplat (90)."""
+    """Return a function that opens a page with a text; scenes are /scene.csplat (60 splats) and /other.csplat (90)."""
     fast = EncodeOptions(preset="fast")
     site.add("/scene.csplat", encode(make_model(60, 0, scales=np.full((60, 3), -2, "f")), fast))
     site.add("/other.csplat", encode(make_model(90, 0, scales=np.full((90, 3), -2, "f")), fast))
@@ -309,7 +309,7 @@ def shown(page, element="csplat-view"):
 
 @pytest.mark.slow
 @pytest.mark.area(name="chromium")
-def test_a_scene_is_shown_and_then_another_and_then_none(tab, blog):
+def test_scenes_are_shown_replaced_and_removed(tab, blog):
     page = blog('<csplat-view alt="A garden"></csplat-view>')
     page.evaluate("globalThis.view = document.querySelector('csplat-view')")
     page.evaluate("globalThis.progress = 0; view.addEventListener('progress', () => progress++)")
@@ -377,7 +377,7 @@ def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_th
 
 @pytest.mark.slow
 @pytest.mark.area(name="chromium")
-def test_what_went_wrong_is_said_in_words(tab, site, blog):
+def test_errors_are_shown_as_text(tab, site, blog):
     site.add("/cut.csplat", site._files["/scene.csplat"][:-20])
     cases = [
         ("/cut.csplat", "E_TRUNCATED", "ends too early", POLICY),

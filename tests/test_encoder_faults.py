@@ -1,4 +1,4 @@
-"""Faulty encoders: each has one fault, and the suite has to say so; what an encoder is free to do passes."""
+"""Faulty encoders: each has one fault that the suite has to report; freedoms of an encoder pass."""
 
 from collections import Counter
 from functools import cache
@@ -26,7 +26,7 @@ HAS_RENDERER = find_spec("numba") is not None
 #: Tests of the suite itself: they run when it changes.
 in_depth = pytest.mark.area(name="suite")
 
-#: Some of every level and harm, which `make test` tries; the others are tried when the suite changes.
+#: Faults of every level and harm for `make test`; the others run when the suite changes.
 REPRESENTATIVES = (
     # L1
     "half_a_file",
@@ -58,7 +58,7 @@ REPRESENTATIVES = (
 
 @pytest.fixture(scope="module")
 def report_of():
-    """Return a function that gives the suite's finding about a fault."""
+    """Return a function for the suite's finding about a fault."""
     return cache(run.find)
 
 
@@ -80,8 +80,8 @@ def test_every_fault_finds_the_functions_that_it_replaces():
 
 @in_depth
 @pytest.mark.slow
-def test_faults_are_made(tmp_path):
-    # One that changes nothing would go unnoticed for no fault of the suite.
+def test_faults_change_file_or_index(tmp_path):
+    # A fault without an effect could not be found by any suite.
     def check(fault):
         names = [one for one in run.inputs_of(fault) if one in ENCODABLE]
         assert not names or any(differs(tmp_path, fault, one) for one in names)
@@ -152,19 +152,19 @@ ENDS = {
 }
 
 
-def test_ends_are_told_apart(report_of):
+def test_ends_of_a_run_are_distinguished(report_of):
     assert ENDS == {name: report_of(name).failures[0].status for name in ENDS}
 
 
 @in_depth
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "status"), [("crashes", Status.CRASHED), ("hangs", Status.HUNG)])
-def test_ends_of_processes_are_told_apart(report_of, name, status):
+def test_ends_of_processes_are_distinguished(report_of, name, status):
     assert status is report_of(name).failures[0].status
 
 
-def test_our_encoder_without_a_fault_passes_what_catches_them(tmp_path):
-    # The faults are what fails, not the way of making them.
+def test_our_encoder_without_a_fault_passes_the_same_checks(tmp_path):
+    # The failures come from the faults and not from the method of planting them.
     data, _ = honest(written(tmp_path, "ordinary/degree_1").read_bytes())
     for change in (file_bytes.stated(lambda record: record), file_bytes.counts(0, 0)):
         assert data == change(data)

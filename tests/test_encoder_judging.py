@@ -39,19 +39,19 @@ def model_of(name, folder):
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    """The plain input, as it is read."""
+    """The plain input, after reading."""
     return model_of(PLAIN, tmp_path_factory.mktemp("plain"))
 
 
 def judged(name, model, change=lambda scene: scene, **options):
-    """L2 and L3 of what our encoder writes, and why only pictures can judge the rest."""
+    """L2 and L3 of our encoder's file, and the reasons why only pictures can judge the rest."""
     scene = change(decode_scene(csplat.encode(model, csplat.EncodeOptions(**options))))
     content, pairs = check_content(INPUTS[name], INPUTS[name].source(), scene, None)
     return content, *check_errors(INPUTS[name], scene, pairs)
 
 
 def stating(**changes):
-    """Return a change of what a scene states."""
+    """Return a change of the errors that a scene states."""
     return lambda scene: dataclasses.replace(
         scene,
         declared_bounds=dataclasses.replace(
@@ -83,7 +83,7 @@ REFITTED = stating(refitted=lambda _: True, records=without("sh0", "sh1"))
         ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
     ],
 )
-def test_facts_that_the_source_does_not_say_break_their_clause(plain, fact, message):
+def test_facts_that_differ_from_the_source_break_their_clause(plain, fact, message):
     content, *_ = judged(PLAIN, dataclasses.replace(plain, **fact), keep_extra=True)
 
     assert (Status.FAILED, ("SRC-3",)) == (content.status, content.clauses)
@@ -104,7 +104,7 @@ def test_centres_in_doubles_are_compared_in_doubles():
     assert (Status.PASSED, 0) == (content.status, pairs.missing)
 
 
-def test_splats_that_are_nowhere_near_are_named(plain):
+def test_splats_without_a_near_source_are_named(plain):
     moved = plain.means.copy()
     moved[:3, 0] += 7.0
     moved[5] = moved[6]
@@ -122,14 +122,14 @@ def test_splats_that_are_nowhere_near_are_named(plain):
 # Stated errors -------------------------------------------------------------------------------------
 
 
-def test_what_is_not_stated_is_not_proved(plain):
+def test_errors_that_are_not_stated_are_not_proved(plain):
     _, errors, alone = judged(PLAIN, plain, silent)
 
     assert (Status.NOT_PROVED, "the file states no errors") == (errors.status, errors.message)
     assert alone == errors.message
 
 
-def test_what_was_fitted_anew_is_not_proved_and_the_rest_is(plain):
+def test_refitted_attributes_are_not_proved_and_the_others_are(plain):
     _, errors, alone = judged(PLAIN, plain, REFITTED)
 
     assert (Status.NOT_PROVED, "sh0, sh1: refitted, no error is stated") == (errors.status, errors.message)
@@ -137,7 +137,7 @@ def test_what_was_fitted_anew_is_not_proved_and_the_rest_is(plain):
     assert errors.details["means"]["holds"]
 
 
-def test_what_is_stated_holds_fitted_anew_or_not(plain):
+def test_stated_errors_hold_for_refitted_attributes_too(plain):
     halved = stating(
         refitted=lambda _: True,
         records=lambda stated: tuple(
@@ -163,7 +163,7 @@ def test_a_measure_that_is_missing_breaks_its_clause(plain):
     )
 
 
-def test_of_no_splats_there_are_no_errors(tmp_path):
+def test_an_empty_scene_has_no_errors(tmp_path):
     _, errors, alone = judged("nasty/empty", model_of("nasty/empty", tmp_path), silent)
 
     assert (Status.PASSED, "") == (errors.status, alone)
@@ -189,7 +189,7 @@ def test_our_coarsest_preset_stays_below_half_of_every_bound(monkeypatch, plain)
         ({"shN": lambda m: 0 * m.shN}, "sh1: an error of 0."),
     ],
 )
-def test_errors_that_are_honest_and_absurd_are_warned_of(plain, fields, message):
+def test_large_errors_that_are_stated_cause_a_warning(plain, fields, message):
     wrong = dataclasses.replace(plain, **{name: np.asarray(make(plain), np.float32) for name, make in fields.items()})
     _, errors, _ = judged(PLAIN, wrong, honest(plain), attribute_psnr=60.0)
 
@@ -221,14 +221,14 @@ def honest(model):
     return change
 
 
-def test_a_coarse_file_is_warned_of(plain):
+def test_a_coarse_file_causes_a_warning(plain):
     _, errors, _ = judged(PLAIN, plain, attribute_psnr=14.0, sh_coding="none")
 
     assert Status.WARNED is errors.status
     assert "is coarse: splat " in errors.message
 
 
-def test_leaving_much_out_is_warned_of():
+def test_leaving_much_out_causes_a_warning():
     one = INPUTS["ordinary/degree_0"]
     source = one.source()
     for kept, status in ((100, Status.WARNED), (200, Status.PASSED)):
@@ -246,7 +246,7 @@ def test_leaving_much_out_is_warned_of():
 
 @contextmanager
 def rounding(rint):
-    """Let our encoder round otherwise."""
+    """Make our encoder round in another way."""
     numpy = types.ModuleType("numpy")
     vars(numpy).update(vars(np), rint=rint)
     with mock.patch.object(quantisation, "np", numpy), mock.patch.object(shape_codebook, "np", numpy):
@@ -263,7 +263,7 @@ def trunc(values, out=None):
 
 @pytest.mark.parametrize("cut", [floor, trunc])
 @pytest.mark.parametrize("name", ["ordinary/degree_3", "ordinary/quaternions"])
-def test_values_that_are_cut_are_told_from_rounded_ones(tmp_path, name, cut):
+def test_cut_values_are_distinguished_from_rounded_ones(tmp_path, name, cut):
     one, model = INPUTS[name], model_of(name, tmp_path)
     options = csplat.EncodeOptions(sh_coding="scalar", threads=1)
     with rounding(cut):
@@ -290,7 +290,7 @@ def test_coarse_steps_are_not_cuts(tmp_path, name, preset):
 
 @pytest.fixture
 def altered(monkeypatch, plain):
-    """Run the suite over our file, as if it stated something else."""
+    """Run the suite over our file with altered statements."""
     data = csplat.encode(plain)
 
     def run(_command, places, _seconds):
@@ -319,7 +319,7 @@ def statuses(report):
 
 
 @pytest.mark.parametrize(("change", "why"), [(silent, "the file states no errors"), (REFITTED, "sh0, sh1 refitted")])
-def test_where_errors_prove_nothing_pictures_judge_whatever_was_asked_for(altered, change, why):
+def test_pictures_judge_at_any_level_where_errors_prove_nothing(altered, change, why):
     seen = altered(change, render_score=lambda *_: 41.0)
     assert [("L1", Status.PASSED), ("L2", Status.PASSED), ("L3", Status.NOT_PROVED), ("L4", Status.PASSED)] == (
         statuses(seen)
@@ -334,7 +334,7 @@ def test_where_errors_prove_nothing_pictures_judge_whatever_was_asked_for(altere
     assert f"{why}: only renders can check it, and no numba" == blind.outcomes[-1].message
 
 
-def test_pictures_are_asked_for_where_they_say_something_and_errors_were_asked_for(altered):
+def test_pictures_are_requested_where_they_are_needed_at_the_level_of_errors(altered):
     assert ["L1", "L2"] == [level for level, _ in statuses(altered(silent, ("L1", "L2")))]
     assert ("L3", Status.NOT_PROVED) == statuses(altered(silent, renders=False))[-1]
     assert ("L4", Status.SKIPPED) == statuses(altered(silent, ("L3", "L4"), lambda *_: 9.0, renders=False))[-1]
@@ -342,7 +342,7 @@ def test_pictures_are_asked_for_where_they_say_something_and_errors_were_asked_f
     assert ("L4", Status.SKIPPED) == statuses(altered(lambda scene: scene, ("L4",)))[-1]
 
 
-def test_a_picture_that_is_no_number_is_no_picture(altered):
+def test_a_picture_with_nan_is_refused(altered):
     assert ("L4", Status.FAILED) == statuses(altered(lambda scene: scene, ("L4",), lambda *_: float("nan")))[-1]
 
 
@@ -371,7 +371,7 @@ def test_figures_are_those_of_the_file_that_the_suite_ships():
     assert {} == peer_figures("no/such")
 
 
-def test_what_cannot_be_drawn_fails_alone(altered):
+def test_a_scene_that_cannot_be_drawn_fails_alone(altered):
     def far(scene):
         return dataclasses.replace(scene, model=dataclasses.replace(scene.model, origin=(1e300, 0.0, 0.0)))
 
@@ -396,7 +396,7 @@ REPORT = ConformanceReport(
 )
 
 
-def test_warnings_refusals_and_what_is_not_proved_are_counted_and_no_failures():
+def test_warnings_refusals_and_unproved_errors_are_counted_and_no_failures():
     assert REPORT.passed
     table = to_table(REPORT)
     assert "L3  warned      b  coarse <" in table
@@ -410,7 +410,7 @@ def test_warnings_refusals_and_what_is_not_proved_are_counted_and_no_failures():
     )
 
 
-def test_junit_says_them_too():
+def test_junit_contains_warnings_and_refusals():
     root = ET.fromstring(to_junit(REPORT))  # noqa: S314 - our own text
 
     assert {"tests": "4", "failures": "0", "errors": "0", "skipped": "2"}.items() <= root.attrib.items()

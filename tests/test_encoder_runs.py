@@ -34,13 +34,13 @@ def invoke(*words):
 
 
 def program(code):
-    """A command line that runs some Python on {ply} and {out}."""
+    """Return a command line that runs Python code on {ply} and {out}."""
     return f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} {{ply}} {{out}}"
 
 
 @pytest.fixture(scope="module")
 def encoded(tmp_path_factory):
-    """The plain input as our encoder writes it, and its source index."""
+    """The plain input, encoded by our encoder, and its source index."""
     folder = tmp_path_factory.mktemp("encoded")
     (folder / "in.ply").write_bytes(INPUTS[PLAIN].make())
     words = ["encode", folder / "in.ply", folder / "out.csplat", "--source-index", folder / "out.npy", "--quiet"]
@@ -49,7 +49,7 @@ def encoded(tmp_path_factory):
 
 
 def running(encoded, change):
-    """An encoder in this process: ours, then `change` on the paths `ply`, `out` and `index`; it returns a status."""
+    """Return an encoder in this process: our own, then `change` on the paths `ply`, `out` and `index`."""
 
     def run(_command, places, _seconds):
         at = SimpleNamespace(**{name: Path(place) for name, place in places.items()})
@@ -84,7 +84,7 @@ def test_ours_passes_in_this_process(encoded):
         (lambda at: (at.out.parent / "cache").mkdir(), "left cache next to the output"),
     ],
 )
-def test_what_a_run_does_beside_its_output_is_a_failure(encoded, change, message):
+def test_side_effects_of_a_run_are_failures(encoded, change, message):
     report = run_encoder(COMMAND, FILES, run=running(encoded, change))
 
     assert (Status.FAILED, (), message) == first(report)
@@ -115,7 +115,7 @@ def test_the_working_directory_stays_empty():
     assert not Path("core").exists()
 
 
-def test_files_that_the_command_names_are_found_from_another_directory(tmp_path, monkeypatch):
+def test_files_in_the_command_are_found_from_another_directory(tmp_path, monkeypatch):
     (tmp_path / "tools").mkdir()
     (tmp_path / "tools" / "a b.py").write_text("import os, sys; print(*sys.argv[1:], sep='|'); print(os.getcwd())")
     (tmp_path / "small").touch()
@@ -176,7 +176,7 @@ def test_the_chunk_that_differs_is_named(encoded):
         assert f"in the chunk {name}" in first(report)[2]
 
 
-def test_lengths_that_differ_are_told(encoded):
+def test_differing_lengths_are_reported(encoded):
     longer = changed_the_second_time(lambda at: at.out.write_bytes(encoded[0] + b"12345") and None)
     message = first(run_encoder(COMMAND, FILES, run=running(encoded, longer)))[2]
 
@@ -212,20 +212,20 @@ open(sys.argv[2], "wb").write(data + str(int(time.time())).encode() if ".again" 
 
     assert time.monotonic() - began >= REPEAT_SECONDS
     assert ("CNF-10",) == first(report)[1]
-    # Whoever keeps files finds both.
+    # Kept files include both.
     assert ["ordinary-degree_1", "ordinary-degree_1.again"] == sorted(
         path.name for path in (tmp_path / "kept").iterdir()
     )
 
 
-def test_what_is_not_kept_leaves_nothing_and_what_is_kept_lies_apart(encoded, tmp_path):
+def test_only_kept_files_remain_in_folders_of_their_own(encoded, tmp_path):
     choice = EncoderSuiteOptions(PLAIN, ("L1",), keep=tmp_path)
     for _ in range(2):  # a second time over what the first one left
         assert run_encoder(COMMAND, choice, run=running(encoded, lambda _: None)).passed
         assert ["in.ply", "out.csplat", "out.npy"] == sorted(path.name for path in tmp_path.glob("*/*"))
 
 
-def test_what_an_earlier_run_left_is_no_excuse(encoded, tmp_path):
+def test_files_of_an_earlier_run_are_not_accepted(encoded, tmp_path):
     choice = EncoderSuiteOptions(PLAIN, ("L1",), keep=tmp_path)
     for _ in range(2):
         report = run_encoder(
@@ -256,7 +256,7 @@ def test_what_an_earlier_run_left_is_no_excuse(encoded, tmp_path):
         (lambda index: np.where(np.arange(216) == 5, 2**40, index), "is 1099511627776, expected 0 to 215"),
     ],
 )
-def test_a_wrong_index_is_told(encoded, change, message):
+def test_a_wrong_index_is_reported(encoded, change, message):
     report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at: np.save(at.index, change(encoded[1]))))
 
     status, clauses, found = first(report)
@@ -299,7 +299,7 @@ def test_an_index_is_an_npy_file(encoded, write, message):
     assert message in first(report)[2]
 
 
-def test_any_integers_do(encoded):
+def test_any_integer_type_is_accepted(encoded):
     for dtype in ("<u1", ">i8", "<u8"):
         written = encoded[1].astype(dtype)
         report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at, w=written: np.save(at.index, w)))
@@ -307,7 +307,7 @@ def test_any_integers_do(encoded):
 
 
 def test_errors_are_proved_by_the_encoders_own_index(monkeypatch, tmp_path):
-    # Equal centres: nobody but the encoder knows which of them is which.
+    # Centres are equal: only the encoder knows the pairs.
     ran = []
 
     def seen(*args):
@@ -338,7 +338,7 @@ def test_errors_are_proved_by_the_encoders_own_index(monkeypatch, tmp_path):
 # Refusals ------------------------------------------------------------------------------------------
 
 
-def test_who_refuses_all_that_is_unusual_is_told_so():
+def test_refusing_all_unusual_inputs_is_reported():
     refuses = program("import sys; print('error: unusual'); sys.exit(1)")
     report = run_encoder(refuses, EncoderSuiteOptions("nasty/empty,nasty/outlier,nasty/duplicates,broken/cut", ("L1",)))
 
@@ -349,7 +349,7 @@ def test_who_refuses_all_that_is_unusual_is_told_so():
     )
     assert {"refused: error: unusual"} == {
         one.message for one in report.outcomes
-    }  # from standard output, for want of other
+    }  # from standard output, as standard error is empty
 
 
 def test_one_refusal_is_counted():
@@ -403,7 +403,7 @@ def test_the_command_writes_inputs_and_runs_nothing(tmp_path):
 
 
 @pytest.mark.parametrize("words", [("--cmd", "x {ply} {out}"), ("--level", 2), ("--keep", "y"), ("--jobs", 2)])
-def test_writing_inputs_takes_no_option_of_a_run(tmp_path, words):
+def test_writing_inputs_accepts_no_option_of_a_run(tmp_path, words):
     result = invoke("--write-inputs", tmp_path / "new", *words)
 
     assert 2 == result.exit_code

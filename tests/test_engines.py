@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("numba", reason="our own pictures want the extra [render]")
-pytest.importorskip("PIL.Image", reason="pictures want the extra [render]")
+pytest.importorskip("numba", reason="our own pictures require the extra [render]")
+pytest.importorskip("PIL.Image", reason="pictures require the extra [render]")
 
 from chromium import absent
 
@@ -33,7 +33,7 @@ LIKE_THE_PLY = {"three": 60.0, "playcanvas": 45.0, "babylon": 60.0, "spark": 38.
 
 @pytest.fixture(scope="module")
 def packages():
-    """The engines, as the examples have them."""
+    """The engines of the examples."""
     npm = shutil.which("npm")
     if npm is None:
         absent("the engines come from npm, which is not installed")
@@ -47,7 +47,7 @@ def packages():
 
 @pytest.fixture(scope="module")
 def files(packages, sample_path):
-    """A served folder with a scene in all the states that are looked at, the scene, and a camera."""
+    """A served folder with a scene in all tested states, the scene, and a camera."""
     source = read_ply(sample_path)
     source = source.select(slice(0, 4001))  # no multiple of anything
     data = encode(source, replace(FAST, tile_splats=3000))
@@ -88,7 +88,7 @@ def settled(trial):
     return settled_image(trial.page, 0.2)
 
 
-def test_a_scene_stands_upright_and_is_ours(trial, picture, files):
+def test_a_scene_is_upright_and_equals_ours(trial, picture, files):
     shown, said = picture
     _, _, model, camera = files
     assert said["count"] - len(model) in range(16)  # Babylon.js fills up
@@ -115,13 +115,13 @@ def test_the_picture_is_that_of_the_ply(trial, picture):
 @pytest.mark.parametrize(
     ("file", "code"), [("flipped", "E_CRC"), ("cut", "E_TRUNCATED"), ("text", "E_MAGIC"), ("none", "E_INPUT")]
 )
-def test_what_is_wrong_with_a_file_is_told(trial, file, code):
+def test_errors_of_a_file_are_reported(trial, file, code):
     failed = trial.show(f"{file}.csplat")["failed"]
     assert code == failed["code"]
     assert len(failed["message"]) > 20
 
 
-def test_a_load_can_be_ended(trial):
+def test_loading_can_be_stopped(trial):
     assert "AbortError" == trial.show("scene.csplat", abortAt=1)["failed"]["name"]
 
 

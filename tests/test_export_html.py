@@ -29,9 +29,7 @@ def invoke(*words):
 
 
 @pytest.mark.slow
-def test_the_page_opens_from_a_file_without_a_network_and_does_what_the_served_one_does(
-    viewer, tab, sample, make_model, tmp_path
-):
+def test_the_page_opens_without_a_network_and_equals_the_served_one(viewer, tab, sample, make_model, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(sample)
     done = invoke(tmp_path / "scene.csplat", tmp_path / "page.html")
     assert 0 == done.exit_code, done.output
@@ -104,7 +102,7 @@ def test_the_command_puts_cameras_and_axes_into_the_page(make_model, cameras, tm
     assert export_page(data, "scene.csplat", wishes).page == (tmp_path / "page.html").read_bytes()
 
 
-def test_no_charset_can_spoil_the_page(sample):
+def test_the_page_is_ascii(sample):
     exported = export_page(sample, "Gärtchen 🌷.csplat")
     assert exported.page.isascii()
     text = exported.page.decode()
@@ -112,7 +110,7 @@ def test_no_charset_can_spoil_the_page(sample):
     assert '"name":"G\\u00e4rtchen \\ud83c\\udf37.csplat"' in text
 
 
-def test_parts_of_the_page_are_what_the_report_says(sample):
+def test_parts_of_the_page_equal_the_report(sample):
     exported = export_page(sample, "scene.csplat")
     assert len(exported.page) == exported.code_bytes + exported.scene_bytes
     assert abs(exported.scene_bytes / len(sample) - 4 / 3) < 0.001
@@ -167,7 +165,7 @@ def test_modules_become_functions_behind_those_that_they_import():
         ({"a.mjs": "import a from './b.mjs';"}, r"a\.mjs has a statement that cannot be linked: import a from"),
     ],
 )
-def test_modules_that_cannot_be_linked_are_noticed(texts, expected):
+def test_modules_that_cannot_be_linked_are_refused(texts, expected):
     with pytest.raises(AssertionError, match=expected):
         link_modules(texts, ["a.mjs"])
 
@@ -181,7 +179,7 @@ def test_a_ply_is_encoded(make_model, tmp_path):
     assert (tmp_path / "page.html").read_bytes().startswith(b"<!doctype html>")
 
 
-def test_it_refuses_what_it_should(sample, sample_path, tmp_path):
+def test_refusals_leave_the_page_unchanged(sample, sample_path, tmp_path):
     target = tmp_path / "page.html"
     target.write_text("mine")
     assert "--force replaces it" in invoke(sample_path, target).stderr
@@ -195,7 +193,7 @@ def test_it_refuses_what_it_should(sample, sample_path, tmp_path):
     assert ["broken.csplat", "page.html"] == sorted(path.name for path in tmp_path.iterdir())
 
 
-def test_the_page_can_go_to_a_pipe(sample, tmp_path):
+def test_the_page_can_be_written_to_a_pipe(sample, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(sample)
     done = invoke(tmp_path / "scene.csplat", "-", "--quiet")
     assert (0, "") == (done.exit_code, done.stderr)

@@ -72,7 +72,7 @@ def test_positions_in_doubles_keep_their_origin_in_every_block(tmp_path, large, 
         same(read_ply(tmp_path / "a.ply"), scene.model())
 
 
-def test_formats_are_told_apart_by_content_first(tmp_path, make_model):
+def test_formats_are_recognised_by_content_first(tmp_path, make_model):
     model = make_model(40, 0)
     csplat.write(tmp_path / "a.ply", model)
     data = (tmp_path / "a.ply").read_bytes()
@@ -86,7 +86,7 @@ def test_a_csplat_file_is_read_and_written(tmp_path, make_model):
     same(csplat.decode(tmp_path / "a.csplat"), csplat.read(tmp_path / "a.csplat"))
 
 
-def test_what_a_format_has_no_place_for_is_told(make_model):
+def test_losses_of_a_format_are_reported(make_model):
     model = make_model(10, 2, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
     (ply,) = (one for one in formats() if one.name == "ply")
     assert () == ply.losses(model)
@@ -127,7 +127,7 @@ def test_each_format_has_a_name_of_its_own():
         ("a.csplat", b"\x1f\x8b\x08\0hello", "is gzip, unpack it first, with gunzip"),
     ],
 )
-def test_other_files_are_refused_by_what_they_are(tmp_path, name, data, message):
+def test_other_files_are_refused_with_their_type(tmp_path, name, data, message):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(InputError, match=message):
         csplat.read(tmp_path / name)
@@ -160,7 +160,7 @@ def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, 
         csplat.read(tmp_path / "sog")
 
 
-def test_a_zip_is_told_by_what_is_in_it(tmp_path):
+def test_a_zip_is_recognised_by_its_contents(tmp_path):
     for name, message in (
         ("x.npy", "NumPy"),
         ("scene.ply", r"a zip that contains scene\.ply: unzip it"),
@@ -327,7 +327,7 @@ def test_a_model_and_an_opened_file_show_themselves(make_model, tmp_path):
     assert 40 == len(scene_in(csplat_tools.load_model(tmp_path / "scene.ply")._repr_html_()))
 
 
-def test_of_a_large_scene_what_covers_most_is_shown_and_that_is_said(make_model):
+def test_a_large_scene_is_reduced_to_the_largest_splats_with_a_note(make_model):
     model = make_model(3000, 0)
     model.opacities[::3] = 0.0
     shown = scene_html(model, most_splats=1000)
@@ -417,7 +417,7 @@ def test_facts_that_are_none_are_refused(tmp_path, text):
         read_archive(tmp_path / "a.npz", KIND).facts()
 
 
-def test_what_is_missing_or_of_another_kind_is_named(tmp_path):
+def test_missing_parts_and_parts_of_another_kind_are_named(tmp_path):
     np.savez(tmp_path / "a.npz", one=np.zeros(1))
     found = read_archive(tmp_path / "a.npz", KIND)
     with pytest.raises(InputError, match="has no two"):

@@ -1,4 +1,4 @@
-"""The fuzzer itself: the same cases every time, and it sees what it looks for."""
+"""The fuzzer: reproducible cases, and findings that are recognised."""
 
 import importlib.util
 import random
@@ -133,7 +133,7 @@ def test_a_warning_is_a_finding(monkeypatch):
     assert "UserWarning: odd" in attempt(b"")[1]
 
 
-def test_a_refusal_is_none(monkeypatch):
+def test_a_refusal_is_no_finding(monkeypatch):
     def refuse(*_args, **_options):
         raise FormatError("E_CRC", 0, "CHK-1")
 
@@ -321,8 +321,8 @@ def test_edges_are_new_once():
 @needs_node
 @pytest.mark.slow
 @pytest.mark.area(name="suite")  # `make test` runs the program unguided
-def test_the_program_says_what_it_did(tmp_path):
-    # The target with most to report.
+def test_the_program_prints_its_tally(tmp_path):
+    # The target with the longest report.
     words = [sys.executable, str(PROGRAM), "--target", "others", "--count", "12", "--jobs", "1", "--out", str(tmp_path)]
     run = subprocess.run(words, capture_output=True, text=True, check=False)
 
@@ -333,7 +333,7 @@ def test_the_program_says_what_it_did(tmp_path):
     assert "0 kinds of findings" in run.stdout
 
 
-def test_what_was_found_once_stays_mended(ply_target):
+def test_earlier_findings_stay_fixed(ply_target):
     targets = {"ply": ply_target, "decoder": DecoderTarget()}
 
     def check(path):

@@ -1,4 +1,4 @@
-"""Imports: how much each brings in, and the classes of errors."""
+"""Imports: the modules that each loads, and the classes of errors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def test_importing_csplat_loads_none_of_its_modules():
     assert set() == {one for one in modules_after("import csplat") if one.startswith("csplat.")}
 
 
-def test_the_decoder_loads_nothing_of_the_others_and_works_where_plyfile_is_absent():
+def test_the_decoder_loads_no_other_part_and_works_without_plyfile():
     loaded = modules_after("sys.modules['plyfile'] = None; import csplat.decoder; from csplat import decode")
     assert "csplat.decoder" in loaded
     loaded.remove("plyfile")
@@ -51,9 +51,9 @@ def test_an_unknown_name_is_an_attribute_error():
 
 
 @pytest.mark.slow
-def test_the_renderer_needs_no_torch():
-    """That cameras need no numba is tested in test_interface.py."""
-    pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+def test_the_renderer_requires_no_torch():
+    """test_interface.py tests that cameras require no numba."""
+    pytest.importorskip("numba", reason="the renderer requires the extra [render]")
     loaded = {
         name.split(".")[0]
         for name in modules_after("import csplat_render.rasteriser, csplat_render.reference_rasteriser")
@@ -72,7 +72,7 @@ def test_the_message_contains_the_values_found_and_expected():
     assert "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5" == str(error)
 
 
-def test_a_format_error_without_a_place_leaves_it_out():
+def test_a_format_error_may_lack_a_place():
     assert "E_HASH (SHA-1)" == str(errors.FormatError("E_HASH", None, "SHA-1"))
 
 

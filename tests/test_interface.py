@@ -1,4 +1,4 @@
-"""The Python interface: its names, what they take, what they refuse and how, and that the commands call them."""
+"""The Python interface: names, forms of files, refusals, and the commands that call it."""
 
 import doctest
 import gzip
@@ -21,7 +21,7 @@ from csplat_tools.cli.app import app
 
 @pytest.fixture
 def files(make_model, tmp_path):
-    """One scene as a model, a PLY and a .csplat file: a ball, which virtual cameras see from afar."""
+    """A ball as a model, a PLY and a .csplat file."""
     model = make_model(60, 1, scales=np.full((60, 3), -1.5, np.float32))
     model = replace(model, means=model.means / np.linalg.norm(model.means, axis=1, keepdims=True))
     csplat.write_ply(tmp_path / "scene.ply", model)
@@ -45,28 +45,24 @@ def assert_same(a, b):
         assert np.array_equal(getattr(a, name), getattr(b, name)), name
 
 
-# names
-
-
+# Names.
 @pytest.mark.parametrize("package", [csplat, csplat_render, csplat_tools, csplat_trainer])
-def test_every_name_is_there_and_listed(package):
+def test_every_listed_name_exists(package):
     assert set(package.__all__) <= set(dir(package))
     for name in package.__all__:
         assert getattr(package, name) is not None
 
 
-def test_the_packages_load_neither_renderer_nor_command_line():
+def test_importing_the_packages_loads_no_renderer_or_command_line():
     code = "import csplat, csplat_tools, csplat_trainer, sys; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert not {"numba", "numpy", "typer", "rich", "torch", "csplat_render"} & set(loaded)
 
 
-# what the documentation shows
-
-
+# Examples of the documentation.
 @pytest.fixture(scope="module")
 def documented(tmp_path_factory, sample_path):
-    """A folder with the files that examples name."""
+    """A folder with the files of the examples."""
     folder = tmp_path_factory.mktemp("documented")
     model = csplat.read_ply(sample_path).select(slice(0, 1000))
     csplat.write_ply(folder / "scene.ply", model)
@@ -76,7 +72,7 @@ def documented(tmp_path_factory, sample_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("package", [csplat, csplat_render, csplat_tools])
-def test_what_the_documentation_shows_is_so(package, documented, monkeypatch):
+def test_examples_of_the_documentation_run(package, documented, monkeypatch):
     monkeypatch.chdir(documented)
     shown = {id(one): one for one in (package, *(getattr(package, name) for name in package.__all__))}
     examples = 0
@@ -87,11 +83,9 @@ def test_what_the_documentation_shows_is_so(package, documented, monkeypatch):
     assert examples >= 3
 
 
-# files, in every form
-
-
+# Forms of files.
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
-def test_a_file_may_be_a_path_or_open_or_bytes(files, form):
+def test_files_may_be_paths_streams_or_bytes(files, form):
     model, ply, coded = files
     assert_same(csplat.read_ply(ply), csplat.read_ply(form(ply)))
     assert_same(csplat.decode(coded.read_bytes()), csplat.decode(form(coded)))
@@ -102,14 +96,14 @@ def test_a_file_may_be_a_path_or_open_or_bytes(files, form):
         assert (len(model), path.stat().st_size) == (len(loaded.model), loaded.size_bytes)
 
 
-def test_a_ply_may_be_written_into_an_open_file_which_stays_open(files):
+def test_a_ply_is_written_to_an_open_file(files):
     model, ply, _ = files
     stream = io.BytesIO()
     csplat.write_ply(stream, model)
     assert ply.read_bytes() == stream.getvalue()
 
 
-def test_what_is_read_from_an_open_file_begins_where_that_stands(files):
+def test_open_files_are_read_from_their_position(files):
     _, ply, _ = files
     stream = io.BytesIO(b"before" + ply.read_bytes())
     stream.seek(6)
@@ -122,24 +116,22 @@ def test_messages_name_an_open_file(tmp_path):
         csplat.read_ply(stream)
 
 
-# what cannot be used
-
-
+# Refusals.
 @pytest.mark.parametrize("wrong", [5, None, 1.5, ["scene.ply"], io.StringIO("ply\n")])
 @pytest.mark.parametrize("function", ["read_ply", "decode", "read_header", "lint_ply"])
-def test_what_is_no_file_is_a_typed_error(function, wrong):
+def test_other_objects_than_files_are_typed_errors(function, wrong):
     with pytest.raises(InputError, match="expected"):
         getattr(csplat, function)(wrong)
 
 
 @pytest.mark.parametrize("function", ["read_ply", "decode", "read_header"])
-def test_a_file_that_is_not_there_is_named(function, tmp_path):
+def test_an_absent_file_is_named(function, tmp_path):
     with pytest.raises(FileNotFoundError, match="absent"):
         getattr(csplat, function)(tmp_path / "absent")
 
 
 @pytest.mark.parametrize("wrong", ["scene.ply", b"ply", None, 5])
-def test_what_is_no_model_is_refused_with_the_name_of_what_makes_one(wrong, tmp_path):
+def test_other_objects_than_models_are_refused_with_a_remedy(wrong, tmp_path):
     calls = [csplat.encode, csplat.encode_with_report, lambda model: csplat.write_ply(tmp_path / "out.ply", model)]
     for call in calls:
         with pytest.raises(InputError, match=r"expects a SplatModel.*csplat\.read_ply"):
@@ -147,7 +139,7 @@ def test_what_is_no_model_is_refused_with_the_name_of_what_makes_one(wrong, tmp_
     assert not list(tmp_path.iterdir())
 
 
-def test_a_preset_in_place_of_options_is_refused_with_what_was_meant(files):
+def test_a_preset_in_place_of_options_is_refused_with_a_remedy(files):
     with pytest.raises(InputError, match=r"EncodeOptions\(preset="):
         csplat.encode(files[0], "small")
 
@@ -160,13 +152,13 @@ def test_files_of_the_other_kind_are_typed_errors(files):
                 call(form(wrong))
 
 
-def test_a_ply_that_is_to_be_decoded_is_called_what_it_is(files):
+def test_decoding_a_ply_names_the_right_function(files):
     with pytest.raises(csplat.FormatError, match=r"a PLY, which csplat\.read_ply reads"):
         csplat.decode(files[1])
 
 
 @pytest.mark.slow
-def test_the_program_starts_without_extras_and_what_wants_one_says_so(files):
+def test_the_program_starts_without_extras_and_names_missing_ones(files):
     code = f"""
 import sys
 from csplat_tools.cli.app import app
@@ -201,10 +193,8 @@ for call in (
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 
-# targets
-
-
-def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
+# Targets.
+def test_targets_of_a_model_and_a_file_give_the_same_bytes(files):
     _, ply, _ = files
     stages = []
 
@@ -229,18 +219,16 @@ def test_a_target_takes_a_model_or_a_file_and_gives_the_same_bytes(files):
         ({"psnr": "40"}, "psnr is '40', expected a number"),
     ],
 )
-def test_a_target_that_is_none_is_refused_before_the_scene_is_read(asked, message):
+def test_an_invalid_target_is_refused_before_reading_the_scene(asked, message):
     with pytest.raises(InputError, match=message):
         csplat_tools.encode_to("absent.ply", **asked)
 
 
-# the commands call these
-
-
+# Commands.
 @pytest.fixture(scope="module")
 def views_once():
-    """Virtual cameras are searched for once: all commands are called with the same scene."""
-    pytest.importorskip("numba", reason="virtual cameras want the extra [render]")
+    """Place virtual cameras once: all commands get the same scene."""
+    pytest.importorskip("numba", reason="virtual cameras require the extra [render]")
     from csplat_tools.views import view_sets
 
     search, known = view_sets.virtual_cameras, {}
@@ -256,8 +244,8 @@ def views_once():
         yield
 
 
-class Called(Exception):  # noqa: N818  # no error: it ends a command where the interface begins
-    """Raised to end a command where the interface begins; carries the arguments that were passed."""
+class Called(Exception):  # noqa: N818  # not an error
+    """Ends a command when it calls the interface; carries the arguments."""
 
 
 @pytest.mark.parametrize(
@@ -276,7 +264,7 @@ class Called(Exception):  # noqa: N818  # no error: it ends a command where the 
     ],
 )
 @pytest.mark.usefixtures("views_once")
-def test_commands_call_the_functions_that_programs_call(files, monkeypatch, words, name, given):
+def test_commands_call_the_public_functions(files, monkeypatch, words, name, given):
     monkeypatch.chdir(files[1].parent)
     monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)
 
@@ -291,8 +279,8 @@ def test_commands_call_the_functions_that_programs_call(files, monkeypatch, word
     assert given.items() <= named.items()
 
 
-def test_a_comparison_of_models_counts_them_as_plain_plies(files):
-    pytest.importorskip("numba", reason="comparing wants the extra [render]")
+def test_the_size_of_a_model_is_that_of_a_plain_ply(files):
+    pytest.importorskip("numba", reason="comparing requires the extra [render]")
     model, ply, coded = files
     size = ply.stat().st_size - len(ply.read_bytes().partition(b"end_header\n")[0]) - len(b"end_header\n")
     assert size == csplat_tools.load_model(model).size_bytes
@@ -308,10 +296,10 @@ def test_a_comparison_of_models_counts_them_as_plain_plies(files):
         (["finetune", "scene.ply", "out.csplat", "--data", "."], "finetune", "SplatModel"),
     ],
 )
-def test_what_learns_is_called_by_its_command_too(tmp_path, monkeypatch, words, name, kind):
-    pytest.importorskip("numba", reason="these commands want the extra [render]")
-    pytest.importorskip("scipy", reason="data sets want the extra [render]")
-    from captures import photograph, shell  # want what is looked for above
+def test_train_and_finetune_call_the_public_functions(tmp_path, monkeypatch, words, name, kind):
+    pytest.importorskip("numba", reason="these commands require the extra [render]")
+    pytest.importorskip("scipy", reason="data sets require the extra [render]")
+    from captures import photograph, shell
 
     monkeypatch.chdir(photograph(shell(3), tmp_path))
     monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)

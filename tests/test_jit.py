@@ -12,7 +12,7 @@ import pytest
 
 from csplat.errors import InputError
 
-pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 
 
 from csplat_render import kernels

@@ -1,4 +1,4 @@
-"""Scenes that do not fit the memory: encoded by way of the disk, to the bytes that they have in memory."""
+"""Out-of-core encoding: the same bytes as in memory, resumed runs, full disks, lost workers."""
 
 import errno
 import json
@@ -26,14 +26,14 @@ from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import OutOfCoreOptions, encode_out_of_core, estimate_cost
 
-WHOLE = 600  # splats, in place of half a million
+WHOLE = 600  # splats per bucket, in place of half a million
 COUNT = 6 * WHOLE
 FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32)
 
 
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch):
-    """Scenes of thousands of splats are large."""
+    """Make scenes of thousands of splats large."""
     for module in (tiling, encode_plan, disk_encode):
         monkeypatch.setattr(module, "BUCKET_SPLATS", WHOLE)
 
@@ -52,21 +52,17 @@ def model(sample_path):
 
 @pytest.fixture(scope="module")
 def whole(model):
-    """The bytes that the scene has in memory."""
+    """The file of the scene, encoded in memory."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tiling, "BUCKET_SPLATS", WHOLE)
         patch.setattr(encode_plan, "BUCKET_SPLATS", WHOLE)
         return encode(model, FAST)
 
 
-def test_a_scene_by_way_of_the_disk_has_the_bytes_that_it_has_in_memory(model, whole, tmp_path):
+def test_out_of_core_encoding_gives_the_bytes_of_memory(model, whole, tmp_path):
     stages = {}
-    report = encode_large(
-        source_from_model(model),
-        tmp_path / "out.csplat",
-        FAST,
-        progress=lambda stage, done: stages.update({stage: done}),
-    )
+    note = lambda stage, done: stages.update({stage: done})  # noqa: E731
+    report = encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, progress=note)
     assert whole == (tmp_path / "out.csplat").read_bytes()
     assert ["out.csplat"] == [path.name for path in tmp_path.iterdir()]
     assert (len(model), len(whole)) == (report.splat_count, report.size_bytes)
@@ -74,7 +70,7 @@ def test_a_scene_by_way_of_the_disk_has_the_bytes_that_it_has_in_memory(model, w
     assert 1.0 == stages["looking"] == stages["sorting"] == stages["coding"]
 
 
-def test_a_file_of_many_buckets_conforms_and_states_its_errors(model, whole):
+def test_a_file_of_many_buckets_is_valid_with_declared_errors(model, whole):
     assert validate(whole).conforms
     result = encode_with_report(model, FAST)
     assert COUNT == len(np.unique(result.source_index))
@@ -84,7 +80,7 @@ def test_a_file_of_many_buckets_conforms_and_states_its_errors(model, whole):
     assert 7 <= result.report.tile_count <= 12
 
 
-def test_colours_that_were_fitted_anew_are_those_that_are_decided_on(model):
+def test_the_sample_of_a_plan_has_refitted_colours(model):
     other = encode_plan.EncodePlan.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
     assert other.sample is not None
     assert np.array_equal(-model.shN[tiling.sample_rows(COUNT)], other.sample.model.shN)
@@ -92,7 +88,7 @@ def test_colours_that_were_fitted_anew_are_those_that_are_decided_on(model):
     assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
 
 
-def test_two_processes_give_the_bytes_of_one(model, whole, tmp_path):
+def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
     encode_large(source_from_model(model), tmp_path / "out.csplat", replace(FAST, threads=2))
     assert whole == (tmp_path / "out.csplat").read_bytes()
 
@@ -105,12 +101,12 @@ def test_two_processes_give_the_bytes_of_one(model, whole, tmp_path):
         EncodeOptions(preset="fast", sh_degree=1, adaptive=0.5, tile_splats=300),
     ],
 )
-def test_options_are_those_of_memory(model, options, tmp_path):
+def test_options_give_the_bytes_of_memory(model, options, tmp_path):
     encode_large(source_from_model(model), tmp_path / "out.csplat", options)
     assert encode(model, options) == (tmp_path / "out.csplat").read_bytes()
 
 
-def test_positions_in_doubles_huge_values_and_huge_sh_are_those_of_memory(model, tmp_path):
+def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
     origin = (4.5e5, 5.4e6, 100.0)
     doubles = model.means.astype(np.float64) + np.array(origin) + 1e-9
     scales, shN = model.scales.copy(), model.shN.copy()
@@ -123,7 +119,7 @@ def test_positions_in_doubles_huge_values_and_huge_sh_are_those_of_memory(model,
 
 
 class Interrupt:
-    """Progress that is interrupted in a stage."""
+    """Progress that raises an error in a stage."""
 
     def __init__(self, stage, error=KeyboardInterrupt, after=0):
         self.stage, self.error, self.after = stage, error, after
@@ -136,7 +132,7 @@ class Interrupt:
 
 
 @pytest.mark.parametrize(("stage", "after"), [("looking", 0), ("sorting", 0), ("codebook", 0), ("coding", 3)])
-def test_an_interrupted_encoding_goes_on(model, whole, tmp_path, stage, after):
+def test_an_interrupted_encoding_is_resumed(model, whole, tmp_path, stage, after):
     target, scene = tmp_path / "out.csplat", source_from_model(model)
     with pytest.raises(KeyboardInterrupt):
         encode_large(scene, target, FAST, progress=Interrupt(stage, after=after))
@@ -154,7 +150,7 @@ def test_an_interrupted_encoding_goes_on(model, whole, tmp_path, stage, after):
     assert [target] == list(tmp_path.iterdir())
 
 
-def test_a_killed_worker_is_said_and_nothing_is_lost(model, whole, tmp_path):
+def test_an_encoding_with_a_killed_worker_is_resumed(model, whole, tmp_path):
     target, two = tmp_path / "out.csplat", replace(FAST, threads=2)
 
     def kill(stage, _done):
@@ -170,7 +166,7 @@ def test_a_killed_worker_is_said_and_nothing_is_lost(model, whole, tmp_path):
     assert whole == target.read_bytes()
 
 
-def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, monkeypatch):
+def test_a_full_disk_is_reported_and_the_encoding_resumed(model, whole, tmp_path, monkeypatch):
     target = tmp_path / "out.csplat"
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
@@ -195,7 +191,7 @@ def test_a_full_disk_is_said_before_and_survived_within(model, whole, tmp_path, 
 
 
 @pytest.mark.parametrize("kind", ["sample", "bucket-000003", "chunks-000001", "tiles-000001", "state.json"])
-def test_a_damaged_file_of_the_working_folder_is_named(model, tmp_path, kind):
+def test_a_damaged_work_file_is_named(model, tmp_path, kind):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
         encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding", after=2))
@@ -208,7 +204,7 @@ def test_a_damaged_file_of_the_working_folder_is_named(model, tmp_path, kind):
     assert not target.exists()
 
 
-def test_a_folder_of_somebody_else_stays_as_it_is(model, tmp_path):
+def test_a_folder_with_other_files_is_refused_and_kept(model, tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()
     (folder / "one.jpg").write_bytes(b"dear to somebody")
@@ -218,7 +214,7 @@ def test_a_folder_of_somebody_else_stays_as_it_is(model, tmp_path):
     assert b"dear to somebody" == (folder / "one.jpg").read_bytes()
 
 
-def test_what_was_begun_by_way_of_the_disk_goes_on_there_with_more_memory(model, whole, tmp_path):
+def test_an_out_of_core_encoding_is_resumed_with_more_memory(model, whole, tmp_path):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
         encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding", after=2))
@@ -232,7 +228,7 @@ def test_what_was_begun_by_way_of_the_disk_goes_on_there_with_more_memory(model,
     assert [target] == list(tmp_path.iterdir())
 
 
-def test_a_scene_that_gets_shorter_while_it_is_read_is_refused(model, tmp_path):
+def test_a_scene_that_shrinks_while_it_is_read_is_refused(model, tmp_path):
     times = []
 
     def blocks():
@@ -252,7 +248,7 @@ def test_too_little_memory_is_refused(model, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_buckets_are_neighbours_and_hold_every_splat_once(model):
+def test_buckets_partition_the_splats_by_place(model):
     rows = bucket_rows(model.means)
     assert np.array_equal(np.arange(len(model)), np.sort(np.concatenate(rows)))
     assert max(map(len, rows)) <= WHOLE
@@ -261,10 +257,10 @@ def test_buckets_are_neighbours_and_hold_every_splat_once(model):
     assert np.median([np.ptp(model.means[part], axis=0).prod() for part in rows]) < volume / 4
 
 
-def test_a_bucket_that_the_sample_misjudged_is_cut_into_equal_parts():
+def test_a_large_bucket_is_split_into_equal_parts():
     rng = np.random.default_rng(1)
     means = rng.normal(0, 1, (COUNT, 3)).astype(np.float32)
-    means[tiling.sample_rows(COUNT)] += 100.0  # the sampled rows lie apart from all others
+    means[tiling.sample_rows(COUNT)] += 100.0  # the sampled rows are far from the others
     parts = bucket_rows(means)
     assert np.array_equal(np.arange(COUNT), np.sort(np.concatenate(parts)))
     assert max(map(len, parts)) <= WHOLE
@@ -280,8 +276,8 @@ def test_a_small_scene_has_one_bucket():
 
 @pytest.mark.slow
 @pytest.mark.area(name="dask")
-def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, whole, tmp_path):
-    distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
+def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     target = tmp_path / "out.csplat"
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50
@@ -299,8 +295,8 @@ def test_a_cluster_gives_the_same_bytes_though_a_worker_is_killed(model, whole, 
 
 
 @pytest.mark.area(name="dask")
-def test_a_cluster_that_does_not_answer_is_said(model, tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed", reason="a cluster wants the extra [scale]")
+def test_an_unreachable_cluster_is_reported(model, tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))
     with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
         encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, cluster="tcp://127.0.0.1:9")
@@ -316,7 +312,7 @@ def ply(model, tmp_path):
     return tmp_path / "scene.ply"
 
 
-def test_a_file_goes_by_way_of_the_disk_where_it_is_told(ply, tmp_path):
+def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     target, scale = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, out_of_core=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
     foretold = estimate_cost(ply, options, scale)
@@ -332,7 +328,7 @@ def test_a_file_goes_by_way_of_the_disk_where_it_is_told(ply, tmp_path):
         assert encode(scene.model(), options) == target.read_bytes()
 
 
-def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeypatch):
+def test_the_command_passes_out_of_core_options(ply, tmp_path, monkeypatch):
     target, asked = tmp_path / "out.csplat", []
 
     def encode_here(_local, _target, _options, _facts, scale, **_):
@@ -353,9 +349,9 @@ def test_the_command_asks_for_the_disk_as_its_options_say(ply, tmp_path, monkeyp
     assert 2 == refused.exit_code
 
 
-def test_only_large_files_and_small_memories_make_a_command_look_whether_a_scene_fits(ply, tmp_path):
+def test_only_large_files_may_exceed_the_memory(ply, tmp_path):
     def may_leave(path, size, **scale):
-        os.truncate(path, size)  # no byte of the rest takes room
+        os.truncate(path, size)  # a sparse file
         return OutOfCoreOptions(**scale).may_exceed_memory(path)
 
     assert not may_leave(ply, 4 << 20, memory_bytes=1)
@@ -364,4 +360,4 @@ def test_only_large_files_and_small_memories_make_a_command_look_whether_a_scene
     assert may_leave(ply, 4 << 20, memory_bytes=1, resume=True)
     csplat_file = tmp_path / "scene.csplat"
     csplat_file.write_bytes(b"CSPLAT")
-    assert may_leave(csplat_file, 5 << 20, memory_bytes=1 << 40)  # its size does not tell how large it becomes
+    assert may_leave(csplat_file, 5 << 20, memory_bytes=1 << 40)  # its decoded size is unknown

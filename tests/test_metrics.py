@@ -11,7 +11,7 @@ import pytest
 
 from csplat.errors import InputError
 
-pytest.importorskip("numba", reason="SSIM wants the extra [render]")
+pytest.importorskip("numba", reason="SSIM requires the extra [render]")
 
 
 from csplat_render import lpips as module

@@ -130,7 +130,7 @@ def test_a_mutant_that_hangs_is_caught(few):
     assert (Fate.CAUGHT, "hangs, or ends the process") == (result.fate, result.by)
 
 
-def test_what_another_decoder_may_leave_unread_must_be_refused():
+def test_damage_that_another_decoder_may_leave_unread_must_be_refused():
     mutants.vectors.cache_clear()
 
     assert any(vector.error["optional"] for vector in load() if vector.error)
@@ -149,7 +149,7 @@ def test_the_command_prints_survivors_and_score(few, monkeypatch, capsys):
     assert "3 of 3, " in out.err
 
 
-def test_survivors_stand_in_a_table_and_the_score_counts_what_can_be_seen():
+def test_survivors_are_in_a_table_and_the_score_counts_visible_mutants():
     text = "x = a |\\\n b; y\nz\n"
     results = [
         MutantResult(Mutant("a.py", 1, 4, "a |\\\n b", "(a &\\\n b)"), Fate.SAME),

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-pytest.importorskip("numba", reason="targets want the extra [render]")
+pytest.importorskip("numba", reason="targets require the extra [render]")
 
 import extremes
 from analytic_search import AnalyticScene, analytic_removal

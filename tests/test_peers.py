@@ -1,4 +1,4 @@
-"""csplat reads files of other programs, and they read ours: every property of a splat, within a step of the format.
+"""Files of other programs in csplat and ours in them: each property of a splat is equal within a step of the format.
 
 SPZ's own library is installed on demand. CONTRIBUTING.md describes where the other programs come from; tests of a
 program that is absent are skipped.
@@ -110,7 +110,7 @@ class Spz:
 
 
 class Converter:
-    """A program that converts files: its source or its target is a PLY."""
+    """A program that converts files from or to PLY."""
 
     def write(self, model, path, format):
         csplat.write(path.with_name("source.ply"), model)

@@ -1,6 +1,6 @@
-"""Systems other than Linux: each call that they lack has a replacement, or a clear refusal.
+"""Systems other than Linux: each missing call has a replacement or a clear refusal.
 
-Tests hide such calls on Linux. What only the other systems themselves can show is left to their runners.
+Tests hide such calls on Linux; the other systems run the whole suite themselves.
 """
 
 import mmap
@@ -38,7 +38,7 @@ from csplat_trainer.training_report import peak_memory
 ROOT = Path(__file__).resolve().parent.parent
 PRODUCT = ("codec/csplat", "conformance/csplat_conformance", "tools/csplat_tools", "trainer")
 
-#: Modules and attributes that Windows or macOS lack, and that product code might use.
+#: Modules and attributes that Windows or macOS lack.
 POSIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
 POSIX_NAMES = {
     "mmap": r"MAP_\w+|PROT_\w+|MADV_\w+",
@@ -53,10 +53,10 @@ POSIX_NAMES = {
 }
 IMPORT = re.compile(r"^ *(?:import|from) (?P<module>\w+)", re.MULTILINE)
 
-#: Words that every file contains that uses them, and many others: this search takes a tenth of the time.
+#: A necessary condition for using them, which is ten times as fast.
 ANY = re.compile(rf"{'|'.join(POSIX_MODULES)}|\.(?:{'|'.join(POSIX_NAMES.values())})")
 
-#: Files of the product that use them, each with the reason.
+#: Files of the product that use them, with reasons.
 USERS = {
     "codec/csplat/file_source.py": "advice on pages that were read, if the system takes any",
     "codec/csplat/system.py": "the replacements",
@@ -66,7 +66,7 @@ USERS = {
 
 @pytest.fixture
 def elsewhere(monkeypatch):
-    """Hide what Windows lacks from product code."""
+    """Hide from product code what Windows lacks."""
     for module, names in {
         mmap: ("MAP_PRIVATE", "MAP_ANONYMOUS", "MAP_NORESERVE", "MADV_DONTNEED"),
         os: ("fork", "killpg", "link", "pread", "preadv", "sched_getaffinity", "sysconf"),
@@ -83,7 +83,7 @@ def product_files():
 
 
 def posix_uses(path):
-    """Return what a file uses of the tables above, as `os.pread`."""
+    """Return the names of the tables above that a file uses, such as `os.pread`."""
     text = path.read_text("utf-8")
     if not ANY.search(text):
         return []
@@ -93,16 +93,14 @@ def posix_uses(path):
     return sorted(found)
 
 
-def test_calls_that_only_some_systems_have_are_in_few_files():
+def test_few_files_use_posix_calls():
     found = {path.relative_to(ROOT).as_posix(): posix_uses(path) for path in product_files()}
     users = {name for name, uses in found.items() if uses}
     assert {} == {name: found[name] for name in users - set(USERS)}, "csplat.system is the place for these"
     assert set(USERS) <= users
 
 
-# files
-
-
+# Files.
 @pytest.mark.usefixtures("elsewhere")
 def test_a_file_is_read_in_parts(make_model, tmp_path):
     path, model = tmp_path / "scene.csplat", make_model(3000, 1)
@@ -122,7 +120,7 @@ def test_threads_read_a_file_at_the_same_time(tmp_path, monkeypatch):
 
     def slow_seek(*where):
         seek(*where)
-        time.sleep(1e-4)  # another thread has its turn
+        time.sleep(1e-4)  # lets another thread run
 
     monkeypatch.setattr(os, "lseek", slow_seek)
     data = np.random.default_rng(0).bytes(40 * 500)
@@ -149,7 +147,7 @@ def test_a_mapped_file_without_advice_is_read(tmp_path):
 
 
 @pytest.mark.usefixtures("elsewhere")
-def test_of_two_writers_of_one_name_one_fails_without_hard_links(tmp_path):
+def test_one_of_two_writers_of_a_name_fails_without_hard_links(tmp_path):
     path = tmp_path / "out"
 
     def write_late():
@@ -172,11 +170,9 @@ def test_paths_of_windows_do_not_lead_out_of_a_folder(tmp_path):
     assert names == {name: leads_out(name, PureWindowsPath) for name in names}
 
 
-# memory
-
-
+# Memory.
 @pytest.mark.usefixtures("elsewhere")
-def test_memory_has_a_size_where_the_system_does_not_tell(monkeypatch):
+def test_the_memory_has_a_default_size(monkeypatch):
     def absent(*_):
         raise FileNotFoundError
 
@@ -186,11 +182,9 @@ def test_memory_has_a_size_where_the_system_does_not_tell(monkeypatch):
     assert system.core_count() == os.cpu_count()
 
 
-# processes
-
-
+# Processes.
 @pytest.mark.slow
-def test_work_is_given_to_processes_that_are_no_copies(monkeypatch):
+def test_spawned_processes_share_the_work(monkeypatch):
     starts, context = [], multiprocessing.get_context
     monkeypatch.setattr(system, "CAN_FORK", False)
     monkeypatch.setattr(multiprocessing, "get_context", lambda start: (starts.append(start), context(start))[1])
@@ -209,7 +203,7 @@ def test_command_lines_of_windows_keep_their_backslashes():
 
 
 @pytest.mark.usefixtures("elsewhere")
-def test_a_program_ends_or_is_killed_without_process_groups():
+def test_programs_end_or_are_killed_without_process_groups():
     ended = run_program(f"{sys.executable} -S -c 'print(5)'", {}, 20)
     assert (None, b"5\n") == (ended.status, ended.stdout)
     begun = time.monotonic()
@@ -222,7 +216,7 @@ class _Echo(DecoderProcess):
         return self._answered(data)
 
 
-def test_a_decoder_is_asked_where_pipes_cannot_be_waited_for(monkeypatch):
+def test_a_decoder_answers_without_poll_and_select(monkeypatch):
     monkeypatch.delattr(select, "poll")
     monkeypatch.delattr(select, "select")
     answers = (
@@ -237,7 +231,7 @@ def test_a_decoder_is_asked_where_pipes_cannot_be_waited_for(monkeypatch):
 
 
 @pytest.mark.usefixtures("elsewhere")
-def test_mutants_are_refused_without_copies_of_processes(monkeypatch, capsys):
+def test_mutants_are_refused_without_fork(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["mutation", "--count", "1"])
     assert mutation.main() == 1
     assert "use Linux or macOS" in capsys.readouterr().err
@@ -258,9 +252,7 @@ def test_the_main_thread_is_interrupted_without_signals_to_threads():
         signal.signal(signal.SIGINT, before)
 
 
-# batches
-
-
+# Batches.
 @pytest.mark.usefixtures("elsewhere")
 def test_one_program_at_a_time_writes_a_journal_without_fcntl(tmp_path):
     with open_journal(tmp_path), pytest.raises(InputError, match="another batch writes to"), open_journal(tmp_path):

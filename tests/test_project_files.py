@@ -27,7 +27,7 @@ def commands(text):
 
 
 def problem(command, targets):
-    """Return what is wrong with a step; nothing if it runs make targets that exist, or publishes."""
+    """Return the problem of a step; nothing if it runs existing make targets, or publishes."""
     program, *words = command.split()
     if command.startswith(PUBLISHING):
         return ""
@@ -49,11 +49,11 @@ def test_steps_of_workflows_run_targets_that_exist():
 
 
 @pytest.mark.parametrize("command", ["make tset", "make", "|", "pip install csplat", ".ci/run tset"])
-def test_a_step_that_runs_anything_else_is_noticed(command):
+def test_a_step_that_runs_anything_else_is_reported(command):
     assert problem(command, make_targets())
 
 
-def test_workflows_ask_for_few_rights_and_end():
+def test_workflows_have_few_rights_and_a_time_limit():
     for path in WORKFLOWS:
         text = path.read_text("utf-8")
         jobs = text[text.index("\njobs:") :].count("    runs-on:")
@@ -116,7 +116,7 @@ def copied(tmp_path):
     return tmp_path
 
 
-def test_a_release_names_the_repository_that_it_is_made_in(copied):
+def test_a_release_names_its_own_repository(copied):
     before = tomllib.loads((copied / "pyproject.toml").read_text("utf-8"))
     tag = f"v{csplat.__version__}"
     for url in ("https://github.com/first/csplat", "https://github.com/second/csplat"):  # twice: links are replaced

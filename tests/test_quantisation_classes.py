@@ -1,4 +1,4 @@
-"""Quantisation classes: splats sorted by visibility of errors, steps by class; files that both decoders read."""
+"""Quantisation classes: splats sorted by importance, steps by class, files that both decoders read."""
 
 import hashlib
 import shutil
@@ -25,7 +25,7 @@ from csplat.model import normalise_quats
 from csplat_trainer.tuning.tuned_scene import TunedScene, cost_slopes
 
 ROOT = Path(__file__).resolve().parent.parent
-COUNT = 5_000  # splats, enough for several classes
+COUNT = 5_000  # splats; enough for several classes
 
 
 def unequal(model, seed=0, spread=3.0):
@@ -47,10 +47,8 @@ def model(make_model):
     return make_model(COUNT, 0)
 
 
-# what errors do
-
-
-def test_shape_curvatures_are_those_of_the_covariance(make_model):
+# Errors.
+def test_blocks_of_shapes_agree_with_the_covariance(make_model):
     model = make_model(50, 0)
     plan = choose_parameters(model, EncodeOptions(scale_step=1.0, quat_levels=100), importance_given=True)
     curvatures = unequal(model)
@@ -79,13 +77,13 @@ def test_shape_curvatures_are_those_of_the_covariance(make_model):
 
 
 def _multiplied(q, turn):
-    """q · turn: a rotation in the splat's own axes."""
+    """Return q · turn, a rotation in the splat's own axes."""
     w, v = q[:, :1], q[:, 1:]
     a, b = turn[0], turn[1:]
     return np.concatenate([w * a - (v @ b)[:, None], w * b + a * v + np.cross(v, b)], axis=1)
 
 
-def test_twice_the_step_is_four_times_the_error(model):
+def test_twice_the_step_gives_four_times_the_error(model):
     curvatures = unequal(model)
     fine, coarse = (
         rounding_errors(model, curvatures, choose_parameters(model, EncodeOptions(**options), importance_given=True))
@@ -99,8 +97,8 @@ def test_twice_the_step_is_four_times_the_error(model):
 
 
 @pytest.mark.slow
-def test_what_rounding_loses_is_foretold():
-    pytest.importorskip("numba", reason="pictures want the extra [render]")
+def test_the_error_of_rounding_is_predicted():
+    pytest.importorskip("numba", reason="pictures require the extra [render]")
     from captures import cameras, shell
 
     from csplat_render import render
@@ -116,23 +114,21 @@ def test_what_rounding_loses_is_foretold():
     assert foretold / 1.6 < lost < 1.6 * foretold
 
 
-# the file
-
-
+# Files.
 def test_classes_have_steps_of_their_own(model):
     plain, _ = encoded(model)
     graded, _ = encoded(model, important(model))
-    said = graded.report.options["classes"]
-    assert sum(said["splats"]) == COUNT
-    assert len(said["splats"]) == graded.report.tile_count > plain.report.tile_count == 1
+    classes = graded.report.options["classes"]
+    assert sum(classes["splats"]) == COUNT
+    assert len(classes["splats"]) == graded.report.tile_count > plain.report.tile_count == 1
     for name in CLASSED_ATTRIBUTES:
-        assert min(said[name]) == (1 if name in ("opacities", "quats") else 0)
-    assert any(max(said[name]) > 1 for name in CLASSED_ATTRIBUTES)
+        assert min(classes[name]) == (1 if name in ("opacities", "quats") else 0)
+    assert any(max(classes[name]) > 1 for name in CLASSED_ATTRIBUTES)
     assert graded.report.notes == ()
 
 
 @pytest.mark.parametrize("name", ["means", "opacities", "scales", "sh0"])
-def test_what_matters_more_is_kept_better(model, name):
+def test_important_splats_have_smaller_errors(model, name):
     importance = important(model)
     result, decoded = encoded(model, importance, attribute_psnr=45)
     source = model if name != "scales" else replace(model, scales=np.sort(model.scales, axis=1))
@@ -143,7 +139,7 @@ def test_what_matters_more_is_kept_better(model, name):
     assert errors[order[-COUNT // 10 :]].mean() < 0.75 * errors[order[: COUNT // 10]].mean()
 
 
-def test_knobs_that_are_set_hold_for_all_splats(model):
+def test_explicit_options_apply_to_all_classes(model):
     result, _ = encoded(model, important(model), scale_step=0.01, opacity_levels=100, position_bits=12)
     said = result.report.options
     assert (said["scale_step"], said["opacity_levels"]) == (float(np.float32(0.01)), 100)
@@ -154,23 +150,23 @@ def test_knobs_that_are_set_hold_for_all_splats(model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [{"max_classes": 1}, {"shape_codebook_size": 16}])
-def test_one_class_is_as_without_blocks(model, options):
+def test_one_class_equals_an_encoding_without_blocks(model, options):
     with_them, without = important(model), Importance(np.ones(COUNT))
     assert encoded(model, with_them, **options)[0].data == encoded(model, without, **options)[0].data
 
 
-def test_few_splats_are_in_one_class(make_model):
+def test_small_scenes_have_one_class(make_model):
     few = make_model(200, 1)
     assert "classes" not in encoded(few, important(few))[0].report.options
 
 
-def test_without_errors_all_is_one_class(model):
+def test_blocks_of_zeros_give_one_class(model):
     nothing = GaussNewtonBlocks(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
     result, _ = encoded(model, Importance(np.ones(COUNT), blocks=nothing))
     assert "classes" not in result.report.options
 
 
-def test_classes_can_be_ruled_out(model):
+def test_classes_may_be_disallowed(model):
     fixed = fix_quantisation(EncodePlan.of(model, importance=important(model), allow_classes=False))
     assert fixed.encode_plan.classes is None
     assert fixed.encode_plan.options.max_classes is None
@@ -183,10 +179,10 @@ def test_outliers_get_tiles_of_their_own(model):
     result, decoded = encoded(exploded, important(exploded))
     place = np.argsort(result.source_index)
     errors = np.abs(decoded.sh0[place] - sh0).max(axis=1)
-    assert np.delete(errors, 5).max() < 5.0  # the coarsest class's step, not that of 3e12
+    assert np.delete(errors, 5).max() < 5.0  # the step of the coarsest class, not that of 3e12
 
 
-def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
+def test_the_scene_of_a_plan_equals_the_decoded_one(model):
     draft = EncodePlan.of(model, importance=important(model))
     result = encode_tiles(draft).write()
     decoded = csplat.decode(result.data)
@@ -194,7 +190,7 @@ def test_the_scene_of_a_draft_is_what_a_decoder_sees(model):
         np.testing.assert_array_equal(getattr(draft.scene, name)[result.source_index], getattr(decoded, name))
 
 
-def test_fixed_values_of_several_classes_are_as_decoded(model):
+def test_fixed_values_of_several_classes_equal_the_decoded_ones(model):
     fixed = fix_quantisation(EncodePlan.of(model, importance=important(model)))
     values = fixed.start()
     result = fixed.encode(values).write()
@@ -204,9 +200,9 @@ def test_fixed_values_of_several_classes_are_as_decoded(model):
         np.testing.assert_array_equal(getattr(seen, name)[order], getattr(decoded, name))
 
 
-def test_integers_of_each_class_are_counted_as_they_are_coded(make_model):
-    """Counts are those of the encoder: integers divided by the multiple of their class."""
-    model = make_model(8_000, 0)  # counts of fewer differ by more than a thousandth
+def test_costs_count_the_encoded_integers_of_each_class(make_model):
+    # The encoder counts integers divided by the multiple of their class.
+    model = make_model(8_000, 0)  # counts of fewer splats differ by more than a thousandth
     fixed = fix_quantisation(EncodePlan.of(model, EncodeOptions(sh_coding="none"), importance=important(model)))
     scene, plan, tiles = TunedScene(fixed), fixed.parameters, fixed.encode_plan.tiles
     values, bits = scene.free_values, 0.0
@@ -224,7 +220,7 @@ def test_integers_of_each_class_are_counted_as_they_are_coded(make_model):
     assert scene.count(scene.dequantise()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)
 
 
-def test_codings_are_tried_on_splats_of_all_classes(model):
+def test_trial_rows_cover_all_classes(model):
     parameters, classes = choose_classes(
         model, unequal(model), choose_parameters(model, EncodeOptions(), importance_given=True), EncodeOptions()
     )
@@ -235,7 +231,7 @@ def test_codings_are_tried_on_splats_of_all_classes(model):
     assert set(trial_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
 
 
-def test_one_splat_does_not_say_how_precise_the_others_have_to_be(model):
+def test_one_splat_does_not_change_the_steps_of_others(model):
     one = unequal(model).means.copy()
     one[7] *= 1e20
     alone, together = important(model, means=one), important(model)
@@ -250,7 +246,7 @@ def test_scenes_of_any_extent_are_encoded(model, factor):
     encoded(scaled, important(scaled))
 
 
-def test_any_step_may_be_given(model):
+def test_steps_of_any_size_are_accepted(model):
     result, _ = encoded(model, important(model), position_step=1e200)
     assert result.report.options["position_step"] == 1e200
 
@@ -270,18 +266,18 @@ def test_the_preset_fast_has_one_class_by_default(model):
         ("shapes", np.ones((COUNT, 6))),
     ],
 )
-def test_other_curvatures_are_refused(model, field, value):
+def test_invalid_blocks_are_refused(model, field, value):
     with pytest.raises(InputError, match=f"Gauss-Newton blocks of {field}"):
         encode_with_report(model, importance=important(model, **{field: value}))
 
 
-def test_the_bytes_do_not_depend_on_threads(model):
+def test_the_number_of_threads_does_not_change_the_bytes(model):
     one, two = (encode_with_report(model, EncodeOptions(threads=n), importance=important(model)) for n in (1, 2))
     assert one.data == two.data
     assert "classes" in one.report.options
 
 
-def test_javascript_reads_the_same(model, tmp_path):
+def test_the_javascript_decoder_agrees(model, tmp_path):
     node = shutil.which("node")
     if node is None:
         pytest.skip("node is not installed")
@@ -305,10 +301,8 @@ console.log(hash.digest('hex'));
     assert seen.stdout.strip() == digest.hexdigest()
 
 
-# its parts
-
-
-def test_tiles_of_a_class_have_its_step_factors(model):
+# Classes and integers.
+def test_tiles_have_the_step_factors_of_their_class(model):
     plan = choose_parameters(model, EncodeOptions(), importance_given=True)
     finer, classes = choose_classes(model, unequal(model), plan, EncodeOptions())
     tiles = cut_scene(model, finer, classes)
@@ -319,13 +313,12 @@ def test_tiles_of_a_class_have_its_step_factors(model):
         assert tile.exponent >= tile.factors.means
     assert min(one.means for one in classes.factors) == min(one.sh0 for one in classes.factors) == 0
     weights = unequal(model).means
-    assert (
-        weights[classes.index == 0].mean() > weights[classes.index == classes.index.max()].mean()
-    )  # the most important splats come first
+    first, last = (weights[classes.index == index].mean() for index in (0, classes.index.max()))
+    assert first > last
 
 
 @pytest.mark.parametrize("multiple", [2, 3, 7])
-def test_coarse_opacities_are_multiples_and_the_ends(multiple):
+def test_coarse_opacities_are_multiples_or_ends(multiple):
     alpha = np.linspace(0, 1, 999, dtype=np.float32)
     q = opacity_levels(alpha, 50, square=True, multiple=multiple)
     assert (q[0], q[-1]) == (0, 50)
@@ -347,7 +340,7 @@ def test_coarse_rotations_are_multiples_within_bounds(levels, multiple):
     assert np.abs(q - rotation[1:] * levels * 2**0.5).max() <= multiple
 
 
-def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
+def test_measured_weights_have_a_floor(model):
     measured = np.zeros((COUNT, 2))
     measured[:10] = 1.0
     floored = apply_weight_floor(measured, model)
@@ -359,7 +352,7 @@ def test_measured_weights_are_trusted_down_to_half_of_what_is_suggested(model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("most", [None, 2])
-def test_the_command_says_that_weights_alone_grade_nothing(model, tmp_path, most):
+def test_the_command_notes_that_weights_give_one_class(model, tmp_path, most):
     from command_line import change_options, invoke
 
     csplat.write_ply(tmp_path / "scene.ply", model)

@@ -15,7 +15,7 @@ from csplat.errors import InputError, LimitError
 from csplat.model import SH_C0, SplatModel
 from csplat.ply import read_ply
 
-pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 
 
 from oracle import (

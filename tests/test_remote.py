@@ -1,4 +1,4 @@
-"""Files that are read in parts, from a disk, from memory and from a store; servers: `test_remote_servers.py`."""
+"""Files that are read in parts from a disk, memory or a store; `test_remote_servers.py` tests servers."""
 
 import io
 import math
@@ -20,12 +20,12 @@ from csplat.splat_file import SplatFile
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
-#: So small that a file of some hundred kB takes several requests.
+#: Small enough that a file of some hundred kB takes several requests.
 SMALL = RequestSizes(first=512, batch=20_000, gap=100, request=10_000)
 
 
 class Watched(SplatFile):
-    """A file whose windows can be looked at."""
+    """A file that keeps its last window."""
 
     def window(self):
         self.last_window = super().window()
@@ -33,7 +33,7 @@ class Watched(SplatFile):
 
 
 def opened(file):
-    """Open a file that is asked for small parts."""
+    """Open a file with small requests."""
     store = open_store(file)
     store.sizes = SMALL
     return Watched(store, Limits())
@@ -51,7 +51,7 @@ def box(data):
 
 @pytest.fixture
 def store(data, monkeypatch):
-    """A file system that fsspec uses for URLs of `store://` and of the web."""
+    """A file system for `store://` and web URLs, in place of fsspec."""
     system = FileSystem({"scene.csplat": data})
     core = SimpleNamespace(url_to_fs=lambda url, **_: (system, url.partition("://")[2].rpartition("/")[2]))
     monkeypatch.setitem(sys.modules, "fsspec", SimpleNamespace(core=core))
@@ -59,11 +59,9 @@ def store(data, monkeypatch):
     return system
 
 
-# what is read
-
-
+# Reading.
 @pytest.mark.slow
-def test_a_part_is_that_of_a_whole_decode_and_less_is_read(data, box, tmp_path):
+def test_a_part_equals_that_of_a_whole_decode_with_fewer_bytes_read(data, box, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(data)
     with csplat.open(tmp_path / "scene.csplat") as file:
         assert read_header(data) == file.header
@@ -80,7 +78,7 @@ def test_a_part_is_that_of_a_whole_decode_and_less_is_read(data, box, tmp_path):
         assert_same(decode(data), file.read())
 
 
-def test_boxes_are_those_of_the_splats(data):
+def test_boxes_of_tiles_are_exact(data):
     with csplat.open(data) as file:
         assert (len(file.header.tiles), 2, 3) == file.boxes.shape
         for box, tile in zip(file.boxes, file.tiles(sh_degree=0), strict=True):
@@ -88,7 +86,7 @@ def test_boxes_are_those_of_the_splats(data):
             np.testing.assert_array_equal(box[1].astype(np.float32), tile.means.max(axis=0))
 
 
-def test_tiles_come_one_after_the_other_and_what_was_before_them_is_let_go_of(data, box):
+def test_tiles_are_iterated_and_released(data, box):
     with opened(io.BytesIO(data)) as file:
         for degree in (None, 0, 2):
             wanted = list(iter_tiles(data, sh_degree=degree))
@@ -101,7 +99,7 @@ def test_tiles_come_one_after_the_other_and_what_was_before_them_is_let_go_of(da
         assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
 
 
-def test_bands_that_are_not_wanted_are_not_fetched(data):
+def test_unused_bands_are_not_fetched(data):
     layers = {layer: sum(tile.layers[layer].size for tile in read_header(data).tiles) for layer in range(4)}
     with opened(data) as file:
         before = file.bytes_read
@@ -109,7 +107,7 @@ def test_bands_that_are_not_wanted_are_not_fetched(data):
         assert layers[0] <= file.bytes_read - before < layers[0] + layers[1] / 2
 
 
-def test_what_was_not_fetched_is_never_taken_for_data(data):
+def test_bytes_that_were_not_fetched_fail_their_checksum(data):
     with opened(data) as file:
         window = file.window()
         window.fetch([(0, _spec.HEADER_SIZE + file.header.index_size)])
@@ -119,7 +117,7 @@ def test_what_was_not_fetched_is_never_taken_for_data(data):
             list(iter_tiles(window.view))
 
 
-def test_a_mapped_file_is_let_go_of_and_a_window_keeps_what_was_fetched(data, tmp_path):
+def test_releasing_pages_keeps_fetched_bytes(data, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(data)
     window = FileWindow(MemoryStore(data))
     window.fetch([(0, len(data))])
@@ -128,14 +126,14 @@ def test_a_mapped_file_is_let_go_of_and_a_window_keeps_what_was_fetched(data, tm
         assert data == view
 
 
-def test_an_index_that_is_longer_than_the_first_request_takes_a_second_one(data):
+def test_a_long_index_takes_a_second_request(data):
     with opened(data) as file:
         assert 2 <= file.requests
         assert _spec.HEADER_SIZE + file.header.index_size == file.bytes_read
         assert read_header(data) == file.header
 
 
-def test_a_part_is_cut_out_in_small_requests_as_in_large_ones(data, box):
+def test_the_size_of_requests_does_not_change_an_extracted_part(data, box):
     parts = []
     for file in (csplat.open(data), opened(data)):
         with file:
@@ -146,7 +144,7 @@ def test_a_part_is_cut_out_in_small_requests_as_in_large_ones(data, box):
     assert requests > 10
 
 
-def test_parts_that_lie_together_are_read_in_one_request(data):
+def test_neighbouring_parts_are_read_in_one_request(data):
     store = MemoryStore(data)
     window, gap = FileWindow(store), store.sizes.gap
     window.fetch([(10, 5), (0, 10), (15 + gap, 5)])
@@ -161,10 +159,8 @@ def test_parts_that_lie_together_are_read_in_one_request(data):
     assert not any(window.view)
 
 
-# what is refused
-
-
-def test_arguments_that_make_no_sense_are_typed_errors_before_anything_is_read(data):
+# Refusals.
+def test_invalid_arguments_are_refused_before_reading(data):
     with csplat.open(data, limits=Limits(splats=1000)) as file:
         before = file.bytes_read
         for call, error, message in (
@@ -186,7 +182,7 @@ def test_arguments_that_make_no_sense_are_typed_errors_before_anything_is_read(d
 
 
 @pytest.mark.parametrize("size", [0, 10, 100, 3000, -1])
-def test_a_file_that_is_cut_short_or_too_long_is_refused_as_a_decode_refuses_it(data, size):
+def test_files_of_wrong_size_give_the_errors_of_decode(data, size):
     wrong = data + b"x" if size < 0 else data[:size]
     with pytest.raises(FormatError) as wanted:
         decode(wrong)
@@ -195,7 +191,7 @@ def test_a_file_that_is_cut_short_or_too_long_is_refused_as_a_decode_refuses_it(
     assert str(wanted.value) == str(found.value)
 
 
-def test_a_file_that_shrinks_or_changes_while_it_is_read_is_told(data, tmp_path):
+def test_a_file_that_changes_while_it_is_read_is_an_error(data, tmp_path):
     path = tmp_path / "scene.csplat"
     for wrong in (data[:70_000], data[:70_000] + bytes(len(data) - 70_000)):
         path.write_bytes(data)
@@ -214,10 +210,8 @@ def test_a_damaged_file_is_named(data, tmp_path):
     assert str(tmp_path / "scene.csplat") == raised.value.path
 
 
-# a store that fsspec knows
-
-
-def test_a_store_gives_the_parts_that_are_wanted(store, data, box):
+# Stores of fsspec.
+def test_parts_are_read_from_a_store(store, data, box):
     with csplat.open("store://scenes/scene.csplat") as file:
         assert (2, 65536) == (file.requests, file.bytes_read)
         chosen = [tile.tile.index for tile in file.tiles(box)]
@@ -227,7 +221,7 @@ def test_a_store_gives_the_parts_that_are_wanted(store, data, box):
 
 
 @pytest.mark.parametrize("size", [None, 70_000])
-def test_a_file_of_a_store_that_changes_between_requests_is_told(store, data, size):
+def test_a_stored_file_that_changes_between_requests_is_an_error(store, data, size):
     with csplat.open("store://scene.csplat") as file:
         store.files["scene.csplat"] = bytes(reversed(data))[:size]
         with pytest.raises(StoreError, match=r"/scene\.csplat has changed while it was read: open it again"):
@@ -237,7 +231,7 @@ def test_a_file_of_a_store_that_changes_between_requests_is_told(store, data, si
             file.read(tiles=[5])
 
 
-def test_a_store_that_breaks_off_is_a_typed_error(store):
+def test_an_incomplete_answer_of_a_store_is_a_typed_error(store):
     store.cut_after = 0
     with pytest.raises(StoreError, match=r"/scene\.csplat returned 32768 bytes from byte 0, expected 65536"):
         csplat.open("store://scene.csplat")
@@ -257,7 +251,7 @@ def test_a_web_server_without_parts_is_refused(store):
         file.read(sh_degree=0)
 
 
-def test_a_web_server_that_gives_parts_is_asked_for_them(store, data):
+def test_a_web_server_with_parts_is_used(store, data):
     store.protocol = ("http", "https")
     with csplat.open("https://example.org/scene.csplat") as file:
         assert_same(decode(data, sh_degree=0), file.read(sh_degree=0))
@@ -274,7 +268,7 @@ def test_a_damaged_file_of_a_store_is_named(store, data):
     ("status", "error", "message"),
     [(404, FileNotFoundError, "No such file"), (403, PermissionError, "Permission"), (500, StoreError, "status 500")],
 )
-def test_what_a_store_refuses_is_said_without_secrets(store, status, error, message):
+def test_errors_of_a_store_contain_no_secrets(store, status, error, message):
     store.answer = Refused("store://scene.csplat?key=secret")
     store.answer.status = status
     with pytest.raises(error, match=message) as raised:
@@ -284,11 +278,11 @@ def test_what_a_store_refuses_is_said_without_secrets(store, status, error, mess
     assert "password" not in str(raised.value)
 
 
-class Refused(Exception):  # noqa: N818  # as libraries of stores have them
-    """An error that a store raises instead of returning a file."""
+class Refused(Exception):  # noqa: N818  # named like errors of libraries
+    """An error that a store raises."""
 
 
-def test_a_url_that_fsspec_does_not_know_is_refused(store, monkeypatch):
+def test_an_unknown_url_is_refused(store, monkeypatch):
     def refuse(url, **_):
         raise ValueError(f"Protocol not known: {url}")
 
@@ -298,16 +292,14 @@ def test_a_url_that_fsspec_does_not_know_is_refused(store, monkeypatch):
     assert 0 == store.asked
 
 
-def test_without_the_extra_a_url_says_what_is_missing(monkeypatch):
+def test_without_the_extra_a_url_is_an_error_with_a_remedy(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "fsspec.core", None)
     with pytest.raises(InputError, match=r"pip install 'csplat\[remote\]'"):
         csplat.open("https://example.org/scene.csplat")
 
 
-# the command
-
-
-def test_extract_takes_a_url_and_leaves_no_half_of_a_file(store, data, box, tmp_path):
+# The command.
+def test_extract_reads_a_url_and_leaves_no_partial_file(store, data, box, tmp_path):
     out, local = tmp_path / "part.csplat", tmp_path / "local.csplat"
     words = ["extract", "store://scenes/scene.csplat", str(out), f"--box={','.join(map(repr, box))}"]
     done = CliRunner().invoke(app, words)
@@ -319,7 +311,7 @@ def test_extract_takes_a_url_and_leaves_no_half_of_a_file(store, data, box, tmp_
     refused = CliRunner().invoke(app, [*words, "--force"])
     assert (1, 1) == (refused.exit_code, len(refused.stderr.splitlines()))
     assert "store://scenes/scene.csplat" in refused.stderr
-    assert local.read_bytes() == out.read_bytes()  # the one that was there
+    assert local.read_bytes() == out.read_bytes()  # the previous file
 
 
 def test_extract_reads_standard_input_and_writes_standard_output(data, box):

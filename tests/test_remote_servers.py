@@ -1,4 +1,4 @@
-"""Files at URLs, from a web server and an S3 on this machine: what fsspec and its file systems make of requests."""
+"""Files at URLs of a local web server and a local S3, through fsspec."""
 
 import io
 
@@ -12,8 +12,8 @@ from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.area(name="remote")
-pytest.importorskip("fsspec", reason="URLs want the extra [remote]")
-pytest.importorskip("aiohttp", reason="URLs want the extra [remote]")
+pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
+pytest.importorskip("aiohttp", reason="URLs require the extra [remote]")
 
 
 @pytest.fixture(scope="module")
@@ -34,10 +34,8 @@ def web(data):
         yield server
 
 
-# the web
-
-
-def test_the_web_gives_the_parts_that_are_wanted(web, data, box):
+# Web servers.
+def test_parts_are_read_from_a_web_server(web, data, box):
     with csplat.open(web.url) as file:
         assert [("HEAD", None), ("GET", "bytes=0-65535")] == [(one[0], one[2]) for one in web.asked]
         chosen = [tile.tile.index for tile in file.tiles(box)]
@@ -65,7 +63,7 @@ def test_a_lost_connection_is_a_typed_error(web):
 
 
 @pytest.mark.parametrize("size", [None, 70_000])
-def test_a_file_that_changes_between_requests_is_told(web, data, size):
+def test_a_file_that_changes_between_requests_is_an_error(web, data, size):
     with csplat.open(web.url) as file:
         web.files["/scene.csplat"] = bytes(reversed(data))[:size]
         with pytest.raises(StoreError, match=r"/scene\.csplat has changed while it was read: open it again"):
@@ -83,7 +81,7 @@ def test_a_file_of_the_web_that_is_damaged_is_named(web, data):
     ("answer", "error", "message"),
     [(404, FileNotFoundError, "No such file"), (403, PermissionError, "Permission"), (500, StoreError, "status 500")],
 )
-def test_what_a_server_refuses_is_said_without_secrets(web, answer, error, message):
+def test_errors_of_a_server_contain_no_secrets(web, answer, error, message):
     web.files["/other.csplat?key=secret"] = answer
     address = web.url.replace("://", "://somebody:password@").replace("scene", "other")
     with pytest.raises(error, match=message) as raised:
@@ -93,12 +91,12 @@ def test_what_a_server_refuses_is_said_without_secrets(web, answer, error, messa
     assert "password" not in str(raised.value)
 
 
-def test_a_url_that_nothing_knows_is_refused():
+def test_an_unknown_url_is_refused():
     with pytest.raises(InputError, match="nowhere://scene"):
         csplat.open("nowhere://scene.csplat")
 
 
-def test_other_file_systems_of_fsspec_serve_too(data, box, tmp_path):
+def test_other_file_systems_of_fsspec_are_used(data, box, tmp_path):
     import fsspec
 
     (tmp_path / "scene.csplat").write_bytes(data)
@@ -108,11 +106,9 @@ def test_other_file_systems_of_fsspec_serve_too(data, box, tmp_path):
             assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
 
 
-# S3
-
-
-def test_s3_gives_the_parts_that_are_wanted(data, box):
-    pytest.importorskip("moto", reason="an S3 wants the extra [remote-tests]")
+# S3.
+def test_parts_are_read_from_s3(data, box):
+    pytest.importorskip("moto", reason="an S3 requires the extra [remote-tests]")
     with s3({"scene.csplat": data}) as storage:
         with csplat.open("s3://scenes/scene.csplat", storage=storage) as file:
             assert 65536 == file.bytes_read
@@ -130,10 +126,8 @@ def test_s3_gives_the_parts_that_are_wanted(data, box):
             csplat.open("s3://scenes/absent", storage=storage)
 
 
-# the command
-
-
-def test_extract_takes_a_url_and_says_what_it_read(web, data, box, tmp_path):
+# The command.
+def test_extract_reads_a_url_and_reports_the_bytes(web, data, box, tmp_path):
     out = tmp_path / "part.csplat"
     words = ["extract", web.url, str(out), f"--box={','.join(map(repr, box))}"]
     done = CliRunner().invoke(app, words)
@@ -148,7 +142,7 @@ def test_extract_takes_a_url_and_says_what_it_read(web, data, box, tmp_path):
     assert 1 == refused.exit_code
     assert 1 == len(refused.stderr.splitlines())
     assert web.url in refused.stderr
-    assert local.read_bytes() == out.read_bytes()  # the one that was there
+    assert local.read_bytes() == out.read_bytes()  # the previous file
     web.cut_after = 1 + len(web.gets)
     refused = CliRunner().invoke(app, ["extract", web.url, "-", *words[3:]])
     assert (1, b"") == (refused.exit_code, refused.stdout_bytes)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 
 from oracle import adversarial, extreme_splats, facing
 

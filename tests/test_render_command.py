@@ -39,7 +39,7 @@ def ply(tmp_path):
         opacities=np.ones(1, np.float32),
         sh0=np.array([[1.7, -1.8, -1.8]], np.float32),
         shN=np.zeros((1, 3, 3), np.float32),
-        metadata={"up": [0, -1, 0]},  # otherwise it would be searched for
+        metadata={"up": [0, -1, 0]},  # otherwise it would be estimated
     )
     path = tmp_path / "ball.ply"
     write_ply(path, model)
@@ -47,7 +47,7 @@ def ply(tmp_path):
 
 
 def camera(image=None, width=64, height=48):
-    """Two units in front of the origin."""
+    """Return a camera two units in front of the origin."""
     entry = {
         "K": [[60.0, 0.0, width / 2], [0.0, 60.0, height / 2], [0.0, 0.0, 1.0]],
         "viewmat": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]],
@@ -209,7 +209,7 @@ def test_a_wrong_command_line_has_status_2(ply, tmp_path, words):
 
 
 @pytest.mark.parametrize(("module", "package"), [("numba", "numba"), ("PIL", "pillow")])
-def test_without_the_extra_packages_one_line_says_what_to_install(ply, cameras, tmp_path, monkeypatch, module, package):
+def test_missing_packages_are_named(ply, cameras, tmp_path, monkeypatch, module, package):
     pytest.importorskip("numba", reason="one of the two is absent anyway")
     monkeypatch.setitem(sys.modules, module, None)
     line = f"error: this needs {package}: pip install 'csplat[render]' (E_INPUT)\n"
@@ -250,7 +250,7 @@ def test_bytes_are_rounded_and_clipped():
     assert [0, 0, 128, 255, 255, 0, 255] == to_uint8(values).tolist()
 
 
-def test_panels_show_both_and_the_amplified_difference():
+def test_panels_show_both_renders_and_the_amplified_difference():
     a, b = np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1, 3), 0.45, np.float32)
     assert [[128] * 3, [115] * 3, [128] * 3] == side_by_side(a, b, 10.0)[0].tolist()
 
@@ -262,7 +262,7 @@ def test_sizes_and_colours_are_parsed():
 
 
 @pytest.mark.parametrize("text", ["1,1", "0,0,2", "red", "nan,0,0", "0,0,0,0"])
-def test_other_colours_are_refused(text):
+def test_invalid_colours_are_refused(text):
     import typer
 
     with pytest.raises(typer.BadParameter, match="expected red,green,blue"):
@@ -274,7 +274,7 @@ ORBIT = ("--orbit", 4, "--size", "64x48")
 
 @pytest.fixture(scope="module")
 def film_scene(tmp_path_factory):
-    """Return a scene with a recorded up direction, which would otherwise be searched for."""
+    """A PLY with a recorded up direction, which would otherwise be estimated."""
     rng, path = np.random.default_rng(0), tmp_path_factory.mktemp("film") / "scene.ply"
     model = SplatModel(
         means=rng.standard_normal((200, 3)).astype(np.float32),
@@ -290,7 +290,7 @@ def film_scene(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def pictures(film_scene, tmp_path_factory):
-    """The pictures of an orbit."""
+    """The renders of an orbit."""
     folder = tmp_path_factory.mktemp("pictures") / "turn"
     assert 0 == invoke("render", film_scene, *ORBIT, folder).exit_code
     return [read_picture(folder / f"{number:04d}.png") for number in range(4)]
@@ -302,7 +302,7 @@ def read_picture(path):
 
 
 def frames_of(path):
-    """Every frame as RGB, and how long it stays, ms."""
+    """Return every frame as RGB, its duration in ms, and the loop count."""
     with Image.open(path) as film:
         frames, times = [], []
         for number in range(film.n_frames):
@@ -351,7 +351,7 @@ def test_an_mp4_resembles_the_renders_and_is_reproducible(film_scene, tmp_path):
         assert np.abs(expected - frame).mean() < 8.0
 
 
-def test_without_pyav_one_line_says_what_to_install(film_scene, tmp_path, monkeypatch):
+def test_a_missing_pyav_is_named(film_scene, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
     done = invoke("render", film_scene, "--orbit", 2, tmp_path / "turn.mp4")
     assert (1, "error: this needs av: pip install 'csplat[film]' (E_INPUT)\n") == (done.exit_code, done.stderr)
@@ -370,7 +370,7 @@ def test_an_existing_film_is_kept_without_force(film_scene, tmp_path):
     assert film.read_bytes().startswith(b"GIF89a")
 
 
-def test_a_film_of_one_picture_is_a_picture(tmp_path):
+def test_a_film_of_one_frame_is_an_image(tmp_path):
     for ending in ("webp", "gif", "png"):
         film = tmp_path / f"still.{ending}"
         write_film(str(film), [np.full((24, 32, 3), 9, np.uint8)], 25.0)
@@ -398,7 +398,7 @@ def test_renders_of_two_sizes_are_refused():
         check_film("a.gif", [(4, 4), (5, 4)], 25.0)
 
 
-def test_a_film_larger_than_memory_allows_is_refused():
+def test_a_film_beyond_the_memory_limit_is_refused():
     with pytest.raises(InputError, match=r"more than 2 GiB: render into a folder"):
         check_film("a.webp", [(1920, 1080)] * 400, 25.0)
 
@@ -416,7 +416,7 @@ def test_names_distinguish_films_from_folders():
     ]
 
 
-def test_a_film_that_pillow_cannot_write_is_one_line(tmp_path, monkeypatch):
+def test_a_film_that_pillow_cannot_write_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(Image, "SAVE_ALL", {})
     monkeypatch.setattr(Image, "SAVE", {})
     monkeypatch.setattr(Image, "init", lambda: None)

@@ -8,8 +8,6 @@ import sys
 
 import numpy as np
 import pytest
-
-# Importing them needs what is looked for above.
 from captures import cameras, shell
 from posed_sets import write_blender
 from typer.testing import CliRunner
@@ -19,7 +17,7 @@ from csplat import EncodeOptions, encode, read_ply, write_ply
 pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
 pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
 pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
-pytest.importorskip("matplotlib", reason="plots want the extra [render]")
+pytest.importorskip("matplotlib", reason="plots require the extra [render]")
 
 
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
@@ -36,7 +34,7 @@ def invoke(*words):
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A scene and a file made of it."""
+    """A scene and its file."""
     folder = tmp_path_factory.mktemp("files")
     scene = shell(8)
     write_ply(folder / "scene.ply", scene)
@@ -55,11 +53,11 @@ def page(files):
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_the_page_says_what_the_text_says(files, page):
+def test_the_page_agrees_with_the_text(files, page):
     text = html.unescape(page.read_text())
     facts = describe_file(files[0].read_bytes())
     assert "<h1>a & b.csplat: content</h1>" in text
-    assert "a & b" not in page.read_text()  # names are no markup
+    assert "a & b" not in page.read_text()  # names are escaped
     for name, one in facts.attributes.items():
         assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td><td[^>]*>{one.size_bytes:,}</td>", text)
     for record in facts.declared_bounds.records:
@@ -72,7 +70,7 @@ def test_the_page_says_what_the_text_says(files, page):
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_the_page_shows_the_source_beside_the_file(files, page):
+def test_the_page_shows_source_and_file(files, page):
     text = page.read_text()
     assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', text))
     words = ["compare", str(files[1]), str(files[0])]
@@ -82,7 +80,7 @@ def test_the_page_shows_the_source_beside_the_file(files, page):
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
+def test_the_page_opens_in_a_browser(tab, page):
     tab.page.set_viewport_size({"width": 400, "height": 700})
     tab.page.goto(page.as_uri())
     assert "a & b.csplat: content" == tab.page.title()
@@ -98,7 +96,7 @@ def test_the_page_opens_in_a_browser_without_a_complaint(tab, page):
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_the_page_refers_to_nothing_outside(page):
+def test_the_page_has_no_external_references(page):
     text = page.read_text()
     assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
     assert all(one.startswith("data:image/webp") for one in re.findall(r'(?:src|href)="([^"]*)"', text))
@@ -107,7 +105,7 @@ def test_the_page_refers_to_nothing_outside(page):
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_the_page_replaces_nothing_unless_forced(files, tmp_path):
+def test_the_page_does_not_replace_a_file_without_force(files, tmp_path):
     target = tmp_path / "page.html"
     target.write_text("mine")
     refused = invoke(files[0], "--page", target)
@@ -129,14 +127,14 @@ def test_a_file_without_splats_has_a_page(tmp_path, make_model):
 
 
 @pytest.mark.usefixtures("small_views")
-def test_a_source_without_a_page_is_a_wrong_command_line(files):
+def test_a_source_without_a_page_has_status_2(files):
     assert 2 == invoke(files[0], "--source", files[1]).exit_code
     assert 2 == invoke(files[0], "--page", "-").exit_code
 
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_without_the_renderer_there_is_a_page_but_no_comparison(files, tmp_path):
+def test_without_the_renderer_the_page_has_no_comparison(files, tmp_path):
     code = """import json, sys
 sys.modules["numba"] = sys.modules["PIL"] = None
 from typer.testing import CliRunner
@@ -155,7 +153,7 @@ for words in ((f"{folder}/a.html",), (f"{folder}/b.html", "--source", source)):
 
 
 @pytest.mark.usefixtures("small_views")
-def test_bars_are_as_long_as_their_bytes():
+def test_bars_are_proportional_to_bytes():
     text = draw_bars([Bar("a", {"means": 100, "sh0": 300}, "400"), Bar("b", {"means": 50}, "50")], key=True)
     widths = [float(one) for one in re.findall(r'width="([\d.]+)" height="17"', text)]
     assert 3 == len(widths)
@@ -187,7 +185,7 @@ def test_the_hardest_place_is_where_the_error_is():
 
 @pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_views_that_are_shown_show_detail(sample_path):
+def test_display_views_show_detail(sample_path):
     source = read_ply(sample_path)
     views = find_view_set(source, count=0)
     shown = display_cameras(source, views)
@@ -198,13 +196,13 @@ def test_views_that_are_shown_show_detail(sample_path):
 
 
 @pytest.mark.usefixtures("small_views")
-def test_views_of_a_user_are_shown_as_they_are():
+def test_views_of_the_user_are_displayed_unchanged():
     own = cameras(3)
     assert display_cameras(shell(8), ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
 
 
 @pytest.mark.usefixtures("small_views")
-def test_equal_pictures_have_a_place_too():
+def test_equal_images_have_a_hardest_place():
     place = HardestPlaceSearch()
     place.examine(0, np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32))
     assert 99.0 == place.found().psnr
@@ -227,7 +225,7 @@ def headings(page):
 
 
 @pytest.mark.slow
-def test_a_page_about_a_training_and_its_file(file_runs):
+def test_a_page_shows_a_training_and_its_file(file_runs):
     page = file_runs.page.read_text()
     assert [
         "Scores", "Renders", "Training", "Tuning", "Bytes by attribute", "Options",
@@ -240,7 +238,7 @@ def test_a_page_about_a_training_and_its_file(file_runs):
 
 
 @pytest.mark.slow
-def test_a_training_alone_has_a_page_and_the_scores_of_its_scene_are_those_of_compare(file_runs, tmp_path):
+def test_a_page_of_a_training_without_a_file_agrees_with_compare(file_runs, tmp_path):
     compared, path = tmp_path / "compared.json", tmp_path / "page.html"
     file_runs.made("a.ply", "--resume", file_runs.checkpoint, "--page", path)
     page = path.read_text()
@@ -255,7 +253,7 @@ def test_a_training_alone_has_a_page_and_the_scores_of_its_scene_are_those_of_co
             assert scores[score] == pytest.approx(judged[one][score], abs=1e-3)
 
 
-def test_a_page_is_not_replaced_without_being_told(folder, tmp_path):
+def test_a_page_is_not_replaced_without_force(folder, tmp_path):
     (tmp_path / "page.html").write_text("mine")
     words = ["train", str(folder), str(tmp_path / "a.ply"), "--page", str(tmp_path / "page.html")]
     result = CliRunner().invoke(app, words)

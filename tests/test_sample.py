@@ -1,4 +1,4 @@
-"""The sample scene that ships, and its recipe on a small scale."""
+"""The shipped sample scene, and its recipe on a small scale."""
 
 import sys
 from pathlib import Path
@@ -41,7 +41,7 @@ def small(recipe):
 
 
 def field_at(garden, point):
-    """Distance, part and item at a point of the garden."""
+    """Return distance, part and item at a point of the garden."""
     return sys.modules["distances"].field(garden, *point)
 
 
@@ -63,7 +63,7 @@ def test_the_recipe_makes_the_same_scene_twice(recipe, small, tmp_path):
 
 
 @RECIPE
-def test_pictures_are_read_back_with_the_cameras_that_took_them(recipe, small, tmp_path):
+def test_pictures_are_read_with_their_cameras(recipe, small, tmp_path):
     recipe.photograph_all(tmp_path, small)
     data = load(tmp_path)
     for pictures, count, between in ((data.train, 3, False), (data.test, 2, True)):
@@ -83,7 +83,7 @@ def test_points_to_start_from_lie_on_the_garden(recipe, garden, small, tmp_path)
 
 @RECIPE
 def test_rays_end_at_the_first_surface(recipe, garden):
-    """Small steps from the camera find no surface before, but for grazing rays."""
+    """Small steps from the camera find no nearer surface, except for grazing rays."""
     camera = recipe.cameras(5, 24, between=False)[3]
     pixels, points = recipe.photograph(garden, camera)
     ends, eye = points[pixels[..., 3] == SOLID][::3] * TURN, camera.position * TURN
@@ -119,7 +119,7 @@ def test_gloss_depends_on_the_direction_and_moss_does_not(garden):
     assert np.ptp(colours((x, heights[0], z), kinds.MOSS), axis=0).max() == 0.0
 
 
-def test_the_sample_has_no_defects_and_says_whose_it_is(sample_path):
+def test_the_sample_has_no_defects_and_names_its_author(sample_path):
     report = []
     model = read_ply(sample_path, strict=True, report=report)
     assert [] == report
@@ -128,8 +128,8 @@ def test_the_sample_has_no_defects_and_says_whose_it_is(sample_path):
     assert sample_path.stat().st_size < 2.6e6
 
 
-def test_the_sample_has_something_of_everything(sample_path):
-    """Examples and tests rest on it: three bands of colour, needles, discs, glass and solid."""
+def test_the_sample_contains_all_kinds_of_splats(sample_path):
+    """Examples and tests depend on it: three bands of colour, needles, discs, glass and solid."""
     model = read_ply(sample_path)
     assert 3 == model.sh_degree
     assert 6000 <= len(model) <= 10_000

@@ -11,7 +11,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply, write_ply
 
-pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 
 from checked import covariances, quaternion_of
 from command_line import call, change_views, invoke

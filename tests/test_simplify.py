@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer import BadParameter
 
-pytest.importorskip("numba", reason="simplification wants the extra [render]")
+pytest.importorskip("numba", reason="simplification requires the extra [render]")
 
 from captures import views_of
 from command_line import call, change_options, change_views, invoke

@@ -1,4 +1,4 @@
-"""The pseudo-code of the spec, run as it stands, against the decoder's vectorised functions."""
+"""The unmodified pseudo-code of the spec against the decoder's vectorised functions."""
 
 import math
 import re
@@ -100,7 +100,7 @@ def record(attribute: int, mapping: int, **fields: float) -> _spec.AttributeReco
 
 
 def columns(rows: list[list[int]], exponent: int = 0) -> ColumnBlock:
-    """[n][C] integers as a block; wide ones, as an offset and elements make them."""
+    """Return [n][C] integers as a block; wide ones are an offset plus elements."""
     return ColumnBlock(np.array(rows, np.int64).T, (0,) * len(rows[0]), exponent, 0)
 
 
@@ -201,7 +201,7 @@ def test_nearness(spec, array):
 
 @pytest.mark.parametrize("measure", ["means", "covariance", "opacities", "sh0", "sh3"])
 @pytest.mark.parametrize("reach", [0.0, 3.0, 5e6])
-def test_what_may_be_stated(spec, measure, reach):
+def test_permitted_stated_errors(spec, measure, reach):
     # SER-7
     for error in (0.0, 1e-12, 1e-7, 3e-3, 0.5, 1e6):
         for wide in (0.0, 1e-13, 1e-9, 1.9e-7, 2.1e-7, 1.9e-6, 2.1e-6, 9e-5 * error, 1.1e-4 * error, error):

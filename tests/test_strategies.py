@@ -1,4 +1,4 @@
-"""Simple strategies: what they keep, what they cost by hand, and that their files prove what they state."""
+"""Simple strategies: kept splats, sizes by hand, and verified files."""
 
 import json
 import subprocess
@@ -24,16 +24,16 @@ def source(make_model):
 
 @pytest.fixture(scope="module")
 def shell():
-    """A shell of overlapping splats, which pictures show."""
-    pytest.importorskip("numba", reason="rendering wants the extra [render]")
-    pytest.importorskip("PIL", reason="photographs want the extra [render]")
+    """A shell of overlapping splats."""
+    pytest.importorskip("numba", reason="rendering requires the extra [render]")
+    pytest.importorskip("PIL", reason="photographs require the extra [render]")
     from captures import shell
 
     return shell(8)
 
 
 def stored(source, result):
-    """Prove what a file states against the source; return what it decodes to."""
+    """Verify a file against its source; return the decoded scene."""
     scene = decode_scene(result.data)
     proof = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert () == proof.failures
@@ -45,10 +45,8 @@ def stored(source, result):
     return scene
 
 
-# pruning
-
-
-def test_splats_above_the_threshold_stay_in_their_order(source):
+# Pruning.
+def test_splats_above_the_threshold_are_kept_in_order(source):
     source.opacities[:4] = np.float32([0.25, np.nextafter(np.float32(0.25), 1), 0.0, 1.0])
     pruned, rows = prune_opacity(source, 0.25)
     assert np.flatnonzero(source.opacities > 0.25).tolist() == rows.tolist()
@@ -65,7 +63,7 @@ def test_the_threshold_is_not_rounded(source):
     assert [1, 2] == prune_opacity(source, 0.1)[1].tolist()
 
 
-def test_a_threshold_that_leaves_nothing_is_refused(source):
+def test_a_threshold_without_splats_above_is_refused(source):
     source.opacities[:] = 0.5
     with pytest.raises(InputError, match=r"no splat has an opacity above 0\.5: the largest is 0\.5"):
         prune_opacity(source, 0.5)
@@ -74,9 +72,7 @@ def test_a_threshold_that_leaves_nothing_is_refused(source):
             prune_opacity(source, tau)
 
 
-# clustering
-
-
+# Clustering.
 def test_one_entry_per_splat_changes_nothing(make_model):
     model = make_model(50, 1)
     found, _ = cluster_attributes(model, 50)
@@ -132,7 +128,7 @@ def test_clusters_do_not_depend_on_threads(make_model):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
-def test_scenes_of_no_splat_and_of_one_can_be_clustered(make_model):
+def test_scenes_of_0_and_1_splats_are_clustered(make_model):
     for count in (0, 1):
         assert count == len(cluster_attributes(make_model(count, 1), 5)[0])
 
@@ -147,10 +143,8 @@ def test_progress_rises_to_its_end(source):
     assert len(shares) > 12
 
 
-# files
-
-
-def test_a_pruned_file_proves_its_errors_and_says_what_is_gone(source):
+# Files.
+def test_a_pruned_file_is_verified_and_records_the_reduction(source):
     result = encode_reduced(source, Reduction(prune_opacity=0.5, sh_degree=1))
     scene = stored(source, result)
     assert {"splats": 150, "prune_opacity": 0.5, "sh_degree": 1, "sh": "truncated"} == scene.options["reduced"]
@@ -163,7 +157,7 @@ def test_a_pruned_file_proves_its_errors_and_says_what_is_gone(source):
     assert 1 == scene.model.sh_degree
 
 
-def test_the_encoders_degree_is_the_reductions(source):
+def test_the_degree_of_the_encoder_counts_as_a_reduction(source):
     scene = stored(source, encode_reduced(source, Reduction(), EncodeOptions(sh_degree=0)))
     assert (0, "truncated") == (scene.model.sh_degree, scene.options["reduced"]["sh"])
 
@@ -178,20 +172,20 @@ def test_a_clustered_file_declares_its_errors_against_the_source(source):
     by_coding = measure_errors(clustered, scene.model, np.searchsorted(
         np.flatnonzero(source.opacities > 0.2), result.source_index))  # fmt: skip
     rms = {record.measure: record.rms for record in scene.declared_bounds.records}
-    assert rms["sh0"] > 5 * by_coding["sh0"][1]  # most of it comes from clustering
+    assert rms["sh0"] > 5 * by_coding["sh0"][1]  # clustering causes most of the error
     report = scene.options["reduced"]["kmeans"]
     assert set(ATTRIBUTES) == set(report)
     assert [24] == report["sh0"]["sizes"]
     assert by_coding["means"][0] < 0.1
 
 
-def test_a_file_is_the_same_each_time(source):
+def test_files_are_deterministic(source):
     reduction = Reduction(prune_opacity=0.2, kmeans=16)
     assert encode_reduced(source, reduction).data == encode_reduced(source, reduction).data
 
 
 @pytest.mark.slow
-def test_a_distilled_degree_looks_more_like_the_source(shell):
+def test_distilling_raises_the_psnr(shell):
     from captures import cameras, views_of
 
     from csplat_render.scorer import Scorer
@@ -211,7 +205,7 @@ def test_a_distilled_degree_looks_more_like_the_source(shell):
     assert after > before + 1.0
 
 
-def test_distilled_and_clustered_colours_state_no_error(shell):
+def test_distilled_and_clustered_colours_declare_no_error(shell):
     from captures import cameras, views_of
 
     reduction = Reduction(prune_opacity=0.15, sh_degree=1, distil=True, kmeans=64)
@@ -230,7 +224,7 @@ def test_a_scene_of_one_splat_can_be_distilled(shell):
     assert 1 == len(stored(one, result).model)
 
 
-def test_given_cameras_decide_and_one_is_not_enough(shell):
+def test_given_cameras_are_used_and_one_is_refused(shell):
     from captures import cameras, views_of
 
     reduction = Reduction(sh_degree=1, distil=True)
@@ -254,7 +248,7 @@ def test_impossible_reductions_are_refused(make_model):
 
 
 @pytest.mark.slow
-def test_pruning_and_clustering_want_no_renderer():
+def test_pruning_and_clustering_need_no_renderer():
     code = (
         "import sys, json; import csplat_tools.study;"
         "print(json.dumps([name for name in ('numba', 'torch', 'matplotlib') if name in sys.modules]))"

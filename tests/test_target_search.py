@@ -5,7 +5,7 @@ from functools import cache
 
 import pytest
 
-pytest.importorskip("numba", reason="targets want the extra [render]")
+pytest.importorskip("numba", reason="targets require the extra [render]")
 
 from analytic_search import AnalyticScene, Views, search
 

@@ -15,7 +15,7 @@ from csplat_tools.console import parse_size_bytes
 from csplat_tools.optimise.target_encoding import encode_to, meet_bounds
 from csplat_tools.optimise.targets import Target, parse_max_error
 
-pytest.importorskip("numba", reason="targets of size and PSNR want the extra [render]")
+pytest.importorskip("numba", reason="targets of size and PSNR require the extra [render]")
 
 from captures import cameras, photograph, shell
 

@@ -21,7 +21,7 @@ from csplat.ply import write_ply
 from csplat.scene_source import source_from_model
 from csplat_conformance.manifest import load
 
-pytest.importorskip("numba", reason="the renderer wants the extra [render]")
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 
 
 import csplat_tools

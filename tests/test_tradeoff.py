@@ -582,7 +582,7 @@ def test_a_wrong_command_line_has_status_2(capture):
     assert {} == {words: status for words, status in statuses.items() if status != 2}
 
 
-def test_the_option_what_is_parsed():
+def test_the_list_of_a_sweep_is_parsed():
     assert ("targets", "presets") == parse_sweep("targets,presets,targets").what
     assert (*USUAL, "finetune") == parse_sweep("usual, finetune").what
     wanted = parse_sweep("targets=38:2MB:.5e2:38, strategies=0.1:16:256, precision=")

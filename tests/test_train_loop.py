@@ -16,8 +16,8 @@ from csplat.encoder import PRESETS, EncodeOptions
 from csplat.errors import InputError
 from csplat.training_record import TrainingRecord
 
-pytest.importorskip("numba", reason="tuning wants the extra [render]")
-pytest.importorskip("scipy", reason="tuning wants the extra [render]")
+pytest.importorskip("numba", reason="tuning requires the extra [render]")
+pytest.importorskip("scipy", reason="tuning requires the extra [render]")
 
 
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to

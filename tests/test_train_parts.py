@@ -12,7 +12,7 @@ from test_train_loop import QUICK, assert_resumes_identically, training_images
 from csplat.encoder import EncodeOptions, EncodePlan, fix_quantisation
 from csplat.errors import InputError
 
-pytest.importorskip("numba", reason="the trainer wants the extra [train]")
+pytest.importorskip("numba", reason="the trainer requires the extra [train]")
 
 
 from csplat_render.camera import Camera, intrinsics, orbit

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch", reason="the torch wrapper wants torch (the train extra)")
+torch = pytest.importorskip("torch", reason="the torch wrapper requires torch (the train extra)")
 
 from csplat.errors import InputError
 from csplat_render import lpips

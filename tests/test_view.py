@@ -1,4 +1,4 @@
-"""`csplat view`: what its server answers, what it refuses, and how the command ends."""
+"""`csplat view`: answers and refusals of its server, and the end of the command."""
 
 import http.client
 import json
@@ -83,7 +83,7 @@ def test_ranges():
 @pytest.mark.parametrize(
     ("header", "size"), [("bytes=1000-", SIZE), ("bytes=-0", SIZE), ("bytes=0-0", 0), ("bytes=-5", 0)]
 )
-def test_ranges_of_which_nothing_is_there(header, size):
+def test_ranges_beyond_the_end_are_refused(header, size):
     with pytest.raises(ValueError, match="range"):
         byte_range(header, size)
 
@@ -173,7 +173,7 @@ ELSEWHERE = [
 ]
 
 
-def test_nothing_else_is_reachable(scene_path):
+def test_other_paths_are_not_served(scene_path):
     (scene_path.parent / "secret.txt").write_text("secret")
     with served(scene_path) as server:
         answers = {path: ask(server, path) for path in ELSEWHERE}
@@ -204,7 +204,7 @@ def test_a_ply_is_encoded_in_memory(tmp_path, make_model):
     assert ["scene.ply"] == sorted(path.name for path in tmp_path.iterdir())
 
 
-def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
+def test_cameras_are_served_with_the_scene(tmp_path, scene_path):
     entry = {"K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
     cameras = tmp_path / "cameras.json"
     cameras.write_text(json.dumps([entry, entry]))
@@ -216,13 +216,13 @@ def test_cameras_are_served_beside_the_scene(tmp_path, scene_path):
 
 
 @pytest.mark.parametrize("axes", ["RL", "RDX", "RUD", "rdf", "RDFF"])
-def test_axes_that_are_none_are_refused(axes):
+def test_invalid_axes_are_refused(axes):
     with pytest.raises(typer.BadParameter, match="expected three letters"):
         parse_axes(axes)
 
 
 @pytest.mark.parametrize("up", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"])
-def test_directions_that_are_none_are_refused(up):
+def test_invalid_directions_are_refused(up):
     with pytest.raises(typer.BadParameter, match="three numbers as"):
         parse_up(up)
 
@@ -237,7 +237,7 @@ def test_directions_that_are_none_are_refused(up):
         ({"up": "0,-2,0.2", "axes": "RDF"}, {"up": "0,-0.995037,0.099504", "axes": "RDF"}),
     ],
 )
-def test_the_page_is_told_what_the_user_says_of_up(words, wishes):
+def test_the_page_receives_the_given_up_direction(words, wishes):
     assert wishes == page_parameters(None, parse_overrides(**words))
 
 
@@ -266,20 +266,20 @@ def test_a_file_that_is_damaged_from_its_first_byte_is_known_by_its_name(scene_p
     assert code in refused(scene_path)
 
 
-def test_a_ply_is_one_whatever_its_name(tmp_path, make_model):
+def test_a_ply_may_have_any_name(tmp_path, make_model):
     path = tmp_path / "scene.csplat"
     write_ply(path, make_model(20, 1))
     with open_viewer_scene(str(path), preset="fast") as scene:
         assert 20 == scene.header.splat_count
 
 
-def test_something_else_is_refused(tmp_path):
+def test_another_format_is_refused(tmp_path):
     path = tmp_path / "scene.txt"
     path.write_text("no scene")
     assert "no format that csplat knows" in refused(path)
 
 
-def test_a_taken_port_is_refused(scene_path):
+def test_a_port_in_use_is_refused(scene_path):
     with socket.socket() as other:
         other.bind(("127.0.0.1", 0))
         other.listen()
@@ -359,7 +359,7 @@ def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
         (["SAMPLE", "--port", "70000"], 2, "65535"),
     ],
 )
-def test_the_command_says_what_is_wrong(sample_path, words, status, expected):
+def test_errors_of_the_command_are_reported(sample_path, words, status, expected):
     given = [str(sample_path) if word == "SAMPLE" else word for word in words]
     done = CliRunner().invoke(app, ["view", *given, "--no-browser"])
     assert (status, "") == (done.exit_code, done.stdout)

@@ -1,4 +1,4 @@
-"""The page of the viewer in headless Chromium: loading, messages, the camera in a person's hands, the first picture."""
+"""The page of the viewer in headless Chromium: loading, messages, control of the camera, the first picture."""
 
 import base64
 import json
@@ -19,7 +19,7 @@ FAST = EncodeOptions(preset="fast", tile_splats=500)
 
 @pytest.fixture(scope="module")
 def model(request):
-    """Every sixth splat of the shipped scene, larger for that: axes are known, spherical harmonics of degree 3."""
+    """Every sixth splat of the shipped scene, enlarged, with known axes and spherical harmonics of degree 3."""
     whole = read_ply(request.getfixturevalue("sample_path"))
     part = whole.select(np.arange(0, len(whole), 6))
     return replace(part, scales=part.scales + np.float32(0.8))
@@ -33,13 +33,13 @@ def sample(model):
 
 @pytest.fixture(scope="module")
 def light(request):
-    """A file of every sixtieth splat: quickly drawn, as a moving camera asks for many pictures."""
+    """A file of every sixtieth splat, quickly drawn: a moving camera requires many pictures."""
     whole = read_ply(request.getfixturevalue("sample_path"))
     part = whole.select(np.arange(0, len(whole), 60))
     return encode(replace(part, scales=part.scales + np.float32(1.6)), FAST)
 
 
-def test_a_scene_arrives_by_ranges_and_says_what_it_is(viewer, sample_path):
+def test_a_scene_arrives_by_ranges_with_its_facts(viewer, sample_path):
     model = read_ply(sample_path)
     data = encode(model, EncodeOptions(preset="fast", tile_splats=2000))  # more than a first request brings
     viewer.site.bytes_per_second = 400_000
@@ -59,7 +59,7 @@ def test_a_scene_arrives_by_ranges_and_says_what_it_is(viewer, sample_path):
     assert {viewer.site.url("/")} == {re.match(r"http://[^/]+/|data:", one)[0] for one in loaded} - {"data:"}
 
 
-def test_a_server_without_ranges_will_do(viewer, model, sample):
+def test_a_server_without_ranges_suffices(viewer, model, sample):
     viewer.site.ranges = False
     path = viewer.show(sample)
     assert {200} == set(viewer.site.statuses(path))
@@ -108,7 +108,7 @@ def test_an_absent_file_is_explained(viewer):
 
 
 @pytest.mark.area(name="chromium")
-def test_a_browser_without_webgl_is_told(tab, site, sample):
+def test_a_browser_without_webgl_shows_an_error(tab, site, sample):
     tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     viewer = ViewerPage(tab, site)
     site.add("/scene.csplat", sample)
@@ -131,7 +131,7 @@ DROP = """async ([text, name]) => {
 
 
 @pytest.mark.area(name="chromium")
-def test_a_page_without_a_scene_complains_of_its_address_and_takes_files(tab, site, model, sample):
+def test_a_page_without_a_scene_shows_an_error_and_accepts_files(tab, site, model, sample):
     viewer = ViewerPage(tab, site)
     viewer.load("?size=big&axes=RRR&camera=[{}]")
     complaints = viewer.text("#toast")
@@ -249,7 +249,7 @@ def look_at(eye, up=(0.0, -1.0, 0.0)):
     return {**CAMERA, "viewmat": viewmat.tolist()}
 
 
-def test_the_file_says_where_to_stand(viewer, make_model):
+def test_the_file_gives_the_first_view(viewer, make_model):
     cameras = [
         {**look_at([2.0, -1.0, -6.0]), "image": "a/first.jpg"},
         {**look_at([-2.0, -1.0, -6.0]), "image": "b.jpg"},
@@ -275,7 +275,7 @@ def test_the_file_says_where_to_stand(viewer, make_model):
 
 
 @pytest.mark.area(name="chromium")
-def test_the_address_goes_before_what_the_file_says(tab, site, make_model):
+def test_the_address_has_precedence_over_the_file(tab, site, make_model):
     views = [look_at([0.0, 0.0, -4.0]), look_at([3.0, 0.0, -4.0])]
     site.add("/cameras.json", json.dumps(views).encode())
     scene = make_model(
@@ -324,7 +324,7 @@ def test_axes_of_the_file_are_honoured(viewer, make_model):
     assert pose["basis"][2][1] > 0.5  # and the camera looks along +y, forward
 
 
-def test_a_scene_stands_in_front_of_what_it_was_trained_on(viewer, make_model):
+def test_a_scene_is_first_seen_from_its_training_cameras(viewer, make_model):
     training = {"background": [1, 1, 0.4], "near": 0.2}
     viewer.show(encode(make_model(1, 0, opacities=np.zeros(1, np.float32), metadata={"training": training})))
     behind = []
@@ -369,13 +369,13 @@ def test_turning_upright_can_be_kept(viewer, make_model, tmp_path):
     assert viewer.hides("#keep")
 
 
-def test_an_empty_scene_is_a_scene(viewer, make_model):
+def test_an_empty_scene_is_shown(viewer, make_model):
     viewer.show(encode(make_model(0, 0)))
     assert "0 splats" in viewer.text("#summary")
     assert viewer.error() is None
 
 
-def test_everything_has_a_name_and_can_be_reached_by_keys(viewer, make_model):
+def test_all_controls_have_a_name_and_can_be_reached_by_keys(viewer, make_model):
     viewer.show(encode(make_model(100, 0)))
     page = viewer.page
     names = page.evaluate(

@@ -23,7 +23,7 @@ from csplat_render.virtual_cameras import virtual_cameras
 
 pytestmark = [pytest.mark.slow, pytest.mark.area(name="chromium")]
 
-#: Well above the 38 dB that are asked for: leaving out all SH costs 33, 8-bit rounding alone leaves 59.
+#: Well above the required 38 dB: leaving out all SH gives 33, 8-bit rounding alone 59.
 GOOD = 50.0
 FAST = EncodeOptions(preset="fast")
 
@@ -41,7 +41,7 @@ def part(sample):
 
 
 def reference(model, camera, background=(0, 0, 0), **options):
-    """Return the rasteriser's picture, clipped as a screen does."""
+    """Return the rasteriser's picture, clipped to 0 to 1."""
     return np.clip(render(model, camera, background=background, **options).rgb, 0.0, 1.0)
 
 
@@ -151,7 +151,7 @@ def test_every_format_of_the_picture_is_good_enough(engine, part, camera):
 
 
 def unlike(engine, scenes, camera_of, least):
-    """Return the names of scenes that the engine draws unlike the rasteriser, and their PSNR; files by name."""
+    """Return names and PSNR of the scenes that the engine draws unlike the rasteriser; files by name."""
     found = {}
     for name, data in scenes.items():
         assert engine.open(data) is None, name
@@ -181,7 +181,7 @@ def test_every_coding_is_drawn(engine, sample, camera):
 
 
 def one_coefficient_each():
-    """48 splats, each with one SH coefficient of one channel; from no axis does one hide another."""
+    """48 splats, each with one SH coefficient of one channel; none hides another along any axis."""
     k = np.arange(48)
     x, y = k % 7, k // 7
     means = np.stack([x, y, (x + 2 * y) % 7], axis=1) - 3.0
@@ -285,7 +285,7 @@ def test_a_scene_appears_from_layer_0_and_sharpens(engine, sample):
     assert psnr(engine.picture(camera), reference(model, camera)) >= GOOD
 
 
-def test_files_come_from_memory_too(engine, part, camera):
+def test_files_may_be_in_memory(engine, part, camera):
     data = encode(part, FAST)
     engine.open(data)
     wanted = engine.picture(camera)
@@ -330,7 +330,7 @@ def test_a_damaged_file_is_refused_and_the_next_one_shown(engine, part, camera):
     assert psnr(engine.picture(camera), reference(decode(data), camera)) >= GOOD
 
 
-def test_the_picture_comes_back_after_the_gpu_was_taken_away(engine, part, camera):
+def test_the_picture_returns_after_the_loss_of_the_gpu(engine, part, camera):
     engine.open(encode(part, FAST))
     before = engine.picture(camera)
     engine.page.evaluate("void (window.lose = engine.renderer.gl.getExtension('WEBGL_lose_context')).loseContext()")
@@ -356,7 +356,7 @@ def test_without_webgl_2_there_is_no_engine(engine):
     assert "E_WEBGL2" == engine.page.evaluate(made)
 
 
-def test_more_splats_than_the_gpu_has_room_for_are_refused(engine, part):
+def test_too_many_splats_for_the_gpu_are_refused(engine, part):
     room = engine.page.evaluate("engine.renderer.capabilities.splatsMax")
     engine.page.evaluate("void (engine.renderer.capabilities.splatsMax = 1000)")
     assert "E_LIMIT" == engine.open(encode(part, FAST))["code"]
