@@ -20,7 +20,7 @@ const AT = spec.STATED_ERROR_RECORD_OFFSETS;
 export const emptyDescription = () => ({ metadata: null, cameras: null, options: null, statedErrors: null });
 
 /**
- * Read an ancillary chunk that this version knows into its place in `into`.
+ * Read an ancillary chunk of a known type and store its value in `into`.
  *
  * @param {Description} into
  * @param {DirectoryRecord} record
@@ -64,9 +64,9 @@ function readStatedErrors(payload, splatCount) {
     'the head of SERR',
   );
   const { source_count: source, pruned_count: pruned } = head;
-  // SER-4: integers, not modulo 2^64
+  // SER-4 compares integers, not integers modulo 2^64.
   if (source - pruned !== BigInt(splatCount)) {
-    throw fault(ERROR_VALUE, offset, 'SER-4', `${source} splats less ${pruned}, the file holds ${splatCount}`);
+    throw fault(ERROR_VALUE, offset, 'SER-4', `${source} splats minus ${pruned}, the file has ${splatCount}`);
   }
   if (head.error_flags & ~spec.ERROR_FLAG_REFITTED) {
     throw fault(
@@ -92,9 +92,9 @@ function readStatedErrors(payload, splatCount) {
 
 /**
  * @param {Payload} payload
- * @param {number} last measure of the record before
+ * @param {number} last measure of the previous record
  * @param {StatedErrors} stated
- * @returns {number} this record's measure
+ * @returns {number} measure of this record
  */
 function readStatedError(payload, last, stated) {
   const { fields, offset } = payload.read(
@@ -118,7 +118,7 @@ function readStatedError(payload, last, stated) {
 }
 
 /**
- * Components of a measure (spec 5.5): 3 (2l + 1) for SH band l, 1 for the others.
+ * Number of components of a measure (spec 5.5): 3 (2l + 1) for SH band l, 1 for the others.
  *
  * @param {number} measure
  */

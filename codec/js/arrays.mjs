@@ -1,4 +1,4 @@
-// The arrays that a decoder returns: floats (spec sections 3 and 7) or integers (9.2), filled tile by tile.
+// The arrays that a decoder returns, filled tile by tile: floats (spec sections 3 and 7) or integers (9.2).
 
 import { tableValues } from './codebooks.mjs';
 import { columnCount, radicand } from './codings.mjs';
@@ -12,11 +12,11 @@ import * as spec from './spec.mjs';
  * @typedef {import('./codings.mjs').Block} Block
  */
 
-/** Rows of shN for a degree. @param {number} shDegree */
+/** Rows of shN at an SH degree. @param {number} shDegree */
 export const shRows = (shDegree) => (shDegree + 1) ** 2 - 1;
 
 /**
- * Bytes of the arrays that the two classes below make, for the budget.
+ * Bytes of the arrays that the two classes below allocate; LIM-1 compares them with the budget.
  *
  * @param {number} count splats
  * @param {number} shDegree
@@ -34,7 +34,7 @@ export class FloatArrays {
   /**
    * @param {number} count splats
    * @param {number} shDegree
-   * @param {Partial<Record<string, Float32Array>>} [spare] arrays whose memory may be used again
+   * @param {Partial<Record<string, Float32Array>>} [spare] arrays whose memory may be reused
    */
   constructor(count, shDegree, spare = {}) {
     const room = (/** @type {string} */ name, /** @type {number} */ length) => {
@@ -47,14 +47,14 @@ export class FloatArrays {
     this.scales = room('scales', 3 * count);
     this.opacities = room('opacities', count);
     this.sh0 = room('sh0', 3 * count);
-    this.shN = room('shN', 3 * count * shRows(shDegree)); // "coefficients of a band left out are +0"
+    this.shN = room('shN', 3 * count * shRows(shDegree)); // zero: "coefficients of a band left out are +0"
     this.shDegree = shDegree;
   }
 
   /**
    * @param {Block} block
    * @param {TileRecord} tile
-   * @param {number} first splat of the arrays that is the tile's first
+   * @param {number} first index in the arrays of the tile's first splat
    */
   put(block, tile, first) {
     const { attribute, columns, exponent } = block;
@@ -76,7 +76,7 @@ export class FloatArrays {
     return { means, quats, scales, opacities, sh0, shN };
   }
 
-  /** The arrays, and how many values of a splat each has. */
+  /** The arrays, with the number of values per splat of each. */
   columns() {
     const { means, quats, scales, opacities, sh0, shN, shDegree } = this;
     return Object.entries({
@@ -91,7 +91,7 @@ export class FloatArrays {
 }
 
 /**
- * Spec 7.3; the array rounds the binary64 quotient once.
+ * Write opacities (spec 7.3); the array rounds the binary64 quotient once.
  *
  * @param {Float32Array} out
  * @param {Block} block
@@ -107,7 +107,7 @@ function putOpacities(out, { attribute, columns }) {
 }
 
 /**
- * Spec 7.5
+ * Write quaternions (spec 7.5).
  *
  * @param {Float32Array} out
  * @param {Block} block
@@ -127,11 +127,11 @@ function putQuats(out, { attribute: { levels }, columns }, n) {
 }
 
 /**
- * Colours, from columns or from a codebook's table and the escapes.
+ * Write colours, from columns or from a codebook's table and the escapes.
  *
  * @param {Float32Array} out
- * @param {number} stride values of a splat in `out`
- * @param {number} start place of the band among them
+ * @param {number} stride values per splat in `out`
+ * @param {number} start position of the band among them
  * @param {number} first splat
  * @param {Block} block
  * @param {number} n splats
@@ -150,7 +150,7 @@ export class IntegerArrays {
   /**
    * @param {number} count splats
    * @param {number} shDegree
-   * @param {TileRecord[]} tiles those that the arrays will hold, in this order
+   * @param {TileRecord[]} tiles the tiles that the arrays will hold, in this order
    * @param {number} attributeCount
    */
   constructor(count, shDegree, tiles, attributeCount) {
@@ -169,7 +169,7 @@ export class IntegerArrays {
   /**
    * @param {Block} block
    * @param {TileRecord} tile
-   * @param {number} first splat of the arrays that is the tile's first
+   * @param {number} first index in the arrays of the tile's first splat
    */
   put({ attribute, columns, exponent }, tile, first) {
     const n = tile.splatCount;
@@ -201,7 +201,7 @@ export class IntegerArrays {
 }
 
 /**
- * One SH band of one tile, [splat, coefficient, channel].
+ * Return one SH band of one tile, [splat, coefficient, channel].
  *
  * @param {Block} block
  * @param {number} n splats
@@ -221,10 +221,10 @@ export function bandArray(block, n, integers) {
 }
 
 /**
- * Buffers of all arrays in a message but tables of codebooks, which stay.
+ * Collect the buffers of all arrays in a message, except codebook tables, which are not transferred.
  *
  * @param {object} message
- * @returns {ArrayBuffer[]} each once
+ * @returns {ArrayBuffer[]} without duplicates
  */
 export function buffersOf(message) {
   /** @type {Set<ArrayBuffer>} */

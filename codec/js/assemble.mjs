@@ -1,4 +1,4 @@
-// From decoded layers to what the caller gets.
+// Assembles decoded layers into the arrays that the caller gets.
 
 import { FloatArrays, IntegerArrays, arrayBytes } from './arrays.mjs';
 import { allocate, fault } from './errors.mjs';
@@ -13,15 +13,15 @@ import * as spec from './spec.mjs';
  * @typedef {{shDegree: number, integers: boolean, extra: boolean}} Wanted
  */
 
-/** The arrays of some tiles, one after the other. */
+/** The arrays of some tiles, concatenated. */
 export class Assembly {
   /**
    * @param {Header} header
    * @param {TileRecord[]} tiles
    * @param {Wanted} wanted
    * @param {Required<Limits>} limits
-   * @param {number} tableBytes of all codebooks
-   * @param {any} [spare] fields of another one, of floats, whose memory may be used again
+   * @param {number} tableBytes size of all codebooks
+   * @param {any} [spare] float fields of another assembly whose memory may be reused
    */
   constructor(header, tiles, wanted, limits, tableBytes, spare) {
     const { shDegree, integers, extra } = wanted;
@@ -41,7 +41,7 @@ export class Assembly {
   /**
    * @param {Layer} layer
    * @param {TileRecord} tile
-   * @param {number} first splat of the arrays that is the tile's first
+   * @param {number} first index in the arrays of the tile's first splat
    */
   put({ blocks, extras }, tile, first) {
     for (const block of blocks) this.arrays.put(block, tile, first);
@@ -49,9 +49,9 @@ export class Assembly {
   }
 
   /**
-   * Copy what another assembly has of one tile, which comes from a worker.
+   * Copy the fields of another assembly, which holds one tile and comes from a worker.
    *
-   * @param {any} fields of floats
+   * @param {any} fields floats
    * @param {number} first
    */
   copy(fields, first) {
@@ -67,10 +67,10 @@ export class Assembly {
 }
 
 /**
- * LIM-1
+ * Refuse a decode beyond the budget (LIM-1).
  *
  * @param {number} count splats
- * @param {number} bytes of arrays and tables
+ * @param {number} bytes size of arrays and tables
  * @param {Required<Limits>} limits
  */
 export function checkBudget(count, bytes, limits) {

@@ -1,9 +1,9 @@
 // CRC-32 (spec section 2).
 
-/** Bytes of a CRC-32. */
+/** Size of a CRC-32 in bytes. */
 export const CRC_SIZE = 4;
 
-/** @type {Uint32Array | null} eight tables of 256, made at the first use */
+/** @type {Uint32Array | null} eight tables of 256 entries, built on first use */
 let crcTables = null;
 
 function makeCrcTables() {
@@ -21,7 +21,7 @@ function makeCrcTables() {
 }
 
 /**
- * CRC-32 of ISO 3309 and RFC 1952, eight bytes at a time ("slicing by eight", Intel 2006).
+ * Return the CRC-32 of ISO 3309 and RFC 1952, computed eight bytes at a time ("slicing by eight", Intel 2006).
  *
  * @param {Uint8Array} bytes
  * @returns {number} 0 .. 2^32 − 1

@@ -22,12 +22,12 @@ const { CODEBOOK_HEAD_OFFSETS: AT_HEAD, CODEBOOK_PARAMS_OFFSETS: AT_PARAMS } = s
 const ENTRY_WIDTH_MAX = 4; // STR-2
 
 /**
- * Entries of one chunk: the columns one after the other, each `size` entries and a 0 (the place of the escape index), and
- * what none of them exceeds in magnitude; the values of the entries, or their final integers, once they are needed.
+ * The entries of one chunk, column after column: `size` entries and a 0 in place of the escape index. No entry exceeds
+ * `bound` in magnitude. Values and final integers of the entries are computed on first use.
  *
  * @typedef {{size: number, entries: Int32Array, bound: number, values?: Float32Array, packed?: PackedColumns}} Table
  *
- * What a tile's blocks of one codebook have in common.
+ * The indices that all blocks of one codebook in a tile share.
  *
  * @typedef {{index: Uint32Array, escapeCount: number, escaped: Uint32Array}} Indices
  * @typedef {import('./codings.mjs').Block} Block
@@ -46,7 +46,7 @@ function columnsOf(name) {
 }
 
 /**
- * Columns of a codebook's chunk: those of the band, or of all attributes of the kind.
+ * Return the columns of a codebook's chunk: those of the band, or of all attributes of the kind.
  *
  * @param {CodebookRecord} codebook
  * @param {number} layer
@@ -57,7 +57,7 @@ function tableColumns({ attributes, bandFirst }, layer) {
 }
 
 /**
- * What LIM-1 counts of the tables of some CODB chunks: four bytes for each entry and column.
+ * Return the bytes that LIM-1 counts for the tables of some CODB chunks: four per entry and column.
  *
  * @param {DirectoryRecord[]} directory
  * @param {Map<number, CodebookRecord>} codebooks by id
@@ -77,7 +77,7 @@ export function tableBytes(directory, codebooks) {
  * @param {Uint8Array<ArrayBuffer>} bytes
  * @param {DirectoryRecord} record
  * @param {CodebookRecord} codebook
- * @param {AttributeRecord[]} attributes all of the file
+ * @param {AttributeRecord[]} attributes all attributes of the file
  * @param {Inflate} inflate
  * @returns {Promise<Table>}
  */
@@ -107,21 +107,21 @@ export async function readTable(bytes, { id, layer, offset }, codebook, attribut
 }
 
 /**
- * CBK-7: each entry obeys by itself what integers in a stream must.
+ * Check the entries of a table (CBK-7): each must satisfy the requirements on integers of a stream.
  *
- * @param {{integers: Int32Array, bound: number, offset: number}} table column after column, and where its stream begins
+ * @param {{integers: Int32Array, bound: number, offset: number}} table column after column; `offset` of its stream
  * @param {CodebookRecord} codebook
- * @param {number} layer of the chunk
- * @param {AttributeRecord[]} attributes all of the file
+ * @param {number} layer layer of the chunk
+ * @param {AttributeRecord[]} attributes all attributes of the file
  */
 function checkEntries({ integers, bound, offset }, codebook, layer, attributes) {
   const { size } = codebook;
   let first = 0;
   for (const name of codebook.attributes) {
-    const attribute = /** @type {AttributeRecord} */ (attributes.find((one) => one.name === name)); // by CBR-2
+    const attribute = /** @type {AttributeRecord} */ (attributes.find((one) => one.name === name)); // exists by CBR-2
     if (layer > 0 && attribute.id !== spec.ATTRIBUTE_SH0 + layer) continue;
     const end = first + size * columnCount(attribute);
-    // To scales a summand comes: their sums are bound, by CBK-6.
+    // A summand is added to the scales, and CBK-6 bounds the sums instead.
     if (attribute.id !== spec.ATTRIBUTE_SCALES) {
       const block = { attribute, columns: new Float64Array(integers.subarray(first, end)), exponent: 0, bound, offset };
       checkIntegers(block, size);
@@ -135,12 +135,12 @@ function checkEntries({ integers, bound, offset }, codebook, layer, attributes) 
 }
 
 /**
- * Read a block coded CODEBOOK, behind its head.
+ * Read a block with the coding CODEBOOK, after its head.
  *
  * @param {TileContext} tile
  * @param {Payload} payload
  * @param {AttributeRecord} attribute
- * @param {boolean} integers whether all integers are wanted; if not, colours may stay in a table
+ * @param {boolean} integers whether all integers are required; if not, colours may stay in a table
  * @returns {Promise<Block>}
  */
 export async function readCodebookBlock(tile, payload, attribute, integers) {
@@ -172,24 +172,24 @@ export async function readCodebookBlock(tile, payload, attribute, integers) {
     if (escapeCount) return { ...(await readEscapes(tile, payload, attribute, escapeCount)), lookup };
     return { attribute, columns: new Float64Array(0), exponent: 0, bound: 0, offset, lookup };
   }
-  // Columns of the codebook's attributes before this one; a band has a chunk of its own.
+  // Columns of the codebook's attributes before this one. A band has its own chunk.
   const before = isSh ? 0 : codebook.attributes.indexOf(attribute.name) * spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SCALES];
   const block = gatherEntries(tile.sums(attribute), table, before, shared.index, attribute, offset);
   const hasSummand = attribute.id === spec.ATTRIBUTE_SCALES;
   if (hasSummand) await addSummand(tile, payload, block);
   if (escapeCount) putEscapes(block, shared.escaped, await readEscapes(tile, payload, attribute, escapeCount));
-  if (hasSummand) checkIntegers(block, tile.splatCount); // of other blocks CBK-7 has looked at the entries
+  if (hasSummand) checkIntegers(block, tile.splatCount); // without a summand, CBK-7 has checked the entries
   return block;
 }
 
 /**
- * The indices of a codebook's first block (CBK-2, CBK-3), remembered for its other blocks.
+ * Read the indices in a codebook's first block (CBK-2, CBK-3) and keep them for its other blocks.
  *
  * @param {TileContext} tile
  * @param {Payload} payload
  * @param {CodebookRecord} codebook
  * @param {number} escapeCount
- * @param {number} at of the parameters
+ * @param {number} at offset of the parameters
  * @returns {Promise<Indices>}
  */
 async function readIndices(tile, payload, codebook, escapeCount, at) {
@@ -205,7 +205,7 @@ async function readIndices(tile, payload, codebook, escapeCount, at) {
     if (index[i] > size) throw fault(ERROR_CODEBOOK, offset, 'CBK-2', `index ${index[i]} of ${size} entries`);
   const escaped = new Uint32Array(Math.min(escapeCount, n));
   let found = 0;
-  // Beyond its end nothing is written.
+  // Writes beyond the end of a typed array are ignored.
   for (let i = 0; i < n; i++) if (index[i] === size) escaped[found++] = i;
   if (found !== escapeCount) {
     throw fault(
@@ -221,12 +221,12 @@ async function readIndices(tile, payload, codebook, escapeCount, at) {
 }
 
 /**
- * The indices that the tile's first block of the codebook holds (CBK-4).
+ * Return the indices that the tile's first block of the codebook holds (CBK-4).
  *
  * @param {TileContext} tile
  * @param {CodebookRecord} codebook
  * @param {number} escapeCount
- * @param {number} at of the parameters
+ * @param {number} at offset of the parameters
  */
 async function knownIndices(tile, codebook, escapeCount, at) {
   if (codebook.bandFirst && !tile.indices.has(codebook.id)) await tile.needLayer(codebook.bandFirst);
@@ -251,7 +251,7 @@ async function knownIndices(tile, codebook, escapeCount, at) {
 }
 
 /**
- * Values of the entries of such a table, by rows.
+ * Return the values of a table's entries, row by row.
  *
  * @param {Table} table
  * @param {AttributeRecord} attribute
@@ -268,7 +268,7 @@ export function tableValues(table, attribute) {
 }
 
 /**
- * Final integers of the entries of such a table, column after column: R, G, B.
+ * Return the final integers of a table's entries, column after column: R, G, B.
  *
  * @param {Table} table
  * @param {AttributeRecord} attribute
@@ -280,14 +280,14 @@ export function entryColumns(table, { mapping, chromaShift }) {
 }
 
 /**
- * The entries that the indices name.
+ * Look up the entries that the indices name.
  *
- * @param {Float64Array} columns to fill
+ * @param {Float64Array} columns filled with the entries
  * @param {Table} table
- * @param {number} before columns of the table before the attribute's
+ * @param {number} before number of columns of the table before the attribute's
  * @param {Uint32Array} index
  * @param {AttributeRecord} attribute
- * @param {number} offset of the block
+ * @param {number} offset offset of the block
  * @returns {Block}
  */
 function gatherEntries(columns, { size, entries, bound }, before, index, attribute, offset) {
@@ -302,11 +302,11 @@ function gatherEntries(columns, { size, entries, bound }, before, index, attribu
 }
 
 /**
- * The common summand of the scales.
+ * Add the common summand of the scales to their entries.
  *
  * @param {TileContext} tile
  * @param {Payload} payload
- * @param {Block} block changed: sums below 2^33
+ * @param {Block} block changed; its sums are below 2^33
  */
 async function addSummand(tile, payload, block) {
   const { attribute, columns } = block;
@@ -346,7 +346,7 @@ async function readEscapes(tile, payload, attribute, count) {
 }
 
 /**
- * Put the escapes in the place of the escaped splats' sums.
+ * Replace the sums of the escaped splats with the escapes.
  *
  * @param {Block} block changed
  * @param {Uint32Array} escaped

@@ -9,17 +9,17 @@ import { readIntegers, readStream } from './streams.mjs';
 const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
 
 /**
- * The integers of one block, column after column, each below 2^53 in magnitude and never −0.
+ * The integers of one block, column after column. Each is below 2^53 in magnitude and never −0.
  *
  * @typedef {object} Block
  * @property {AttributeRecord} attribute
- * @property {Float64Array} columns [C × n], or with `lookup` those of the escaped splats alone
- * @property {{id: number, table: Table, index: Uint32Array, escaped: Uint32Array}} [lookup] a codebook of colours, the
- *   entry of each splat, and the splats that have none
- * @property {Uint32Array} [present] the splats whose integers the columns hold, those of the others are 0; all where absent
- * @property {number} exponent of the tile's lattice of this attribute
- * @property {number} bound what no integer exceeds in magnitude
- * @property {number} offset in the file of the stream, or block, to blame for what the integers are
+ * @property {Float64Array} columns [C × n]; with `lookup`, only the columns of the escaped splats
+ * @property {{id: number, table: Table, index: Uint32Array, escaped: Uint32Array}} [lookup] a colour codebook, the entry
+ *   of each splat, and the splats without an entry
+ * @property {Uint32Array} [present] the splats that the columns cover, the others are 0; if absent, all splats
+ * @property {number} exponent of the tile's lattice for this attribute
+ * @property {number} bound maximum magnitude of the integers
+ * @property {number} offset offset in the file of the stream or block, reported in errors about the integers
  *
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./decoder.d.ts').AttributeRecord} AttributeRecord
@@ -30,14 +30,14 @@ const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
 const AT = spec.BLOCK_HEAD_OFFSETS;
 
 /**
- * Columns of an attribute.
+ * Return the number of columns of an attribute.
  *
  * @param {AttributeRecord} attribute
  */
 export const columnCount = ({ id }) => spec.ATTRIBUTE_COLUMNS[/** @type {keyof typeof spec.ATTRIBUTE_COLUMNS} */ (id)];
 
 /**
- * Read the head of a block; BLK-1 holds after it.
+ * Read the head of a block and check BLK-1.
  *
  * @param {Payload} payload
  */
@@ -67,13 +67,13 @@ export function checkCoding({ attribute, name, offset }) {
 }
 
 /**
- * Read parameters and streams of a block in a coding other than CODEBOOK.
+ * Read the parameters and streams of a block with a coding other than CODEBOOK.
  *
  * @param {TileContext} tile
- * @param {Payload} payload behind the block's head
+ * @param {Payload} payload after the block's head
  * @param {AttributeRecord} attribute
- * @param {number} coding one that the attribute may have
- * @param {number} n splats
+ * @param {number} coding a coding that the registry lists for the attribute
+ * @param {number} n number of splats
  * @param {boolean} escaped whether this is an escape block
  * @returns {Promise<Block>}
  */
@@ -89,7 +89,7 @@ export async function readValues(tile, payload, attribute, coding, n, escaped) {
 }
 
 /**
- * Lattice parameters (spec 6.4.4).
+ * Read lattice parameters (spec 6.4.4).
  *
  * @param {Payload} payload
  * @param {AttributeRecord} attribute
@@ -112,7 +112,7 @@ export function readLatticeParams(payload, attribute, mustBeZero) {
 }
 
 /**
- * LAT-1
+ * Check the step of a lattice (LAT-1).
  *
  * @param {AttributeRecord} attribute
  * @param {number} exponent
@@ -126,7 +126,7 @@ function checkStep({ step }, exponent, offset) {
 }
 
 /**
- * Offsets i32[count] (LAT-3).
+ * Read offsets i32[count] (LAT-3).
  *
  * @param {Payload} payload
  * @param {number} count
@@ -188,7 +188,7 @@ async function readMorton(tile, payload, attribute, n) {
     const l = low[i],
       h = high === null ? 0 : high[i];
     if (h * 4294967296 + l >= end) throw fault(ERROR_RANGE, offset, 'MOR-2', `a code of more than ${3 * bits} bits`);
-    const a = l & 0x3fffffff; // the lower ten bits of each axis; the upper seven are 21 bits of the code
+    const a = l & 0x3fffffff; // the lower ten bits of each axis; the code's other 21 bits are the upper seven
     const b = (l >>> 30) | (h << 2);
     columns[i] = thirdBits(a) | (thirdBits(b) << 10);
     columns[n + i] = thirdBits(a >>> 1) | (thirdBits(b >>> 1) << 10);
@@ -198,7 +198,7 @@ async function readMorton(tile, payload, attribute, n) {
 }
 
 /**
- * Bits 0, 3, 6, ... 27, close together.
+ * Compact bits 0, 3, 6, ... 27 into bits 0 to 9.
  *
  * @param {number} x 30 bits
  */
@@ -285,7 +285,7 @@ async function readSigned(tile, payload, attribute, n, exponent) {
 }
 
 /**
- * A mask, and the integers of the splats that it names (spec 6.4.7).
+ * Read a mask and the integers of the splats in it (spec 6.4.7).
  *
  * @param {TileContext} tile
  * @param {Payload} payload
@@ -309,14 +309,14 @@ async function readSparse(tile, payload, attribute, n) {
   if (n & 7 && mask[n >> 3] >> (n & 7)) throw fault(ERROR_RANGE, offset, 'SPA-3', `a mask of more than ${n} splats`);
   const present = new Uint32Array(count);
   let found = 0;
-  // Beyond its end nothing is written.
+  // Writes beyond the end of a typed array are ignored.
   for (let i = 0; i < n; i++) if ((mask[i >> 3] >> (i & 7)) & 1) present[found++] = i;
   if (found !== count) throw fault(ERROR_RANGE, offset, 'SPA-2', `a mask that names ${found} splats, not ${count}`);
   return { ...(await readSigned(tile, payload, attribute, count, exponent)), present };
 }
 
 /**
- * The same block with columns of all splats.
+ * Return the block with columns for all splats.
  *
  * @param {Block} block
  * @param {number} n splats
@@ -333,7 +333,7 @@ export function everySplat({ present, ...block }, n) {
 }
 
 /**
- * LEV-1, QUA-1, QUA-2 or LAT-4, whichever the attribute is under.
+ * Check integers against LEV-1, QUA-1, QUA-2 or LAT-4, depending on the attribute.
  *
  * @param {Block} block
  * @param {number} n splats
@@ -356,22 +356,22 @@ export function checkIntegers({ attribute, columns, bound, offset }, n) {
 }
 
 /**
- * Place of the first integer below `low` or above `high`, or −1.
+ * Return the position of the first integer below `low` or above `high`, or −1.
  *
  * @param {Float64Array} columns
  * @param {number} low
  * @param {number} high
  */
 function outside(columns, low, high) {
-  // A loop: findIndex, with a call for each, takes several times as long.
+  // findIndex, which calls a function per element, is several times slower.
   for (let i = 0; i < columns.length; i++) if (columns[i] < low || columns[i] > high) return i;
   return -1;
 }
 
 /**
- * R of spec 7.5.
+ * Return R of spec 7.5.
  *
- * @param {number} q1 at most `levels` in magnitude, like the others
+ * @param {number} q1 magnitude at most `levels`, also for q2 and q3
  * @param {number} q2
  * @param {number} q3
  * @param {number} levels at most 32,767
@@ -387,7 +387,7 @@ export const radicand = (q1, q2, q3, levels) => 2 * levels * levels - q1 * q1 - 
  * @param {number} offset
  */
 function checkColumns(attribute, columns, n, offset) {
-  const firstChroma = (n * columnCount(attribute)) / 3; // Y, Co, Cg have a third of the columns each
+  const firstChroma = (n * columnCount(attribute)) / 3; // a third of the columns each for Y, Co and Cg
   for (let i = 0; i < columns.length; i++) {
     const most = i < firstChroma ? spec.COLUMN_MAX : spec.COLUMN_MAX / 2 ** attribute.chromaShift;
     if (Math.abs(columns[i]) > most)
@@ -396,7 +396,7 @@ function checkColumns(attribute, columns, n, offset) {
 }
 
 /**
- * Spec 7.1, in place; nothing where the columns are no Y, Co, Cg.
+ * Apply spec 7.1 in place to columns of Y, Co, Cg; leave other columns alone.
  *
  * @param {Block} block
  */
@@ -404,11 +404,11 @@ export function liftColours(block) {
   const { mapping, chromaShift } = block.attribute;
   if (mapping !== spec.MAPPING_NAMES[spec.MAPPING_YCOCG]) return;
   rgbFromYcocg(block.columns, block.columns.length / 3, chromaShift);
-  block.bound *= 4 * 2 ** chromaShift; // |R| <= |Y| + |Cg| / 2 + 3 |Co| / 2 and 1 for each rounding
+  block.bound *= 4 * 2 ** chromaShift; // |R| <= |Y| + |Cg| / 2 + 3 |Co| / 2 plus 1 for each rounding
 }
 
 /**
- * Refuse integers whose value leaves binary32.
+ * Refuse integers whose values are outside binary32.
  *
  * @param {Block} block
  * @param {number} step

@@ -12,17 +12,17 @@ import * as spec from './spec.mjs';
 
 const { HEADER_OFFSETS: AT, CHUNK_HEADER_OFFSETS: AT_CHUNK } = spec;
 
-/** Four letters as a string. @param {Uint8Array} bytes */
+/** Decode four letters as a string. @param {Uint8Array} bytes */
 export const typeName = (bytes) => String.fromCharCode(...bytes);
 
 /** @param {number} value */
 const hex = (value) => `0x${value.toString(16).padStart(8, '0')}`;
 
 /**
- * Name what servers send in place of a file.
+ * Name what a server sent in place of a csplat file, if the first bytes show it.
  *
- * @param {Uint8Array} bytes the first ones
- * @returns {string} behind a comma; '' where they give no sign of that
+ * @param {Uint8Array} bytes the first bytes
+ * @returns {string} starts with a comma; '' if the content is not recognised
  */
 function standIn(bytes) {
   const text = String.fromCharCode(...bytes.subarray(0, spec.HEADER_SIZE));
@@ -32,10 +32,10 @@ function standIn(bytes) {
 }
 
 /**
- * Read and check the header alone. What follows it in `bytes` is not looked at.
+ * Read and check the header. Bytes after it are ignored.
  *
  * @param {Uint8Array<ArrayBuffer>} bytes
- * @returns {FileHeader} `end` is the end of the index
+ * @returns {FileHeader} `end` is the offset of the end of the index
  */
 export function readFileHeader(bytes) {
   const wrong = spec.MAGIC.findIndex((byte, i) => i < bytes.length && bytes[i] !== byte);
@@ -68,7 +68,7 @@ export function readFileHeader(bytes) {
   if (profile !== spec.PROFILE_BASE) {
     throw fault(spec.ERROR_UNSUPPORTED, AT.profile, 'HDR-4', `profile ${profile}: this decoder reads the profile base`);
   }
-  const fileSize = Number(header.file_size); // may round above 2^53; no data has that length
+  const fileSize = Number(header.file_size); // rounded above 2^53; no data is that long
   const end = spec.HEADER_SIZE + indexSize;
   if (indexSize < spec.INDEX_HEAD_SIZE + CRC_SIZE || end > fileSize) {
     throw fault(spec.ERROR_VALUE, AT.index_size, 'HDR-7', `an index of ${indexSize} bytes in a file of ${fileSize}`);
@@ -82,7 +82,7 @@ export function readFileHeader(bytes) {
  */
 export function checkFileSize(size, { fileSize }) {
   if (size < fileSize)
-    throw fault(spec.ERROR_TRUNCATED, size, 'HDR-5', `the file has ${fileSize} bytes, ${size} are here`);
+    throw fault(spec.ERROR_TRUNCATED, size, 'HDR-5', `the file has ${fileSize} bytes, the data has ${size}`);
   if (size > fileSize) throw fault(spec.ERROR_TRAILING, fileSize, 'HDR-6', `${size - fileSize} bytes follow the end`);
 }
 
@@ -98,9 +98,9 @@ export function checkIndexCrc(index) {
 }
 
 /**
- * Check CRC and header of a chunk against the record that names it.
+ * Check the CRC and header of a chunk against its record in the index.
  *
- * @param {Uint8Array<ArrayBuffer>} chunk all its bytes, as many as the record says
+ * @param {Uint8Array<ArrayBuffer>} chunk all bytes of the chunk, of the size in the record
  * @param {ChunkPlace} place
  * @returns {Uint8Array<ArrayBuffer>} the payload
  */
@@ -117,7 +117,7 @@ export function openChunk(chunk, place) {
       spec.ERROR_INDEX,
       offset + AT_CHUNK.flags,
       'CHK-3',
-      `flags ${header.flags}, the index says ${place.flags}`,
+      `flags ${header.flags}, the index has ${place.flags}`,
     );
   }
   checkReserved(header, offset, spec.CHUNK_HEADER_RESERVED, 'a chunk header');
@@ -127,7 +127,7 @@ export function openChunk(chunk, place) {
       spec.ERROR_INDEX,
       offset + AT_CHUNK.payload_size,
       'CHK-3',
-      `a payload of ${header.payload_size} bytes, the index says ${payload.length}`,
+      `a payload of ${header.payload_size} bytes, the index has ${payload.length}`,
     );
   }
   return payload;
@@ -135,8 +135,8 @@ export function openChunk(chunk, place) {
 
 /**
  * @param {Uint8Array<ArrayBuffer>} bytes
- * @param {number} found their CRC as the file has it
- * @param {number} at byte of the file to blame
+ * @param {number} found the CRC stored in the file
+ * @param {number} at offset in the file, for the error
  * @param {string} clause
  */
 function checkCrc(bytes, found, at, clause) {

@@ -1,4 +1,4 @@
-// The side of the worker: see workers.mjs.
+// The code that runs in a worker; workers.mjs runs in the calling thread.
 
 import { buffersOf } from './arrays.mjs';
 import { Reader } from './reader.mjs';
@@ -6,8 +6,8 @@ import { Reader } from './reader.mjs';
 /**
  * @typedef {Map<number, Uint8Array<ArrayBuffer>>} Parts of the file, by their offsets
  * @typedef {{form?: import('./decoder.d.ts').LayerForm, shDegree: number, extra: boolean}} Wanted of a tile
- * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts, spare?: any}} Request `spare`: fields whose memory may be used again
- * @typedef {{fields?: any}} Answer the arrays of a tile; without them where it was refused
+ * @typedef {{open: Parts, wanted: Wanted} | {tile: number, parts: Parts, spare?: any}} Request `spare`: fields whose memory may be reused
+ * @typedef {{fields?: any}} Answer the arrays of a tile, or nothing if it was refused
  */
 
 /** @type {Parts} */
@@ -16,7 +16,7 @@ let parts = new Map();
 let wanted;
 /** @type {Reader} */
 let reader;
-/** @type {Set<object>} tables of codebooks that were sent */
+/** @type {Set<object>} codebook tables already sent */
 let sent = new Set();
 
 /**
@@ -43,7 +43,7 @@ async function answer(request) {
   return { fields };
 }
 
-/** @param {any} port that requests come from and answers go to */
+/** @param {any} port source of requests and target of answers */
 function serve(port) {
   const listen = async (/** @type {Request} */ request) => {
     const given = await answer(request).catch(() => ({}));
@@ -53,7 +53,7 @@ function serve(port) {
   else port.addEventListener('message', (/** @type {MessageEvent} */ { data }) => listen(data));
 }
 
-// No await out here: bundlers that make a classic script of a worker know none.
+// No top-level await: bundlers that turn a worker into a classic script do not support it.
 const { process } = /** @type {{process?: {versions?: {node?: string}}}} */ (globalThis);
 const name = 'node:worker_threads';
 if (process?.versions?.node === undefined) serve(globalThis);

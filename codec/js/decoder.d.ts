@@ -1,39 +1,39 @@
-// Types of the csplat decoder. test/types.ts holds decoder.mjs against them.
+// Types of the csplat decoder. test/types.ts checks decoder.mjs against them.
 
-/** What a file may ask for. Defaults are those of the spec, section 8. */
+/** Limits on what a file may require. The defaults are those of the spec, section 8. */
 export interface Limits {
-  /** Splats of one decode; any number, if left out. */
+  /** Splats per decode. Default: no limit. */
   splats?: number;
-  /** Bytes of decoded arrays and tables, 2 GiB; also of a file that a server sends without ranges. */
+  /** Bytes of decoded arrays and tables, and of a file that a server sends without ranges. Default: 2 GiB. */
   bytes?: number;
-  /** Bytes of one JSON chunk, 64 MiB. */
+  /** Bytes of one JSON chunk. Default: 64 MiB. */
   jsonBytes?: number;
 }
 
-/** Raw DEFLATE of exactly `size` bytes; refuses early ends, late ends and trailing bytes by throwing. */
+/** Inflates raw DEFLATE to exactly `size` bytes. Throws if the stream ends early or late, or if bytes follow it. */
 export type Inflate = (coded: Uint8Array<ArrayBuffer>, size: number) => Uint8Array | Promise<Uint8Array>;
 
 export type Form = 'floats' | 'integers';
-/** Of a reader's tiles and layers. */
+/** The form of a reader's tiles and layers. */
 export type LayerForm = Form | 'packed';
 
 export interface DecodeOptions {
   limits?: Limits;
   /** SH bands above this degree are not decoded (their chunks are still checked). */
   shDegree?: number;
-  /** Indices of the tiles to decode, in this order; all of them by default. */
+  /** Indices of the tiles to decode, in this order. Default: all tiles. */
   tiles?: Iterable<number>;
-  /** `integers` for the arrays of the spec, section 9.2. */
+  /** 'integers' returns the arrays of the spec, section 9.2. */
   form?: Form;
   signal?: AbortSignal;
-  /** Splats so far, and all of them. */
+  /** Called with the number of splats decoded so far, and of all splats. */
   onProgress?: (done: number, total: number) => void;
   /**
-   * Workers at most that decode, a tile each at a time; by default this thread does. Where a page's policy or a bundler
-   * keeps them from starting, this thread does, too, and `workers` of the scene is 0.
+   * Maximum number of workers, each of which decodes a tile at a time. Default: 0, which decodes in this thread. If a
+   * page's policy or a bundler prevents workers from starting, this thread decodes and `workers` of the scene is 0.
    */
   workers?: number;
-  /** Takes the place of node:zlib or DecompressionStream, and of WebAssembly and workers, which have an inflate of their own. */
+  /** Replaces node:zlib or DecompressionStream. WebAssembly and workers, which have their own inflate, are not used. */
   inflate?: Inflate;
 }
 
@@ -52,29 +52,29 @@ export interface CodebookRecord {
   attributes: string[];
   bandFirst: number;
   bandLast: number;
-  /** How many entries it has. */
+  /** Number of entries. */
   size: number;
 }
 
 export interface ExtraRecord {
   name: string;
-  /** null where this decoder does not know the type: then the column is not returned. */
+  /** null if this decoder does not know the type; the column is then not returned. */
   dtype: 'u8' | 'i8' | 'u16' | 'i16' | 'u32' | 'i32' | 'f32' | 'f64' | null;
-  /** Of one value; 0 where the type is not known. */
+  /** Bytes per value; 0 if the type is not known. */
   bytes: number;
 }
 
-/** Bytes of a file. */
+/** A range of bytes in a file. */
 export interface ByteRange {
   offset: number;
   size: number;
 }
 
-/** A chunk as the index names it; the `Field`s are the places of offset and size in the index. */
+/** A chunk as listed in the index; the `Field` members are the positions of offset and size in the index. */
 export interface ChunkPlace extends ByteRange {
   type: string;
   flags: number;
-  /** CRC-32 of its bytes. */
+  /** CRC-32 of the chunk. */
   crc: number;
   offsetField: number;
   sizeField: number;
@@ -92,7 +92,7 @@ export interface LayerRecord extends ChunkPlace {
 
 export interface TileRecord {
   index: number;
-  /** Number of the tile's first splat in the whole scene. */
+  /** Index of the tile's first splat in the whole scene. */
   first: number;
   splatCount: number;
   /** Lattice of the means: exponent, step × 2^exponent, corner and extent in its integers. */
@@ -100,12 +100,12 @@ export interface TileRecord {
   step: number;
   corner: number[];
   extent: number[];
-  /** Box of the centres. */
+  /** Bounding box of the centres. */
   min: number[];
   max: number[];
   /** Natural logarithm of the largest standard deviation. */
   maxScale: number;
-  /** Those that this decoder does not know too. */
+  /** All layers, including those that this decoder does not know. */
   layers: LayerRecord[];
   /** Ids of the codebooks. */
   tables: number[];
@@ -122,11 +122,11 @@ export interface Header {
   shDegree: number;
   antialiased: boolean;
   flat: boolean;
-  /** Letters of the directions of +x, +y, +z ("RDF"), or empty where they are not known. */
+  /** Letters of the directions of +x, +y, +z ("RDF"), or empty if unknown. */
   axes: string;
-  /** Metres per scene unit, 0 where unknown. */
+  /** Metres per scene unit, 0 if unknown. */
   unitMetres: number;
-  /** What the means are relative to. */
+  /** Position that the means are relative to. */
   origin: number[];
   attributes: AttributeRecord[];
   codebooks: CodebookRecord[];
@@ -143,16 +143,16 @@ export interface StatedErrors {
   errors: Record<string, { max: number; rms: number }>;
 }
 
-/** Ancillary chunks; null for those that the file does not have. */
+/** Ancillary chunks; null for chunks that the file does not have. */
 export interface Description {
   metadata: Record<string, unknown> | null;
   cameras: Record<string, unknown>[] | null;
-  /** What the encoder was asked. */
+  /** Options that the encoder was called with. */
   options: Record<string, unknown> | null;
   statedErrors: StatedErrors | null;
 }
 
-/** Which CRCs were checked: those of header, index and so many chunks. */
+/** The checked CRCs: header, index, and the number of chunks. */
 export interface Checks {
   header: boolean;
   index: boolean;
@@ -200,25 +200,25 @@ export interface IntegerSplats {
   extra: Record<string, ExtraArray>;
 }
 
-/** Integers of one attribute in one tile, as narrow as they can be. */
+/** Integers of one attribute in one tile, in the narrowest type that holds them. */
 export interface PackedColumns {
-  /** Column after column, each as long as the list of splats: an integer is `offsets[column]` + element. */
+  /** Column after column, each with one element per splat; the integer is `offsets[column]` + element. */
   columns: Uint8Array | Uint16Array | Uint32Array | Float64Array;
   offsets: number[];
   /** A value is `Math.fround(integer * step)`; 0 for opacities and quats, see `levels` of their attribute record. */
   step: number;
 }
 
-/** An SH band may stay in its codebook. */
+/** Packed columns, or an SH band that stays in its codebook. */
 export interface Packed extends PackedColumns {
-  /** The splats that the columns are about, where they are not all: the others stand in the codebook, or are 0. */
+  /** The splats that the columns cover, if not all: the others are in the codebook, or 0. */
   rows?: Uint32Array;
   lookup?: {
     /** Id of the codebook. */
     codebook: number;
-    /** Its entries, and one row of zeros behind them. The same object for every tile of a reader. */
+    /** Its entries, followed by one row of zeros. The same object for every tile of a reader. */
     table: PackedColumns;
-    /** [count], a row of the table; the last one for the splats `rows`. */
+    /** [count], the row of the table for each splat; the last row for the splats in `rows`. */
     index: Uint8Array | Uint16Array | Uint32Array;
   };
 }
@@ -236,7 +236,7 @@ export interface PackedGeometry {
   sh0: PackedColumns;
 }
 
-/** A tile: layer 0 and, from band 1 on, its SH bands; null for those that it leaves out, whose coefficients are 0. */
+/** A tile: layer 0 and the SH bands from 1 on; null for bands that the tile leaves out, whose coefficients are 0. */
 export interface PackedTile extends PackedGeometry {
   sh: (Packed | null)[];
 }
@@ -250,13 +250,13 @@ export interface PackedBand {
 export interface Whole extends Description {
   header: Header;
   checks: Checks;
-  /** That decoded tiles; 0 where this thread did. */
+  /** Number of workers that decoded tiles; 0 if this thread did. */
   workers: number;
 }
 export type Scene = Splats & Whole;
 export type IntegerScene = IntegerSplats & Whole;
 
-/** Decode a whole file, with all of its checksums. */
+/** Decode a whole file and check all of its checksums. */
 export function decode(
   data: ArrayBuffer | ArrayBufferView,
   options: DecodeOptions & { form: 'integers' },
@@ -266,27 +266,27 @@ export function decode(
   options?: DecodeOptions & { form?: 'floats' },
 ): Promise<Scene>;
 
-/** Read and check header and index; the data may end behind the index. */
+/** Read and check header and index; the data may end after the index. */
 export function readHeader(data: ArrayBuffer | ArrayBufferView, options?: { limits?: Limits }): Header;
 
-/** Where a reader's bytes come from. `read` gives exactly `size` bytes or throws. */
+/** The source of a reader's bytes. `read` returns exactly `size` bytes or throws. */
 export interface ByteSource {
   read(offset: number, size: number, signal?: AbortSignal): Promise<Uint8Array<ArrayBuffer>>;
   prefetch?(ranges: ByteRange[], signal?: AbortSignal): void;
-  /** Of the file, where it is known. */
+  /** Size of the file, if known. */
   size?: number | null;
 }
 
 export interface ReaderOptions {
   limits?: Limits;
-  /** Of the first request, 64 KiB: header and index, one hopes. */
+  /** Size of the first request, which should cover header and index. Default: 64 KiB. */
   firstBytes?: number;
-  /** Of `open`, and of the body of a server without ranges. */
+  /** Aborts `open`, and the body of a server without ranges. */
   signal?: AbortSignal;
-  /** Bytes received so far, and the size of the file (0 before the header is here). */
+  /** Called with the bytes received so far and the size of the file (0 before the header has arrived). */
   onProgress?: (received: number, fileSize: number) => void;
   fetch?: typeof fetch;
-  /** Credentials, headers, mode of each request. */
+  /** Credentials, headers and mode of each request. */
   request?: RequestInit;
   inflate?: Inflate;
 }
@@ -297,13 +297,13 @@ export interface ReadOptions {
 }
 
 export interface TilesOptions {
-  /** Indices; all tiles by default. */
+  /** Indices of the tiles. Default: all tiles. */
   tiles?: Iterable<number>;
   form?: LayerForm;
   shDegree?: number;
-  /** Extra columns; not of packed tiles. */
+  /** Include extra columns; not available for packed tiles. */
   extra?: boolean;
-  /** Workers at most, as for `decode`; a reader with an `inflate` of the caller has none. */
+  /** Maximum number of workers, as for `decode`; 0 for a reader with its own `inflate`. */
   workers?: number;
   signal?: AbortSignal;
 }
@@ -318,9 +318,9 @@ export class CsplatReader {
   static open(from: string | URL | Blob | ArrayBuffer | ByteSource, options?: ReaderOptions): Promise<CsplatReader>;
   readonly header: Header;
   readonly checks: Checks;
-  /** Milliseconds that reads have waited for bytes so far, each for itself. */
+  /** Total milliseconds that reads have waited for bytes; concurrent reads count separately. */
   readonly waitedMs: number;
-  /** A tile with its SH bands up to a degree, and its extra columns if they are asked for. */
+  /** Read a tile with its SH bands up to a degree, and its extra columns if requested. */
   readTile(
     index: number,
     options: ReadOptions & { form: 'integers'; shDegree?: number; extra?: boolean },
@@ -329,16 +329,16 @@ export class CsplatReader {
     index: number,
     options?: ReadOptions & { form?: 'floats'; shDegree?: number; extra?: boolean },
   ): Promise<Splats>;
-  /** Integers as narrow as the tile allows, codebooks as tables: to be drawn or kept as they are. */
+  /** Read integers in the narrowest types that hold them and codebooks as tables, for drawing or storage. */
   readTile(index: number, options: { form: 'packed'; shDegree?: number; signal?: AbortSignal }): Promise<PackedTile>;
-  /** What readTile gives of each tile, and its `index`: one after the other, or with workers as they are done. */
+  /** Yield the result of readTile for each tile, with its `index`; in order, or with workers as they are done. */
   readTiles(options: TilesOptions & { form: 'packed' }): AsyncGenerator<PackedTile & { index: number }, void>;
   readTiles(options: TilesOptions & { form: 'integers' }): AsyncGenerator<IntegerSplats & { index: number }, void>;
   readTiles(options?: TilesOptions & { form?: 'floats' }): AsyncGenerator<Splats & { index: number }, void>;
-  /** Layer 0: geometry and base colour. */
+  /** Read layer 0: geometry and base colour. */
   readLayer(index: number, layer: 0, options: ReadOptions & { form: 'integers' }): Promise<IntegerSplats>;
   readLayer(index: number, layer: 0, options?: ReadOptions & { form?: 'floats' }): Promise<Splats>;
-  /** An SH band, [count, 2·layer + 1, 3]; null where the tile leaves it out and its coefficients are 0. */
+  /** Read an SH band, [count, 2·layer + 1, 3]; null if the tile leaves it out and its coefficients are 0. */
   readLayer(
     index: number,
     layer: number,
@@ -356,7 +356,7 @@ export class CsplatReader {
     options: { form: 'packed'; signal?: AbortSignal },
   ): Promise<PackedBand | null>;
   describe(options?: { signal?: AbortSignal }): Promise<Description>;
-  /** Begin to fetch layers that will be read soon, neighbours with one request. */
+  /** Start to fetch layers that will be read soon; neighbours share a request. */
   prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;
 }
 
@@ -382,7 +382,7 @@ export type ErrorCode =
   | 'E_INPUT';
 // end generated
 
-/** Base of all errors; `clause` is the broken requirement. */
+/** Base of all errors; `clause` is the id of the violated requirement. */
 export class CsplatError extends Error {
   readonly code: ErrorCode;
   readonly offset: number | null;

@@ -1,8 +1,8 @@
-// Decoder of the csplat format, from spec/format.md. No dependencies: browsers, workers, Node 20.
+// Decoder of the csplat format, from spec/format.md. No dependencies. Runs in browsers, workers and Node 20.
 //
 //   import { CsplatReader, decode, readHeader } from './decoder.mjs';
 //   const scene = await decode(bytes);              // the whole scene as Float32Arrays
-//   const reader = await CsplatReader.open(url);    // header and index, then the parts that are asked for
+//   const reader = await CsplatReader.open(url);    // header and index, then only the parts that are read
 //   const tile = await reader.readTile(0, { shDegree: 1 });
 
 import { Assembly } from './assemble.mjs';
@@ -29,7 +29,7 @@ export { CsplatError, FormatError, InputError, LimitError, UnsupportedError };
 /**
  * Read and check header and index.
  *
- * @param {ArrayBuffer | ArrayBufferView} data a file, or the beginning of one with the whole index
+ * @param {ArrayBuffer | ArrayBufferView} data a file, or the beginning of a file up to at least the end of the index
  * @param {{limits?: Limits}} [options]
  * @returns {Header}
  */
@@ -41,14 +41,14 @@ export function readHeader(data, options = {}) {
       spec.ERROR_TRUNCATED,
       bytes.length,
       'HDR-5',
-      `the index ends at ${file.end}, ${bytes.length} bytes are here`,
+      `the index ends at ${file.end}, the data has ${bytes.length} bytes`,
     );
   }
   return readIndex(bytes.subarray(spec.HEADER_SIZE, file.end), file, checkedLimits(options.limits));
 }
 
 /**
- * Decode a whole file, all of its checksums checked. decoder.d.ts describes the options and what comes back.
+ * Decode a whole file and check all of its checksums. decoder.d.ts describes the options and the result.
  *
  * @param {ArrayBuffer | ArrayBufferView} data
  * @param {DecodeOptions} [options]
@@ -100,7 +100,7 @@ export async function decode(data, options = {}) {
   }
 }
 
-/** Reads parts of a file, and checks the CRC of each. */
+/** Reads parts of a file and checks the CRC of each. */
 export class CsplatReader extends Reader {
   /**
    * @param {Parameters<typeof Reader.open>[0]} from
@@ -112,10 +112,10 @@ export class CsplatReader extends Reader {
   }
 
   /**
-   * Read tiles one after the other, or in workers; then in the order in which they are done.
+   * Read tiles in order, or with workers in the order in which they are done.
    *
    * @param {TilesOptions} [options]
-   * @returns {AsyncGenerator<any, void>} what `readTile` gives, with the tile's `index`
+   * @returns {AsyncGenerator<any, void>} results of `readTile`, with the tile's `index`
    */
   async *readTiles({ tiles, shDegree, extra = false, form, workers = 0, signal } = {}) {
     const waiting = [...checkedTiles(tiles, this.header)].reverse();
@@ -132,7 +132,7 @@ export class CsplatReader extends Reader {
 }
 
 /**
- * Arrays that tile after tile uses again, and band after band: fresh memory costs more than what is done with it.
+ * Return a function that reuses the same arrays for every tile and band: allocating them costs more than decoding.
  *
  * @param {number} shDegree
  * @returns {(key: number, length: number) => Float64Array<ArrayBuffer>}
@@ -143,7 +143,7 @@ function reused(shDegree) {
   return (key, length) => {
     const band = Math.abs(key) - spec.ATTRIBUTE_SH0;
     const place = band > 0 ? Math.sign(key) * spec.ATTRIBUTE_SH1 : key;
-    const most = band > 0 ? (length / (2 * band + 1)) * (2 * shDegree + 1) : length; // what the highest band takes
+    const most = band > 0 ? (length / (2 * band + 1)) * (2 * shDegree + 1) : length; // length for the highest band
     const known = arrays.get(place);
     const array = known && known.length >= length ? known : new Float64Array(most);
     arrays.set(place, array);

@@ -1,4 +1,4 @@
-// What a decoder throws (spec section 12, error codes). Nothing else leaves this package for bytes that are at fault.
+// The errors of a decoder (spec section 12, error codes). Invalid bytes cause no other errors in this package.
 
 import { ERROR_INPUT, ERROR_LIMIT, ERROR_UNSUPPORTED } from './spec.mjs';
 
@@ -7,13 +7,13 @@ import { ERROR_INPUT, ERROR_LIMIT, ERROR_UNSUPPORTED } from './spec.mjs';
 /**
  * Base of all errors of this package.
  *
- * `code` is one of the codes of the spec, `offset` the byte of the file that is to blame and `clause` the id of the
- * broken requirement, both null where there is none.
+ * `code` is one of the codes of the spec, `offset` the position of the error in the file and `clause` the id of the
+ * violated requirement. Both are null if they do not apply.
  */
 export class CsplatError extends Error {
   /**
    * @param {ErrorCode} code
-   * @param {string} detail what was found and what was wanted
+   * @param {string} detail what was found and what was expected
    * @param {{offset?: number | null, clause?: string | null, cause?: unknown}} [place]
    */
   constructor(code, detail, { offset = null, clause = null, cause } = {}) {
@@ -26,16 +26,16 @@ export class CsplatError extends Error {
   }
 }
 
-/** The bytes break a requirement of the format. */
+/** The bytes violate a requirement of the format. */
 export class FormatError extends CsplatError {}
 
-/** The file, or this platform, asks for something that this decoder does not have. */
+/** The file requires something that this decoder or this platform does not support. */
 export class UnsupportedError extends CsplatError {}
 
-/** The file is beyond the caller's budget. */
+/** The file exceeds the caller's budget. */
 export class LimitError extends CsplatError {}
 
-/** The caller's arguments, or the way to the file, are at fault. */
+/** The caller's arguments are invalid, or the file cannot be fetched. */
 export class InputError extends CsplatError {
   /**
    * @param {string} detail
@@ -47,10 +47,10 @@ export class InputError extends CsplatError {
 }
 
 /**
- * The error for a file, of the class that its code asks for.
+ * Return the error for a file, of the class that belongs to its code.
  *
  * @param {ErrorCode} code
- * @param {number} offset byte of the file
+ * @param {number} offset offset in the file
  * @param {string} clause id of the requirement
  * @param {string} detail
  * @param {unknown} [cause]
@@ -64,7 +64,7 @@ export function fault(code, offset, clause, detail, cause) {
 }
 
 /**
- * Allocate. A platform that cannot is a budget too small.
+ * Call `make`, which allocates. If the platform cannot allocate, throw a LimitError.
  *
  * @template T
  * @param {() => T} make

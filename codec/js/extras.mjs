@@ -19,14 +19,14 @@ const EXTRA_VIEWS = {
 };
 
 /**
- * Whether this version knows a column's type; a column of another one is not returned (ANC-3).
+ * Return true if this version knows the type of a column; other columns are not returned (ANC-3).
  *
  * @param {ExtraRecord} record
  * @returns {record is ExtraRecord & {dtype: string}}
  */
 export const isKnown = (record) => record.dtype !== null;
 
-/** Extra columns, bit for bit: floats are never read as such, so that NaN keep their bits. */
+/** Extra columns as raw bits: floats are never read as numbers, so that NaN keep their bits. */
 export class ExtraArrays {
   /**
    * @param {number} count splats
@@ -39,7 +39,7 @@ export class ExtraArrays {
 
   /**
    * @param {Elements[]} columns
-   * @param {number} first splat
+   * @param {number} first index of the first splat
    */
   put(columns, first) {
     for (const [column, { low, high, width }] of columns.entries()) {
@@ -57,7 +57,7 @@ export class ExtraArrays {
     }
   }
 
-  /** @returns {Record<string, ExtraArray>} without a prototype: a column may have any name */
+  /** @returns {Record<string, ExtraArray>} without a prototype, since a column may have any name */
   byName() {
     const columns = Object.create(null);
     for (const [i, { name, dtype }] of this.records.entries()) columns[name] = EXTRA_VIEWS[dtype](this.buffers[i]);

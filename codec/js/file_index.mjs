@@ -1,4 +1,4 @@
-// The index (spec 4.3): records of the whole file. `tile_records.mjs` reads the rest of it, the tiles.
+// The index (spec 4.3): records of the whole file. `tile_records.mjs` reads the tiles, which follow them.
 
 import { CRC_SIZE } from './checksums.mjs';
 import { fault } from './errors.mjs';
@@ -24,9 +24,9 @@ const { ERROR_INDEX, ERROR_LIMIT, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE
  */
 
 const AT_HEAD = spec.INDEX_HEAD_OFFSETS;
-/** @type {Record<string, number | undefined>} Directions along one line. */
+/** @type {Record<string, number | undefined>} axis of each direction letter */
 const LINES = { R: 0, L: 0, U: 1, D: 1, F: 2, B: 2 };
-/** Sizes that the head states, with the least of each. */
+/** Record sizes in the index head, with the minimum of each. */
 const RECORD_SIZES = /** @type {const} */ ([
   ['head_size', spec.INDEX_HEAD_SIZE],
   ['attribute_size', spec.ATTRIBUTE_RECORD_SIZE],
@@ -36,12 +36,12 @@ const RECORD_SIZES = /** @type {const} */ ([
   ['tile_size', spec.TILE_RECORD_SIZE],
   ['layer_size', spec.LAYER_RECORD_SIZE],
 ]);
-const INDEX_GROWTH = 8; // the objects made of an index take about so many times its bytes
+const INDEX_GROWTH = 8; // memory of the parsed index, as a multiple of its bytes (approximate)
 
 /**
  * Read and check the whole index.
  *
- * @param {Uint8Array<ArrayBuffer>} bytes of the index, its CRC included
+ * @param {Uint8Array<ArrayBuffer>} bytes the index with its CRC
  * @param {FileHeader} file
  * @param {Required<Limits>} limits
  * @returns {Header}
@@ -90,7 +90,7 @@ export function readIndex(bytes, file, limits) {
       ERROR_INDEX,
       spec.HEADER_SIZE + AT_HEAD.splat_count,
       'IDX-7',
-      `N is ${head.splat_count}, the tiles hold ${header.splatCount}`,
+      `N is ${head.splat_count}, the tiles have ${header.splatCount}`,
     );
   }
   checkCoverage(header, file.end);
@@ -101,7 +101,7 @@ export function readIndex(bytes, file, limits) {
 const omit = ({ profile, fileSize, indexSize }) => ({ profile, fileSize, indexSize });
 
 /**
- * IDX-8: what this version reads of a record lies within it.
+ * Check IDX-8: the fields that this version reads lie within the record.
  *
  * @param {IndexHead} head
  */
@@ -147,10 +147,10 @@ function readScene(head) {
 }
 
 /**
- * Compare what the head announces with the bytes of the index and with the budget, before anything is made of it.
+ * Check the counts in the head against the size of the index and the budget, before anything is allocated.
  *
  * @param {IndexHead} head
- * @param {Payload} index behind the head
+ * @param {Payload} index after the head
  * @param {Required<Limits>} limits
  */
 function checkCounts(head, index, limits) {
@@ -173,7 +173,7 @@ function checkCounts(head, index, limits) {
     head.directory_count * head.directory_size +
     head.tile_count * head.tile_size;
   if (least > index.left)
-    throw fault(ERROR_INDEX, at, 'IDX-2', `records of at least ${least} bytes, ${index.left} are there`);
+    throw fault(ERROR_INDEX, at, 'IDX-2', `records of at least ${least} bytes, ${index.left} are left`);
   if (index.bytes.length * INDEX_GROWTH > limits.bytes) {
     throw fault(
       ERROR_LIMIT,
@@ -186,7 +186,7 @@ function checkCounts(head, index, limits) {
 
 /**
  * @param {Payload} index
- * @param {number} size of the record
+ * @param {number} size size of the record
  * @param {number} place
  * @returns {AttributeRecord}
  */
@@ -236,7 +236,7 @@ function readAttribute(index, size, place) {
 /**
  * @param {Payload} index
  * @param {number} recordSize
- * @param {number} before id of the record before
+ * @param {number} before id of the previous record
  * @param {number} shDegree
  * @returns {CodebookRecord}
  */
@@ -273,7 +273,7 @@ function readCodebook(index, recordSize, before, shDegree) {
 /**
  * @param {Payload} index
  * @param {number} recordSize
- * @param {Set<string>} names those of the columns before
+ * @param {Set<string>} names names of the previous columns
  * @returns {ExtraRecord}
  */
 function readExtra(index, recordSize, names) {
@@ -287,7 +287,7 @@ function readExtra(index, recordSize, names) {
     throw fault(ERROR_VALUE, offset + places.name_size, 'EXR-1', `a name of ${size} bytes`);
   const name = decodeUtf8(fields.name.slice(0, size));
   if (name === null) {
-    let sound = size - 1; // bytes before the first that is not UTF-8
+    let sound = size - 1; // length of the longest valid UTF-8 prefix
     while (decodeUtf8(fields.name.slice(0, sound)) === null) sound--;
     throw fault(ERROR_VALUE, offset + places.name + sound, 'EXR-2', 'a name that is not UTF-8');
   }
@@ -305,7 +305,7 @@ function readExtra(index, recordSize, names) {
 
 /**
  * @param {Uint8Array} bytes
- * @returns {string | null} null if they are not UTF-8
+ * @returns {string | null} null if the bytes are not UTF-8
  */
 function decodeUtf8(bytes) {
   try {
@@ -363,11 +363,11 @@ function readDirectory(index, recordSize) {
 }
 
 /**
- * DIR-4 and DIR-5: what must occur once does, and nothing else.
+ * Check DIR-4 and DIR-5: required chunks occur exactly once, and no other chunks occur.
  *
  * @param {DirectoryRecord[]} directory
  * @param {CodebookRecord[]} codebooks
- * @param {number} offset of the directory
+ * @param {number} offset offset of the directory
  */
 function checkDirectory(directory, codebooks, offset) {
   const due = new Set(); // CODB chunks still to come, as id × 256 + layer

@@ -1,16 +1,16 @@
-// Raw DEFLATE (RFC 1951) by the platform, held to COD-2 and COD-4: the stream ends within the last byte, gives exactly
-// the declared size, and no more than that is ever produced. COD-5 to COD-8 are what zlib, and with it the platforms,
-// refuse of themselves.
+// Raw DEFLATE (RFC 1951) with the platform's implementation. This module ensures COD-2 and COD-4: the stream ends within
+// the last byte and gives exactly the declared size, and no more output than that is ever produced. zlib, and thus every
+// platform, checks COD-5 to COD-8.
 
 import { UnsupportedError } from './errors.mjs';
 import { ERROR_UNSUPPORTED } from './spec.mjs';
 
 /** @typedef {(coded: Uint8Array<ArrayBuffer>, size: number) => Uint8Array | Promise<Uint8Array>} Inflate */
 
-const CHUNK_BYTES = 1 << 20; // output of one step of zlib at most
-const FEED_BYTES = 1 << 14; // input of one step of a DecompressionStream: at most 16 MiB come out of it unasked
+const CHUNK_BYTES = 1 << 20; // maximum output of one step of zlib
+const FEED_BYTES = 1 << 14; // input of one step of a DecompressionStream, which inflates to at most 16 MiB
 
-/** What zlib says of a stream that it refuses, by its last word, where that is not COD-2; in Chromium and Firefox, too. */
+/** The clause of each zlib error, by the last word of its message; COD-2 otherwise. Browsers use the same words. */
 const CLAUSES = new Map([
   ['symbols', 'COD-5'], // too many length or distance symbols
   ['set', 'COD-6'], // invalid code lengths set, invalid literal/lengths set, invalid distances set
@@ -20,11 +20,11 @@ const CLAUSES = new Map([
   ['back', 'COD-8'], // invalid distance too far back
 ]);
 
-/** Why coded bytes are not the stream that they have to be. The caller knows where in the file they lie. */
+/** Coded bytes that are not a valid stream. The caller knows their offset in the file. */
 export class InflateError extends Error {
   /**
    * @param {string} message
-   * @param {number} [at] byte of the coded bytes
+   * @param {number} [at] offset in the coded bytes
    * @param {string} [clause]
    */
   constructor(message, at = 0, clause = 'COD-2') {
@@ -34,7 +34,7 @@ export class InflateError extends Error {
   }
 }
 
-/** @param {unknown} error of the platform */
+/** @param {unknown} error error from the platform */
 function refused(error) {
   const message = error instanceof Error ? error.message : String(error);
   const [last] = /[\w-]*(?=\W*$)/.exec(message) ?? [''];
@@ -45,8 +45,8 @@ function refused(error) {
 let chosen = null;
 
 /**
- * The quickest way to inflate here: node:zlib in Node (several times faster than its DecompressionStream), otherwise
- * DecompressionStream.
+ * Return the fastest inflate of this platform: node:zlib in Node (several times faster than its DecompressionStream),
+ * otherwise DecompressionStream.
  *
  * @returns {Promise<Inflate>}
  */
@@ -57,9 +57,9 @@ export function platformInflate() {
 
 /** @returns {Promise<Inflate>} */
 export async function zlibInflate() {
-  const name = 'node:zlib'; // a variable, so that bundlers for browsers do not look for it
+  const name = 'node:zlib'; // hides it from bundlers for browsers
   const zlib = await import(/* webpackIgnore: true */ /* @vite-ignore */ name);
-  // Not every copy of Node's zlib says how much it read. An empty block of ten bits, and a byte:
+  // Some versions of zlib in Node do not report how much they read. The probe is an empty block of ten bits, and a byte.
   if (zlib.inflateRawSync(Uint8Array.of(3, 0, 0), { info: true }).engine?.bytesWritten !== 2) return streamInflate();
   return (coded, size) => {
     let result;
@@ -70,7 +70,7 @@ export async function zlibInflate() {
       throw refused(error);
     }
     const { buffer, engine } = result;
-    if (buffer.length !== size) throw new InflateError(`${buffer.length} bytes came out instead of ${size}`);
+    if (buffer.length !== size) throw new InflateError(`inflated to ${buffer.length} bytes instead of ${size}`);
     const used = engine.bytesWritten; // bytes of input that zlib consumed
     if (used !== coded.length) throw new InflateError(`${coded.length - used} bytes follow the final block`, used);
     return buffer;
@@ -84,7 +84,7 @@ export async function streamInflate() {
   } catch (cause) {
     throw new UnsupportedError(ERROR_UNSUPPORTED, "this platform has no DecompressionStream('deflate-raw')", { cause });
   }
-  // The standard demands an error for bytes after the end; Node 20 does not give one. An empty stored block and a byte:
+  // The standard requires an error for bytes after the end; Node 20 reports none. The probe is an empty block and a byte.
   const probe = Uint8Array.of(1, 0, 0, 255, 255, 0);
   const strict = await drain(probe, 0).then(
     () => false,
@@ -92,7 +92,7 @@ export async function streamInflate() {
   );
   return async (coded, size) => {
     const bytes = await drain(coded, size);
-    // A stream that ends within the last byte is not complete without it.
+    // A stream that ends within its last byte is incomplete without that byte.
     const early =
       !strict &&
       coded.length > 1 &&
@@ -112,13 +112,13 @@ export async function streamInflate() {
 async function drain(coded, size) {
   const stream = new DecompressionStream('deflate-raw');
   const feeding = feed(stream.writable.getWriter(), coded);
-  feeding.catch(() => {}); // the reader meets the same error
+  feeding.catch(() => {}); // the reader gets the same error
   const reader = stream.readable.getReader();
   const bytes = new Uint8Array(size);
   let filled = 0;
   try {
     for (let part = await reader.read(); !part.done; part = await reader.read()) {
-      if (part.value.length > size - filled) throw new InflateError(`more than ${size} bytes come out`);
+      if (part.value.length > size - filled) throw new InflateError(`inflates to more than ${size} bytes`);
       bytes.set(part.value, filled);
       filled += part.value.length;
     }
@@ -127,7 +127,7 @@ async function drain(coded, size) {
     reader.cancel().catch(() => {});
     throw error instanceof InflateError ? error : refused(error);
   }
-  if (filled !== size) throw new InflateError(`${filled} bytes came out instead of ${size}`);
+  if (filled !== size) throw new InflateError(`inflated to ${filled} bytes instead of ${size}`);
   return bytes;
 }
 

@@ -1,12 +1,12 @@
-// Strict JSON (spec 5.4, JSN-1). JSON.parse takes the last of two equal names, makes Infinity of a large number, lets
-// lone surrogates pass and recurses as deep as the text does, so it cannot be used.
+// A strict JSON parser (spec 5.4, JSN-1). JSON.parse is too lenient: it keeps the last of two equal names, turns large
+// numbers into Infinity, accepts lone surrogates and recurses without a limit.
 
 import { JSON_DEPTH_MAX } from './spec.mjs';
 
 const NUMBER = /-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][+-]?[0-9]+)?/y;
 const PLAIN = /[^"\\\u0000-\u001f]*/y;
 const SPACE = /[ \t\n\r]*/y;
-const SURROGATE = /\p{Surrogate}/u; // with the flag u, matches halves without their partner alone
+const SURROGATE = /\p{Surrogate}/u; // with the flag u, matches only unpaired surrogates
 /** @type {Record<string, string>} */
 const ESCAPES = { '"': '"', '\\': '\\', '/': '/', b: '\b', f: '\f', n: '\n', r: '\r', t: '\t' };
 /** @type {[string, unknown][]} */
@@ -17,11 +17,11 @@ const WORDS = [
 ];
 
 /**
- * The value of a JSON text.
+ * Parse a JSON text.
  *
  * @param {Uint8Array} bytes UTF-8
  * @returns {unknown}
- * @throws {SyntaxError} saying what JSN-1 does not allow; the caller knows where in the file
+ * @throws {SyntaxError} names what violates JSN-1; the caller knows the offset in the file
  */
 export function parseJson(bytes) {
   let text;
@@ -52,7 +52,7 @@ class Parser {
     return new SyntaxError(`${what} at character ${this.at}`);
   }
 
-  /** @param {RegExp} pattern a sticky one */
+  /** @param {RegExp} pattern sticky */
   match(pattern) {
     pattern.lastIndex = this.at;
     const found = pattern.exec(this.text)?.[0] ?? '';
@@ -67,7 +67,7 @@ class Parser {
     return true;
   }
 
-  /** A value with the white space around it. @returns {unknown} */
+  /** Parse a value and the white space around it. @returns {unknown} */
   value() {
     this.match(SPACE);
     const value = this.bareValue();
@@ -109,7 +109,7 @@ class Parser {
       if (Object.hasOwn(object, name)) throw this.error(`the name ${JSON.stringify(name)} twice`);
       this.match(SPACE);
       if (!this.accept(':')) throw this.error('no colon');
-      // Defined, not assigned: the name may be __proto__.
+      // defineProperty, since the name may be __proto__.
       Object.defineProperty(object, name, {
         value: this.value(),
         writable: true,

@@ -1,19 +1,19 @@
-// Lattices: exact steps, colour lifting, and the way from integers to the arrays (spec 7.1, 7.2).
+// Lattices: exact steps, colour lifting, and the conversion from integers to the arrays (spec 7.1, 7.2).
 
-const ROWS_AT_ONCE = 1024; // of shN, so that the rows written column by column stay in the cache
+const ROWS_AT_ONCE = 1024; // rows of shN; keeps the rows that are written column by column in the cache
 
-/** Smallest step × 2^exponent of means (ATT-6, TIL-9): no product with it is subnormal in binary64. */
+/** Minimum of step × 2^exponent of means (ATT-6, TIL-9): no product with it is subnormal in binary64. */
 export const STEP_MIN = 2 ** -1022;
 
-/** The same of scales and colours (ATT-10, LAT-1), in binary32. */
+/** Minimum for scales and colours (ATT-10, LAT-1): no product with it is subnormal in binary32. */
 export const SINGLE_MIN = 2 ** -126;
 
 /**
- * x × 2^e without the power, which may lie outside binary64 (spec 7.2).
+ * Return x × 2^e without computing the power, which may be outside binary64 (spec 7.2).
  *
  * @param {number} x at least 2^−1022 and finite
  * @param {number} exponent an i16
- * @returns {number} exact, or 0 or Infinity where the result is not within [2^−1022, 2^1024)
+ * @returns {number} exact, or 0 or Infinity if the result is outside [2^−1022, 2^1024)
  */
 export function ldexp(x, exponent) {
   const view = new DataView(new ArrayBuffer(8));
@@ -27,10 +27,10 @@ export function ldexp(x, exponent) {
 }
 
 /**
- * Spec 7.1 on whole columns, in place: Y, Co, Cg become R, G, B. All of it is exact below 2^53.
+ * Convert whole columns of Y, Co, Cg to R, G, B in place (spec 7.1). All operations are exact below 2^53.
  *
  * @param {Float64Array} columns
- * @param {number} third elements of Y, as many as of Co and Cg
+ * @param {number} third elements per channel
  * @param {number} k chroma shift
  */
 export function rgbFromYcocg(columns, third, k) {
@@ -50,8 +50,8 @@ export function rgbFromYcocg(columns, third, k) {
  * Write columns [channel × rows + row] × s as `out`[splat, row, channel] (spec 7.2); the array rounds once.
  *
  * @param {Float32Array} out
- * @param {number} stride values of a splat in `out`
- * @param {number} start place of the first row among them
+ * @param {number} stride values per splat in `out`
+ * @param {number} start position of the first row among them
  * @param {number} first splat
  * @param {Float64Array} columns three per row
  * @param {number} rows
@@ -76,18 +76,18 @@ export function putRows(out, stride, start, first, columns, rows, n, s) {
 }
 
 /**
- * Copy rows of a table into `out`, for each splat the one that its index names.
+ * Copy to each splat in `out` the row of a table that its index names.
  *
  * @param {Float32Array} out
- * @param {number} stride values of a splat in `out`
- * @param {number} start place of the first value among them
+ * @param {number} stride values per splat in `out`
+ * @param {number} start position of the first value among them
  * @param {number} first splat
  * @param {Float32Array} values rows of the table
- * @param {number} width values of a row, a multiple of 3: of colours
+ * @param {number} width values per row, a multiple of 3
  * @param {Uint32Array} index
  */
 export function copyRows(out, stride, start, first, values, width, index) {
-  // As bits: on their way through binary64, which is what a float is in JavaScript, they would take twice as long.
+  // Copies bits: copying floats would convert each to binary64 and back and take twice as long.
   const to = new Int32Array(out.buffer, out.byteOffset, out.length);
   const table = new Int32Array(values.buffer, values.byteOffset, values.length);
   let at = first * stride + start;
@@ -102,15 +102,15 @@ export function copyRows(out, stride, start, first, values, width, index) {
 }
 
 /**
- * As putRows, for the splats of a list.
+ * Do the same as putRows for a list of splats.
  *
  * @param {Float32Array} out
  * @param {number} stride
  * @param {number} start
  * @param {number} first
- * @param {Float64Array} columns as long as the list
+ * @param {Float64Array} columns one element per listed splat
  * @param {number} rows
- * @param {Uint32Array} splats counted from `first`
+ * @param {Uint32Array} splats relative to `first`
  * @param {number} s step
  */
 export function scatterRows(out, stride, start, first, columns, rows, splats, s) {
@@ -125,8 +125,8 @@ export function scatterRows(out, stride, start, first, columns, rows, splats, s)
 }
 
 /**
- * Write columns [channel × rows + row] as `out`[splat, row, channel], a BigInt's halves by hand: a BigInt for each
- * value would take ten times as long.
+ * Write columns [channel × rows + row] as `out`[splat, row, channel]. The halves of each integer are written separately:
+ * creating a BigInt per value would take ten times as long.
  *
  * @param {BigInt64Array} out
  * @param {number} first splat
@@ -135,7 +135,7 @@ export function scatterRows(out, stride, start, first, columns, rows, splats, s)
  * @param {number} n
  */
 export function putWide(out, first, columns, rows, n) {
-  const halves = new Int32Array(out.buffer); // low, high: this module runs on little-endian platforms alone
+  const halves = new Int32Array(out.buffer); // low, high; this module only runs on little-endian platforms
   for (let channel = 0; channel < 3; channel++) {
     for (let row = 0; row < rows; row++) {
       const column = (channel * rows + row) * n;

@@ -1,4 +1,4 @@
-// What the caller gives, checked: whatever is wrong here is E_INPUT.
+// Checks of the caller's arguments. Every error here is E_INPUT.
 
 import { InputError } from './errors.mjs';
 import { BUDGET_BYTES_JS, BUDGET_JSON_BYTES } from './spec.mjs';
@@ -40,7 +40,7 @@ export function checkedLimits(limits = {}) {
 /**
  * @param {number | undefined} shDegree
  * @param {Header} header
- * @returns {number} at most the file's
+ * @returns {number} at most the degree of the file
  */
 export function checkedDegree(shDegree, header) {
   if (shDegree === undefined) return header.shDegree;
@@ -71,10 +71,10 @@ export function checkedTile(index, header) {
 
 /**
  * @param {unknown} form
- * @returns {boolean} whether integers are wanted
+ * @returns {boolean} true for integers
  */
 export function checkedForm(form) {
   if (form === undefined || form === 'floats') return false;
   if (form === 'integers') return true;
-  throw new InputError(`form ${JSON.stringify(form)}: it is 'floats' or 'integers'`);
+  throw new InputError(`form is ${JSON.stringify(form)}, expected 'floats' or 'integers'`);
 }

@@ -1,4 +1,5 @@
-// The form 'packed': integers as narrow as a tile's layer allows, codebooks as tables. For those who draw them as they are.
+// The form 'packed', for callers that draw or store integers: in the narrowest type of each tile's layer, codebooks as
+// tables.
 
 import { entryColumns } from './codebooks.mjs';
 import { columnCount } from './codings.mjs';
@@ -13,11 +14,11 @@ import * as spec from './spec.mjs';
  */
 
 /**
- * The blocks of one layer.
+ * Pack the blocks of one layer.
  *
  * @param {Block[]} blocks
  * @param {number} layer
- * @param {number} count splats
+ * @param {number} count number of splats
  * @returns {any} PackedGeometry for layer 0, PackedBand for the others
  */
 export function packLayer(blocks, layer, count) {
@@ -34,14 +35,14 @@ function packBlock({ attribute, columns, exponent, lookup, present }) {
   const packed = packColumns(columns, columnCount(attribute), step);
   if (lookup === undefined) return present ? { ...packed, rows: present } : packed;
   const { id, index, escaped, table } = lookup;
-  // The values of one table are asked for by tile after tile, under one attribute: those of a band have a chunk of their own.
+  // All tiles share the packed table. It belongs to one attribute, since a band has its own chunk.
   table.packed ??= packColumns(entryColumns(table, attribute), columnCount(attribute), attribute.step);
   return { ...packed, rows: escaped, lookup: { codebook: id, table: table.packed, index: narrow(index, table.size) } };
 }
 
 /**
  * @param {Float64Array} columns
- * @param {number} count of columns
+ * @param {number} count number of columns
  * @param {number} step
  * @returns {PackedColumns}
  */
@@ -59,7 +60,7 @@ function packColumns(columns, count, step) {
     offsets.push(low);
     most = Math.max(most, high - low);
   }
-  // Differences of such integers may need more than the 53 bits that they have themselves.
+  // The differences of such integers may need more than 53 bits.
   if (most >= 2 ** 32) return { columns: columns.slice(), offsets: offsets.fill(0), step };
   const out = arrayFor(most, columns.length);
   for (let c = 0; c < count; c++) {

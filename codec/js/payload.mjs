@@ -1,14 +1,14 @@
-// Bytes of a file with their place in it: every length is checked here before it is used.
+// Bytes of a file with their offset in it. Every length is checked here before it is used.
 
 import { fault } from './errors.mjs';
 import { ERROR_RESERVED, ERROR_STREAM } from './spec.mjs';
 
-/** The payload of a chunk (or the index), read from its beginning to its end. */
+/** The payload of a chunk (or the index), read from beginning to end. */
 export class Payload {
   /**
    * @param {Uint8Array<ArrayBuffer>} bytes
-   * @param {number} base offset of the first byte in the file
-   * @param {string} clause the one that demands that the payload ends with its last part
+   * @param {number} base offset in the file of the first byte
+   * @param {string} clause the clause that requires the payload to end after its last part
    * @param {import('./decoder.d.ts').ErrorCode} [code]
    */
   constructor(bytes, base, clause, code = ERROR_STREAM) {
@@ -30,11 +30,11 @@ export class Payload {
   }
 
   /**
-   * Step over the next `size` bytes.
+   * Skip the next `size` bytes.
    *
    * @param {number} size
-   * @param {string} what for the message
-   * @returns {number} where they begin, for `view`
+   * @param {string} what name for the message
+   * @returns {number} position of the first of them in `view`
    */
   claim(size, what) {
     if (size > this.left)
@@ -44,14 +44,14 @@ export class Payload {
   }
 
   /**
-   * Read a structure with its generated reader and refuse reserved fields that are not 0.
+   * Read a structure with its generated reader and refuse reserved fields other than 0.
    *
    * @template {Record<string, unknown>} T
    * @param {(view: DataView, at: number) => T} unpack
-   * @param {number} size of the structure with its tail, which is skipped
+   * @param {number} size size of the structure with its tail, which is skipped
    * @param {Readonly<Record<string, number>>} reserved offsets of its reserved fields
-   * @param {string} what for the message
-   * @returns {{fields: T, offset: number}} `offset` in the file
+   * @param {string} what name for the message
+   * @returns {{fields: T, offset: number}} the offset in the file
    */
   read(unpack, size, reserved, what) {
     const offset = this.offset;
@@ -66,12 +66,12 @@ export class Payload {
 }
 
 /**
- * RES-1: "A reserved field or bit MUST be 0".
+ * Check RES-1: "A reserved field or bit MUST be 0".
  *
  * @param {Record<string, unknown>} fields of a structure
- * @param {number} at where it begins in the file
+ * @param {number} at offset of the structure in the file
  * @param {Readonly<Record<string, number>>} reserved offsets of its reserved fields
- * @param {string} what for the message
+ * @param {string} what name for the message
  */
 export function checkReserved(fields, at, reserved, what) {
   for (const name in reserved) {

@@ -1,7 +1,7 @@
-// Tiles and layers of a file, one by one and in any order, over HTTP Range, from a Blob or from memory.
+// Reads tiles and layers of a file one by one in any order, over HTTP Range, from a Blob or from memory.
 //
-// Two complete decoders are behind this reader: WebAssembly (wasm_decoder.mjs) and JavaScript (tile_blocks.mjs). The second
-// serves pages whose content security policy forbids WebAssembly, asks for integers, or needs the place of an error.
+// This reader contains two complete decoders: WebAssembly (wasm_decoder.mjs) and JavaScript (tile_blocks.mjs). JavaScript
+// decodes if the page's content security policy forbids WebAssembly, for integers, and to locate errors.
 
 import { describe, emptyDescription } from './ancillary.mjs';
 import { FloatArrays, arrayBytes, bandArray } from './arrays.mjs';
@@ -18,7 +18,7 @@ import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile_blocks.mjs';
 
-const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thirty million splats
+const FIRST_BYTES = 1 << 16; // bytes; header and index of most files up to about thirty million splats
 
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
@@ -39,7 +39,7 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
  */
 
 /**
- * Layers of a tile that are wanted.
+ * Select the layers of a tile that a read requires.
  *
  * @param {TileRecord} record
  * @param {{shDegree: number, extra: boolean}} wanted
@@ -47,14 +47,14 @@ const FIRST_BYTES = 1 << 16; // header and index of most files of up to some thi
 const wantedLayers = ({ layers }, { shDegree, extra }) =>
   layers.filter(({ layer }) => (layer === spec.LAYER_EXTRA ? extra : layer <= shDegree));
 
-/** Reads parts of a file, and checks the CRC of each. */
+/** Reads parts of a file and checks the CRC of each. */
 export class Reader {
   /**
-   * Open a file: one request for header and index of all but huge files.
+   * Open a file, with one request for header and index unless the index is very large.
    *
    * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
    * @param {ReaderOptions} [options]
-   * @returns {Promise<Reader>} one of the class that it is called on
+   * @returns {Promise<Reader>} of the class that `open` is called on
    */
   static async open(from, options = {}) {
     const { signal } = options;
@@ -90,7 +90,7 @@ export class Reader {
    * @param {Header} header
    * @param {Required<Limits>} limits
    * @param {Inflate} inflate
-   * @param {WasmDecoder | null} compiled for floats and packed arrays, where WebAssembly runs
+   * @param {WasmDecoder | null} compiled decodes floats and packed arrays; null without WebAssembly
    */
   constructor(source, header, limits, inflate, compiled) {
     this.source = source;
@@ -100,11 +100,11 @@ export class Reader {
     this.compiled = compiled;
     /** @type {Map<number, Bytes>} header and index by their offsets */
     this.opening = new Map();
-    /** Whether the caller brings the inflate, which workers cannot have. */
+    /** Whether the caller supplies the inflate, which workers cannot use. */
     this.inflates = false;
-    /** @type {Set<number>} offsets of the chunks whose CRC was checked */
+    /** @type {Set<number>} offsets of the chunks whose CRC has been checked */
     this.checked = new Set();
-    /** How long reads have waited for bytes so far, each for itself. */
+    /** Total milliseconds that reads have waited for bytes; concurrent reads count separately. */
     this.waitedMs = 0;
     this.codebooks = codebooksById(header.codebooks);
     this.tableBytes = tableBytes(header.directory, this.codebooks);
@@ -113,18 +113,18 @@ export class Reader {
     for (const record of header.directory) {
       if (record.type === spec.CHUNK_CODEBOOK) this.codebookChunks.set(`${record.id}.${record.layer}`, record);
     }
-    /** @type {Map<string, Promise<Bytes>>} those that were fetched */
+    /** @type {Map<string, Promise<Bytes>>} fetched codebook chunks */
     this.codebookBytes = new Map();
     /** @type {Map<string, Promise<Table>>} */
     this.tables = new Map();
-    /** @type {Map<number, Tile>} tiles that hold indices which layers to come need */
+    /** @type {Map<number, Tile>} tiles with indices that later layers need */
     this.open = new Map();
-    /** @type {Map<LayerRecord, Bytes>} layers that hold such indices, for WebAssembly */
+    /** @type {Map<LayerRecord, Bytes>} layers with such indices, for WebAssembly */
     this.kept = new Map();
     this.table = this.table.bind(this);
   }
 
-  /** Which CRCs were checked so far. */
+  /** The CRCs checked so far. */
   get checks() {
     return { header: true, index: true, chunks: this.checked.size };
   }
@@ -134,8 +134,8 @@ export class Reader {
    *
    * @param {number} index
    * @param {{form?: LayerForm, shDegree?: number, extra?: boolean, signal?: AbortSignal}} [options]
-   * @param {any} [spare] what it gave before, of floats: its memory may be used again
-   * @returns {Promise<any>} the arrays that `decode` gives, of the one tile; packed, see decoder.d.ts
+   * @param {any} [spare] an earlier result, of floats, whose memory may be reused
+   * @returns {Promise<any>} the arrays that `decode` returns, for this tile; for packed tiles see decoder.d.ts
    */
   async readTile(index, { shDegree, extra = false, form, signal } = {}, spare) {
     const record = checkedTile(index, this.header);
@@ -170,7 +170,7 @@ export class Reader {
    *
    * @param {Assembly} assembly
    * @param {TileRecord} record
-   * @param {number} first splat of the arrays that is the tile's first
+   * @param {number} first index in the arrays of the tile's first splat
    * @param {AbortSignal} [signal]
    */
   async fill(assembly, record, first, signal) {
@@ -191,7 +191,7 @@ export class Reader {
   }
 
   /**
-   * Bytes by their offsets for another reader, in a worker: header, index, codebooks; or what a tile has.
+   * Collect the bytes that a reader in a worker needs, by offset: header, index and codebooks, or the chunks of a tile.
    *
    * @param {{shDegree: number, extra: boolean}} wanted
    * @param {TileRecord} [record]
@@ -201,19 +201,20 @@ export class Reader {
     const parts = record ? [] : [...this.opening];
     for (const place of record ? wantedLayers(record, wanted) : []) parts.push([place.offset, await this.fetch(place)]);
     for (const [key, { layer, offset }] of record ? [] : this.codebookChunks) {
-      if (layer <= wanted.shDegree) parts.push([offset, await this.codebookChunk(key)]); // every worker wants them
+      if (layer <= wanted.shDegree) parts.push([offset, await this.codebookChunk(key)]); // every worker needs them
     }
-    return new Map(parts.map(([offset, bytes]) => [offset, bytes.slice()])); // alone in their buffers, which are sent
+    return new Map(parts.map(([offset, bytes]) => [offset, bytes.slice()])); // in buffers of their own, to transfer
   }
 
   /**
-   * Read one layer of a tile: 0 is geometry and base colour, 1 to 3 are the SH bands. In any order, as often as wanted.
+   * Read one layer of a tile: 0 is geometry and base colour, 1 to 3 are the SH bands. Layers can be read in any order and
+   * repeatedly.
    *
    * @param {number} index
    * @param {number} layer
    * @param {{form?: LayerForm, signal?: AbortSignal}} [options] packed: integers, see decoder.d.ts
-   * @returns {Promise<any>} the arrays by name, an SH band as `sh` [count, 2l + 1, 3]; null where the tile leaves the
-   *   band out: its coefficients are 0
+   * @returns {Promise<any>} the arrays by name, an SH band as `sh` [count, 2l + 1, 3]; null if the tile leaves the band
+   *   out and its coefficients are 0
    */
   async readLayer(index, layer, { form, signal } = {}) {
     const record = checkedTile(index, this.header);
@@ -247,7 +248,7 @@ export class Reader {
     if (this.compiled === null) return null;
     const { layer } = place;
     const chunks = new Map([[place, chunk]]);
-    // Bands of one codebook share the indices of the lowest of them, which is kept for the others.
+    // Bands with the same codebook share the indices in the lowest of them, whose chunk is kept for the others.
     for (const { bandFirst, bandLast } of record.tables.flatMap((id) => this.codebooks.get(id) ?? [])) {
       if (bandFirst === bandLast || layer < bandFirst || layer > bandLast) continue;
       const lowest = record.layers.find((one) => one.layer === bandFirst);
@@ -264,13 +265,13 @@ export class Reader {
   }
 
   /**
-   * Let WebAssembly decode layers of a tile.
+   * Decode layers of a tile with WebAssembly.
    *
    * @template T
    * @param {TileRecord} record
-   * @param {Map<LayerRecord, Bytes>} chunks of the layers
+   * @param {Map<LayerRecord, Bytes>} chunks chunks of the layers
    * @param {(decoder: WasmDecoder) => T} decode
-   * @returns {Promise<T | null>} null or false where it cannot: then it is up to the modules beside this one
+   * @returns {Promise<T | null>} null or false if WebAssembly cannot decode them: then the JavaScript modules do
    */
   async byCompiled({ tables }, chunks, decode) {
     if (this.compiled === null) return null;
@@ -283,7 +284,7 @@ export class Reader {
   }
 
   /**
-   * Metadata, cameras, the encoder's options, stated errors; null for what the file does not have.
+   * Read metadata, cameras, encoder options and stated errors; null for what the file does not have.
    *
    * @param {{signal?: AbortSignal}} [options]
    */
@@ -298,8 +299,8 @@ export class Reader {
   }
 
   /**
-   * Check what nobody has read so far. CHK-2: a decoder of a whole file checks "the CRC of all chunks, known or not", and
-   * reads "all CODB chunks, used or not".
+   * Check everything that has not been read yet. CHK-2: a decoder of a whole file checks "the CRC of all chunks, known or
+   * not", and reads "all CODB chunks, used or not".
    */
   async checkAll() {
     const { directory, tiles } = this.header;
@@ -316,10 +317,10 @@ export class Reader {
   }
 
   /**
-   * Begin to fetch layers that will be read soon, neighbours in the file with one request, and the codebooks that lie
-   * between them.
+   * Start to fetch layers that will be read soon and the codebooks between them. Neighbours in the file share a
+   * request.
    *
-   * @param {Iterable<LayerRequest>} wanted each is to be read once afterwards
+   * @param {Iterable<LayerRequest>} wanted each must be read once afterwards
    * @param {{signal?: AbortSignal}} [options]
    */
   prefetch(wanted, { signal } = {}) {
@@ -363,7 +364,7 @@ export class Reader {
   }
 
   /**
-   * A chunk of a codebook, fetched once. Without a signal: others may wait for the same chunk.
+   * Fetch a chunk of a codebook once. Without a signal, since others may wait for the same chunk.
    *
    * @param {string} key
    */
@@ -371,16 +372,16 @@ export class Reader {
     let bytes = this.codebookBytes.get(key);
     if (bytes === undefined) {
       const record = this.codebookChunks.get(key);
-      if (!record) throw new InputError(`no codebook ${key}`); // DIR-5 and CBK-1 leave no way here
+      if (!record) throw new InputError(`no codebook ${key}`); // unreachable by DIR-5 and CBK-1
       bytes = this.fetch(record);
       this.codebookBytes.set(key, bytes);
-      bytes.catch(() => this.codebookBytes.delete(key)); // may be tried again
+      bytes.catch(() => this.codebookBytes.delete(key)); // allows another try
     }
     return bytes;
   }
 
   /**
-   * The table of a codebook's chunk, decoded once.
+   * Return the table of a codebook's chunk, decoded once.
    *
    * @param {number} id
    * @param {number} layer
@@ -392,13 +393,13 @@ export class Reader {
     if (table === undefined) {
       table = this.fetchTable(key, id);
       this.tables.set(key, table);
-      table.catch(() => this.tables.delete(key)); // may be tried again
+      table.catch(() => this.tables.delete(key)); // allows another try
     }
     return table;
   }
 
   /**
-   * Tiles may be decoded at the same time, so that none can use another's arrays.
+   * Return a new array: tiles may be decoded concurrently, so they cannot share arrays.
    *
    * @param {number} _key
    * @param {number} length
@@ -443,7 +444,7 @@ export class Reader {
   }
 
   /**
-   * Forget a tile that holds no indices for other layers.
+   * Forget a tile without indices that other layers need.
    *
    * @param {Tile} tile
    */

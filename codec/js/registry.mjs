@@ -3,7 +3,7 @@
 import * as spec from './spec.mjs';
 
 /**
- * A registry entry's name.
+ * Return the name of a registry entry.
  *
  * @param {Record<number, string>} names
  * @param {number} id
@@ -12,9 +12,9 @@ import * as spec from './spec.mjs';
 export const nameOf = (names, id) => (Object.hasOwn(names, id) ? names[id] : undefined);
 
 /**
- * The flags that the registry gives a chunk type.
+ * Return the flags that the registry assigns to a chunk type.
  *
- * @param {string} type a known one
+ * @param {string} type a known type
  */
 export function registeredFlags(type) {
   /** @type {readonly string[]} */

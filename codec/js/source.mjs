@@ -1,22 +1,22 @@
-// Where the bytes of a file come from when they are not in memory: HTTP with Range, or what `whole_sources.mjs` has.
+// Sources of a file that is not in memory: HTTP with Range, or one of those in `whole_sources.mjs`.
 
 import { InputError } from './errors.mjs';
 import { BlobSource, MemorySource, WholeSource, asInputError, bodyParts, shortData } from './whole_sources.mjs';
 
-const GAP_BYTES = 1 << 14; // ranges this close are fetched as one
-const REQUEST_BYTES = 1 << 23; // ranges are not joined beyond this
+const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
+const REQUEST_BYTES = 1 << 23; // bytes; joined ranges do not exceed this
 
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
  * @typedef {import('./decoder.d.ts').ByteRange} ByteRange
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
- * @typedef {(received: number) => void} Received called with the bytes of each part that arrives
+ * @typedef {(received: number) => void} Received called with the number of bytes of each part that arrives
  * @typedef {{fetch: typeof fetch, init: RequestInit, firstBytes: number, received: Received, limit: number}} Way
  */
 
 /**
  * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
- * @param {Way} way how to fetch
+ * @param {Way} way request options
  * @returns {Promise<ByteSource>}
  */
 export async function openSource(from, way) {
@@ -24,12 +24,12 @@ export async function openSource(from, way) {
   if (from instanceof Blob) return new BlobSource(from);
   if (from instanceof ArrayBuffer) return new MemorySource(new Uint8Array(from));
   if (typeof from?.read === 'function') return from;
-  throw new InputError('neither an address, nor a Blob or ArrayBuffer, nor an object with a method read');
+  throw new InputError('the source is not a URL, a Blob, an ArrayBuffer or an object with a method read');
 }
 
 /**
- * Open a URL with one request for the first bytes. A server that ignores the range sends the whole file, which is
- * then read as it arrives.
+ * Open a URL with one request for the first bytes. If the server ignores the range and sends the whole file, the body is
+ * read as it arrives.
  *
  * @param {string | URL} url
  * @param {Way} way
@@ -74,9 +74,9 @@ async function request(url, start, end, way, signal) {
 }
 
 /**
- * @param {Response} response of status 206
+ * @param {Response} response with status 206
  * @param {number} start
- * @returns {{total: number | null}} size of the file where the server says it (across origins it may be hidden)
+ * @returns {{total: number | null}} size of the file if the server reports it (it may be hidden across origins)
  */
 function checkRange(response, start) {
   const range = response.headers.get('content-range');
@@ -89,7 +89,7 @@ function checkRange(response, start) {
 
 /**
  * @param {Response} response
- * @param {number} most bytes; more is not read
+ * @param {number} most maximum number of bytes to read
  * @param {Received} received
  * @returns {Promise<Bytes>}
  */
@@ -106,12 +106,12 @@ async function readBody(response, most, received) {
   return bytes.subarray(0, filled);
 }
 
-/** A server that honours ranges. */
+/** A server that supports ranges. */
 export class HttpSource {
   /**
    * @param {string | URL} url
    * @param {Bytes} head the first bytes
-   * @param {number | null} size of the file, where it is known
+   * @param {number | null} size size of the file, if known
    * @param {Way} way
    * @param {string | null} etag
    */
@@ -122,7 +122,7 @@ export class HttpSource {
     this.way = way;
     this.etag = etag;
     /** @type {{start: number, end: number, bytes: Promise<Bytes>, due: number}[]} */
-    this.fetched = []; // by prefetch, each kept until all its parts have been read
+    this.fetched = []; // prefetched ranges, each kept until all its parts have been read
     /** @type {WholeSource | null} */
     this.whole = null;
   }
@@ -161,7 +161,7 @@ export class HttpSource {
   }
 
   /**
-   * Begin to fetch parts that will be read soon, neighbours with one request.
+   * Start to fetch parts that will be read soon; neighbours share a request.
    *
    * @param {ByteRange[]} wanted
    * @param {AbortSignal} [signal]
@@ -186,7 +186,7 @@ export class HttpSource {
     }
     for (const range of joined) {
       const entry = { ...range, bytes: this.fetch(range.start, range.end, signal) };
-      entry.bytes.catch(() => (this.fetched = this.fetched.filter((one) => one !== entry))); // may be tried again
+      entry.bytes.catch(() => (this.fetched = this.fetched.filter((one) => one !== entry))); // allows another try
       this.fetched.push(entry);
     }
   }

@@ -10,7 +10,7 @@ const AT = spec.STREAM_HEAD_OFFSETS;
 const { TRANSFORM_DELTA, TRANSFORM_ZIGZAG, TRANSFORM_RUN_LENGTH } = spec;
 
 /**
- * Elements of a stream as unsigned integers: `low` holds their lower 32 bits, `high` the others (null up to width 4).
+ * The elements of a stream as unsigned integers: `low` holds their lower 32 bits, `high` the others (null up to width 4).
  *
  * @typedef {{low: Uint32Array, high: Uint32Array | null, width: number, offset: number}} Elements
  * @typedef {import('./payload.mjs').Payload} Payload
@@ -22,10 +22,10 @@ const { TRANSFORM_DELTA, TRANSFORM_ZIGZAG, TRANSFORM_RUN_LENGTH } = spec;
  * Read one stream.
  *
  * @param {Payload} payload at the stream's head
- * @param {number} count elements that the place of the stream requires
- * @param {number} widthMax bytes of an element at most
+ * @param {number} count number of elements required here
+ * @param {number} widthMax maximum bytes per element
  * @param {Inflate} inflate
- * @returns {Promise<Elements>} `offset` is the head's
+ * @returns {Promise<Elements>} with the offset of the head
  */
 export async function readStream(payload, count, widthMax, inflate) {
   const { head, offset } = readHead(payload, widthMax, (found, at) => checkCount(found, count, at));
@@ -34,12 +34,12 @@ export async function readStream(payload, count, widthMax, inflate) {
 }
 
 /**
- * Read the stream of a JSON chunk (spec 5.4) to its value.
+ * Read and parse the stream of a JSON chunk (spec 5.4).
  *
  * @param {Payload} payload
- * @param {number} limit bytes of the text at most
+ * @param {number} limit maximum bytes of the text
  * @param {Inflate} inflate
- * @returns {Promise<{value: unknown, offset: number}>} `offset` is the head's
+ * @returns {Promise<{value: unknown, offset: number}>} with the offset of the head
  */
 export async function readJson(payload, limit, inflate) {
   const { head, offset } = readHead(payload, 1, (found, at) => {
@@ -59,14 +59,14 @@ export async function readJson(payload, limit, inflate) {
 }
 
 /**
- * Read one stream to integers in binary64.
+ * Read one stream as integers in binary64.
  *
  * @param {Payload} payload at the stream's head
  * @param {number} count
  * @param {number} widthMax at most 4
  * @param {boolean} isSigned
  * @param {Inflate} inflate
- * @param {Float64Array} columns to fill
+ * @param {Float64Array} columns filled with the integers
  * @returns {Promise<{columns: Float64Array, width: number, offset: number}>}
  */
 export async function readIntegers(payload, count, widthMax, isSigned, inflate, columns) {
@@ -79,7 +79,7 @@ export async function readIntegers(payload, count, widthMax, isSigned, inflate, 
 /**
  * @param {Payload} payload
  * @param {number} widthMax
- * @param {(count: number, offset: number) => void} checkItsCount refuses a count that does not fit its place
+ * @param {(count: number, offset: number) => void} checkItsCount throws if the count is not allowed here
  */
 function readHead(payload, widthMax, checkItsCount) {
   const { fields: head, offset } = payload.read(
@@ -90,7 +90,7 @@ function readHead(payload, widthMax, checkItsCount) {
   );
   const { width, coder, packed_size, coded_size } = head;
   if (width < 1 || width > widthMax) {
-    throw fault(spec.ERROR_STREAM, offset, 'STR-2', `elements of ${width} bytes, 1 to ${widthMax} may be`);
+    throw fault(spec.ERROR_STREAM, offset, 'STR-2', `elements of ${width} bytes, expected 1 to ${widthMax}`);
   }
   if (!(coder in spec.CODER_NAMES)) throw fault(spec.ERROR_UNSUPPORTED, offset + AT.coder, 'RES-2', `coder ${coder}`);
   checkTransforms(head.transforms, offset + AT.transforms);
@@ -128,7 +128,7 @@ function checkTransforms(transforms, offset) {
   let last = 0;
   for (let i = 0; i < transforms.length; i++) {
     const transform = transforms[i];
-    const after = i > 0 && last === spec.TRANSFORM_NONE; // nothing but NONE may follow NONE
+    const after = i > 0 && last === spec.TRANSFORM_NONE; // only NONE may follow NONE
     if (after ? transform !== spec.TRANSFORM_NONE : transform !== spec.TRANSFORM_NONE && transform <= last) {
       throw fault(spec.ERROR_STREAM, offset, 'STR-3', `transforms ${[...transforms].join(', ')}`);
     }
@@ -139,7 +139,7 @@ function checkTransforms(transforms, offset) {
 /**
  * Undo the coder and RUN_LENGTH.
  *
- * @param {Payload} payload behind the stream's head; ends behind the coded bytes
+ * @param {Payload} payload after the stream's head; left after the coded bytes
  * @param {StreamHead} head
  * @param {number} offset
  * @param {Inflate} inflate
@@ -162,7 +162,8 @@ async function unpack(payload, head, offset, inflate) {
       throw fault(spec.ERROR_CODER, start + error.at, error.clause, error.message, error);
     }
   }
-  if (packed.length !== size) throw new InputError(`options.inflate gave ${packed.length} bytes instead of ${size}`);
+  if (packed.length !== size)
+    throw new InputError(`options.inflate returned ${packed.length} bytes instead of ${size}`);
   if (!head.transforms.includes(TRANSFORM_RUN_LENGTH)) return packed;
   return undoRunLength(packed, head.count * head.width, start);
 }

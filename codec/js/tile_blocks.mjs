@@ -1,4 +1,4 @@
-// One tile: the blocks of its layers, decoded to integers and checked (spec 5.2, 6.4, 7.1, 7.2, 7.4).
+// Decodes the blocks of one tile's layers to integers and checks them (spec 5.2, 6.4, 7.1, 7.2, 7.4).
 
 import { readCodebookBlock } from './codebooks.mjs';
 import {
@@ -33,34 +33,34 @@ const { TILE_HEAD_OFFSETS: AT_HEAD, TILE_RECORD_OFFSETS: AT_RECORD } = spec;
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  * @typedef {import('./streams.mjs').Elements} Elements
  *
- * What a block's decoder may ask of its tile.
+ * The parts of a tile that a block's decoder uses.
  *
  * @typedef {object} TileContext
  * @property {number} splatCount
  * @property {Inflate} inflate
- * @property {Map<number, Indices>} indices of the codebooks that blocks of the tile use so far
- * @property {(attribute: AttributeRecord, n: number) => Float64Array} columns an array for integers of n splats
- * @property {(attribute: AttributeRecord) => Float64Array} sums another one, for entries and their sums
- * @property {(id: number) => CodebookRecord | undefined} codebook one that the tile lists
+ * @property {Map<number, Indices>} indices indices of the codebooks used so far in the tile
+ * @property {(attribute: AttributeRecord, n: number) => Float64Array} columns returns an array for integers of n splats
+ * @property {(attribute: AttributeRecord) => Float64Array} sums returns a second array, for entries and their sums
+ * @property {(id: number) => CodebookRecord | undefined} codebook returns a codebook that the tile lists
  * @property {(id: number, layer: number) => Promise<Table>} table
- * @property {(layer: number) => Promise<void>} needLayer sees to it that the layer, if the tile has it, is decoded
+ * @property {(layer: number) => Promise<void>} needLayer ensures that the layer, if the tile has it, is decoded
  *
- * What tiles share.
+ * The parts that all tiles share.
  *
  * @typedef {object} SceneContext
  * @property {Header} header
  * @property {Map<number, CodebookRecord>} codebooks by id
  * @property {Inflate} inflate
  * @property {TileContext['table']} table
- * @property {(key: number, length: number) => Float64Array} scratch an array of any content, to be used until the
- *   layer is done
+ * @property {(key: number, length: number) => Float64Array} scratch returns an array with arbitrary content, valid until
+ *   the layer is done
  *
- * What a layer decodes to.
+ * The result of decoding a layer.
  *
  * @typedef {{blocks: Block[], extras: Elements[]}} Layer
  */
 
-/** Decodes the layers of one tile and remembers what later layers need of earlier ones. */
+/** Decodes the layers of one tile and keeps the data of earlier layers that later ones need. */
 export class Tile {
   /**
    * @param {SceneContext} scene
@@ -98,11 +98,11 @@ export class Tile {
   }
 
   /**
-   * Decode one layer. Blocks come back with their final integers: R, G, B and the file's lattice.
+   * Decode one layer. The blocks have their final integers: R, G, B, and the lattice of the file.
    *
    * @param {Uint8Array<ArrayBuffer>} bytes payload of the TILE chunk
    * @param {LayerRecord} place
-   * @param {boolean} integers whether all integers are wanted; if not, colours may stay in tables
+   * @param {boolean} integers whether all integers are required; if not, colours may stay in tables
    * @returns {Promise<Layer>}
    */
   async readLayer(bytes, { layer, offset }, integers) {
@@ -142,14 +142,14 @@ export class Tile {
 
   /**
    * @param {Payload} payload at the block's head
-   * @param {AttributeRecord} attribute that the place of the block demands
+   * @param {AttributeRecord} attribute the attribute required here
    * @param {boolean} integers
    * @returns {Promise<Block>}
    */
   async readBlock(payload, attribute, integers) {
     const head = readBlockHead(payload);
     if (head.attribute !== attribute.id) {
-      throw fault(ERROR_STREAM, head.offset, 'TLE-2', `attribute ${head.attribute} in the place of ${attribute.name}`);
+      throw fault(ERROR_STREAM, head.offset, 'TLE-2', `attribute ${head.attribute} instead of ${attribute.name}`);
     }
     checkCoding(head);
     if (head.coding === spec.CODING_CODEBOOK) return readCodebookBlock(this, payload, attribute, integers);
@@ -160,7 +160,7 @@ export class Tile {
   /**
    * @param {Payload} payload at the block's head
    * @param {number} column
-   * @param {ExtraRecord} extra its record
+   * @param {ExtraRecord} extra record of the column
    */
   async readRaw(payload, column, extra) {
     const head = readBlockHead(payload);
@@ -185,7 +185,7 @@ export class Tile {
   }
 
   /**
-   * Take a block's integers to those of the file's lattice, in place, and check what only they show.
+   * Convert a block's integers to the lattice of the file, in place, and check them.
    *
    * @param {Block} block
    * @returns {Block}
@@ -205,7 +205,7 @@ export class Tile {
   }
 
   /**
-   * TIL-10, then n = corner + q (spec 7.4).
+   * Check TIL-10, then add the corner: n = corner + q (spec 7.4).
    *
    * @param {Block} block
    */
@@ -222,7 +222,7 @@ export class Tile {
       }
       // "The means' integers q MUST have on each axis the minimum 0 and the maximum extent."
       if (least !== 0 || most !== extent[axis]) {
-        const what = `axis ${axis}: integers from ${least} to ${most}, the record says 0 to ${extent[axis]}`;
+        const what = `axis ${axis}: integers from ${least} to ${most}, the record has 0 to ${extent[axis]}`;
         throw fault(ERROR_BOX, recordOffset + AT_RECORD.corner, 'TIL-10', what);
       }
       const first = corner[axis];
@@ -233,9 +233,9 @@ export class Tile {
   }
 
   /**
-   * TIL-11
+   * Check the maximum scale of the tile record (TIL-11).
    *
-   * @param {Float64Array} integers of the scales
+   * @param {Float64Array} integers integers of the scales
    * @param {number} step
    */
   checkMaxScale(integers, step) {
@@ -248,7 +248,7 @@ export class Tile {
         ERROR_BOX,
         recordOffset + AT_RECORD.max_scale,
         'TIL-11',
-        `the largest scale is ${value}, the record says ${maxScale}`,
+        `the largest scale is ${value}, the record has ${maxScale}`,
       );
     }
   }

@@ -16,7 +16,7 @@ const AXES = [0, 1, 2];
  * @typedef {import('./decoder.d.ts').LayerRecord} LayerRecord
  * @typedef {import('./payload.mjs').Payload} Payload
  *
- * As the index head states them.
+ * The record sizes in the index head.
  *
  * @typedef {Pick<ReturnType<typeof spec.unpackIndexHead>, 'tile_size' | 'layer_size'>} RecordSizes
  */
@@ -26,8 +26,8 @@ const AXES = [0, 1, 2];
  *
  * @param {Payload} index at the record
  * @param {RecordSizes} sizes
- * @param {Header} header with attributes and extras; the tiles before stand in `tiles`
- * @param {number} place number of the tile
+ * @param {Header} header with attributes and extras, and the previous tiles in `tiles`
+ * @param {number} place index of the tile
  * @returns {TileRecord}
  */
 export function readTile(index, sizes, header, place) {
@@ -75,7 +75,7 @@ export function readTile(index, sizes, header, place) {
 /**
  * @param {bigint[]} corner
  * @param {number[]} extent
- * @param {number} offset of the tile record
+ * @param {number} offset offset of the tile record
  */
 function readCorner(corner, extent, offset) {
   const most = BigInt(spec.INTEGER_MAX);
@@ -154,7 +154,7 @@ function readLayers(index, recordSize, count, header) {
  * TIL-6: "The table ids MUST ascend strictly, and each MUST be the id of a codebook record."
  *
  * @param {TileRecord} tile
- * @param {Set<number>} codebooks their ids
+ * @param {Set<number>} codebooks ids of the codebooks
  */
 export function checkTables({ tables, tablesOffset }, codebooks) {
   tables.forEach((id, i) => {
@@ -165,10 +165,10 @@ export function checkTables({ tables, tablesOffset }, codebooks) {
 }
 
 /**
- * COV-1: the chunks begin behind the index, follow each other without gap or overlap, and end with the file.
+ * Check COV-1: the chunks start at the end of the index, follow each other without gap or overlap, and end with the file.
  *
  * @param {Header} header
- * @param {number} start end of the index
+ * @param {number} start offset of the end of the index
  */
 export function checkCoverage(header, start) {
   const places = [...header.directory, ...header.tiles.flatMap((tile) => tile.layers)];
@@ -176,7 +176,7 @@ export function checkCoverage(header, start) {
     const least = spec.CHUNK_HEADER_SIZE;
     if (size < least) throw fault(ERROR_INDEX, sizeField, 'CHK-3', `a chunk of ${size} bytes, its header has ${least}`);
   }
-  // Offsets of 2^53 and more are rounded. They lie behind the end of the file, or `end` misses it: either is refused.
+  // Offsets from 2^53 on are rounded. They lie beyond the end of the file, or `end` differs from it: both are refused.
   places.sort((a, b) => a.offset - b.offset);
   let end = start;
   for (const { offset, offsetField, size } of places) {

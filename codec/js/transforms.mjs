@@ -8,7 +8,7 @@ const { TRANSFORM_DELTA, TRANSFORM_ZIGZAG, TRANSFORM_BYTE_PLANES } = spec;
 /** @typedef {ReturnType<typeof spec.unpackStreamHead>} StreamHead */
 
 /**
- * Signed integers of up to four bytes.
+ * Return the elements as signed integers of up to four bytes.
  *
  * @param {{low: Uint32Array, width: number}} stream its elements are overwritten
  * @returns {Int32Array}
@@ -21,11 +21,11 @@ export function signed({ low, width }) {
 }
 
 /**
- * Elements as integers in binary64.
+ * Write elements as integers in binary64.
  *
- * @param {Float64Array} out of `count` elements
+ * @param {Float64Array} out `count` elements
  * @param {Uint8Array} bytes
- * @param {StreamHead} head of a width up to 4
+ * @param {StreamHead} head with a width of at most 4
  * @param {boolean} isSigned
  */
 export function putIntegers(out, bytes, head, isSigned) {
@@ -35,7 +35,7 @@ export function putIntegers(out, bytes, head, isSigned) {
     out.set(isSigned ? signed({ low, width }) : low);
     return;
   }
-  // By far the most streams: bytes that stand alone, by a table.
+  // Most streams are single bytes, which a table converts.
   const every = Uint32Array.from({ length: 256 }, (_, byte) => byte);
   if (transforms.includes(TRANSFORM_ZIGZAG)) undoZigzag(every, 1);
   const table = new Float64Array(isSigned ? signed({ low: every, width }) : every);
@@ -43,12 +43,12 @@ export function putIntegers(out, bytes, head, isSigned) {
 }
 
 /**
- * @param {Uint8Array} packed values, low bytes and high bytes of the lengths minus one
+ * @param {Uint8Array} packed values, then low bytes and high bytes of the lengths minus one
  * @param {number} size
  * @param {number} offset
  */
 export function undoRunLength(packed, size, offset) {
-  const runs = packed.length / 3; // whole by STR-5
+  const runs = packed.length / 3; // an integer by STR-5
   let total = 0;
   for (let i = 0; i < runs; i++) total += 1 + packed[runs + i] + 256 * packed[2 * runs + i];
   // TRF-1: "The lengths of the runs MUST add up to count × width"
@@ -88,7 +88,7 @@ export function elements(bytes, { count, width, transforms }) {
 }
 
 /**
- * Bytes `first` to `last` − 1 of each element; byte k of element i lies at i × `step` + k × `plane`.
+ * Return bytes `first` to `last` − 1 of each element; byte k of element i is at i × `step` + k × `plane`.
  *
  * @param {Uint8Array} bytes
  * @param {number} count

@@ -1,5 +1,5 @@
 // The C decoder compiled to WebAssembly (wasm/, codec/c), for floats and packed arrays. Files that it refuses are decoded
-// again by the JavaScript modules, which report what is wrong and where.
+// again by the JavaScript modules, which report the error and its offset.
 
 import { shRows } from './arrays.mjs';
 import * as spec from './spec.mjs';
@@ -12,9 +12,9 @@ import { WASM } from './wasm_binary.mjs';
  * @typedef {import('./decoder.d.ts').PackedGeometry} PackedGeometry
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
- * @typedef {Map<number, Bytes>} Parts of the file, by their offset
+ * @typedef {Map<number, Bytes>} Parts chunks by their offset in the file
  *
- * What wasm/interface.c exports. Functions return an address, or 0 where they refuse.
+ * The exports of wasm/interface.c. Functions return an address, or 0 if they refuse the data.
  *
  * @typedef {object} Exports
  * @property {WebAssembly.Memory} memory
@@ -29,7 +29,7 @@ import { WASM } from './wasm_binary.mjs';
  * @property {(id: number, band: number) => number} read_packed_codebook
  */
 
-/** csplat_columns and csplat_packed of csplat.h, as they lie in memory. */
+/** The layout in memory of csplat_columns and csplat_packed of csplat.h. */
 const COLUMNS = { data: 0, width: 4, columns: 8, count: 12, offset: 16, step: 184 };
 const PACKED = { rows: 192, index: 196, indexWidth: 200, codebook: 204, size: 208 };
 const GEOMETRY = ['opacities', 'scales', 'quats', 'means', 'sh0'];
@@ -39,18 +39,18 @@ const ARRAYS = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };
 /** @type {Promise<WebAssembly.Module | null> | null} */
 let compiling = null;
 
-/** @type {WeakRef<WasmDecoder> | null} one that is closed: its memory is there already */
+/** @type {WeakRef<WasmDecoder> | null} a closed decoder, whose memory can be reused */
 let spare = null;
 
-/** The module; null where the platform, or the page's policy, has no WebAssembly of this kind. */
+/** Compile the module; null if the platform or the page's policy does not allow it. */
 function compiledModule() {
   compiling ??= (async () => {
     try {
       const text = atob(WASM);
       const bytes = new Uint8Array(text.length);
-      for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i); // Uint8Array.from takes several times as long
+      for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i); // Uint8Array.from is several times slower
       const module = await WebAssembly.compile(bytes);
-      spare = new WeakRef(new WasmDecoder(module)); // here, not before, WebKit heeds the policy
+      spare = new WeakRef(new WasmDecoder(module)); // WebKit applies the policy only when the module is instantiated
       return module;
     } catch {
       return null;
@@ -65,7 +65,7 @@ export class WasmDecoder {
    * @param {number} fileSize
    * @param {Bytes} head the file's first bytes
    * @param {Bytes} index
-   * @returns {Promise<WasmDecoder | null>} null where the platform cannot, or the file is refused
+   * @returns {Promise<WasmDecoder | null>} null if the platform has no WebAssembly, or the file is refused
    */
   static async open(fileSize, head, index) {
     const module = await compiledModule();
@@ -95,18 +95,18 @@ export class WasmDecoder {
     /** @type {Set<number>} */
     this.seen = new Set();
     this.isBroken = false;
-    /** @type {Map<string, PackedColumns>} entries of codebooks by id and band */
+    /** @type {Map<string, PackedColumns>} codebook entries by id and band */
     this.codebooks = new Map();
   }
 
   /**
-   * Decode something. All other methods want to be called from `decode`.
+   * Call `decode` with access to `parts`. All other methods must be called from it.
    *
    * @template T
-   * @param {Parts} parts what may be read
-   * @param {Set<number>} checked gets the offsets of those that were read, unless something was refused
+   * @param {Parts} parts the chunks that may be read
+   * @param {Set<number>} checked receives the offsets of the chunks that were read, unless any was refused
    * @param {(decoder: WasmDecoder) => T} decode
-   * @returns {T | null} null where it broke down
+   * @returns {T | null} null after a trap
    */
   reading(parts, checked, decode) {
     if (this.isBroken) return null;
@@ -117,7 +117,7 @@ export class WasmDecoder {
       return made;
     } catch (error) {
       if (!(error instanceof WebAssembly.RuntimeError)) throw error;
-      this.isBroken = true; // a trap: its memory may hold anything
+      this.isBroken = true; // after a trap the memory is in an undefined state
       return null;
     } finally {
       this.parts = new Map();
@@ -125,7 +125,7 @@ export class WasmDecoder {
     }
   }
 
-  /** Forget the file. Nothing may be called after it. */
+  /** Forget the file. No method may be called afterwards. */
   close() {
     if (this.isBroken) return;
     this.exports.close();
@@ -133,7 +133,7 @@ export class WasmDecoder {
     spare = new WeakRef(this);
   }
 
-  /** Check and read what no tile needs: codebooks, texts, chunks of unknown types. */
+  /** Read and check everything outside the tiles: codebooks, texts, chunks of unknown types. */
   check() {
     return this.exports.check() !== 0;
   }
@@ -142,8 +142,8 @@ export class WasmDecoder {
    * Decode a tile.
    *
    * @param {TileRecord} tile
-   * @param {FloatArrays} arrays to fill
-   * @param {number} first splat of the arrays that is the tile's first
+   * @param {FloatArrays} arrays filled with the tile
+   * @param {number} first index in the arrays of the tile's first splat
    */
   readTile({ index, splatCount: n }, arrays, first) {
     let at = this.exports.read_tile(index, arrays.shDegree);
@@ -226,7 +226,7 @@ export class WasmDecoder {
     return table;
   }
 
-  /** @param {number} at of a csplat_columns */
+  /** @param {number} at address of a csplat_columns */
   columnsAt(at) {
     const view = new DataView(this.exports.memory.buffer, at);
     const [data, width, columns, count] = [COLUMNS.data, COLUMNS.width, COLUMNS.columns, COLUMNS.count].map((place) =>
@@ -241,7 +241,7 @@ export class WasmDecoder {
   }
 
   /**
-   * @param {number} width bytes of an element
+   * @param {number} width bytes per element
    * @param {number} at
    * @param {number} length
    * @returns {any}

@@ -1,4 +1,4 @@
-// Sources that have the whole file, sooner or later: a body from a server without ranges, memory, a Blob.
+// Sources that hold the whole file: a body from a server without ranges, memory, a Blob.
 
 import { readFileHeader } from './container.mjs';
 import { CsplatError, InputError, LimitError, allocate, fault } from './errors.mjs';
@@ -6,20 +6,20 @@ import { ERROR_LIMIT, ERROR_TRAILING, ERROR_TRUNCATED, HEADER_SIZE } from './spe
 
 /**
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
- * @typedef {(received: number) => void} Received called with the bytes of each part that arrives
+ * @typedef {(received: number) => void} Received called with the number of bytes of each part that arrives
  */
 
 /**
- * The error for data that ends before what the index announces.
+ * Return the error for data that is shorter than the index requires.
  *
- * @param {number} offset where it ends
- * @param {number} size
+ * @param {number} offset length of the data
+ * @param {number} size bytes that were requested
  */
 export const shortData = (offset, size) =>
-  fault(ERROR_TRUNCATED, offset, 'HDR-5', `${size} bytes were asked for, the data ends before`);
+  fault(ERROR_TRUNCATED, offset, 'HDR-5', `${size} bytes were requested, the data ends earlier`);
 
 /**
- * An abort stays what it is; everything else that a network does is E_INPUT.
+ * Turn a network error into E_INPUT; keep aborts and errors of the decoder.
  *
  * @param {unknown} error
  * @param {string | URL} url
@@ -30,7 +30,7 @@ export function asInputError(error, url) {
 }
 
 /**
- * The parts of a body as they arrive; the rest is dropped when the loop is left.
+ * Yield the parts of a body as they arrive; the rest is cancelled if the loop is left early.
  *
  * @param {Response} response
  */
@@ -46,11 +46,11 @@ export async function* bodyParts(response) {
   }
 }
 
-/** A body with the whole file in it, usable from its first part on. */
+/** A body with the whole file, usable as soon as its first part has arrived. */
 export class WholeSource {
   /**
    * @param {Response} response
-   * @param {{limit: number, received: Received}} way the largest file, and what to call with each part
+   * @param {{limit: number, received: Received}} way maximum size of the file, and the callback for each part
    */
   static async open(response, way) {
     const source = new WholeSource();
@@ -105,7 +105,7 @@ export class WholeSource {
     return this.bytes.subarray(offset, end);
   }
 
-  /** Everything is on its way. */
+  /** Do nothing: the whole file is already on its way. */
   prefetch() {}
 
   /**
@@ -124,7 +124,7 @@ export class WholeSource {
   take(arrived) {
     for (const part of arrived) {
       if (part.length > this.bytes.length - this.filled) {
-        throw fault(ERROR_TRAILING, this.bytes.length, 'HDR-6', 'the server sends bytes behind the end of the file');
+        throw fault(ERROR_TRAILING, this.bytes.length, 'HDR-6', 'the server sends bytes after the end of the file');
       }
       this.bytes.set(part, this.filled);
       this.filled += part.length;
@@ -172,7 +172,7 @@ export class MemorySource {
   }
 }
 
-/** A File or Blob: a file that was dropped on a page. */
+/** A File or Blob, such as a file dropped on a page. */
 export class BlobSource {
   /** @param {Blob} blob */
   constructor(blob) {

@@ -1,4 +1,4 @@
-// Tiles decoded by workers. csplat-worker.mjs is their side, and imports nothing that imports this: bundlers would not end.
+// Decodes tiles in workers. csplat-worker.mjs runs in the worker and does not import this module: bundlers would not end.
 
 import { buffersOf } from './arrays.mjs';
 
@@ -11,18 +11,18 @@ import { buffersOf } from './arrays.mjs';
  * @typedef {import('./decoder.d.ts').PackedColumns} PackedColumns
  */
 
-const IDLE_MS = 5000; // a worker without work ends after so long: to start one takes as long as to decode 100,000 splats
+const IDLE_MS = 5000; // an idle worker ends after this; starting one takes about as long as decoding 100,000 splats
 
-/** A worker that answers requests, one after the other. */
+/** A worker that answers requests one at a time. */
 class Correspondent {
-  /** @param {any} worker of a browser, or of Node */
+  /** @param {any} worker a worker of the browser or of Node */
   constructor(worker) {
     this.worker = worker;
     /** @type {(answer: Answer | null) => void} */
     this.answered = () => {};
     const message = (/** @type {Answer} */ answer) => this.answered(answer);
     const failed = (/** @type {Event | Error} */ event) => {
-      if ('preventDefault' in event) event.preventDefault(); // the console needs no line: decode goes on without it
+      if ('preventDefault' in event) event.preventDefault(); // not logged: decoding continues without it
       this.answered(null);
     };
     if (worker.addEventListener) {
@@ -36,7 +36,7 @@ class Correspondent {
 
   /**
    * @param {Request} request
-   * @returns {Promise<Answer | null>} null where the worker has failed, or never started
+   * @returns {Promise<Answer | null>} null if the worker has failed or never started
    */
   ask(request) {
     return new Promise((resolve) => {
@@ -46,7 +46,7 @@ class Correspondent {
   }
 }
 
-/** @type {Map<Correspondent, ReturnType<typeof setTimeout>>} workers without work, and what will end them */
+/** @type {Map<Correspondent, ReturnType<typeof setTimeout>>} idle workers, and the timers that end them */
 const idle = new Map();
 
 /** @returns {Promise<Correspondent>} */
@@ -61,7 +61,7 @@ async function take() {
 
 /** @param {Correspondent} worker */
 function giveBack(worker) {
-  worker.worker.unref?.(); // Node may end
+  worker.worker.unref?.(); // Node may exit
   const end = () => {
     idle.delete(worker);
     worker.worker.terminate();
@@ -77,20 +77,20 @@ async function start() {
   if (process?.versions?.node === undefined) {
     return new Correspondent(new Worker(new URL('./csplat-worker.mjs', import.meta.url), { type: 'module' }));
   }
-  const [name, side] = ['node:worker_threads', './csplat-worker.mjs']; // so that bundlers for browsers do not look for them
+  const [name, side] = ['node:worker_threads', './csplat-worker.mjs']; // hides them from bundlers
   const threads = await import(/* webpackIgnore: true */ /* @vite-ignore */ name);
   return new Correspondent(new threads.Worker(new URL(side, import.meta.url)));
 }
 
 /**
- * Let a worker decode a tile. Where it refuses, or has failed, the result has no fields.
+ * Decode a tile in a worker. If it refuses the tile, or has failed, the result has no fields.
  *
  * @param {Reader} reader
  * @param {Correspondent} worker
  * @param {TileRecord} tile
  * @param {Wanted} wanted
  * @param {boolean} isFirst
- * @param {any} spare fields of another tile, whose memory the worker may use again
+ * @param {any} spare fields of another tile, whose memory the worker may reuse
  * @returns {Promise<{worker: Correspondent, tile: TileRecord, fields?: any}>}
  */
 async function decodeTile(reader, worker, tile, wanted, isFirst, spare) {
@@ -102,7 +102,7 @@ async function decodeTile(reader, worker, tile, wanted, isFirst, spare) {
     if (answer?.fields) for (const offset of offsets) reader.checked.add(offset);
     return { worker, tile, fields: answer?.fields };
   } catch {
-    return { worker, tile }; // what is wrong shows itself again where there is no worker
+    return { worker, tile }; // decoding in this thread reports the error
   }
 }
 
@@ -110,12 +110,12 @@ async function decodeTile(reader, worker, tile, wanted, isFirst, spare) {
  * Decode tiles in workers.
  *
  * @param {Reader} reader
- * @param {TileRecord[]} waiting from the last to the first; what is left there afterwards no worker could decode
+ * @param {TileRecord[]} waiting tiles in reverse order; afterwards, the tiles that no worker could decode
  * @param {Wanted} wanted
- * @param {number} count workers at most
+ * @param {number} count maximum number of workers
  * @param {AbortSignal} [signal]
- * @param {any[]} [spares] fields that the caller has copied and gives back
- * @returns {AsyncGenerator<{tile: TileRecord, fields: any, worker: object}, void>} in the order in which they are done
+ * @param {any[]} [spares] fields that the caller has copied and no longer needs
+ * @returns {AsyncGenerator<{tile: TileRecord, fields: any, worker: object}, void>} in the order of completion
  */
 export async function* byWorkers(reader, waiting, wanted, count, signal, spares = []) {
   /** @type {Map<Correspondent, ReturnType<typeof decodeTile>>} */
@@ -153,8 +153,8 @@ export async function* byWorkers(reader, waiting, wanted, count, signal, spares 
 }
 
 /**
- * What messages do not carry: the prototype of the extra columns, and that codebooks, which a worker sends once each, are
- * the same objects for all tiles.
+ * Restore what messages do not carry: the prototype of the extra columns, and the identity of codebook tables, which a
+ * worker sends once and which are the same objects for all tiles.
  *
  * @param {any} fields changed
  * @param {Map<string, PackedColumns>} tables

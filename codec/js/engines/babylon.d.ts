@@ -1,4 +1,4 @@
-// Types of the plugin for Babylon.js. To import the module registers it.
+// Types of the plugin for Babylon.js. Importing the module registers the plugin.
 
 import type { AssetContainer } from '@babylonjs/core/assetContainer.js';
 import type { IFileRequest } from '@babylonjs/core/Misc/fileRequest.js';
@@ -8,11 +8,11 @@ import type { LoadOptions, SceneFacts } from './options.d.ts';
 
 /** `pluginOptions: { csplat: … }` of the scene loader. */
 export interface CSPLATLoadingOptions extends LoadOptions {
-  /** As GaussianSplattingMesh has it. */
+  /** As for GaussianSplattingMesh. */
   keepInRam?: boolean;
 }
 
-/** `dispose(false, true)` frees it with its material. */
+/** A mesh; `dispose(false, true)` frees it with its material. */
 export type CSPLATMesh = GaussianSplattingMesh & { metadata: { csplat: SceneFacts } };
 
 export interface CSPLATImport {
@@ -27,8 +27,8 @@ export interface CSPLATImport {
 }
 
 /**
- * The plugin. Disposal of scene or mesh and `signal` end a load. A file's `CsplatError` is the `innerError` of what the scene
- * loader rejects with.
+ * The plugin. A load ends if the scene or mesh is disposed, or by `signal`. If a file is invalid, the scene loader rejects
+ * with an error whose `innerError` is the `CsplatError`.
  */
 export class CSPLATFileLoader {
   constructor(options?: CSPLATLoadingOptions);

@@ -1,4 +1,4 @@
-// A plugin of Babylon.js's scene loader for .csplat; to import this module registers it. See babylon.d.ts.
+// A plugin of Babylon.js's scene loader for .csplat. Importing this module registers it. See babylon.d.ts.
 //
 //   import 'csplat-decoder/babylon';
 //   const { meshes: [splats] } = await ImportMeshAsync('scene.csplat', scene);
@@ -13,8 +13,8 @@ import { openScene } from './scene.mjs';
 import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
 
 const NAME = 'csplat';
-const ROW_BYTES = 32; // centre and scales as float32, colour, alpha and rotation as bytes
-const SH_BYTES = 16; // of a splat in one texture
+const ROW_BYTES = 32; // per splat: centre and scales as float32; colour, alpha and rotation as bytes
+const SH_BYTES = 16; // per splat in one texture
 const SH_ZERO = 128;
 
 /**
@@ -32,13 +32,13 @@ export class CSPLATFileLoader {
     this.options = options;
   }
 
-  /** @param {Record<string, any>} options of all plugins, by their names */
+  /** @param {Record<string, any>} options options of all plugins, by their names */
   createPlugin(options) {
     return new CSPLATFileLoader(options[NAME]);
   }
 
   /**
-   * Open a file, which importMeshAsync reads then, piece after piece.
+   * Open a file; importMeshAsync then reads it tile by tile.
    *
    * @param {Scene} scene
    * @param {string | Blob | ArrayBufferView} from
@@ -119,14 +119,14 @@ async function meshOf(scene, opened, keepInRam = false) {
   const rows = await rowsOf(opened, bands);
   if (scene.isDisposed) {
     opened.release();
-    throw new Error('the scene was disposed of before its splats had come');
+    throw new Error('the scene was disposed before its splats had loaded');
   }
   const mesh = new GaussianSplattingMesh('GaussianSplatting', null, scene, keepInRam);
   mesh.onDisposeObservable.addOnce(() => opened.abort());
   try {
     if (header.antialiased) /** @type {any} */ (mesh.material).compensation = true;
     await mesh.updateDataAsync(rows, bands.textures, undefined, degree);
-    // Babylon's vectors are rows: column by column.
+    // Babylon multiplies row vectors, so the matrix is given column by column.
     const upright = Matrix.FromValues(a[0], b[0], c[0], 0, a[1], b[1], c[1], 0, a[2], b[2], c[2], 0, 0, 0, 0, 1);
     mesh.rotationQuaternion = new Quaternion();
     upright.decompose(mesh.scaling, mesh.rotationQuaternion);
@@ -143,7 +143,7 @@ async function meshOf(scene, opened, keepInRam = false) {
 /**
  * @param {SplatScene} opened
  * @param {Bands} bands
- * @returns {Promise<ArrayBuffer>} a row for each splat
+ * @returns {Promise<ArrayBuffer>} one row per splat
  */
 async function rowsOf(opened, bands) {
   const { header } = opened;
@@ -171,7 +171,7 @@ async function rowsOf(opened, bands) {
  * @param {GaussianSplattingMesh} mesh
  * @param {ArrayBuffer} rows
  * @param {SplatScene} opened
- * @param {number} width of textures
+ * @param {number} width width of the textures
  */
 async function addBands(mesh, rows, opened, width) {
   const bands = new Bands(opened.header.splatCount, opened.degree, width);
@@ -181,16 +181,16 @@ async function addBands(mesh, rows, opened, width) {
   await mesh.updateDataAsync(rows, bands.textures, undefined, opened.degree);
 }
 
-/** SH in bytes, as textures. */
+/** SH coefficients as bytes, in textures. */
 class Bands {
   /**
    * @param {number} count
    * @param {number} degree
-   * @param {number} width of textures
+   * @param {number} width width of the textures
    */
   constructor(count, degree, width) {
     const values = 3 * ((degree + 1) ** 2 - 1);
-    const size = SH_BYTES * width * (Math.floor(count / width) + 1); // a splat more than there are, as the mesh has it
+    const size = SH_BYTES * width * (Math.floor(count / width) + 1); // room for one more splat, as in the mesh
     const textures = Array.from({ length: Math.ceil(values / SH_BYTES) }, () => new Uint8Array(size).fill(SH_ZERO));
     this.textures = textures.length > 0 ? textures : undefined;
     const clamped = textures.map(({ buffer }) => new Uint8ClampedArray(buffer));
@@ -209,7 +209,7 @@ class Bands {
   }
 }
 
-/** In bytes, −1 to 1. @param {number} value */
+/** Map −1 to 1 to a byte. @param {number} value */
 const signed = (value) => 127.5 * value + 127.5;
 
 RegisterSceneLoaderPlugin(new CSPLATFileLoader());

@@ -1,4 +1,4 @@
-// Packed tiles seen in a mirror, −x for x: for left-handed scenes in engines that can only turn splats.
+// Mirrors packed tiles in x, for left-handed scenes in engines that can rotate splats but not mirror them.
 
 /**
  * @typedef {import('../decoder.d.ts').Packed} Packed
@@ -6,9 +6,9 @@
  * @typedef {import('../decoder.d.ts').PackedGeometry} PackedGeometry
  */
 
-const ODD = [[], [2], [0, 3], [1, 4, 6]]; // coefficients of a band whose function of the direction is odd in x
+const ODD = [[], [2], [0, 3], [1, 4, 6]]; // per band, the coefficients whose basis function is odd in x
 
-/** @type {WeakMap<PackedColumns, PackedColumns>} of codebooks' tables, which many tiles have */
+/** @type {WeakMap<PackedColumns, PackedColumns>} mirrored codebook tables, which many tiles share */
 const tables = new WeakMap();
 
 /**
@@ -19,7 +19,7 @@ const tables = new WeakMap();
 export const mirroredGeometry = (tile) => ({
   ...tile,
   means: negated(tile.means, [0]),
-  quats: negated(tile.quats, [1, 2]), // the axis of a rotation is mirrored, its angle turns the other way
+  quats: negated(tile.quats, [1, 2]), // mirrors the axis and reverses the angle
 });
 
 /**
@@ -39,7 +39,7 @@ export function mirroredBand(band, layer) {
 }
 
 /**
- * Columns with −(offset + element) where some have offset + element: exactly, and as narrow.
+ * Negate the values of the columns in `which`, exactly and without widening them.
  *
  * @param {PackedColumns} packed
  * @param {number[]} which

@@ -1,27 +1,27 @@
-// What the adapters for engines have in common.
+// Types that the adapters for engines share.
 
 import type { ByteSource, Header, ReaderOptions } from '../decoder.d.ts';
 
-/** `signal` holds for all of a load. */
+/** Options of a load; `signal` aborts all of it. */
 export interface LoadOptions extends Omit<ReaderOptions, 'inflate'> {
   /** SH bands above this degree are not fetched. */
   shDegree?: number;
-  /** Resolve as soon as geometry and base colour are there; SH bands follow, see `complete`. */
+  /** Resolve as soon as geometry and base colour are available; SH bands follow, see `complete`. */
   progressive?: boolean;
-  /** That decode; 2 by default, 0 for none. */
+  /** Number of decoding workers. Default: 2. */
   workers?: number;
 }
 
-/** What a scene may come from. */
+/** The source of a scene. */
 export type SceneSource = string | URL | Blob | ArrayBuffer | ByteSource;
 
-/** What stands beside an engine's object, as `csplat`. */
+/** The property `csplat` of an engine's object. */
 export interface SceneFacts<T = void> {
-  /** `axes`, `antialiased`, `origin` (what positions are relative to), `unitMetres`, `splatCount`, `shDegree`, … */
+  /** `axes`, `antialiased`, `origin` (the position that coordinates are relative to), `unitMetres`, `splatCount`, `shDegree`, … */
   header: Header;
   metadata: Record<string, unknown> | null;
-  /** A ball around most splats, as they stand upright: for a first camera. */
+  /** A sphere around most splats of the upright scene, for an initial camera. */
   bounds: { center: number[]; radius: number };
-  /** Resolves when the SH bands are there too: at once, unless the load was progressive. Disposal ends it. */
+  /** Resolves when the SH bands are loaded: at once, unless the load was progressive. Disposal ends it. */
   complete: Promise<T>;
 }

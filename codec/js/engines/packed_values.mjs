@@ -1,4 +1,4 @@
-// Packed tiles as numbers of any kind and layout: what the adapters for other people's engines have in common.
+// Converts packed tiles to numbers of any type and layout, for the adapters of engines.
 
 /**
  * @typedef {import('../decoder.d.ts').AttributeRecord} AttributeRecord
@@ -7,24 +7,24 @@
  * @typedef {import('../decoder.d.ts').PackedColumns} PackedColumns
  * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
  * @typedef {Float32Array | Float64Array | Uint8Array | Uint8ClampedArray | Uint16Array | Uint32Array} Numbers
- * @typedef {{array: Numbers, stride: number, start: number}} Place of a value: splat i's is array[i * stride + start]
- * @typedef {(value: number) => number} Change of a value into the engine's; integers of `opacities` come as they are
+ * @typedef {{array: Numbers, stride: number, start: number}} Place target of a value: array[i * stride + start] for splat i
+ * @typedef {(value: number) => number} Change conversion to the engine's value; receives integers for `opacities`
  */
 
 const SH_C0 = 0.28209479177387814;
 const ROWS_AT_ONCE = 1024;
 
-/** Of a display, 0 to 1 for what can be shown. @param {number} sh0 */
+/** Display colour, 0 to 1 within the displayable range. @param {number} sh0 */
 export const displayColour = (sh0) => 0.5 + SH_C0 * sh0;
 
-/** Alpha from the integers of `opacities`. @param {Header} header @returns {Change} */
+/** Return the conversion from the integers of `opacities` to alpha. @param {Header} header @returns {Change} */
 export function alphaOf({ attributes }) {
   const { levels, mapping } = /** @type {AttributeRecord} */ (attributes.find(({ name }) => name === 'opacities'));
   return mapping === 'square' ? (q) => (q * q) / (levels * levels) : (q) => q / levels;
 }
 
 /**
- * Places of values that lie beside each other.
+ * Return the places of adjacent values.
  *
  * @param {Numbers} array
  * @param {number} stride
@@ -36,10 +36,10 @@ export const places = (array, stride, start, width = 3) =>
   Array.from({ length: width }, (_, column) => ({ array, stride, start: start + column }));
 
 /**
- * Put the columns of one attribute where the engine has them.
+ * Write the columns of one attribute to an engine's arrays.
  *
  * @param {PackedColumns} packed
- * @param {Place[]} to for each column
+ * @param {Place[]} to target of each column
  * @param {number} first splat
  * @param {Change} change
  */
@@ -58,10 +58,10 @@ export function putColumns(packed, to, first, change) {
 }
 
 /**
- * Put an SH band where the engine has it. Coefficients that are not in the file are left as they are.
+ * Write an SH band to an engine's arrays. Coefficients that are not in the file are left unchanged.
  *
  * @param {Packed} band
- * @param {Place[]} to for each value of a splat, coefficient after coefficient, R, G, B of each
+ * @param {Place[]} to targets of a splat's values: R, G, B of each coefficient in turn
  * @param {number} first splat
  * @param {Change} change
  */
@@ -90,11 +90,11 @@ export function putBand(band, to, first, change) {
 }
 
 /**
- * Put rotations: unit quaternions, w x y z.
+ * Write rotations as unit quaternions, w x y z.
  *
  * @param {PackedColumns} quats
  * @param {Header} header
- * @param {Place[]} to for w, x, y, z
+ * @param {Place[]} to targets of w, x, y, z
  * @param {number} first splat
  * @param {Change} change
  */
@@ -109,7 +109,7 @@ export function putQuats(quats, header, to, first, change) {
 }
 
 /**
- * Put covariance matrices: xx, xy, xz, yy, yz, zz, beside each other.
+ * Write covariance matrices as xx, xy, xz, yy, yz, zz per splat.
  *
  * @param {Pick<PackedTile, 'count' | 'quats' | 'scales'>} tile
  * @param {Header} header
@@ -155,7 +155,7 @@ export function putCovariances({ count, quats, scales }, header, out, first) {
 }
 
 /**
- * Call with the column of each splat's smallest scale, which is to be read as zero in flat scenes.
+ * Call `put` with the column of each splat's smallest scale, which counts as zero in flat scenes.
  *
  * @param {Pick<PackedTile, 'count' | 'scales'>} tile
  * @param {(splat: number, column: number) => void} put
@@ -169,13 +169,13 @@ export function eachThinnest({ count, scales: { columns, offsets } }, put) {
 }
 
 /**
- * The linear map that stands a scene upright in an engine whose +y is up: what its axes say, RDF where they are not known,
- * and then the shortest turn to where the metadata has `up`.
+ * Return the linear map that makes a scene upright in an engine whose +y is up. It converts the axes of the file, RDF if they
+ * are unknown, and then applies the shortest rotation of the metadata's `up` to +y.
  *
  * @param {Header} header
  * @param {Record<string, unknown> | null} metadata
- * @param {'RUB' | 'RUF'} engine letters of its directions +x, +y, +z
- * @returns {number[][]} 3 × 3, by rows; of determinant −1 where either of both is left-handed
+ * @param {'RUB' | 'RUF'} engine letters of the engine's directions +x, +y, +z
+ * @returns {number[][]} 3 × 3, by rows; with determinant −1 if exactly one of the two is left-handed
  */
 export function uprightIn({ axes }, metadata, engine) {
   const opposite = /** @type {Record<string, string>} */ ({ R: 'L', L: 'R', U: 'D', D: 'U', F: 'B', B: 'F' });
@@ -184,7 +184,7 @@ export function uprightIn({ axes }, metadata, engine) {
   const up = upOf(metadata);
   if (up === null) return map;
   const [x, y, z] = map.map((row) => row[0] * up[0] + row[1] * up[1] + row[2] * up[2]);
-  const a = y > -1 + 1e-9 ? 1 / (1 + y) : 0; // turned over about x
+  const a = y > -1 + 1e-9 ? 1 / (1 + y) : 0; // half a turn about x
   const turn = [
     [1 - a * x * x, -x, -a * x * z],
     [x, y, z],
@@ -194,7 +194,7 @@ export function uprightIn({ axes }, metadata, engine) {
 }
 
 /**
- * The direction that the metadata has as up, of length 1; null where it has none.
+ * Return the up direction in the metadata, normalised, or null if there is none.
  *
  * @param {Record<string, unknown> | null} metadata
  * @returns {number[] | null}
@@ -210,9 +210,9 @@ function upOf(metadata) {
 const said = new Set();
 
 /**
- * Say something in the console, once.
+ * Log a message to the console, once.
  *
- * @param {string} name of the adapter
+ * @param {string} name name of the adapter
  * @param {string} text
  */
 export function onceSaid(name, text) {
@@ -222,7 +222,7 @@ export function onceSaid(name, text) {
 }
 
 /**
- * The engine's value of an element.
+ * Return a function from a column's elements to the engine's values.
  *
  * @param {PackedColumns} packed
  * @param {number} column
@@ -237,7 +237,7 @@ function valueOf({ offsets, step }, column, change) {
 }
 
 /**
- * Values of all that a column may hold, where it is long enough for that to be worthwhile.
+ * Return a table of the values of all possible elements, if the column is long enough to make up for the cost.
  *
  * @param {PackedColumns['columns']} column
  * @param {Change} value
@@ -251,13 +251,13 @@ function tableOf(column, value, target) {
   return table;
 }
 
-/** Copies between arrays of one kind change no numbers. @param {Numbers} array @param {number} length @returns {Numbers} */
+/** A new array of the same type, so that copies are exact. @param {Numbers} array @param {number} length @returns {Numbers} */
 const alike = (array, length) => new /** @type {any} */ (array.constructor)(length);
 
 /**
- * Columns of rows that stay in the processor's cache meanwhile.
+ * Call `put` for each column of a block of rows that fits the cache, block after block.
  *
- * @param {number} n rows
+ * @param {number} n number of rows
  * @param {Place[]} to
  * @param {(from: number, end: number, place: Place, column: number) => void} put
  */
@@ -283,7 +283,7 @@ function gather(array, at, stride, table, index, from, end) {
 /**
  * @param {PackedColumns} quats
  * @param {Header} header
- * @returns {(splat: number, out: Float64Array) => void} that writes w x y z
+ * @returns {(splat: number, out: Float64Array) => void} writes w x y z
  */
 function quatReader({ columns, offsets: [x0, y0, z0] }, { attributes }) {
   const { levels } = /** @type {AttributeRecord} */ (attributes.find(({ name }) => name === 'quats'));

@@ -1,4 +1,5 @@
-// A file's integers as textures for PlayCanvas, as narrow as the scene allows. Without the engine, so that they can be tested.
+// Stores a file's integers in textures for PlayCanvas, in the narrowest format that the scene allows. Independent of the
+// engine, for testing.
 
 import { places, putColumns } from './packed_values.mjs';
 
@@ -8,17 +9,17 @@ import { places, putColumns } from './packed_values.mjs';
  * @typedef {import('../decoder.d.ts').Packed} Packed
  * @typedef {import('../decoder.d.ts').PackedColumns} PackedColumns
  * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
- * @typedef {Uint8Array | Uint16Array | Uint32Array | Float32Array} Texels four to a texel
+ * @typedef {Uint8Array | Uint16Array | Uint32Array | Float32Array} Texels four elements per texel
  * @typedef {{width: number, height: number, texels: Texels}} Image
  * @typedef {{low: number, step: number, bits: number}} Lattice value = (low + texel) * step
  */
 
 /**
- * Geometry and base colours.
+ * Return the images of geometry and base colours.
  *
  * @param {Header} header
- * @param {PackedTile[]} tiles all of them
- * @param {number} maxSize of a texture
+ * @param {PackedTile[]} tiles all tiles
+ * @param {number} maxSize maximum texture size
  */
 export function imagesOf(header, tiles, maxSize) {
   const count = header.splatCount;
@@ -60,11 +61,11 @@ export function imagesOf(header, tiles, maxSize) {
 }
 
 /**
- * SH bands. Takes the place of some parameters.
+ * Return the images of SH bands, with their parameters, which replace some of those of `imagesOf`.
  *
  * @param {Header} header
- * @param {(Packed | null | undefined)[][]} layers a list for each band, tile after tile
- * @param {number} maxSize of a texture
+ * @param {(Packed | null | undefined)[][]} layers for each band, the bands of all tiles
+ * @param {number} maxSize maximum texture size
  */
 export function bandImagesOf(header, layers, maxSize) {
   const bands = layers.map((tiles, i) => bandOf(header, tiles, i + 1, maxSize));
@@ -84,7 +85,7 @@ export function bandImagesOf(header, layers, maxSize) {
 }
 
 /**
- * A texel for each splat.
+ * Return an image with one texel per splat.
  *
  * @param {number} count
  * @param {number} bits
@@ -97,7 +98,7 @@ function imageOf(count, bits) {
 }
 
 /**
- * Corner and step of each tile.
+ * Return an image with the corner and step of each tile.
  *
  * @param {PackedTile[]} tiles
  * @param {number} maxSize
@@ -113,10 +114,10 @@ function tileTable(tiles, maxSize) {
 }
 
 /**
- * An SH band: what its splats have, once for each entry of a codebook, and a row of it for each splat.
+ * Return the images of an SH band: a table of rows, in which codebook entries occur once, and each splat's row.
  *
  * @param {Header} header
- * @param {(Packed | null | undefined)[]} bands tile after tile
+ * @param {(Packed | null | undefined)[]} bands the bands of all tiles
  * @param {number} layer
  * @param {number} maxSize
  */
@@ -135,7 +136,7 @@ function bandOf(header, bands, layer, maxSize) {
   const add = (/** @type {PackedColumns} */ packed) => {
     const n = sizeOf(packed);
     for (let c = 0; c < 3 * terms; c++) {
-      const place = 4 * (c % terms) + Math.floor(c / terms); // the columns of R come first, then those of G and B
+      const place = 4 * (c % terms) + Math.floor(c / terms); // columns are ordered by channel
       const offset = packed.offsets[c];
       const factor = packed.step / lattice.step;
       for (let i = 0; i < n; i++) {
@@ -163,7 +164,7 @@ function bandOf(header, bands, layer, maxSize) {
 }
 
 /**
- * One offset and step for columns of one attribute, whose steps differ by powers of two, and the bits of what is left.
+ * Return one offset and step for columns of one attribute, whose steps differ by powers of two, and the bits of the texels.
  *
  * @param {PackedColumns[]} all
  * @param {boolean} [zero] whether 0 is among the values
@@ -185,14 +186,14 @@ function latticeOf(all, zero = false) {
   }
   if (low > high) low = high = 0;
   for (; high - low >= 2 ** 32 - 2; step *= 2) {
-    low = Math.floor(low / 2); // no texel holds such integers
+    low = Math.floor(low / 2); // larger differences do not fit a texel
     high = Math.ceil(high / 2);
   }
   return { low, step, bits: bitsFor(high - low) };
 }
 
 /**
- * Put three columns where texels have them; without a lattice, elements as they are.
+ * Write three columns to texels; without a lattice, write the elements unchanged.
  *
  * @param {PackedColumns} packed
  * @param {Texels} texels

@@ -2,16 +2,16 @@
 import type { AppBase, Asset, Entity, GSplatResourceBase } from 'playcanvas';
 import type { LoadOptions, SceneFacts } from './options.d.ts';
 
-/** What `asset.resource` is. The integers of the file lie in textures; `destroy`, of the engine, frees them and ends a load. */
+/** The type of `asset.resource`. Textures hold the integers of the file; the engine's `destroy` frees them and ends a load. */
 export interface CsplatResource extends GSplatResourceBase {
   csplat: SceneFacts;
-  /** Turn an entity so that the scene stands upright, by its axes and `up` of the metadata, and draw it again once it is complete. */
+  /** Rotate an entity so that the scene is upright, by its axes and the metadata's `up`, and draw it again once complete. */
   stand(entity: Entity): void;
 }
 
 /**
- * Loads assets of type `gsplat` whose name ends in `.csplat`. The asset fires `progress` with bytes received and those of the
- * file; `error` with the decoder's CsplatError, and nothing is left behind then. Opacity compensation is
+ * Loads assets of type `gsplat` whose name ends in `.csplat`. The asset fires `progress` with the received and total bytes,
+ * and `error` with the decoder's CsplatError; a failed load leaves nothing behind. Opacity compensation is the option
  * `app.scene.gsplat.antiAlias`.
  */
 export class CsplatParser {

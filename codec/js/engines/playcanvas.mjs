@@ -1,5 +1,5 @@
 // .csplat in PlayCanvas 2.23: `app.loader.getHandler('gsplat').addParser(new CsplatParser(app))`. See playcanvas.d.ts.
-// The file's integers lie in textures as they are; the shaders below make values of them.
+// Textures hold the integers of the file; the shaders below convert them to values.
 
 import * as pc from 'playcanvas';
 
@@ -121,7 +121,7 @@ ${BANDS.map((band) => {
 #endif
 `;
 
-/** A scene whose integers lie in textures. */
+/** A scene whose integers are in textures. */
 class CsplatResource extends pc.GSplatResourceBase {
   /**
    * @param {object} device
@@ -151,7 +151,7 @@ class CsplatResource extends pc.GSplatResourceBase {
   /**
    * @param {Record<string, Image>} images
    * @param {Record<string, number[]>} parameters
-   * @param {number} degree that is there now
+   * @param {number} degree SH degree now available
    */
   add(images, parameters, degree) {
     const { device } = this;
@@ -165,7 +165,7 @@ class CsplatResource extends pc.GSplatResourceBase {
     for (const [name, value] of Object.entries(parameters)) this.parameters.set(name, value);
   }
 
-  /** Of a progressive load. */
+  /** Add the SH bands of a progressive load. */
   async addBands() {
     const { scene } = this;
     const layers = [];

@@ -1,4 +1,4 @@
-// A file as the adapters for engines take it: the options that they share, and its packed tiles as they come.
+// A file as the adapters for engines load it: their shared options, and packed tiles as they arrive.
 
 import { CsplatReader } from '../decoder.mjs';
 import { mirroredBand, mirroredGeometry } from './mirror.mjs';
@@ -9,22 +9,22 @@ import { onceSaid, uprightIn } from './packed_values.mjs';
  * @typedef {import('../decoder.d.ts').Packed} Packed
  * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
  * @typedef {import('./options.d.ts').LoadOptions} LoadOptions
- * @typedef {{first: number, count: number, sh: Packed}} Band of a tile, from its first splat on
+ * @typedef {{first: number, count: number, sh: Packed}} Band the band of a tile, and the index of its first splat
  */
 
-const WORKERS = 2; // as many as the decoder uses at most
+const WORKERS = 2; // default number of decoding workers
 const DETERMINANT_ROWS = [[1, 2], [2, 0], [0, 1]]; // prettier-ignore
-const SAMPLE = 1024; // splats of a tile, for the bounds
-const MOST = 0.9; // of them lie within the bounds
+const SAMPLE = 1024; // splats per tile from which bounds are computed
+const MOST = 0.9; // fraction of the sample within the bounds
 
 /**
  * Open a file.
  *
  * @param {Parameters<typeof CsplatReader.open>[0]} from
  * @param {LoadOptions} options
- * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean}} target the adapter's name; letters of the engine's directions
- *   +x, +y, +z; whether it draws what a matrix mirrors
- * @param {(AbortSignal | undefined)[]} [signals] that end it, beside the option
+ * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean}} target name of the adapter; letters of the engine's
+ *   directions +x, +y, +z; whether the engine can draw with a mirroring matrix
+ * @param {(AbortSignal | undefined)[]} [signals] further signals that abort the load
  */
 export async function openScene(from, options, target, signals = []) {
   const { shDegree, progressive, workers, signal: given, ...others } = options;
@@ -55,7 +55,7 @@ export async function openScene(from, options, target, signals = []) {
   }
 }
 
-/** Of a load: ends when others say so, and lets go of them when it is over; they may live longer. */
+/** The lifetime of a load. It ends when any of the signals aborts, and removes its listeners when the load is over. */
 class Life {
   /** @param {(AbortSignal | undefined)[]} signals */
   constructor(signals) {
@@ -75,7 +75,7 @@ class Life {
   }
 }
 
-/** Tiles, bands and facts of a file. */
+/** Tiles, bands and metadata of a file. */
 export class SplatScene {
   /**
    * @param {CsplatReader} reader
@@ -85,7 +85,7 @@ export class SplatScene {
    * @param {Life} life
    */
   constructor(reader, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, life) {
-    /** @type {CsplatReader | null} null once all is read: it holds bytes of the file, and a decoder */
+    /** @type {CsplatReader | null} null once everything has been read, to free the bytes of the file and the decoder */
     this.reader = reader;
     this.header = reader.header;
     this.metadata = metadata;
@@ -93,22 +93,22 @@ export class SplatScene {
     this.progressive = progressive;
     this.workers = workers;
     this.life = life;
-    /** @type {number[][]} centres of some splats */
+    /** @type {number[][]} sampled centres */
     this.sample = [];
     const [a, b, c] = uprightIn(reader.header, metadata, engine);
     const determinant = DETERMINANT_ROWS.reduce((sum, [i, j], k) => sum + a[k] * (b[i] * c[j] - b[j] * c[i]), 0);
-    /** Whether splats come mirrored, −x for x, since the engine can only turn them. */
+    /** True if the tiles are mirrored, −x for x, because the engine can only rotate them. */
     this.mirrored = determinant < 0 && !mirrors;
-    /** 3 × 3, by rows: stands the scene upright. */
+    /** 3 × 3, by rows: makes the scene upright. */
     this.upright = [a, b, c].map(([x, y, z]) => [this.mirrored ? -x : x, y, z]);
   }
 
-  /** End what is under way. */
+  /** Abort the load. */
   abort() {
     this.life.controller.abort();
   }
 
-  /** Once nothing reads any more. */
+  /** Free the reader once all reads have ended. */
   release() {
     this.life.end();
     this.reader?.compiled?.close();
@@ -116,9 +116,9 @@ export class SplatScene {
   }
 
   /**
-   * Layers from 0 on that are there when a load resolves.
+   * Yield the tiles with the layers that a load waits for.
    *
-   * @returns {AsyncGenerator<PackedTile & {index: number, first: number}, void>} tiles as they are done
+   * @returns {AsyncGenerator<PackedTile & {index: number, first: number}, void>} tiles in the order of completion
    */
   async *tiles() {
     const { header, progressive, workers } = this;
@@ -146,10 +146,10 @@ export class SplatScene {
     }
   }
 
-  /** As soon as layer 0 has come, so that nothing competes with it, and the line does not rest meanwhile. */
+  /** Fetch SH bands as soon as layer 0 has arrived: no earlier, to not compete with it, and no later, to not idle. */
   fetchBandsNext() {
     const { life, header, degree } = this;
-    const base = header.tiles.reduce((end, { layers: [{ offset, size }] }) => Math.max(end, offset + size), 0); // it lies first
+    const base = header.tiles.reduce((end, { layers: [{ offset, size }] }) => Math.max(end, offset + size), 0); // layer 0 comes first
     life.onBytes = () => {
       if (life.received < base || life.signal.aborted) return;
       life.onBytes = () => {};
@@ -159,7 +159,7 @@ export class SplatScene {
   }
 
   /**
-   * A band of all tiles that have it, for a load that is progressive.
+   * Yield one band of all tiles that have it, for a progressive load.
    *
    * @param {number} layer 1 to 3
    * @returns {AsyncGenerator<Band & {index: number}, void>}
@@ -175,22 +175,22 @@ export class SplatScene {
   }
 
   /**
-   * What stands beside the engine's object.
+   * Return the property `csplat` of the engine's object.
    *
    * @template T
-   * @param {(() => Promise<T>)} work puts the bands where the engine has them
-   * @param {T} done what it gives, if nothing is left to do
+   * @param {(() => Promise<T>)} work passes the bands to the engine
+   * @param {T} done result if nothing is left to do
    * @returns {import('./options.d.ts').SceneFacts<T>}
    */
   facts(work, done) {
     const { header, metadata, bounds } = this;
     const complete = this.progressive ? work() : Promise.resolve(done);
-    // Of those who do not wait for it nobody else would hear.
+    // If the caller does not await `complete`, its errors would be lost.
     complete.catch((error) => this.life.signal.aborted || console.error(error)).finally(() => this.release());
     return { header, metadata, bounds, complete };
   }
 
-  /** Of most splats, upright: a few far away would make it useless. */
+  /** Bounds of most splats of the upright scene: a few far away would make the bounds of all useless. */
   get bounds() {
     const turn = this.mirrored ? this.upright.map(([x, y, z]) => [-x, y, z]) : this.upright;
     const centre = [0, 1, 2].map((axis) => quantile(this.sample.map((mean) => mean[axis]), 0.5)); // prettier-ignore
@@ -202,7 +202,7 @@ export class SplatScene {
   }
 
   /**
-   * The reader, while it fetches layers.
+   * Return the reader and start to fetch layers.
    *
    * @param {number[]} layers
    */
@@ -210,7 +210,7 @@ export class SplatScene {
     const { header, reader } = this;
     const { signal } = this.life;
     signal.throwIfAborted();
-    if (reader === null) throw new Error('all of it was read already');
+    if (reader === null) throw new Error('the whole file has already been read');
     reader.prefetch(
       header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer }))),
       { signal },

@@ -1,4 +1,4 @@
-// The words that Spark's splats are made of, from packed tiles. Without the engine, so that they can be tested.
+// Packs tiles into the words of Spark's splats. Independent of the engine, for testing.
 
 import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
 
@@ -11,20 +11,20 @@ import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQ
  * @typedef {{rgbMin: number, rgbMax: number, lnScaleMin: number, lnScaleMax: number, sh1Max: number, sh2Max: number, sh3Max: number}} SplatEncoding
  */
 
-const ROW = 2048; // splats; what does not fill a row of a texture is lost
+const ROW = 2048; // splats per row of a texture; incomplete rows are lost
 const LAYER = ROW * 2048;
 const LN_SCALE_ZERO = -30;
 const SH_BITS = [7, 8, 6];
 const SH_WORDS = [2, 4, 4];
 
-/** How many splats arrays must have room for. @param {number} count */
+/** Number of splats to allocate in Spark's arrays. @param {number} count */
 export const paddedCount = (count) => {
   const unit = count > LAYER ? LAYER : ROW;
   return Math.max(1, Math.ceil(count / unit)) * unit;
 };
 
 /**
- * Whether float16 centres, of PackedSplats, are off by no more than a step of the file's, anywhere in the scene.
+ * Return true if float16 centres, as in PackedSplats, are off by at most one step of the file anywhere in the scene.
  *
  * @param {Header} header
  */
@@ -67,7 +67,7 @@ export class ExtWords {
   }
 
   /**
-   * Those of a layer one after the other, lower layers first.
+   * Add the bands of a layer, lower layers first.
    *
    * @param {number} layer
    * @param {Band[]} bands
@@ -97,10 +97,10 @@ export class ExtWords {
   }
 }
 
-/** Arrays of PackedSplats: float16 centres, bytes of all else, which hold the file's integers where these fit. */
+/** Arrays of PackedSplats: float16 centres and bytes for the rest, which hold the file's integers if they fit. */
 export class PackedWords {
   /**
-   * @param {Header} header
+   * @param {PackedTile[]} tiles all tiles, for their ranges
    * @param {PackedTile[]} tiles all of them, for their ranges
    */
   constructor(header, tiles) {
@@ -121,7 +121,7 @@ export class PackedWords {
   put(tile, first) {
     const { header, packedArray } = this;
     const { rgbMin, rgbMax, lnScaleMin, lnScaleMax } = this.splatEncoding;
-    const bytes = new Uint8ClampedArray(packedArray.buffer); // these round
+    const bytes = new Uint8ClampedArray(packedArray.buffer); // rounds when written
     const alpha = alphaOf(header);
     putColumns(
       tile.sh0,
@@ -145,7 +145,7 @@ export class PackedWords {
 
   /**
    * @param {1 | 2 | 3} layer
-   * @param {Band[]} bands all of them, for their range
+   * @param {Band[]} bands all bands of the layer, for their range
    */
   addBands(layer, bands) {
     const columns = bands.flatMap(({ sh }) => [sh, ...(sh.lookup ? [sh.lookup.table] : [])]);
@@ -178,7 +178,7 @@ export class PackedWords {
 }
 
 /**
- * Lowest and highest value of such columns; the highest so that steps become whole numbers of `levels`, if they can.
+ * Return the lowest and highest value. If possible, the highest is raised so that `levels` steps cover the range exactly.
  *
  * @param {PackedColumns[]} all
  * @param {number} levels
@@ -195,7 +195,7 @@ function span(all, levels) {
 }
 
 /**
- * The value that the integer `limit` stands for: for as many steps, if none is larger.
+ * Return the value of the integer `limit`: `limit` steps, or the largest magnitude if that is larger.
  *
  * @param {PackedColumns[]} all
  * @param {number} limit
@@ -210,7 +210,7 @@ function largest(all, limit) {
 }
 
 /**
- * Smallest and largest integer.
+ * Return the smallest and largest integer.
  *
  * @param {PackedColumns} packed
  */
@@ -255,13 +255,13 @@ const float = new Float32Array(1);
 const floatBits = new Uint32Array(float.buffer);
 const SHARED_SCALES = Float64Array.from({ length: 32 }, (_, exponent) => 255 * 2 ** (15 - exponent));
 
-/** Bits of the float16 nearest to a number. @param {number} value */
+/** Return the bits of the nearest float16. @param {number} value */
 export function half(value) {
   float[0] = value;
   const sign = (floatBits[0] >>> 16) & 0x8000;
   const magnitude = Math.abs(float[0]);
   if (!(magnitude < 65520)) return sign | 0x7c00;
-  // Multiples of 2^-24 where float16 has no exponent of its own any more
+  // Subnormal float16: multiples of 2^-24
   if (magnitude < 2 ** -14) return sign | roundEven(magnitude * 2 ** 24);
   const bits = floatBits[0] & 0x7fffffff;
   return sign | ((bits + 0xfff + ((bits >>> 13) & 1) - 0x38000000) >>> 13);
@@ -275,8 +275,8 @@ function roundEven(value) {
 }
 
 /**
- * Three numbers of 8 bits with signs and one exponent. Spark's own encoder takes the exponent below the largest of them,
- * and so cuts what exceeds the power of two.
+ * Encode three numbers as signed bytes with a shared exponent. Spark's own encoder uses the exponent below the largest of
+ * them, and so clips values above that power of two.
  *
  * @param {number} r
  * @param {number} g
@@ -288,7 +288,7 @@ export function sharedExponent(r, g, b) {
   const z = Math.abs(b);
   float[0] = x > y ? (x > z ? x : z) : y > z ? y : z;
   const bits = floatBits[0];
-  const above = (bits >>> 23) - 112 + ((bits & 0x7fffff) > 0 ? 1 : 0); // the power of two not below it, plus 15
+  const above = (bits >>> 23) - 112 + ((bits & 0x7fffff) > 0 ? 1 : 0); // exponent of the smallest power of two that is not less, plus 15
   const exponent = above < 0 ? 0 : above > 31 ? 31 : above;
   const scale = SHARED_SCALES[exponent];
   const signs = (r < 0 ? 1 : 0) | (g < 0 ? 2 : 0) | (b < 0 ? 4 : 0);
@@ -306,13 +306,13 @@ function sharedByte(value, scale) {
 }
 
 /**
- * A rotation as an axis on an octahedron, and an angle.
+ * Encode a rotation as an octahedral axis and an angle.
  *
  * @param {number} w at least 0
  * @param {number} x
  * @param {number} y
  * @param {number} z
- * @param {number} axisBits of each of two numbers
+ * @param {number} axisBits bits for each of two numbers
  * @param {number} angleBits
  */
 export function octahedral(w, x, y, z, axisBits, angleBits) {

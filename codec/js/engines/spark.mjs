@@ -38,7 +38,7 @@ export async function loadCsplat(from, { layout, ...options } = {}) {
   return mesh;
 }
 
-/** Float32 centres. @param {SplatScene} scene */
+/** Build ExtSplats, with float32 centres. @param {SplatScene} scene */
 async function ext(scene) {
   const { header } = scene;
   const words = new ExtWords(header);
@@ -54,7 +54,7 @@ async function ext(scene) {
   return { splats, words, mesh: new SplatMesh({ extSplats: splats }) };
 }
 
-/** Float16 centres. @param {SplatScene} scene */
+/** Build PackedSplats, with float16 centres. @param {SplatScene} scene */
 async function packed(scene) {
   const { header } = scene;
   const tiles = [];
@@ -69,7 +69,7 @@ async function packed(scene) {
   if (!scene.progressive) for (const layer of LAYERS.slice(0, scene.degree)) words.addBands(layer, bands[layer - 1]);
   const { packedArray, extra, splatEncoding } = words;
   const splats = new PackedSplats({ packedArray, extra, numSplats: header.splatCount, splatEncoding });
-  return { splats, words, mesh: new SplatMesh({ packedSplats: splats, splatEncoding }) }; // it would take its own encoding
+  return { splats, words, mesh: new SplatMesh({ packedSplats: splats, splatEncoding }) }; // without this, SplatMesh uses an encoding of its own
 }
 
 /**
@@ -81,7 +81,7 @@ function keepBands(bands, { sh, first, count }) {
 }
 
 /**
- * Of a progressive load.
+ * Add the SH bands of a progressive load.
  *
  * @param {SplatScene} scene
  * @param {ExtSplats | PackedSplats} splats

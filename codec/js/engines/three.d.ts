@@ -8,12 +8,12 @@ export type { LoadOptions };
 export type SplatGeometry = BufferGeometry & {
   userData: {
     /** `complete` resolves to the geometry with SH: the same one, or after a progressive load another one, for a new
-     * GaussianSplat. `upright` stands the object upright: `splats.applyMatrix4(geometry.userData.csplat.upright)`. */
+     * GaussianSplat. `upright` makes the object upright: `splats.applyMatrix4(geometry.userData.csplat.upright)`. */
     csplat: SceneFacts<SplatGeometry> & { upright: Matrix4 };
   };
 };
 
-/** Loads `.csplat` as the geometry that `GaussianSplat` of three/addons takes. Errors of a file are `CsplatError`s. */
+/** Loads `.csplat` as a geometry for `GaussianSplat` of three/addons. Invalid files cause `CsplatError`s. */
 export class CSPLATLoader extends Loader<SplatGeometry> {
   constructor(manager?: LoadingManager);
   setOptions(options: LoadOptions): this;
@@ -24,12 +24,12 @@ export class CSPLATLoader extends Loader<SplatGeometry> {
     onError?: (error: unknown) => void,
   ): void;
   loadAsync(url: string, onProgress?: (event: ProgressEvent) => void): Promise<SplatGeometry>;
-  /** Of a file in memory; undefined where an error went to onError. */
+  /** Load a file in memory; undefined if an error went to onError. */
   parse(
     buffer: ArrayBuffer,
     onLoad?: (geometry: SplatGeometry) => void,
     onError?: (error: unknown) => void,
   ): Promise<SplatGeometry | undefined>;
-  /** End all that this loader has begun. */
+  /** Abort all loads of this loader. */
   abort(): this;
 }

@@ -1,7 +1,7 @@
-// A loader for three.js: what its own loaders of splats give, from a .csplat. See three.d.ts.
+// A loader for three.js: loads a .csplat as the same geometry as three.js's own splat loaders. See three.d.ts.
 //
 //   const geometry = await new CSPLATLoader().loadAsync('scene.csplat');
-//   const splats = new GaussianSplat(geometry); // of three/addons/objects/GaussianSplat.js
+//   const splats = new GaussianSplat(geometry); // from three/addons/objects/GaussianSplat.js
 //   splats.applyMatrix4(geometry.userData.csplat.upright);
 
 import { BufferAttribute, BufferGeometry, Loader, Matrix4 } from 'three';
@@ -18,10 +18,10 @@ import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovar
 
 const NAME = 'CSPLATLoader';
 const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true };
-const SH_WORDS = [0, 3, 4, 6]; // of a splat in a band, four coefficients each
+const SH_WORDS = [0, 3, 4, 6]; // words per splat in a band, of four coefficients each
 const SH_ZERO = 0x80808080;
 
-/** Loads splats as the geometry that GaussianSplat takes. */
+/** Loads splats as a geometry for GaussianSplat. */
 export class CSPLATLoader extends Loader {
   /** @param {import('three').LoadingManager} [manager] */
   constructor(manager) {
@@ -68,7 +68,7 @@ export class CSPLATLoader extends Loader {
    * @param {ArrayBuffer} buffer a file
    * @param {(geometry: BufferGeometry) => void} [onLoad]
    * @param {(error: unknown) => void} [onError]
-   * @returns {Promise<BufferGeometry | undefined>} undefined where an error went to onError
+   * @returns {Promise<BufferGeometry | undefined>} undefined if an error went to onError
    */
   async parse(buffer, onLoad, onError) {
     try {
@@ -81,7 +81,7 @@ export class CSPLATLoader extends Loader {
     }
   }
 
-  /** End all that this loader has begun. */
+  /** Abort all loads of this loader. */
   abort() {
     this.controller.abort();
     this.controller = new AbortController();
@@ -118,7 +118,7 @@ async function geometryOf(scene) {
     for (const [i, band] of tile.sh.entries()) if (band) bands.put(i + 1, band, first);
   }
   if (!antialiased)
-    onceSaid(NAME, 'three.js draws all splats as antialiased ones; small ones of scenes that are not come out fainter');
+    onceSaid(NAME, 'three.js draws all scenes as antialiased; small splats of this scene appear too faint');
   const geometry = new BufferGeometry();
   geometry.setAttribute('position', new BufferAttribute(centres, 3));
   geometry.setAttribute('covariance', new BufferAttribute(covariances, 6));
@@ -134,7 +134,7 @@ async function geometryOf(scene) {
 }
 
 /**
- * The same splats with all bands, in a geometry of its own: GaussianSplat takes what it finds when it is made.
+ * Return a new geometry of the same splats with all bands: GaussianSplat reads its geometry only on construction.
  *
  * @param {SplatScene} scene
  * @param {BufferGeometry} base
@@ -153,7 +153,7 @@ async function wholeOf(scene, base) {
   return geometry;
 }
 
-/** SH in bytes, four to a word. */
+/** SH coefficients as bytes, four per word. */
 class Bands {
   /**
    * @param {number} count

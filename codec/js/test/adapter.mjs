@@ -1,9 +1,9 @@
-// This decoder behind the protocol of the conformance runner (conformance/IMPLEMENTERS.md), a process for each file:
+// Adapts this decoder to the protocol of the conformance runner (conformance/IMPLEMENTERS.md), one process per file:
 //
 //   csplat conformance decoder --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
 //
-// and, with --serve, for any number of files: requests on standard input are a u32, the file's size, and the file;
-// each answer is a line of JSON, either {code, offset, clause} or {header, arrays: {name: [bytes, SHA-256]}}.
+// With --serve, one process answers for any number of files. A request on standard input is a u32, the file's size, and the
+// file; an answer is a line of JSON, either {code, offset, clause} or {header, arrays: {name: [bytes, SHA-256]}}.
 
 import { createHash } from 'node:crypto';
 import { readFileSync, writeFileSync } from 'node:fs';
@@ -13,7 +13,7 @@ import { pathToFileURL } from 'node:url';
 const FLOATS = ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN'];
 const INTEGERS = ['opacities', 'scales', 'quats', 'means', 'sh0', 'sh1', 'sh2', 'sh3', 'tile_splats', 'exponents'];
 
-/** Where the decoder lies: a copy of it may be tested in its place. */
+/** Folder of the decoder; a copy may be tested instead. */
 const folder = process.env.CSPLAT_JS ? pathToFileURL(`${process.env.CSPLAT_JS}/`) : new URL('../', import.meta.url);
 const { CsplatError, decode } = await import(new URL('decoder.mjs', folder).href);
 const { zlibInflate } = await import(new URL('inflate.mjs', folder).href);
@@ -23,7 +23,7 @@ const inflate = await zlibInflate();
 const raw = (array) => new Uint8Array(array.buffer, array.byteOffset, array.byteLength);
 
 /**
- * Floats by WebAssembly, which has to be right where JavaScript is, and nowhere else.
+ * Decode to floats with WebAssembly and with JavaScript, and check that they agree.
  *
  * @param {Uint8Array} bytes
  * @param {object} options
@@ -40,7 +40,7 @@ async function floats(bytes, options) {
 }
 
 /**
- * Decode a file to floats and to integers.
+ * Decode a file to floats and integers.
  *
  * @param {Uint8Array} bytes
  * @param {object} [limits] budgets
@@ -67,10 +67,10 @@ async function decoded(bytes, limits = {}) {
   return { header: facts, arrays };
 }
 
-/** @param {string} character of ASCII */
+/** @param {string} character ASCII */
 const encodeByte = (character) => `%${character.charCodeAt(0).toString(16).toUpperCase()}`;
 
-/** What a refusal says, by the protocol. Another error is a defect of the decoder. @param {unknown} error */
+/** Convert a refusal to the protocol. Any other error is a defect of the decoder. @param {unknown} error */
 function refusal(error) {
   if (!(error instanceof CsplatError)) throw error;
   const { code, offset, clause } = error;
@@ -116,7 +116,7 @@ async function serve(limits) {
     while (waiting.length >= 4) {
       const size = waiting.readUInt32LE(0);
       if (waiting.length < 4 + size) break;
-      // A copy that begins at byte 0 of its buffer, as a file that was read does.
+      // Copies, so that the bytes start at 0 of their buffer, as in a file that was read.
       const bytes = Uint8Array.from(waiting.subarray(4, 4 + size));
       waiting = waiting.subarray(4 + size);
       process.stdout.write(`${await answer(bytes, limits)}\n`);

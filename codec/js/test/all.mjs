@@ -1,5 +1,5 @@
-// All tests of the decoder and the viewer in one process, which compiles the decoder once, at half the time of a process
-// for each file: `node codec/js/test/all.mjs`, or with a report of each test `node --test-reporter=spec …`.
+// All tests of the decoder and the viewer in one process, which compiles the decoder once and takes half the time of one
+// process per file: `node codec/js/test/all.mjs`, or with a report of each test `node --test-reporter=spec …`.
 import { readdirSync } from 'node:fs';
 
 for (const folder of [new URL('./', import.meta.url), new URL('../../../tools/viewer/test/', import.meta.url)]) {

@@ -12,7 +12,7 @@ const PAGE = 'codec/js/test/browser.html';
 const TYPES = { '.html': 'text/html', '.mjs': 'text/javascript', '.json': 'application/json' };
 const LIMIT_MS = 120_000;
 
-/** Content-Security-Policies, whether WebAssembly runs under them, and how many of two workers. */
+/** Content-Security-Policies, whether WebAssembly runs under them, and how many of two workers start. */
 const PAGES = [
   { name: 'WebAssembly', policy: '', compiled: true, workers: 2 },
   { name: 'JavaScript', policy: "script-src 'self' 'unsafe-inline'; worker-src 'none'", compiled: false, workers: 0 },
@@ -91,7 +91,7 @@ function finish() {
   if (!browser.kill()) browser.emit('exit');
 }
 
-// A browser's helpers outlive it by a moment and write on into its profile; what cannot go decides no test.
+// A browser's helper processes may outlive it and write to its profile. A folder that cannot be removed fails no test.
 async function discard(folder) {
   for (let attempt = 0; attempt < 20; attempt++) {
     try {

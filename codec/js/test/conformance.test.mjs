@@ -1,4 +1,4 @@
-// Every vector of the conformance suite, whole, as floats and as integers, and tile by tile.
+// Every vector of the conformance suite: decoded whole, as floats and as integers, and tile by tile.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -24,7 +24,7 @@ const facts = (header) => ({
   origin: header.origin,
 });
 
-test('there are vectors of all kinds', () => {
+test('vectors of all kinds are present', () => {
   assert.ok(valid.length > 100 && invalid.length > 200);
 });
 
@@ -55,7 +55,7 @@ test('refuses every invalid vector', async () => {
   assert.deepEqual(failed, {});
 });
 
-test('decodes with DecompressionStream what every coder made', { skip: noStream }, async () => {
+test('decodes files of every coder with DecompressionStream', { skip: noStream }, async () => {
   const inflate = await streamInflate();
   const some = valid.filter(({ name }) => /coder|deflate|combined|rich|seeded/.test(name));
   assert.ok(some.length > 20);
@@ -81,7 +81,7 @@ test(
   },
 );
 
-test('the header of every valid vector is read from the beginning of the file alone', () => {
+test('the header of every valid vector is read from the beginning of the file', () => {
   for (const { name, expect } of valid) {
     const file = vector(name);
     const { indexSize } = readHeader(file);
@@ -89,7 +89,7 @@ test('the header of every valid vector is read from the beginning of the file al
   }
 });
 
-test('a reader gives for each tile what a whole decode gives', async () => {
+test('a reader returns the same tiles as a whole decode', async () => {
   for (const { name } of valid) {
     const file = vector(name);
     const whole = await decode(file);

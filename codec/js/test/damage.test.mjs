@@ -1,4 +1,4 @@
-// Damaged files are refused with an error of ours, never decoded, never answered with another exception.
+// Damaged files are refused with a CsplatError: they are not decoded, and cause no other exception.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -25,7 +25,7 @@ test('flipped bits of the worked example are refused', async () => {
   }
 });
 
-test('what servers send in place of a file is named', async () => {
+test('other content that servers send in place of a file is named', async () => {
   for (const [text, says] of [
     ['version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n', /pointer of Git LFS/],
     ['\n<!DOCTYPE html><html><head></head><body>Not Found</body></html>', /web page/],
@@ -38,14 +38,14 @@ test('what servers send in place of a file is named', async () => {
   }
 });
 
-test('bytes behind the end are refused', async () => {
+test('bytes after the end are refused', async () => {
   const longer = new Uint8Array(example.length + 1);
   longer.set(example);
   const { code, offset } = await refusal(() => decode(longer));
   assert.deepEqual([code, offset], ['E_TRAILING', example.length]);
 });
 
-test('flipped bits under repaired checksums give a scene or an error of ours', async () => {
+test('flipped bits under repaired checksums give a scene or a CsplatError', async () => {
   for (const [name, step] of [
     ['valid/rich', 7],
     ['extreme/seeded', 23],
@@ -66,7 +66,7 @@ test('flipped bits under repaired checksums give a scene or an error of ours', a
   }
 });
 
-test('words of all ones and all zeros under repaired checksums do no worse', async () => {
+test('words of all ones and all zeros under repaired checksums give a scene or a CsplatError', async () => {
   const file = vector('valid/rich');
   for (const [place, value] of [0xffffffff, 0, 0x7fffffff, 0x80000000].entries()) {
     for (let at = 8 + 2 * place; at + 4 <= file.length; at += 23) {

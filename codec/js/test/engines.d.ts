@@ -1,4 +1,4 @@
-// As much of the engines as their adapters use, for checks without the engines' packages.
+// The parts of the engines that their adapters use, for type checks without the engines' packages.
 
 declare module 'three' {
   export class BufferAttribute {

@@ -1,4 +1,4 @@
-// The adapters for engines hold the numbers of the form 'floats', in the engines' layouts.
+// The adapters for engines return the numbers of the form 'floats', in the engines' layouts.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -17,7 +17,7 @@ import {
 import { failures, manifest, vector } from './helpers.mjs';
 
 const same = (value) => value;
-/** Covariances by matrices, in the plain way. */
+/** Covariances computed with matrices. */
 function covariances({ count, quats, scales }) {
   const out = [];
   for (let i = 0; i < count; i++) {
@@ -42,14 +42,14 @@ function covariances({ count, quats, scales }) {
 }
 
 const valid = manifest.filter(({ name }) => /^(valid|render)/.test(name));
-test("unpacked numbers are the decoder's, of every vector", async () => {
+test("unpacked numbers of every vector equal the decoder's", async () => {
   const failed = await failures(valid, async ({ name }) => {
     const reader = await CsplatReader.open(new Blob([vector(name)]));
     const { header } = reader;
     for (const { index, splatCount: count } of header.tiles) {
       const floats = await reader.readTile(index);
       const tile = await reader.readTile(index, { form: 'packed' });
-      // One splat further than needed and a stride of their own: nothing lies where it would by chance.
+      // A different stride and one splat more than needed, so that no value is at its default position.
       const put = (width, fill) => {
         const array = new Float32Array(8 * (count + 1));
         fill(places(array, 8, 1, width));
@@ -88,7 +88,7 @@ test("unpacked numbers are the decoder's, of every vector", async () => {
       putCovariances(tile, { ...header, flat: false }, out, 1);
       for (const [at, expected] of covariances(floats).entries()) {
         const [of, p] = [at - (at % 6), at % 6];
-        const length = Math.max(out[6 + of], out[9 + of], out[11 + of]); // others may be what a difference leaves
+        const length = Math.max(out[6 + of], out[9 + of], out[11 + of]); // off-diagonal values may cancel
         if (length < 1e38) assert.ok(Math.abs(out[6 + at] - expected) <= 1e-6 * length, `${p} of splat ${of / 6}`);
       }
     }
@@ -97,7 +97,7 @@ test("unpacked numbers are the decoder's, of every vector", async () => {
 });
 
 for (const name of ['valid/rich', 'valid/codebook_sh_1_3', 'valid/combined_tiles']) {
-  test(`${name}: a mirror changes the signs of what is odd in x, and no more`, async () => {
+  test(`${name}: mirroring changes exactly the signs of values that are odd in x`, async () => {
     const reader = await CsplatReader.open(new Blob([vector(name)]));
     const { header } = reader;
     const odd = [0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 0, 0, 1, 0, 1]; // y z x, xy yz zz xz xx, …
@@ -124,7 +124,7 @@ for (const name of ['valid/rich', 'valid/codebook_sh_1_3', 'valid/combined_tiles
   });
 }
 
-test('of flat scenes the smallest scale is zero', async () => {
+test('in flat scenes the smallest scale is zero', async () => {
   const reader = await CsplatReader.open(new Blob([vector('valid/rich')]));
   const tile = await reader.readTile(0, { form: 'packed' });
   const [round, flat] = [new Float32Array(6 * tile.count), new Float32Array(6 * tile.count)];
@@ -138,7 +138,7 @@ test('of flat scenes the smallest scale is zero', async () => {
   }
 });
 
-test('a scene stands upright in the axes of an engine', () => {
+test('scenes are upright in the axes of an engine', () => {
   const map = (axes, engine, up) => uprightIn({ axes }, { up }, engine);
   assert.deepEqual(map('RUB', 'RUB'), [
     [1, 0, 0],
@@ -172,12 +172,12 @@ test('a scene stands upright in the axes of an engine', () => {
     assert.ok(Math.hypot(x, y - 1, z) < 1e-12, `${up} is up`);
     const [a, b, c] = rows;
     const cross = [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
-    assert.ok(Math.hypot(...cross.map((one, i) => one + c[i])) < 1e-12, `${up}: neither mirrored nor bent`);
+    assert.ok(Math.hypot(...cross.map((one, i) => one + c[i])) < 1e-12, `${up}: a rotation`);
   }
 });
 
 for (const options of [{}, { progressive: true }, { workers: 0 }]) {
-  test(`a load asks for every byte once: ${JSON.stringify(options)}`, async () => {
+  test(`a load requests every byte once: ${JSON.stringify(options)}`, async () => {
     const bytes = vector('valid/combined_codebooks');
     const asked = [];
     const fetch = async (_url, { headers }) => {
@@ -199,7 +199,7 @@ for (const options of [{}, { progressive: true }, { workers: 0 }]) {
         for await (const band of scene.bands(layer)) assert.ok(band.count > 0);
     });
     await complete.complete;
-    await new Promise((resolve) => setTimeout(resolve)); // what follows on it
+    await new Promise((resolve) => setTimeout(resolve)); // lets pending callbacks run
     assert.equal(count, scene.header.splatCount);
     assert.equal(scene.reader, null);
     asked.sort(([a], [b]) => a - b);

@@ -1,4 +1,4 @@
-// What the tests share: the conformance vectors, hashes, checksums made good again, a server.
+// Helpers of the tests: the conformance vectors, hashes, repaired checksums, a server.
 
 import { createHash } from 'node:crypto';
 import { readFileSync } from 'node:fs';
@@ -12,22 +12,22 @@ const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', impo
 
 export const manifest = JSON.parse(readFileSync(new URL('manifest.json', VECTORS), 'utf8')).vectors;
 
-/** @param {string} name as `valid/rich` */
+/** @param {string} name such as `valid/rich` */
 export const vector = (name) => new Uint8Array(readFileSync(new URL(`${name}.csplat`, VECTORS)));
 
-/** Why tests of DecompressionStream are skipped, or false where they are not. */
+/** The reason to skip tests of DecompressionStream, or false. */
 export const noStream = await streamInflate().then(
   () => false,
   (error) => error.message,
 );
 
 /**
- * Check each vector of a list, all of them even where some fail.
+ * Check all vectors of a list, even if some fail.
  *
  * @template {{name: string}} T
  * @param {T[]} vectors
  * @param {(vector: T) => Promise<void>} check
- * @returns {Promise<Record<string, string>>} what was thrown for those that failed, by their names: none, one hopes
+ * @returns {Promise<Record<string, string>>} the errors of the vectors that failed, by name
  */
 export async function failures(vectors, check) {
   /** @type {Record<string, string>} */
@@ -47,10 +47,10 @@ export const hash = (array) =>
     .digest('hex');
 
 /**
- * What a decode is refused with.
+ * Return the error that a decode is refused with.
  *
  * @param {() => unknown} run
- * @returns {Promise<CsplatError>} anything else that is thrown fails the test
+ * @returns {Promise<CsplatError>} any other exception fails the test
  */
 export async function refusal(run) {
   try {
@@ -63,9 +63,9 @@ export async function refusal(run) {
 }
 
 /**
- * A copy of a file with some bytes changed and all checksums right again.
+ * Return a copy of a file with some bytes changed and all checksums repaired.
  *
- * @param {Uint8Array} file a valid one, whose chunks lie where its index says
+ * @param {Uint8Array} file a valid file
  * @param {(bytes: Uint8Array, view: DataView) => void} change
  */
 export function forged(file, change) {
@@ -88,8 +88,8 @@ export function forged(file, change) {
  *
  * @param {import('node:test').TestContext} test
  * @param {Uint8Array} file
- * @param {{ranges?: boolean, sent?: Uint8Array}} [options] `sent` is sent whole in place of the file
- * @returns {Promise<{url: string, requests: string[]}>} `requests` collects the ranges that are asked for
+ * @param {{ranges?: boolean, sent?: Uint8Array}} [options] `sent` is sent as a whole in place of the file
+ * @returns {Promise<{url: string, requests: string[]}>} `requests` collects the requested ranges
  */
 export async function serve(test, file, { ranges = true, sent = file } = {}) {
   const requests = [];

@@ -1,4 +1,4 @@
-// Both ways to inflate keep to the declared size and notice what does not end where it has to.
+// Both inflate implementations enforce the declared size and the end of the stream.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 import { deflateRawSync } from 'node:zlib';
@@ -18,7 +18,7 @@ for (const [name, make] of Object.entries({ zlib: zlibInflate, DecompressionStre
     assert.deepEqual(new Uint8Array(await inflate(coded, plain.length)), plain);
   });
 
-  test(`${name} refuses bytes behind the end`, { skip }, async () => {
+  test(`${name} refuses bytes after the end`, { skip }, async () => {
     const inflate = await make();
     for (const tail of [[0], [1, 2, 3], coded]) {
       await assert.rejects(async () => inflate(joined(coded, Uint8Array.from(tail)), plain.length), InflateError);

@@ -1,4 +1,4 @@
-// Budgets, options and the caller's mistakes.
+// Budgets, options and invalid arguments.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -8,7 +8,7 @@ import { hash, manifest, refusal, vector } from './helpers.mjs';
 
 const rich = vector('valid/rich');
 
-test('a budget of exactly the splats suffices, one fewer does not', async () => {
+test('a budget of exactly the number of splats suffices, one less does not', async () => {
   const { splatCount } = readHeader(rich);
   await decode(rich, { limits: { splats: splatCount } });
   const error = await refusal(() => decode(rich, { limits: { splats: splatCount - 1 } }));
@@ -16,7 +16,7 @@ test('a budget of exactly the splats suffices, one fewer does not', async () => 
   assert.deepEqual([error.code, error.clause], ['E_LIMIT', 'LIM-1']);
 });
 
-test('a budget of bytes counts arrays and tables, before they are made', async () => {
+test('a budget of bytes counts arrays and tables before they are allocated', async () => {
   const file = vector('extreme/tile_of_65536');
   const { count, means, quats, scales, opacities, sh0, shN } = await decode(file);
   const bytes = [means, quats, scales, opacities, sh0, shN].reduce((sum, array) => sum + array.byteLength, 0);
@@ -66,7 +66,7 @@ test('a lower SH degree gives the rows of the lower bands', async () => {
   }
 });
 
-test('chosen tiles come in the order of the choice', async () => {
+test('tiles are returned in the requested order', async () => {
   const whole = await decode(rich);
   const [a, b] = whole.header.tiles;
   const swapped = await decode(rich, { tiles: [1, 0] });
@@ -96,7 +96,7 @@ test('data may be an ArrayBuffer, any view, or shared memory', async () => {
   }
 });
 
-test("the caller's mistakes are E_INPUT", async () => {
+test('invalid arguments are E_INPUT', async () => {
   const reader = await CsplatReader.open(new Blob([rich]));
   const mistakes = [
     () => decode('a string'),

@@ -1,6 +1,6 @@
-// The mutants of JavaScript modules: operators, constants, bounds and statements, one at a time (csplat_selftest.mutation).
+// Generates mutants of JavaScript modules: one changed operator, constant, bound or statement each (csplat_selftest.mutation).
 //
-//   node operators.mjs .../typescript/lib/typescript.js a.mjs b.mjs    # a line of JSON: [[file, line, start, old, new], ...]
+//   node operators.mjs .../typescript/lib/typescript.js a.mjs b.mjs    # one line of JSON: [[file, line, start, old, new], ...]
 
 import { readFileSync } from 'node:fs';
 import { basename } from 'node:path';
@@ -10,14 +10,14 @@ const [library, ...files] = process.argv.slice(2);
 const { default: ts } = await import(pathToFileURL(library).href);
 const { SyntaxKind: Kind } = ts;
 
-/** What stands in the place of an operator. @type {Record<string, string[]>} */
+/** Replacements of operators. @type {Record<string, string[]>} */
 const BINARY = {
   '<': ['<=', '>='],
   '<=': ['<', '>'],
   '>': ['>=', '<='],
   '>=': ['>', '<'],
   '===': ['!=='],
-  '!==': ['===', '<', '>'], // one side of a mismatch alone
+  '!==': ['===', '<', '>'], // only one side of a mismatch
   '==': ['!='],
   '!=': ['==', '<', '>'],
   '&&': ['||'],
@@ -57,7 +57,7 @@ for (const file of files) {
 
   function inside(node) {
     of(node);
-    // What is thrown is dropped as a whole, its words are not read; those of templates say nothing either.
+    // Mutants drop a throw statement as a whole; its message, like templates and imports, is not mutated.
     if (ts.isThrowStatement(node) || ts.isTemplateExpression(node) || ts.isImportDeclaration(node)) return;
     ts.forEachChild(node, inside);
   }
@@ -68,7 +68,7 @@ for (const file of files) {
     mutants.push([basename(file), line, start, text.slice(start, node.end), changed]);
   }
 
-  /** What changes at this node itself. */
+  /** Add the mutants of this node, without its children. */
   function of(node) {
     if (ts.isBinaryExpression(node)) {
       const { left, operatorToken: operator, right } = node;
@@ -104,13 +104,13 @@ for (const file of files) {
     if (other !== undefined) replaced(node.expression, `${object.getText(source)}.${other}`);
     if (!SLICES.includes(name.text)) return;
     for (const bound of node.arguments) {
-      if (ts.isNumericLiteral(bound)) continue; // a constant of its own
+      if (ts.isNumericLiteral(bound)) continue; // mutated as a constant
       for (const sign of ['+', '-']) replaced(bound, `(${bound.getText(source)}) ${sign} 1`);
     }
   }
 }
 
-/** Whether a function ends with it: without a value any caller notices. */
+/** Return true if the statement is the last of a function, whose return value no caller uses. */
 function isLast(node) {
   const block = node.parent;
   return ts.isBlock(block) && block.statements.at(-1) === node && ts.isFunctionLike(block.parent);

@@ -1,4 +1,4 @@
-// The form 'packed' holds the same numbers as the form 'floats', for every vector and layer.
+// The form 'packed' has the same values as the form 'floats', for every vector and layer.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -8,7 +8,7 @@ import { failures, hash, manifest, refusal, vector } from './helpers.mjs';
 
 const valid = manifest.filter(({ error }) => error.code === undefined);
 
-/** Values of columns, [splat, column] with the columns in the order that `place` gives. */
+/** Values of columns, [splat, column], with the columns in the order of `place`. */
 function values({ columns, offsets, step }, place = (c) => c) {
   const n = columns.length / offsets.length;
   const out = new Float32Array(columns.length);
@@ -17,7 +17,7 @@ function values({ columns, offsets, step }, place = (c) => c) {
   return out;
 }
 
-/** Values of colours, [splat, coefficient, channel], those of a codebook looked up. */
+/** Values of colours, [splat, coefficient, channel], after codebook lookup. */
 function colours(packed, count) {
   const width = packed.offsets.length;
   const place = (c) => 3 * (c % (width / 3)) + Math.floor((3 * c) / width);
@@ -58,7 +58,7 @@ const inflate = await zlibInflate();
 const ways = { WebAssembly: {}, JavaScript: { inflate } };
 
 for (const [way, options] of Object.entries(ways)) {
-  test(`packed integers have the values of the floats, of every vector, by ${way}`, async () => {
+  test(`packed integers of every vector have the values of the floats, by ${way}`, async () => {
     const failed = await failures(valid, async ({ name }) => {
       const reader = await CsplatReader.open(new Blob([vector(name)]), options);
       const record = Object.fromEntries(reader.header.attributes.map((one) => [one.name, one]));
@@ -90,7 +90,7 @@ for (const [way, options] of Object.entries(ways)) {
   });
 }
 
-test('a codebook stays a table, the same object for every tile and band apart', async () => {
+test('a codebook stays a table, the same object for every tile, with one table per band', async () => {
   const reader = await CsplatReader.open(new Blob([vector('valid/codebook_sh_1_3')]));
   const [one, again, other] = await Promise.all(
     [1, 1, 2].map((layer) => reader.readLayer(0, layer, { form: 'packed' }).then(({ sh }) => sh.lookup)),
@@ -101,7 +101,7 @@ test('a codebook stays a table, the same object for every tile and band apart', 
   assert.deepEqual(one.index, other.index);
 });
 
-test('elements are as narrow as they can be', async () => {
+test('elements have the narrowest possible type', async () => {
   const reader = await CsplatReader.open(new Blob([vector('valid/rich')]));
   const { means, quats, opacities } = await reader.readLayer(0, 0, { form: 'packed' });
   const { extent, corner } = reader.header.tiles[0];
@@ -111,12 +111,12 @@ test('elements are as narrow as they can be', async () => {
   assert.equal(quats.columns.length, 3 * opacities.columns.length);
 });
 
-test('budgets hold for the form packed', async () => {
+test('budgets apply to the form packed', async () => {
   const reader = await CsplatReader.open(new Blob([vector('valid/rich')]), { limits: { splats: 1 } });
   assert.equal((await refusal(() => reader.readLayer(0, 0, { form: 'packed' }))).code, 'E_LIMIT');
 });
 
-test('a tile comes packed up to a degree, whole scenes do not', async () => {
+test('tiles can be packed up to a degree, whole scenes cannot', async () => {
   const file = vector('valid/rich');
   const reader = await CsplatReader.open(new Blob([file]));
   assert.equal((await reader.readTile(0, { form: 'packed', shDegree: 1 })).sh.length, 1);

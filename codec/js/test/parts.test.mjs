@@ -1,4 +1,4 @@
-// Checksums, strict JSON and exact products on their own.
+// Checksums, strict JSON and exact products.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -22,7 +22,7 @@ test('CRC-32 of known texts and of every length', () => {
   }
 });
 
-test('JSON that JSON.parse reads the same way', () => {
+test('valid JSON is parsed as by JSON.parse', () => {
   const texts = [
     '{}',
     '[]',
@@ -43,7 +43,7 @@ test('JSON that JSON.parse reads the same way', () => {
   assert.equal(hostile.polluted, undefined);
 });
 
-test('JSON that is none', () => {
+test('invalid JSON is refused', () => {
   const texts = [
     '',
     ' ',
@@ -88,13 +88,13 @@ test('JSON that is none', () => {
   assert.throws(() => parseJson(Uint8Array.of(34, 0xed, 0xa0, 0x80, 34)), SyntaxError);
 });
 
-test('JSON of 64 levels, and of 65', () => {
+test('JSON may have 64 levels, not 65', () => {
   assert.ok(parseJson(bytes('['.repeat(64) + ']'.repeat(64))));
   assert.throws(() => parseJson(bytes('['.repeat(65) + ']'.repeat(65))), SyntaxError);
   assert.throws(() => parseJson(bytes('['.repeat(1_000_000))), SyntaxError);
 });
 
-test('ldexp is exact and tells when it cannot be', () => {
+test('ldexp is exact, or returns 0 or Infinity', () => {
   assert.equal(ldexp(0.1, 10), 102.4);
   assert.equal(ldexp(2 ** -1022, 2045), 2 ** 1023);
   assert.equal(ldexp(1.5, -1022), 1.5 * 2 ** -1022);

@@ -1,4 +1,4 @@
-// The textures of PlayCanvas' adapter hold the numbers of the form 'floats'.
+// The textures of the PlayCanvas adapter have the values of the form 'floats'.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -11,7 +11,7 @@ const valid = manifest.filter(({ name }) =>
   /^(valid|render).*(rich|combined_tiles|codebook|sparse|opacities|quats|tiles)/.test(name),
 );
 
-/** All images of a scene. */
+/** Return all images of a scene. */
 function madeOf(header, tiles, size) {
   const base = imagesOf(header, tiles, size);
   if (header.shDegree === 0) return base;
@@ -20,7 +20,7 @@ function madeOf(header, tiles, size) {
   return { ...base, images: { ...base.images, ...images }, parameters: { ...base.parameters, ...parameters } };
 }
 
-/** Splats as the shaders read them. */
+/** Read splats as the shaders do. */
 function readerOf({ images, parameters }) {
   const texel = ({ width, height, texels }, x, y = 0) => {
     assert.ok(x < width && y < height, `texel ${x}, ${y} of ${width}, ${height}`);
@@ -50,7 +50,7 @@ function readerOf({ images, parameters }) {
   };
 }
 
-test('textures stand for the numbers of every vector', async () => {
+test('textures have the values of every vector', async () => {
   const failed = await failures(valid, async ({ name }) => {
     const reader = await CsplatReader.open(new Blob([vector(name)]));
     const { header } = reader;
@@ -86,7 +86,7 @@ test('textures stand for the numbers of every vector', async () => {
   assert.deepEqual(failed, {});
 });
 
-test('texels are as narrow as the scene allows, and tables lie there once', async () => {
+test('texels have the narrowest possible type, and tables are stored once', async () => {
   const reader = await CsplatReader.open(new Blob([vector('valid/codebook_sh_1_3')]));
   const tile = await reader.readTile(0, { form: 'packed' });
   const { images } = madeOf(reader.header, [tile], 4096);

@@ -1,4 +1,4 @@
-// CsplatReader over HTTP, with ranges and without, and what can go wrong on the way.
+// CsplatReader over HTTP, with and without ranges, and its errors.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -14,7 +14,7 @@ async function readAll(reader) {
   for (const { index } of reader.header.tiles) await reader.readTile(index, { extra: true });
 }
 
-test('one request for header and index of a small file, none for what came with it', async (t) => {
+test('a small file takes one request for header and index, and none for the parts that came with it', async (t) => {
   const { url, requests } = await serve(t, seeded);
   const reader = await CsplatReader.open(url);
   const tile = await reader.readTile(0);
@@ -23,7 +23,7 @@ test('one request for header and index of a small file, none for what came with 
   assert.deepEqual({ ...reader.checks, chunks: reader.checks.chunks > 0 }, { header: true, index: true, chunks: true });
 });
 
-test('with small first requests each part is fetched by itself', async (t) => {
+test('with a small first request each part is fetched separately', async (t) => {
   const { url, requests } = await serve(t, rich);
   const whole = await decode(rich);
   const reader = await CsplatReader.open(url, { firstBytes: 64 });
@@ -38,7 +38,7 @@ test('with small first requests each part is fetched by itself', async (t) => {
   });
 });
 
-test('layers in any order, those that need the indices of a lower band too', async (t) => {
+test('layers can be read in any order, also if they need the indices of a lower band', async (t) => {
   const file = vector('valid/codebook_sh_1_3');
   const { url } = await serve(t, file);
   const whole = await decode(file);
@@ -69,7 +69,7 @@ test('layers in any order, those that need the indices of a lower band too', asy
   }
 });
 
-test('layers read at the same time', async () => {
+test('layers can be read concurrently', async () => {
   const file = vector('valid/codebook_sh_1_3');
   const reader = await CsplatReader.open(new Blob([file]));
   const alone = await Promise.all(
@@ -88,7 +88,7 @@ test('a band that the tile leaves out is null', async () => {
   assert.ok((await reader.readLayer(0, 2)).sh.length > 0);
 });
 
-test('prefetch joins neighbours to one request and reads nothing twice', async (t) => {
+test('prefetch joins neighbours into one request and reads nothing twice', async (t) => {
   const file = vector('extreme/tiles_of_one');
   const { url, requests } = await serve(t, file);
   const reader = await CsplatReader.open(url, { firstBytes: 64 });
@@ -104,7 +104,7 @@ test('prefetch joins neighbours to one request and reads nothing twice', async (
   assert.equal(reader.source.fetched.length, 0);
 });
 
-test('of a part that begins in the first request only the rest is fetched', async (t) => {
+test('only the rest of a part that begins in the first request is fetched', async (t) => {
   const whole = await decode(rich);
   const { offset, size } = whole.header.tiles[0].layers[0];
   for (const isPrefetched of [false, true]) {
@@ -130,14 +130,14 @@ test('a server without ranges sends the whole file', async (t) => {
   assert.equal(received.at(-1)[0], seeded.length);
 });
 
-test('files cut short and files too long, with and without ranges', async (t) => {
+test('truncated files and files that are too long are refused, with and without ranges', async (t) => {
   const longer = new Uint8Array(rich.length + 5);
   longer.set(rich);
   for (const ranges of [true, false]) {
     for (const size of [0, 10, 64, 300, rich.length - 1]) {
       const { url } = await serve(t, rich.subarray(0, size), { ranges });
       const error = await refusal(async () => {
-        await readAll(await CsplatReader.open(url)); // with ranges the server says how long the file is
+        await readAll(await CsplatReader.open(url)); // with ranges the server reports the size of the file
       });
       assert.equal(error.code, 'E_TRUNCATED', `${size} bytes, ranges ${ranges}`);
     }
@@ -157,7 +157,7 @@ test('a damaged part is refused, the others are not', async (t) => {
   assert.ok((await reader.readTile(1)).count > 0);
 });
 
-test('a codebook that is damaged is refused each time it is asked for', async () => {
+test('a damaged codebook is refused on every read', async () => {
   const file = vector('valid/codebook_shape');
   const { header } = await decode(file);
   const damaged = forged(file, (bytes) => (bytes[header.directory[0].offset + 12] ^= 1));
@@ -165,7 +165,7 @@ test('a codebook that is damaged is refused each time it is asked for', async ()
   for (let i = 0; i < 2; i++) assert.equal((await refusal(() => reader.readTile(0))).clause, 'CDB-1');
 });
 
-test('memory is a source as a Blob is', async () => {
+test('memory and a Blob are sources', async () => {
   const whole = await decode(rich);
   const reader = await CsplatReader.open(rich.slice().buffer);
   const { means } = await reader.readTile(0);
@@ -179,7 +179,7 @@ test('memory is a source as a Blob is', async () => {
   }
 });
 
-test('budgets hold for readers', async (t) => {
+test('budgets apply to readers', async (t) => {
   const { url } = await serve(t, rich, { ranges: false });
   assert.equal((await refusal(() => CsplatReader.open(url, { limits: { bytes: rich.length - 1 } }))).code, 'E_LIMIT');
   const reader = await CsplatReader.open(new Blob([rich]), { limits: { splats: 1 } });
@@ -192,7 +192,7 @@ test('a missing file and an unreachable server are E_INPUT', async (t) => {
   assert.equal((await refusal(() => CsplatReader.open('http://127.0.0.1:1/x'))).code, 'E_INPUT');
 });
 
-test('a file that changes behind the reader is noticed', async (t) => {
+test('a file that changes while a reader is open is detected', async (t) => {
   const { url } = await serve(t, rich);
   let etag = 0;
   const changing = async (...request) => {

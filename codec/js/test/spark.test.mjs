@@ -1,4 +1,4 @@
-// The words of Spark's splats stand for what the file has, as nearly as their bits can.
+// The words of Spark's splats have the values of the file, to the precision of their bits.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -14,14 +14,14 @@ import {
 } from '../engines/spark-words.mjs';
 import { vector } from './helpers.mjs';
 
-/** Value of a float16. */
+/** Decode a float16. */
 function ofHalf(bits) {
   const [sign, exponent, fraction] = [bits >> 15 ? -1 : 1, (bits >> 10) & 31, bits & 1023];
   if (exponent === 31) return sign * Infinity;
   return sign * (exponent ? 2 ** (exponent - 15) * (1 + fraction / 1024) : 2 ** -24 * fraction);
 }
 
-/** The quaternion w x y z that Spark makes of a word. */
+/** Decode the quaternion w x y z as Spark does. */
 function ofOctahedral(word, axisBits, angleBits) {
   const most = 2 ** axisBits - 1;
   let x = ((word & most) / most) * 2 - 1;
@@ -40,7 +40,7 @@ const ofShared = (word) =>
     (c) => ((word >>> (24 + c)) & 1 ? -1 : 1) * ((word >>> (8 * c)) & 255) * (2 ** ((word >>> 27) - 15) / 255),
   );
 
-test('float16 is the nearest one', () => {
+test('float16 is rounded to nearest', () => {
   for (let bits = 0; bits < 0x7bff; bits += 7) {
     const [low, high] = [ofHalf(bits), ofHalf(bits + 1)];
     assert.deepEqual([half(low), half(-high)], [bits, 0x8000 | (bits + 1)]);
@@ -50,7 +50,7 @@ test('float16 is the nearest one', () => {
   assert.deepEqual([half(65519), half(65520), half(-1e9), half(0)], [0x7bff, 0x7c00, 0xfc00, 0]);
 });
 
-test('rotations and triples come back within their bits', () => {
+test('rotations and triples are decoded within the precision of their bits', () => {
   for (let i = 0; i < 2000; i++) {
     const quat = [Math.abs(Math.sin(i)), Math.sin(3 * i), Math.cos(7 * i), Math.sin(11 * i + 1)];
     const norm = Math.hypot(...quat);
@@ -70,11 +70,11 @@ test('rotations and triples come back within their bits', () => {
   assert.deepEqual([octahedral(1, 0, 0, 0, 10, 12) >>> 20, sharedExponent(0, 0, 0)], [0, 0]);
 });
 
-test('arrays fill whole rows of textures, and layers', () => {
+test('arrays fill whole rows and layers of textures', () => {
   assert.deepEqual([1, 2048, 2049, 2048 * 2048 + 1].map(paddedCount), [2048, 2048, 4096, 2 * 2048 * 2048]);
 });
 
-test('float32 centres are taken where float16 is coarser than the file', () => {
+test('float32 centres are used if float16 is coarser than the file', () => {
   const tile = (step, max) => ({ tiles: [{ min: [0, 0, 0], max: [0, max, 0], step }] });
   assert.deepEqual([tile(2 ** -11, 1.5), tile(2 ** -11, 2), tile(1, 70000)].map(halvesSuffice), [true, false, false]);
 });
@@ -84,7 +84,7 @@ for (const [name, flat] of [
   ['valid/codebook_sh_1_3', true],
   ['valid/combined_tiles', false],
 ]) {
-  test(`${name}: both layouts hold its numbers`, async () => {
+  test(`${name}: both layouts have its values`, async () => {
     const reader = await CsplatReader.open(new Blob([vector(name)]));
     const header = { ...reader.header, flat };
     const tiles = [];

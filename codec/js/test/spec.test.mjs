@@ -1,4 +1,4 @@
-// The generated constants read the header and index of a file as the spec lays them out.
+// The generated constants match the layout of header and index in the spec.
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { test } from 'node:test';
@@ -9,7 +9,7 @@ const vectors = new URL('../../../conformance/csplat_conformance/vectors/', impo
 const file = readFileSync(new URL('valid/worked_example.csplat', vectors));
 const view = new DataView(file.buffer, file.byteOffset, file.byteLength);
 
-test('the header is where the registry says', () => {
+test('the fields of the header have the offsets of the registry', () => {
   const header = spec.unpackHeader(view, 0);
   assert.deepEqual([...header.magic], [...spec.MAGIC]);
   assert.equal(header.version_major, spec.VERSION_MAJOR);
@@ -17,7 +17,7 @@ test('the header is where the registry says', () => {
   assert.equal(header.file_size, BigInt(file.length));
 });
 
-test('the index begins behind the header and counts its tiles', () => {
+test('the index begins after the header and counts its tiles', () => {
   const head = spec.unpackIndexHead(view, spec.HEADER_SIZE);
   assert.equal(head.attribute_count, 5 + head.sh_degree);
   assert.ok(head.tile_count >= 1);

@@ -1,4 +1,4 @@
-// decoder.mjs is what decoder.d.ts says. Compiled, never run.
+// Checks that decoder.mjs matches decoder.d.ts. Compiled, never run.
 
 import * as implementation from '../decoder.mjs';
 import type * as declared from '../decoder.d.ts';

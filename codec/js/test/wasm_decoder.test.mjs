@@ -1,4 +1,4 @@
-// The decoder in WebAssembly by itself: what it reads and refuses without the modules that step in for it.
+// The WebAssembly decoder alone: what it decodes and refuses without the JavaScript modules as a fallback.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -11,7 +11,7 @@ import { hash, manifest, vector } from './helpers.mjs';
 
 const valid = manifest.filter(({ error }) => !error.code);
 
-/** All that it can decode of a file whose header and index are right, or null. */
+/** Return everything that it decodes of a file with valid header and index, or null. */
 async function decodeAll(file, header) {
   const end = HEADER_SIZE + header.indexSize;
   const decoder = await WasmDecoder.open(file.length, file.subarray(0, HEADER_SIZE), file.subarray(HEADER_SIZE, end));
@@ -38,7 +38,7 @@ test('reads every valid vector', async () => {
   }
 });
 
-test('refuses every invalid vector, but for what it leaves to the others: extra columns, the budget', async () => {
+test('refuses every invalid vector, except for extra columns and budgets, which it does not check', async () => {
   const taken = [];
   for (const { name } of manifest.filter(({ name, error }) => error.code && !name.endsWith('_beyond_budget'))) {
     const file = vector(name);
@@ -46,7 +46,7 @@ test('refuses every invalid vector, but for what it leaves to the others: extra 
     try {
       header = readHeader(file);
     } catch {
-      continue; // it never gets to see these
+      continue; // never reaches WebAssembly
     }
     const others = /extra|raw/.test(name);
     if ((await decodeAll(file, header)) !== null && !others) taken.push(name);
@@ -54,16 +54,16 @@ test('refuses every invalid vector, but for what it leaves to the others: extra 
   assert.deepEqual(taken, []);
 });
 
-test('runs for floats and packed arrays, and steps aside for an inflate of the caller', async () => {
+test('decodes floats and packed arrays, but not with an inflate of the caller', async () => {
   const file = vector('valid/rich');
   assert.ok((await CsplatReader.open(new Blob([file]))).compiled);
   assert.equal((await CsplatReader.open(new Blob([file]), { inflate: await zlibInflate() })).compiled, null);
 });
 
-test('a page that forbids WebAssembly has no such decoder', async () => {
+test('open returns null on a page that forbids WebAssembly', async () => {
   const file = vector('valid/rich');
   for (const forbidden of ['compile', 'Instance']) {
-    // WebKit forbids the second
+    // WebKit forbids only the second
     const allowed = WebAssembly[forbidden];
     WebAssembly[forbidden] = function () {
       throw new WebAssembly.CompileError('unsafe-eval');
@@ -77,7 +77,7 @@ test('a page that forbids WebAssembly has no such decoder', async () => {
   }
 });
 
-test('a decoder that breaks down is not used again', async () => {
+test('a decoder is not used again after a trap', async () => {
   const file = vector('valid/rich');
   const reader = await CsplatReader.open(file.buffer);
   const { compiled } = reader;

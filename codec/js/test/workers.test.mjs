@@ -1,4 +1,4 @@
-// Tiles decoded by workers: the same scene, the same refusals; without workers where none starts.
+// Tiles decoded by workers: the same scenes and refusals as without workers, also if no worker starts.
 import assert from 'node:assert/strict';
 import { spawnSync } from 'node:child_process';
 import { once } from 'node:events';
@@ -28,14 +28,14 @@ test('workers decode every scene of several tiles to the same arrays', async () 
   }
 });
 
-test('tiles in another order and lower degrees come from workers, too', async () => {
+test('tiles in another order and lower degrees come from workers too', async () => {
   const file = vector(several.find(({ expect }) => expect.header.sh_degree > 1).name);
   const options = { tiles: [1, 0], shDegree: 1 };
   const [one, other] = [await decode(file, { ...options, workers: 2 }), await decode(file, options)];
   for (const part of ['means', 'shN']) assert.equal(hash(one[part]), hash(other[part]));
 });
 
-test('a damaged tile is refused as without workers', async () => {
+test('a damaged tile is refused with the same error as without workers', async () => {
   const file = vector(several[0].name);
   const { tiles } = readHeader(file);
   for (const options of [{ workers: 2 }, {}]) {
@@ -54,13 +54,17 @@ test('an abort ends the work of workers', async () => {
 });
 
 const noRequire = !process.features.require_module && 'this Node cannot require modules';
-test('a classic script can be made of the worker: no module awaits out in the open', { skip: noRequire }, async () => {
-  const path = fileURLToPath(new URL('../csplat-worker.mjs', import.meta.url));
-  const worker = new Worker(`require(${JSON.stringify(path)})`, { eval: true });
-  worker.postMessage({ tile: 0, parts: new Map() });
-  assert.deepEqual(await once(worker, 'message'), [{}]); // refused, for there is no file
-  await worker.terminate();
-});
+test(
+  'the worker can be bundled as a classic script: no module has a top-level await',
+  { skip: noRequire },
+  async () => {
+    const path = fileURLToPath(new URL('../csplat-worker.mjs', import.meta.url));
+    const worker = new Worker(`require(${JSON.stringify(path)})`, { eval: true });
+    worker.postMessage({ tile: 0, parts: new Map() });
+    assert.deepEqual(await once(worker, 'message'), [{}]); // refused, since there is no file
+    await worker.terminate();
+  },
+);
 
 test('tiles come from workers in each form', async () => {
   const file = vector('valid/combined_codebooks').buffer;
@@ -82,7 +86,7 @@ test('tiles come from workers in each form', async () => {
   }
 });
 
-test('a loop over tiles may end early', async () => {
+test('a loop over tiles can end early', async () => {
   const reader = await CsplatReader.open(vector(several[0].name).buffer);
   for await (const { index } of reader.readTiles({ workers: 2 })) {
     assert.ok(index < reader.header.tiles.length);
@@ -93,7 +97,7 @@ test('a loop over tiles may end early', async () => {
   assert.equal(count, 3 * reader.header.tiles[1].splatCount);
 });
 
-test('where no worker may start, decode does without', () => {
+test('decode works if no worker can start', () => {
   const script = `
     import { readFileSync } from 'node:fs';
     import { decode } from './decoder.mjs';

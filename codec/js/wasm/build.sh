@@ -1,9 +1,9 @@
 #!/bin/sh
-# Compile the decoder in C to WebAssembly and write it as a module that bundlers, pages and Node import alike:
+# Compile the decoder in C to WebAssembly and write it as a module that bundlers, pages and Node can import:
 #
 #     codec/js/wasm/build.sh codec/js/wasm_binary.mjs
 #
-# The same bytes come out wherever the packages are Debian 12's: clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32.
+# The output is reproducible with the packages of Debian 12: clang-14 lld-14 wasi-libc libclang-rt-14-dev-wasm32.
 set -eu
 cd "$(dirname "$0")"
 out=$(mktemp)

@@ -1,5 +1,5 @@
-/* What the JavaScript decoder (../wasm_decoder.mjs) calls of the decoder in C: one file to an instance, its bytes by the
- * import `read`. Messages are left out: what is refused here JavaScript decodes again, to say why.
+/* The interface of the C decoder for JavaScript (../wasm_decoder.mjs). An instance decodes one file, which it reads with the
+ * import `read`. It has no messages: JavaScript decodes refused files again to report the error.
  * SPDX-License-Identifier: Apache-2.0 */
 #include "../../c/csplat.c"
 
@@ -9,7 +9,7 @@ __attribute__((import_module("env"), import_name("read"))) int read_part(double 
 
 enum { SH_ROWS = 512 }; /* as in ../wasm_decoder.mjs */
 
-/* ../wasm_decoder.mjs reads these structures as they lie in memory. */
+/* ../wasm_decoder.mjs reads these structures directly from memory. */
 typedef char columns_as_expected[sizeof(csplat_columns) == 192 && offsetof(csplat_columns, offset) == 16 ? 1 : -1];
 typedef char packed_as_expected[sizeof(csplat_packed) == 208 && offsetof(csplat_packed, rows) == 192 ? 1 : -1];
 
@@ -21,7 +21,7 @@ static buffer values;
 static block bands[SPEC_SH_DEGREE_MAX + 1];
 static size_t rows_put[SPEC_SH_DEGREE_MAX + 1];
 
-/* In the place of the library's, which would take up more than the decoder. */
+/* Replaces the library's snprintf, which would be larger than the decoder. */
 int snprintf(char *out, size_t size, const char *format, ...)
 {
     (void)format;
@@ -62,7 +62,7 @@ int EXPORT(check)(void)
     return csplat_check(file) == CSPLAT_OK;
 }
 
-/* A tile's means, quats, scales, opacities and sh0, one after the other; NULL where it, or an SH band, is refused. */
+/* A tile's means, quats, scales, opacities and sh0, one after the other; NULL if the tile or an SH band is refused. */
 const float *EXPORT(read_tile)(uint32_t index, unsigned degree)
 {
     const tile *t;
@@ -78,7 +78,7 @@ const float *EXPORT(read_tile)(uint32_t index, unsigned degree)
     return read_tile_blocks(file, t, degree, &out, bands) ? values.data : NULL;
 }
 
-/* SH of the tile's splats `from` to `to`; from the first on, some at a time, so that they stay in the nearest caches. */
+/* SH of the tile's splats `from` to `to`. Called in order, with few splats at a time so that they stay in the L1 cache. */
 const float *EXPORT(read_rows)(unsigned degree, uint32_t from, uint32_t to)
 {
     static float rows[SH_ROWS * 3 * 15];
