@@ -365,7 +365,7 @@ def test_turning_upright_can_be_kept(viewer, make_model, tmp_path):
     assert not viewer.hides("#upright")
     for _ in range(5):
         page.keyboard.press("u")
-    assert "z is up, as the scene says" == viewer.text("#toast")
+    assert "z is up, as in the file" == viewer.text("#toast")
     assert viewer.hides("#keep")
 
 

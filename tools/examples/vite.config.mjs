@@ -1,4 +1,4 @@
-// The pages as they are; `npm run build` puts them into dist/. The scene lies in public/.
+// Configuration of the example pages; `npm run build` builds them into dist/. The scene is in public/.
 import { defineConfig } from 'vite';
 import manifest from './package.json' with { type: 'json' };
 
@@ -6,7 +6,7 @@ const pages = ['index', 'three', 'spark', 'playcanvas', 'babylon', 'view'];
 
 export default defineConfig({
   base: './',
-  // The decoder lies beside these pages, not in node_modules, and takes its engines from here.
+  // The decoder is outside node_modules and must use the engines installed here.
   resolve: { dedupe: Object.keys(manifest.dependencies) },
   server: { fs: { allow: ['.', '../../codec/js'] } },
   build: {

@@ -1,4 +1,4 @@
-// The first picture: from a camera of the file, or from one that finds the scene by itself.
+// The initial view: from a camera of the file, or from an automatic camera.
 
 import { evened, findFrame, quantiles } from './bounding_frame.mjs';
 import { OrbitCamera, defaultLens } from './orbit_camera.mjs';
@@ -14,33 +14,33 @@ import { across, add, cross, dot, length, lookAlong, scale, sub, turn, unit } fr
  * @typedef {import('./vectors.mjs').Vec3} Vec3
  */
 
-/** Near plane where a camera does not say another, scene units. */
+/** Near plane of cameras that specify none, scene units. */
 export const DEFAULT_NEAR = 0.2;
 
-/** Axes that a scene is shown with where it does not name its own. */
+/** Axes of scenes that specify none. */
 export const DEFAULT_AXES = 'RDF';
 
-const NEAR_SHARE = 0.05; // near plane in extents, DEFAULT_NEAR at most
-const FIT_SHARE = 0.995; // of an object lies to the left of the right side of its first picture, and so on
+const NEAR_SHARE = 0.05; // near plane in extents, at most DEFAULT_NEAR
+const FIT_SHARE = 0.995; // share of an object's samples inside each side of the initial view
 const FIT_STEPS = 4;
 const MARGIN = 1.08;
-const ELEVATION = 0.3; // radians above the horizon, from which an object is seen
-const AZIMUTHS = 12; // directions that are tried
+const ELEVATION = 0.3; // radians above the horizon, for views of an object
+const AZIMUTHS = 12; // number of directions tried
 const ROOM_ELEVATION = 0.12;
-const ASIDE = 0.4; // radians beside the front, from where an object looks less flat
-const BESIDE = 0.8; // the detail of another side counts this much less than that of the front
+const ASIDE = 0.4; // radians away from the front, where an object looks less flat
+const BESIDE = 0.8; // weight of the detail of other sides, compared with the front
 const SURROUNDINGS = { elevations: [0.05, 0.25, 0.6], distances: [1.3, 0.8, 0.5] };
-const NEARER = 0.9; // the detail of a nearer view counts this much less than that of the next farther one
-const HIDING = 0.4; // extents; what is nearer to a camera in surroundings only hides
-const JUDGED = 3000; // samples that many views are judged by
-const SNAP = 0.94; // cosine of the angle between the cameras' upward direction and an axis that is taken for it
-const ROTATION_TOLERANCE = 1e-2; // of the entries of R Rᵀ − 1; camera files hold few digits
+const NEARER = 0.9; // weight of the detail of a view, compared with the next farther one
+const HIDING = 0.4; // extents; samples nearer to a camera in surroundings only occlude
+const JUDGED = 3000; // maximum number of samples used to compare views
+const SNAP = 0.94; // cosine of the angle within which the cameras' up direction snaps to an axis
+const ROTATION_TOLERANCE = 1e-2; // of the entries of R Rᵀ − 1; camera files have few digits
 
-/** Names of directions, as they stand in a file, by what they are the opposite of. */
+/** Letters of directions, as used in files, and their opposites. */
 const OPPOSITE = /** @type {Record<string, string>} */ ({ R: 'L', L: 'R', U: 'D', D: 'U', F: 'B', B: 'F' });
 
 /**
- * The direction in the world of a letter of `axes`.
+ * Return the world direction of a letter of `axes`.
  *
  * @param {string} axes three letters, directions of +x, +y, +z
  * @param {string} letter
@@ -48,13 +48,13 @@ const OPPOSITE = /** @type {Record<string, string>} */ ({ R: 'L', L: 'R', U: 'D'
  */
 export function directionOf(axes, letter) {
   const k = [...axes].findIndex((one) => one === letter || one === OPPOSITE[letter]);
-  if (k < 0) throw new RangeError(`axes are ${axes}, wanted one letter each of R or L, U or D, F or B`);
+  if (k < 0) throw new RangeError(`axes are ${axes}, expected one letter each of R or L, U or D, F or B`);
   const sign = axes[k] === letter ? 1 : -1;
   return /** @type {Vec3} */ ([0, 1, 2].map((i) => (i === k ? sign : 0)));
 }
 
 /**
- * A camera of a camera file, or of the chunk CAMS.
+ * Parse a camera of a camera file or of the chunk CAMS.
  *
  * @param {unknown} entry {K, viewmat, W, H, near}
  * @returns {{viewmat: number[], lens: Lens, near: number}}
@@ -68,10 +68,11 @@ export function readCamera(entry) {
       `the viewmat of a camera has the last row ${m.slice(12).join(' ')}, expected 0 0 0 1: transposed?`,
     );
   }
-  if (!(W >= 1 && H >= 1 && k[0] > 0 && k[4] > 0)) throw new TypeError('a camera has no size or no focal length');
+  if (!(W >= 1 && H >= 1 && k[0] > 0 && k[4] > 0)) throw new TypeError('a camera has no size or focal length');
   const rows = [0, 4, 8].map((at) => /** @type {Vec3} */ (m.slice(at, at + 3)));
   const bent = rows.some((a, i) => rows.some((b, j) => Math.abs(dot(a, b) - Number(i === j)) > ROTATION_TOLERANCE));
-  if (bent || dot(cross(rows[0], rows[1]), rows[2]) < 0) throw new TypeError('the viewmat of a camera is no rotation');
+  if (bent || dot(cross(rows[0], rows[1]), rows[2]) < 0)
+    throw new TypeError('the viewmat of a camera is not a rotation');
   const lens = { fx: k[0], fy: k[4], cx: k[2], cy: k[5], W: Number(W), H: Number(H) };
   return { viewmat: m, lens, near: near > 0 && Number.isFinite(near) ? Number(near) : DEFAULT_NEAR };
 }
@@ -91,7 +92,7 @@ function numbers(matrix, size, name) {
 }
 
 /**
- * The pose of a camera file's camera. What it turns around is what it looks at.
+ * Return the pose of a camera from a camera file. Its pivot is on the surface it looks at.
  *
  * @param {ReturnType<typeof readCamera>} camera
  * @param {Samples} samples
@@ -109,10 +110,10 @@ export function cameraPose({ viewmat: m, lens, near }, samples, frame, up) {
 }
 
 /**
- * Which way is up for people who took pictures: they hold their cameras level.
+ * Return the up direction of photographs, which are usually taken with a level camera.
  *
  * @param {{viewmat: number[]}[]} cameras at least one
- * @returns {Vec3} the nearest axis of the world where one is near
+ * @returns {Vec3} snapped to a world axis if one is near
  */
 export function upOfCameras(cameras) {
   let sum = /** @type {Vec3} */ ([0, 0, 0]);
@@ -126,10 +127,10 @@ export function upOfCameras(cameras) {
 }
 
 /**
- * Ways up that a scene may have, the likely ones first: COLMAP's and PLY's, then those of programs that model.
+ * Return candidate up directions of a scene, likely ones first: those of COLMAP and PLY, then those of modelling programs.
  *
- * @param {Vec3} first the present one
- * @returns {Vec3[]} all six axes, or seven
+ * @param {Vec3} first the current up direction
+ * @returns {Vec3[]} the six axes, preceded by `first` if it is not one of them
  */
 export function waysUp(first) {
   /** @type {Vec3[]} */
@@ -138,12 +139,12 @@ export function waysUp(first) {
 }
 
 /**
- * A camera that finds the scene by itself.
+ * Find a pose that shows the scene.
  *
  * @param {Samples} samples
- * @param {number} splatCount of the scene
- * @param {{up: Vec3, front: Vec3, isFrontKnown: boolean}} ways `front` is where a person looks who sees the scene from
- *   its front; where that is not known, another side may show more
+ * @param {number} splatCount number of splats in the scene
+ * @param {{up: Vec3, front: Vec3, isFrontKnown: boolean}} ways `front` is the viewing direction of a view from the front;
+ *   if it is not known, views of other sides may show more
  * @returns {{pose: Pose, frame: Frame}}
  */
 export function automaticPose(samples, splatCount, { up, front, isFrontKnown }) {
@@ -174,10 +175,10 @@ export function automaticPose(samples, splatCount, { up, front, isFrontKnown }) 
 }
 
 /**
- * Views that the first picture may show, the preferred ones first.
+ * Return candidates for the initial view, preferred ones first.
  *
  * @param {Frame} frame
- * @param {(elevation: number) => Vec3[]} around directions to look in, the front first
+ * @param {(elevation: number) => Vec3[]} around returns viewing directions, the front first
  * @returns {{direction: Vec3, distance: number, weight: number}[]} distances from the centre of the frame
  */
 function candidates({ kind, extent, half }, around) {
@@ -198,7 +199,7 @@ function candidates({ kind, extent, half }, around) {
 }
 
 /**
- * Directions all around, from beside the front.
+ * Return viewing directions all around, starting slightly to the side of the front.
  *
  * @param {Vec3} ahead horizontal
  * @param {Vec3} up
@@ -210,12 +211,12 @@ function around(ahead, up, elevation) {
 }
 
 /**
- * A direction turned to the right of the scene, and downwards.
+ * Return a direction turned to the right around the scene, and downwards.
  *
  * @param {Vec3} ahead horizontal
  * @param {Vec3} up
  * @param {number} azimuth radians
- * @param {number} elevation radians, of the camera above what it looks at
+ * @param {number} elevation radians, of the camera above its target
  */
 function tilted(ahead, up, azimuth, elevation) {
   const level = turn(ahead, up, azimuth);
@@ -223,12 +224,12 @@ function tilted(ahead, up, azimuth, elevation) {
 }
 
 /**
- * Come so near, and step aside so far, that an object fills a square picture.
+ * Find the nearest position from which an object fits a square picture.
  *
- * @param {Samples} scene not too many of them
+ * @param {Samples} scene a small number of samples
  * @param {Frame} frame
  * @param {Basis} basis
- * @returns {{centre: Vec3, distance: number}} what to look at, and from how far away
+ * @returns {{centre: Vec3, distance: number}} the target, and the distance from it
  */
 function fitted(scene, { centre, extent }, [right, down, forward]) {
   const { samples, weights } = scene;
@@ -255,7 +256,7 @@ function fitted(scene, { centre, extent }, [right, down, forward]) {
 }
 
 /**
- * The way to the front for a direction upwards that the scene did not name.
+ * Return the direction towards the front for an up direction that the scene does not specify.
  *
  * @param {string} axes
  * @param {Vec3} up

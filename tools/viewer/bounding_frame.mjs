@@ -1,35 +1,35 @@
-// Centre, size and kind (object or surroundings) of a scene, from samples of its splats. Not the bounding box of all
-// splats: a few distant ones must not decide the first view.
+// Centre, size and kind (object or surroundings) of a scene, from samples of its splats. Unlike the bounding box of all
+// splats, they do not depend on a few distant ones.
 
 /**
  * @typedef {import('./vectors.mjs').Vec3} Vec3
  * @typedef {Pick<import('./types.d.ts').Bounds, 'samples' | 'weights'>} Samples means [S, 3], and alpha times area [S]
  *
- * An object is looked at from outside. Surroundings reach much farther than their dense middle, in or near which one
- * stands; one stands inside a room, too.
+ * An object is viewed from outside. Surroundings extend much farther than their dense middle and are viewed from within or
+ * near it. A room is viewed from inside.
  * @typedef {'object' | 'surroundings' | 'room'} Kind
  *
  * @typedef {object} Frame
  * @property {Kind} kind
  * @property {Vec3} centre
- * @property {number} extent what distances are multiples of, above 0: half the diagonal of an object or a room, the
- *   distance from the centre within which half of surroundings lies
+ * @property {number} extent unit of distances, above 0: half the diagonal of an object or a room; for surroundings, the
+ *   distance from the centre within which half of them lies
  * @property {Vec3} half half the sides of the box of 5 to 95 % of the scene
  */
 
-const FAR_REACH = 4; // times the distance within which half of a scene lies: nothing of an object lies there
-const FAR_SHARE = 0.02; // of the surface, that an object may have there
-const WALL = 0.08; // of the side of a box, within which its wall is looked for
+const FAR_REACH = 4; // times the median distance from the centre; an object does not extend beyond this
+const FAR_SHARE = 0.02; // maximum share of an object's surface beyond it
+const WALL = 0.08; // share of the side of a box; depth of a wall
 const WALL_CELLS = 6; // per side of a wall
-const WALL_COVER = 0.9; // of the cells, in which a wall has something: also in its corners
-const INNER_SHARE = 0.15; // of a room that stands away from its walls, at most
+const WALL_COVER = 0.9; // minimum share of a wall's cells with samples, including its corners
+const INNER_SHARE = 0.15; // maximum share of a room that is away from its walls
 
 /**
- * Quantiles of values that have weights.
+ * Return quantiles of weighted values.
  *
  * @param {ArrayLike<number>} values
- * @param {ArrayLike<number>} weights of the same length, not all 0
- * @param {number[]} shares 0 to 1, rising
+ * @param {ArrayLike<number>} weights same length, not all 0
+ * @param {number[]} shares 0 to 1, ascending
  * @returns {number[]}
  */
 export function quantiles(values, weights, shares) {
@@ -46,8 +46,8 @@ export function quantiles(values, weights, shares) {
 
 /**
  * @param {Samples} samples
- * @param {Vec3} up the axis nearest to it has the floor and the ceiling of a room
- * @returns {Frame} one of extent 1 around 0 where there are no samples
+ * @param {Vec3} up the nearest axis points from the floor to the ceiling of a room
+ * @returns {Frame} of extent 1 around 0 if there are no samples
  */
 export function findFrame({ samples, weights }, up) {
   const count = weights.length;
@@ -61,7 +61,7 @@ export function findFrame({ samples, weights }, up) {
   );
   const [reach] = quantiles(distances, even, [0.5]);
   const size = Math.hypot(...half);
-  const extent = size > 0 ? size : Math.sqrt(Math.max(...even)) || 1; // one splat, or several in one place
+  const extent = size > 0 ? size : Math.sqrt(Math.max(...even)) || 1; // one splat, or several at one position
   if (reach > 0 && farShare(distances, weights, reach) > FAR_SHARE) {
     return { kind: 'surroundings', centre: middle, extent: reach, half };
   }
@@ -71,7 +71,7 @@ export function findFrame({ samples, weights }, up) {
 }
 
 /**
- * Weights of which none outweighs a scene: the sky is a handful of splats, and a large one is no more interesting.
+ * Limit weights so that none dominates a scene: large splats of the sky are not more important than others.
  *
  * @param {ArrayLike<number>} weights
  * @returns {Float32Array}
@@ -86,14 +86,14 @@ export function evened(weights) {
 }
 
 /**
- * The share of the surface that lies far from the middle.
+ * Return the share of the surface that is far from the centre.
  *
  * @param {Float32Array} distances
  * @param {ArrayLike<number>} weights
  * @param {number} reach
  */
 function farShare(distances, weights, reach) {
-  const most = (0.5 * reach) ** 2; // no single floater makes a landscape
+  const most = (0.5 * reach) ** 2; // one floater does not make a scene surroundings
   let all = 0;
   let far = 0;
   for (let i = 0; i < distances.length; i++) {
@@ -105,8 +105,8 @@ function farShare(distances, weights, reach) {
 }
 
 /**
- * Whether a scene is closed above, below and on three sides at least, and nearly hollow: a room seen from inside. The
- * bottom of an object is rarely there, and rarely does an object fill the corners of its box.
+ * Return true for a room seen from inside: closed above, below and on at least three sides, and almost hollow. Objects
+ * rarely have a bottom and rarely fill the corners of their box.
  *
  * @param {ArrayLike<number>} samples
  * @param {Float32Array} even
@@ -129,12 +129,12 @@ function isRoom(samples, even, up) {
 }
 
 /**
- * How much of one side of a box has samples close by, 0 to 1.
+ * Return the share of one side of a box that has samples close to it, 0 to 1.
  *
  * @param {ArrayLike<number>} samples
  * @param {number[][]} bounds low and high of each axis
  * @param {number} axis
- * @param {number} side 0 the low one, 1 the high one
+ * @param {number} side 0 for the lower side, 1 for the upper
  */
 function wallCover(samples, bounds, axis, side) {
   const [u, v] = [0, 1, 2].filter((k) => k !== axis);
@@ -150,7 +150,7 @@ function wallCover(samples, bounds, axis, side) {
 }
 
 /**
- * The share of a scene in the inner half of its box, along each axis.
+ * Return the share of a scene in the inner half of its box, along each axis.
  *
  * @param {ArrayLike<number>} samples
  * @param {Float32Array} even

@@ -1,4 +1,4 @@
-// Where a scene lies: from the boxes of its tiles at first, from samples of its splats when layer 0 is here.
+// Bounds of a scene: from the boxes of its tiles first, then from samples of its splats when layer 0 has arrived.
 
 /**
  * @typedef {import('../../codec/js/decoder.d.ts').Header} Header
@@ -6,17 +6,17 @@
  * @typedef {[number, number, number]} Point
  */
 
-/** Splats that are sampled of a scene, about. */
+/** Approximate number of splats sampled from a scene. */
 export const SAMPLE_COUNT = 20_000;
 
-/** Share of what shows that the radius covers. */
+/** Share of the visible weight within the radius. */
 const SHARE = 0.9;
 
-/** Log-scales count as if they lay within this of 0. */
+/** Log-scales are clamped to this magnitude. */
 const LOG_SCALE_LIMIT = 60;
 
 /**
- * Bounds from the boxes of tiles alone.
+ * Return bounds from the boxes of tiles.
  *
  * @param {Header} header
  * @returns {Bounds}
@@ -33,7 +33,7 @@ export function coarseBounds({ tiles }) {
 }
 
 /**
- * Bounds from samples of splats.
+ * Return bounds from samples of splats.
  *
  * @param {Header} header
  * @param {Float32Array} samples [S, 3]
@@ -45,10 +45,10 @@ export function fineBounds({ tiles }, samples, weights) {
 }
 
 /**
- * How much a splat shows: the square root of alpha times the area of its ellipse, roughly.
+ * Return the visibility weight of a splat: roughly the square root of alpha times the area of its ellipse.
  *
  * @param {number} alpha
- * @param {number} a two of its log-scales, the larger ones
+ * @param {number} a larger log-scale; `b` is the second largest
  * @param {number} b
  */
 export function showing(alpha, a, b) {
@@ -89,7 +89,7 @@ function boundsOf(samples, weights) {
 }
 
 /**
- * The smallest value that at least a share of the weight does not exceed; 0 of nothing.
+ * Return the smallest value that at least a share of the weight does not exceed; 0 without values.
  *
  * @param {Float64Array} values
  * @param {Float32Array} weights not negative

@@ -1,15 +1,15 @@
-// Camera files of other programs, as entries of our own: cameras.json of INRIA, camera paths of nerfstudio,
-// transforms.json. `csplat_render/camera_files.py` describes them, and reads them in the same way.
+// Converts camera files of other programs to csplat's own form: cameras.json of INRIA, camera paths of nerfstudio,
+// transforms.json. `csplat_render/camera_files.py` describes them and reads them in the same way.
 
-const NEAR = 0.01; // scene units, of nerfstudio's renderer
+const NEAR = 0.01; // scene units, as in nerfstudio's renderer
 
 /** @typedef {Record<string, any>} Entry */
 
 /**
- * Bring cameras of any of these forms into that of camera files.
+ * Convert cameras of any of these forms to the form of camera files.
  *
- * @param {unknown} value of a JSON file
- * @returns {unknown[]} entries {K, viewmat, W, H, near, image}; what is none of the other forms is left as it is
+ * @param {unknown} value content of a JSON file
+ * @returns {unknown[]} entries {K, viewmat, W, H, near, image}; values of unknown form are returned unchanged
  */
 export function ownCameras(value) {
   if (Array.isArray(value)) return value.map((entry) => (entry?.rotation ? ofInria(entry) : entry));
@@ -26,7 +26,7 @@ export function ownCameras(value) {
 /** @param {Entry} entry */
 function ofInria({ rotation: R, position: p, fx, fy, width: W, height: H, img_name: image }) {
   if (!isMatrix(R, 3, 3) || !isMatrix([p], 1, 3))
-    throw new TypeError('rotation and position of a camera are no numbers');
+    throw new TypeError('rotation and position of a camera must be numbers');
   const rows = [0, 1, 2].map((k) => {
     const axis = R.map((/** @type {number[]} */ row) => row[k]);
     return [...axis, -(axis[0] * p[0] + axis[1] * p[1] + axis[2] * p[2])];
@@ -60,7 +60,7 @@ function ofTransforms(document, frame) {
 }
 
 /**
- * World to camera with OpenCV axes, from camera to world with OpenGL axes.
+ * Convert camera to world with OpenGL axes to world to camera with OpenCV axes.
  *
  * @param {any} pose
  * @param {string} name
@@ -70,7 +70,7 @@ function ofOpenGL(pose, name) {
   if (pose.length === 4 && pose[3].join() !== '0,0,0,1') {
     throw new TypeError(`${name} has the last row ${pose[3].join(' ')}, expected 0 0 0 1: is it transposed?`);
   }
-  const scale = Math.hypot(pose[0][0], pose[1][0], pose[2][0]); // some exporters leave the scale of the world in it
+  const scale = Math.hypot(pose[0][0], pose[1][0], pose[2][0]); // some exporters include the scale of the world
   const rows = [0, 1, 2].map((k) => {
     const sign = k === 0 ? 1 : -1;
     const axis = [0, 1, 2].map((row) => (sign * pose[row][k]) / scale);

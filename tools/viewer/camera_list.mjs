@@ -1,4 +1,4 @@
-// A scene's cameras, from its file and the page's address: the list, the first one shown, and the up direction.
+// The cameras of a scene, from its file and the page's address: their list, the initial one, and the up direction.
 
 import {
   DEFAULT_AXES,
@@ -26,9 +26,9 @@ import { dot, unitDirection } from './vectors.mjs';
  * @typedef {ReturnType<typeof readCamera> & {image: string}} Camera
  */
 
-const SAME = 0.999; // cosine of the angle between directions that are taken for one
+const SAME = 0.999; // cosine of the angle within which directions count as equal
 
-/** @returns {Pose} of a camera before anything is known */
+/** @returns {Pose} placeholder until a scene is loaded */
 export function emptyPose() {
   return {
     basis: [
@@ -44,7 +44,7 @@ export function emptyPose() {
   };
 }
 
-/** What a file says of its scene. */
+/** Metadata of a file that specifies none. */
 const noFacts = () => {
   return {
     /** @type {Vec3 | null} */
@@ -52,9 +52,9 @@ const noFacts = () => {
     axes: '',
     /** @type {Camera[]} */
     cameras: [],
-    /** @type {Camera | null} of the metadata */
+    /** @type {Camera | null} initial camera in the metadata */
     start: null,
-    /** @type {Vec3 | null} what the scene was trained in front of: red, green, blue, 0 to 1 */
+    /** @type {Vec3 | null} background of the training: red, green, blue, 0 to 1 */
     background: null,
     title: '',
     licence: '',
@@ -65,8 +65,8 @@ export class CameraList {
   /**
    * @param {OrbitCamera} rig
    * @param {Controls} controls
-   * @param {{up: Vec3 | null, axes: string | null, seems: Vec3 | null}} wanted instead of the file's; `seems`: what is
-   * up in the first scene if nothing says it
+   * @param {{up: Vec3 | null, axes: string | null, seems: Vec3 | null}} wanted override the file's; `seems` is the up
+   *   direction of the first scene if nothing specifies it
    */
   constructor(rig, controls, wanted) {
     this.rig = rig;
@@ -74,7 +74,7 @@ export class CameraList {
     this.wanted = wanted;
     /** @type {Vec3 | null} */
     this.seems = null;
-    /** @type {Camera[]} of the address: for whatever scene */
+    /** @type {Camera[]} from the address, for any scene */
     this.wantedCameras = [];
     this.first = 0;
     this.facts = noFacts();
@@ -82,11 +82,11 @@ export class CameraList {
     this.bounds = null;
     this.shown = 0;
     this.up = directionOf(DEFAULT_AXES, 'U');
-    /** Whether the camera still has to find its place. */
+    /** Whether the camera still waits to be placed. */
     this.waits = true;
   }
 
-  /** Forget the scene before. */
+  /** Forget the previous scene. */
   begin() {
     this.facts = noFacts();
     this.seems = this.wanted.seems;
@@ -96,16 +96,16 @@ export class CameraList {
     this.controls.touched = false;
   }
 
-  /** The cameras that one can step through. */
+  /** The cameras to step through. */
   get cameras() {
     return this.wantedCameras.length ? this.wantedCameras : this.facts.cameras;
   }
 
   /**
-   * Take the cameras that the address names.
+   * Use the cameras in the address.
    *
-   * @param {unknown[]} entries of a camera file
-   * @param {number} first which one to show first
+   * @param {unknown[]} entries cameras of a camera file
+   * @param {number} first index of the initial camera
    */
   useCameras(entries, first) {
     this.wantedCameras = entries.map(named);
@@ -131,12 +131,12 @@ export class CameraList {
     this.shown = this.first;
   }
 
-  /** Whether the file says which way is up, or who took its pictures, or it seems plain. */
+  /** Whether the up direction is known from the file or the cameras of its photographs, or estimated. */
   get knowsUp() {
     return (this.#namedUp() ?? this.seems) !== null;
   }
 
-  /** @returns {Vec3 | null} what the file says by itself, whoever took its pictures */
+  /** @returns {Vec3 | null} up direction in the file, regardless of its cameras */
   get saidUp() {
     const { up, axes } = this.facts;
     return up ?? (axes ? directionOf(axes, 'U') : null);
@@ -158,11 +158,11 @@ export class CameraList {
   }
 
   /**
-   * Put the camera where the first picture is taken from: once roughly, once for good, never after a person moved it.
+   * Place the camera for the initial view: once roughly, once finally, never after the user has moved it.
    *
    * @param {Bounds} bounds
    * @param {number} splatCount
-   * @param {boolean} atOnce nothing is to be seen yet: no need to glide
+   * @param {boolean} atOnce without animation, if nothing is visible yet
    * @returns {boolean} whether it was moved
    */
   place(bounds, splatCount, atOnce) {
@@ -176,7 +176,7 @@ export class CameraList {
     return true;
   }
 
-  /** Back to the first view. */
+  /** Return to the initial view. */
   goHome() {
     this.shown = this.first;
     this.controls.glide(this.rig.home);
@@ -185,8 +185,8 @@ export class CameraList {
   /**
    * Show the next camera of the file.
    *
-   * @param {number} step 1, or −1 for the one before
-   * @returns {string} its name, empty where there are no others
+   * @param {number} step 1, or −1 for the previous one
+   * @returns {string} its name, empty if there are no others
    */
   otherCamera(step) {
     const { cameras, bounds } = this;
@@ -199,11 +199,11 @@ export class CameraList {
   }
 
   /**
-   * Turn another side of the scene up, and look at it from its front.
+   * Turn the scene to the next up direction and show its front.
    *
    * @param {Bounds} bounds
    * @param {number} splatCount
-   * @returns {{up: Vec3, isSaid: boolean}} what is up now, and whether the file says so
+   * @returns {{up: Vec3, isSaid: boolean}} the up direction, and whether it is the one in the file
    */
   turnUpright(bounds, splatCount) {
     const all = waysUp(this.#firstUp());
@@ -216,7 +216,7 @@ export class CameraList {
   }
 
   /**
-   * The pose that turns around what lies at a point of the canvas.
+   * Return a pose that orbits the point of the scene at a point of the canvas.
    *
    * @param {number} x CSS pixels
    * @param {number} y CSS pixels
@@ -249,7 +249,7 @@ export class CameraList {
    */
   #automatic(bounds, splatCount, up) {
     const named = this.wanted.axes ?? this.facts.axes;
-    const axes = named && dot(directionOf(named, 'U'), up) > Math.SQRT1_2 ? named : ''; // of another way up: no front
+    const axes = named && dot(directionOf(named, 'U'), up) > Math.SQRT1_2 ? named : ''; // the front is unknown for another up direction
     const front = frontFor(axes || DEFAULT_AXES, up);
     const { pose, frame } = automaticPose(bounds, splatCount, { up, front, isFrontKnown: axes !== '' });
     this.rig.extent = frame.extent;
@@ -276,7 +276,7 @@ function named(entry) {
 }
 
 /**
- * A camera of a file, or none: a wrong one is not worth the scene.
+ * Return the camera of a file in a list, or an empty list if it is invalid: the scene is still shown.
  *
  * @param {unknown} entry
  * @returns {Camera[]}

@@ -1,4 +1,4 @@
-// Cameras as cull and shaders want them. Conventions are those of the rasteriser (csplat_render/conventions.py).
+// Cameras for cull and shaders, with the conventions of the rasteriser (csplat_render/conventions.py).
 
 /**
  * @typedef {import('./types.d.ts').Camera} Camera
@@ -10,20 +10,20 @@ export const DEFAULT_NEAR = 0.2;
 /** Added to both variances of the projected covariance, in square pixels. */
 export const DILATION = 0.3;
 
-/** A splat does not touch a pixel that it covers with less than this alpha. */
+/** Pixels that a splat covers with less than this alpha are skipped. */
 export const ALPHA_MIN = 1 / 255;
 
-/** The perspective is linearised at most this far outside the picture, in half-widths of it. */
+/** Maximum distance outside the picture at which the perspective is linearised, in half-widths of the picture. */
 const FOV_MARGIN = 0.3;
 
-/** How far a splat of alpha 1 reaches at ALPHA_MIN, in standard deviations. */
+/** Radius at which a splat of alpha 1 falls to ALPHA_MIN, in standard deviations. */
 export const REACH_MAX = Math.sqrt(2 * Math.log(1 / ALPHA_MIN));
 
-/** Of a canvas that has not been given a camera: nothing is drawn but the background. */
+/** Camera of a canvas without a camera: only the background is drawn. */
 export const NO_CAMERA = { viewmat: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1], fx: 1, fy: 1, cx: 0, cy: 0 };
 
 /**
- * A camera with the size of its picture, everything checked and copied.
+ * Combine a camera with the size of its picture; all values are checked and copied.
  *
  * @param {Camera} camera
  * @param {number} width pixels
@@ -33,14 +33,14 @@ export const NO_CAMERA = { viewmat: [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0
 export function viewOf({ viewmat, fx, fy, cx, cy, near = DEFAULT_NEAR }, width, height) {
   const matrix = Array.from(viewmat, Number);
   if (matrix.length !== 16 || ![...matrix, fx, fy, cx, cy, near].every(Number.isFinite)) {
-    throw new RangeError('a camera is 16 numbers of viewmat and fx, fy, cx, cy, near, all finite');
+    throw new RangeError('a camera must have 16 finite numbers in viewmat and finite fx, fy, cx, cy and near');
   }
-  if (!(fx > 0 && fy > 0 && near > 0)) throw new RangeError(`fx ${fx}, fy ${fy} and near ${near} must be above 0`);
+  if (!(fx > 0 && fy > 0 && near > 0)) throw new RangeError(`fx ${fx}, fy ${fy} and near ${near} must be positive`);
   return { viewmat: matrix, fx, fy, cx, cy, near, width, height };
 }
 
 /**
- * Smallest and largest x/z and y/z at which the perspective is linearised.
+ * Return the smallest and largest x/z and y/z at which the perspective is linearised.
  *
  * @param {View} view
  * @returns {[number, number, number, number]}
@@ -52,7 +52,7 @@ export function slopeLimits({ fx, fy, cx, cy, width, height }) {
 }
 
 /**
- * A point of the world in camera coordinates.
+ * Transform a point from world to camera coordinates.
  *
  * @param {ArrayLike<number>} m viewmat
  * @param {ArrayLike<number>} p
@@ -67,7 +67,7 @@ export function toCamera(m, p) {
 }
 
 /**
- * Where a camera stands: −Rᵀ t.
+ * Return the position of a camera: −Rᵀ t.
  *
  * @param {ArrayLike<number>} m viewmat
  * @returns {[number, number, number]}

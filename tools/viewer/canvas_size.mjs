@@ -2,19 +2,19 @@
 
 /** @typedef {{setSize: (width: number, height: number) => void}} Sized */
 
-const PIXEL_RATIO = 2; // pixels of the drawing buffer per CSS pixel at most: more nobody sees in splats
-const SLOW_MS = 45; // of a frame while moving: coarser
-const FAST_MS = 20; // finer again
+const PIXEL_RATIO = 2; // maximum pixels of the drawing buffer per CSS pixel; more makes no visible difference for splats
+const SLOW_MS = 45; // frame time while moving above which resolution is reduced
+const FAST_MS = 20; // frame time below which resolution is raised again
 const WANTED_MS = 30;
-const COARSEST = 0.4; // of the pixels per side
-const STEPS = [0.6, 1.15]; // limits of what one frame changes
-const REST_MS = 220; // without movement, until the picture is drawn at full size
+const COARSEST = 0.4; // minimum share of the pixels per side
+const STEPS = [0.6, 1.15]; // limits of the change per frame
+const REST_MS = 220; // time without movement before the picture is drawn at full size
 
 export class CanvasSize {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{width: number, height: number} | null} fixed size of the drawing buffer, whatever the page's
-   * @param {() => void} resized called when the drawing buffer has another size
+   * @param {{width: number, height: number} | null} fixed fixed size of the drawing buffer
+   * @param {() => void} resized called when the size of the drawing buffer has changed
    */
   constructor(canvas, fixed, resized) {
     this.canvas = canvas;
@@ -41,7 +41,7 @@ export class CanvasSize {
     this.fit();
   }
 
-  /** Give the drawing buffer the size that it is to have now. */
+  /** Set the drawing buffer to its current target size. */
   fit() {
     const { canvas, fixed } = this;
     const ratio = Math.min(devicePixelRatio || 1, PIXEL_RATIO) * (this.moving ? this.quality : 1);
@@ -54,7 +54,7 @@ export class CanvasSize {
     this.resized();
   }
 
-  /** The camera moves. */
+  /** Note that the camera moves. */
   moved() {
     if (this.fixed) return;
     if (!this.moving) {
@@ -69,9 +69,9 @@ export class CanvasSize {
   }
 
   /**
-   * A frame has been drawn.
+   * Adapt the resolution to the time of a frame.
    *
-   * @param {number} frameMs what it took
+   * @param {number} frameMs time of the frame
    */
   drawn(frameMs) {
     if (!this.moving || (frameMs >= FAST_MS && frameMs <= SLOW_MS)) return;

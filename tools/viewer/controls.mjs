@@ -1,4 +1,4 @@
-// Mouse, fingers and keys: what a person does on the canvas, turned into movements of the rig.
+// Mouse, touch and keyboard input on the canvas, converted to camera movements.
 
 import { between } from './orbit_camera.mjs';
 
@@ -8,29 +8,29 @@ import { between } from './orbit_camera.mjs';
  *
  * @typedef {object} Hooks
  * @property {() => void} moved called when the rig's pose has changed
- * @property {(x: number, y: number) => Pose | null} pivotAt the pose that turns around what lies at a point of the
- *   canvas, CSS pixels; null where nothing does
- * @property {() => boolean} calm whether a person wants no animations
+ * @property {(x: number, y: number) => Pose | null} pivotAt returns a pose that orbits the point of the scene at a point of
+ *   the canvas, in CSS pixels; null if there is none
+ * @property {() => boolean} calm whether the user prefers no animations
  *
  * @typedef {object} Reach
- * @property {EventTarget} keys where keys count: the whole page, or the canvas alone
- * @property {() => boolean} wheel whether the wheel is the scene's, not the page's
+ * @property {EventTarget} keys target of key events: the whole page, or only the canvas
+ * @property {() => boolean} wheel whether the wheel zooms the scene instead of scrolling the page
  */
 
 const ORBIT = Math.PI; // radians per shorter side of the canvas
-const WHEEL = 0.0015; // natural logarithm of the distance per pixel that a wheel scrolls
-const PINCH_WHEEL = 0.01; // the same where a trackpad reports a pinch
-const LINE = 16; // pixels of a line that a wheel scrolls by
+const WHEEL = 0.0015; // natural logarithm of the distance, per scrolled pixel
+const PINCH_WHEEL = 0.01; // same, for a pinch on a trackpad
+const LINE = 16; // pixels per scrolled line
 const KEY_TURN = 1.2; // radians per second
 const KEY_ZOOM = 1.4; // natural logarithm of the distance per second
-const FASTER = 4; // with Shift
+const FASTER = 4; // speed factor with Shift
 const GLIDE_MS = 450;
-const FOLLOW_MS = 45; // within which a drag is followed to two thirds
-const TAP_MS = 320; // between two taps
-const TAP_PIXELS = 24; // between two taps
-const STILL_PIXELS = 6; // that a tap may move
+const FOLLOW_MS = 45; // time to follow a drag to two thirds
+const TAP_MS = 320; // maximum time between two taps
+const TAP_PIXELS = 24; // maximum distance between two taps
+const STILL_PIXELS = 6; // maximum movement during a tap
 
-/** Keys that fly: to the right, down, forward. */
+/** Keys that fly: right, down, forward. */
 const FLY = /** @type {Record<string, [number, number, number]>} */ ({
   KeyW: [0, 0, 1],
   ArrowUp: [0, 0, 1],
@@ -44,7 +44,7 @@ const FLY = /** @type {Record<string, [number, number, number]>} */ ({
   KeyE: [0, -1, 0],
 });
 
-/** Keys that turn around the pivot (arrows with Shift): to the right, down. */
+/** Keys that orbit the pivot (arrows with Shift): right, down. */
 const TURN = /** @type {Record<string, [number, number]>} */ ({
   ArrowLeft: [-1, 0],
   ArrowRight: [1, 0],
@@ -59,7 +59,7 @@ export class Controls {
    * @param {HTMLElement} canvas
    * @param {OrbitCamera} rig
    * @param {Hooks} hooks
-   * @param {Reach} [reach] everything, by default
+   * @param {Reach} [reach] default: the whole page
    */
   constructor(canvas, rig, hooks, reach = { keys: window, wheel: () => true }) {
     this.canvas = canvas;
@@ -67,7 +67,7 @@ export class Controls {
     this.hooks = hooks;
     this.reach = reach;
     this.listeners = new AbortController();
-    /** Whether a person has moved the camera since it was placed. */
+    /** Whether the user has moved the camera since it was placed. */
     this.touched = false;
     /** @type {Map<number, {x: number, y: number}>} */
     this.pointers = new Map();
@@ -79,14 +79,14 @@ export class Controls {
     this.gliding = null;
     this.tap = { time: -Infinity, x: 0, y: 0 };
     this.press = { x: 0, y: 0, still: false, pans: false };
-    this.before = { pose: rig.pose, touched: false }; // the fingers that are down
+    this.before = { pose: rig.pose, touched: false }; // state before the current touch
     this.frame = 0;
     this.last = 0;
     this.#listen();
   }
 
   /**
-   * Bring the camera to a pose, at once where no animations are wanted.
+   * Move the camera to a pose; immediately if animations are off.
    *
    * @param {Pose} pose
    * @param {boolean} [atOnce]
@@ -103,7 +103,7 @@ export class Controls {
     this.#wake();
   }
 
-  /** Let go of the canvas and the page. */
+  /** Remove all listeners from the canvas and the page. */
   close() {
     this.listeners.abort();
     cancelAnimationFrame(this.frame);
@@ -170,13 +170,13 @@ export class Controls {
     if (!this.pointers.delete(event.pointerId)) return;
     if (event.type === 'pointercancel') this.#takeBack();
     if (event.type !== 'pointerup' || event.pointerType === 'mouse' || !this.press.still) return;
-    const { offsetX: x, offsetY: y, timeStamp } = event; // browsers differ in whether two taps are a double click
+    const { offsetX: x, offsetY: y, timeStamp } = event; // browsers differ on whether two taps make a double click
     const near = Math.hypot(x - this.tap.x, y - this.tap.y) < TAP_PIXELS;
     if (near && timeStamp - this.tap.time < TAP_MS) this.#choosePivot(x, y);
     this.tap = { time: timeStamp, x, y };
   }
 
-  /** What began as a drag was the page's: it scrolls. */
+  /** Undo a drag that the browser took over to scroll the page. */
   #takeBack() {
     this.pending = { right: 0, down: 0 };
     this.rig.pose = this.before.pose;
@@ -263,7 +263,7 @@ export class Controls {
   }
 
   /**
-   * Follow a drag, a little softened.
+   * Follow a drag with slight smoothing.
    *
    * @param {number} seconds
    */
@@ -278,7 +278,7 @@ export class Controls {
   }
 
   /**
-   * Fly, turn and zoom by the keys that are down.
+   * Fly, turn and zoom by the pressed keys.
    *
    * @param {number} seconds
    */

@@ -1,26 +1,26 @@
-// What a camera sees: whole tiles first, then splats. Conservative with regard to the shaders: nothing visible is lost.
+// Frustum culling: whole tiles first, then splats. Conservative compared with the shaders: no visible splat is lost.
 
 import { ALPHA_MIN, DILATION, REACH_MAX, slopeLimits } from './camera_maths.mjs';
 
 /**
  * @typedef {import('./types.d.ts').View} View
  *
- * What the cull keeps of a tile.
+ * Data of a tile for culling.
  *
  * @typedef {object} CullTile
  * @property {number} count splats
- * @property {number} slot of the first splat
+ * @property {number} slot slot of the first splat
  * @property {Uint8Array | Uint16Array | Uint32Array | Float64Array} means [3 × count] integers, column after column
- * @property {number[]} corner what is added to them
+ * @property {number[]} corner offsets added to them
  * @property {number} step scene units
  * @property {number[]} extent largest integer per axis
- * @property {number} reach distance from its centre at which no splat of the tile is visible any more, scene units
- * @property {Uint8Array} reaches [count], the same for each splat, see reachClass
+ * @property {number} reach distance from the centre beyond which no splat of the tile is visible, scene units
+ * @property {Uint8Array} reaches [count], the same per splat, see reachClass
  *
- * @typedef {{depths: Float32Array, slots: Uint32Array, count: number}} Visible depth and slot of the splats in view
+ * @typedef {{depths: Float32Array, slots: Uint32Array, count: number}} Visible depths and slots of the splats in view
  */
 
-/** Reaches are kept in steps of an eighth of an octave, rounded up: 2^−15 … 2^16, beyond "everywhere". */
+/** Reaches are quantised to an eighth of an octave, rounded up: 2^−15 … 2^16; larger ones are infinite. */
 const CLASS_STEPS = 8;
 const CLASS_ZERO = 121;
 const CLASS_MAX = 255;
@@ -30,11 +30,11 @@ const CLASS_REACH = Float64Array.from({ length: 256 }, (_, c) =>
   c === CLASS_MAX ? Infinity : c === 0 ? 0 : 2 ** ((c - CLASS_ZERO) / CLASS_STEPS),
 );
 
-/** Pixels that the dilation adds to a splat's reach at most, and one for rounding. */
+/** Maximum number of pixels that the dilation adds to a splat's reach, plus one for rounding. */
 const PAD = REACH_MAX * Math.sqrt(DILATION) + 1;
 
 /**
- * Class of a splat's reach, rounded up.
+ * Return the class of a splat's reach, rounded up.
  *
  * @param {number} alpha
  * @param {number} logScale natural logarithm of its largest standard deviation
@@ -47,8 +47,8 @@ export function reachClass(alpha, logScale) {
 }
 
 /**
- * The sides of the view as linear functions of the world: a splat with the reach r is out of view where one of them is
- * below −r × slack.
+ * Return the sides of the view frustum as linear functions of the world. A splat of reach r is out of view if one of them
+ * is below −r × slack.
  *
  * @param {View} view
  * @returns {{planes: number[][], slack: number[]}} planes [4][4], each x, y, z and constant
@@ -73,7 +73,7 @@ function sides(view) {
 }
 
 /**
- * Least and largest value of a linear function over a tile's box.
+ * Return the minimum and maximum of a linear function over a tile's box.
  *
  * @param {number[]} plane
  * @param {CullTile} tile
@@ -92,11 +92,11 @@ function overBox(plane, { corner, extent, step }) {
 }
 
 /**
- * Depths and slots of the splats that a camera may see, in the order of the tiles.
+ * Collect depths and slots of the splats that a camera may see, in the order of the tiles.
  *
  * @param {CullTile[]} tiles
  * @param {View} view
- * @param {Visible} out arrays as long as all tiles together; `count` is set
+ * @param {Visible} out arrays with room for all tiles; `count` is set
  */
 export function cull(tiles, view, out) {
   const { viewmat: m, near } = view;
@@ -121,7 +121,7 @@ export function cull(tiles, view, out) {
 }
 
 /**
- * A linear function of the world as one of a tile's integers.
+ * Convert a linear function of the world to one of a tile's integers.
  *
  * @param {number[]} plane
  * @param {CullTile} tile
@@ -132,14 +132,14 @@ function onIntegers(plane, { corner, step }) {
 }
 
 /**
- * A tile between the sides: only the near plane matters.
+ * Add the splats of a tile inside all sides; only the near plane matters.
  *
  * @param {CullTile} tile
  * @param {number[]} forward
  * @param {number} near
  * @param {Visible} out
  * @param {number} at
- * @returns {number} the next place in `out`
+ * @returns {number} the next position in `out`
  */
 function takeAll(tile, forward, near, { depths, slots }, at) {
   const { count: n, means, reaches, slot } = tile;
@@ -155,7 +155,7 @@ function takeAll(tile, forward, near, { depths, slots }, at) {
 }
 
 /**
- * A tile that the sides cut.
+ * Add the visible splats of a tile that intersects a side.
  *
  * @param {CullTile} tile
  * @param {number[][]} planes
@@ -164,7 +164,7 @@ function takeAll(tile, forward, near, { depths, slots }, at) {
  * @param {number} near
  * @param {Visible} out
  * @param {number} at
- * @returns {number} the next place in `out`
+ * @returns {number} the next position in `out`
  */
 function takeSome(tile, planes, slack, forward, near, { depths, slots }, at) {
   const { count: n, means, reaches, slot } = tile;

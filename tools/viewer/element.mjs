@@ -1,6 +1,6 @@
-// <csplat-view src="scene.csplat" alt="A garden">: a scene in a page, like a picture. One of its own size in CSS.
+// <csplat-view src="scene.csplat" alt="A garden">: a scene in a page, used like an image and sized by CSS.
 //
-// Attributes: src, alt, and of the parameters of main.mjs: camera, view, up, axes, background.
+// Attributes: src, alt, and these parameters of main.mjs: camera, view, up, axes, background.
 // Events: progress, load (detail: the engine's Stats), error (detail: ErrorReport). Property `engine`: null until it loads.
 
 import { E_CONTEXT } from './engine_error.mjs';
@@ -15,8 +15,8 @@ import { SceneViewer } from './viewer.mjs';
 
 const WISHES = ['camera', 'view', 'up', 'axes', 'background'];
 const HOW =
-  'Arrow keys fly, Shift and arrow keys turn around it, plus and minus zoom, R goes back to the first view, Escape leaves it.';
-const AHEAD = '50% 0px'; // how far from the window an element is when it loads
+  'Arrow keys fly, Shift and arrow keys turn around it, plus and minus zoom, R returns to the initial view, Escape leaves the scene.';
+const AHEAD = '50% 0px'; // distance from the window at which an element starts to load
 const SHEET = `
 :host { display: block; position: relative; aspect-ratio: 3 / 2; overflow: hidden; background: #000; }
 :host([hidden]) { display: none; }
@@ -34,7 +34,7 @@ canvas.keys { outline: 2px solid #1f8fe0; outline-offset: -2px; }
 `;
 
 /** @type {CSSStyleSheet | null} */
-let sheet = null; // a style element would be at the mercy of the page's policy
+let sheet = null; // the page's policy could forbid a style element
 
 /**
  * @template {keyof HTMLElementTagNameMap} K
@@ -92,7 +92,7 @@ export class CsplatView extends HTMLElement {
     this.setAttribute('src', address);
   }
 
-  /** The engine that draws; null before the element loads, and once it has left the page. */
+  /** The engine; null before the element loads and after it has left the page. */
   get engine() {
     return this.#showing?.engine ?? null;
   }
@@ -108,7 +108,7 @@ export class CsplatView extends HTMLElement {
 
   disconnectedCallback() {
     queueMicrotask(() => {
-      if (this.isConnected) return; // it was moved
+      if (this.isConnected) return; // it was moved within the page
       this.#observer.disconnect();
       this.#isNear = false;
       this.#stop();
@@ -127,7 +127,7 @@ export class CsplatView extends HTMLElement {
     else this.#renew();
   }
 
-  /** Begin anew, once for attributes that change together. */
+  /** Load again, once for attributes that change together. */
   #renew() {
     if (this.#isStale) return;
     this.#isStale = true;
@@ -138,7 +138,7 @@ export class CsplatView extends HTMLElement {
     });
   }
 
-  /** @param {boolean} isNear whether the window is */
+  /** @param {boolean} isNear whether the element is near the window */
   #seen(isNear) {
     this.#isNear = isNear;
     if (isNear && !this.#showing && !this.#isStale) void this.#start();
@@ -175,7 +175,7 @@ export class CsplatView extends HTMLElement {
     await showing.show(src);
   }
 
-  /** Free everything. The next scene gets a canvas, a context and a worker of its own: nothing stays behind. */
+  /** Free everything. The next scene gets a new canvas, context and worker, so that nothing is left over. */
   #stop() {
     if (!this.#showing) return;
     this.#showing.close();
@@ -234,7 +234,7 @@ export class CsplatView extends HTMLElement {
 
   /** @param {ErrorReport} report */
   #failed(report) {
-    // A browser takes contexts back where a page has many: an element that nobody sees loads again when it is near.
+    // Browsers take contexts away from pages with many. An element out of view loads again when it comes near.
     if (report.code === E_CONTEXT && !this.#isNear) return this.#stop();
     this.#hasFailed = report.fatal;
     this.#progress.hidden = true;

@@ -1,4 +1,4 @@
-// The viewer's engine: a canvas, a scene, a camera. Decoding, culling and sorting happen in a worker.
+// The viewer's engine: a canvas, a scene and a camera. Decoding, culling and sorting run in a worker.
 //
 //   import { createEngine } from './engine.mjs';
 //   const engine = await createEngine(canvas, { onError: ({ message }) => show(message) });
@@ -25,17 +25,17 @@ export { EngineError };
  */
 
 /**
- * Make an engine that draws on a canvas.
+ * Create an engine that draws on a canvas.
  *
  * @param {HTMLCanvasElement} canvas
  * @param {EngineOptions} [options]
- * @returns {Promise<Engine>} rejects with an EngineError: E_WEBGL2 where the browser has no WebGL 2, E_WORKER where the page may
- *   start no worker
+ * @returns {Promise<Engine>} rejects with an EngineError: E_WEBGL2 if the browser has no WebGL 2, E_WORKER if the page cannot
+ *   start a worker
  */
 export async function createEngine(canvas, options = {}) {
   const renderer = createRenderer(canvas, options.pictureFormat);
   if (renderer === null) {
-    throw new EngineError({ code: E_WEBGL2, message: 'this browser has no WebGL 2, or it is switched off' });
+    throw new EngineError({ code: E_WEBGL2, message: 'this browser does not support WebGL 2, or it is disabled' });
   }
   try {
     return new SplatEngine(canvas, renderer, options);
@@ -45,11 +45,11 @@ export async function createEngine(canvas, options = {}) {
   }
 }
 
-const NO_WORKER = 'it did not start; a Content-Security-Policy of the page may forbid it (worker-src)';
+const NO_WORKER = 'it did not start; the Content-Security-Policy of the page may forbid it (worker-src)';
 
 /**
  * @param {EngineOptions} options
- * @throws {EngineError} E_WORKER where the page may have none
+ * @throws {EngineError} E_WORKER if the page cannot start a worker
  */
 function startWorker({ workerFactory }) {
   try {
@@ -79,7 +79,7 @@ class SplatEngine {
     this.sceneCount = 0;
     /** @type {SceneLoad | null} */
     this.opening = null;
-    /** @type {(() => void)[]} those that wait for the next message of the worker */
+    /** @type {(() => void)[]} callbacks for the next message of the worker */
     this.waiting = [];
     this.stats = emptyStats(renderer.capabilities);
     this.frames = new FrameScheduler(
@@ -109,12 +109,12 @@ class SplatEngine {
   open(source) {
     this.replaced('another scene was opened before everything was decoded');
     const isAddress = typeof source === 'string' || source instanceof URL;
-    const from = isAddress ? new URL(source, document.baseURI).href : source; // the worker has another base
+    const from = isAddress ? new URL(source, document.baseURI).href : source; // the worker has a different base URL
     return new Promise((/** @type {(value: void) => void} */ resolve, reject) => this.begin(from, { resolve, reject }));
   }
 
   /**
-   * Have a scene read.
+   * Start to read a scene.
    *
    * @param {string | Blob | ArrayBuffer} source
    * @param {import('./scene_load.mjs').Settle} settle
@@ -126,7 +126,7 @@ class SplatEngine {
     const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
       if (this.opening === opening) this.tell({ type: 'open', scene: opening.scene, source: readable });
     };
-    // WebKit lets no worker of a file: page read a Blob; the page itself may.
+    // In WebKit, the worker of a file: page cannot read a Blob, but the page can.
     if (self.origin !== 'null' || !(source instanceof Blob)) return tell(source);
     source.arrayBuffer().then(tell, (error) => {
       if (this.opening === opening) this.fail(new EngineError({ code: E_INPUT, message: String(error) }));
@@ -181,7 +181,7 @@ class SplatEngine {
     }
   }
 
-  /** Resolves when everything is decoded and sorted for the camera of then. */
+  /** Resolves when everything is decoded and sorted for the current camera. */
   async sorted() {
     for (;;) {
       if (this.opening?.error) throw this.opening.error;
@@ -197,7 +197,7 @@ class SplatEngine {
   async readPixels() {
     await this.sorted();
     this.frames.skip();
-    this.drawNow(); // at once: a browser may clear what it has shown
+    this.drawNow(); // immediately, since a browser may clear the canvas
     return this.renderer.readPixels();
   }
 
@@ -209,7 +209,7 @@ class SplatEngine {
       port1.onmessage = (/** @type {{data: import('./worker.mjs').Rewritten}} */ { data: { bytes, error } }) => {
         port1.close();
         if (bytes) resolve(bytes);
-        else reject(new EngineError(error ?? { code: E_WORKER, message: 'no file came' }));
+        else reject(new EngineError(error ?? { code: E_WORKER, message: 'no file was written' }));
       };
     });
   }
@@ -302,8 +302,8 @@ class SplatEngine {
 
   /** @param {Event} event */
   contextLost(event) {
-    event.preventDefault(); // or it would never be given back
-    const message = 'the browser has taken the GPU away; the picture comes back with it';
+    event.preventDefault(); // otherwise the context would not be restored
+    const message = 'the browser has lost the GPU; the picture returns when it is restored';
     this.options.onError?.({ code: E_CONTEXT, message, fatal: false });
   }
 

@@ -1,21 +1,21 @@
-// What the engine rejects with.
+// Errors of the engine.
 
 /** @typedef {import('./types.d.ts').ErrorReport} ErrorReport */
 
-/** There is no WebGL 2. */
+/** WebGL 2 is not available. */
 export const E_WEBGL2 = 'E_WEBGL2';
-/** The browser has taken the GPU away; the engine goes on by itself when it is given back. */
+/** The browser has lost the GPU; the engine continues by itself when it is restored. */
 export const E_CONTEXT = 'E_CONTEXT';
 /** Another scene was opened, or the engine closed, before everything was decoded. */
 export const E_REPLACED = 'E_REPLACED';
-/** The worker did not start, or broke. */
+/** The worker did not start, or failed. */
 export const E_WORKER = 'E_WORKER';
-/** The file cannot be read; as the format's. */
+/** The file cannot be read; the same code as the format's. */
 export const E_INPUT = 'E_INPUT';
-/** More splats than the GPU has room for; as the format's. */
+/** More splats than fit on the GPU; the same code as the format's. */
 export const E_LIMIT = 'E_LIMIT';
 
-/** An error of the engine (see above) or of the file, with the format's code, byte and clause. */
+/** An error of the engine (see above) or of the file, with the format's code, offset and clause. */
 export class EngineError extends Error {
   /** @param {Omit<ErrorReport, 'fatal'>} report */
   constructor({ code, message, offset, clause }) {

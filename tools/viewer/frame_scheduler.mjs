@@ -1,4 +1,4 @@
-// Draws at the next animation frame, but not before the GPU has finished the last one.
+// Draws in the next animation frame, but not before the GPU has finished the previous one.
 
 const SECOND_MS = 1000;
 
@@ -14,11 +14,11 @@ export class FrameScheduler {
     this.isBusy = false;
     this.isClosed = false;
     this.current = Promise.resolve();
-    /** @type {number[]} when the frames of the last second were done */
+    /** @type {number[]} completion times of the frames of the last second */
     this.done = [];
   }
 
-  /** Draw soon. */
+  /** Request a frame. */
   request() {
     this.isWanted = true;
     if (!this.isBusy && !this.isClosed) this.schedule();
@@ -32,13 +32,13 @@ export class FrameScheduler {
     });
   }
 
-  /** Resolves when what is wanted has been drawn, whether the page is shown or not. */
+  /** Resolves when the requested frame has been drawn, whether or not the page is visible. */
   async settle() {
     await this.current;
     if (this.isWanted && !this.isClosed) await this.now();
   }
 
-  /** What was wanted has been drawn by other means. */
+  /** Cancel the request: the frame has been drawn by other means. */
   skip() {
     this.isWanted = false;
   }

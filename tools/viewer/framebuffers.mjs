@@ -1,4 +1,4 @@
-// Render targets: records of projected splats and the image, and the quads that are drawn.
+// Render targets: records of projected splats and the picture; and the quads that are drawn.
 
 import { UNITS } from './shader_programs.mjs';
 import { RECORD_COLUMNS } from './shader_attributes.mjs';
@@ -6,11 +6,11 @@ import { makeTexture } from './textures.mjs';
 
 /** @typedef {import('./types.d.ts').PictureFormat} PictureFormat */
 
-/** Records at a time: 8 MiB, however many splats there are. */
+/** Maximum number of records at a time, 8 MiB, for any number of splats. */
 const RECORDS_MAX = 1 << 18;
 
 /**
- * A framebuffer with textures of one size.
+ * Create a framebuffer with textures of one size.
  *
  * @param {WebGL2RenderingContext} gl
  * @param {WebGLTexture[]} textures
@@ -49,7 +49,7 @@ export class Records {
     });
   }
 
-  /** @param {number} rows that are going to be written */
+  /** @param {number} rows rows that will be written */
   target(rows) {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
@@ -63,7 +63,7 @@ export class Records {
   }
 }
 
-/** The picture that splats are blended into, in the best format that can be. */
+/** The picture that splats are blended into, in the best available format. */
 export class Picture {
   /**
    * @param {WebGL2RenderingContext} gl
@@ -103,7 +103,7 @@ export class Picture {
     gl.clearBufferfv(gl.COLOR, 0, [0, 0, 0, 0]);
   }
 
-  /** Blend what is drawn over what is there; colours come multiplied by their alpha. */
+  /** Blend over the existing content; colours are premultiplied by alpha. */
   target() {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, this.framebuffer);
@@ -123,7 +123,7 @@ export class Picture {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** @returns {Uint8Array} of the canvas, the top row first */
+  /** @returns {Uint8Array} the canvas, top row first */
   read() {
     const { gl, width, height } = this;
     const rows = new Uint8Array(4 * width * height);
@@ -141,16 +141,16 @@ export class Picture {
   }
 }
 
-/** Bytes of a pixel. */
+/** Bytes per pixel. */
 const BYTES = Object.freeze({ RGBA32F: 16, RGBA16F: 8, RGBA8: 4 });
 
 /**
- * The format for the picture: halves, or whole floats where the GPU is a program (in which they are several times
- * faster); bytes, which round each layer, where neither can be blended.
+ * Choose the format of the picture: half floats, or floats for software renderers, in which they are several times
+ * faster. If neither can be blended, bytes, which are rounded after each layer.
  *
  * @param {WebGL2RenderingContext} gl
  * @param {boolean} isSoftware
- * @param {PictureFormat} [wanted] this one, if it can be
+ * @param {PictureFormat} [wanted] used if available
  * @returns {PictureFormat}
  */
 export function pictureFormat(gl, isSoftware, wanted) {
@@ -166,7 +166,7 @@ export function pictureFormat(gl, isSoftware, wanted) {
 
 /**
  * @param {WebGL2RenderingContext} gl
- * @param {number} internal format
+ * @param {number} internal internal format
  */
 function canBeTarget(gl, internal) {
   const texture = makeTexture(gl, internal, 1, 1);
@@ -176,7 +176,7 @@ function canBeTarget(gl, internal) {
   return isComplete;
 }
 
-/** RECORD_COLUMNS quads an instance: few large instances are faster than one for each quad. */
+/** Quads, RECORD_COLUMNS per instance: a few large instances are faster than one per quad. */
 export class Quads {
   /** @param {WebGL2RenderingContext} gl */
   constructor(gl) {
@@ -196,7 +196,7 @@ export class Quads {
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, indices, gl.STATIC_DRAW);
   }
 
-  /** @param {number} rows of records */
+  /** @param {number} rows rows of records */
   draw(rows) {
     this.gl.drawElementsInstanced(this.gl.TRIANGLES, 6 * RECORD_COLUMNS, this.gl.UNSIGNED_SHORT, 0, rows);
   }

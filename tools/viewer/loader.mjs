@@ -1,4 +1,4 @@
-// Reads a file for the viewer: layer 0 of all tiles first, then the SH bands; packs each for the GPU as it arrives.
+// Reads a file for the viewer: layer 0 of all tiles first, then the SH bands. Packs each part for the GPU as it arrives.
 
 import { CsplatReader } from '../../codec/js/decoder.mjs';
 import { SAMPLE_COUNT, showing } from './bounds.mjs';
@@ -16,7 +16,7 @@ import { layoutSlots, packBand, packGeometry, packRows } from './texels.mjs';
  * @typedef {import('./texels.mjs').Rows} Rows
  * @typedef {import('./types.d.ts').View} View
  *
- * What becomes of a file's parts.
+ * Receives the parts of a file.
  *
  * @typedef {object} Sink
  * @property {(header: Header, description: any) => void} header
@@ -25,16 +25,16 @@ import { layoutSlots, packBand, packGeometry, packRows } from './texels.mjs';
  * @property {(tile: number, layer: number, band: BandTexels) => void} band
  * @property {(progress: {phase: 'open' | 'layers', received: number, fileSize: number, splatsDone: number,
  *   splatCount: number, layer: number, decodeMs: number}) => void} progress
- * @property {() => View | null} view the camera of now
+ * @property {() => View | null} view returns the current camera
  *
  * @typedef {{points: Float32Array<ArrayBuffer>, weights: Float32Array<ArrayBuffer>}} Samples
  */
 
-/** Layers are fetched in groups of so many bytes, and one group ahead of the one that is being decoded. */
+/** Bytes of a group of layers; one group is fetched ahead of the one being decoded. */
 const GROUP_BYTES = 1 << 19;
 
 /**
- * Read all of a file.
+ * Read a whole file.
  *
  * @param {string | Blob | ArrayBuffer} source
  * @param {Sink} sink
@@ -54,7 +54,7 @@ export async function load(source, sink, signal) {
   const { header } = reader;
   const description = await reader.describe({ signal });
   Object.assign(state, { fileSize: header.fileSize, splatCount: header.splatCount });
-  const isLocal = typeof source !== 'string'; // then nothing is reported as received
+  const isLocal = typeof source !== 'string'; // the decoder then reports no received bytes
   if (isLocal) state.received = header.indexSize;
   sink.header(header, description);
   tell(0);
@@ -79,7 +79,7 @@ export async function load(source, sink, signal) {
 }
 
 /**
- * Tiles, the nearest to the camera first; in the order of the file where there is no camera yet.
+ * Sort tiles by distance from the camera, nearest first; keep the order of the file without a camera.
  *
  * @param {TileRecord[]} tiles
  * @param {View | null} view
@@ -90,14 +90,14 @@ export function tileOrder(tiles, view) {
     const centre = [0, 1, 2].map((axis) => (min[axis] + max[axis]) / 2);
     const half = Math.hypot(max[0] - min[0], max[1] - min[1], max[2] - min[2]) / 2;
     const [x, y, z] = toCamera(view.viewmat, centre);
-    return Math.hypot(x, y, z) + (z < -half ? 1e30 : 0) - half; // what lies behind comes last
+    return Math.hypot(x, y, z) + (z < -half ? 1e30 : 0) - half; // tiles behind the camera come last
   };
   const far = new Map(tiles.map((tile) => [tile, distance(tile)]));
   return [...tiles].sort((a, b) => Number(far.get(a)) - Number(far.get(b)));
 }
 
 /**
- * Tiles that have a layer, each once its bytes have been asked for.
+ * Yield the tiles that have a layer, each once its bytes have been requested.
  *
  * @param {CsplatReader} reader
  * @param {TileRecord[]} order
@@ -135,7 +135,7 @@ async function* fetched(reader, order, layer, signal) {
 /**
  * @param {CsplatReader} reader
  * @param {TileRecord} tile
- * @param {number} slot of its first splat
+ * @param {number} slot slot of its first splat
  * @param {Sink} sink
  * @param {AbortSignal} signal
  */
@@ -162,7 +162,7 @@ function alphasOf({ opacities: { columns, offsets }, count }, { levels, mapping 
 }
 
 /**
- * Log-scale of a splat's column.
+ * Return the log-scale of a splat in a column.
  *
  * @param {PackedGeometry} packed
  * @param {number} column
@@ -185,12 +185,12 @@ function cullTile(packed, alphas, { extent, maxScale }, slot) {
     const largest = Math.max(logScale(packed, 0, i), logScale(packed, 1, i), logScale(packed, 2, i));
     reaches[i] = reachClass(alphas[i], largest);
   }
-  const reach = 4 * Math.exp(maxScale); // above REACH_MAX with the rounding of the classes
+  const reach = 4 * Math.exp(maxScale); // 4 exceeds REACH_MAX plus the rounding of the classes
   return { count, slot, means: means.columns, corner: means.offsets, step: means.step, extent, reach, reaches };
 }
 
 /**
- * Every `stride`-th splat.
+ * Sample every `stride`-th splat.
  *
  * @param {PackedGeometry} packed
  * @param {Float32Array} alphas
@@ -216,7 +216,7 @@ function samplesOf(packed, alphas, stride) {
  * @param {CsplatReader} reader
  * @param {TileRecord} tile
  * @param {number} layer
- * @param {Set<string>} tables those that the sink has
+ * @param {Set<string>} tables tables that the sink has received
  * @param {Sink} sink
  * @param {AbortSignal} signal
  */

@@ -1,7 +1,7 @@
-// The page: an engine, a camera that a person moves, and what stands over the scene.
+// The page: an engine, a camera that the user moves, and the overlay.
 //
 // Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
-// `window.csplatViewer` lets programs drive the page; its `ready` resolves when the scene is drawn for good.
+// `window.csplatViewer` lets programs control the page; its `ready` resolves when the scene has been drawn completely.
 
 import { SaveUpOffer, upWord } from './save_up.mjs';
 import { Overlay, element } from './overlay.mjs';
@@ -21,7 +21,7 @@ const canvas = element('canvas', HTMLCanvasElement);
 const overlay = new Overlay({ open: (file) => void show(file, file.name) });
 const keep = new SaveUpOffer({
   file: async (up) => {
-    if (!showing.engine) throw new Error('there is no scene');
+    if (!showing.engine) throw new Error('no scene is loaded');
     return showing.engine.fileWithUp(up);
   },
   say: (text) => overlay.toast(text),
@@ -46,10 +46,10 @@ const { view } = showing;
 document.documentElement.classList.toggle('bare', !wishes.ui);
 document.documentElement.classList.toggle('fixed', wishes.size !== null);
 
-let shade = 0; // which of `backgrounds` is behind the scene
+let shade = 0; // index of the current background
 
 /**
- * Show a scene in the place of the present one.
+ * Replace the current scene.
  *
  * @param {string | Blob | ArrayBuffer} source
  * @param {string} name
@@ -62,7 +62,7 @@ async function show(source, name) {
   await showing.show(source);
 }
 
-/** @param {boolean} known whether a scene is */
+/** @param {boolean} known whether a scene is loaded */
 function tools(known) {
   element('upright', HTMLElement).hidden = !known || view.knowsUp;
   element('cameras', HTMLElement).hidden = !known || view.cameras.length < 2;
@@ -74,7 +74,7 @@ function otherCamera(step) {
   if (name) overlay.toast(name);
 }
 
-/** What may stand behind the scene. */
+/** Available backgrounds. */
 function backgrounds() {
   const own = showing.background;
   return [own, ...BACKGROUNDS.filter((colour) => String(colour) !== String(own))];
@@ -86,7 +86,7 @@ function otherBackground(step) {
   shade = (shade + step) % all.length;
   showing.engine?.setBackground(all[shade]);
   const colour = `rgb(${all[shade].map((value) => Math.round(255 * value))})`;
-  document.querySelector('meta[name=theme-color]')?.setAttribute('content', colour); // a phone's bars
+  document.querySelector('meta[name=theme-color]')?.setAttribute('content', colour); // colours the bars of a phone's browser
 }
 
 /** @param {number} degree */
@@ -100,10 +100,10 @@ function turnUpright() {
   const { engine } = showing;
   if (!engine?.bounds) return;
   const { up, isSaid } = view.turnUpright(engine.bounds, engine.stats.splatCount);
-  element('upright', HTMLElement).hidden = false; // who turns a scene once may want to go on
+  element('upright', HTMLElement).hidden = false; // allows turning the scene further
   if (isSaid) {
     keep.hide();
-    overlay.toast(`${upWord(up).replace('-', '−')} is up, as the scene says`);
+    overlay.toast(`${upWord(up).replace('-', '−')} is up, as in the file`);
   } else keep.show(overlay.name, up);
 }
 
@@ -111,11 +111,11 @@ async function fullScreen() {
   try {
     await (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
   } catch {
-    overlay.toast('This browser does not allow a full screen here');
+    overlay.toast('This browser does not allow full screen here');
   }
 }
 
-/** @type {Record<string, () => void>} by the code of the key, and by the id of the button where there is one */
+/** @type {Record<string, () => void>} by key code, or by the id of a button */
 const ACTIONS = {
   KeyR: () => view.goHome(),
   KeyF: () => void fullScreen(),
@@ -180,7 +180,7 @@ const viewer = {
   rig: showing.rig,
   controls: showing.controls,
   stage: showing.stage,
-  /** Resolves when the first scene is shown or has failed; `#error` is visible then. */
+  /** Resolves when the first scene is shown or has failed; `#error` is then visible. */
   ready: Promise.resolve(),
   show,
 };

@@ -1,24 +1,24 @@
-// What went wrong, in words for people who do not know the format.
+// Error messages for users who do not know the format.
 
 /**
  * @typedef {{code: string, message: string, offset?: number | null, clause?: string | null}} Problem
  * @typedef {{title: string, advice: string, facts: string}} Message
  */
 
-const AGAIN = 'Download or copy it again; if that does not help, whoever made it has to write it again.';
-const NEWER = 'A newer version of this viewer may know it.';
+const AGAIN = 'Download or copy it again. If that does not help, it has to be created again.';
+const NEWER = 'A newer version of this viewer may support it.';
 const BROKEN = {
-  title: 'This file contradicts itself.',
-  advice: `It is damaged, or what wrote it is at fault. ${AGAIN}`,
+  title: 'This file is invalid.',
+  advice: `It is damaged, or the program that wrote it has a bug. ${AGAIN}`,
 };
-const DAMAGED = { title: 'This file is damaged: some of its bytes are not what was written.', advice: AGAIN };
+const DAMAGED = { title: 'This file is damaged: some of its bytes have changed.', advice: AGAIN };
 
 /** @type {Record<string, {title: string, advice: string}>} */
 const WORDS = {
-  E_MAGIC: { title: 'This is not a .csplat file.', advice: 'A PLY becomes one with the command “csplat encode”.' },
+  E_MAGIC: { title: 'This is not a .csplat file.', advice: 'To convert a PLY, use the command “csplat encode”.' },
   E_VERSION: { title: 'This file was written in another version of the format.', advice: NEWER },
-  E_TRUNCATED: { title: 'This file ends too early: a part of it is missing.', advice: AGAIN },
-  E_TRAILING: { title: 'Something follows the end of this file.', advice: AGAIN },
+  E_TRUNCATED: { title: 'This file is incomplete: its end is missing.', advice: AGAIN },
+  E_TRAILING: { title: 'This file has extra data after its end.', advice: AGAIN },
   E_CRC: DAMAGED,
   E_CODER: DAMAGED,
   E_RESERVED: BROKEN,
@@ -29,8 +29,8 @@ const WORDS = {
   E_CODEBOOK: BROKEN,
   E_BOX: BROKEN,
   E_JSON: BROKEN,
-  E_UNSUPPORTED: { title: 'This file uses something that this viewer does not have.', advice: NEWER },
-  E_LIMIT: { title: 'This scene is too large for this viewer.', advice: 'A scene of fewer splats will fit.' },
+  E_UNSUPPORTED: { title: 'This file uses a feature that this viewer does not support.', advice: NEWER },
+  E_LIMIT: { title: 'This scene is too large for this viewer.', advice: 'Use a scene with fewer splats.' },
   E_INPUT: { title: 'The file could not be read.', advice: 'Check its address and the connection, then try again.' },
   E_WEBGL2: {
     title: 'This browser cannot draw the scene: it has no WebGL 2.',
@@ -47,9 +47,11 @@ const WORDS = {
 };
 
 /**
+ * Explain an error.
+ *
  * @param {Problem} problem
- * @param {string} [name] of the file
- * @returns {Message} one line that everybody understands, what to do, and what a report of the error needs
+ * @param {string} [name] name of the file
+ * @returns {Message} a title for all users, advice, and the details for a bug report
  */
 export function explain({ code, message, offset, clause }, name = '') {
   let words = WORDS[code] ?? { title: 'Something went wrong.', advice: 'Load the page again.' };

@@ -1,4 +1,4 @@
-// Rewrites a file with an up direction in META (spec 5.4); index and header are updated, all else is copied.
+// Writes an up direction to META of a file (spec 5.4). Index and header are updated, everything else is copied.
 
 import { CRC_SIZE, crc32 } from '../../codec/js/checksums.mjs';
 import { CsplatReader } from '../../codec/js/decoder.mjs';
@@ -10,16 +10,16 @@ const AT_INDEX = spec.INDEX_HEAD_OFFSETS;
 const AT_RECORD = spec.DIRECTORY_RECORD_OFFSETS;
 const AT_CHUNK = spec.CHUNK_HEADER_OFFSETS;
 const AT_STREAM = spec.STREAM_HEAD_OFFSETS;
-const AXIS_AGREES = Math.SQRT1_2; // cosine: beyond 45 degrees another letter of the axes is up
+const AXIS_AGREES = Math.SQRT1_2; // cosine of 45 degrees; beyond it another axis is up
 const HEADER_FIXED = AT_HEADER.header_crc;
 
 /**
- * Write `up` into the metadata. Axes that it contradicts go; so do chunks that this version does not know and that say
- * of themselves that they do not outlive a change (CHK-5).
+ * Write `up` to the metadata. Axes that contradict it are removed, and so are chunks of unknown type that are not safe to
+ * copy (CHK-5).
  *
- * @param {ArrayBuffer} bytes of a file
- * @param {number[]} up of length 1
- * @returns {Promise<Uint8Array<ArrayBuffer>>} a file
+ * @param {ArrayBuffer} bytes a file
+ * @param {number[]} up unit vector
+ * @returns {Promise<Uint8Array<ArrayBuffer>>} the new file
  */
 export async function withUp(bytes, up) {
   const reader = await CsplatReader.open(bytes);
@@ -33,7 +33,7 @@ export async function withUp(bytes, up) {
   const meta = metadataChunk({ ...metadata, up }, flags);
 
   const source = new Uint8Array(bytes);
-  const index = source.slice(0, spec.HEADER_SIZE + header.indexSize - CRC_SIZE); // with the header
+  const index = source.slice(0, spec.HEADER_SIZE + header.indexSize - CRC_SIZE); // includes the header
   const view = new DataView(index.buffer);
   const head = spec.unpackIndexHead(view, spec.HEADER_SIZE);
   const begin = spec.HEADER_SIZE + recordsBefore(head);
@@ -42,7 +42,7 @@ export async function withUp(bytes, up) {
   const indexSize = header.indexSize + (count - head.directory_count) * head.directory_size;
 
   const others = [...directory.filter((place) => place !== before), ...header.tiles.flatMap(({ layers }) => layers)];
-  const first = before?.offset ?? 0; // a new one comes before all others
+  const first = before?.offset ?? 0; // a new META chunk comes first
   const chunks = [{ offset: first, bytes: meta, field: 0 }];
   for (const { offset, size, offsetField } of others) {
     chunks.push({ offset, bytes: source.subarray(offset, offset + size), field: offsetField });
@@ -74,7 +74,7 @@ export async function withUp(bytes, up) {
 }
 
 /**
- * Bytes of the index before the directory.
+ * Return the bytes of the index before the directory.
  *
  * @param {ReturnType<typeof spec.unpackIndexHead>} head
  */
@@ -84,7 +84,7 @@ function recordsBefore(head) {
 }
 
 /**
- * A chunk META, stored as it is (spec 5.1, 6.1).
+ * Return a META chunk, stored without compression (spec 5.1, 6.1).
  *
  * @param {object} metadata
  * @param {number} flags
@@ -107,9 +107,9 @@ function metadataChunk(metadata, flags) {
 }
 
 /**
- * @param {Uint8Array} record of the directory
+ * @param {Uint8Array} record directory record
  * @param {number} flags
- * @param {Uint8Array} chunk META
+ * @param {Uint8Array} chunk META chunk
  * @param {number} offset
  */
 function putRecord(record, flags, chunk, offset) {
@@ -130,7 +130,7 @@ function putType(bytes, at) {
 }
 
 /**
- * Whether axes, where there are any, may stand beside a direction.
+ * Return true if the axes are compatible with an up direction.
  *
  * @param {string} axes
  * @param {number[]} up
@@ -142,7 +142,7 @@ function isUpright(axes, up) {
 
 /**
  * @param {Uint8Array[]} parts
- * @param {number} size of all together
+ * @param {number} size total size
  */
 function joined(parts, size) {
   const whole = new Uint8Array(size);

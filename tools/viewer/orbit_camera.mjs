@@ -1,4 +1,4 @@
-// The interactive camera: position, pivot, and the lens fitted to the canvas. No DOM here.
+// The interactive camera: position, pivot, and lens fitted to the canvas. Independent of the DOM.
 
 import {
   add,
@@ -20,37 +20,37 @@ import {
  * @typedef {import('./vectors.mjs').Vec3} Vec3
  * @typedef {import('./vectors.mjs').Basis} Basis
  *
- * A lens, as it stands in a camera file: focal lengths and principal point of a picture of W by H pixels.
+ * A lens as in a camera file: focal lengths and principal point of a picture of W by H pixels.
  * @typedef {{fx: number, fy: number, cx: number, cy: number, W: number, H: number}} Lens
  *
  * @typedef {object} Pose
  * @property {Basis} basis right, down, forward
- * @property {Vec3} eye where the camera stands
- * @property {number} distance to the pivot, straight ahead; above 0
- * @property {Vec3} up of the world
+ * @property {Vec3} eye position of the camera
+ * @property {number} distance distance to the pivot, straight ahead; above 0
+ * @property {Vec3} up up direction of the world
  * @property {Lens} lens
  * @property {number} near distance of the near plane
- * @property {number[]} [viewmat] exactly as a file gave it, 16 numbers by rows, until the camera moves
+ * @property {number[]} [viewmat] exact matrix of a file, 16 numbers by rows, until the camera moves
  *
  * @typedef {{viewmat: number[], fx: number, fy: number, cx: number, cy: number, near: number}} EngineCamera
  */
 
-const POLE = 0.02; // radians that stay between the line of sight and the vertical
-const NEAREST = 1e-4; // of the extent: the pivot comes no nearer
-const FARTHEST = 60; // extents
-const NEAR_SHARE = 0.1; // of the distance to the pivot: the near plane lies no farther than that
+const POLE = 0.02; // minimum angle between the line of sight and the vertical, radians
+const NEAREST = 1e-4; // minimum distance to the pivot, extents
+const FARTHEST = 60; // maximum distance to the pivot, extents
+const NEAR_SHARE = 0.1; // maximum distance of the near plane, as a share of the distance to the pivot
 
-/** Field of view of the shorter side of the canvas, where no file says another, radians. */
+/** Default field of view of the shorter side of the canvas, radians. */
 export const FIELD_OF_VIEW = (55 * Math.PI) / 180;
 
-/** @returns {Lens} the lens where no file says another */
+/** @returns {Lens} the default lens */
 export function defaultLens() {
   const focal = 0.5 / Math.tan(FIELD_OF_VIEW / 2);
   return { fx: focal, fy: focal, cx: 0.5, cy: 0.5, W: 1, H: 1 };
 }
 
 /**
- * Scale of a lens whose whole picture is to be seen on a canvas.
+ * Return the scale at which the whole picture of a lens fits a canvas.
  *
  * @param {Lens} lens
  * @param {number} width
@@ -61,7 +61,7 @@ const fit = (lens, width, height) => Math.min(width / lens.W, height / lens.H);
 export class OrbitCamera {
   /**
    * @param {Pose} pose
-   * @param {number} extent of the scene: what speeds and limits are multiples of
+   * @param {number} extent size of the scene, the unit of speeds and limits
    */
   constructor(pose, extent) {
     this.pose = pose;
@@ -69,15 +69,15 @@ export class OrbitCamera {
     this.extent = extent;
   }
 
-  /** @returns {Vec3} what the camera turns around */
+  /** @returns {Vec3} centre of rotation */
   get pivot() {
     return pivotOf(this.pose);
   }
 
   /**
-   * What the engine wants.
+   * Return the camera for the engine.
    *
-   * @param {number} width of the drawing buffer, pixels
+   * @param {number} width width of the drawing buffer, pixels
    * @param {number} height
    * @returns {EngineCamera}
    */
@@ -101,7 +101,7 @@ export class OrbitCamera {
   }
 
   /**
-   * Turn around the pivot: the scene follows the hand.
+   * Orbit the pivot; the scene follows the pointer.
    *
    * @param {number} right radians
    * @param {number} down radians
@@ -113,7 +113,7 @@ export class OrbitCamera {
   }
 
   /**
-   * Turn the head.
+   * Turn the camera in place.
    *
    * @param {number} right radians
    * @param {number} down radians
@@ -123,11 +123,11 @@ export class OrbitCamera {
   }
 
   /**
-   * Move across the picture, so that what lies at the distance of the pivot follows the hand.
+   * Move parallel to the picture, so that points at the distance of the pivot follow the pointer.
    *
-   * @param {number} right of the hand, pixels
-   * @param {number} down of the hand, pixels
-   * @param {number} width of the canvas in the same pixels
+   * @param {number} right movement of the pointer, pixels
+   * @param {number} down movement of the pointer, pixels
+   * @param {number} width width of the canvas in the same pixels
    * @param {number} height
    */
   pan(right, down, width, height) {
@@ -139,10 +139,10 @@ export class OrbitCamera {
   }
 
   /**
-   * Come nearer to the pivot or go farther away; what lies under the pointer stays there.
+   * Zoom towards or away from the pivot; the point under the pointer stays in place.
    *
-   * @param {number} factor of the distance, below 1 to come nearer
-   * @param {{x: number, y: number, width: number, height: number}} [at] the pointer on the canvas
+   * @param {number} factor factor of the distance, below 1 to zoom in
+   * @param {{x: number, y: number, width: number, height: number}} [at] pointer on the canvas
    */
   zoom(factor, at) {
     const { basis, eye, lens, distance } = this.pose;
@@ -159,9 +159,9 @@ export class OrbitCamera {
   }
 
   /**
-   * Move through the scene; the pivot comes along.
+   * Move through the scene together with the pivot.
    *
-   * @param {Vec3} by to the right, down and forward, scene units
+   * @param {Vec3} by right, down and forward, scene units
    */
   fly(by) {
     const { basis, eye } = this.pose;
@@ -169,13 +169,13 @@ export class OrbitCamera {
     this.#change({ eye: moved });
   }
 
-  /** @returns {number} scene units per second that suit where the camera is */
+  /** @returns {number} speed of flying at the current position, scene units per second */
   get speed() {
     return 0.7 * Math.min(Math.max(this.pose.distance, 0.2 * this.extent), 2 * this.extent);
   }
 
   /**
-   * The pose that looks at another pivot from where the camera stands.
+   * Return a pose at the same position with another pivot.
    *
    * @param {Vec3} point
    * @returns {Pose}
@@ -187,7 +187,7 @@ export class OrbitCamera {
   }
 
   /**
-   * The pose of the same place seen with another direction upwards: the scene turns around the pivot.
+   * Return a pose with another up direction: the scene turns around the pivot.
    *
    * @param {Vec3} up
    * @returns {Pose}
@@ -196,7 +196,7 @@ export class OrbitCamera {
     const { pose, pivot } = this;
     const axis = cross(pose.up, up);
     const angle = Math.atan2(length(axis), dot(pose.up, up));
-    const around = length(axis) > 1e-9 ? unit(axis) : pose.basis[2]; // upside down: around the line of sight
+    const around = length(axis) > 1e-9 ? unit(axis) : pose.basis[2]; // if upside down, around the line of sight
     const basis = turnBasis(pose.basis, around, angle);
     return { ...pose, basis, up, eye: sub(pivot, scale(basis[2], pose.distance)), viewmat: undefined };
   }
@@ -209,9 +209,9 @@ export class OrbitCamera {
   #turned(right, down) {
     const { basis, up } = this.pose;
     const turned = turnBasis(basis, up, -right);
-    const slope = Math.acos(Math.min(1, Math.max(-1, dot(turned[2], up)))); // 0 looks straight up
+    const slope = Math.acos(Math.min(1, Math.max(-1, dot(turned[2], up)))); // 0: straight up
     const wanted = Math.min(Math.max(slope + down, POLE), Math.PI - POLE);
-    // A start view that rolls has its own horizon: its picture tilts around its own horizontal line.
+    // An initial view that is rolled has a tilted horizon, and pitches around the horizontal axis of its picture.
     return turnBasis(turned, turned[0], slope - wanted);
   }
 
@@ -228,7 +228,7 @@ export class OrbitCamera {
 export const pivotOf = ({ eye, basis, distance }) => add(eye, scale(basis[2], distance));
 
 /**
- * Between two poses, for a camera that glides: around the pivot rather than straight through it.
+ * Interpolate between two poses, around the pivot rather than along a straight line.
  *
  * @param {Pose} from
  * @param {Pose} to

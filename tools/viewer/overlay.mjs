@@ -1,4 +1,4 @@
-// What stands over the scene: progress, statistics, messages, the place to drop a file. No scene is known here.
+// The overlay: progress, statistics, messages and drop target. Independent of scenes.
 
 import { explain } from './messages.mjs';
 
@@ -9,7 +9,7 @@ import { explain } from './messages.mjs';
  */
 
 const TOAST_MS = 2600;
-const STATISTICS_MS = 250; // between two updates of the numbers
+const STATISTICS_MS = 250; // interval between updates
 
 /** @type {(value: number) => string} */
 const count = (value) => Math.round(value).toLocaleString('en');
@@ -57,7 +57,7 @@ export class Overlay {
     const input = element('file', HTMLInputElement);
     input.addEventListener('change', () => {
       if (input.files?.[0]) hooks.open(input.files[0]);
-      input.value = ''; // the same file may be chosen again
+      input.value = ''; // allows choosing the same file again
     });
     this.#acceptDrops();
   }
@@ -66,13 +66,13 @@ export class Overlay {
     element('file', HTMLInputElement).click();
   }
 
-  /** Ask for a scene where the page was opened without one. */
+  /** Ask for a file if the page was opened without a scene. */
   welcome() {
     html('welcome').hidden = false;
   }
 
   /**
-   * A scene is being opened.
+   * Show that a scene is being opened.
    *
    * @param {string} name
    */
@@ -85,7 +85,7 @@ export class Overlay {
     this.describe(name);
     this.#bar(0);
     html('progress').hidden = false;
-    html('summary').textContent = 'SceneLoad …';
+    html('summary').textContent = 'Opening …';
   }
 
   /**
@@ -105,10 +105,10 @@ export class Overlay {
     this.#bar(Math.min(1, share));
     const what = layer > 0 ? `colour detail ${layer} of 3` : `${count(splatsDone)} of ${count(splatCount)} splats`;
     html('summary').textContent =
-      phase === 'open' ? 'SceneLoad …' : `${what} · ${megabytes(received)} of ${megabytes(fileSize)} MB`;
+      phase === 'open' ? 'Opening …' : `${what} · ${megabytes(received)} of ${megabytes(fileSize)} MB`;
   }
 
-  /** Everything is here. */
+  /** Show that the scene is complete. */
   done() {
     html('progress').hidden = true;
     if (this.stats) this.#summary(this.stats);
@@ -117,7 +117,7 @@ export class Overlay {
 
   /**
    * @param {Stats} stats
-   * @param {boolean} isMoving whether frames follow each other: only then is there a rate of them
+   * @param {boolean} isMoving whether frames are drawn continuously; otherwise there is no frame rate
    */
   statistics(stats, isMoving) {
     const now = performance.now();
@@ -141,12 +141,12 @@ export class Overlay {
     if (dialog.open) return dialog.close();
     dialog.showModal();
     html('help-close').focus();
-    dialog.scrollTop = 0; // on a small screen that button is at the end
+    dialog.scrollTop = 0; // on a small screen the focused button is at the end
   }
 
   /**
    * @param {import('./messages.mjs').Problem} problem
-   * @param {boolean} scene whether it is a scene's, not the page's
+   * @param {boolean} scene whether the error belongs to a scene, not to the page
    */
   error(problem, scene = true) {
     const { title, advice, facts } = explain(problem, this.name);
@@ -168,7 +168,7 @@ export class Overlay {
   }
 
   /**
-   * Say something for a moment.
+   * Show a message briefly.
    *
    * @param {string} text
    */

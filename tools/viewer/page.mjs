@@ -1,4 +1,4 @@
-// What the address of the page asks for, and what a page that carries its scene has inside.
+// The parameters in the page's address, and the scene embedded in an exported page.
 
 import { ownCameras } from './camera_forms.mjs';
 import { unitDirection } from './vectors.mjs';
@@ -6,20 +6,20 @@ import { unitDirection } from './vectors.mjs';
 /**
  * @typedef {object} Wishes
  * @property {string | null} scene address of a .csplat file
- * @property {string | null} camera a camera, a list of them, or the address of a file of one or the other
- * @property {number} view which camera of a list, from 0
- * @property {import('./vectors.mjs').Vec3 | null} up direction that is up, of length 1, instead of what the file says
- * @property {import('./vectors.mjs').Vec3 | null} seems which way seems to be up, if nothing says it
- * @property {string | null} axes directions of +x, +y, +z instead of the file's
+ * @property {string | null} camera a camera, a list of cameras, or the address of a file with one or the other
+ * @property {number} view index of the camera in the list
+ * @property {import('./vectors.mjs').Vec3 | null} up up direction, a unit vector; overrides the file's
+ * @property {import('./vectors.mjs').Vec3 | null} seems up direction if nothing else specifies it
+ * @property {string | null} axes directions of +x, +y, +z; override the file's
  * @property {{width: number, height: number} | null} size of the drawing buffer, pixels
- * @property {[number, number, number] | null} background 0 to 1, instead of what the file says
- * @property {boolean} ui false for the scene alone
+ * @property {[number, number, number] | null} background 0 to 1; overrides the file's
+ * @property {boolean} ui false to show only the scene
  *
- * What `csplat export-html` puts into the page.
+ * The data that `csplat export-html` embeds in the page.
  * @typedef {object} Embedded
  * @property {string} name
  * @property {() => ArrayBuffer} scene
- * @property {Record<string, string>} wishes parameters, as an address would have them
+ * @property {Record<string, string>} wishes parameters, as in an address
  */
 
 const UP = /^[-+.\de]+(?:,[-+.\de]+){2}$/i;
@@ -35,7 +35,7 @@ export function embedded() {
  * Read the parameters of an address.
  *
  * @param {URLSearchParams} query
- * @returns {{wishes: Wishes, complaints: string[]}} complaints about values that have no meaning, one line each
+ * @returns {{wishes: Wishes, complaints: string[]}} complaints about invalid values, one line each
  */
 export function readWishes(query) {
   /** @type {string[]} */
@@ -44,7 +44,7 @@ export function readWishes(query) {
   const match = (name, pattern, wanted) => {
     const text = query.get(name);
     const found = text === null ? null : pattern.exec(text);
-    if (text !== null && !found) complaints.push(`${name} is “${text}”, wanted ${wanted}`);
+    if (text !== null && !found) complaints.push(`${name} is “${text}”, expected ${wanted}`);
     return found;
   };
   const size = match('size', /^([1-9]\d{0,3})x([1-9]\d{0,3})$/, 'width and height as 800x600');
@@ -53,7 +53,7 @@ export function readWishes(query) {
   const direction = (name) => {
     const numbers = match(name, UP, THREE);
     const found = numbers && unitDirection(numbers[0].split(',').map(Number));
-    if (numbers && !found) complaints.push(`${name} is “${numbers[0]}”, wanted ${THREE}`);
+    if (numbers && !found) complaints.push(`${name} is “${numbers[0]}”, expected ${THREE}`);
     return found;
   };
   const axes = match('axes', AXES, 'three letters as RDF');
@@ -75,10 +75,10 @@ export function readWishes(query) {
 }
 
 /**
- * Get the cameras that the address names.
+ * Fetch the cameras in the address.
  *
- * @param {string} text JSON, or where it lies
- * @returns {Promise<unknown[]>} entries of a camera file
+ * @param {string} text JSON, or its URL
+ * @returns {Promise<unknown[]>} cameras of a camera file
  */
 export async function fetchCameras(text) {
   let json = text;
@@ -91,7 +91,7 @@ export async function fetchCameras(text) {
 }
 
 /**
- * The last part of an address, as people name a file.
+ * Return the last part of an address, the name of a file.
  *
  * @param {string} address
  */
@@ -101,6 +101,6 @@ export function nameOf(address) {
   try {
     return decodeURIComponent(last) || address;
   } catch {
-    return last; // a percent sign that encodes nothing
+    return last; // invalid percent-encoding
   }
 }

@@ -1,4 +1,4 @@
-// Coarse renders of a scene from samples of its splats: how much a view shows, and the depth under a pixel.
+// Coarse renders of samples of a scene: how much detail a view shows, and the depth under a pixel.
 
 /**
  * @typedef {import('./bounding_frame.mjs').Samples} Samples
@@ -6,18 +6,18 @@
  * @typedef {import('./vectors.mjs').Vec3} Vec3
  */
 
-const COLUMNS = 32; // of a rough picture
+const COLUMNS = 32; // width of a coarse render
 const ROWS = 24;
-const FINE = 4; // pixels of a picture of 640: splats of this size and less count fully
-const PICK_RADII = [6, 14, 30, 60]; // pixels around the pointer, until enough is there
-const PICK_ENOUGH = 12; // samples, so that what lies behind is not all that is seen
-const PICK_SHARE = 0.25; // of what shows around the pointer: as much lies before the point that is picked
+const FINE = 4; // pixels in a picture of width 640; splats up to this size count fully
+const PICK_RADII = [6, 14, 30, 60]; // pixels around the pointer, increased until there are enough samples
+const PICK_ENOUGH = 12; // minimum number of samples, so that the point is not on the background
+const PICK_SHARE = 0.25; // quantile of the depths around the pointer that is picked
 
 /**
- * Take every n-th sample, so that many views can be judged quickly.
+ * Take every Nth sample, to compare many views quickly.
  *
  * @param {Samples} samples
- * @param {number} most
+ * @param {number} most maximum number of samples
  * @returns {Samples}
  */
 export function thinned({ samples, weights }, most) {
@@ -32,13 +32,13 @@ export function thinned({ samples, weights }, most) {
 }
 
 /**
- * How much of a picture shows fine splats with nothing before them, 0 to 1. Views that no photograph was taken from
- * show large, smeared splats, or something close by that hides the rest.
+ * Return the share of a picture, 0 to 1, that shows fine splats with nothing in front of them. Views unlike those of the
+ * photographs show large, smeared splats, or are occluded by something close.
  *
  * @param {Samples} scene
- * @param {number} standsFor splats of the scene per sample
- * @param {EngineCamera} camera of a picture of COLUMNS by ROWS pixels
- * @param {number} nearest what lies nearer than this hides without showing anything, scene units
+ * @param {number} standsFor number of splats that a sample represents
+ * @param {EngineCamera} camera camera of a picture of COLUMNS by ROWS pixels
+ * @param {number} nearest samples nearer than this occlude without showing detail, scene units
  */
 export function detail({ samples, weights }, standsFor, { viewmat: m, fx, fy, cx, cy, near }, nearest) {
   const count = weights.length;
@@ -63,7 +63,7 @@ export function detail({ samples, weights }, standsFor, { viewmat: m, fx, fy, cx
     const area = (weights[i] * fx * fy) / depths[i] ** 2; // in cells
     const size = (640 / COLUMNS) * Math.sqrt(area);
     const fine = depths[i] >= nearest ? FINE / Math.max(size, FINE) : 0;
-    // a large splat hides what lies behind all the cells that it is spread over: a wall may be a few of them
+    // a large splat occludes all the cells that it covers: a wall may consist of a few
     const side = Math.max(1, Math.round(Math.sqrt(area)));
     const top = Math.floor(cells[i] / COLUMNS) - (side >> 1);
     const left = (cells[i] % COLUMNS) - (side >> 1);
@@ -79,17 +79,17 @@ export function detail({ samples, weights }, standsFor, { viewmat: m, fx, fy, cx
   return sum / (COLUMNS * ROWS);
 }
 
-/** Size of the rough pictures. */
+/** Size of the coarse renders. */
 export const ROUGH = { width: COLUMNS, height: ROWS };
 
 /**
- * The point of a scene under a pointer.
+ * Return the point of a scene under the pointer.
  *
  * @param {Samples} scene
  * @param {EngineCamera} camera
  * @param {number} x pixels
  * @param {number} y pixels
- * @returns {Vec3 | null} a point on the ray through the pixel; null where nothing is
+ * @returns {Vec3 | null} a point on the ray through the pixel; null if there is none
  */
 export function pick(scene, camera, x, y) {
   for (const radius of PICK_RADII) {
@@ -105,14 +105,14 @@ export function pick(scene, camera, x, y) {
 }
 
 /**
- * How far away the nearest surface around a pixel lies, floaters aside.
+ * Return the depth of the nearest surface around a pixel, ignoring floaters.
  *
  * @param {Samples} scene
  * @param {EngineCamera} camera
  * @param {number} x
  * @param {number} y
  * @param {number} radius pixels
- * @param {number} enough samples that there have to be
+ * @param {number} enough minimum number of samples
  * @returns {number | null} scene units along the line of sight
  */
 function depthAround({ samples, weights }, { viewmat: m, fx, fy, cx, cy, near }, x, y, radius, enough) {

@@ -1,22 +1,22 @@
-// Offers to save the up direction that the user chose: a rewritten file, or the command that writes one.
+// Offers to save the up direction that the user chose: as a rewritten file, or with a command.
 
 import { element } from './overlay.mjs';
 
 /**
  * @typedef {import('./vectors.mjs').Vec3} Vec3
  * @typedef {object} Hooks
- * @property {(up: Vec3) => Promise<Uint8Array<ArrayBuffer>>} file gives the scene's file, saying what is up
- * @property {(text: string) => void} say something for a moment
+ * @property {(up: Vec3) => Promise<Uint8Array<ArrayBuffer>>} file returns the scene's file with this up direction
+ * @property {(text: string) => void} say shows a message briefly
  */
 
-const DIGITS = 1e6; // a millionth of a radian
+const DIGITS = 1e6; // a precision of a millionth of a radian
 const AXES = ['x', 'y', 'z'];
-const LINK_MS = 60000; // that the browser may take to begin to save
+const LINK_MS = 60000; // time for the browser to start saving
 
 /**
- * A direction as files hold it.
+ * Round a direction as stored in files.
  *
- * @param {Vec3} up of length 1
+ * @param {Vec3} up unit vector
  * @returns {Vec3}
  */
 export function rounded(up) {
@@ -24,7 +24,7 @@ export function rounded(up) {
 }
 
 /**
- * A direction as `--up` takes it: `z`, `-y` or three numbers.
+ * Format a direction for the option `--up`: `z`, `-y` or three numbers.
  *
  * @param {Vec3} up
  */
@@ -35,9 +35,9 @@ export function upWord(up) {
 }
 
 /**
- * The command that makes the file anew, saying what is up.
+ * Return the command that encodes the file again with an up direction.
  *
- * @param {string} name of the file
+ * @param {string} name name of the file
  * @param {Vec3} up
  */
 export function saveUpCommand(name, up) {
@@ -61,7 +61,7 @@ export class SaveUpOffer {
   }
 
   /**
-   * @param {string} name of the file
+   * @param {string} name name of the file
    * @param {Vec3} up
    */
   show(name, up) {
@@ -81,7 +81,7 @@ export class SaveUpOffer {
     try {
       await navigator.clipboard.writeText(code.textContent ?? '');
     } catch {
-      getSelection()?.selectAllChildren(code); // a page without HTTPS: the older way
+      getSelection()?.selectAllChildren(code); // without HTTPS, select the text instead
       if (!document.execCommand('copy')) return this.hooks.say('Selected: the browser copies it by its own menu');
     }
     this.hooks.say('Copied');

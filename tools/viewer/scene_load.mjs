@@ -1,4 +1,4 @@
-// One call of the engine's `open`: receives a scene from the worker and tracks what has arrived.
+// One call of the engine's `open`: receives a scene from the worker and tracks its parts.
 
 import { coarseBounds, fineBounds } from './bounds.mjs';
 import { EngineError, E_LIMIT } from './engine_error.mjs';
@@ -10,15 +10,15 @@ import { expandedBytes } from './statistics.mjs';
  * @typedef {import('./types.d.ts').Header} Header
  * @typedef {import('./worker.mjs').Reply} Reply
  *
- * Of the promise that `open` gave.
+ * The callbacks of the promise that `open` returned.
  * @typedef {{resolve: () => void, reject: (error: EngineError) => void}} Settle
  */
 
 export class SceneLoad {
   /**
    * @param {string | Blob | ArrayBuffer} source
-   * @param {number} scene number by which the worker's messages are told from those for earlier scenes
-   * @param {import('./types.d.ts').Stats} stats of this scene; changed in place
+   * @param {number} scene number that distinguishes the worker's messages from those for earlier scenes
+   * @param {import('./types.d.ts').Stats} stats statistics of this scene; changed in place
    * @param {Pick<import('./types.d.ts').EngineOptions, 'onHeader' | 'onProgress'>} hooks
    * @param {Settle} settle
    */
@@ -28,7 +28,7 @@ export class SceneLoad {
     this.stats = stats;
     this.hooks = hooks;
     this.settle = settle;
-    /** Milliseconds. */
+    /** Start time, milliseconds. */
     this.begun = performance.now();
     /** @type {EngineError | null} */
     this.error = null;
@@ -39,7 +39,7 @@ export class SceneLoad {
     /** Whether everything is decoded. */
     this.isDone = false;
     this.tilesHere = 0;
-    /** The last sort: for which camera and how many tiles. */
+    /** The last sort: its camera and number of tiles. */
     this.order = { id: 0, tiles: 0 };
     /** @type {number[]} samples of splats */
     this.points = [];
@@ -47,7 +47,7 @@ export class SceneLoad {
     this.weights = [];
   }
 
-  /** Whether layer 0 of all tiles is here. */
+  /** Whether layer 0 of all tiles has arrived. */
   get isWhole() {
     return this.header !== null && this.tilesHere === this.header.tiles.length;
   }
@@ -55,13 +55,13 @@ export class SceneLoad {
   /**
    * Whether everything is decoded and sorted.
    *
-   * @param {number} viewId of the camera, 0 where there is none
+   * @param {number} viewId id of the camera, 0 without one
    */
   isSorted(viewId) {
     return this.isDone && (viewId === 0 || (this.order.id === viewId && this.isOrderWhole));
   }
 
-  /** Whether the last sort had all tiles. */
+  /** Whether the last sort included all tiles. */
   get isOrderWhole() {
     return this.order.id > 0 && this.order.tiles === this.header?.tiles.length;
   }
@@ -69,7 +69,7 @@ export class SceneLoad {
   /**
    * @param {Reply} reply
    * @param {Renderer} renderer
-   * @throws {EngineError} the worker's, or E_LIMIT for a scene that the GPU cannot hold
+   * @throws {EngineError} the worker's, or E_LIMIT for a scene that does not fit on the GPU
    */
   take(reply, renderer) {
     if (reply.type === 'header') this.#takeHeader(reply, renderer);

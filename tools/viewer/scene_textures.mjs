@@ -1,4 +1,4 @@
-// The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, the order.
+// The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, and the order.
 
 import { toCamera } from './camera_maths.mjs';
 import { BLOCK_SPLATS, layoutSlots } from './texels.mjs';
@@ -26,7 +26,7 @@ export class SceneTextures {
   constructor(gl, layout, splatsMax) {
     const { tiles } = layout;
     const { starts, slotCount } = layoutSlots(tiles);
-    if (slotCount > splatsMax) throw new RangeError(`${slotCount} splats, this GPU has room for ${splatsMax}`);
+    if (slotCount > splatsMax) throw new RangeError(`${slotCount} splats, this GPU can hold ${splatsMax}`);
     const { words, word, floats } = formats(gl);
     this.gl = gl;
     this.layout = layout;
@@ -38,13 +38,13 @@ export class SceneTextures {
     this.blocks = new LinearTexture(gl, word, slotCount / BLOCK_SPLATS);
     this.order = new LinearTexture(gl, word, slotCount);
     this.records = new Records(gl, slotCount);
-    this.count = 0; // of the order
+    this.count = 0; // number of splats in the order
     this.constants = new Uint32Array(TILE_WORDS * tiles.length);
     this.constantFloats = new Float32Array(this.constants.buffer);
     this.corners = new Float32Array(4 * tiles.length);
     /** @type {Map<string, {at: number, rows: Rows}>} by codebook and layer */
     this.tables = new Map();
-    /** @type {Map<string, number>} where the indices lie, by tile and codebook */
+    /** @type {Map<string, number>} offsets of the indices, by tile and codebook */
     this.indices = new Map();
     this.putBlocks();
   }
@@ -54,7 +54,7 @@ export class SceneTextures {
     return textures.reduce((sum, { bytes }) => sum + bytes, 0);
   }
 
-  /** Which tile each block of slots belongs to. */
+  /** Write the tile of each block of slots. */
   putBlocks() {
     const { starts, layout } = this;
     layout.tiles.forEach(({ splatCount }, tile) => {
@@ -135,7 +135,7 @@ export class SceneTextures {
   }
 
   /**
-   * Corners of tiles in camera coordinates, from binary64: far from the origin nothing trembles.
+   * Write the corners of tiles in camera coordinates, computed in binary64 to avoid jitter far from the origin.
    *
    * @param {View} view
    */
@@ -154,7 +154,7 @@ export class SceneTextures {
     this.places.write(0, corners);
   }
 
-  /** Bind everything that shaders read. */
+  /** Bind all textures that the shaders read. */
   bind() {
     const { gl } = this;
     const textures = {

@@ -1,32 +1,32 @@
-// Where the textures keep what, and the part of the shaders that reads attributes from them. texels.mjs describes the layout.
+// Layout constants of the textures, and the shader code that reads attributes from them. texels.mjs describes the layout.
 
-/** Texels of a row of the textures that are addressed by one number. */
+/** Texels per row of the textures that are addressed by one number. */
 export const ROW_TEXELS = 2048;
 
-/** Texels of a tile's row in the table of tiles: geometry 3, then 2 for each SH band. */
+/** Texels of a tile's row in the table of tiles: 3 for geometry, then 2 for each SH band. */
 export const TILE_TEXELS = 9;
 
-/** Records of a row, which are the quads of an instance. */
+/** Records per row, one quad of an instance each. */
 export const RECORD_COLUMNS = 512;
 
-/** What a tile has of an SH band. */
+/** How a tile stores an SH band. */
 export const BAND_NONE = 0;
 export const BAND_ROWS = 1;
 export const BAND_CODEBOOK = 2;
 
-/** Fields of a splat one after the other. */
+/** Reads the fields of a splat in order. */
 export const READ_GEOMETRY = `
-uniform usampler2D uFirst; // a texel of each splat
-uniform usampler2D uStore; // everything else: words
+uniform usampler2D uFirst; // first texel of each splat
+uniform usampler2D uStore; // everything else, as words
 uniform usampler2D uTiles; // constants of tiles
-uniform sampler2D uPlaces; // of tiles: corner in camera coordinates, step
+uniform sampler2D uPlaces; // per tile: corner in camera coordinates, step
 uniform usampler2D uBlocks; // tile of each block of slots
 
 ivec2 place(uint i) {
   return ivec2(i % ${ROW_TEXELS}u, i / ${ROW_TEXELS}u);
 }
 
-// A word of the store; its texel is fetched anew where one begins, and for the first word of a run.
+// A word of the store; a texel is fetched when a new one begins, and for the first word of a run.
 uvec4 gTexel;
 uint storeWord(uint at, bool isFirst) {
   if (isFirst || (at & 3u) == 0u) gTexel = texelFetch(uStore, place(at >> 2), 0);
@@ -34,9 +34,9 @@ uint storeWord(uint at, bool isFirst) {
 }
 
 uvec4 gFirst; // words of the first texel
-uint gWord; // of those of the splat that are to come
-uint gMore; // word of the store that follows those of the first texel
-uint gBuffer; // bits that are left of the last word
+uint gWord; // index of the splat's next word
+uint gMore; // word of the store that continues the first texel
+uint gBuffer; // remaining bits of the last word
 uint gBuffered;
 
 // The next field, of 1 to 32 bits.
@@ -72,12 +72,12 @@ vec3 values(uint bits, uvec4 lattice) {
 }
 `;
 
-/** Coefficients of a band one after the other. */
+/** Reads the coefficients of a band in order. */
 export const READ_BANDS = `
 uint rNext; // word of the store
 bool rIsFirst;
 uint rWord;
-uint rFields; // left of the word
+uint rFields; // remaining fields of the word
 uint rBits;
 float rOffset;
 float rStep;
@@ -116,7 +116,7 @@ uint rowWords(uint columns, uint bits) {
   return (columns + perWord - 1u) / perWord;
 }
 
-// Go to a splat's coefficients of a band; false where its tile has none.
+// Go to a splat's coefficients of a band; return false if its tile has none.
 bool openBand(uint tile, uint local, uint band) {
   uint row = tile * ${TILE_TEXELS}u + 1u + 2u * band;
   uvec4 head = texelFetch(uTiles, place(row), 0); // kind and bits, index, table, rows
@@ -144,7 +144,7 @@ bool openBand(uint tile, uint local, uint band) {
 }
 `;
 
-/** Spherical harmonics in the order and with the signs of csplat_render/projection.py. */
+/** Spherical harmonics with the order and signs of csplat_render/projection.py. */
 export const COLOUR = `
 uniform int uDegree;
 
@@ -182,6 +182,6 @@ vec3 colourOf(uint tile, uint local, vec3 sh0, vec3 d) {
   if (uDegree >= 1 && openBand(tile, local, 1u)) sum += band1(d);
   if (uDegree >= 2 && openBand(tile, local, 2u)) sum += band2(d);
   if (uDegree >= 3 && openBand(tile, local, 3u)) sum += band3(d);
-  return clamp(sum, 0.0, 60000.0); // records hold it in half precision
+  return clamp(sum, 0.0, 60000.0); // records store it in half precision
 }
 `;

@@ -7,7 +7,7 @@ import { COVER_VERTEX, PROJECT_FRAGMENT, RESOLVE_FRAGMENT, SPLAT_FRAGMENT, SPLAT
  * @typedef {import('./types.d.ts').View} View
  */
 
-/** Texture units by the names that samplers have in the shaders. */
+/** Texture units by sampler name. */
 export const UNITS = Object.freeze({
   uFirst: 0,
   uStore: 1,
@@ -20,7 +20,7 @@ export const UNITS = Object.freeze({
   uPicture: 8,
 });
 
-/** A linked program with the places of its uniforms. */
+/** A linked program and the locations of its uniforms. */
 class Program {
   /**
    * @param {WebGL2RenderingContext} gl
@@ -35,7 +35,7 @@ class Program {
       [gl.FRAGMENT_SHADER, fragment],
     ])) {
       const shader = gl.createShader(type);
-      if (shader === null) continue; // the context is lost
+      if (shader === null) continue; // context lost
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       gl.attachShader(this.program, shader);
@@ -56,7 +56,7 @@ class Program {
     throw new Error(`a shader of the viewer: ${[gl.getProgramInfoLog(program), ...logs].filter(Boolean).join('; ')}`);
   }
 
-  /** @param {string} name of a uniform */
+  /** @param {string} name name of a uniform */
   at(name) {
     let place = this.places.get(name);
     if (place === undefined) {
@@ -67,7 +67,7 @@ class Program {
   }
 }
 
-/** All of them. */
+/** All programs. */
 export class ShaderPrograms {
   /** @param {WebGL2RenderingContext} gl */
   constructor(gl) {
@@ -103,7 +103,7 @@ export class ShaderPrograms {
   }
 
   /**
-   * @param {number} begin place in the order
+   * @param {number} begin position in the order
    * @param {number} end
    */
   useProject(begin, end) {

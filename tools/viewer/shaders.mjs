@@ -1,4 +1,4 @@
-// The shaders. A fragment pass projects the splats of the order, one to a pixel, into records; quads are drawn from those.
+// The shaders. A fragment pass projects the splats in order, one per pixel, into records; quads are drawn from the records.
 
 import { BLOCK_SPLATS } from './texels.mjs';
 import { COLOUR, READ_BANDS, READ_GEOMETRY, RECORD_COLUMNS, TILE_TEXELS } from './shader_attributes.mjs';
@@ -16,13 +16,13 @@ void main() {
   gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0);
 }`;
 
-/** One splat to a record; follows csplat_render/projection.py, in single precision. */
+/** Projects one splat per record; follows csplat_render/projection.py, in single precision. */
 export const PROJECT_FRAGMENT = `${HEAD}
 ${READ_GEOMETRY}
 ${READ_BANDS}
 ${COLOUR}
 uniform usampler2D uOrder;
-uniform uint uBegin; // place in the order of the first record
+uniform uint uBegin; // position of the first record in the order
 uniform uint uEnd;
 uniform mat3 uRotation; // world to camera
 uniform vec4 uFocal; // fx fy cx cy
@@ -38,7 +38,7 @@ layout(location = 0) out uvec4 oPlace; // centre x y, the longer half-axis x y (
 layout(location = 1) out uvec4 oLook; // the shorter half-axis, opacity, colour in halves
 
 const float LOG_SCALE_LIMIT = 60.0;
-const float PIXELS_MAX = 1e8; // standard deviations on the picture count as at most that: squares of squares stay finite
+const float PIXELS_MAX = 1e8; // maximum standard deviation on the picture, so that fourth powers stay finite
 
 // Columns: axes of the splat.
 mat3 axesOf(vec3 n) {
@@ -52,8 +52,8 @@ mat3 axesOf(vec3 n) {
     2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y));
 }
 
-// The projected ellipse without dilation: variances and covariance, and the determinant as a sum of squares, which
-// loses nothing however long and thin the splat is.
+// The projected ellipse without dilation: variances and covariance, and the determinant as a sum of squares, which is
+// accurate for long and thin splats.
 vec4 ellipseOf(vec3 p, vec3 logScales, mat3 axes) {
   vec2 slope = clamp(p.xy / p.z, uSlopes.xz, uSlopes.yw);
   vec2 j = uFocal.xy / p.z;
@@ -110,7 +110,7 @@ void main() {
   axis = radius > 0.0 ? normalize(axis / max(abs(axis.x), abs(axis.y))) : vec2(1.0, 0.0);
   vec2 reach = sqrt(2.0 * log(max(255.0 * opacity, 1.0))) * sqrt(vec2(a, c)) + 0.5;
   bool isSeen = opacity >= ${1 / 255} && all(greaterThan(centre + reach, vec2(0.0))) && all(lessThan(centre - reach, uSize));
-  if (!isSeen) return; // NaN and infinity end here too
+  if (!isSeen) return; // also for NaN and infinity
 
   vec3 d = transpose(uRotation) * p;
   d /= max(max(abs(d.x), abs(d.y)), abs(d.z));
@@ -120,7 +120,7 @@ void main() {
   oLook = uvec4(floatBitsToUint(vec2(sqrt(shorter), opacity)), packHalf2x16(colour.rg), packHalf2x16(vec2(colour.b, 0.0)));
 }`;
 
-/** A quad around the ellipse in which a splat's alpha is at least 1/255; an instance is a row of records. */
+/** A quad around the ellipse in which a splat's alpha is at least 1/255. An instance is a row of records. */
 export const SPLAT_VERTEX = `${HEAD}
 uniform usampler2D uRecordPlace;
 uniform usampler2D uRecordLook;
@@ -139,7 +139,7 @@ void main() {
   vec4 record = uintBitsToFloat(texelFetch(uRecordPlace, at, 0));
   float longer = length(record.zw), shorter = uintBitsToFloat(look.x);
   vec2 axis = record.zw / longer;
-  // Beyond the farthest corner of the picture nothing is drawn: quads stay of a size that can be clipped exactly.
+  // Nothing is drawn beyond the farthest corner of the picture, so that quads stay small enough to be clipped exactly.
   float farthest = length(abs(record.xy - 0.5 * uSize) + 0.5 * uSize);
   float reach = sqrt(2.0 * log(max(255.0 * opacity, 1.0))) * 1.0001 + 1e-4;
   vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
@@ -160,7 +160,7 @@ void main() {
   oColour = vec4(vColour.rgb * alpha, alpha);
 }`;
 
-/** The background behind what has been blended. */
+/** Adds the background behind the blended splats. */
 export const RESOLVE_FRAGMENT = `${HEAD}
 uniform sampler2D uPicture;
 uniform vec3 uBackground;

@@ -4,7 +4,7 @@ const DIGIT_BITS = 11;
 const DIGITS = 1 << DIGIT_BITS;
 const KEY_BITS = 2 * DIGIT_BITS;
 
-/** Memory that sorts use again and again. */
+/** Sorts by depth; keeps its memory between sorts. */
 export class DepthSorter {
   constructor() {
     this.keys = new Uint32Array(0);
@@ -15,10 +15,10 @@ export class DepthSorter {
   }
 
   /**
-   * Order slots by depth, the farthest first; equal keys: the later one first, so that the earlier is blended over it.
+   * Order slots by depth, farthest first. Of equal keys the later slot comes first, so that the earlier is drawn over it.
    *
-   * Positive binary32 numbers are in the order of their bits. The bits above the nearest depth's are cut to 22: where
-   * depths span a factor of 2^k, neighbours are told apart down to a relative difference of k × 2^−22.
+   * Positive binary32 numbers sort by their bits. The bits above those of the nearest depth are cut to 22: if depths span
+   * a factor of 2^k, the relative resolution is k × 2^−22.
    *
    * @param {Float32Array} depths [count] or longer, above 0 and finite
    * @param {Uint32Array} slots [count] or longer
@@ -41,14 +41,14 @@ export class DepthSorter {
     low.fill(0);
     high.fill(0);
     for (let i = 0; i < count; i++) {
-      const key = (farthest - bits[i]) >>> shift; // the farthest first
+      const key = (farthest - bits[i]) >>> shift; // farthest first
       keys[i] = key;
       low[key & (DIGITS - 1)]++;
       high[key >>> DIGIT_BITS]++;
     }
     begins(low);
     begins(high);
-    // Backwards once: of equal keys the later slot comes first.
+    // One pass runs backwards, so that of equal keys the later slot comes first.
     for (let i = count - 1; i >= 0; i--) {
       const at = low[keys[i] & (DIGITS - 1)]++;
       swap[at] = slots[i];
@@ -67,7 +67,7 @@ export class DepthSorter {
 }
 
 /**
- * Counts to the places where their digits begin.
+ * Convert counts to start positions.
  *
  * @param {Uint32Array} counts
  */

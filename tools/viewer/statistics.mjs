@@ -1,4 +1,4 @@
-// Numbers about a scene and its frames.
+// Statistics of a scene and its frames.
 
 /**
  * @typedef {import('./types.d.ts').Header} Header
@@ -34,7 +34,7 @@ export function emptyStats({ name, pictureFormat }) {
 }
 
 /**
- * Bytes of a splat's attributes as binary32 numbers: means, quats, scales, alpha and colours.
+ * Return the bytes of a splat's attributes in binary32: means, quats, scales, alpha and colours.
  *
  * @param {number} shDegree
  */

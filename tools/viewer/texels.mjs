@@ -1,9 +1,9 @@
 // Packs a tile's integers into texels of four 32-bit words. shaders.mjs reads the same layout.
 //
-// Geometry is a string of bits per splat: means x y z, quats x y z, scales (three), opacity, sh0 r g b, each field with
-// as many bits as the tile needs; the first 128 bits are a texel, what does not fit follows in words apart. Colours of
-// SH bands are rows of equal fields that do not cross words: entries of a codebook, or one row per splat. Indices of a
-// codebook are such fields too. Each of these arrays of words is filled up to whole texels.
+// Geometry is a string of bits per splat: means x y z, quats x y z, scales (three), opacity, sh0 r g b. The tile determines
+// the bits of each field. The first 128 bits are a texel; the rest follows in a separate array of words. Colours of SH bands
+// are rows of equal fields that do not cross words: entries of a codebook, or one row per splat. Indices of a codebook are
+// such fields too. Each of these arrays of words is padded to whole texels.
 
 /**
  * @typedef {import('../../codec/js/decoder.d.ts').AttributeRecord} AttributeRecord
@@ -12,40 +12,40 @@
  * @typedef {import('../../codec/js/decoder.d.ts').PackedGeometry} PackedGeometry
  * @typedef {Uint8Array | Uint16Array | Uint32Array | Float64Array} Elements
  *
- * Values are `offset` + field × step, or binary32 patterns where a field has 32 bits (offset and step are then unused).
+ * Values are `offset` + field × step, or binary32 patterns if a field has 32 bits (offset and step are then unused).
  *
  * @typedef {object} GeometryTexels
  * @property {number} count splats
  * @property {Uint32Array<ArrayBuffer>} first [4 × count], the first texel of each splat
- * @property {Uint32Array<ArrayBuffer> | null} more [moreWords × count], filled up
- * @property {number} moreWords of each splat
- * @property {{means: number[], quats: number, scales: number, opacities: number, sh0: number}} bits of a field
+ * @property {Uint32Array<ArrayBuffer> | null} more [moreWords × count], padded
+ * @property {number} moreWords words per splat in `more`
+ * @property {{means: number[], quats: number, scales: number, opacities: number, sh0: number}} bits bits per field
  * @property {{offsets: number[], step: number}} scales
  * @property {{offsets: number[], step: number}} sh0
  *
- * Rows of SH coefficients, r g b of one after the other; a value is (offset + field) × step, or a binary32 pattern.
+ * Rows of SH coefficients, r g b of each in turn; a value is (offset + field) × step, or a binary32 pattern.
  *
  * @typedef {{texels: Uint32Array<ArrayBuffer>, rowWords: number, rows: number, bits: number, offset: number, step: number}} Rows
  *
- * An SH band of a tile: a row per splat, or indices of rows and a row for each escaped splat (null: none is). An index
- * of `size` + k is the k-th of those.
+ * An SH band of a tile: a row per splat, or indices of rows and a row for each escaped splat (null if there are none). An
+ * index of `size` + k refers to the k-th of these.
  *
  * @typedef {{rows: Rows | null, codebook: {id: number, size: number, index: Uint32Array<ArrayBuffer>, indexBits: number} | null}} BandTexels
  */
 
-/** Splats of a tile begin at a multiple of this, so that a table of blocks tells a splat's tile. */
+/** The first slot of a tile is a multiple of this, so that a table of blocks gives the tile of a splat. */
 export const BLOCK_SPLATS = 64;
 
-/** Integers of up to so many bits, and their sums with offsets of as many, are exact in binary32. */
+/** Integers of up to this many bits, and their sums with offsets of the same size, are exact in binary32. */
 const EXACT_BITS = 23;
 const FLOAT_BITS = 32;
 const TEXEL_WORDS = 4;
 
 /**
- * First slots of tiles.
+ * Assign the first slots of tiles.
  *
  * @param {{splatCount: number}[]} tiles
- * @returns {{starts: number[], slotCount: number}} slotCount: of all, those between tiles too
+ * @returns {{starts: number[], slotCount: number}} slotCount includes the unused slots between tiles
  */
 export function layoutSlots(tiles) {
   const starts = [];
@@ -58,7 +58,7 @@ export function layoutSlots(tiles) {
 }
 
 /**
- * Layer 0 of a tile.
+ * Pack layer 0 of a tile.
  *
  * @param {PackedGeometry} tile
  * @param {{levels: number}} opacities attribute record
@@ -89,11 +89,11 @@ export function packGeometry(tile, opacities, quats) {
   return { count, ...splitTexels(writer.words, count, words), bits, scales: scales.values, sh0: sh0.values };
 }
 
-/** Fields of splats, one string of bits each. */
+/** The fields of splats, one string of bits per splat. */
 class BitWriter {
   /**
    * @param {number} count splats
-   * @param {number} stride words of a splat
+   * @param {number} stride words per splat
    */
   constructor(count, stride) {
     this.count = count;
@@ -107,7 +107,7 @@ class BitWriter {
    *
    * @param {Elements} from
    * @param {number} first element
-   * @param {number} add to each element, the sum is at least 0 and has `bits` bits
+   * @param {number} add added to each element; the sum is not negative and has `bits` bits
    * @param {number} bits at most 32
    */
   put(from, first, add, bits) {
@@ -127,7 +127,7 @@ class BitWriter {
 /**
  * @param {Uint32Array<ArrayBuffer>} words
  * @param {number} count
- * @param {number} stride words of a splat
+ * @param {number} stride words per splat
  */
 function splitTexels(words, count, stride) {
   const moreWords = stride - TEXEL_WORDS;
@@ -141,11 +141,12 @@ function splitTexels(words, count, stride) {
   return { first, more, moreWords };
 }
 
-/** An array of at least so many words. @param {number} words */
+/** Return an array of at least `words` words, in whole texels. @param {number} words */
 const wholeTexels = (words) => new Uint32Array(Math.ceil(words / TEXEL_WORDS) * TEXEL_WORDS);
 
 /**
- * Fields of columns with one width: the integers above each column's offset, or binary32 patterns where those are many.
+ * Return the fields of columns with a common width: integers relative to each column's offset, or binary32 patterns if
+ * those would be too wide.
  *
  * @param {PackedColumns} packed
  * @param {number} count splats
@@ -169,7 +170,7 @@ function fieldsOf({ columns, offsets, step }, count) {
 const lesser = (a, b) => Math.min(a, b);
 
 /**
- * An SH band of a tile.
+ * Pack an SH band of a tile.
  *
  * @param {Packed} packed
  * @param {number} count splats
@@ -179,7 +180,7 @@ export function packBand(packed, count) {
   if (packed.lookup === undefined) return { rows: packRows(everySplat(packed, count)), codebook: null };
   const { codebook: id, table, index } = packed.lookup;
   const escaped = packed.rows ?? [];
-  const size = table.columns.length / packed.offsets.length - 1; // the last row stands for the escaped
+  const size = table.columns.length / packed.offsets.length - 1; // without the last row, for escaped splats
   const full = Uint32Array.from(index);
   for (let k = 0; k < escaped.length; k++) full[escaped[k]] = size + k;
   const indexBits = bitsFor(Math.max(0, size + escaped.length - 1));
@@ -189,7 +190,7 @@ export function packBand(packed, count) {
 }
 
 /**
- * The same integers with a row for every splat.
+ * Expand packed columns to one row per splat.
  *
  * @param {Packed} packed without a codebook
  * @param {number} count splats
@@ -207,7 +208,7 @@ function everySplat({ columns, offsets, step, rows }, count) {
 }
 
 /**
- * Rows of colours, each beginning with a word.
+ * Pack rows of colours, each starting at a word.
  *
  * @param {PackedColumns} packed
  * @returns {Rows}
@@ -243,7 +244,7 @@ export function packRows({ columns, offsets, step }) {
 }
 
 /**
- * One field per splat, as many to a word as fit.
+ * Pack one field per splat, as many per word as fit.
  *
  * @param {Uint32Array} values
  * @param {number} count
@@ -256,7 +257,7 @@ function packFields(values, count, bits) {
   return words;
 }
 
-/** Bits of an unsigned integer below 2^32, at least one. @param {number} most */
+/** Return the number of bits of an unsigned integer below 2^32, at least 1. @param {number} most */
 export const bitsFor = (most) => Math.max(1, 32 - Math.clz32(most));
 
 /**

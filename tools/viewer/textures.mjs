@@ -1,16 +1,16 @@
-// Textures that are addressed by one number, row by row, and grow.
+// Growing textures that are addressed by one number, row by row.
 
 import { ROW_TEXELS } from './shader_attributes.mjs';
 
 /**
- * Format of a texture.
+ * The format of a texture.
  *
  * @typedef {{internal: number, format: number, type: number, channels: number, bytes: number}} Format
  * @typedef {Uint32Array | Float32Array} Texels
  */
 
 /**
- * The formats that the renderer uses.
+ * Return the formats that the renderer uses.
  *
  * @param {WebGL2RenderingContext} gl
  */
@@ -24,10 +24,10 @@ export function formats(gl) {
 }
 
 /**
- * A texture of fixed size without filtering.
+ * Create a texture of fixed size without filtering.
  *
  * @param {WebGL2RenderingContext} gl
- * @param {number} internal format
+ * @param {number} internal internal format
  * @param {number} width
  * @param {number} height
  */
@@ -47,15 +47,15 @@ export function makeTexture(gl, internal, width, height) {
   return texture;
 }
 
-/** The unit for work on textures; those that shaders read are bound to others. */
+/** The texture unit for uploads; the textures that shaders read are bound to others. */
 export const SCRATCH_UNIT = 15;
 
-/** Texels in a row, cut into rows of ROW_TEXELS. */
+/** A sequence of texels, split into rows of ROW_TEXELS. */
 export class LinearTexture {
   /**
    * @param {WebGL2RenderingContext} gl
    * @param {Format} format
-   * @param {number} texels for which there is to be room
+   * @param {number} texels initial capacity
    */
   constructor(gl, format, texels) {
     this.gl = gl;
@@ -70,7 +70,7 @@ export class LinearTexture {
   }
 
   /**
-   * Write texels from a place on.
+   * Write texels at a position.
    *
    * @param {number} first texel
    * @param {Texels} data
@@ -94,7 +94,7 @@ export class LinearTexture {
   }
 
   /**
-   * Change the room, keeping what is there.
+   * Change the capacity and keep the content.
    *
    * @param {number} texels
    */
@@ -123,7 +123,7 @@ export class LinearTexture {
 /** @param {number} texels */
 const rowsFor = (texels) => Math.max(1, Math.ceil(texels / ROW_TEXELS));
 
-/** A texture to which texels are appended. */
+/** A texture that texels are appended to. */
 export class Store {
   /**
    * @param {WebGL2RenderingContext} gl
@@ -138,7 +138,7 @@ export class Store {
    * Append texels.
    *
    * @param {Texels} data
-   * @returns {number} the place of the first
+   * @returns {number} the position of the first
    */
   append(data) {
     const first = this.used;
@@ -149,7 +149,7 @@ export class Store {
     return first;
   }
 
-  /** Give room back that is not used. */
+  /** Free unused capacity. */
   trim() {
     if (rowsFor(this.used) < this.linear.rows) this.linear.resize(this.used);
   }

@@ -1,4 +1,4 @@
-// Vectors of three numbers and rotations, as far as the cameras of the page need them. Nothing is changed in place.
+// Three-component vectors and rotations, for the page's cameras. All functions return new values.
 
 /**
  * @typedef {[number, number, number]} Vec3
@@ -28,14 +28,14 @@ export const length = (a) => Math.hypot(a[0], a[1], a[2]);
 export const unit = (a) => scale(a, 1 / (length(a) || 1));
 
 /**
- * A direction as files and addresses say it, at length 1.
+ * Normalise a direction from a file or address.
  *
  * @param {unknown} value
- * @returns {Vec3 | null} null where it is not three finite numbers, or all are 0
+ * @returns {Vec3 | null} null if it is not three finite numbers, or all are 0
  */
 export function unitDirection(value) {
   if (!Array.isArray(value) || value.length !== 3 || !value.every(Number.isFinite)) return null;
-  const largest = Math.max(...value.map(Math.abs)); // squares of large ones are infinite
+  const largest = Math.max(...value.map(Math.abs)); // squares of large values would be infinite
   return largest > 0 ? unit(/** @type {Vec3} */ (value.map((one) => one / largest))) : null;
 }
 
@@ -43,7 +43,7 @@ export function unitDirection(value) {
 export const mix = (a, b, t) => add(scale(a, 1 - t), scale(b, t));
 
 /**
- * Turn a vector around an axis of unit length (Rodrigues).
+ * Rotate a vector around a unit axis (Rodrigues).
  *
  * @param {Vec3} v
  * @param {Vec3} axis
@@ -57,7 +57,7 @@ export function turn(v, axis, angle) {
 }
 
 /**
- * Turn a whole basis, and take out what rounding has bent.
+ * Rotate a whole basis and orthonormalise it.
  *
  * @param {Basis} basis
  * @param {Vec3} axis
@@ -71,10 +71,10 @@ export function turnBasis([right, , forward], axis, angle) {
 }
 
 /**
- * The basis of a camera that looks along a direction with `up` upwards in its picture.
+ * Return the basis of a camera that looks along a direction with `up` upwards in its picture.
  *
  * @param {Vec3} direction
- * @param {Vec3} up where it is parallel to the direction, any other will do
+ * @param {Vec3} up replaced by another direction if it is parallel to `direction`
  * @returns {Basis}
  */
 export function lookAlong(direction, up) {
@@ -86,7 +86,7 @@ export function lookAlong(direction, up) {
 }
 
 /**
- * The axis of the world that lies most across a direction.
+ * Return the world axis that is most perpendicular to a direction.
  *
  * @param {Vec3} direction
  * @returns {Vec3}
@@ -99,7 +99,7 @@ export function across(direction) {
 
 /**
  * @param {Basis} basis
- * @returns {Quat} of unit length
+ * @returns {Quat} unit quaternion
  */
 export function toQuat([[a, b, c], [d, e, f], [g, h, i]]) {
   const w = Math.max(0, 1 + a + e + i);
@@ -117,7 +117,7 @@ export function toQuat([[a, b, c], [d, e, f], [g, h, i]]) {
 }
 
 /**
- * @param {Quat} quat of unit length
+ * @param {Quat} quat unit quaternion
  * @returns {Basis}
  */
 export function toBasis([w, x, y, z]) {
@@ -129,7 +129,7 @@ export function toBasis([w, x, y, z]) {
 }
 
 /**
- * The rotation at `t` of the way from one to another, the shorter way round.
+ * Interpolate between two rotations along the shorter way.
  *
  * @param {Quat} from
  * @param {Quat} to

@@ -1,5 +1,5 @@
-// The viewer: an engine, a camera with its controls, and a canvas that follows the page's size. The page (main.mjs) and
-// the element (element.mjs) are built around it.
+// The viewer: an engine, a camera with its controls, and a canvas that follows the page's size. The page (main.mjs) and the
+// element (element.mjs) are built on it.
 
 import { Controls } from './controls.mjs';
 import { createEngine } from './engine.mjs';
@@ -16,13 +16,13 @@ import { CanvasSize } from './canvas_size.mjs';
  * @typedef {import('./types.d.ts').Stats} Stats
  *
  * @typedef {object} Hooks
- * @property {() => boolean} calm whether a person wants no animations
- * @property {() => void} [header] what the file says of its scene is in `view.facts`
- * @property {() => void} [placed] the camera may have found its place
+ * @property {() => boolean} calm whether the user prefers no animations
+ * @property {() => void} [header] called when `view.facts` holds the file's metadata
+ * @property {() => void} [placed] called when the camera may have been placed
  * @property {(progress: Progress) => void} progress
- * @property {(stats: Stats) => void} frame a frame has been drawn
- * @property {(stats: Stats) => void} shown the scene is drawn for good
- * @property {(report: ErrorReport) => void} failed each error once
+ * @property {(stats: Stats) => void} frame called when a frame has been drawn
+ * @property {(stats: Stats) => void} shown called when the scene has been drawn completely
+ * @property {(report: ErrorReport) => void} failed called once for each error
  */
 
 const BLACK = /** @type {[number, number, number]} */ ([0, 0, 0]);
@@ -32,7 +32,7 @@ export class SceneViewer {
    * @param {HTMLCanvasElement} canvas
    * @param {import('./page.mjs').Wishes} wishes
    * @param {Hooks} hooks
-   * @param {import('./controls.mjs').Reach} [reach] of the controls
+   * @param {import('./controls.mjs').Reach} [reach] scope of the controls
    */
   constructor(canvas, wishes, hooks, reach) {
     this.canvas = canvas;
@@ -40,7 +40,7 @@ export class SceneViewer {
     this.hooks = hooks;
     /** @type {Engine | null} */
     this.engine = null;
-    this.turn = 0; // counts scenes, so that what is late for one is not shown for the next
+    this.turn = 0; // number of scenes so far; discards late results of earlier scenes
     this.isOpening = false;
     this.isClosed = false;
     this.rig = new OrbitCamera(emptyPose(), 1);
@@ -63,7 +63,7 @@ export class SceneViewer {
     this.view = new CameraList(this.rig, this.controls, wishes);
   }
 
-  /** What stands behind the scene: first what is wished, else what it was trained in front of, else black. */
+  /** The background: the requested one, else that of the training, else black. */
   get background() {
     return this.wishes.background ?? this.view.facts.background ?? BLACK;
   }
@@ -75,9 +75,9 @@ export class SceneViewer {
   }
 
   /**
-   * Make the engine.
+   * Create the engine.
    *
-   * @returns {Promise<Engine | null>} null where it could not be made, as `failed` was told
+   * @returns {Promise<Engine | null>} null if it failed; `failed` has then been called
    */
   async start() {
     const { hooks } = this;
@@ -98,7 +98,7 @@ export class SceneViewer {
           this.stage.drawn(stats.frameMs);
           hooks.frame(stats);
         },
-        // what `open` rejects with is told by `show`
+        // `show` reports the rejections of `open`
         onError: (report) => (report.fatal && this.isOpening) || hooks.failed(report),
       });
       if (this.isClosed) {
@@ -114,9 +114,9 @@ export class SceneViewer {
   }
 
   /**
-   * Take the cameras that are wished; a wrong one does not cost the scene.
+   * Read the requested cameras; an invalid one does not prevent the scene from loading.
    *
-   * @returns {Promise<string>} why they cannot be used, or nothing
+   * @returns {Promise<string>} an error message, or ''
    */
   async readCameras() {
     const { camera, view } = this.wishes;
@@ -130,7 +130,7 @@ export class SceneViewer {
   }
 
   /**
-   * Show a scene in the place of the present one.
+   * Replace the current scene.
    *
    * @param {string | Blob | ArrayBuffer} source
    */
@@ -161,7 +161,7 @@ export class SceneViewer {
     engine.requestFrame();
   }
 
-  /** Put the camera where it should be by what is known of the scene so far. */
+  /** Place the camera according to what is known of the scene so far. */
   #place() {
     const { engine } = this;
     if (!engine?.bounds || !engine.header) return;
@@ -170,7 +170,7 @@ export class SceneViewer {
     this.hooks.placed?.();
   }
 
-  /** Free everything, the canvas's context too; nothing else may be called afterwards. */
+  /** Free everything, including the canvas's context; no method may be called afterwards. */
   close() {
     this.isClosed = true;
     this.turn++;
@@ -179,7 +179,7 @@ export class SceneViewer {
     if (!this.engine) return;
     this.engine.close();
     this.engine = null;
-    // browsers have few contexts, and take one back when they please
+    // browsers limit the number of contexts and may take any of them away
     this.canvas.getContext('webgl2')?.getExtension('WEBGL_lose_context')?.loseContext();
   }
 }

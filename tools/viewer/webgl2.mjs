@@ -1,4 +1,4 @@
-// The WebGL 2 back end: see renderer.mjs for what its methods do.
+// The WebGL 2 back end. renderer.mjs documents its methods.
 
 import { slopeLimits } from './camera_maths.mjs';
 import { ShaderPrograms } from './shader_programs.mjs';
@@ -17,14 +17,14 @@ import { Picture, Quads, pictureFormat } from './framebuffers.mjs';
  * @typedef {import('./types.d.ts').View} View
  */
 
-/** Names of drivers that draw on the CPU. */
+/** Names of software drivers. */
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
 /** @implements {Renderer} */
 export class WebGl2Renderer {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {PictureFormat} [format] of the picture, if it can be
+   * @param {PictureFormat} [format] format of the picture, used if available
    */
   static create(canvas, format) {
     const gl = canvas.getContext('webgl2', {
@@ -158,7 +158,7 @@ export class WebGl2Renderer {
   wait() {
     const { gl } = this;
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // gl.finish does not wait in browsers
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4)); // in browsers, gl.finish does not wait
   }
 
   dispose() {

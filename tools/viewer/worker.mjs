@@ -1,4 +1,4 @@
-// The viewer's worker: reads and packs the file, and sorts what the camera sees. engine.mjs talks to it.
+// The viewer's worker: reads and packs the file and sorts the visible splats. engine.mjs sends it requests.
 
 import { cull } from './cull.mjs';
 import { load } from './loader.mjs';
@@ -18,7 +18,7 @@ import { DepthSorter } from './sort.mjs';
  *   | {type: 'rewrite', up: number[], port: MessagePort}
  *   | {type: 'stop'}} Request
  *
- * The answer to `rewrite`, to its port.
+ * The answer to `rewrite`, sent to its port.
  *
  * @typedef {{bytes?: Uint8Array<ArrayBuffer>, error?: ErrorReport}} Rewritten
  *
@@ -35,16 +35,16 @@ import { DepthSorter } from './sort.mjs';
  *   | {type: 'error', error: ErrorReport})} Reply
  */
 
-/** While tiles arrive, sort at most this often. */
+/** Minimum interval between sorts while tiles arrive. */
 const SORT_INTERVAL_MS = 100;
 
 /**
- * What of DedicatedWorkerGlobalScope is used.
+ * The part of DedicatedWorkerGlobalScope that is used.
  *
  * @typedef {{onmessage: ((event: {data: Request}) => void) | null, postMessage: (message: Reply, transfer?: Transferable[]) => void}} Scope
  */
 
-/** One worker's state: the scene that is open, and the camera. */
+/** State of a worker: the open scene and the camera. */
 class Job {
   /** @param {Scope} scope */
   constructor(scope) {
@@ -55,14 +55,14 @@ class Job {
     this.abort = new AbortController();
     /** @type {CullTile[]} */
     this.tiles = [];
-    this.splatCount = 0; // of them
+    this.splatCount = 0; // number of splats in `tiles`
     /** @type {{id: number, view: View} | null} */
     this.camera = null;
     this.sorter = new DepthSorter();
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     /** @type {Uint32Array<ArrayBuffer>[]} */
     this.spare = [];
-    this.isWaiting = false; // for the turn to sort
+    this.isWaiting = false; // a sort is scheduled
     this.sortedAt = -Infinity;
   }
 
@@ -77,7 +77,7 @@ class Job {
     else if (this.spare.length < 2) this.spare.push(request.order);
   }
 
-  /** Leave the scene. */
+  /** Close the scene. */
   reset() {
     this.scene = 0;
     this.abort.abort();
@@ -104,7 +104,7 @@ class Job {
     };
     try {
       await load(source, this.sink(post), signal);
-      this.sort(); // so that the last tiles are in the order before it is said that all is done
+      this.sort(); // includes the last tiles in the order before `done` is sent
       post({ type: 'done' });
     } catch (error) {
       post({ type: 'error', error: reportOf(error) });
@@ -112,7 +112,7 @@ class Job {
   }
 
   /**
-   * Give the file of the scene, saying another way up.
+   * Send the scene's file with another up direction.
    *
    * @param {number[]} up
    * @param {MessagePort} port
@@ -135,7 +135,7 @@ class Job {
       header: (header, description) => post({ type: 'header', header, description }),
       geometry: (tile, texels, culled, samples) => {
         this.tiles.push(culled);
-        this.tiles.sort((a, b) => a.slot - b.slot); // equal depths stay in the order of the file
+        this.tiles.sort((a, b) => a.slot - b.slot); // keeps equal depths in the order of the file
         this.splatCount += culled.count;
         const transfer = [texels.first.buffer, samples.points.buffer, samples.weights.buffer];
         if (texels.more) transfer.push(texels.more.buffer);
@@ -156,9 +156,9 @@ class Job {
   }
 
   /**
-   * Sort once other messages have been taken: of cameras that came in the meantime the latest wins.
+   * Sort after the messages that are already queued, so that only the latest camera is sorted for.
    *
-   * @param {number} interval since the last sort, milliseconds
+   * @param {number} interval minimum time since the last sort, milliseconds
    */
   sortSoon(interval) {
     if (this.isWaiting) return;
@@ -194,7 +194,7 @@ class Job {
 }
 
 /**
- * All bytes of a file.
+ * Return all bytes of a file.
  *
  * @param {string | Blob | ArrayBuffer} source
  */

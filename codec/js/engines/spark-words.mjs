@@ -100,8 +100,8 @@ export class ExtWords {
 /** Arrays of PackedSplats: float16 centres and bytes for the rest, which hold the file's integers if they fit. */
 export class PackedWords {
   /**
+   * @param {Header} header
    * @param {PackedTile[]} tiles all tiles, for their ranges
-   * @param {PackedTile[]} tiles all of them, for their ranges
    */
   constructor(header, tiles) {
     this.header = header;

@@ -1,10 +1,10 @@
-// Who says which way is up.
+// Sources of the up direction, and their order.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { CameraList } from '../camera_list.mjs';
 
-/** A camera of a file, held so that +z is up. */
+/** A camera of a file, level if +z is up. */
 const LEVEL = {
   K: [
     [90, 0, 40],
@@ -28,7 +28,7 @@ function opened({ axes = '', metadata = null, cameras = null }, wanted = {}) {
   return view;
 }
 
-test('a person comes first, then the metadata, the axes, the cameras', () => {
+test('the up direction of the user comes first, then that of metadata, axes and cameras', () => {
   const said = { axes: 'LUF', metadata: { up: [0, 0.6, -0.8] }, cameras: [LEVEL] };
   assert.deepEqual(opened(said, { up: [1, 0, 0], axes: 'RFU' }).up, [1, 0, 0]);
   assert.deepEqual(opened(said, { axes: 'RFD' }).up, [0, 0, -1]);
@@ -39,7 +39,7 @@ test('a person comes first, then the metadata, the axes, the cameras', () => {
   assert.deepEqual(opened({}).up, [0, -1, 0]);
 });
 
-test('what seems to be up is asked for last, and of the first scene alone', () => {
+test('the estimated up direction is used last, and only for the first scene', () => {
   const seems = [0, 0, 1];
   assert.deepEqual(opened({ axes: 'RUB' }, { seems }).up, [0, 1, 0]);
   const view = opened({}, { seems });
@@ -50,7 +50,7 @@ test('what seems to be up is asked for last, and of the first scene alone', () =
   assert.deepEqual(view.up, [0, -1, 0]);
 });
 
-test('who takes its word is offered no other way up', () => {
+test('no other up direction is offered if it is known', () => {
   for (const said of [{ axes: 'RFU' }, { metadata: { up: [0, 0, 1] } }, { cameras: [LEVEL] }]) {
     assert.ok(opened(said).knowsUp);
   }
@@ -58,7 +58,7 @@ test('who takes its word is offered no other way up', () => {
   assert.ok(!opened({}).knowsUp);
 });
 
-test('metadata that say nothing sensible are not listened to', () => {
+test('invalid metadata are ignored', () => {
   const behind = (background) => opened({ metadata: { training: { background } } }).facts.background;
   assert.deepEqual(behind([1, 0.5, 0]), [1, 0.5, 0]);
   for (const wrong of ['white', [1, 1], [1, 1, 1, 1], [1, 1, 2], [1, -1, 1], [1, null, 1], ['1', 1, 1]]) {

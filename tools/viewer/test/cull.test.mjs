@@ -1,4 +1,4 @@
-// The cull keeps everything that can be seen, and drops most of what cannot.
+// The cull keeps all visible splats and drops most others.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -8,7 +8,7 @@ import { random } from './random.mjs';
 
 const EXTENT = 4000;
 
-/** A tile of random splats, and what they are. */
+/** A tile of random splats, and their parameters. */
 function makeTile(next, slot, centre, size, count) {
   const step = size / EXTENT;
   const corner = centre.map((c) => Math.round((c - size / 2) / step));
@@ -22,7 +22,7 @@ function makeTile(next, slot, centre, size, count) {
   return { tile, mean, logScales, alphas };
 }
 
-/** Whether a ball of that size could touch the picture, by the rasteriser's own sums. */
+/** Whether a ball of that size could touch the picture, computed as in the rasteriser. */
 function isSeen(view, mean, logScale, alpha) {
   const [x, y, z] = toCamera(view.viewmat, mean);
   if (!(z > view.near) || alpha < ALPHA_MIN) return false;
@@ -59,7 +59,7 @@ function randomView(next, from) {
   return viewOf(camera, 400, 300);
 }
 
-test('nothing visible is lost, whatever the camera; most of the rest is dropped', () => {
+test('no visible splat is lost for any camera, and most others are dropped', () => {
   const next = random(3);
   const scenes = Array.from({ length: 27 }, (_, k) =>
     makeTile(
@@ -97,7 +97,7 @@ test('nothing visible is lost, whatever the camera; most of the rest is dropped'
   assert.ok(kept < 1.5 * seen && kept < all / 3, `${kept} kept of ${all}, ${seen} are seen`);
 });
 
-test('depths are those along the viewing direction', () => {
+test('depths are measured along the viewing direction', () => {
   const next = random(4);
   const { tile, mean } = makeTile(next, 64, [0, 0, 0], 2, 50);
   const view = viewOf(
@@ -111,7 +111,7 @@ test('depths are those along the viewing direction', () => {
   for (let k = 0; k < out.count; k++) assert.ok(Math.abs(out.depths[k] - mean(out.slots[k] - 64)[2] - 9) < 1e-5);
 });
 
-test('far from the origin depths keep their digits', () => {
+test('depths are accurate far from the origin', () => {
   const next = random(5);
   const far = [1e6, -2e6, 3e6];
   const { tile, mean } = makeTile(next, 0, far, 2, 50);
@@ -126,7 +126,7 @@ test('far from the origin depths keep their digits', () => {
   for (let k = 0; k < out.count; k++) assert.ok(Math.abs(out.depths[k] - (mean(out.slots[k])[2] + 5 - far[2])) < 1e-6);
 });
 
-test('splats too faint to be drawn are dropped, enormous ones are kept', () => {
+test('splats too faint to be drawn are dropped, huge ones are kept', () => {
   const one = (alpha, logScale) => ({
     count: 1,
     slot: 0,
@@ -152,7 +152,7 @@ test('splats too faint to be drawn are dropped, enormous ones are kept', () => {
   assert.equal(keeps(0.004, 60), true);
 });
 
-test('classes of reaches are rounded up, by an eighth of an octave at most', () => {
+test('classes of reaches are rounded up, by at most an eighth of an octave', () => {
   const next = random(6);
   for (let i = 0; i < 1000; i++) {
     const alpha = ALPHA_MIN + next() * (1 - ALPHA_MIN);

@@ -1,4 +1,4 @@
-// In what order a file is read, and what is told on the way.
+// The order in which a file is read, and the events on the way.
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { test } from 'node:test';
@@ -11,7 +11,7 @@ import { load, tileOrder } from '../loader.mjs';
 const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
 const bytes = (name) => readFileSync(new URL(`${name}.csplat`, VECTORS));
 
-/** Everything that a sink is told. */
+/** Return all events of a sink. */
 async function loaded(source, signal = new AbortController().signal) {
   const events = [];
   const sink = {
@@ -35,7 +35,7 @@ test('layer 0 of all tiles comes first, then band after band', async () => {
   assert.equal(layers.length, header.tiles.flatMap((tile) => tile.layers.filter(({ layer }) => layer < 8)).length);
 });
 
-test('a table comes once, before the first band that needs it', async () => {
+test('a table is passed on once, before the first band that needs it', async () => {
   const events = await loaded(new Blob([bytes('valid/codebook_sh_1_3')]));
   const tables = events.filter(({ type }) => type === 'table').map(({ layer }) => layer);
   assert.deepEqual(tables, [1, 2, 3]);
@@ -45,7 +45,7 @@ test('a table comes once, before the first band that needs it', async () => {
   }
 });
 
-test('progress ends with everything', async () => {
+test('progress ends at the totals', async () => {
   for (const source of [new Blob([bytes('valid/rich')]), new Uint8Array(bytes('valid/rich')).buffer]) {
     const events = await loaded(source);
     const { received, fileSize, splatsDone, splatCount } = events.at(-1);
@@ -63,13 +63,13 @@ test('an abort ends the reading', async () => {
   await assert.rejects(loaded(new Blob([bytes('valid/rich')]), AbortSignal.abort(new Error('enough'))), /enough/);
 });
 
-test('damage is refused with its code', async () => {
+test('a damaged file is refused with its code', async () => {
   const damaged = Uint8Array.from(bytes('valid/rich'));
   damaged[readHeader(damaged).tiles[0].layers[1].offset + 20] ^= 1;
   await assert.rejects(loaded(damaged.buffer), { code: 'E_CRC' });
 });
 
-test('slots of tiles and their culls fit together', async () => {
+test('slots of tiles and of their cull data match', async () => {
   const events = await loaded(new Blob([bytes('valid/rich')]));
   const tiles = events.filter(({ type }) => type === 'geometry');
   let end = 0;
@@ -82,7 +82,7 @@ test('slots of tiles and their culls fit together', async () => {
   }
 });
 
-test('the tiles nearest to the camera come first, those behind it last', () => {
+test('tiles nearest to the camera come first, tiles behind it last', () => {
   const tile = (z) => ({ min: [-1, -1, z - 1], max: [1, 1, z + 1] });
   const tiles = [tile(90), tile(-20), tile(3), tile(10)];
   const view = viewOf(
@@ -94,7 +94,7 @@ test('the tiles nearest to the camera come first, those behind it last', () => {
   assert.equal(tileOrder(tiles, null), tiles);
 });
 
-test('bounds: boxes first, then what shows', async () => {
+test('bounds come from boxes first, then from samples', async () => {
   const events = await loaded(new Blob([bytes('valid/rich')]));
   const { header } = events[events.findIndex(({ type }) => type === 'header')];
   const coarse = coarseBounds(header);

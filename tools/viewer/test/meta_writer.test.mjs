@@ -1,4 +1,4 @@
-// Files that are written again with another META: everything else in them stays.
+// Files rewritten with another META: everything else is kept.
 import assert from 'node:assert/strict';
 import { readFileSync, readdirSync } from 'node:fs';
 import { test } from 'node:test';
@@ -12,7 +12,7 @@ const UP = [0, 0.6, -0.8];
 
 const read = (name) => new Uint8Array(readFileSync(new URL(name, FOLDER))).buffer;
 
-/** What a scene is, and what it says; not where it stands in the file. */
+/** The content of a scene and its metadata, independent of offsets in the file. */
 async function facts(bytes) {
   const { header, metadata, checks, ...rest } = await decode(bytes);
   const { axes, unitMetres, origin, attributes, splatCount } = header;
@@ -20,7 +20,7 @@ async function facts(bytes) {
   return { metadata, axes, rest, other: { unitMetres, origin, attributes, splatCount } };
 }
 
-test('every file keeps all but its metadata', async () => {
+test('everything but the metadata is kept', async () => {
   assert.ok(NAMES.length > 50);
   let without = 0;
   for (const name of NAMES) {
@@ -31,13 +31,13 @@ test('every file keeps all but its metadata', async () => {
     assert.deepEqual(after.rest, before.rest, name);
     assert.deepEqual(after.other, before.other, name);
     assert.deepEqual(after.metadata, { ...before.metadata, up: UP }, name);
-    assert.deepEqual(await withUp(written.buffer, UP), written, name); // and again: the same bytes
+    assert.deepEqual(await withUp(written.buffer, UP), written, name); // idempotent
     without += Number(before.metadata === null);
   }
-  assert.ok(without > 0 && without < NAMES.length); // META is new in some, another in others
+  assert.ok(without > 0 && without < NAMES.length); // META is new in some files, replaced in others
 });
 
-test('axes stay where they do not contradict', async () => {
+test('axes are kept unless they contradict the up direction', async () => {
   let known = 0;
   for (const name of NAMES) {
     const { axes } = await facts(read(name));

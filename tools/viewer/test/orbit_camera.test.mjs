@@ -1,4 +1,4 @@
-// The camera that a person moves: where the pivot lies in the picture before and after each movement.
+// The interactive camera: the position of the pivot in the picture before and after each movement.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -8,7 +8,7 @@ import { cross, dot, length, lookAlong, slerp, sub, toBasis, toQuat, turnBasis }
 const WIDTH = 800;
 const HEIGHT = 600;
 
-/** A camera three units before the origin, looking along +z, y down; what it turns around is the origin. */
+/** A camera three units in front of the origin, its pivot, looking along +z, y down. */
 function rig(changes = {}) {
   const pose = {
     basis: lookAlong([0, 0, 1], [0, -1, 0]),
@@ -22,7 +22,7 @@ function rig(changes = {}) {
   return new OrbitCamera(pose, 1);
 }
 
-/** Where a point falls on the picture, in pixels, and its depth. */
+/** The position of a point in the picture, in pixels, and its depth. */
 function project(some, [x, y, z], width = WIDTH, height = HEIGHT) {
   const { viewmat: m, fx, fy, cx, cy } = some.camera(width, height);
   const [a, b, c] = [0, 4, 8].map((row) => m[row] * x + m[row + 1] * y + m[row + 2] * z + m[row + 3]);
@@ -43,11 +43,11 @@ test('a camera that looks along +z with -y up has the axes of the world', () => 
   close(rig().camera(WIDTH, HEIGHT).viewmat, [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1]);
 });
 
-test('looking straight up gives a basis too', () => {
+test('looking straight up gives a valid basis', () => {
   proper(lookAlong([0, -1, 0], [0, -1, 0]));
 });
 
-test('orbiting keeps the pivot in the middle at its distance', () => {
+test('orbiting keeps the pivot centred and at its distance', () => {
   const some = rig();
   some.orbit(0.7, -0.4);
   const { x, y, z } = project(some, [0, 0, 0]);
@@ -55,7 +55,7 @@ test('orbiting keeps the pivot in the middle at its distance', () => {
   proper(some.pose.basis);
 });
 
-test('what faces the camera follows the hand', () => {
+test('points that face the camera follow the pointer', () => {
   const right = rig();
   right.orbit(0.3, 0);
   assert.ok(project(right, [0, 0, -0.5]).x > WIDTH / 2);
@@ -65,7 +65,7 @@ test('what faces the camera follows the hand', () => {
   assert.ok(down.pose.eye[1] < 0, 'the camera rises');
 });
 
-test('orbiting stops before the poles and can come back', () => {
+test('orbiting stops before the poles and can turn back', () => {
   const some = rig();
   for (let i = 0; i < 100; i++) some.orbit(0, 0.3);
   assert.ok(dot(some.pose.basis[2], some.pose.up) > -1);
@@ -74,20 +74,20 @@ test('orbiting stops before the poles and can come back', () => {
   assert.ok(Math.abs(dot(some.pose.basis[2], some.pose.up)) < 0.05);
 });
 
-test('a full turn comes back to where it began', () => {
+test('a full turn returns to the start', () => {
   const some = rig();
   for (let i = 0; i < 360; i++) some.orbit((2 * Math.PI) / 360, 0);
   close(some.pose.eye, [0, 0, -3]);
 });
 
-test('panning moves what lies at the pivot as far as the hand', () => {
+test('panning moves the pivot as far as the pointer', () => {
   const some = rig();
   some.pan(40, -25, WIDTH, HEIGHT);
   const { x, y } = project(some, [0, 0, 0]);
   close([x, y], [WIDTH / 2 + 40, HEIGHT / 2 - 25]);
 });
 
-test('zooming leaves what is under the pointer where it is', () => {
+test('zooming keeps the point under the pointer in place', () => {
   const some = rig();
   const point = [0.4, -0.3, 0]; // at the distance of the pivot
   const before = project(some, point);
@@ -96,7 +96,7 @@ test('zooming leaves what is under the pointer where it is', () => {
   close([after.x, after.y, after.z], [before.x, before.y, 1.5]);
 });
 
-test('zooming ends at limits that follow from the extent', () => {
+test('zooming has limits that depend on the extent', () => {
   const some = rig();
   for (let i = 0; i < 200; i++) some.zoom(0.5);
   assert.ok(some.pose.distance > 0);
@@ -105,28 +105,28 @@ test('zooming ends at limits that follow from the extent', () => {
   assert.equal(some.pose.distance, 60);
 });
 
-test('flying takes the pivot along', () => {
+test('flying moves the pivot along', () => {
   const some = rig();
   some.fly([1, 0.5, 2]);
   close(some.pose.eye, [1, 0.5, -1]);
   close(some.pivot, [1, 0.5, 2]);
 });
 
-test('looking around stays where it is', () => {
+test('looking around keeps the position', () => {
   const some = rig();
   some.look(0.2, 0.1);
   close(some.pose.eye, [0, 0, -3]);
   assert.ok(some.pose.basis[2][0] > 0 && some.pose.basis[2][1] > 0);
 });
 
-test('turning towards a point puts it into the middle', () => {
+test('turning towards a point centres it', () => {
   const some = rig();
   some.pose = some.towards([0.5, 0.2, 1]);
   const { x, y, z } = project(some, [0.5, 0.2, 1]);
   close([x, y, z], [WIDTH / 2, HEIGHT / 2, some.pose.distance]);
 });
 
-test('a lens of a file is fitted into the canvas', () => {
+test('a lens of a file is fitted to the canvas', () => {
   const lens = { fx: 500, fy: 510, cx: 310, cy: 245, W: 640, H: 480 };
   const { fx, fy, cx, cy } = rig({ lens }).camera(640, 480);
   close([fx, fy, cx, cy], [500, 510, 310, 245]);
@@ -136,7 +136,7 @@ test('a lens of a file is fitted into the canvas', () => {
   close([tall.fx, tall.fy, tall.cx, tall.cy], [250, 255, 155, 122.5 + 230]);
 });
 
-test('the matrix of a file is used as it is until the camera moves', () => {
+test('the matrix of a file is used unchanged until the camera moves', () => {
   const viewmat = [1, 0, 0, 1e-17, 0, 1, 0, 0, 0, 0, 1, 3, 0, 0, 0, 1];
   const some = rig({ viewmat });
   assert.equal(some.camera(WIDTH, HEIGHT).viewmat, viewmat);
@@ -144,7 +144,7 @@ test('the matrix of a file is used as it is until the camera moves', () => {
   assert.notEqual(some.camera(WIDTH, HEIGHT).viewmat, viewmat);
 });
 
-test('the near plane keeps away from the pivot', () => {
+test('the near plane is in front of the pivot', () => {
   assert.equal(rig().camera(WIDTH, HEIGHT).near, 0.2);
   assert.equal(rig({ distance: 0.5 }).camera(WIDTH, HEIGHT).near, 0.05);
 });
@@ -154,7 +154,7 @@ for (const up of [
   [0, 0, 1],
   [1, 0, 0],
 ]) {
-  test(`turning ${up} up keeps the pivot in the middle`, () => {
+  test(`turning ${up} up keeps the pivot centred`, () => {
     const some = rig();
     some.orbit(0.3, 0.2);
     some.pose = some.turnedUp(up);
@@ -165,7 +165,7 @@ for (const up of [
   });
 }
 
-test('a camera glides around the pivot', () => {
+test('a camera moves around the pivot', () => {
   const from = rig().pose;
   const other = rig();
   other.orbit(Math.PI / 2, 0);
@@ -175,7 +175,7 @@ test('a camera glides around the pivot', () => {
   assert.equal(between(from, other.pose, 1), other.pose);
 });
 
-test('rotations survive the way through quaternions', () => {
+test('rotations are unchanged by conversion to quaternions', () => {
   let basis = lookAlong([0, 0, 1], [0, -1, 0]);
   for (let i = 0; i < 50; i++) {
     basis = turnBasis(basis, [0.6, 0, 0.8], 0.9);
@@ -186,7 +186,7 @@ test('rotations survive the way through quaternions', () => {
   }
 });
 
-test('the shorter way round is taken', () => {
+test('the shorter rotation is taken', () => {
   const quat = toQuat(turnBasis(lookAlong([0, 0, 1], [0, -1, 0]), [0, 1, 0], 0.5));
   const half = slerp(
     quat,

@@ -1,4 +1,4 @@
-// What the address asks for, and what errors say.
+// The parameters of the address, and the error messages.
 import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
@@ -8,7 +8,7 @@ import { saveUpCommand, upWord } from '../save_up.mjs';
 import { explain } from '../messages.mjs';
 import { fetchCameras, readWishes } from '../page.mjs';
 
-test('an empty address wishes nothing', () => {
+test('an empty address has no parameters', () => {
   const { wishes, complaints } = readWishes(new URLSearchParams());
   assert.deepEqual(complaints, []);
   assert.deepEqual(wishes, {
@@ -35,7 +35,7 @@ test('every parameter is read', () => {
   assert.deepEqual([scene, camera, view, axes, ui], ['/a.csplat', '[]', 3, 'RUB', false]);
 });
 
-test('up is a direction of length 1', () => {
+test('up is normalised', () => {
   const up = (text) => readWishes(new URLSearchParams({ up: text })).wishes.up;
   assert.deepEqual(up('0,-1,0'), [0, -1, 0]);
   assert.deepEqual(
@@ -48,14 +48,14 @@ test('up is a direction of length 1', () => {
 const WRONG = ['size=0x5', 'size=20', 'background=red', 'axes=RLF', 'axes=RDFU', 'view=-1', 'view=x'];
 const NOWHERE = ['up=z', 'up=0,1', 'up=0,0,0', 'up=1,2,3,4', 'up=1,e,2', 'up=1e999,0,0'];
 for (const query of [...WRONG, ...NOWHERE]) {
-  test(`${query} is complained about, and left out`, () => {
+  test(`${query} is reported and ignored`, () => {
     const { wishes, complaints } = readWishes(new URLSearchParams(query));
     assert.equal(complaints.length, 1);
     assert.deepEqual(wishes, readWishes(new URLSearchParams()).wishes);
   });
 }
 
-// Each of these stands at 1 2 3 and looks along x, z up: 64 by 48 pixels, focal length 50.
+// Each camera is at 1 2 3 and looks along x, z up: 64 by 48 pixels, focal length 50.
 const FOREIGN = {
   'cameras.json of INRIA': [
     {
@@ -112,7 +112,7 @@ for (const [what, file] of Object.entries(FOREIGN)) {
   });
 }
 
-test('other cameras that are none are refused', async () => {
+test('invalid cameras of other programs are refused', async () => {
   const { frames, ...document } = FOREIGN['transforms.json'];
   const turned = [{ transform_matrix: [0, 1, 2, 3].map((k) => frames[0].transform_matrix.map((row) => row[k])) }];
   for (const [wrong, says] of [
@@ -125,13 +125,13 @@ test('other cameras that are none are refused', async () => {
   }
 });
 
-test('cameras may stand in the address', async () => {
+test('the address may contain cameras', async () => {
   assert.deepEqual(await fetchCameras(' [{"W": 1}, {"W": 2}]'), [{ W: 1 }, { W: 2 }]);
   assert.deepEqual(await fetchCameras('{"W": 1}'), [{ W: 1 }]);
   await assert.rejects(fetchCameras('[1'), SyntaxError);
 });
 
-test('every code of the format has words of its own', () => {
+test('every code of the format has a message', () => {
   const codes = Object.entries(spec)
     .filter(([name]) => /^ERROR_[A-Z]+$/.test(name))
     .map(([, code]) => code)
@@ -140,7 +140,7 @@ test('every code of the format has words of its own', () => {
   for (const code of codes) assert.notEqual(explain({ code, message: '' }).title, 'Something went wrong.', code);
 });
 
-test('an error names its code, byte and clause once', () => {
+test('an error has its code, offset and clause once', () => {
   const message = 'E_CRC at byte 12345 (CHK-1): the chunk has another CRC';
   const { title, facts } = explain({ code: 'E_CRC', message, offset: 12345, clause: 'CHK-1' });
   assert.equal(facts, 'E_CRC at byte 12,345 (CHK-1): the chunk has another CRC');
@@ -152,7 +152,7 @@ test('a PLY is recognised by its name', () => {
   assert.match(explain({ code: 'E_MAGIC', message: 'x' }, 'scene.zip').title, /not a \.csplat/);
 });
 
-test('the command that keeps what is up can be pasted into a shell', () => {
+test('the command that saves the up direction can be pasted into a shell', () => {
   assert.equal(saveUpCommand('scene.csplat', [0, 0, 1]), 'csplat encode scene.ply scene.csplat --up z');
   assert.equal(saveUpCommand('a.b.CSPLAT', [0, -1, -0]), 'csplat encode a.b.ply a.b.csplat --up -y');
   assert.equal(

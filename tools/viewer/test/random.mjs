@@ -1,4 +1,4 @@
-// Numbers that are the same in every run.
+// Reproducible random numbers.
 
 /** A generator of numbers in [0, 1): mulberry32. @param {number} seed */
 export function random(seed) {

@@ -5,7 +5,7 @@ import { test } from 'node:test';
 import { DepthSorter } from '../sort.mjs';
 import { random } from './random.mjs';
 
-/** Depths in the order that a sort gives, and the slots. */
+/** The sorted depths and slots. */
 function sorted(depths, sorter = new DepthSorter()) {
   const slots = Uint32Array.from(depths, (_, i) => 7 * i + 3);
   const out = new Uint32Array(depths.length);
@@ -13,10 +13,10 @@ function sorted(depths, sorter = new DepthSorter()) {
   return [...out].map((slot) => (slot - 3) / 7);
 }
 
-/** The farthest first; of equal depths the later one. */
+/** Farthest first; of equal depths, the later slot first. */
 const plain = (depths) => [...depths.keys()].sort((a, b) => depths[b] - depths[a] || b - a);
 
-test('few distinct depths come in exactly the order of a plain sort, equal ones backwards', () => {
+test('a few distinct depths have exactly the order of a plain sort, equal ones in reverse', () => {
   const next = random(1);
   const depths = Float32Array.from({ length: 5000 }, () => 0.25 + Math.floor(next() * 300) / 256);
   assert.deepEqual(sorted(depths), plain(depths));
@@ -28,7 +28,7 @@ for (const [name, low, high] of [
   ['all that float32 has', 1e-30, 1e30],
   ['a wall', 5, 5.0001],
 ]) {
-  test(`${name}: neighbours are out of order by no more than a key`, () => {
+  test(`${name}: neighbours are out of order by at most one key`, () => {
     const next = random(2);
     const depths = Float32Array.from({ length: 20_000 }, () => low * (high / low) ** next());
     const order = sorted(depths);
@@ -44,7 +44,7 @@ for (const [name, low, high] of [
   });
 }
 
-test('nothing, one, and fewer than before', () => {
+test('no splat, one splat, and fewer than before', () => {
   const sorter = new DepthSorter();
   assert.deepEqual(
     sorted(

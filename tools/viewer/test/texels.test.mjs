@@ -1,4 +1,4 @@
-// Texels hold the decoder's values: read back the way the shaders do, for every conformance vector.
+// Texels have the decoder's values, read back as in the shaders, for every conformance vector.
 import assert from 'node:assert/strict';
 import { readFileSync } from 'node:fs';
 import { test } from 'node:test';
@@ -14,7 +14,7 @@ const open = (name) => CsplatReader.open(new Blob([readFileSync(new URL(`${name}
 
 const float = (bits) => new Float32Array(Uint32Array.of(bits).buffer)[0];
 
-/** Reads fields of a splat one after the other. */
+/** Reads the fields of a splat in order. */
 function fields(texels, i) {
   const stride = texels.moreWords;
   const words = [
@@ -29,7 +29,7 @@ function fields(texels, i) {
   };
 }
 
-/** A splat's geometry, in the names of the decoder. */
+/** A splat's geometry, by the names of the decoder. */
 function unpack(texels, i, tile, header) {
   const take = fields(texels, i);
   const [opacity, , quat] = header.attributes;
@@ -51,7 +51,7 @@ function unpack(texels, i, tile, header) {
   };
 }
 
-/** Coefficients of a row: r g b of the first, and so on. */
+/** Coefficients of a row: r g b of the first, then of the next. */
 function row(rows, i, width) {
   const perWord = Math.floor(32 / rows.bits);
   const words = rows.texels.subarray(rows.rowWords * i, rows.rowWords * (i + 1));
@@ -72,7 +72,7 @@ function coefficients(band, table, i, width) {
   return at < size ? row(table, at, width) : row(band.rows, at - size, width);
 }
 
-/** Values agree but for rounding to binary32, measured against the largest of all that share an offset. */
+/** Values agree up to rounding to binary32, relative to the largest of all that share an offset. */
 function near(found, wanted, scale, what) {
   assert.equal(found.length, wanted.length, what);
   found.forEach((value, k) => {
@@ -80,7 +80,7 @@ function near(found, wanted, scale, what) {
   });
 }
 
-/** Up to some 300 splats of a tile, the first and the last among them. */
+/** Up to about 300 splats of a tile, including the first and the last. */
 function some(count) {
   const step = Math.ceil(count / 300);
   return [...Array(Math.ceil(count / step)).keys()].map((k) => k * step).concat(count - 1);
@@ -88,7 +88,7 @@ function some(count) {
 
 const largest = (array) => array.reduce((most, one) => Math.max(most, Math.abs(one)), 1e-30);
 
-test('texels hold what the decoder gives, for every vector', async () => {
+test('texels have the values of the decoder for every vector', async () => {
   const failed = await failures(valid, async ({ name }) => {
     const reader = await open(name);
     const { header } = reader;
@@ -125,7 +125,7 @@ test('texels hold what the decoder gives, for every vector', async () => {
 /** Packed columns of integers. */
 const columns = (array, offsets, step = 1) => ({ columns: array, offsets, step });
 
-test('a splat of ordinary precision is one texel, one of the widest integers eleven words', async () => {
+test('a splat of usual precision takes one texel, one of the widest integers eleven words', async () => {
   const levels = { levels: 63 };
   const ordinary = (Type, most) => ({
     count: 1,
@@ -162,6 +162,6 @@ test('tiles begin at blocks', () => {
   assert.deepEqual(layoutSlots([]), { starts: [], slotCount: 0 });
 });
 
-test('bits of integers', () => {
+test('number of bits of integers', () => {
   assert.deepEqual([0, 1, 2, 255, 256, 2 ** 32 - 1].map(bitsFor), [1, 1, 2, 8, 9, 32]);
 });
