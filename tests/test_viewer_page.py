@@ -84,7 +84,7 @@ def test_statistics_are_shown_on_demand(viewer, model, sample):
 def test_a_broken_file_is_explained(viewer, sample):
     middle = 2 * len(sample) // 3
     cases = {
-        "E_TRUNCATED": ("ends too early", "scene.csplat", sample[:middle]),
+        "E_TRUNCATED": ("is incomplete", "scene.csplat", sample[:middle]),
         "E_CRC": ("is damaged", "scene.csplat", sample[:middle] + bytes([sample[middle] ^ 1]) + sample[middle + 1 :]),
         "E_MAGIC": ("This is a PLY", "scene.ply", b"ply\nformat ascii 1.0\n" * 20),
     }

@@ -1,8 +1,8 @@
-/* csplat.h says what this is for; spec/format.md what the bytes mean. Names of clauses, as [HDR-1], are the specification's.
+/* csplat.h documents the interface, spec/format.md the format. Names of clauses, such as [HDR-1], are the specification's.
  *
- * From the bottom up: bytes and errors, chunks, streams (6.1 to 6.3), header and index (4), codebooks (5.3), blocks (6.4),
- * values (7), texts (5.4), what a caller calls. No two floating-point operations follow each other that a compiler could
- * contract. SPDX-License-Identifier: Apache-2.0 */
+ * In this order: bytes and errors, chunks, streams (6.1 to 6.3), header and index (4), codebooks (5.3), blocks (6.4),
+ * values (7), texts (5.4), the public functions. No two floating-point operations are combined such that a compiler could
+ * contract them. SPDX-License-Identifier: Apache-2.0 */
 #include "csplat.h"
 
 #include <float.h>
@@ -17,13 +17,13 @@
 #endif
 
 #if FLT_EVAL_METHOD < 0 || FLT_EVAL_METHOD == 2 || FLT_EVAL_METHOD > 64
-#error "csplat wants binary64 products rounded to binary64: compile with -msse2 -mfpmath=sse"
+#error "csplat requires binary64 products rounded to binary64: compile with -msse2 -mfpmath=sse"
 #endif
 #ifdef __FAST_MATH__
-#error "csplat wants IEEE arithmetic: compile without -ffast-math"
+#error "csplat requires IEEE arithmetic: compile without -ffast-math"
 #endif
 #if (-1 >> 1) != -1
-#error "csplat wants right shifts of negative integers to round down"
+#error "csplat requires right shifts of negative integers to round down"
 #endif
 
 /* begin generated: numbers */
@@ -266,12 +266,12 @@
             return 0; \
     } while (0)
 
-/* Note what is wrong; 0, which functions return that failed. */
+/* Note an error and evaluate to 0, which functions return on failure. */
 #define fail(...) (note(__VA_ARGS__), 0)
 
 enum { OPACITIES = SPEC_ATTRIBUTE_OPACITIES, SCALES, QUATS, MEANS, SH0, SH1, SH2, SH3, ATTRIBUTES_END };
-enum { EXTRA = 4, LAYERS }; /* places of a tile's layers: 0, SH bands 1 to 3, extra columns */
-enum { PIECE = 64 };        /* splats that are turned at a time, so that their rows stay in the nearest cache */
+enum { EXTRA = 4, LAYERS }; /* layers of a tile: 0, SH bands 1 to 3, extra columns */
+enum { PIECE = 64 };        /* splats transposed at a time, so that their rows stay in the L1 cache */
 
 #define FLOAT32_END 0x1.ffffffp127 /* numbers from here on are infinite in binary32 */
 
@@ -286,9 +286,9 @@ typedef struct attribute {
     double step;
 } attribute;
 
-/* A chunk as the index names it. */
+/* A chunk as listed in the index. */
 typedef struct chunk {
-    uint64_t offset, record; /* its own place, and that of the record */
+    uint64_t offset, record; /* of the chunk and of its record */
     uint32_t size, crc;
     uint8_t type[4];
     uint16_t flags;
@@ -299,14 +299,14 @@ typedef struct book {
     uint16_t id;
     uint8_t kind, band_first, band_last;
     uint32_t size;
-    const chunk *chunks[3]; /* by SH band from the first on; of other kinds the first one */
-    int32_t *tables[3];     /* [size][columns], colours as [coefficient][r, g, b]; NULL until they are read */
-    float *values[3];       /* the same of SH bands, in the memory behind tables */
+    const chunk *chunks[3]; /* by SH band, starting at the first; other kinds use [0] */
+    int32_t *tables[3];     /* [size][columns], colours as [coefficient][r, g, b]; NULL until read */
+    float *values[3];       /* values of SH bands, in the memory after tables */
 } book;
 
 typedef struct tile {
     uint64_t first, record;
-    const uint8_t *tables; /* their ids */
+    const uint8_t *tables; /* ids of the codebooks */
     const chunk *layers[LAYERS];
     double step;
     int64_t corner[3];
@@ -316,16 +316,16 @@ typedef struct tile {
     int16_t exponent;
 } tile;
 
-/* Bytes of a payload, and the clause that says where it ends. */
+/* The bytes of a payload, and the clause that defines its end. */
 typedef struct cursor {
     const uint8_t *data;
     size_t size, at;
-    uint64_t offset; /* of data in the file */
+    uint64_t offset; /* offset of data in the file */
     csplat_code code;
     const char *clause;
 } cursor;
 
-/* A stream without its coder and its runs. */
+/* A stream after its coder and runs are undone. */
 typedef struct stream {
     const uint8_t *bytes;
     uint64_t offset;
@@ -336,17 +336,17 @@ typedef struct stream {
 /* The integers of one attribute in one tile; colours are R, G, B. */
 typedef struct block {
     int32_t *columns;     /* [columns][count] */
-    const uint32_t *rows; /* [count], splats that the columns are about; NULL: all */
+    const uint32_t *rows; /* [count], splats that the columns cover; NULL: all */
     uint32_t count;
-    const book *book; /* where the other splats have their integers; NULL: they are 0 */
+    const book *book; /* the integers of the other splats; NULL: they are 0 */
     const int32_t *table;
-    const float *values; /* of the table, of SH bands */
+    const float *values; /* of the table, for SH bands */
     const uint32_t *index;
     int exponent;
     double step; /* step x 2^exponent */
 } block;
 
-/* Where the integers of a tile go, one of these. */
+/* The output for the integers of a tile, one of these. */
 typedef struct sink {
     const csplat_floats *floats;
     const csplat_integers *integers;
@@ -369,14 +369,14 @@ struct csplat {
     size_t chunk_count;
     tile *tiles;
     const chunk *texts[3], *stated;
-    buffer index_bytes, chunk_bytes, book_bytes;   /* of the source, where it is not in memory */
+    buffer index_bytes, chunk_bytes, book_bytes;   /* copies of the source's bytes, if it is not in memory */
     buffer inflated, unrun, integers, entries, escapes, summands, rows, codes; /* working memory */
     buffer band_integers[SPEC_SH_DEGREE_MAX + 1], band_rows[SPEC_SH_DEGREE_MAX + 1];
     buffer indices[ATTRIBUTES_END], narrow[ATTRIBUTES_END], narrow_index, text, names;
     const uint8_t *index;
     size_t index_size;
     uint64_t table_bytes;
-    /* The tile that was read last; by attribute the codebook whose indices are here, and how many splats it does not serve. */
+    /* The last tile read; by attribute, the codebook whose indices are loaded, and the number of escaped splats. */
     const tile *current;
     const book *used[ATTRIBUTES_END];
     uint32_t escapes_of[ATTRIBUTES_END];
@@ -404,7 +404,7 @@ static uint64_t get_u64(const uint8_t *p)
     return (uint64_t)get_u32(p) | (uint64_t)get_u32(p + 4) << 32;
 }
 
-/* Two's complement, without conversions that an implementation may define. */
+/* Convert two's complement without implementation-defined conversions. */
 static int32_t signed32(uint32_t x)
 {
     return x < 0x80000000u ? (int32_t)x : -(int32_t)~x - 1;
@@ -466,7 +466,7 @@ const char *csplat_code_name(csplat_code code)
     return (size_t)code < sizeof names / sizeof *names ? names[code] : "";
 }
 
-/* Note what is wrong. */
+/* Note an error. */
 static void note(csplat *d, csplat_code code, const char *clause, uint64_t offset, const char *format, ...)
 {
     csplat_error *e = &d->error;
@@ -499,7 +499,7 @@ static void plain_release(void *user, void *memory)
     free(memory);
 }
 
-/* Room for count elements, at least one; NULL when it failed. */
+/* Allocate count elements, at least one; NULL on failure. */
 static void *allocate(csplat *d, uint64_t count, size_t size)
 {
     void *memory = NULL;
@@ -517,7 +517,7 @@ static void release(csplat *d, void *memory)
         d->options.release(d->options.user, memory);
 }
 
-/* Give a buffer room for count elements; what it held is lost. */
+/* Reserve room for count elements; the previous content is lost. */
 static int reserve(csplat *d, buffer *b, uint64_t count, size_t size)
 {
     if (count <= b->size / size && b->data)
@@ -555,7 +555,7 @@ static void make_crc_table(uint32_t table[8][256])
             table[k][i] = table[k - 1][i] >> 8 ^ table[0][table[k - 1][i] & 255];
 }
 
-/* CRC-32 of RFC 1952, eight bytes at a time. */
+/* Return the CRC-32 of RFC 1952, computed eight bytes at a time. */
 static uint32_t crc32_of(const csplat *d, const uint8_t *p, size_t size)
 {
     const uint32_t(*t)[256] = d->crc_table;
@@ -570,7 +570,7 @@ static uint32_t crc32_of(const csplat *d, const uint8_t *p, size_t size)
     return ~crc;
 }
 
-/* Whether `size` bytes that begin with this one are UTF-8 as a whole; RFC 3629. */
+/* Return whether the `size` bytes from here on are UTF-8 (RFC 3629). */
 static int is_utf8(const uint8_t *p, size_t size)
 {
     for (size_t i = 0; i < size;) {
@@ -591,14 +591,14 @@ static int is_utf8(const uint8_t *p, size_t size)
     return 1;
 }
 
-/* Sort numbers by a comparison, in the worst case n log n, without recursion. */
+/* Sort numbers by a comparison, in n log n even in the worst case, without recursion. */
 static void sort(uint32_t *order, size_t n, int (*less)(const void *context, uint32_t a, uint32_t b), const void *context)
 {
     size_t i, start = n / 2, end = n;
     for (i = 1; i < n && !less(context, order[i], order[i - 1]); i++)
         ;
     if (i >= n)
-        return; /* it was sorted */
+        return; /* already sorted */
     while (end > 1) {
         uint32_t value;
         size_t hole, child;
@@ -622,7 +622,7 @@ static void sort(uint32_t *order, size_t n, int (*less)(const void *context, uin
 
 /* Chunks ------------------------------------------------------------------------------------------------------------- */
 
-/* Point to bytes of the source, or copy them into a buffer. */
+/* Point to bytes of the source, or copy them to a buffer. */
 static int fetch(csplat *d, uint64_t offset, size_t size, buffer *into, const uint8_t **out)
 {
     if (d->memory) {
@@ -636,7 +636,7 @@ static int fetch(csplat *d, uint64_t offset, size_t size, buffer *into, const ui
     return 1;
 }
 
-/* Read a chunk, check its frame, and begin with its payload. */
+/* Read a chunk, check its frame, and start at its payload. */
 static int load(csplat *d, const chunk *k, buffer *into, csplat_code code, const char *clause, cursor *out)
 {
     const uint8_t *p;
@@ -644,7 +644,7 @@ static int load(csplat *d, const chunk *k, buffer *into, csplat_code code, const
     TRY(fetch(d, k->offset, k->size, into, &p));
     crc = crc32_of(d, p, k->size);
     if (crc != k->crc)
-        return fail(d, CSPLAT_E_CRC, "CHK-1", k->offset, "the index says 0x%08lx, computed 0x%08lx",
+        return fail(d, CSPLAT_E_CRC, "CHK-1", k->offset, "the index has 0x%08lx, computed 0x%08lx",
                     (unsigned long)k->crc, (unsigned long)crc);
     if (memcmp(p, k->type, 4) != 0 || get_u16(p + SPEC_CHUNK_HEADER_AT_FLAGS) != k->flags)
         return fail(d, CSPLAT_E_INDEX, "CHK-3", k->offset, "type or flags of the chunk are not those of its record");
@@ -669,7 +669,7 @@ static uint64_t place(const cursor *c)
 static int take(csplat *d, cursor *c, size_t size, const uint8_t **out)
 {
     if (size > c->size - c->at)
-        return fail(d, c->code, c->clause, place(c), "%llu bytes are left, wanted %llu",
+        return fail(d, c->code, c->clause, place(c), "%llu bytes are left, expected %llu",
                     (unsigned long long)(c->size - c->at), (unsigned long long)size);
     *out = c->data + c->at;
     c->at += size;
@@ -721,7 +721,7 @@ static int zlib_inflate(void *user, const uint8_t *coded, size_t coded_size, uin
 }
 #endif
 
-/* Undo DEFLATE: `size` bytes into d->inflated. */
+/* Undo DEFLATE: write `size` bytes to d->inflated. */
 static int undo_deflate(csplat *d, const uint8_t *coded, size_t coded_size, size_t size, uint64_t offset)
 {
     int (*by)(void *, const uint8_t *, size_t, uint8_t *, size_t) = d->options.inflate;
@@ -738,11 +738,11 @@ static int undo_deflate(csplat *d, const uint8_t *coded, size_t coded_size, size
     }
 #endif
     return by(user, coded, coded_size, d->inflated.data, size) ||
-           fail(d, CSPLAT_E_CODER, "COD-2", offset, "%llu bytes are no DEFLATE stream of %llu",
+           fail(d, CSPLAT_E_CODER, "COD-2", offset, "%llu bytes are not a DEFLATE stream of %llu",
                 (unsigned long long)coded_size, (unsigned long long)size);
 }
 
-/* RUN_LENGTH: values, low bytes, high bytes of the lengths minus one. `out` has 16 bytes of room behind its end. */
+/* Undo RUN_LENGTH: values, then low bytes and high bytes of the lengths minus one. `out` has 16 spare bytes at its end. */
 static int undo_runs(const uint8_t *data, size_t runs, uint8_t *out, size_t size)
 {
     size_t at = 0;
@@ -758,7 +758,7 @@ static int undo_runs(const uint8_t *data, size_t runs, uint8_t *out, size_t size
     return at == size;
 }
 
-/* Read a stream of `count` elements of at most `width_max` bytes, up to its runs. */
+/* Read a stream of `count` elements of at most `width_max` bytes, and undo its coder and runs. */
 static int read_stream(csplat *d, cursor *c, uint64_t count, unsigned width_max, stream *s)
 {
     const uint8_t *head, *coded;
@@ -775,10 +775,10 @@ static int read_stream(csplat *d, cursor *c, uint64_t count, unsigned width_max,
     coded_size = get_u32(head + SPEC_STREAM_HEAD_AT_CODED_SIZE);
     coder = head[SPEC_STREAM_HEAD_AT_CODER];
     if (s->count != count || count == 0)
-        return fail(d, CSPLAT_E_STREAM, "STR-1", start + SPEC_STREAM_HEAD_AT_COUNT, "%lu elements, wanted %llu",
+        return fail(d, CSPLAT_E_STREAM, "STR-1", start + SPEC_STREAM_HEAD_AT_COUNT, "%lu elements, expected %llu",
                     (unsigned long)s->count, (unsigned long long)count);
     if (s->width < 1 || s->width > width_max)
-        return fail(d, CSPLAT_E_STREAM, "STR-2", start, "a width of %u, wanted 1 to %u", s->width, width_max);
+        return fail(d, CSPLAT_E_STREAM, "STR-2", start, "a width of %u, expected 1 to %u", s->width, width_max);
     if (coder != SPEC_CODER_STORED && coder != SPEC_CODER_DEFLATE)
         return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", start + SPEC_STREAM_HEAD_AT_CODER, "the coder %u", coder);
     for (unsigned i = 0; i < SPEC_TRANSFORMS_MAX; i++) {
@@ -802,7 +802,7 @@ static int read_stream(csplat *d, cursor *c, uint64_t count, unsigned width_max,
     total = count * s->width;
     if (!runs && packed_size != total)
         return fail(d, CSPLAT_E_STREAM, "STR-4", start + SPEC_STREAM_HEAD_AT_PACKED_SIZE,
-                    "a packed_size of %lu, wanted %llu", (unsigned long)packed_size, (unsigned long long)total);
+                    "a packed_size of %lu, expected %llu", (unsigned long)packed_size, (unsigned long long)total);
     if (runs && (packed_size < 3 || packed_size % 3 || packed_size > 3 * total))
         return fail(d, CSPLAT_E_STREAM, "STR-5", start + SPEC_STREAM_HEAD_AT_PACKED_SIZE,
                     "a packed_size of %lu is not that of 1 to %llu runs", (unsigned long)packed_size,
@@ -815,7 +815,7 @@ static int read_stream(csplat *d, cursor *c, uint64_t count, unsigned width_max,
     if (coder == SPEC_CODER_STORED) {
         if (coded_size != packed_size)
             return fail(d, CSPLAT_E_CODER, "COD-1", start + SPEC_STREAM_HEAD_AT_CODED_SIZE,
-                        "%lu stored bytes, wanted %lu", (unsigned long)coded_size, (unsigned long)packed_size);
+                        "%lu stored bytes, expected %lu", (unsigned long)coded_size, (unsigned long)packed_size);
         s->bytes = coded;
     } else {
         TRY(undo_deflate(d, coded, coded_size, packed_size, start + SPEC_STREAM_HEAD_SIZE));
@@ -837,7 +837,7 @@ static int read_stream(csplat *d, cursor *c, uint64_t count, unsigned width_max,
 #define INLINE static inline
 #endif
 
-/* One element of `width` bytes, `lane` bytes from each to the next. */
+/* Return one element of `width` bytes; `lane` is the distance between its bytes. */
 INLINE uint32_t element32(const uint8_t *p, size_t lane, unsigned width)
 {
     uint32_t x = p[0];
@@ -850,7 +850,7 @@ INLINE uint32_t element32(const uint8_t *p, size_t lane, unsigned width)
     return x;
 }
 
-/* All elements of a stream; written out for each width and set of transforms, which the compiler knows then. */
+/* Undo all transforms of a stream; specialised for each width and set of transforms, which are then constants. */
 INLINE void undo_all(const stream *s, unsigned width, int zigzag, int delta, int is_signed, uint32_t *out)
 {
     const size_t n = s->count, step = s->planes ? 1 : width, lane = s->planes ? n : 1;
@@ -880,7 +880,7 @@ INLINE void undo_of_width(const stream *s, unsigned width, int is_signed, uint32
         undo_all(s, width, 0, 0, is_signed, out);
 }
 
-/* The elements of a stream of at most four bytes. */
+/* Undo the transforms of a stream of elements up to four bytes. */
 INLINE void undo32(const stream *s, int is_signed, uint32_t *out)
 {
     switch (s->width) {
@@ -905,7 +905,7 @@ static void undo_unsigned(const stream *s, uint32_t *out)
 
 static void undo_signed(const stream *s, int32_t *out)
 {
-    undo32(s, 1, (uint32_t *)out); /* two's complement, as all int32_t are */
+    undo32(s, 1, (uint32_t *)out); /* int32_t is two's complement */
 }
 
 static void undo64(const stream *s, uint64_t *out)
@@ -931,7 +931,7 @@ static void undo64(const stream *s, uint64_t *out)
 
 /* Header and index (4) ----------------------------------------------------------------------------------------------- */
 
-/* step x 2^exponent, exact as it is where the result is normal; 0 where it is not (TIL-9, LAT-1). */
+/* step x 2^exponent, exact if the result is normal; 0 otherwise (TIL-9, LAT-1). */
 static int scaled(double step, int exponent, int least, int most, double *out)
 {
     uint64_t bits;
@@ -958,13 +958,13 @@ static int read_header(csplat *d)
         if (first)
             TRY(fetch(d, 0, (size_t)first, &local, &p));
         if (memcmp(p, SPEC_MAGIC, (size_t)first) != 0)
-            return fail(d, CSPLAT_E_MAGIC, "HDR-11", 0, "this is no csplat file");
-        return fail(d, CSPLAT_E_TRUNCATED, "HDR-11", size, "%llu bytes, wanted a header of %d", (unsigned long long)size,
+            return fail(d, CSPLAT_E_MAGIC, "HDR-11", 0, "this is not a csplat file");
+        return fail(d, CSPLAT_E_TRUNCATED, "HDR-11", size, "%llu bytes, expected a header of %d", (unsigned long long)size,
                     SPEC_HEADER_SIZE);
     }
     TRY(fetch(d, 0, SPEC_HEADER_SIZE, &local, &p));
     if (memcmp(p, SPEC_MAGIC, 8) != 0)
-        return fail(d, CSPLAT_E_MAGIC, "HDR-1", 0, "this is no csplat file, or a transfer as text damaged it");
+        return fail(d, CSPLAT_E_MAGIC, "HDR-1", 0, "this is not a csplat file, or a text-mode transfer damaged it");
     major = get_u16(p + SPEC_HEADER_AT_VERSION_MAJOR);
     minor = get_u16(p + SPEC_HEADER_AT_VERSION_MINOR);
     if (major != SPEC_VERSION_MAJOR || minor != SPEC_VERSION_MINOR)
@@ -1000,7 +1000,7 @@ static int read_header(csplat *d)
     return 1;
 }
 
-/* Facts of the scene: the index head but for sizes and counts. */
+/* Read the properties of the scene: the index head without sizes and counts. */
 static int read_facts(csplat *d, const uint8_t *p)
 {
     static const char letters[] = "?RLUDFB";
@@ -1030,7 +1030,7 @@ static int read_facts(csplat *d, const uint8_t *p)
         info->axes[i] = lines == 1 ? '\0' : letters[axes[i]];
     info->unit_metres = get_f64(p + SPEC_INDEX_HEAD_AT_UNIT_METRES);
     if (!(info->unit_metres >= 0) || !is_finite(info->unit_metres))
-        return fail(d, CSPLAT_E_VALUE, "IDX-5", at + SPEC_INDEX_HEAD_AT_UNIT_METRES, "unit_metres is no length");
+        return fail(d, CSPLAT_E_VALUE, "IDX-5", at + SPEC_INDEX_HEAD_AT_UNIT_METRES, "unit_metres is not a length");
     for (unsigned i = 0; i < 3; i++) {
         info->origin[i] = get_f64(p + SPEC_INDEX_HEAD_AT_ORIGIN + 8 * i);
         if (!is_finite(info->origin[i]))
@@ -1044,7 +1044,7 @@ static int is_colour(unsigned id)
     return id >= SH0;
 }
 
-/* Integers per splat. */
+/* Number of integers per splat. */
 static unsigned columns_of(unsigned id)
 {
     return id == OPACITIES ? 1 : is_colour(id) ? 3 * (2 * (id - SH0) + 1) : 3;
@@ -1055,9 +1055,9 @@ static int read_attribute(csplat *d, unsigned id, const uint8_t *p, uint64_t at)
     attribute *a = &d->attributes[id];
     uint64_t step_at = at + SPEC_ATTRIBUTE_RECORD_AT_STEP, step_bits = get_u64(p + SPEC_ATTRIBUTE_RECORD_AT_STEP);
     uint64_t levels_at = at + SPEC_ATTRIBUTE_RECORD_AT_LEVELS;
-    int power = (int)(step_bits >> 52) - 1023; /* beyond 1023 where it is negative or not finite */
+    int power = (int)(step_bits >> 52) - 1023; /* above 1023 if negative or not finite */
     if (p[SPEC_ATTRIBUTE_RECORD_AT_ATTRIBUTE] != id)
-        return fail(d, CSPLAT_E_INDEX, "ATT-1", at, "the attribute %u, wanted %u", p[SPEC_ATTRIBUTE_RECORD_AT_ATTRIBUTE],
+        return fail(d, CSPLAT_E_INDEX, "ATT-1", at, "the attribute %u, expected %u", p[SPEC_ATTRIBUTE_RECORD_AT_ATTRIBUTE],
                     id);
     TRY(reserved(d, p + SPEC_ATTRIBUTE_RECORD_AT_RESERVED_0, 1, at + SPEC_ATTRIBUTE_RECORD_AT_RESERVED_0));
     a->mapping = p[SPEC_ATTRIBUTE_RECORD_AT_MAPPING];
@@ -1189,7 +1189,7 @@ static unsigned chunks_of_book(const book *b)
     return is_sh_book(b) ? (unsigned)(b->band_last - b->band_first + 1) : 1;
 }
 
-/* What a directory record names, of the types that this version knows; they have to be there once. */
+/* Register the chunk of a directory record of a known type; each must occur once. */
 static int claim(csplat *d, const chunk *k, const uint8_t *p)
 {
     static const char *const types[] = {SPEC_CHUNK_METADATA, SPEC_CHUNK_CAMERAS, SPEC_CHUNK_OPTIONS,
@@ -1201,7 +1201,7 @@ static int claim(csplat *d, const chunk *k, const uint8_t *p)
     while (memcmp(k->type, types[type], 4) != 0)
         type++;
     if ((k->flags & ~(unsigned)SPEC_ANCILLARY_CHUNK_FLAGS) != flags[type])
-        return fail(d, CSPLAT_E_VALUE, "CHK-4", k->record + SPEC_DIRECTORY_RECORD_AT_FLAGS, "flags %u of %s, wanted %u",
+        return fail(d, CSPLAT_E_VALUE, "CHK-4", k->record + SPEC_DIRECTORY_RECORD_AT_FLAGS, "flags %u of %s, expected %u",
                     k->flags, types[type], flags[type]);
     if (type < 4) {
         slot = type < 3 ? &d->texts[type] : &d->stated;
@@ -1214,7 +1214,7 @@ static int claim(csplat *d, const chunk *k, const uint8_t *p)
         else if (b && !is_sh_book(b) && layer == 0)
             slot = &b->chunks[0];
         if (!slot || *slot)
-            return fail(d, CSPLAT_E_INDEX, "DIR-5", k->record, "a CODB of codebook %u, layer %u, that none asks for", id,
+            return fail(d, CSPLAT_E_INDEX, "DIR-5", k->record, "a CODB of codebook %u, layer %u, that is not required", id,
                         layer);
     }
     *slot = k;
@@ -1228,7 +1228,7 @@ static int is_known(const uint8_t *type)
            !memcmp(type, SPEC_CHUNK_CODEBOOK, 4);
 }
 
-/* Sizes and places that COV-1 looks at later. */
+/* Read a size and an offset, which COV-1 checks later. */
 static int read_place(csplat *d, chunk *k, uint64_t record, const uint8_t *size, const uint8_t *offset, const uint8_t *crc)
 {
     k->record = record;
@@ -1268,7 +1268,7 @@ static int read_directory(csplat *d, chunk *k, const uint8_t *p, uint64_t at)
     return 1;
 }
 
-/* The layers of a tile, as chunks; which of them it needs. */
+/* Read the layers of a tile as chunks and check that the required ones are present. */
 static int read_layers(csplat *d, tile *t, chunk *k, unsigned count, size_t stride, const uint8_t *p, uint64_t at)
 {
     int last = -1;
@@ -1320,10 +1320,10 @@ static int read_tile(csplat *d, tile *t, const uint8_t *p)
             return fail(d, CSPLAT_E_VALUE, "TIL-8", extent_at, "an extent of %lu", (unsigned long)t->extent[i]);
         if (t->corner[i] < -SPEC_INTEGER_MAX || t->corner[i] > SPEC_INTEGER_MAX - (int64_t)t->extent[i])
             return fail(d, CSPLAT_E_VALUE, "TIL-7", corner_at, "a box beyond 2^53");
-        /* By TIL-10 some splats lie on these two, so their values are those of MEA-1 that can fail. */
+        /* By TIL-10 some splats are on these two planes, so their values are the extremes for MEA-1. */
         high = (double)(t->corner[i] + (int64_t)t->extent[i]) * t->step;
         if (!(high < FLOAT32_END && high > -FLOAT32_END && fabs((double)t->corner[i] * t->step) < FLOAT32_END))
-            return fail(d, CSPLAT_E_RANGE, "MEA-1", corner_at, "means that leave binary32");
+            return fail(d, CSPLAT_E_RANGE, "MEA-1", corner_at, "means outside binary32");
     }
     for (unsigned i = 0; i < t->table_count; i++) {
         unsigned id = get_u16(t->tables + 2 * i);
@@ -1352,7 +1352,7 @@ static int check_coverage(csplat *d)
     for (size_t i = 0; i < d->chunk_count; i++) {
         const chunk *k = &d->chunks[order[i]];
         if (k->offset != at || k->size > d->info.file_size - at)
-            return fail(d, CSPLAT_E_INDEX, "COV-1", k->record, "a chunk from byte %llu on, wanted %llu",
+            return fail(d, CSPLAT_E_INDEX, "COV-1", k->record, "a chunk from byte %llu on, expected %llu",
                         (unsigned long long)k->offset, (unsigned long long)at);
         at += k->size;
     }
@@ -1360,7 +1360,7 @@ static int check_coverage(csplat *d)
            fail(d, CSPLAT_E_INDEX, "COV-1", at, "the chunks end at byte %llu", (unsigned long long)at);
 }
 
-/* Step over the tiles: how many layers they have; whether the records fill the index. */
+/* Skip the tiles, count their layers, and check that the records fill the index. */
 static int count_layers(csplat *d, uint64_t at, size_t tile_size, size_t layer_size, uint64_t *layers)
 {
     *layers = 0;
@@ -1377,7 +1377,7 @@ static int count_layers(csplat *d, uint64_t at, size_t tile_size, size_t layer_s
                         (unsigned long)i);
         at += wanted;
     }
-    return at == d->index_size || fail(d, CSPLAT_E_INDEX, "IDX-2", SPEC_HEADER_SIZE + at, "the index goes on behind its tiles");
+    return at == d->index_size || fail(d, CSPLAT_E_INDEX, "IDX-2", SPEC_HEADER_SIZE + at, "the index continues after its tiles");
 }
 
 static int read_tiles(csplat *d, uint64_t at, size_t tile_size, size_t layer_size, chunk *k)
@@ -1414,7 +1414,7 @@ static int read_index(csplat *d)
     csplat_info *info = &d->info;
     for (unsigned i = 0; i < sizeof least; i++)
         if (sizes[i] < least[i])
-            return fail(d, CSPLAT_E_VALUE, "IDX-8", SPEC_HEADER_SIZE + i, "records of %u bytes, wanted at least %u", sizes[i],
+            return fail(d, CSPLAT_E_VALUE, "IDX-8", SPEC_HEADER_SIZE + i, "records of %u bytes, expected at least %u", sizes[i],
                         least[i]);
     TRY(read_facts(d, head));
     info->tile_count = get_u32(head + SPEC_INDEX_HEAD_AT_TILE_COUNT);
@@ -1430,7 +1430,7 @@ static int read_index(csplat *d)
                     (unsigned long long)end, (unsigned long long)d->index_size);
     if (counts[0] != last_attribute(d))
         return fail(d, CSPLAT_E_INDEX, "ATT-1", SPEC_HEADER_SIZE + SPEC_INDEX_HEAD_AT_ATTRIBUTE_COUNT,
-                    "%u attribute records, wanted %u", d->attribute_count, last_attribute(d));
+                    "%u attribute records, expected %u", d->attribute_count, last_attribute(d));
     for (unsigned id = OPACITIES; id <= last_attribute(d); id++, at += sizes[1])
         TRY(read_attribute(d, id, d->index + at, SPEC_HEADER_SIZE + at));
     TRY(count_layers(d, end, sizes[5], sizes[6], &layers));
@@ -1464,7 +1464,7 @@ static int read_index(csplat *d)
 
 /* Integers on lattices (6.4.4) ---------------------------------------------------------------------------------------- */
 
-/* Whether float32(n x step) is finite for all. Below 2^103 it is for every n that LAT-4 lets through. */
+/* Return whether float32(n x step) is finite for all. Below 2^103 it is for every n that LAT-4 allows. */
 static int all_finite(const int32_t *n, size_t count, double step)
 {
     if (step < 0x1p103)
@@ -1475,14 +1475,14 @@ static int all_finite(const int32_t *n, size_t count, double step)
     return 1;
 }
 
-/* Magnitude of the integers of a column by LAT-4. */
+/* Maximum magnitude of the integers of a column by LAT-4. */
 static int32_t bound_of(const csplat *d, unsigned id, unsigned column)
 {
     const attribute *a = &d->attributes[id];
     return SPEC_COLUMN_MAX >> (a->mapping == SPEC_MAPPING_YCOCG && column >= columns_of(id) / 3 ? a->shift : 0);
 }
 
-/* Y, Co, Cg to R, G, B (7.1), in place. */
+/* Convert Y, Co, Cg to R, G, B in place (7.1). */
 static void lift(int32_t *y, int32_t *co, int32_t *cg, size_t n, unsigned shift)
 {
     const int32_t scale = (int32_t)1 << shift;
@@ -1494,14 +1494,14 @@ static void lift(int32_t *y, int32_t *co, int32_t *cg, size_t n, unsigned shift)
     }
 }
 
-/* What follows LAT-4: colours become R, G, B, and all values are finite. */
+/* Apply the steps after LAT-4: convert colours to R, G, B and check that all values are finite. */
 static int finish_lattice(csplat *d, unsigned id, int32_t *columns, size_t n, double step, uint64_t offset)
 {
     const attribute *a = &d->attributes[id];
     size_t of_channel = columns_of(id) / 3 * n;
     if (a->mapping == SPEC_MAPPING_YCOCG)
         lift(columns, columns + of_channel, columns + 2 * of_channel, of_channel, a->shift);
-    return all_finite(columns, 3 * of_channel, step) || fail(d, CSPLAT_E_RANGE, "LAT-5", offset, "values that leave binary32");
+    return all_finite(columns, 3 * of_channel, step) || fail(d, CSPLAT_E_RANGE, "LAT-5", offset, "values outside binary32");
 }
 
 static int check_quats(csplat *d, const int32_t *columns, size_t n, uint64_t offset)
@@ -1534,7 +1534,7 @@ static int check_signed(csplat *d, unsigned id, int32_t *columns, size_t n, doub
     return finish_lattice(d, id, columns, n, step, offset);
 }
 
-/* An offset as OFFSET and summands have it, and its exponent: LAT-1 to LAT-3. */
+/* Read an exponent and an offset, as in OFFSET and in summands: LAT-1 to LAT-3. */
 static int read_exponent(csplat *d, cursor *c, unsigned id, int none, int *exponent, double *step)
 {
     const uint8_t *p;
@@ -1544,7 +1544,7 @@ static int read_exponent(csplat *d, cursor *c, unsigned id, int none, int *expon
     *exponent = get_i16(p);
     *step = d->attributes[id].step;
     if (none && *exponent != 0)
-        return fail(d, CSPLAT_E_VALUE, "LAT-2", at, "an exponent of %d, wanted 0", *exponent);
+        return fail(d, CSPLAT_E_VALUE, "LAT-2", at, "an exponent of %d, expected 0", *exponent);
     return none || scaled(*step, *exponent, -126, 127, step) ||
            fail(d, CSPLAT_E_VALUE, "LAT-1", at, "an exponent of %d", *exponent);
 }
@@ -1559,7 +1559,7 @@ static int read_offset(csplat *d, cursor *c, int32_t *offset)
            fail(d, CSPLAT_E_VALUE, "LAT-3", at, "an offset of %ld", (long)*offset);
 }
 
-/* OFFSET and SIGNED: n splats into [columns][n]. */
+/* Read OFFSET or SIGNED: n splats to [columns][n]. */
 static int read_lattice(csplat *d, cursor *c, unsigned id, unsigned coding, int escape, uint32_t n, buffer *into, block *b)
 {
     unsigned columns = columns_of(id);
@@ -1598,7 +1598,7 @@ static unsigned columns_of_book(const book *b, unsigned slot)
     return is_sh_book(b) ? columns_of(SH0 + b->band_first + slot) : 6;
 }
 
-/* Check the entries of an attribute, column by column, and put them into rows (CBK-7). */
+/* Check the entries of an attribute column by column, and store them as rows (CBK-7). */
 static int fill_table(csplat *d, unsigned id, int32_t *columns, uint32_t size, int32_t *rows, unsigned stride, uint64_t offset)
 {
     unsigned coefficients = columns_of(id) / 3;
@@ -1685,7 +1685,7 @@ static int may_be_coded(unsigned id, unsigned coding)
     }
 }
 
-/* A block's head. `escape`: CBK-5 holds in the place of TLE-2 and BLK-1. */
+/* Read a block's head. If `escape`, CBK-5 applies instead of TLE-2 and BLK-1. */
 static int read_block_head(csplat *d, cursor *c, unsigned id, int escape, unsigned *coding)
 {
     const uint8_t *p;
@@ -1693,7 +1693,7 @@ static int read_block_head(csplat *d, cursor *c, unsigned id, int escape, unsign
     TRY(take(d, c, SPEC_BLOCK_HEAD_SIZE, &p));
     *coding = p[SPEC_BLOCK_HEAD_AT_CODING];
     if (p[SPEC_BLOCK_HEAD_AT_ATTRIBUTE] != id)
-        return fail(d, CSPLAT_E_STREAM, escape ? "CBK-5" : "TLE-2", at, "a block of attribute %u, wanted %u",
+        return fail(d, CSPLAT_E_STREAM, escape ? "CBK-5" : "TLE-2", at, "a block of attribute %u, expected %u",
                     p[SPEC_BLOCK_HEAD_AT_ATTRIBUTE], id);
     TRY(reserved(d, p + SPEC_BLOCK_HEAD_AT_RESERVED_0, 2, at + SPEC_BLOCK_HEAD_AT_RESERVED_0));
     at += SPEC_BLOCK_HEAD_AT_CODING;
@@ -1724,7 +1724,7 @@ static int read_levels(csplat *d, cursor *c, uint32_t n, block *b)
     return !beyond || fail(d, CSPLAT_E_RANGE, "LEV-1", s.offset, "levels above %lu", (unsigned long)levels);
 }
 
-/* Every third bit of a code, from the lowest one on. */
+/* Collect every third bit of a code, starting at the lowest. */
 static uint32_t third_bits(uint64_t code)
 {
     code &= UINT64_C(0x1249249249249249);
@@ -1774,7 +1774,7 @@ static int read_means(csplat *d, cursor *c, const tile *t, unsigned coding, bloc
         TRY(read_morton(d, c, n, q));
     else {
         stream s;
-        TRY(read_stream(d, c, 3 * (uint64_t)n, 3, &s)); /* so AXI-1 holds */
+        TRY(read_stream(d, c, 3 * (uint64_t)n, 3, &s)); /* ensures AXI-1 */
         undo_unsigned(&s, q);
     }
     for (unsigned axis = 0; axis < 3; axis++, q += n) {
@@ -1784,13 +1784,13 @@ static int read_means(csplat *d, cursor *c, const tile *t, unsigned coding, bloc
             high = q[i] > high ? q[i] : high;
         }
         if (low != 0 || high != t->extent[axis])
-            return fail(d, CSPLAT_E_BOX, "TIL-10", at, "axis %u goes from %lu to %lu, wanted 0 to %lu", axis,
+            return fail(d, CSPLAT_E_BOX, "TIL-10", at, "axis %u goes from %lu to %lu, expected 0 to %lu", axis,
                         (unsigned long)low, (unsigned long)high, (unsigned long)t->extent[axis]);
     }
     return 1;
 }
 
-/* SPARSE: columns of the splats that a mask names. */
+/* Read SPARSE: columns of the splats in a mask. */
 static int read_sparse(csplat *d, cursor *c, unsigned id, uint32_t n, block *b)
 {
     const uint8_t *p;
@@ -1815,11 +1815,11 @@ static int read_sparse(csplat *d, cursor *c, unsigned id, uint32_t n, block *b)
     if (n & 7 && mask[s.count - 1] >> (n & 7))
         return fail(d, CSPLAT_E_RANGE, "SPA-3", s.offset, "bits that belong to no splat");
     for (uint32_t i = 0; i < n; i++) {
-        rows[found] = i; /* stays if the splat is present */
+        rows[found] = i; /* kept if the splat is present */
         found += mask[i >> 3] >> (i & 7) & 1;
     }
     if (found != present)
-        return fail(d, CSPLAT_E_RANGE, "SPA-2", s.offset, "%lu bits are 1, wanted %lu", (unsigned long)found,
+        return fail(d, CSPLAT_E_RANGE, "SPA-2", s.offset, "%lu bits are 1, expected %lu", (unsigned long)found,
                     (unsigned long)present);
     TRY(read_stream(d, c, (uint64_t)columns_of(id) * present, 4, &s));
     TRY(reserve(d, &d->integers, s.count, sizeof *b->columns));
@@ -1845,7 +1845,7 @@ static int is_listed(const tile *t, unsigned id)
     return 0;
 }
 
-/* The attribute whose block has the indices of a codebook; `has` is whether the codebook is one of `id`. */
+/* Return the attribute whose block has the indices of a codebook; set `has` if the codebook is one for `id`. */
 static unsigned first_of(const book *b, unsigned id, int *has)
 {
     if (is_sh_book(b)) {
@@ -1873,14 +1873,14 @@ static int read_indices(csplat *d, cursor *c, const book *b, unsigned id, uint32
         return fail(d, CSPLAT_E_CODEBOOK, "CBK-2", s.offset, "the index %lu of %lu entries", (unsigned long)highest,
                     (unsigned long)b->size);
     if (escaped != escape_count)
-        return fail(d, CSPLAT_E_CODEBOOK, "CBK-3", s.offset, "%lu splats are escaped, wanted %lu", (unsigned long)escaped,
+        return fail(d, CSPLAT_E_CODEBOOK, "CBK-3", s.offset, "%lu splats are escaped, expected %lu", (unsigned long)escaped,
                     (unsigned long)escape_count);
     d->used[id] = b;
     d->escapes_of[id] = escape_count;
     return 1;
 }
 
-/* The summands of scales: offset and elements, [n] in d->summands. */
+/* Read the summands of scales: their offset, and elements [n] in d->summands. */
 static int read_summands(csplat *d, cursor *c, uint32_t n, int32_t *offset)
 {
     int exponent;
@@ -1894,7 +1894,7 @@ static int read_summands(csplat *d, cursor *c, uint32_t n, int32_t *offset)
     return 1;
 }
 
-/* Columns of all splats, of entries (with what is added to them) and escapes, in the place of both. */
+/* Combine entries (plus summands) and escapes into columns of all splats. */
 static int expand(csplat *d, unsigned id, uint32_t n, unsigned stride, const uint32_t *summands, int64_t offset, block *b,
                   uint64_t at)
 {
@@ -1923,7 +1923,7 @@ static int expand(csplat *d, unsigned id, uint32_t n, unsigned stride, const uin
     if (beyond)
         return fail(d, CSPLAT_E_RANGE, "CBK-6", at, "sums of entry and summand beyond %d", SPEC_COLUMN_MAX);
     return id == QUATS || all_finite(b->columns, 3 * (size_t)n, b->step) ||
-           fail(d, CSPLAT_E_RANGE, "LAT-5", at, "values that leave binary32");
+           fail(d, CSPLAT_E_RANGE, "LAT-5", at, "values outside binary32");
 }
 
 static int read_codebook_block(csplat *d, cursor *c, const tile *t, unsigned id, block *b)
@@ -1942,7 +1942,7 @@ static int read_codebook_block(csplat *d, cursor *c, const tile *t, unsigned id,
     escape_count = get_u32(p + SPEC_CODEBOOK_PARAMS_AT_ESCAPE_COUNT);
     k = is_listed(t, book_id) ? find_book(d, book_id) : NULL;
     if (!k || (first = first_of(k, id, &has), !has))
-        return fail(d, CSPLAT_E_CODEBOOK, "CBK-1", at, "codebook %u is not listed, or none of attribute %u", book_id, id);
+        return fail(d, CSPLAT_E_CODEBOOK, "CBK-1", at, "codebook %u is not listed, or not for attribute %u", book_id, id);
     if (escape_count > n)
         return fail(d, CSPLAT_E_CODEBOOK, "CBK-3", at + SPEC_CODEBOOK_PARAMS_AT_ESCAPE_COUNT, "%lu of %lu splats are escaped",
                     (unsigned long)escape_count, (unsigned long)n);
@@ -2031,15 +2031,15 @@ static void put_quats(const csplat *d, const int32_t *columns, size_t n, float *
 static void put_means(const tile *t, const int32_t *q, size_t n, float *out)
 {
     const double x = (double)t->corner[0], y = (double)t->corner[1], z = (double)t->corner[2];
-    for (size_t i = 0; i < n; i++, out += 3) { /* sums of integers within 2^53: exact */
+    for (size_t i = 0; i < n; i++, out += 3) { /* integer sums within 2^53 are exact */
         out[0] = (float)((x + (double)q[i]) * t->step);
         out[1] = (float)((y + (double)q[n + i]) * t->step);
         out[2] = (float)((z + (double)q[2 * n + i]) * t->step);
     }
 }
 
-/* Lattice values of rows `from` to `to` of the columns, where the block has them, or those splats. Single precision is exact (7.2).
- * Splat `base` is the first of `out`. */
+/* Write lattice values of splats `from` to `to` or, if the block lists rows, of these entries of the list. Single precision is
+ * exact (7.2). Splat `base` is the first of `out`. */
 static void put_columns(const block *b, unsigned coefficients, size_t from, size_t to, size_t base, float *out, size_t stride)
 {
     const float step = (float)b->step;
@@ -2055,7 +2055,7 @@ static void put_columns(const block *b, unsigned coefficients, size_t from, size
     }
 }
 
-/* Rows of a codebook, of a number of columns that the compiler knows. */
+/* Write rows of a codebook; the number of columns is a compile-time constant. */
 static inline void put_entries(const block *b, size_t from, size_t to, unsigned columns, size_t base, float *out, size_t stride)
 {
     const uint32_t size = b->book->size;
@@ -2069,8 +2069,8 @@ static unsigned coefficients_of(unsigned degree)
     return (degree + 1) * (degree + 1) - 1;
 }
 
-/* SH bands `first` to `last` of splats `base` to `end`, rows `stride` floats apart: all bands of a few splats, then of the
- * next. `row` counts, by band, the rows that the columns are about; it is 0 where `base` is. */
+/* Write SH bands `first` to `last` of splats `base` to `end`, in rows `stride` floats apart: all bands of a few splats at a time.
+ * `row` counts, by band, the listed rows before `base`, and is advanced. */
 static void put_bands(const block *b, unsigned first, unsigned last, size_t base, size_t end, size_t *row, float *out,
                       size_t stride)
 {
@@ -2110,7 +2110,7 @@ static void put_integers(const block *b, unsigned columns, size_t n, int64_t *ou
             out[(b->rows ? b->rows[i] : i) * columns + k] = b->columns[(k % 3 * coefficients + k / 3) * (size_t)b->count + i];
 }
 
-/* Copy integers into the narrowest elements that hold them. */
+/* Copy integers to the narrowest elements that hold them. */
 static void narrow_into(const int32_t *in, size_t n, int32_t least, unsigned width, void *out)
 {
     uint8_t *bytes = out;
@@ -2132,7 +2132,7 @@ static unsigned width_of(uint32_t most)
     return most < 256 ? 1 : most < 65536 ? 2 : 4;
 }
 
-/* `rest` rows of zeros follow the n rows of each column. */
+/* Pack columns; `rest` rows of zeros follow the n rows of each column. */
 static int pack(csplat *d, buffer *into, const int32_t *columns, size_t n, unsigned count, unsigned rest, double step,
                 csplat_columns *out)
 {
@@ -2180,14 +2180,14 @@ static int load_layer(csplat *d, const tile *t, unsigned layer, unsigned blocks,
     TRY(load(d, t->layers[layer], &d->chunk_bytes, CSPLAT_E_STREAM, "TLE-3", c));
     TRY(take(d, c, SPEC_TILE_HEAD_SIZE, &p));
     if (p[SPEC_TILE_HEAD_AT_LAYER] != id)
-        return fail(d, CSPLAT_E_INDEX, "TLE-1", c->offset, "layer %u, the record says %u", p[0], id);
+        return fail(d, CSPLAT_E_INDEX, "TLE-1", c->offset, "layer %u, the record has %u", p[0], id);
     if (p[SPEC_TILE_HEAD_AT_BLOCK_COUNT] != (blocks & 255) || blocks > 255)
-        return fail(d, CSPLAT_E_STREAM, "TLE-2", c->offset + SPEC_TILE_HEAD_AT_BLOCK_COUNT, "%u blocks, wanted %u",
+        return fail(d, CSPLAT_E_STREAM, "TLE-2", c->offset + SPEC_TILE_HEAD_AT_BLOCK_COUNT, "%u blocks, expected %u",
                     p[SPEC_TILE_HEAD_AT_BLOCK_COUNT], blocks);
     return reserved(d, p + SPEC_TILE_HEAD_AT_RESERVED_0, 2, c->offset + SPEC_TILE_HEAD_AT_RESERVED_0);
 }
 
-/* TIL-11: bit for bit the value of the largest integer. */
+/* Check TIL-11: max_scale is bit for bit the value of the largest integer. */
 static int check_scales(csplat *d, const tile *t, const block *b)
 {
     int32_t high = b->columns[0];
@@ -2239,7 +2239,7 @@ static int pack_geometry(csplat *d, const tile *t, unsigned id, const block *b, 
     return 1;
 }
 
-/* Layer 0, into one of the forms of a sink. */
+/* Read layer 0 to one of the outputs of a sink. */
 static int read_geometry(csplat *d, const tile *t, const sink *out)
 {
     cursor c;
@@ -2260,7 +2260,7 @@ static int read_geometry(csplat *d, const tile *t, const sink *out)
     return at_end(d, &c);
 }
 
-/* An SH band; of one that is left out the block has no rows. */
+/* Read an SH band; if it is left out, the block has no rows. */
 static int read_band(csplat *d, const tile *t, unsigned band, block *b)
 {
     cursor c;
@@ -2272,7 +2272,7 @@ static int read_band(csplat *d, const tile *t, unsigned band, block *b)
     return at_end(d, &c);
 }
 
-/* Whether bands of the tile may have their indices in a lower one, which was not read last. */
+/* Return whether bands of the tile may have their indices in a lower one that was not read last. */
 static int may_lack_indices(const csplat *d, const tile *t, unsigned band)
 {
     for (unsigned i = 0; i < t->table_count; i++) {
@@ -2283,7 +2283,7 @@ static int may_lack_indices(const csplat *d, const tile *t, unsigned band)
     return 0;
 }
 
-/* An SH band of a tile, of which others may have been read or not: its indices may stand in a lower band. */
+/* Read an SH band of a tile on its own; its indices may be in a lower band, which is then read first. */
 static int read_band_alone(csplat *d, const tile *t, unsigned band, block *b)
 {
     if (d->current != t)
@@ -2320,10 +2320,10 @@ static int read_extras(csplat *d, const tile *t, void *const *out)
         TRY(take(d, &c, SPEC_RAW_PARAMS_SIZE, &p));
         TRY(reserved(d, p + SPEC_RAW_PARAMS_AT_RESERVED_0, 2, at + SPEC_RAW_PARAMS_AT_RESERVED_0));
         if (get_u16(p) != i)
-            return fail(d, CSPLAT_E_STREAM, "RAW-1", at, "the column %u, wanted %u", get_u16(p), i);
+            return fail(d, CSPLAT_E_STREAM, "RAW-1", at, "the column %u, expected %u", get_u16(p), i);
         TRY(read_stream(d, &c, t->splat_count, 8, &s));
         if (e->bytes && s.width != e->bytes)
-            return fail(d, CSPLAT_E_STREAM, "RAW-2", s.offset, "a width of %u, wanted %u", s.width, e->bytes);
+            return fail(d, CSPLAT_E_STREAM, "RAW-2", s.offset, "a width of %u, expected %u", s.width, e->bytes);
         if (!e->bytes || !out || !out[i])
             continue;
         TRY(reserve(d, &d->codes, s.count, sizeof *values));
@@ -2344,7 +2344,7 @@ static int read_extras(csplat *d, const tile *t, void *const *out)
 
 /* JSON (5.4) ----------------------------------------------------------------------------------------------------------- */
 
-/* A name: where it stands behind its quotation mark, and a sum of what it means. */
+/* A name: its position after the quotation mark, and a hash of its content. */
 typedef struct name {
     uint32_t at, sum;
 } name;
@@ -2387,7 +2387,8 @@ static int hex4(const json *j, size_t at, unsigned *out)
     return 1;
 }
 
-/* The next character of a string, an escape resolved, as 1 to 4 bytes of UTF-8: how many; 0 at its end, -1 where it is bad. */
+/* Read the next character of a string, with escapes resolved, as 1 to 4 bytes of UTF-8; return their number, 0 at the end of
+ * the string, -1 if it is invalid. */
 static int next_character(const json *j, size_t *at, uint8_t out[4])
 {
     static const char from[] = "\"\\/bfnrt", to[] = "\"\\/\b\f\n\r\t";
@@ -2401,7 +2402,7 @@ static int next_character(const json *j, size_t *at, uint8_t out[4])
     out[0] = (uint8_t)c;
     *at += 1;
     if (c != '\\')
-        return 1; /* of several bytes each counts for itself */
+        return 1; /* bytes of a multi-byte character are returned one by one */
     c = *at < j->size ? j->text[(*at)++] : 0;
     if (c != 'u') {
         if (!c || !(found = strchr(from, c)))
@@ -2441,7 +2442,7 @@ static int next_character(const json *j, size_t *at, uint8_t out[4])
     return 3;
 }
 
-/* Step over a string that begins here; sum up what it means (FNV-1a). */
+/* Skip a string that starts here and hash its content (FNV-1a). */
 static int json_string(json *j, uint32_t *sum)
 {
     uint8_t bytes[4];
@@ -2462,7 +2463,7 @@ static int json_string(json *j, uint32_t *sum)
     return 1;
 }
 
-/* Whether the nearest binary64 of a number, m digits before the point or after, is infinite: |x| >= 2^1024 - 2^970. */
+/* Return whether the nearest binary64 of a number is infinite: |x| >= 2^1024 - 2^970. */
 static int is_beyond_binary64(const uint8_t *p, size_t size)
 {
     static const char end[] = "17976931348623158079372897140530341507993413271003782693617377898044496829276475094664901797758720"
@@ -2482,7 +2483,7 @@ static int is_beyond_binary64(const uint8_t *p, size_t size)
                 exponent = 10 * exponent + (p[i] - '0');
         exponent = negative ? -exponent : exponent;
     }
-    for (i = 0; i < mark; i++) { /* digits from the first one that is not 0, and how many stand before the point */
+    for (i = 0; i < mark; i++) { /* digits after leading zeros, and how many of them precede the point */
         if (p[i] == '.')
             seen_point = 1;
         if (p[i] < '0' || p[i] > '9')
@@ -2517,7 +2518,7 @@ static int json_number(json *j)
         while (peek(j) >= '0' && peek(j) <= '9')
             j->at++;
         if (j->at == digits)
-            return json_fail(j, "a number without digits behind its point");
+            return json_fail(j, "a number without digits after its point");
     }
     if (peek(j) == 'e' || peek(j) == 'E') {
         j->at++;
@@ -2541,7 +2542,7 @@ static int json_word(json *j, const char *word)
     return 1;
 }
 
-/* By their sums, then by what they mean. */
+/* Compare by hash, then by content. */
 static int compare_names(const json *j, const name *a, const name *b)
 {
     uint8_t x[4], y[4];
@@ -2590,7 +2591,7 @@ static int add_name(json *j, size_t at, uint32_t sum)
     return 1;
 }
 
-/* At the end of an object: its names, those from `first` on, differ. */
+/* Check at the end of an object that its names, from `first` on, differ. */
 static int check_object(json *j, size_t first)
 {
     csplat *d = j->d;
@@ -2610,7 +2611,7 @@ static int check_object(json *j, size_t first)
     return 1;
 }
 
-/* A name of an object and its colon. */
+/* Read a name of an object and its colon. */
 static int json_name(json *j)
 {
     uint32_t sum;
@@ -2625,7 +2626,7 @@ static int json_name(json *j)
     return 1;
 }
 
-/* One value, without recursion; of an array of objects (CAMS) what lies in the outermost array has to be objects. */
+/* Read one value, without recursion. In an array of objects (CAMS), the elements of the outermost array must be objects. */
 static int json_value(json *j, int array_of_objects)
 {
     struct {
@@ -2637,10 +2638,10 @@ static int json_value(json *j, int array_of_objects)
     skip_space(j);
     if (peek(j) != (array_of_objects ? '[' : '{'))
         return json_fail(j, "not the kind of value that this chunk has,");
-    for (;;) { /* here a value begins */
+    for (;;) { /* a value begins */
         int c = peek(j);
         if (array_of_objects && depth == 1 && c != '{')
-            return json_fail(j, "a camera that is no object,");
+            return json_fail(j, "a camera that is not an object,");
         if (c == '{' || c == '[') {
             if (depth == SPEC_JSON_DEPTH_MAX)
                 return json_fail(j, "arrays and objects too deep");
@@ -2659,10 +2660,10 @@ static int json_value(json *j, int array_of_objects)
             TRY(json_word(j, c == 't' ? "true" : c == 'f' ? "false" : "null"));
         else
             TRY(json_number(j));
-        for (;;) { /* here one has ended */
+        for (;;) { /* a value has ended */
             skip_space(j);
             if (depth == 0)
-                return j->at == j->size || json_fail(j, "something behind the value,");
+                return j->at == j->size || json_fail(j, "something after the value,");
             c = peek(j);
             if (c == ',') {
                 j->at++;
@@ -2906,14 +2907,14 @@ static void swap(buffer *a, buffer *b)
     *b = kept;
 }
 
-/* A tile: geometry into arrays, SH bands up to a degree as blocks, for put_bands. */
+/* Read a tile: geometry to arrays, SH bands up to a degree as blocks for put_bands. */
 static int read_tile_blocks(csplat *d, const tile *t, unsigned degree, const csplat_floats *out, block *bands)
 {
     const sink into = {out, NULL, NULL};
     TRY(read_geometry(d, t, &into));
     for (unsigned band = 1; band <= degree; band++) {
         int worked;
-        swap(&d->integers, &d->band_integers[band]); /* what the block points to stays until all bands are here */
+        swap(&d->integers, &d->band_integers[band]); /* keeps the data of the block until all bands are read */
         swap(&d->rows, &d->band_rows[band]);
         worked = read_band(d, t, band, &bands[band]);
         swap(&d->integers, &d->band_integers[band]);
@@ -3039,7 +3040,7 @@ csplat_code csplat_read_text(csplat *d, csplat_text which, const char **text, si
     if (!read_text(d, which))
         return d->error.code;
     *text = d->text.data;
-    *size = strlen(*text); /* a text in JSON has no NUL */
+    *size = strlen(*text); /* JSON has no NUL */
     return CSPLAT_OK;
 }
 
@@ -3071,7 +3072,7 @@ csplat_code csplat_check(csplat *d)
     return done(d, check(d));
 }
 
-/* What BUDGET_BYTES counts: arrays and codebooks. */
+/* Check the budgets for arrays and codebooks. */
 static int check_budget(csplat *d, unsigned degree, int whole)
 {
     const csplat_info *info = &d->info;

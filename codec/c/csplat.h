@@ -5,14 +5,14 @@
  *     if (csplat_open_memory(&file, data, size, NULL, &error)) return puts(error.message);
  *     const csplat_info *info = csplat_get_info(file);
  *     for (uint32_t i = 0; i < info->tile_count; i++) {
- *         csplat_floats out = {means, quats, scales, opacities, sh0, NULL};   room for CSPLAT_TILE_SPLATS each
- *         if (csplat_read_tile(file, i, 0, &out)) break;                      csplat_last_error(file) says why
+ *         csplat_floats out = {means, quats, scales, opacities, sh0, NULL};    CSPLAT_TILE_SPLATS rows each
+ *         if (csplat_read_tile(file, i, 0, &out)) break;                      csplat_last_error(file) has the error
  *     }
  *     csplat_close(file);
  *
- * Nothing is global. A csplat belongs to one thread at a time; several threads open one each, of the same bytes.
+ * There is no global state. A csplat belongs to one thread at a time; threads can each open one on the same bytes.
  * Every function that can fail returns CSPLAT_OK, which is 0, or the code of the specification. After a failure the
- * csplat can still be asked for something else. SPDX-License-Identifier: Apache-2.0 */
+ * csplat can still be used. SPDX-License-Identifier: Apache-2.0 */
 #ifndef CSPLAT_H
 #define CSPLAT_H
 
@@ -23,7 +23,7 @@
 extern "C" {
 #endif
 
-#define CSPLAT_TILE_SPLATS 65536 /* splats of a tile at most */
+#define CSPLAT_TILE_SPLATS 65536 /* maximum splats per tile */
 #define CSPLAT_NO_OFFSET UINT64_MAX
 
 typedef struct csplat csplat;
@@ -54,56 +54,57 @@ typedef enum csplat_code {
 
 typedef struct csplat_error {
     csplat_code code;
-    uint64_t offset;       /* of the byte to blame, from the start of the file, or CSPLAT_NO_OFFSET */
-    const char *clause;    /* of the specification, "CRC-1", or "" */
-    char message[192];     /* one line: code, place, what is wrong */
+    uint64_t offset;       /* of the error, from the start of the file, or CSPLAT_NO_OFFSET */
+    const char *clause;    /* clause of the specification, "CRC-1", or "" */
+    char message[192];     /* one line: code, offset, clause, what is wrong */
 } csplat_error;
 
-/* Where the bytes of a file come from. */
+/* The source of the bytes of a file. */
 typedef struct csplat_source {
-    /* Put exactly `size` bytes from `offset` on into `into`; 0 when that fails. */
+    /* Copy exactly `size` bytes at `offset` to `into`; return 0 on failure. */
     int (*read)(void *user, uint64_t offset, size_t size, void *into);
     void *user;
-    uint64_t size; /* of the file */
+    uint64_t size; /* size of the file */
 } csplat_source;
 
-/* Everything here may be 0, which is the default. */
+/* Every field may be 0, the default. */
 typedef struct csplat_options {
-    uint64_t splats_max;     /* of csplat_decode, any number */
-    uint64_t bytes_max;      /* of the arrays of csplat_decode and of codebooks, 8 GiB */
-    uint64_t json_bytes_max; /* of one text of csplat_read_text, 64 MiB */
-    /* malloc and free. Both or none. */
+    uint64_t splats_max;     /* limit of csplat_decode; default: none */
+    uint64_t bytes_max;      /* limit of the arrays of csplat_decode and of codebooks; default: 8 GiB */
+    uint64_t json_bytes_max; /* limit of a text of csplat_read_text; default: 64 MiB */
+    /* Replace malloc and free. Set both or neither. */
     void *(*allocate)(void *user, size_t size);
     void (*release)(void *user, void *memory);
-    /* zlib; csplat_inflate where CSPLAT_NO_ZLIB is defined. Raw DEFLATE (RFC 1951): 1 if `coded` is one complete stream, no byte longer, of exactly `size` bytes.
-     * What else it has to refuse is told by section 6.2 of the specification (COD-2 to COD-8). */
+    /* Replaces zlib, or csplat_inflate if CSPLAT_NO_ZLIB is defined. Raw DEFLATE (RFC 1951): return 1 if `coded` is exactly
+     * one complete stream of exactly `size` bytes. Section 6.2 of the specification lists the other requirements (COD-2 to
+     * COD-8). */
     int (*inflate)(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size);
-    void *user; /* of the three above */
+    void *user; /* passed to the three functions above */
 } csplat_options;
 
 typedef struct csplat_extra {
-    const char *name; /* UTF-8, ends with a 0 */
+    const char *name; /* UTF-8, NUL-terminated */
     uint8_t dtype;    /* 1 u8, 2 i8, 3 u16, 4 i16, 5 u32, 6 i32, 7 f32, 8 f64; 0: unknown, never returned */
-    uint8_t bytes;    /* of one value; 0 where unknown */
+    uint8_t bytes;    /* per value; 0 if unknown */
 } csplat_extra;
 
 typedef struct csplat_codebook {
     uint16_t id;
-    uint8_t band_first, band_last; /* SH bands, or 0 where it is not of colours of SH */
-    uint32_t size;                 /* entries */
+    uint8_t band_first, band_last; /* SH bands, or 0 if the codebook is not for SH colours */
+    uint32_t size;                 /* number of entries */
 } csplat_codebook;
 
-/* What header and index say. */
+/* The contents of header and index. */
 typedef struct csplat_info {
     uint64_t file_size;
     uint64_t splat_count;
     uint32_t tile_count;
     uint8_t sh_degree;
-    uint8_t antialiased, flat; /* how to render: mip-splatting's filter, 2DGS */
-    char axes[4];              /* directions of +x, +y, +z: letters of R L U D F B; "" where unknown */
-    double unit_metres;        /* 0 where unknown */
-    double origin[3];          /* what the means are relative to; it is not added */
-    uint32_t opacity_levels;   /* M of the opacities; they are (q / M), or squared: (q / M)^2 */
+    uint8_t antialiased, flat; /* how to render: filter of Mip-Splatting, 2DGS */
+    char axes[4];              /* directions of +x, +y, +z: letters of R L U D F B; "" if unknown */
+    double unit_metres;        /* 0 if unknown */
+    double origin[3];          /* the means are relative to it; it is not added */
+    uint32_t opacity_levels;   /* M of the opacities; they are q / M, or (q / M)^2 if squared */
     uint8_t opacity_squared;
     uint32_t quat_levels;      /* M of the rotations */
     const csplat_codebook *codebooks;
@@ -112,15 +113,15 @@ typedef struct csplat_info {
 } csplat_info;
 
 typedef struct csplat_tile {
-    uint64_t first;       /* number of its first splat in the scene */
+    uint64_t first;       /* index of its first splat in the scene */
     uint32_t splat_count;
-    uint8_t bands;        /* bit l - 1 is set: it has SH band l; all coefficients are 0 otherwise */
-    float min[3], max[3]; /* box of the centres */
+    uint8_t bands;        /* bit l - 1 is set if it has SH band l; otherwise its coefficients are 0 */
+    float min[3], max[3]; /* bounding box of the centres */
     float max_scale;      /* natural logarithm of the largest standard deviation */
-    uint32_t bytes[4];    /* of layer 0 and of SH bands 1 to 3 in the file */
+    uint32_t bytes[4];    /* sizes of layer 0 and SH bands 1 to 3 in the file */
 } csplat_tile;
 
-/* Where a tile's values go; what is NULL is left out. K = (degree + 1)^2 - 1. */
+/* Arrays for a tile's values; NULL to skip one. K = (degree + 1)^2 - 1. */
 typedef struct csplat_floats {
     float *means;     /* [n][3], scene units, relative to the origin */
     float *quats;     /* [n][4], w x y z, unit length */
@@ -133,12 +134,12 @@ typedef struct csplat_floats {
 /* A whole scene. */
 typedef struct csplat_scene {
     uint64_t splat_count;
-    unsigned sh_degree; /* of shN */
+    unsigned sh_degree; /* degree of shN */
     csplat_floats values;
-    void **extras; /* [extra_count], NULL for unknown types; of each the values of its type */
+    void **extras; /* [extra_count], values of each column's type; NULL for unknown types */
 } csplat_scene;
 
-/* The integer arrays of the specification, 9.2, for tests. What is NULL is left out. */
+/* The integer arrays of the specification, 9.2, for tests; NULL to skip one. */
 typedef struct csplat_integers {
     uint32_t *opacities;
     int64_t *scales, *means, *sh0, *sh[3]; /* sh[l - 1]: [n][2 l + 1][3] */
@@ -148,25 +149,25 @@ typedef struct csplat_integers {
 
 /* Quantised values in narrow arrays: an integer is offset[column] + element, a value float32(integer * step).
  * Opacities and quats have no step, see csplat_info. Colours are R, G, B; column channel * (2l + 1) + m of an SH
- * band holds coefficient m. The pointers hold until anything but a codebook is read. */
+ * band contains coefficient m. The pointers are valid until anything but a codebook is read. */
 typedef struct csplat_columns {
     const void *data;       /* u8, u16 or u32: all elements of column 0, then of column 1, ... */
-    unsigned width;         /* bytes of an element: 1, 2, 4 */
+    unsigned width;         /* bytes per element: 1, 2 or 4 */
     unsigned columns;
     uint32_t count;         /* rows */
     int64_t offset[21];
     double step;
 } csplat_columns;
 
-/* One attribute. Where `index` is not NULL the values stand in a codebook, but those of the splats `rows`, whose index
- * is the size of the codebook: `columns` has a row for each of these. Where `index` is NULL and `rows` is not, `columns`
- * has the splats `rows`, and all others are 0. */
+/* One attribute. If `index` is not NULL, the values are in a codebook, except those of the splats in `rows`, whose index is
+ * the size of the codebook: `columns` has a row for each of them. If only `rows` is not NULL, `columns` has the splats in
+ * `rows`, and all others are 0. */
 typedef struct csplat_packed {
     csplat_columns columns;
-    const uint32_t *rows;  /* [columns.count], or NULL: all splats */
+    const uint32_t *rows;  /* [columns.count], or NULL for all splats */
     const void *index;     /* [n] u8, u16 or u32, or NULL */
     unsigned index_width;
-    uint16_t codebook;     /* its id */
+    uint16_t codebook;     /* id of the codebook */
 } csplat_packed;
 
 /* Layer 0 of a tile. */
@@ -174,7 +175,7 @@ typedef struct csplat_packed_geometry {
     csplat_packed opacities, scales, quats, means, sh0; /* quats: x, y, z; w follows (specification, 7.5) */
 } csplat_packed_geometry;
 
-/* Error bounds that the file states; below 0 where it states none. */
+/* Error bounds declared in the file; negative if not declared. */
 typedef struct csplat_stated_errors {
     uint64_t source_count, pruned_count;
     uint8_t source_sh_degree, refitted;
@@ -185,8 +186,8 @@ typedef struct csplat_stated_errors {
 
 typedef enum csplat_text { CSPLAT_METADATA, CSPLAT_CAMERAS, CSPLAT_ENCODER_OPTIONS } csplat_text;
 
-/* Read and check header and index. *out is NULL on failure; `options` and `error` may be NULL. With csplat_open_memory
- * nothing is copied: `data` stays where it is until csplat_close. */
+/* Read and check header and index. *out is NULL on failure; `options` and `error` may be NULL. csplat_open_memory does not
+ * copy `data`, which must remain valid until csplat_close. */
 csplat_code csplat_open_memory(csplat **out, const void *data, size_t size, const csplat_options *options,
                                csplat_error *error);
 csplat_code csplat_open(csplat **out, const csplat_source *source, const csplat_options *options, csplat_error *error);
@@ -196,37 +197,37 @@ const csplat_info *csplat_get_info(const csplat *file);
 csplat_code csplat_get_tile(csplat *file, uint32_t tile, csplat_tile *out);
 const csplat_error *csplat_last_error(const csplat *file);
 
-/* All splats, in arrays of their own, which csplat_free_scene releases. With sh_degree below the file's, higher bands are
- * neither read nor checked; otherwise all of the file is, as the specification asks of exact decoders. */
+/* Decode all splats into new arrays, which csplat_free_scene releases. If sh_degree is below the file's, higher bands are
+ * neither read nor checked; otherwise the whole file is, as the specification requires of exact decoders. */
 csplat_code csplat_decode(csplat *file, unsigned sh_degree, csplat_scene **out);
 void csplat_free_scene(csplat *file, csplat_scene *scene);
 
-/* One tile with its SH bands up to a degree, which may be above the file's: those are 0. */
+/* Read a tile with its SH bands up to a degree; bands above the file's degree are 0. */
 csplat_code csplat_read_tile(csplat *file, uint32_t tile, unsigned sh_degree, const csplat_floats *out);
-/* One SH band, [n][2 * band + 1][3]; 0 where the tile leaves it out. */
+/* Read an SH band, [n][2 * band + 1][3]; 0 if the tile leaves it out. */
 csplat_code csplat_read_band(csplat *file, uint32_t tile, unsigned band, float *out);
-/* Extra columns: out[i], unless it is NULL, gets the values of column i. */
+/* Read extra columns: out[i], unless it is NULL, receives the values of column i. */
 csplat_code csplat_read_extras(csplat *file, uint32_t tile, void *const *out);
 csplat_code csplat_read_integers(csplat *file, uint32_t tile, const csplat_integers *out);
 
 csplat_code csplat_read_packed(csplat *file, uint32_t tile, csplat_packed_geometry *out);
-/* columns.count and index are 0 where the tile leaves the band out. */
+/* columns.count and index are 0 if the tile leaves the band out. */
 csplat_code csplat_read_packed_band(csplat *file, uint32_t tile, unsigned band, csplat_packed *out);
-/* A band of a codebook: its entries, and one row of zeros behind them, for splats that have no entry. */
+/* Read a band of a codebook: its entries, followed by one row of zeros for splats without an entry. */
 csplat_code csplat_read_packed_codebook(csplat *file, uint16_t id, unsigned band, csplat_columns *out);
 
-/* A text in JSON, checked by section 5.4; it holds until the next text is read. NULL where the file has none. */
+/* Read a JSON text, checked by section 5.4. It is valid until the next text is read. NULL if the file has none. */
 csplat_code csplat_read_text(csplat *file, csplat_text which, const char **text, size_t *size);
-/* *found is 0 where the file states none. */
+/* *found is 0 if the file declares none. */
 csplat_code csplat_read_stated_errors(csplat *file, csplat_stated_errors *out, int *found);
 
-/* Check all that no tile needs: CRCs of chunks and layers that are skipped, codebooks, texts, stated errors. */
+/* Check everything outside the tiles: CRCs of skipped chunks and layers, codebooks, texts, declared errors. */
 csplat_code csplat_check(csplat *file);
 
 /* "E_CRC" */
 const char *csplat_code_name(csplat_code code);
 
-/* An inflate for csplat_options, in a file of its own, inflate.c. */
+/* An inflate for csplat_options, in inflate.c. */
 int csplat_inflate(void *user, const uint8_t *coded, size_t coded_size, uint8_t *out, size_t size);
 
 #ifdef __cplusplus

@@ -1,4 +1,4 @@
-/* cc csplat.c example.c -lz -lm && ./a.out scene.csplat: what is in a file, tile by tile. */
+/* cc csplat.c example.c -lz -lm && ./a.out scene.csplat: print the contents of a file, tile by tile. */
 #include "csplat.h"
 
 #include <stdio.h>

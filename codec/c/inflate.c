@@ -1,7 +1,7 @@
-/* An inflate for programs without zlib (-DCSPLAT_NO_ZLIB): raw DEFLATE (RFC 1951) under the rules of the specification,
- * 6.2. No memory is allocated and no byte outside of the two buffers is touched.
+/* An inflate for programs without zlib (-DCSPLAT_NO_ZLIB): raw DEFLATE (RFC 1951) with the rules of the specification,
+ * 6.2. It allocates no memory and accesses no byte outside the two buffers.
  *
- * A code is read by tables: one that the next ROOT bits point into, and behind it smaller ones for longer codewords.
+ * Codes are decoded with tables: the next ROOT bits index one, which points to smaller tables for longer codewords.
  * SPDX-License-Identifier: Apache-2.0 */
 #include "csplat.h"
 
@@ -9,11 +9,11 @@
 
 enum { LITERALS = 288, DISTANCES = 32, LENGTHS = 19, BITS_MAX = 15 };
 enum { LITERAL_ROOT = 11, DISTANCE_ROOT = 8, LENGTH_ROOT = 7 };
-/* Entries of a table for that many symbols and root bits at most, as zlib's program `enough` counts them. */
+/* Maximum table entries for the numbers of symbols and root bits, as computed by zlib's program `enough`. */
 enum { LITERAL_ENTRIES = 2342, DISTANCE_ENTRIES = 402, LENGTH_ENTRIES = 128 };
 
-/* An entry of a table: the bits of the codeword (0 to 4), extra bits (8 to 11) and flags (5, 12 to 15), a value above. Of
- * SUBTABLE the extra bits are those that point into it, and the value its place; a PAIR is two literals. */
+/* A table entry: bits of the codeword (0 to 4), extra bits (8 to 11), flags (5, 12 to 15), and a value above. The extra bits
+ * of a SUBTABLE index it, and its value is its position; a PAIR is two literals. */
 enum { LITERAL = 0x8000, SUBTABLE = 0x4000, END = 0x2000, WRONG = 0x1000, PAIR = 0x20 };
 
 typedef struct code {
@@ -22,16 +22,16 @@ typedef struct code {
 
 typedef struct reader {
     const uint8_t *at, *end;
-    uint64_t bits; /* the next ones, lowest first; 0 behind the end */
-    int count;     /* of them that are there; below 0 when more were taken */
+    uint64_t bits; /* the next bits, lowest first; 0 after the end */
+    int count;     /* number of valid bits; negative if more were taken */
 } reader;
 
-/* At least 56 bits, where the stream has them. */
+/* Provide at least 56 bits, unless the stream ends. */
 static inline void refill(reader *r)
 {
     if (r->end - r->at >= 8) {
         uint64_t next = 0;
-        for (int i = 0; i < 8; i++) /* one load */
+        for (int i = 0; i < 8; i++) /* compiles to one load */
             next |= (uint64_t)r->at[i] << 8 * i;
         r->bits |= next << r->count;
         r->at += (63 - r->count) >> 3;
@@ -71,7 +71,7 @@ static uint32_t entry(const uint32_t *table, const reader *r, unsigned root)
     return e;
 }
 
-/* What symbols stand for. Lengths: 3 to 10 each by itself, then four to each number of extra bits (RFC 1951, 3.2.5). */
+/* The values of symbols. Lengths: 3 to 10 have a symbol each, then four symbols per number of extra bits (RFC 1951, 3.2.5). */
 static uint32_t literal_entry(unsigned symbol)
 {
     unsigned i = symbol - 257, extra = i < 8 ? 0 : i / 4 - 1;
@@ -95,14 +95,14 @@ static uint32_t length_entry(unsigned symbol)
     return symbol << 16;
 }
 
-/* Make the table of a code from the lengths of its codewords (COD-6). It may be incomplete where it has one codeword, of
- * one bit, or none, and at least `least`. */
+/* Build the table of a code from the lengths of its codewords (COD-6). It may be incomplete if it has no codeword or one of
+ * one bit, and at least `least` codewords. */
 static int make_table(const uint8_t *lengths, unsigned symbols, uint32_t (*means)(unsigned), unsigned root, unsigned least,
                       uint32_t *table)
 {
     unsigned counts[BITS_MAX + 1] = {0}, places[BITS_MAX + 2] = {0}, used = 0, reversed = 0, next = 1u << root;
     uint16_t order[LITERALS];
-    uint32_t left = 1u << BITS_MAX; /* of all sequences of BITS_MAX bits those without a codeword */
+    uint32_t left = 1u << BITS_MAX; /* sequences of BITS_MAX bits without a codeword */
     for (unsigned i = 0; i < symbols; i++)
         counts[lengths[i]]++;
     counts[0] = 0;
@@ -131,7 +131,7 @@ static int make_table(const uint8_t *lengths, unsigned symbols, uint32_t (*means
             for (unsigned at = reversed; at < 1u << root; at += 1u << bits)
                 table[at] = e;
         else {
-            if ((reversed & ((1u << root) - 1)) != prefix) { /* a new subtable, as large as its codewords need */
+            if ((reversed & ((1u << root) - 1)) != prefix) { /* a new subtable, sized for its codewords */
                 int room;
                 sub = bits - root;
                 room = 1 << sub;
@@ -147,7 +147,7 @@ static int make_table(const uint8_t *lengths, unsigned symbols, uint32_t (*means
                 table[(table[prefix] >> 16) + at] = e;
         }
         counts[bits]--;
-        bit = 1u << (bits - 1); /* the next codeword, its bits from the last to the first */
+        bit = 1u << (bits - 1); /* the next codeword, in reversed bit order */
         while (reversed & bit)
             bit >>= 1;
         reversed = bit ? (reversed & (bit - 1)) | bit : 0;
@@ -155,10 +155,10 @@ static int make_table(const uint8_t *lengths, unsigned symbols, uint32_t (*means
     return 1;
 }
 
-/* Where the bits that point to a literal hold the next one, too, both come from one entry. */
+/* Combine two literals in one entry if the bits that index the first also contain the second. */
 static int pair_literals(uint32_t *table)
 {
-    for (unsigned i = 1u << LITERAL_ROOT; i-- > 0;) { /* from above: what is looked up is no pair yet */
+    for (unsigned i = 1u << LITERAL_ROOT; i-- > 0;) { /* downwards, so that the entry looked up is not a pair yet */
         uint32_t e = table[i], next = table[i >> (e & 31)], bits = (e & 31) + (next & 31);
         if (e & LITERAL && next & LITERAL && bits <= LITERAL_ROOT)
             table[i] = LITERAL | PAIR | bits | (e & 0xFF0000) | (next & 0xFF0000) << 8;
@@ -179,7 +179,7 @@ static int fixed_code(code *c)
     return make_table(lengths, DISTANCES, distance_entry, DISTANCE_ROOT, 2, c->distances);
 }
 
-/* The head of a dynamic block. */
+/* Read the head of a dynamic block. */
 static int dynamic_code(reader *r, code *c)
 {
     static const uint8_t order[LENGTHS] = {16, 17, 18, 0, 8, 7, 9, 6, 10, 5, 11, 4, 12, 3, 13, 2, 14, 1, 15};
@@ -214,7 +214,7 @@ static int dynamic_code(reader *r, code *c)
            make_table(lengths + literals, distances, distance_entry, DISTANCE_ROOT, 0, c->distances);
 }
 
-/* `length` bytes from `distance` before, one after the other: the two may overlap. */
+/* Copy `length` bytes from `distance` back, in order, since the two ranges may overlap. */
 static inline void copy_match(uint8_t *to, size_t distance, size_t length, size_t room)
 {
     const uint8_t *from = to - distance;
@@ -228,7 +228,7 @@ static inline void copy_match(uint8_t *to, size_t distance, size_t length, size_
             to[i] = from[i];
 }
 
-/* One literal or two, and how many; two bytes are written. */
+/* Write one literal or two and return how many; always writes two bytes. */
 static inline size_t put_literals(reader *r, uint32_t e, uint8_t *out)
 {
     skip(r, e & 31);
@@ -237,7 +237,7 @@ static inline size_t put_literals(reader *r, uint32_t e, uint8_t *out)
     return 1 + (e >> 5 & 1);
 }
 
-/* The data of a fixed or dynamic block; how far the output goes then, or `wrong`. */
+/* Decode the data of a fixed or dynamic block; return the new end of the output, or `wrong`. */
 static size_t block_data(reader *reading, const code *c, uint8_t *out, size_t at, size_t size, size_t wrong)
 {
     reader r = *reading;
@@ -246,7 +246,7 @@ static size_t block_data(reader *reading, const code *c, uint8_t *out, size_t at
         uint32_t e;
         refill(&r);
         e = entry(c->literals, &r, LITERAL_ROOT);
-        if (e & LITERAL && size - at >= 6) { /* up to three times 15 bits and two bytes */
+        if (e & LITERAL && size - at >= 6) { /* at most three times 15 bits and two bytes */
             at += put_literals(&r, e, out + at);
             e = entry(c->literals, &r, LITERAL_ROOT);
             if (e & LITERAL) {
@@ -287,7 +287,7 @@ static size_t block_data(reader *reading, const code *c, uint8_t *out, size_t at
     return at;
 }
 
-/* A stored block. */
+/* Copy a stored block. */
 static size_t stored_data(reader *r, uint8_t *out, size_t at, size_t size, size_t wrong)
 {
     size_t length, complement;
@@ -296,7 +296,7 @@ static size_t stored_data(reader *r, uint8_t *out, size_t at, size_t size, size_
     complement = number(r, 16);
     if (r->count < 0 || length + complement != 0xFFFF || length > size - at)
         return wrong;
-    r->at -= r->count >> 3; /* what was looked at already */
+    r->at -= r->count >> 3; /* bytes already in `bits` */
     r->bits = 0;
     r->count = 0;
     if (length > (size_t)(r->end - r->at))

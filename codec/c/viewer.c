@@ -1,11 +1,11 @@
-/* A viewer in OpenGL 3.3 and GLFW, which draws as codec/EMBEDDING.md says:
+/* A viewer with OpenGL 3.3 and GLFW, which renders as described in codec/EMBEDDING.md:
  *
- *     cc -O3 csplat.c viewer.c -lz -lm -lglfw -lGL && ./a.out scene.csplat       drag to turn, scroll to come near
+ *     cc -O3 csplat.c viewer.c -lz -lm -lglfw -lGL && ./a.out scene.csplat       drag to turn, scroll to zoom
  *     ./a.out scene.csplat out.ppm 'W H fx fy cx cy near VIEWMAT'                one picture; 12 numbers, row by row
  *
- * The decoder's arrays lie in textures as they are. For each picture the CPU sorts the numbers of the splats by depth; the
- * vertex shader makes of each a rectangle around its ellipse, and evaluates SH. Where the GL library does not export its
- * functions (Windows) a loader is wanted. SPDX-License-Identifier: Apache-2.0 */
+ * Textures hold the decoder's arrays unchanged. For each picture the CPU sorts the indices of the splats by depth; the
+ * vertex shader draws a rectangle around each splat's ellipse and evaluates SH. If the GL library does not export its
+ * functions (Windows), a loader is required. SPDX-License-Identifier: Apache-2.0 */
 #include "csplat.h"
 
 #define GLFW_INCLUDE_GLCOREARB
@@ -16,7 +16,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* A pinhole: x right, y down, z forward; focal lengths and centre in pixels; from the scene's axes to its own, by rows. */
+/* A pinhole camera: x right, y down, z forward; focal lengths and centre in pixels; scene to camera axes, by rows. */
 typedef struct camera {
     int width, height;
     float focal[4], near, view[12];
@@ -24,11 +24,11 @@ typedef struct camera {
 
 static const csplat_info *info;
 static csplat_scene *scene;
-static size_t count;                                 /* of splats */
+static size_t count;                                 /* number of splats */
 static uint32_t *order, *keys, *other;               /* [count], for sorting */
-static double yaw = 0.5, pitch = -0.3, distance = 0; /* of the mouse, around `centre` */
+static double yaw = 0.5, pitch = -0.3, distance = 0; /* set by the mouse, around `centre` */
 static double centre[3];
-static GLuint frame; /* what is drawn into */
+static GLuint frame; /* render target */
 
 static const char vertex_text[] =
     "#version 330 core\n"
@@ -59,7 +59,7 @@ static const char vertex_text[] =
     "void main() {\n"
     "    int i = int(number);\n"
     "    vec3 mean = three(means, i), t = view * vec4(mean, 1), s = three(scales, i), width = exp(s);\n"
-    "    gl_Position = vec4(2, 2, 2, 1);\n" /* outside */
+    "    gl_Position = vec4(2, 2, 2, 1);\n" /* outside the picture */
     "    if (discs) width[s.x <= min(s.y, s.z) ? 0 : s.y <= s.z ? 1 : 2] = 0;\n"
     "    vec4 q = texelFetch(quats, i);\n" /* w x y z in x y z w */
     "    mat3 turn = mat3(1 - 2 * (q.z * q.z + q.w * q.w), 2 * (q.y * q.z + q.x * q.w), 2 * (q.y * q.w - q.x * q.z),\n"
@@ -108,7 +108,7 @@ static void *room(size_t bytes)
     return memory;
 }
 
-/* Decode a file; what it holds stays until the program ends. */
+/* Decode a file; its data is kept until the program ends. */
 static void read_scene(const char *path)
 {
     FILE *input = fopen(path, "rb");
@@ -173,7 +173,7 @@ static void put_texture(GLuint program, GLuint unit, const char *name, const flo
     glUniform1i(glGetUniformLocation(program, name), (GLint)unit);
 }
 
-/* Whatever does not change from picture to picture. */
+/* Set up everything that does not change between pictures. */
 static GLuint set_up(void)
 {
     const csplat_floats *v = &scene->values;
@@ -198,7 +198,7 @@ static GLuint set_up(void)
     glBindBuffer(GL_ARRAY_BUFFER, numbers);
     glEnableVertexAttribArray(0);
     glVertexAttribIPointer(0, 1, GL_UNSIGNED_INT, 0, NULL);
-    glVertexAttribDivisor(0, 1); /* a number for each instance of the rectangle */
+    glVertexAttribDivisor(0, 1); /* one index per instance of the rectangle */
     glGenRenderbuffers(1, &picture);
     glBindRenderbuffer(GL_RENDERBUFFER, picture);
     glGenFramebuffers(1, &frame);
@@ -209,8 +209,8 @@ static GLuint set_up(void)
     return program;
 }
 
-/* Numbers of the splats before the camera, from back to front; returns how many. Depths are positive, so that their bits
- * ascend as they do: two counting sorts, by the low and by the high 16 of them. */
+/* Write the indices of the splats in front of the camera, from back to front; return their number. Depths are positive, so
+ * their bits sort in the same order: two counting sorts, by the low and by the high 16 bits. */
 static size_t sort(const camera *c)
 {
     static uint32_t starts[2][65537];
@@ -222,7 +222,7 @@ static size_t sort(const camera *c)
         if (!(depth >= c->near))
             continue;
         memcpy(&keys[i], &depth, 4);
-        keys[i] = ~keys[i]; /* far ones first */
+        keys[i] = ~keys[i]; /* farthest first */
         order[kept++] = (uint32_t)i;
         starts[0][(keys[i] & 65535) + 1]++;
         starts[1][(keys[i] >> 16) + 1]++;
@@ -238,7 +238,7 @@ static size_t sort(const camera *c)
     return kept;
 }
 
-/* Draw into the frame, in floats: errors of 8 bits would add up, splat by splat. */
+/* Draw to the frame in floats: the rounding errors of 8 bits would add up with every splat. */
 static void draw(GLuint program, const camera *c)
 {
     const size_t kept = sort(c);
@@ -253,7 +253,7 @@ static void draw(GLuint program, const camera *c)
     glDrawArraysInstanced(GL_TRIANGLE_STRIP, 0, 4, (GLsizei)kept);
 }
 
-/* Draw a picture and write it. */
+/* Draw a picture and write it to a file. */
 static void shoot(GLuint program, char *words, const char *path)
 {
     double x[19];
@@ -282,11 +282,11 @@ static void shoot(GLuint program, char *words, const char *path)
         die("cannot write the picture");
 }
 
-/* A camera that looks at the centre from where the mouse has brought it. */
+/* Return a camera that looks at the centre from the position set by the mouse. */
 static camera orbit(int width, int height)
 {
     const double sy = sin(yaw), cy = cos(yaw), sp = sin(pitch), cp = cos(pitch);
-    const double turn[3][3] = {{cy, 0, -sy}, {-sp * sy, -cp, -sp * cy}, {-cp * sy, sp, -cp * cy}}; /* of right, up, back */
+    const double turn[3][3] = {{cy, 0, -sy}, {-sp * sy, -cp, -sp * cy}, {-cp * sy, sp, -cp * cy}}; /* to right, up, back */
     const char *axes = info->axes[0] ? info->axes : "RDF";
     camera c = {width, height, {(float)height, (float)height, (float)width / 2, (float)height / 2}, 0, {0}};
     c.near = 0.01F * (float)distance;
@@ -294,7 +294,7 @@ static camera orbit(int width, int height)
         double v[3], shift = row == 2 ? distance : 0;
         for (int i = 0; i < 3; i++) {
             v[i] = 0;
-            for (int k = 0; k < 3; k++) /* where +x, +y, +z of the scene lead */
+            for (int k = 0; k < 3; k++) /* directions of the scene's +x, +y, +z */
                 v[i] += turn[row][k] * ((axes[i] == "RUB"[k]) - (axes[i] == "LDF"[k]));
             c.view[4 * row + i] = (float)v[i];
             shift -= v[i] * centre[i];

@@ -2,8 +2,8 @@
  *
  *     make fuzz-c
  *
- * Mutants have their checksums repaired, most of them, and where a chunk changed its length the places of all chunks, so that
- * damage gets past the container. What csplat_decode accepts each other way of reading has to accept too. */
+ * Most mutants have their checksums repaired, and the offsets of all chunks if a chunk has changed its length, so that damage
+ * gets past the container. If csplat_decode accepts a file, all other ways of reading must accept it too. */
 #include "../csplat.c"
 
 size_t LLVMFuzzerMutate(uint8_t *data, size_t size, size_t max_size);
@@ -12,10 +12,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
 enum { CHUNKS_MAX = 4096 };
 
-/* What the mutator does is no coverage of the decoder. */
+/* Code of the mutator does not count as coverage of the decoder. */
 #define UNCOVERED __attribute__((no_sanitize("coverage")))
 
-/* A record that names a chunk: places of its fields in the file. */
+/* A record that names a chunk: positions of its fields in the file. */
 typedef struct entry {
     size_t size_at, offset_at, crc_at;
     uint32_t size;
@@ -42,7 +42,7 @@ static uint32_t checksum(const uint8_t *p, size_t size)
     return crc32_of(&tables, p, size);
 }
 
-/* The records that name chunks, as far as the index holds what its counts announce. */
+/* Find the records that name chunks, as far as the index is complete. */
 UNCOVERED static size_t find_entries(const uint8_t *data, size_t size, entry *out)
 {
     const uint8_t *head = data + SPEC_HEADER_SIZE;
@@ -112,7 +112,7 @@ UNCOVERED static void repair(uint8_t *data, size_t size)
     put_u32(data + SPEC_HEADER_AT_HEADER_CRC, checksum(data, SPEC_HEADER_AT_HEADER_CRC));
 }
 
-/* Give a chunk another payload, and all that lies behind it its new place. */
+/* Replace the payload of a chunk and update the offsets of all chunks after it. */
 UNCOVERED static size_t change_chunk(uint8_t *data, size_t size, size_t max_size, unsigned seed)
 {
     static entry entries[CHUNKS_MAX];
@@ -149,7 +149,7 @@ UNCOVERED size_t LLVMFuzzerCustomMutator(uint8_t *data, size_t size, size_t max_
     unsigned kind = (seed >> 20) % 16;
     if (kind < 11)
         size = change_chunk(data, size, max_size, seed);
-    else if (kind < 15 && size > SPEC_HEADER_SIZE) { /* header and index, in place */
+    else if (kind < 15 && size > SPEC_HEADER_SIZE) { /* mutate header and index in place */
         size_t index_size = get_u32(data + SPEC_HEADER_AT_INDEX_SIZE), end = SPEC_HEADER_SIZE + index_size;
         end = end < size ? end : size;
         LLVMFuzzerMutate(data + SPEC_HEADER_SIZE, end - SPEC_HEADER_SIZE, end - SPEC_HEADER_SIZE);
@@ -166,7 +166,7 @@ static int read_bytes(void *user, uint64_t offset, size_t size, void *into)
     return 1;
 }
 
-/* Everything but csplat_decode; whether all of it was accepted. */
+/* Read by every other way than csplat_decode; return whether all of it was accepted. */
 static int read_otherwise(csplat *file)
 {
     const csplat_info *info = csplat_get_info(file);
@@ -193,7 +193,7 @@ static int read_otherwise(csplat *file)
         band = malloc(tile.splat_count * 21 * sizeof(float));
         if (!integers.means || !integers.quats || !integers.sh[0] || !band)
             abort();
-        for (unsigned k = 1; k <= info->sh_degree; k++) { /* from either end: a band may find its indices in a lower one */
+        for (unsigned k = 1; k <= info->sh_degree; k++) { /* in either order, since a band may need the indices of a lower one */
             const unsigned l = (info->file_size + i) % 2 ? k : info->sh_degree + 1 - k;
             accepted &= csplat_read_packed_band(file, i, l, &packed) == CSPLAT_OK;
             if (packed.index)
@@ -227,7 +227,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     csplat_free_scene(file, scene);
     if (csplat_open(&other, &source, &small, NULL))
         abort();
-    /* The others do not ask for the budgets of csplat_decode. */
+    /* The other ways of reading do not check the budgets of csplat_decode. */
     if (csplat_last_error(file)->code != CSPLAT_E_LIMIT && accepted != read_otherwise(other))
         abort();
     csplat_close(file);

@@ -1,4 +1,4 @@
-/* csplat_inflate beside zlib, by libFuzzer: both take the same streams and give the same bytes. `make fuzz-c` */
+/* Compare csplat_inflate with zlib by libFuzzer: both accept the same streams and return the same bytes. `make fuzz-c` */
 #include "../inflate.c"
 
 #include <stdlib.h>
@@ -6,7 +6,7 @@
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
-/* The first byte says how many bytes less, or more, than zlib gives are asked for: none, mostly. */
+/* The first byte is the difference between the requested size and zlib's output: 0 in most cases. */
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
     enum { ROOM = 1 << 16 };
@@ -17,7 +17,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     int ended, right;
     if (size < 2 || inflateInit2(&z, -MAX_WBITS) != Z_OK)
         return 0;
-    coded = malloc(size - 1); /* of exactly that size: the sanitizer guards what follows */
+    coded = malloc(size - 1); /* exactly this size, so that the sanitizer detects reads beyond it */
     memcpy(coded, data + 1, size - 1);
     z.next_in = coded;
     z.avail_in = (uInt)size - 1;

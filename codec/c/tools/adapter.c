@@ -1,13 +1,13 @@
-/* The C decoder behind the protocol of the conformance suite (conformance/IMPLEMENTERS.md):
+/* Adapts the C decoder to the protocol of the conformance suite (conformance/IMPLEMENTERS.md):
  *
  *     csplat conformance decoder --cmd 'csplat_adapter {input} {outdir}'
  *
- * Without arguments it takes them from standard input, line by line in turn, and answers each pair with a line of JSON, {}
- * where the file was decoded: so that tests need not start a process for each file. Three numbers are budgets: splats, bytes,
- * bytes of a text.
+ * Without arguments it reads them from standard input, alternating line by line, and answers each pair with a line of JSON,
+ * which is {} if the file was decoded. Tests then need not start a process for each file. Three numbers are budgets: splats,
+ * bytes, bytes of a text.
  *
  * The file is decoded as a whole and tile by tile; from memory and through a callback; to floats, integers and packed
- * arrays. Where two of these disagree the adapter ends with status 2. */
+ * arrays. If two of these disagree, the adapter exits with status 2. */
 #include "csplat.h"
 
 #include <ctype.h>
@@ -95,7 +95,7 @@ static int64_t element_of(const csplat_columns *c, size_t row, unsigned column)
                                                          : ((const uint32_t *)c->data)[at]);
 }
 
-/* An integer of a packed attribute of splat i of a tile; `table` is its codebook, if it has one. */
+/* Return an integer of a packed attribute of splat i of a tile; `table` is its codebook, if any. */
 static int64_t packed_integer(const csplat_packed *p, const csplat_columns *table, size_t i, unsigned column, size_t *row)
 {
     const csplat_columns *from = &p->columns;
@@ -119,7 +119,7 @@ static int64_t packed_integer(const csplat_packed *p, const csplat_columns *tabl
     return element_of(from, at, column);
 }
 
-/* Whether packed values are the integers [n][columns], colours of `coefficients`. */
+/* Check packed values against the integers [n][columns], colours of `coefficients`. */
 static void compare(const csplat_packed *p, const csplat_columns *table, size_t n, unsigned columns, unsigned coefficients,
                     const int64_t *integers)
 {
@@ -132,7 +132,7 @@ static void compare(const csplat_packed *p, const csplat_columns *table, size_t 
     }
 }
 
-/* Whether a packed attribute of layer 0 has the integers [n][columns], which are no colours. */
+/* Check a packed attribute of layer 0 against the integers [n][columns], which are not colours. */
 static void compare_levels(const csplat_packed *p, size_t n, unsigned columns, const uint32_t *integers)
 {
     size_t row = 0;
@@ -165,7 +165,7 @@ static void compare_packed(csplat *file, uint32_t tile, size_t n, unsigned degre
     }
 }
 
-/* Whether a tile by itself, through a callback, has the values that it has in the whole scene. */
+/* Check a tile that is read alone, through a callback, against its values in the whole scene. */
 static void compare_floats(csplat *file, uint32_t tile, const csplat_tile *t, const csplat_scene *scene)
 {
     const size_t n = t->splat_count, k = ((size_t)scene->sh_degree + 1) * (scene->sh_degree + 1) - 1, first = (size_t)t->first;
@@ -268,7 +268,7 @@ static void put_all(csplat *file, csplat *other, const csplat_scene *scene)
     free(tile_splats);
 }
 
-/* Decode a file of a path; 1 where it was refused. */
+/* Decode the file at a path; return 1 if it was refused. */
 static int answer(const char *path)
 {
     csplat_source source = {from_memory, NULL, 0};

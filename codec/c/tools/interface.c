@@ -1,4 +1,4 @@
-/* What the conformance suite cannot ask: callers' functions that fail, budgets, wrong arguments, a lower degree.
+/* Tests beyond the conformance suite: failing callbacks, budgets, invalid arguments, a lower degree.
  *
  *     interface FILE...        status 0, or the number of a line that does not hold, on standard error */
 #include "csplat.h"
@@ -15,7 +15,7 @@
         }                                                            \
     } while (0)
 
-/* How many calls of a function of the caller work, and how many blocks of memory are out. */
+/* Number of callback calls that succeed, and number of allocated blocks of memory. */
 typedef struct caller {
     long allocations, reads, inflates, blocks;
     const unsigned char *data;
@@ -52,7 +52,7 @@ static int fail_to_inflate(void *user, const uint8_t *coded, size_t coded_size, 
     return 0;
 }
 
-/* Open through callbacks, read everything; the code. `d` comes back closed. */
+/* Open through callbacks, read everything, return the code. `d` is closed afterwards. */
 static csplat_code read_all(caller *c, size_t size, const csplat_options *options)
 {
     csplat_source source = {read_bytes, c, size};
