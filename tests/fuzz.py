@@ -132,8 +132,6 @@ def replay(name, paths):
 
 
 # Parent --------------------------------------------------------------------------------------------
-
-
 def run(name, args):
     """Share the cases among processes until time or count is used up; return tally, findings, coverage."""
     context = multiprocessing.get_context("spawn")
@@ -223,8 +221,6 @@ def report(name, tally, findings, reached, seconds, args):
 
 
 # Worker --------------------------------------------------------------------------------------------
-
-
 def work(k, name, args, clock, results, stop, scratch):
     """Run every case whose number is k modulo the number of processes."""
     target = made(name, scratch)

@@ -124,8 +124,6 @@ class Package:
 
 
 # What becomes of a mutant -----------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Task:
     """A mutant and the tests that judge it.
@@ -287,8 +285,6 @@ class Suite:
 
 
 # What is kept ----------------------------------------------------------------------------------------
-
-
 class State:
     """The mutants of a package and their verdicts, stored in a file.
 
@@ -366,8 +362,6 @@ def _by_others(entry: Mapping[str, Any]) -> str:
 
 
 # The command -----------------------------------------------------------------------------------------
-
-
 def main(words: list[str] | None = None) -> int:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

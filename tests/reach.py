@@ -95,8 +95,6 @@ class Project:
 
 
 # Copies of the project, and processes in them ---------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Answer:
     """The answer of a process or the reason for its absence, and the processor time with its children's."""
@@ -263,8 +261,6 @@ def _remove_bytecode(path: Path) -> None:
 
 
 # Lines -----------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Place:
     """A statement and what surrounds it.
@@ -353,8 +349,6 @@ class Importers:
 
 
 # Tests -----------------------------------------------------------------------------------------------
-
-
 class Recorder:
     """A plugin of pytest that switches coverage to the running test or fixture, and records the time of each.
 

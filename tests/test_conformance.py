@@ -78,7 +78,6 @@ def test_the_built_in_run_passes_every_vector_once_per_level():
     valid, invalid = (
         [one.name for one in vectors if one.name.split("/")[1][0] in "abc"] for vectors in (VALID, INVALID)
     )
-
     assert sorted(valid + invalid) == sorted(one.name for one in report.outcomes if one.level == "L1")
     assert valid == [one.name for one in report.outcomes if one.level == "L2"]
     assert valid == [one.name for one in report.outcomes if one.level == "L3"]
@@ -97,7 +96,6 @@ def test_files_are_those_that_the_manifest_names():
         path.relative_to(VECTORS).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in VECTORS.rglob("*.csplat")
     }
-
     assert {vector.file: vector.sha256 for vector in VECTOR_LIST} == found
 
 
@@ -105,7 +103,6 @@ def test_every_error_code_of_files_has_a_vector():
     from csplat import _spec
 
     codes = {vector.error["code"] for vector in INVALID}
-
     assert set(_spec.ERROR_NAMES) - {_spec.ERROR_INPUT} == codes
 
 
@@ -122,17 +119,14 @@ def test_a_file_beyond_the_splat_budget_is_refused_before_its_tiles_are_read():
     # LIM-1
     built = build(rich_scene())
     damaged = built.patched({"TILE.0.0/head.block_count": 0})
-
     with pytest.raises(csplat.LimitError) as caught:
         csplat.decode(damaged, limits=Limits(splats=4))
-
     assert (csplat.LimitError, "E_LIMIT", "LIM-1") == (type(caught.value), caught.value.code, caught.value.clause)
 
 
 def test_a_file_beyond_the_byte_budget_is_refused():
     # LIM-1
     data = named("extreme/tile_of_65536").data
-
     with pytest.raises(csplat.LimitError):
         csplat.decode(data, limits=Limits(bytes=1_000_000))
 
@@ -157,9 +151,7 @@ def test_a_wrong_hash_fails_the_run(monkeypatch):
     digest = vector.expect["floats"]["quats"]
     wrong = vector.expect | {"floats": vector.expect["floats"] | {"quats": [*digest[:2], "0" * 64]}}
     monkeypatch.setattr(decoder_suite, "load", lambda: [dataclasses.replace(vector, expect=wrong)])
-
     (failure,) = decoder_suite.run_builtin().failures
-
     assert ("L3", Status.FAILED, "floats.quats differs") == (failure.level, failure.status, failure.message)
 
 
@@ -167,15 +159,12 @@ def test_an_accepted_broken_file_fails_the_run(monkeypatch):
     vector = named("valid/quats")
     error = {"code": "E_RANGE", "clause": "QUA-2", "offset": 0, "also": [], "optional": ""}
     monkeypatch.setattr(decoder_suite, "load", lambda: [dataclasses.replace(vector, expect={}, error=error)])
-
     (failure,) = decoder_suite.run_builtin().failures
-
     assert (Status.FAILED, "accepted", "QUA-2") == (failure.status, failure.message, failure.clauses[0])
 
 
 def test_differing_decoding_functions_fail_the_run(monkeypatch):
     monkeypatch.setattr(csplat.decoder, "decode_integers", csplat.decoder.decode)
-
     report = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="invalid/quat_radicand"))
     assert report.passed
 
@@ -189,7 +178,6 @@ def test_differing_decoding_functions_fail_the_run(monkeypatch):
 
 def test_a_manifest_entry_round_trips():
     text = manifest.to_json(VECTOR_LIST)
-
     assert text == (VECTORS / "manifest.json").read_text(encoding="utf-8")
 
 

@@ -72,7 +72,6 @@ def test_pairs_are_found_however_the_file_is_ordered():
     order = np.random.default_rng(1).permutation(len(source))[:60_000]
     moved = source[order] + np.random.default_rng(2).uniform(-0.01, 0.01, (60_000, 3))
     found = pair_splats(source, moved, 0.06)
-
     np.testing.assert_array_equal(order, found.source_index)
     assert (0, 0, len(source) - 60_000) == (found.strays, found.surplus, found.missing)
 
@@ -81,7 +80,6 @@ def test_strays_and_surplus_are_distinguished():
     source = np.array([[0.0, 0, 0], [1, 0, 0], [5, 0, 0]])
     decoded = np.array([[0.1, 0, 0], [0.9, 0, 0], [1.1, 0, 0], [3, 0, 0]])
     found = pair_splats(source, decoded, 1.0)
-
     assert (1, 1, 1) == (found.strays, found.surplus, found.missing)
 
 
@@ -94,7 +92,6 @@ def test_duplicates_are_paired_one_by_one():
 
 def test_any_centre_can_be_paired():
     wild = np.array([[np.inf, 0, 0], [-1e300, 1e300, 0], [0, 0, 0]])
-
     assert 2 == pair_splats(np.zeros((1, 3)), wild, 1e-6).strays
     assert 3 == pair_splats(np.zeros((0, 3)), wild, 1.0).strays
     assert 5 == pair_splats(np.zeros((5, 3)), np.zeros((0, 3)), 1.0).missing
@@ -135,16 +132,9 @@ def encoder_here(preset="balanced"):
 
 #: Inputs whose SH, tiles, columns or ranges reach other code of the encoder with another preset.
 PRESET_DEPENDENT = (
-    "ordinary/degree_3",
-    "ordinary/glossy",
-    "ordinary/strong_colours",
-    "ordinary/one_splat",
-    "ordinary/extra_columns",
-    "nasty/far_doubles",
-    "nasty/huge_colours",
-    "nasty/empty_degree_3",
-    "nasty/duplicates",
-)
+    "ordinary/degree_3", "ordinary/glossy", "ordinary/strong_colours", "ordinary/one_splat", "ordinary/extra_columns",
+    "nasty/far_doubles", "nasty/huge_colours", "nasty/empty_degree_3", "nasty/duplicates",
+)  # fmt: skip
 
 
 @pytest.mark.slow
@@ -152,7 +142,6 @@ def test_our_encoder_passes_on_every_input():
     # CNF-5, CNF-6, SRC-3
     names = [name for name in INPUTS if name != "ordinary/surfaces"]  # another 3,644 splats like those of "glossy"
     report = run_encoder(PLACES, EncoderSuiteOptions(",".join(names), INTEGRITY, jobs=1), run=encoder_here())
-
     assert [] == report.failures
     assert len(report.outcomes) >= 150
     taken = [one for one in report.outcomes if one.name != DEGREE_4]
@@ -165,7 +154,6 @@ def test_our_encoder_passes_at_other_presets(preset):
     # CNF-5, CNF-6, SRC-3
     choice = EncoderSuiteOptions(",".join(PRESET_DEPENDENT), INTEGRITY, jobs=1)
     report = run_encoder(PLACES, choice, run=encoder_here(preset))
-
     assert [] == report.failures
     assert {*PRESET_DEPENDENT} == {one.name for one in report.outcomes if one.status is Status.PASSED}
 
@@ -178,7 +166,6 @@ def test_our_encoder_keeps_the_picture(preset, decibels):
     names = names if preset == "balanced" else names[:1]
     choice = EncoderSuiteOptions(",".join(names), ("L4",), psnr_min=decibels, jobs=1)
     report = run_encoder(PLACES, choice, render_score=run.psnr, run=encoder_here(preset))
-
     assert {*names} == {one.name for one in report.outcomes}
     assert [] == report.failures
 
@@ -188,7 +175,6 @@ def test_refusing_everything_passes_only_where_that_is_allowed():
     refuses = program("import sys; sys.exit('error: not today')")
     report = run_encoder(refuses, EncoderSuiteOptions("*/empty,broken/nothing"))
     ordinary = run_encoder(refuses, EncoderSuiteOptions("ordinary/one_splat"))
-
     assert report.passed
     assert {"nasty/empty", "broken/nothing"} == {one.name for one in report.outcomes}
     assert "refused: error: not today" in {one.message for one in report.outcomes}
@@ -197,7 +183,6 @@ def test_refusing_everything_passes_only_where_that_is_allowed():
 
 def test_a_traceback_is_a_crash():
     report = run_encoder(program("raise ValueError('oh')"), EncoderSuiteOptions("nasty/empty"))
-
     assert [(Status.CRASHED, "a traceback; its last line: ValueError: oh")] == [
         (one.status, one.message) for one in report.failures
     ]
@@ -211,7 +196,6 @@ def test_broken_inputs_must_not_be_accepted():
         return ProcessEnd(None, 0, b"", b"", 0.0)
 
     report = run_encoder(PLACES, EncoderSuiteOptions("broken/*"), run=take)
-
     messages = [one.message for one in report.failures]
     assert {name for name in INPUTS if name.startswith("broken/")} == {one.name for one in report.failures}
     assert ["accepted an input without splats"] * len(report.outcomes) == messages
@@ -220,7 +204,6 @@ def test_broken_inputs_must_not_be_accepted():
 def test_a_remaining_child_process_is_ended():
     lingering = program("import subprocess, sys; subprocess.Popen(['sleep', '600']); sys.exit('no')")
     ended = run_program(lingering, {"ply": "a", "out": "b"}, 30.0)
-
     assert (None, 1) == (ended.status, ended.returncode)
     assert ended.seconds < 20
 
@@ -231,7 +214,6 @@ def test_a_file_that_the_validator_passes_and_the_decoder_refuses_is_a_failure(m
 
     monkeypatch.setattr("csplat_conformance.encoders.file_checks.decode_scene", refuse)
     verdict, scene = check_stream(csplat.encode(ENCODABLE["ordinary/one_splat"].source().to_model((0.0, 0.0, 0.0))))
-
     assert (Status.FAILED, None) == (verdict.status, scene)
     assert "csplat's decoder refuses it" in verdict.message
 
@@ -241,7 +223,6 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
     one = ("--cmd", copying(tmp_path, "ordinary/one_splat"), "--filter", "*/one_splat")
     reports = ("--report", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
     result = invoke(*one, "--level", 3, *reports, "--keep", tmp_path / "kept")
-
     assert 0 == result.exit_code, result.output
     assert "all         3       3       0         0           0       0        0" in result.stdout
     report = json.loads((tmp_path / "r.json").read_text())
@@ -261,27 +242,22 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
 def test_failures_are_shown_with_their_clause(tmp_path):
     command = copying(tmp_path, "ordinary/degree_1", FAULTS["max_scale_linear"].data)
     result = invoke("--cmd", command, "--filter", "ordinary/degree_1", "--level", "1", "--junit", "-")
-
     assert 1 == result.exit_code
     (case,) = ET.fromstring(result.stdout).iter("testcase")  # noqa: S314 - our own text
     assert "TIL-11 E_BOX" in case[0].attrib["message"]
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("--filter", "nothing"), "no input matches 'nothing'"),
-        (("--filter", "*/degree_0", "--filter", "nothing"), "no input matches 'nothing'"),
-        (("--cmd", "true {ply}"), "lacks {out}"),
-        (("--cmd", "true '{ply} {out}"), "cannot be used"),
-        (("--cmd", "true {ply} {out} {what}"), "cannot be used"),
-        (("--cmd", "/no/such/encoder {ply} {out}", "--filter", "broken/cut"), "No such file"),
-        (("--level", "5"), "level is '5'"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), [
+    (("--filter", "nothing"), "no input matches 'nothing'"),
+    (("--filter", "*/degree_0", "--filter", "nothing"), "no input matches 'nothing'"),
+    (("--cmd", "true {ply}"), "lacks {out}"),
+    (("--cmd", "true '{ply} {out}"), "cannot be used"),
+    (("--cmd", "true {ply} {out} {what}"), "cannot be used"),
+    (("--cmd", "/no/such/encoder {ply} {out}", "--filter", "broken/cut"), "No such file"),
+    (("--level", "5"), "level is '5'"),
+])  # fmt: skip
 def test_wrong_arguments_are_reported_in_one_line(words, message):
     result = invoke(*words)
-
     assert (2 if "--level" in words else 1) == result.exit_code
     assert message in result.stderr
     assert 1 == len(result.stderr.strip().splitlines())
@@ -293,7 +269,6 @@ def test_without_a_renderer_pictures_are_skipped_with_a_note(tmp_path, monkeypat
 
     monkeypatch.setattr("csplat_tools.cli.conformance.require_renderer", absent)
     result = invoke("--cmd", copying(tmp_path, "ordinary/degree_1"), "--filter", "*/degree_1")
-
     assert 0 == result.exit_code
     assert "L4 SKIPPED: this needs numba" in result.stdout
     assert "L4  skipped  ordinary/degree_1  this needs numba" in result.stdout
@@ -337,7 +312,6 @@ def test_our_reader_refuses_degree_4(tmp_path):
     (tmp_path / "in.ply").write_bytes(one.make())
     rows = plyfile.PlyData.read(tmp_path / "in.ply")["vertex"].data
     source = one.source()
-
     assert (4, (64, 24, 3)) == (source.sh_degree, source.shN.shape)
     np.testing.assert_array_equal(rows["f_rest_49"], source.shN[:, 1, 2])  # blue comes after 48 of red and green
     with pytest.raises(InputError, match="SH degree 4"):
@@ -347,7 +321,6 @@ def test_our_reader_refuses_degree_4(tmp_path):
 def test_no_origin_brings_far_doubles_into_single_precision(tmp_path):
     model = csplat.read_ply(written(tmp_path, "nasty/far_doubles"))
     means = ENCODABLE["nasty/far_doubles"].source().means
-
     assert np.float64 == means.dtype
     assert model.means_double is not None
     for origin in (means[0], np.median(means, axis=0), np.round(means.mean(axis=0))):
@@ -367,40 +340,16 @@ def test_invalid_rows_are_not_in_the_source(name, left_out):
 
 #: Findings on PLY of programs that write something of their own: encoders need not read it.
 OTHER_PROGRAMS = [
-    "alias-columns",
-    "ambiguous-columns",
-    "colour-columns",
-    "colour-space",
-    "colours-are-rgb",
-    "filter-3d",
-    "half-floats",
-    "integer-columns",
-    "opacities-are-alphas",
-    "rgb-colours",
-    "scales-are-linear",
-    "second-columns",
-    "sh-bands",
-    "sharp-elements",
-    "unusual-header",
-    "unusual-rows",
-    "vertical-axis",
-]
+    "alias-columns", "ambiguous-columns", "colour-columns", "colour-space", "colours-are-rgb", "filter-3d",
+    "half-floats", "integer-columns", "opacities-are-alphas", "rgb-colours", "scales-are-linear", "second-columns",
+    "sh-bands", "sharp-elements", "unusual-header", "unusual-rows", "vertical-axis",
+]  # fmt: skip
 
 #: Findings on glTF, .splat, .ksplat, SOG and checkpoints.
 OTHER_FORMATS = [
-    "linear-colours",
-    "log-scales",
-    "logit-opacities",
-    "negative-scales",
-    "other-scenes",
-    "out-of-range-opacities",
-    "ranks",
-    "short-buffer",
-    "spz-axes",
-    "unclear-scales",
-    "zero-rows",
-    "zip-names",
-]
+    "linear-colours", "log-scales", "logit-opacities", "negative-scales", "other-scenes", "out-of-range-opacities",
+    "ranks", "short-buffer", "spz-axes", "unclear-scales", "zero-rows", "zip-names",
+]  # fmt: skip
 
 
 @pytest.mark.area(name="suite")
@@ -411,7 +360,6 @@ def test_inputs_cause_every_finding_of_lint(tmp_path):
         with contextlib.suppress(InputError):
             found |= {finding.id for finding in lint_ply(tmp_path / "in.ply")}
     known = set(re.findall(r"^\| `([a-z0-9-]+)` \|", lint.__doc__, re.MULTILINE))
-
     # Discs (2DGS) have a third scale for which there is no column, and no place in a source.
     assert {"flat-scales", *OTHER_PROGRAMS, *OTHER_FORMATS} == known - found
 
@@ -453,7 +401,6 @@ def test_another_quality_moves_the_required_psnr_of_all_pictures():
 def test_figures_for_comparison_are_those_of_the_inputs():
     # Written by `python -m csplat_bench figures`
     figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
-
     assert set(ENCODABLE) - {DEGREE_4} == set(figures)
     for name, by in figures.items():
         assert {"csplat"} <= set(by) <= {"csplat", "spz"}, name
@@ -464,7 +411,6 @@ def test_figures_for_comparison_are_those_of_the_inputs():
 def test_figures_of_ours_are_of_this_encoder(tmp_path, name):
     figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
     size = len(csplat.encode(csplat.read_ply(written(tmp_path, name))))
-
     assert size == pytest.approx(figures[name]["csplat"]["bytes"], rel=0.01)
 
 

@@ -49,23 +49,19 @@ def test_the_manifest_is_valid_by_its_schema():
     jsonschema.Draft202012Validator(SCHEMA).validate(MANIFEST)
 
 
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("valid/quats", {"sha256": "0"}),
-        ("valid/quats", {"expect": {}}),
-        ("valid/quats", {"clauses": []}),
-        ("valid/quats", {"note": "more"}),
-        ("valid/quats", {"name": "other/quats"}),
-        ("valid/quats", {"error": {"code": "E_CRC"}}),
-        ("invalid/index_crc", {"error": {}}),
-        ("invalid/index_crc", {"expect": {"header": {}}}),
-        ("render/ellipsoids", {"views": [{"psnr": 40}]}),
-    ],
-)
+@pytest.mark.parametrize(("name", "change"), [
+    ("valid/quats", {"sha256": "0"}),
+    ("valid/quats", {"expect": {}}),
+    ("valid/quats", {"clauses": []}),
+    ("valid/quats", {"note": "more"}),
+    ("valid/quats", {"name": "other/quats"}),
+    ("valid/quats", {"error": {"code": "E_CRC"}}),
+    ("invalid/index_crc", {"error": {}}),
+    ("invalid/index_crc", {"expect": {"header": {}}}),
+    ("render/ellipsoids", {"views": [{"psnr": 40}]}),
+])  # fmt: skip
 def test_the_schema_refuses_invalid_manifests(name, change):
     wrong = MANIFEST | {"vectors": [named(name) | change]}
-
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.Draft202012Validator(SCHEMA).validate(wrong)
 
@@ -74,7 +70,6 @@ def test_files_and_pictures_are_those_of_the_manifest():
     listed = {entry["file"]: entry["sha256"] for entry in MANIFEST["vectors"]}
     listed |= {view["picture"]: view["sha256"] for entry in MANIFEST["vectors"] for view in entry.get("views", ())}
     found = [path for path in VECTORS.rglob("*") if path.is_file() and not path.name.startswith("manifest")]
-
     assert listed == {
         path.relative_to(VECTORS).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in found
     }
@@ -98,7 +93,6 @@ def test_most_clauses_name_an_error_code():
 def test_every_clause_that_can_be_broken_is_broken_by_a_vector():
     found = {(entry["error"]["clause"], entry["error"]["code"]) for entry in MANIFEST["vectors"] if entry["error"]}
     unbroken = {clause for clause, codes in clauses_with_codes() if not {(clause, code) for code in codes} & found}
-
     assert set() == unbroken - {*UNBREAKABLE}
     assert set() == {*UNBREAKABLE} & {clause for clause, _ in found}, "no excuse is needed"
 
@@ -109,7 +103,6 @@ GUIDE_AS_WRITTEN = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding
 
 def test_the_guide_names_vectors_that_exist():
     names = {*re.findall(r"`((?:valid|extreme|invalid)/[a-z0-9_]+)`", GUIDE_AS_WRITTEN)}
-
     assert names
     assert set() == names - {entry["name"] for entry in MANIFEST["vectors"]}
 
@@ -117,7 +110,6 @@ def test_the_guide_names_vectors_that_exist():
 def test_patterns_of_the_guide_find_vectors():
     patterns = {*re.findall(r"'?((?:valid|extreme)/[a-z0-9_]*\*)'?", GUIDE_AS_WRITTEN)}
     names = [entry["name"] for entry in MANIFEST["vectors"]]
-
     assert patterns
     assert [] == [pattern for pattern in sorted(patterns) if not fnmatch.filter(names, pattern)]
 
@@ -126,23 +118,8 @@ def test_the_guide_walks_through_every_chapter_of_clauses():
     chapters = {clause.split("-")[0] for clause in clause_ids(TEXT)}
     # Not steps of a decoder: general rules, and groups that their neighbours' steps include.
     elsewhere = {
-        "NUM",
-        "RES",
-        "ORD",
-        "ATT",
-        "TLE",
-        "CDB",
-        "STR",
-        "TRF",
-        "BLK",
-        "LEV",
-        "AXI",
-        "LAT",
-        "RAW",
-        "MEA",
-        "QUA",
-    }
-
+        "NUM", "RES", "ORD", "ATT", "TLE", "CDB", "STR", "TRF", "BLK", "LEV", "AXI", "LAT", "RAW", "MEA", "QUA",
+    }  # fmt: skip
     assert [] == [chapter for chapter in chapters - elsewhere if chapter not in GUIDE_AS_WRITTEN]
 
 
@@ -178,7 +155,6 @@ def ids(names, legal):
 
 def test_every_attribute_occurs_in_each_legal_coding():
     legal = {(a, c) for a, names in _spec.ATTRIBUTE_CODINGS.items() for c in ids(_spec.CODING_NAMES, names)}
-
     assert legal == {(attribute, block.coding) for scene in SCENES for attribute, block in blocks(scene)}
 
 
@@ -187,7 +163,6 @@ def test_every_coding_has_streams_of_every_width():
         (c, w) for c, most in _spec.CODING_WIDTH_MAX.items() if c in _spec.CODING_NAMES for w in range(1, most + 1)
     }
     legal -= {(_spec.CODING_RAW, width) for width in (3, 5, 6, 7)}  # no type has them
-
     found = {(b.coding, how.width) for scene in SCENES for _, b in blocks(scene) for how in streams(b)}
     assert set() == legal - found
 
@@ -195,13 +170,11 @@ def test_every_coding_has_streams_of_every_width():
 @pytest.mark.parametrize("coder", ["stored", "deflate_stored", "deflate_fixed", "deflate_dynamic"])
 def test_every_list_of_transforms_meets_every_coder(coder):
     found = {how.transforms for s in SCENES for _, b in blocks(s) for how in streams(b) if how.coder == coder}
-
     assert 16 == len(found)
 
 
 def test_every_mapping_kind_type_flag_direction_measure_and_degree_occurs():
     mappings = {(a, m) for a, names in _spec.ATTRIBUTE_MAPPINGS.items() for m in ids(_spec.MAPPING_NAMES, names)}
-
     assert mappings == {(a, record.mapping) for scene in SCENES for a, record in scene.attributes.items()}
     assert set(_spec.CODEBOOK_KIND_NAMES) == {book.kind for scene in SCENES for book in scene.codebooks}
     dtypes = {extra.dtype for scene in SCENES for extra in scene.extras}
@@ -217,7 +190,6 @@ def test_every_mapping_kind_type_flag_direction_measure_and_degree_occurs():
 
 def test_every_attribute_that_a_codebook_may_serve_has_escapes():
     escaped = {attribute for scene in SCENES for attribute, block in blocks(scene) if block.escape}
-
     assert {a for a, names in _spec.ATTRIBUTE_CODINGS.items() if "codebook" in names} == escaped
 
 
@@ -343,7 +315,6 @@ def test_every_must_ends_in_a_clause_id():
     body = TEXT.split("## 3 Terms")[1].split("## 10 Versioning")[0]
     body = re.sub(r"```.*?```", "", body, flags=re.DOTALL)
     sentences = re.findall(r"[^.\n|][^|]*?MUST(?: NOT)?\b[^|]*?(?:\[[A-Z]{3}-\d+\]|\n\n)", body)
-
     assert [] == [sentence for sentence in sentences if not sentence.endswith("]")]
 
 
@@ -368,7 +339,6 @@ def test_an_excuse_that_points_at_a_test_finds_the_clause_there(clause):
 def test_the_worked_example_is_its_file_byte_for_byte():
     rows = worked_example_rows()
     data = b"".join(bytes.fromhex(digits) for _, digits in rows)
-
     assert (VECTORS / "valid" / "worked_example.csplat").read_bytes() == data
 
 
@@ -382,7 +352,6 @@ def test_the_worked_example_states_the_right_offsets():
 def test_the_worked_example_explains_the_right_values():
     floats = {name: array.tolist() for name, array in expected(example_scene()).floats.items()}
     half = 0.7071067690849304  # the binary32 that the text writes as 0.70710677
-
     assert [1.0, 0.25] == floats["opacities"]
     assert [[-3.0, -3.0, -3.0], [-2.0, -3.0, -4.0]] == floats["scales"]
     assert [[1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half]] == floats["quats"]

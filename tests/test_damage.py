@@ -103,7 +103,6 @@ def test_flipped_bits_with_all_checksums_repaired_are_refused_or_decoded():
 def test_trailing_bytes_are_refused(extra):
     with pytest.raises(csplat.FormatError) as caught:
         csplat.decode(SMALL + extra)
-
     assert ("E_TRAILING", len(SMALL)) == (caught.value.code, caught.value.offset)
 
 
@@ -261,27 +260,24 @@ def test_a_deflated_stream_of_three_byte_elements_is_signed():
     assert expected == found.tolist()
 
 
-@pytest.mark.parametrize(
-    ("fields", "clause", "place"),
-    [
-        ({"count": 3}, "STR-1", "count"),
-        ({"count": 0, "packed": 0}, "STR-1", "count"),
-        ({"count": 2**32 - 1, "packed": 2**32 - 1}, "STR-1", "count"),
-        ({"width": 0}, "STR-2", "width"),
-        ({"width": 5, "packed": 20}, "STR-2", "width"),
-        ({"transforms": b"\2\1\0\0"}, "STR-3", "transforms"),
-        ({"transforms": b"\1\1\0\0"}, "STR-3", "transforms"),
-        ({"transforms": b"\1\0\2\0"}, "STR-3", "transforms"),
-        ({"packed": 5}, "STR-4", "packed_size"),
-        ({"packed": 2**32 - 1}, "STR-4", "packed_size"),
-        ({"transforms": RUNS, "packed": 4}, "STR-5", "packed_size"),
-        ({"transforms": RUNS, "packed": 0}, "STR-5", "packed_size"),
-        ({"transforms": RUNS, "packed": 15}, "STR-5", "packed_size"),
-        ({"coded_size": 5}, "STR-6", "coded_size"),
-        ({"coded_size": 2**32 - 1}, "STR-6", "coded_size"),
-        ({"reserved": 1}, "RES-1", "reserved_0"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "clause", "place"), [
+    ({"count": 3}, "STR-1", "count"),
+    ({"count": 0, "packed": 0}, "STR-1", "count"),
+    ({"count": 2**32 - 1, "packed": 2**32 - 1}, "STR-1", "count"),
+    ({"width": 0}, "STR-2", "width"),
+    ({"width": 5, "packed": 20}, "STR-2", "width"),
+    ({"transforms": b"\2\1\0\0"}, "STR-3", "transforms"),
+    ({"transforms": b"\1\1\0\0"}, "STR-3", "transforms"),
+    ({"transforms": b"\1\0\2\0"}, "STR-3", "transforms"),
+    ({"packed": 5}, "STR-4", "packed_size"),
+    ({"packed": 2**32 - 1}, "STR-4", "packed_size"),
+    ({"transforms": RUNS, "packed": 4}, "STR-5", "packed_size"),
+    ({"transforms": RUNS, "packed": 0}, "STR-5", "packed_size"),
+    ({"transforms": RUNS, "packed": 15}, "STR-5", "packed_size"),
+    ({"coded_size": 5}, "STR-6", "coded_size"),
+    ({"coded_size": 2**32 - 1}, "STR-6", "coded_size"),
+    ({"reserved": 1}, "RES-1", "reserved_0"),
+])  # fmt: skip
 def test_inconsistent_stream_heads_are_refused(fields, clause, place):
     with pytest.raises(FormatError) as caught:
         read(**fields)
@@ -301,23 +297,20 @@ def test_a_truncated_head_is_refused():
         read_stream(Cursor(memoryview(bytes(19)), 0, 19, "TLE-3"), 1, 1)
 
 
-@pytest.mark.parametrize(
-    ("fields", "clause"),
-    [
-        ({"coded": b"abc"}, "COD-1"),
-        ({"coded": b"abcde"}, "COD-1"),
-        ({"coder": DEFLATE, "coded": b""}, "COD-2"),
-        ({"coder": DEFLATE, "coded": b"\xff\xff"}, "COD-2"),
-        ({"coder": DEFLATE, "coded": deflate(b"abc")}, "COD-2"),
-        ({"coder": DEFLATE, "coded": deflate(b"abcde")}, "COD-2"),
-        ({"coder": DEFLATE, "coded": deflate(b"abcd")[:-1]}, "COD-2"),
-        ({"coder": DEFLATE, "coded": deflate(b"abcd") + b"\0"}, "COD-2"),
-        ({"coder": DEFLATE, "coded": deflate(b"abcd") * 2}, "COD-2"),
-        ({"coder": DEFLATE, "coded": zlib.compress(b"abcd")}, "COD-2"),
-        ({"coded": b"a\1\1", "transforms": RUNS, "packed": 3}, "TRF-1"),
-        ({"coded": b"a\2\0", "transforms": RUNS, "packed": 3}, "TRF-1"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "clause"), [
+    ({"coded": b"abc"}, "COD-1"),
+    ({"coded": b"abcde"}, "COD-1"),
+    ({"coder": DEFLATE, "coded": b""}, "COD-2"),
+    ({"coder": DEFLATE, "coded": b"\xff\xff"}, "COD-2"),
+    ({"coder": DEFLATE, "coded": deflate(b"abc")}, "COD-2"),
+    ({"coder": DEFLATE, "coded": deflate(b"abcde")}, "COD-2"),
+    ({"coder": DEFLATE, "coded": deflate(b"abcd")[:-1]}, "COD-2"),
+    ({"coder": DEFLATE, "coded": deflate(b"abcd") + b"\0"}, "COD-2"),
+    ({"coder": DEFLATE, "coded": deflate(b"abcd") * 2}, "COD-2"),
+    ({"coder": DEFLATE, "coded": zlib.compress(b"abcd")}, "COD-2"),
+    ({"coded": b"a\1\1", "transforms": RUNS, "packed": 3}, "TRF-1"),
+    ({"coded": b"a\2\0", "transforms": RUNS, "packed": 3}, "TRF-1"),
+])  # fmt: skip
 def test_coded_bytes_of_another_size_or_coder_are_refused(fields, clause):
     with pytest.raises(FormatError, match=rf"E_CODER at byte \d+ \({clause}\)"):
         read(**fields)
@@ -397,21 +390,18 @@ def test_declared_errors_are_read():
     assert [("means", 0.5, 0.25), ("sh0", 1.0, 1.7)] == [(e.measure, e.max, e.rms) for e in errors.records]
 
 
-@pytest.mark.parametrize(
-    ("fields", "clause"),
-    [
-        ({"records": ((0, 1.0, 1.0),)}, "SER-1"),
-        ({"records": ((8, 1.0, 1.0),)}, "SER-1"),
-        ({"records": ((2, 1.0, 1.0), (2, 1.0, 1.0))}, "SER-1"),
-        ({"records": ((1, 1.0, 1.1),)}, "SER-2"),
-        ({"records": ((4, 1.0, 1.8),)}, "SER-2"),
-        ({"records": ((1, float("nan"), 0.0),)}, "SER-2"),
-        ({"records": ((1, float("inf"), 0.0),)}, "SER-2"),
-        ({"records": ((1, 1.0, -1.0),)}, "SER-2"),
-        ({"pruned_count": 1}, "SER-4"),
-        ({"flags": 2}, "RES-1"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "clause"), [
+    ({"records": ((0, 1.0, 1.0),)}, "SER-1"),
+    ({"records": ((8, 1.0, 1.0),)}, "SER-1"),
+    ({"records": ((2, 1.0, 1.0), (2, 1.0, 1.0))}, "SER-1"),
+    ({"records": ((1, 1.0, 1.1),)}, "SER-2"),
+    ({"records": ((4, 1.0, 1.8),)}, "SER-2"),
+    ({"records": ((1, float("nan"), 0.0),)}, "SER-2"),
+    ({"records": ((1, float("inf"), 0.0),)}, "SER-2"),
+    ({"records": ((1, 1.0, -1.0),)}, "SER-2"),
+    ({"pruned_count": 1}, "SER-4"),
+    ({"flags": 2}, "RES-1"),
+])  # fmt: skip
 def test_impossible_declared_errors_are_refused(fields, clause):
     with pytest.raises(FormatError, match=clause):
         decode(stated(**fields))

@@ -241,20 +241,16 @@ def test_limits_are_enforced(limits, name):
     decode(RICH, limits=Limits(splats=5, json_bytes=16))
 
 
-@pytest.mark.parametrize(
-    ("kind", "bands", "columns"),
-    [
-        (_spec.CODEBOOK_KIND_SHAPE, (0, 0), {0: 6}),
-        (_spec.CODEBOOK_KIND_SH, (1, 3), {1: 9, 2: 15, 3: 21}),
-        (_spec.CODEBOOK_KIND_SH, (2, 2), {2: 15}),
-    ],
-)
+@pytest.mark.parametrize(("kind", "bands", "columns"), [
+    (_spec.CODEBOOK_KIND_SHAPE, (0, 0), {0: 6}),
+    (_spec.CODEBOOK_KIND_SH, (1, 3), {1: 9, 2: 15, 3: 21}),
+    (_spec.CODEBOOK_KIND_SH, (2, 2), {2: 15}),
+])  # fmt: skip
 def test_the_budget_includes_codebooks(kind, bands, columns):
     entries = {layer: [[0] * c] * 7 for layer, c in columns.items()}
     built = build(replace(scene(3), codebooks=(Codebook(4, kind, entries, bands),)))
     arrays = 2 * 4 * (3 + 4 + 3 + 1 + 3 * 16)
     limit = arrays + 4 * 7 * sum(columns.values())
-
     decode(built.data, limits=Limits(bytes=limit))
     with pytest.raises(LimitError, match=f"{limit}"):
         decode(built.data, limits=Limits(bytes=limit - 1))

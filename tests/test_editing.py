@@ -259,15 +259,12 @@ def test_merging_checks_the_bytes_that_it_copies(halves):
 
 
 # Re-encoded scenes.
-@pytest.mark.parametrize(
-    ("degree", "fields", "options", "reason"),
-    [
-        (1, {}, {"scale_step": 0.1}, "different steps of scales"),
-        (3, {}, {}, "file 2 has SH of degree 3, file 1 of 1"),
-        (1, {"origin": (100.0, 0.0, 0.0)}, {}, "different origins"),
-        (1, {"extra": {"id": np.arange(50, dtype=np.int32)}}, {}, "different extra columns"),
-    ],
-)
+@pytest.mark.parametrize(("degree", "fields", "options", "reason"), [
+    (1, {}, {"scale_step": 0.1}, "different steps of scales"),
+    (3, {}, {}, "file 2 has SH of degree 3, file 1 of 1"),
+    (1, {"origin": (100.0, 0.0, 0.0)}, {}, "different origins"),
+    (1, {"extra": {"id": np.arange(50, dtype=np.int32)}}, {}, "different extra columns"),
+])  # fmt: skip
 def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, degree, fields, options, reason):
     first, second = make_model(40, 1), make_model(50, degree, **fields)
     files = [
@@ -288,15 +285,12 @@ def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, de
     assert distance.min(axis=0).max() < 1e-3
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be merged: RDF in .*a, RUB in .*b"),
-        (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
-        (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
-        (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),
-    ],
-)
+@pytest.mark.parametrize(("fields", "message"), [
+    (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be merged: RDF in .*a, RUB in .*b"),
+    (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
+    (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
+    (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),
+])  # fmt: skip
 def test_scenes_that_contradict_each_other_are_refused(make_model, tmp_path, fields, message):
     for name, its in zip("ab", fields, strict=True):
         (tmp_path / name).write_bytes(encode(make_model(20, 0, **its), EncodeOptions(preset="fast", **STEPS)))

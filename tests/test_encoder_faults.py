@@ -29,31 +29,17 @@ in_depth = pytest.mark.area(name="suite")
 #: Faults of every level and harm for `make test`; the others run when the suite changes.
 REPRESENTATIVES = (
     # L1
-    "half_a_file",
-    "writes_nothing",
-    "input_appended",
-    "temporary_left",
-    "time_in_options",
-    "blocks_swapped",
+    "half_a_file", "writes_nothing", "input_appended", "temporary_left", "time_in_options", "blocks_swapped",
     "max_scale_linear",
     # L2
-    "last_splat_dropped",
-    "y_and_z_swapped",
-    "axes_guessed",
-    "index_inverse",
-    "pruned_most",
+    "last_splat_dropped", "y_and_z_swapped", "axes_guessed", "index_inverse", "pruned_most",
     # L3
-    "quats_xyzw",
-    "sh2_max_understated",
-    "max_overstated",
-    "alpha_of_three",
+    "quats_xyzw", "sh2_max_understated", "max_overstated", "alpha_of_three",
     # L4
     "coarse",
     # freedoms
-    "talks",
-    "rounded_up",
-    "pruned_counted",
-)
+    "talks", "rounded_up", "pruned_counted",
+)  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +50,6 @@ def report_of():
 
 def test_there_are_faults_of_every_harm():
     harms = Counter(one.harm for one in FAULTS.values())
-
     assert set(Harm) == set(harms) == {FAULTS[name].harm for name in REPRESENTATIVES}
     assert {"", "L1", "L2", "L3", "L4"} == {FAULTS[name].caught[0] for name in REPRESENTATIVES}
     assert len(FAULTS) - harms[Harm.HARMLESS] >= 55
@@ -143,13 +128,9 @@ def test_every_fault_is_caught_and_every_freedom_is_left(report_of, group):
 
 
 ENDS = {
-    "half_a_file": Status.PARTIAL_OUTPUT,
-    "leaves_half": Status.PARTIAL_OUTPUT,
-    "writes_nothing": Status.NO_OUTPUT,
-    "status_3": Status.WRONG_STATUS,
-    "silent_refusal": Status.WRONG_ANSWER,
-    "max_overstated": Status.FAILED,
-}
+    "half_a_file": Status.PARTIAL_OUTPUT, "leaves_half": Status.PARTIAL_OUTPUT, "writes_nothing": Status.NO_OUTPUT,
+    "status_3": Status.WRONG_STATUS, "silent_refusal": Status.WRONG_ANSWER, "max_overstated": Status.FAILED,
+}  # fmt: skip
 
 
 def test_ends_of_a_run_are_distinguished(report_of):

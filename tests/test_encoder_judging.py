@@ -72,20 +72,14 @@ REFITTED = stating(refitted=lambda _: True, records=without("sh0", "sh1"))
 
 
 # Facts ---------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("fact", "message"),
-    [
-        ({"coordinate_system": "RDF"}, "axes is RDF"),
-        ({"unit_metres": 1.0}, "unit_metres is 1.0"),
-        ({"antialiased": True}, "antialiased is True"),
-        ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
-    ],
-)
+@pytest.mark.parametrize(("fact", "message"), [
+    ({"coordinate_system": "RDF"}, "axes is RDF"),
+    ({"unit_metres": 1.0}, "unit_metres is 1.0"),
+    ({"antialiased": True}, "antialiased is True"),
+    ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
+])  # fmt: skip
 def test_facts_that_differ_from_the_source_break_their_clause(plain, fact, message):
     content, *_ = judged(PLAIN, dataclasses.replace(plain, **fact), keep_extra=True)
-
     assert (Status.FAILED, ("SRC-3",)) == (content.status, content.clauses)
     assert message in content.message
 
@@ -100,7 +94,6 @@ def test_centres_in_doubles_are_compared_in_doubles():
     )
     scene = decode_scene(csplat.encode(model))
     content, pairs = check_content(dataclasses.replace(one, source=lambda: far), far, scene, None)
-
     assert (Status.PASSED, 0) == (content.status, pairs.missing)
 
 
@@ -109,7 +102,6 @@ def test_splats_without_a_near_source_are_named(plain):
     moved[:3, 0] += 7.0
     moved[5] = moved[6]
     content, errors, _ = judged(PLAIN, dataclasses.replace(plain, means=moved))
-
     assert (Status.FAILED, ("CNF-6", "SER-5")) == (content.status, content.clauses)
     far, near, _ = content.message.split("; ")
     assert re.fullmatch(r"3 splats of the file, the first splat \d+, are not within 0.03 of a splat of the source", far)
@@ -120,18 +112,14 @@ def test_splats_without_a_near_source_are_named(plain):
 
 
 # Stated errors -------------------------------------------------------------------------------------
-
-
 def test_errors_that_are_not_stated_are_not_proved(plain):
     _, errors, alone = judged(PLAIN, plain, silent)
-
     assert (Status.NOT_PROVED, "the file states no errors") == (errors.status, errors.message)
     assert alone == errors.message
 
 
 def test_refitted_attributes_are_not_proved_and_the_others_are(plain):
     _, errors, alone = judged(PLAIN, plain, REFITTED)
-
     assert (Status.NOT_PROVED, "sh0, sh1: refitted, no error is stated") == (errors.status, errors.message)
     assert "sh0, sh1 refitted" == alone
     assert errors.details["means"]["holds"]
@@ -145,7 +133,6 @@ def test_stated_errors_hold_for_refitted_attributes_too(plain):
         ),
     )
     _, errors, _ = judged(PLAIN, plain, halved)
-
     assert (Status.FAILED, ("SER-5",)) == (errors.status, errors.clauses)
     assert errors.message.startswith("means: max ")
     assert ", source splat " in errors.message
@@ -155,7 +142,6 @@ def test_stated_errors_hold_for_refitted_attributes_too(plain):
 
 def test_a_measure_that_is_missing_breaks_its_clause(plain):
     _, errors, _ = judged(PLAIN, plain, stating(records=without("sh1")))
-
     assert (Status.FAILED, ("SER-6",), "the file states no error of sh1") == (
         errors.status,
         errors.clauses,
@@ -165,13 +151,10 @@ def test_a_measure_that_is_missing_breaks_its_clause(plain):
 
 def test_an_empty_scene_has_no_errors(tmp_path):
     _, errors, alone = judged("nasty/empty", model_of("nasty/empty", tmp_path), silent)
-
     assert (Status.PASSED, "") == (errors.status, alone)
 
 
 # Coarse --------------------------------------------------------------------------------------------
-
-
 def test_our_coarsest_preset_stays_below_half_of_every_bound(monkeypatch, plain):
     for name in ("MEANS_PER_SEPARATION", "COVARIANCE_MAX", "COVARIANCE_RMS", "OPACITIES_MAX", "SH_MAX"):
         module = "csplat_conformance.encoders.error_checks"
@@ -180,19 +163,15 @@ def test_our_coarsest_preset_stays_below_half_of_every_bound(monkeypatch, plain)
         assert Status.PASSED is judged(PLAIN, plain, preset=preset)[1].status
 
 
-@pytest.mark.parametrize(
-    ("fields", "message"),
-    [
-        ({"opacities": lambda m: 1 / (1 + np.exp(-m.opacities))}, "opacities: an error of 0.49"),
-        ({"scales": lambda m: np.exp(m.scales)}, "covariance: an error of "),
-        ({"sh0": lambda m: np.clip(m.sh0, -0.5, 0.5)}, "sh0: an error of 0."),
-        ({"shN": lambda m: 0 * m.shN}, "sh1: an error of 0."),
-    ],
-)
+@pytest.mark.parametrize(("fields", "message"), [
+    ({"opacities": lambda m: 1 / (1 + np.exp(-m.opacities))}, "opacities: an error of 0.49"),
+    ({"scales": lambda m: np.exp(m.scales)}, "covariance: an error of "),
+    ({"sh0": lambda m: np.clip(m.sh0, -0.5, 0.5)}, "sh0: an error of 0."),
+    ({"shN": lambda m: 0 * m.shN}, "sh1: an error of 0."),
+])  # fmt: skip
 def test_large_errors_that_are_stated_cause_a_warning(plain, fields, message):
     wrong = dataclasses.replace(plain, **{name: np.asarray(make(plain), np.float32) for name, make in fields.items()})
     _, errors, _ = judged(PLAIN, wrong, honest(plain), attribute_psnr=60.0)
-
     assert Status.WARNED is errors.status
     assert message in errors.message
     assert "beyond" in errors.message
@@ -223,7 +202,6 @@ def honest(model):
 
 def test_a_coarse_file_causes_a_warning(plain):
     _, errors, _ = judged(PLAIN, plain, attribute_psnr=14.0, sh_coding="none")
-
     assert Status.WARNED is errors.status
     assert "is coarse: splat " in errors.message
 
@@ -242,8 +220,6 @@ def test_leaving_much_out_causes_a_warning():
 
 
 # Cut -----------------------------------------------------------------------------------------------
-
-
 @contextmanager
 def rounding(rint):
     """Make our encoder round in another way."""
@@ -271,7 +247,6 @@ def test_cut_values_are_distinguished_from_rounded_ones(tmp_path, name, cut):
     _, pairs = check_content(one, one.source(), scene, None)
     every = frozenset(("means", "covariance", "opacities", "sh0", "sh1", "sh2", "sh3"))
     lines = find_truncation(one.source(), scene.model, scene.header, pairs.source_index, every)
-
     assert ["means", "opacities", "scales", "quats", "sh0"] == [line.partition(":")[0] for line in lines][:5]
     assert all(line.endswith("truncated instead of rounded?") for line in lines), lines
     assert [] == find_truncation(one.source(), scene.model, scene.header, pairs.source_index, frozenset())
@@ -286,8 +261,6 @@ def test_coarse_steps_are_not_cuts(tmp_path, name, preset):
 
 
 # Pictures ------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def altered(monkeypatch, plain):
     """Run the suite over our file with altered statements."""
@@ -325,10 +298,8 @@ def test_pictures_judge_at_any_level_where_errors_prove_nothing(altered, change,
         statuses(seen)
     )
     assert seen.passed
-
     bad = altered(change, render_score=lambda *_: 11.0)
     assert ("L4", Status.FAILED) == statuses(bad)[-1]
-
     blind = altered(change)
     assert ("L4", Status.FAILED) == statuses(blind)[-1]
     assert f"{why}: only renders can check it, and no numba" == blind.outcomes[-1].message
@@ -366,7 +337,6 @@ def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypa
 
 def test_figures_are_those_of_the_file_that_the_suite_ships():
     shipped = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
-
     assert shipped[PLAIN] == peer_figures(PLAIN)
     assert {} == peer_figures("no/such")
 
@@ -376,12 +346,10 @@ def test_a_scene_that_cannot_be_drawn_fails_alone(altered):
         return dataclasses.replace(scene, model=dataclasses.replace(scene.model, origin=(1e300, 0.0, 0.0)))
 
     report = altered(far, ("L1", "L2", "L3", "L4"), lambda *_: 40.0)
-
     assert [Status.FAILED] == [one.status for one in report.outcomes if one.level == "L4"]
 
 
 # Reports -------------------------------------------------------------------------------------------
-
 REPORT = ConformanceReport(
     "encoder",
     "x",
@@ -412,7 +380,6 @@ def test_warnings_refusals_and_unproved_errors_are_counted_and_no_failures():
 
 def test_junit_contains_warnings_and_refusals():
     root = ET.fromstring(to_junit(REPORT))  # noqa: S314 - our own text
-
     assert {"tests": "4", "failures": "0", "errors": "0", "skipped": "2"}.items() <= root.attrib.items()
     cases = {case.get("name"): case for case in root.iter("testcase")}
     assert "warning: coarse <" == cases["b"].find("system-out").text

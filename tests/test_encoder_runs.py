@@ -67,26 +67,19 @@ def first(report):
 
 
 # Traces --------------------------------------------------------------------------------------------
-
-
 def test_ours_passes_in_this_process(encoded):
     report = run_encoder(COMMAND, EncoderSuiteOptions(PLAIN, ("L1", "L2", "L3")), run=running(encoded, lambda _: None))
-
     assert [Status.PASSED] * 3 == [one.status for one in report.outcomes]
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda at: at.ply.write_bytes(at.ply.read_bytes() + b"\n") and None, "the input was modified"),
-        (lambda at: at.ply.unlink(), "the input is gone"),
-        (lambda at: (at.out.parent / "x.tmp").touch(), "left x.tmp next to the output"),
-        (lambda at: (at.out.parent / "cache").mkdir(), "left cache next to the output"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda at: at.ply.write_bytes(at.ply.read_bytes() + b"\n") and None, "the input was modified"),
+    (lambda at: at.ply.unlink(), "the input is gone"),
+    (lambda at: (at.out.parent / "x.tmp").touch(), "left x.tmp next to the output"),
+    (lambda at: (at.out.parent / "cache").mkdir(), "left cache next to the output"),
+])  # fmt: skip
 def test_side_effects_of_a_run_are_failures(encoded, change, message):
     report = run_encoder(COMMAND, FILES, run=running(encoded, change))
-
     assert (Status.FAILED, (), message) == first(report)
 
 
@@ -98,7 +91,6 @@ def test_a_refusal_leaves_nothing(encoded, name):
         return 1
 
     report = run_encoder(COMMAND, EncoderSuiteOptions(name, ("L1",)), run=running(encoded, refuse))
-
     message = "refused, but left out.npy next to the output; refused, but left x.tmp next to the output"
     assert (Status.FAILED, (), message) == first(report)
 
@@ -106,7 +98,6 @@ def test_a_refusal_leaves_nothing(encoded, name):
 def test_the_working_directory_stays_empty():
     writes = program("import sys; open('core', 'w'); open(sys.argv[2], 'w'); sys.exit(0)")
     refuses = program("import sys; open('log', 'w'); sys.exit('error: no')")
-
     assert "file is empty" in first(run_encoder(writes, FILES))[2]  # an invalid file needs no further report
     assert (
         "refused, but left log in its working directory"
@@ -124,7 +115,6 @@ def test_files_in_the_command_are_found_from_another_directory(tmp_path, monkeyp
     python = shlex.quote(sys.executable)
     command = f"{python} 'tools/a b.py' --lib=tools/ small none.txt {{ply}}"
     ended = run_program(command, {"ply": "in.ply"}, 30.0, cwd=tmp_path / "other")
-
     lines = ended.stdout.decode().splitlines()
     assert [f"--lib={tmp_path}/tools|small|none.txt|in.ply", f"{tmp_path}/other"] == lines
 
@@ -134,15 +124,12 @@ def test_a_program_with_a_slash_is_one_of_the_callers_directory(tmp_path, monkey
     (tmp_path / "enc").chmod(0o755)
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path)
-
     assert (
         f"{tmp_path}/other\n".encode() == run_program("./enc {ply}", {"ply": "x"}, 30.0, cwd=tmp_path / "other").stdout
     )
 
 
 # Repetitions ---------------------------------------------------------------------------------------
-
-
 def changed_the_second_time(change):
     turns = []
 
@@ -165,7 +152,6 @@ def flip(place):
 def test_a_second_run_gives_the_same_bytes(encoded):
     differs = run_encoder(COMMAND, FILES, run=running(encoded, changed_the_second_time(flip(150))))
     status, clauses, message = first(differs)
-
     assert (Status.FAILED, ("CNF-10",)) == (status, clauses)
     assert message.startswith("two runs gave different files: first at byte 150, in attribute[")
 
@@ -179,13 +165,11 @@ def test_the_chunk_that_differs_is_named(encoded):
 def test_differing_lengths_are_reported(encoded):
     longer = changed_the_second_time(lambda at: at.out.write_bytes(encoded[0] + b"12345") and None)
     message = first(run_encoder(COMMAND, FILES, run=running(encoded, longer)))[2]
-
     assert f"({len(encoded[0]):,} and {len(encoded[0]) + 5:,} bytes): first at byte {len(encoded[0])}" in message
 
 
 def test_a_second_run_gives_the_same_index(encoded):
     other = changed_the_second_time(lambda at: np.save(at.index, encoded[1][::-1]))
-
     assert (Status.FAILED, ("CNF-10",), "two runs gave the same file but different source indices") == first(
         run_encoder(COMMAND, FILES, run=running(encoded, other))
     )
@@ -197,7 +181,6 @@ def test_a_second_run_ends_as_the_first(encoded):
         return 1
 
     report = run_encoder(COMMAND, FILES, run=running(encoded, changed_the_second_time(refuse)))
-
     assert "a second run ended differently: exit status 1, no file; its last line: error: no" == first(report)[2]
 
 
@@ -209,7 +192,6 @@ open(sys.argv[2], "wb").write(data + str(int(time.time())).encode() if ".again" 
 """
     began = time.monotonic()
     report = run_encoder(program(code), EncoderSuiteOptions(PLAIN, ("L1",), keep=tmp_path / "kept"))
-
     assert time.monotonic() - began >= REPEAT_SECONDS
     assert ("CNF-10",) == first(report)[1]
     # Kept files include both.
@@ -235,30 +217,18 @@ def test_files_of_an_earlier_run_are_not_accepted(encoded, tmp_path):
 
 
 # The source index ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (lambda index: index + 1, "splat "),
-        (np.argsort, "numbers of the index are wrong"),
-        (lambda index: index[:-1], "expected integers of shape [216]"),
-        (lambda index: index.astype(np.float64), "the source index is float64"),
-        (lambda index: index[:, None], "shape [216, 1]"),
-        (
-            lambda index: np.where(np.arange(216) == 5, index[6], index),
-            "splats 5 and 6 both have the source index",
-        ),
-        (
-            lambda index: np.where(np.arange(216) == 5, -1, index),
-            "the source index of splat 5 is -1, expected 0 to",
-        ),
-        (lambda index: np.where(np.arange(216) == 5, 2**40, index), "is 1099511627776, expected 0 to 215"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda index: index + 1, "splat "),
+    (np.argsort, "numbers of the index are wrong"),
+    (lambda index: index[:-1], "expected integers of shape [216]"),
+    (lambda index: index.astype(np.float64), "the source index is float64"),
+    (lambda index: index[:, None], "shape [216, 1]"),
+    (lambda index: np.where(np.arange(216) == 5, index[6], index), "splats 5 and 6 both have the source index"),
+    (lambda index: np.where(np.arange(216) == 5, -1, index), "the source index of splat 5 is -1, expected 0 to"),
+    (lambda index: np.where(np.arange(216) == 5, 2**40, index), "is 1099511627776, expected 0 to 215"),
+])  # fmt: skip
 def test_a_wrong_index_is_reported(encoded, change, message):
     report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at: np.save(at.index, change(encoded[1]))))
-
     status, clauses, found = first(report)
     assert (Status.FAILED, ("SRC-4",)) == (status, clauses)
     assert message in found
@@ -268,7 +238,6 @@ def test_a_wrong_number_names_splat_claim_and_nearest(encoded):
     wrong = encoded[1].copy()
     wrong[[3, 7]] = wrong[[7, 3]]
     report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at: np.save(at.index, wrong)))
-
     assert (
         f"the source index of splat 3 is {wrong[3]}, but the nearest source splat is {wrong[7]}"
         " (2 of 216 numbers of the index are wrong)"
@@ -280,21 +249,17 @@ def npy(text):
     return b"\x93NUMPY\1\0" + len(text).to_bytes(2, "little") + text
 
 
-@pytest.mark.parametrize(
-    ("write", "message"),
-    [
-        (lambda path: path.unlink(), "no source index was written"),
-        (lambda path: path.write_bytes(b"\x93NUMPY"), "is not a NumPy array file"),
-        (lambda path: path.write_bytes(b""), "is not a NumPy array file"),
-        (lambda path: path.write_bytes(b"PK\3\4" * 9), "is not a NumPy array file"),
-        (lambda path: np.save(path, np.array([None] * 216)), "is not a NumPy array file"),
-        (lambda path: path.write_bytes(npy(b"{'descr': '<u4', 'shape': (216,),")), "is not a NumPy array file"),
-        (lambda path: path.write_bytes(npy(b"{[]: 1}")), "is not a NumPy array file"),
-    ],
-)
+@pytest.mark.parametrize(("write", "message"), [
+    (lambda path: path.unlink(), "no source index was written"),
+    (lambda path: path.write_bytes(b"\x93NUMPY"), "is not a NumPy array file"),
+    (lambda path: path.write_bytes(b""), "is not a NumPy array file"),
+    (lambda path: path.write_bytes(b"PK\3\4" * 9), "is not a NumPy array file"),
+    (lambda path: np.save(path, np.array([None] * 216)), "is not a NumPy array file"),
+    (lambda path: path.write_bytes(npy(b"{'descr': '<u4', 'shape': (216,),")), "is not a NumPy array file"),
+    (lambda path: path.write_bytes(npy(b"{[]: 1}")), "is not a NumPy array file"),
+])  # fmt: skip
 def test_an_index_is_an_npy_file(encoded, write, message):
     report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at: write(at.index) and None))
-
     assert ("SRC-4",) == first(report)[1]
     assert message in first(report)[2]
 
@@ -330,18 +295,14 @@ def test_errors_are_proved_by_the_encoders_own_index(monkeypatch, tmp_path):
     exchanged = exchanged.source_index.copy()
     same = np.flatnonzero((one.source().means[exchanged] == one.source().means[exchanged[0]]).all(axis=1))
     exchanged[same] = np.roll(exchanged[same], 1)
-
     assert run_encoder(COMMAND, EncoderSuiteOptions(one.name, ("L3",)), run=run).passed
     np.testing.assert_array_equal(exchanged, ran[0])
 
 
 # Refusals ------------------------------------------------------------------------------------------
-
-
 def test_refusing_all_unusual_inputs_is_reported():
     refuses = program("import sys; print('error: unusual'); sys.exit(1)")
     report = run_encoder(refuses, EncoderSuiteOptions("nasty/empty,nasty/outlier,nasty/duplicates,broken/cut", ("L1",)))
-
     assert report.passed
     assert ["warning: nasty: 3 of 3 declined"] == list(report.notes)
     assert {"checks": 4, "passed": 1, "warned": 0, "declined": 3, "not proved": 0, "failed": 0, "skipped": 0} == (
@@ -360,17 +321,13 @@ def test_one_refusal_is_counted():
         return ProcessEnd(None, 0, b"", b"", 0.0)
 
     report = run_encoder("encoder {ply} {out}", EncoderSuiteOptions("nasty/empty*", ("L1",)), run=run)
-
     assert ["nasty: 1 of 2 declined"] == list(report.notes)
     assert (Status.DECLINED, (), "refused: error: no splats") == first(report)
 
 
 # Inputs as files -----------------------------------------------------------------------------------
-
-
 def test_inputs_are_written_as_files_with_a_list(tmp_path):
     listed = write_inputs(tmp_path)["inputs"]
-
     assert listed == json.loads((tmp_path / "inputs.json").read_text())["inputs"]
     assert list(INPUTS) == [entry["name"] for entry in listed]
     for entry in listed:
@@ -394,7 +351,6 @@ def test_inputs_are_written_as_files_with_a_list(tmp_path):
 
 def test_the_command_writes_inputs_and_runs_nothing(tmp_path):
     result = invoke("--write-inputs", tmp_path / "new", "--filter", "ordinary/degree_*,broken/cut")
-
     assert (0, f"5 inputs in {tmp_path / 'new'}\n") == (result.exit_code, result.stdout)
     files = {path.relative_to(tmp_path / "new").as_posix() for path in (tmp_path / "new").rglob("*.*")}
     assert {*(f"ordinary/degree_{d}.ply" for d in range(4)), "broken/cut.ply", "inputs.json"} == files
@@ -405,6 +361,5 @@ def test_the_command_writes_inputs_and_runs_nothing(tmp_path):
 @pytest.mark.parametrize("words", [("--cmd", "x {ply} {out}"), ("--level", 2), ("--keep", "y"), ("--jobs", 2)])
 def test_writing_inputs_accepts_no_option_of_a_run(tmp_path, words):
     result = invoke("--write-inputs", tmp_path / "new", *words)
-
     assert 2 == result.exit_code
     assert not (tmp_path / "new").exists()

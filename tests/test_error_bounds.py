@@ -163,7 +163,6 @@ def test_errors_agree_with_the_slow_twin(degree, doubles):
     source, decoded, index = scene(60, degree, 5 + degree, doubles=doubles)
     expected, found = twin(source, decoded, index), measure_pairs(source, decoded, index)
     reach = source.reach(decoded.origin)
-
     assert list(expected) == list(found)
     for name, pair in expected.items():
         for true, measured in zip(pair, found[name][:2], strict=True):
@@ -209,7 +208,6 @@ def test_errors_declared_in_single_precision_pass(spread):
         )
         true = measure_pairs(source, decoded, np.array([row]))["covariance"].max
         assert is_valid_bound("covariance", float(stated[row]), true, 0.0)
-
     alpha = np.float32(1) / (np.float32(1) + np.exp(-logits))
     rows = PlyRows(nothing, raw, scales, logits, nothing, nothing[:, None, :][:, :0])
     assert float(np.abs(alpha.astype(np.float64) - source_of_rows(rows).opacities).max()) < 2e-7 / 2
@@ -236,7 +234,6 @@ def test_rows_with_non_finite_values_are_no_splats():
     rows.scales[2, 0] = -np.inf
     rows.logits[3], rows.logits[4], rows.logits[5] = np.nan, np.inf, -np.inf
     rows.shN[6, 2, 1] = np.inf
-
     assert [False, False, False, False, True, True, False, True] == is_splat(rows).tolist()
     assert [1.0, 0.0] == source_of_rows(rows).opacities[:2].tolist()
 
@@ -246,7 +243,6 @@ def test_a_source_has_alphas_unit_quaternions_and_unchanged_means():
     rows = rows_of()
     rows.quats[3] = 0
     source = source_of_rows(rows)
-
     np.testing.assert_array_equal(rows.means, source.means)
     assert source.means.dtype == np.float64
     for j in range(8):
@@ -260,7 +256,6 @@ def test_a_source_about_another_origin_has_the_same_errors():
     source, decoded, index = scene(40, 0, 3, doubles=True)
     near = source.about(ORIGIN)
     ours, theirs = (measure_pairs(one, decoded, index)["means"].max for one in (source, near))
-
     assert abs(ours - theirs) <= bound_tolerance("means", ours, source.reach(ORIGIN))
     assert source.reach(ORIGIN) == pytest.approx(float(np.abs(source.means).max()), rel=1e-12)
     assert float(np.abs(near.to_model(ORIGIN).means).max()) < 20.0

@@ -92,27 +92,24 @@ def test_the_packed_columns_distinguish_it_from_a_plain_ply(tmp_path):
         read_ply(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (SMALL[:-1], "copy or download it again"),
-        (SMALL.replace(b"vertex 2", b"vertex 2000000000"), "copy or download it again"),
-        (SMALL.replace(b"vertex 2", b"vertex " + b"9" * 30), "header line"),
-        (SMALL.replace(b"vertex 2", b"vertex -2"), "header line"),
-        (built([ROW, ROW], [WORD]), "2 chunks for 1 splat,"),
-        (SMALL.replace(b"element sh 2", b"element sh 1"), "1 row of 9 SH"),
-        (SMALL.replace(b"property uchar f_rest_8\n", b""), "8 SH coefficients"),
-        (SMALL.replace(b"min_scale_x", b"min_scale_q"), "no float32 min_scale_x"),
-        (SMALL.replace(b"uint packed_scale", b"int packed_scale"), "no uint32 packed_scale"),
-        (SMALL.replace(b"packed_color", b"packed_scale"), "twice"),
-        (SMALL.replace(b"little", b"big"), "expected binary_little_endian"),
-        (SMALL.replace(b"made by hand", b"csplat origin 1 2"), r"a\.ply: .*3 finite numbers"),
-        (built([[*ROW[:4], float("nan"), *ROW[5:]]], [WORD]), "max_y of chunk 0 is not finite"),
-        (SMALL.replace(struct.pack("<f", -8), b"\1\0\xa0\x7f"), "min_scale_x of chunk 0 is not finite"),  # signalling
-        (built([ROW], [WORD], [range(72)], rest=72), "SH degree 4, expected at most 3: --sh-degree 3"),
-        (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .*, expected at most max_x"),
-    ],
-)
+@pytest.mark.parametrize(("data", "message"), [
+    (SMALL[:-1], "copy or download it again"),
+    (SMALL.replace(b"vertex 2", b"vertex 2000000000"), "copy or download it again"),
+    (SMALL.replace(b"vertex 2", b"vertex " + b"9" * 30), "header line"),
+    (SMALL.replace(b"vertex 2", b"vertex -2"), "header line"),
+    (built([ROW, ROW], [WORD]), "2 chunks for 1 splat,"),
+    (SMALL.replace(b"element sh 2", b"element sh 1"), "1 row of 9 SH"),
+    (SMALL.replace(b"property uchar f_rest_8\n", b""), "8 SH coefficients"),
+    (SMALL.replace(b"min_scale_x", b"min_scale_q"), "no float32 min_scale_x"),
+    (SMALL.replace(b"uint packed_scale", b"int packed_scale"), "no uint32 packed_scale"),
+    (SMALL.replace(b"packed_color", b"packed_scale"), "twice"),
+    (SMALL.replace(b"little", b"big"), "expected binary_little_endian"),
+    (SMALL.replace(b"made by hand", b"csplat origin 1 2"), r"a\.ply: .*3 finite numbers"),
+    (built([[*ROW[:4], float("nan"), *ROW[5:]]], [WORD]), "max_y of chunk 0 is not finite"),
+    (SMALL.replace(struct.pack("<f", -8), b"\1\0\xa0\x7f"), "min_scale_x of chunk 0 is not finite"),  # signalling
+    (built([ROW], [WORD], [range(72)], rest=72), "SH degree 4, expected at most 3: --sh-degree 3"),
+    (built([[ROW[3] + 1, *ROW[1:]]], [WORD]), "chunk 0 has min_x .*, expected at most max_x"),
+])  # fmt: skip
 def test_inconsistent_files_are_refused(tmp_path, data, message):
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(InputError, match=message):
@@ -136,15 +133,12 @@ def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path, degree):
     assert [("sh-bands", 72 - 3 * coefficients)] == [(one.id, one.count) for one in report]
 
 
-@pytest.mark.parametrize(
-    ("data", "found"),
-    [
-        (b"\xef\xbb\xbf" + SMALL, ["unusual-header"]),
-        (SMALL.replace(b"ply\nformat", b"PLY\nFORMAT").replace(b"end_h", b"END_H"), ["unusual-header"]),
-        (SMALL.replace(b"\n", b"\r", SMALL.partition(b"end_header\n")[0].count(b"\n") + 1), []),
-        (SMALL + SMALL, ["trailing-bytes"]),
-    ],
-)
+@pytest.mark.parametrize(("data", "found"), [
+    (b"\xef\xbb\xbf" + SMALL, ["unusual-header"]),
+    (SMALL.replace(b"ply\nformat", b"PLY\nFORMAT").replace(b"end_h", b"END_H"), ["unusual-header"]),
+    (SMALL.replace(b"\n", b"\r", SMALL.partition(b"end_header\n")[0].count(b"\n") + 1), []),
+    (SMALL + SMALL, ["trailing-bytes"]),
+])  # fmt: skip
 def test_unusual_files_are_read_and_reported(tmp_path, data, found):
     (tmp_path / "a.ply").write_bytes(data)
     report = []

@@ -282,19 +282,16 @@ def test_a_zip_within_a_zip_is_refused(tmp_path):
         csplat.read(zipped_folder(tmp_path / "a.zip", path))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"version": 2}, "version 2 of streamed"),
-        ({"tree": {"lods": 3}}, "not an object"),
-        ({"filenames": ["../a", "b", "c"]}, "outside"),
-        ({"filenames": []}, "integer from 0"),
-        ({"tree": {"children": 3}}, "not a list"),
-        ({"tree": {"lods": {"0": {"file": 0, "offset": 4, "count": 2}}}}, "up to 6"),
-        ({"tree": {"lods": {"x": {"file": 0, "offset": 4, "count": 2}}}}, "level is 'x'"),
-        ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 2}}}] * 2}}, "meta.json twice"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"version": 2}, "version 2 of streamed"),
+    ({"tree": {"lods": 3}}, "not an object"),
+    ({"filenames": ["../a", "b", "c"]}, "outside"),
+    ({"filenames": []}, "integer from 0"),
+    ({"tree": {"children": 3}}, "not a list"),
+    ({"tree": {"lods": {"0": {"file": 0, "offset": 4, "count": 2}}}}, "up to 6"),
+    ({"tree": {"lods": {"x": {"file": 0, "offset": 4, "count": 2}}}}, "level is 'x'"),
+    ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 2}}}] * 2}}, "meta.json twice"),
+])  # fmt: skip
 def test_inconsistent_levels_are_refused(tmp_path, changes, message):
     with pytest.raises(InputError, match=message):
         csplat.read(levels(tmp_path, **changes))
@@ -330,10 +327,8 @@ BAD = {
     "places beyond float32": (changed(["means", "maxs"], [0, 0, 300]), "float32"),
     "bounds the wrong way round": (changed(["means", "mins"], [9, 9, 9]), "means has mins 9, expected at most maxs"),
     "bounds of version 1 the wrong way round": (changed(["scales", "mins"], [9, 9, 9], 1), "scales has mins 9"),
-    "a pointer for a picture": (
-        changed([], 0, quats=b"version https://git-lfs.github.com/spec/v1\noid"),
-        "quats.webp is a pointer of",
-    ),
+    "a pointer for a picture": (changed([], 0, quats=b"version https://git-lfs.github.com/spec/v1\noid"),
+        "quats.webp is a pointer of"),
     "a list for an object": (changed(["means"], []), "means mins is missing"),
     "a short codebook": (changed(["scales", "codebook"], [1.0]), "codebook is shorter"),
     "no codebook": (changed(["sh0", "codebook"], []), "codebook has 0 numbers"),
@@ -345,16 +340,14 @@ BAD = {
     "pictures of two sizes": (changed([], 0, quats=webp(pixels(1, (8, 4)))), "4 x 8 pixels"),
     "far too many pixels": (changed([], 0, means_l=webp(np.zeros((900, 900, 4), np.uint8))), "900 x 900"),
     "a text for a picture": (changed([], 0, means_l=b"no picture"), "not a complete WebP"),
-    "a lossy picture": (
-        changed([], 0, scales=webp(pixels(3), lossless=False)),
-        "scales.webp is a lossy WebP, expected",
-    ),
+    "a lossy picture": (changed([], 0, scales=webp(pixels(3), lossless=False)),
+        "scales.webp is a lossy WebP, expected"),
     "half a picture": (changed([], 0, means_l=webp(pixels(0))[:50]), "not a complete WebP"),
     "brackets": (changed([], 0) | {"meta.json": b"[" * 100_000}, "too many brackets"),
     "no JSON": (changed([], 0) | {"meta.json": b"{"}, "not JSON"),
     "not an object": (changed([], 0) | {"meta.json": b"3"}, "is missing"),
     "no UTF-8": (changed([], 0) | {"meta.json": b"\xff\xff\xff"}, "not JSON"),
-}
+}  # fmt: skip
 
 
 def test_inconsistent_files_are_refused(tmp_path):

@@ -81,20 +81,17 @@ def plausible(rows):
     return table.tobytes()
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (b"<!DOCTYPE html><html>" + b"a" * 3083, "is a web page"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
-        (b'{"message": "Not Found"}'.ljust(64), "is JSON"),
-        (gzip.compress(bytes(100), mtime=0).ljust(64), "gunzip"),
-        (b"a text in many words of English".ljust(96), "hardly .splat: it is text, and begins with 'a text"),
-        (b"0.1234 0.5678 0.9012 1.0 0.5 0.5\n" * 32, "hardly .splat: it is text"),
-        (np.random.default_rng(0).normal(size=320).astype("<f4").tobytes(), "are not splats; the one .* has scales of"),
-        (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: [89].% of 40 rows are not splats"),
-        (bytes(64), "a rotation of the bytes 0, 0, 0, 0"),
-    ],
-)
+@pytest.mark.parametrize(("data", "message"), [
+    (b"<!DOCTYPE html><html>" + b"a" * 3083, "is a web page"),
+    (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "git lfs pull"),
+    (b'{"message": "Not Found"}'.ljust(64), "is JSON"),
+    (gzip.compress(bytes(100), mtime=0).ljust(64), "gunzip"),
+    (b"a text in many words of English".ljust(96), "hardly .splat: it is text, and begins with 'a text"),
+    (b"0.1234 0.5678 0.9012 1.0 0.5 0.5\n" * 32, "hardly .splat: it is text"),
+    (np.random.default_rng(0).normal(size=320).astype("<f4").tobytes(), "are not splats; the one .* has scales of"),
+    (np.random.default_rng(0).bytes(32 * 40), "hardly .splat: [89].% of 40 rows are not splats"),
+    (bytes(64), "a rotation of the bytes 0, 0, 0, 0"),
+])  # fmt: skip
 def test_implausible_splat_files_are_refused_unless_the_format_is_given(tmp_path, data, message):
     (tmp_path / "a.splat").write_bytes(data)
     with pytest.raises(InputError, match=message):
@@ -238,28 +235,25 @@ def test_ksplat_splats_that_are_not_finite_are_dropped_and_counted():
         assert [("nonfinite-rows", 2)] == [(one.id, one.count) for one in scene.findings]
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (simple(0)[:4095], "ends within its header"),
-        (ksplat(0, [], version=(0, 2)), r"version 0\.2, expected 0\.1"),
-        (ksplat(3, []), "compression level 3, expected at most 2"),
-        (ksplat(2, [], sh=(-np.inf, 1)), "SH from -inf"),
-        (ksplat(0, [], most=2**32 - 1), "4,294,967,295 sections, too many"),
-        (ksplat(0, [section(rows(0, 5, 0), 0, 0)], count=6), "5 splats in its sections, its header declares 6"),
-        (simple(0, degree=2)[:-1], "section 0 ends at byte"),
-        (simple(1, room=2**32 - 1), "section 0 ends at byte"),
-        (simple(1, buckets=2**32 - 1), "section 0 ends at byte"),
-        (simple(1, room=4), "5 splats, but space for 4"),
-        (ksplat(0, [section(rows(0, 1, 2), 0, 3)]), "SH degree 3, expected at most 2"),
-        (simple(1, partial=(1, 1)), "contain fewer than its 5 splats"),
-        (simple(1, full=2), "2 full and 2 partial buckets, expected 3"),
-        (simple(1, block=np.nan), "not finite"),
-        (simple(1, block=-5.0), "length of its blocks is -5"),
-        (ksplat(2, [section(rows(2, 5, 1), 2, 1)], sh=(2.0, -2.0)), "expected finite numbers"),
-        (simple(1, centres=CENTRES * np.float32(1.1e36)), "not finite"),
-    ],
-)
+@pytest.mark.parametrize(("data", "message"), [
+    (simple(0)[:4095], "ends within its header"),
+    (ksplat(0, [], version=(0, 2)), r"version 0\.2, expected 0\.1"),
+    (ksplat(3, []), "compression level 3, expected at most 2"),
+    (ksplat(2, [], sh=(-np.inf, 1)), "SH from -inf"),
+    (ksplat(0, [], most=2**32 - 1), "4,294,967,295 sections, too many"),
+    (ksplat(0, [section(rows(0, 5, 0), 0, 0)], count=6), "5 splats in its sections, its header declares 6"),
+    (simple(0, degree=2)[:-1], "section 0 ends at byte"),
+    (simple(1, room=2**32 - 1), "section 0 ends at byte"),
+    (simple(1, buckets=2**32 - 1), "section 0 ends at byte"),
+    (simple(1, room=4), "5 splats, but space for 4"),
+    (ksplat(0, [section(rows(0, 1, 2), 0, 3)]), "SH degree 3, expected at most 2"),
+    (simple(1, partial=(1, 1)), "contain fewer than its 5 splats"),
+    (simple(1, full=2), "2 full and 2 partial buckets, expected 3"),
+    (simple(1, block=np.nan), "not finite"),
+    (simple(1, block=-5.0), "length of its blocks is -5"),
+    (ksplat(2, [section(rows(2, 5, 1), 2, 1)], sh=(2.0, -2.0)), "expected finite numbers"),
+    (simple(1, centres=CENTRES * np.float32(1.1e36)), "not finite"),
+])  # fmt: skip
 def test_invalid_ksplat_files_are_refused(tmp_path, data, message):
     (tmp_path / "a.ksplat").write_bytes(data)
     with pytest.raises(InputError, match=message):

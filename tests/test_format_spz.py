@@ -53,16 +53,13 @@ def word(index, *three):
     return struct.pack("<I", index << 30 | fields[0] << 20 | fields[1] << 10 | fields[2])
 
 
-@pytest.mark.parametrize(
-    ("version", "positions", "rotation", "bare"),
-    [
-        (1, np.array([1.5, -2.0, 0.25], "<f2").tobytes(), bytes([255, 0, 0]), False),
-        (2, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), bytes([255, 0, 0]), True),
-        (2, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), bytes([255, 0, 0]), False),
-        (3, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), word(3, 511, -511, 0), False),
-        (4, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), word(0, 511, 0, -511), False),
-    ],
-)
+@pytest.mark.parametrize(("version", "positions", "rotation", "bare"), [
+    (1, np.array([1.5, -2.0, 0.25], "<f2").tobytes(), bytes([255, 0, 0]), False),
+    (2, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), bytes([255, 0, 0]), True),
+    (2, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), bytes([255, 0, 0]), False),
+    (3, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), word(3, 511, -511, 0), False),
+    (4, bytes([128, 1, 0, 0, 254, 255, 64, 0, 0]), word(0, 511, 0, -511), False),
+])  # fmt: skip
 def test_each_version_is_read(version, positions, rotation, bare):
     data = [positions, b"\x33", bytes([0, 51, 255]), bytes([0, 160, 255]), rotation, bytes([0, 128, 255] * 3)]
     model = checked(spz(version, data, degree=1, flags=1, bare=bare))
@@ -135,23 +132,20 @@ def test_bytes_after_the_splats_are_reported(tmp_path):
 MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
 
 
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        (spz(4, splats(4, degree=3), degree=4), "SH degree 4, expected at most 3: --sh-degree 3"),
-        (struct.pack("<4sI40x", b"NGSP", 5), "version 5"),
-        (gzip.compress(spz(4, splats(4)), mtime=0), "version 4, expected 1 to 4"),
-        (gzip.compress(b"NGSX" + bytes(40), mtime=0), "begins with b'NGSX'"),
-        (spz(3, splats(3), bits=31), "31 fractional bits"),
-        (spz(3, splats(3), flags=0x80), "levels of detail"),
-        (spz(3, splats(3), count=2**32 - 1), "4,294,967,295 splats, too many"),
-        (spz(4, splats(4), count=3), r"streams of \[18, 2, 6, 6, 8\] bytes, expected \[27, 3, 9, 9, 12\]"),
-        (MANY, "4,194,304 splats, too many"),
-        (spz(4, splats(4)) + b"\0", "its table declares"),
-        (spz(3, splats(3), extensions=bytes(1 << 21)), "bytes after its last splat"),
-        (spz(1, [b"\xff\xff" * 3, b"\1", bytes(3), bytes(3), bytes(3)]), "NaN or infinite"),
-    ],
-)
+@pytest.mark.parametrize(("data", "message"), [
+    (spz(4, splats(4, degree=3), degree=4), "SH degree 4, expected at most 3: --sh-degree 3"),
+    (struct.pack("<4sI40x", b"NGSP", 5), "version 5"),
+    (gzip.compress(spz(4, splats(4)), mtime=0), "version 4, expected 1 to 4"),
+    (gzip.compress(b"NGSX" + bytes(40), mtime=0), "begins with b'NGSX'"),
+    (spz(3, splats(3), bits=31), "31 fractional bits"),
+    (spz(3, splats(3), flags=0x80), "levels of detail"),
+    (spz(3, splats(3), count=2**32 - 1), "4,294,967,295 splats, too many"),
+    (spz(4, splats(4), count=3), r"streams of \[18, 2, 6, 6, 8\] bytes, expected \[27, 3, 9, 9, 12\]"),
+    (MANY, "4,194,304 splats, too many"),
+    (spz(4, splats(4)) + b"\0", "its table declares"),
+    (spz(3, splats(3), extensions=bytes(1 << 21)), "bytes after its last splat"),
+    (spz(1, [b"\xff\xff" * 3, b"\1", bytes(3), bytes(3), bytes(3)]), "NaN or infinite"),
+])  # fmt: skip
 def test_invalid_or_oversized_files_are_refused(tmp_path, data, message):
     (tmp_path / "a.spz").write_bytes(data)
     with pytest.raises(InputError, match=message):

@@ -100,33 +100,30 @@ def test_each_format_has_a_name_of_its_own():
     assert len(set(endings)) == len(endings)
 
 
-@pytest.mark.parametrize(
-    ("name", "data", "message"),
-    [
-        ("a.ply", b"", "empty"),
-        ("a.txt", b"hello, this is no scene", "no format that csplat knows"),
-        ("a.ply", b"hello, this is no scene", "not a PLY"),
-        ("a.spx", b"hello", "gsbox"),
-        ("a.gz", b"\x1f\x8b\x08\x00hello", "gunzip"),
-        ("a.glb", b"b3dm\1\0\0\0", "3D Tiles"),
-        ("a.ply", b"\x89PNG\r\n\x1a\n", "is a PNG, an image"),
-        ("a.json", b'{"cameras": []}', "is JSON"),
-        ("a.csplat", b"<?xml version='1.0'?><Error/>", "XML, probably"),
-        ("a.ply", b"\xef\xbb\xbf<html>", "a web page"),
-        ("a.ply", b"<!-- saved from url=(0030)https://example.org/ -->\n<html>", "a web page"),
-        ("a.spz", " <!DOCTYPE html><html>".encode("utf-16"), "a web page"),
-        ("a.splat", b"<title>Sign in</title>".ljust(64), "a web page"),
-        ("a.splat", b" " * 100 + b"<html>", "a web page"),
-        ("a.spz", b"\xef\xbb\xbfversion https://git-lfs.github.com/spec/v1\noid", "Git LFS"),
-        ("a.ply", b"/annex/objects/SHA256E-s1234--abc.ply\n", "a pointer of git-annex, .* run `git annex get`"),
-        ("a.splat", b"{\\rtf1\\ansi hello}".ljust(64), "is RTF, a text"),
-        ("a.splat", b"\x93NUMPY\1\0v\0{'descr': '<f4'", "is a NumPy array, not a scene"),
-        ("a.ckpt", b'\x3c\0\0\0\0\0\0\0{"means":{', "is safetensors, which csplat does not read"),
-        ("a.xz", b"\xfd7zXZ\0\0", "is xz, unpack it first, with unxz"),
-        ("a.ply", b"BZh91AY&SY", "is bzip2, unpack it first"),
-        ("a.csplat", b"\x1f\x8b\x08\0hello", "is gzip, unpack it first, with gunzip"),
-    ],
-)
+@pytest.mark.parametrize(("name", "data", "message"), [
+    ("a.ply", b"", "empty"),
+    ("a.txt", b"hello, this is no scene", "no format that csplat knows"),
+    ("a.ply", b"hello, this is no scene", "not a PLY"),
+    ("a.spx", b"hello", "gsbox"),
+    ("a.gz", b"\x1f\x8b\x08\x00hello", "gunzip"),
+    ("a.glb", b"b3dm\1\0\0\0", "3D Tiles"),
+    ("a.ply", b"\x89PNG\r\n\x1a\n", "is a PNG, an image"),
+    ("a.json", b'{"cameras": []}', "is JSON"),
+    ("a.csplat", b"<?xml version='1.0'?><Error/>", "XML, probably"),
+    ("a.ply", b"\xef\xbb\xbf<html>", "a web page"),
+    ("a.ply", b"<!-- saved from url=(0030)https://example.org/ -->\n<html>", "a web page"),
+    ("a.spz", " <!DOCTYPE html><html>".encode("utf-16"), "a web page"),
+    ("a.splat", b"<title>Sign in</title>".ljust(64), "a web page"),
+    ("a.splat", b" " * 100 + b"<html>", "a web page"),
+    ("a.spz", b"\xef\xbb\xbfversion https://git-lfs.github.com/spec/v1\noid", "Git LFS"),
+    ("a.ply", b"/annex/objects/SHA256E-s1234--abc.ply\n", "a pointer of git-annex, .* run `git annex get`"),
+    ("a.splat", b"{\\rtf1\\ansi hello}".ljust(64), "is RTF, a text"),
+    ("a.splat", b"\x93NUMPY\1\0v\0{'descr': '<f4'", "is a NumPy array, not a scene"),
+    ("a.ckpt", b'\x3c\0\0\0\0\0\0\0{"means":{', "is safetensors, which csplat does not read"),
+    ("a.xz", b"\xfd7zXZ\0\0", "is xz, unpack it first, with unxz"),
+    ("a.ply", b"BZh91AY&SY", "is bzip2, unpack it first"),
+    ("a.csplat", b"\x1f\x8b\x08\0hello", "is gzip, unpack it first, with gunzip"),
+])  # fmt: skip
 def test_other_files_are_refused_with_their_type(tmp_path, name, data, message):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(InputError, match=message):

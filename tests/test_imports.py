@@ -88,15 +88,12 @@ def test_a_limit_error_names_both_sides():
     assert ("max_splats", 10, 5) == (error.limit, error.wanted, error.allowed)
 
 
-@pytest.mark.parametrize(
-    "error",
-    [
-        errors.FormatError("E_CRC", 12, "CRC-1", found=1, wanted=2),
-        errors.UnsupportedError("x", code="E_VERSION", offset=8, clause="VER-1"),
-        errors.LimitError("x", 2, code="E_BUDGET", offset=3),
-        errors.InputError("x"),
-    ],
-)
+@pytest.mark.parametrize("error", [
+    errors.FormatError("E_CRC", 12, "CRC-1", found=1, wanted=2),
+    errors.UnsupportedError("x", code="E_VERSION", offset=8, clause="VER-1"),
+    errors.LimitError("x", 2, code="E_BUDGET", offset=3),
+    errors.InputError("x"),
+])  # fmt: skip
 def test_errors_survive_another_process_and_have_a_code(error):
     again = pickle.loads(pickle.dumps(error))  # noqa: S301 -- our own bytes
     assert str(error) == str(again)

@@ -208,17 +208,14 @@ def test_targets_of_a_model_and_a_file_give_the_same_bytes(files):
     assert all(isinstance(stage, str) and 0.0 <= done <= 1.0 for stage, done in stages)
 
 
-@pytest.mark.parametrize(
-    ("asked", "message"),
-    [
-        ({}, "no target"),
-        ({"psnr": 40.0, "size": 1000}, "one of them"),
-        ({"size": "5 parsecs"}, "expected bytes"),
-        ({"errors": {"colour": 1.0}}, "not a measure"),
-        ({"errors": {"means": "2mm"}}, "means is '2mm', expected a number"),
-        ({"psnr": "40"}, "psnr is '40', expected a number"),
-    ],
-)
+@pytest.mark.parametrize(("asked", "message"), [
+    ({}, "no target"),
+    ({"psnr": 40.0, "size": 1000}, "one of them"),
+    ({"size": "5 parsecs"}, "expected bytes"),
+    ({"errors": {"colour": 1.0}}, "not a measure"),
+    ({"errors": {"means": "2mm"}}, "means is '2mm', expected a number"),
+    ({"psnr": "40"}, "psnr is '40', expected a number"),
+])  # fmt: skip
 def test_an_invalid_target_is_refused_before_reading_the_scene(asked, message):
     with pytest.raises(InputError, match=message):
         csplat_tools.encode_to("absent.ply", **asked)
@@ -248,21 +245,14 @@ class Called(Exception):  # noqa: N818  # not an error
     """Ends a command when it calls the interface; carries the arguments."""
 
 
-@pytest.mark.parametrize(
-    ("words", "name", "given"),
-    [
-        (["encode", "scene.ply", "o", "--max-error", "means=0.01"], "encode_to", {"errors": {"means": 0.01}}),
-        (["encode", "scene.ply", "o", "--target-psnr", "40"], "encode_to", {"psnr": 40.0, "no_prune": False}),
-        (["encode", "scene.ply", "o", "--target-size", "5kB", "--no-prune"], "encode_to", {"size": 5000}),
-        (
-            ["simplify", "scene.ply", "o", "--keep", "0.5"],
-            "simplify",
-            {"keep": 0.5, "psnr": None, "max_psnr_drop": None},
-        ),
-        (["compare", "scene.ply", "scene.csplat", "--mode", "fast"], "compare", {"mode": "fast"}),
-        (["tradeoff", "scene.ply", "--what", "presets"], "tradeoff", {"say": None}),
-    ],
-)
+@pytest.mark.parametrize(("words", "name", "given"), [
+    (["encode", "scene.ply", "o", "--max-error", "means=0.01"], "encode_to", {"errors": {"means": 0.01}}),
+    (["encode", "scene.ply", "o", "--target-psnr", "40"], "encode_to", {"psnr": 40.0, "no_prune": False}),
+    (["encode", "scene.ply", "o", "--target-size", "5kB", "--no-prune"], "encode_to", {"size": 5000}),
+    (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {"keep": 0.5, "psnr": None, "max_psnr_drop": None}),
+    (["compare", "scene.ply", "scene.csplat", "--mode", "fast"], "compare", {"mode": "fast"}),
+    (["tradeoff", "scene.ply", "--what", "presets"], "tradeoff", {"say": None}),
+])  # fmt: skip
 @pytest.mark.usefixtures("views_once")
 def test_commands_call_the_public_functions(files, monkeypatch, words, name, given):
     monkeypatch.chdir(files[1].parent)
@@ -289,13 +279,10 @@ def test_the_size_of_a_model_is_that_of_a_plain_ply(files):
     assert replace(loaded, size_bytes=1).header == csplat.read_header(coded)
 
 
-@pytest.mark.parametrize(
-    ("words", "name", "kind"),
-    [
-        (["train", ".", "out.ply", "--iterations", "3"], "train", "DataSet"),
-        (["finetune", "scene.ply", "out.csplat", "--data", "."], "finetune", "SplatModel"),
-    ],
-)
+@pytest.mark.parametrize(("words", "name", "kind"), [
+    (["train", ".", "out.ply", "--iterations", "3"], "train", "DataSet"),
+    (["finetune", "scene.ply", "out.csplat", "--data", "."], "finetune", "SplatModel"),
+])  # fmt: skip
 def test_train_and_finetune_call_the_public_functions(tmp_path, monkeypatch, words, name, kind):
     pytest.importorskip("numba", reason="these commands require the extra [render]")
     pytest.importorskip("scipy", reason="data sets require the extra [render]")

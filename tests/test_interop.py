@@ -399,19 +399,16 @@ def test_shn_may_be_left_out(model):
     assert 0 == csplat.from_gsplat(splats).sh_degree
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"sh0": None}, "have no sh0"),
-        ({"sh0": None, "features": 1}, "appearance features"),
-        ({"means": np.zeros((20, 2))}, r"means has shape \[20, 2\]"),
-        ({"sh0": np.zeros((20, 2, 3))}, r"sh0 has shape \[20, 2, 3\], expected \[20, 1, 3\]"),
-        ({"opacities": np.full(20, np.nan)}, "NaN"),
-        ({"quats": np.full((20, 4), np.inf)}, "quats contains NaN"),
-        ({"quats": np.zeros((20, 3))}, r"quats has shape \[20, 3\]"),
-        ({"shN": "text"}, "shN is a str"),
-    ],
-)
+@pytest.mark.parametrize(("change", "says"), [
+    ({"sh0": None}, "have no sh0"),
+    ({"sh0": None, "features": 1}, "appearance features"),
+    ({"means": np.zeros((20, 2))}, r"means has shape \[20, 2\]"),
+    ({"sh0": np.zeros((20, 2, 3))}, r"sh0 has shape \[20, 2, 3\], expected \[20, 1, 3\]"),
+    ({"opacities": np.full(20, np.nan)}, "NaN"),
+    ({"quats": np.full((20, 4), np.inf)}, "quats contains NaN"),
+    ({"quats": np.zeros((20, 3))}, r"quats has shape \[20, 3\]"),
+    ({"shN": "text"}, "shN is a str"),
+])  # fmt: skip
 def test_from_gsplat_refuses_invalid_arrays(model, change, says):
     splats = {**csplat.to_gsplat(model), **change}
     splats = {name: value for name, value in splats.items() if value is not None}

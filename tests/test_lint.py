@@ -283,15 +283,12 @@ def coloured(kind, values, names=COLOURS, count=3):
     return rows
 
 
-@pytest.mark.parametrize(
-    ("kind", "largest", "names"),
-    [
-        ("|u1", 255, COLOURS),
-        ("<u2", 65535, ("diffuse_red", "diffuse_green", "diffuse_blue")),
-        ("<f4", 1, COLOURS),
-        ("<f8", 1, ("r", "g", "b")),
-    ],
-)
+@pytest.mark.parametrize(("kind", "largest", "names"), [
+    ("|u1", 255, COLOURS),
+    ("<u2", 65535, ("diffuse_red", "diffuse_green", "diffuse_blue")),
+    ("<f4", 1, COLOURS),
+    ("<f8", 1, ("r", "g", "b")),
+])  # fmt: skip
 def test_red_green_and_blue_replace_f_dc(path, kind, largest, names):
     rows = coloured(kind, (0, largest, largest // 5), names)
     put(path, rows)
@@ -303,13 +300,10 @@ def test_red_green_and_blue_replace_f_dc(path, kind, largest, names):
         assert np.array_equal(model.sh0, scene.model().sh0)
 
 
-@pytest.mark.parametrize(
-    ("kind", "values", "message"),
-    [
-        ("<f4", (0, 17, 255), "floats up to 255, expected 0 to 1"),
-        ("<i4", (0, 17, 255), "of type int32, int32, int32, expected uint8, uint16 or float"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "values", "message"), [
+    ("<f4", (0, 17, 255), "floats up to 255, expected 0 to 1"),
+    ("<i4", (0, 17, 255), "of type int32, int32, int32, expected uint8, uint16 or float"),
+])  # fmt: skip
 def test_colours_of_another_range_are_refused(path, kind, values, message):
     rows = coloured(kind, values)
     put(path, rows)
@@ -386,20 +380,17 @@ def test_extreme_filters_stay_finite(path):
     np.testing.assert_allclose(model.opacities[3], alpha_of_logits(rows["opacity"])[3] / 2**1.5, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("changes", "noted"),
-    [
-        ({"opacity": (0, 1)}, {"opacities-are-alphas"}),
-        ({"opacity": (-0.1, 1)}, set()),
-        ({"opacity": (-1e-7, 1.0000002)}, {"opacities-are-alphas"}),
-        ({"opacity": (0, 255)}, {"opacities-are-alphas"}),
-        ({"scale_0": (0, 0.1), "scale_1": (0, 2), "scale_2": (0, 0.1)}, {"scales-are-linear"}),
-        ({"scale_0": (0.3, 2), "scale_1": (0.5, 3), "scale_2": (1.5, 4)}, set()),  # from 1.3 to 55 in 40
-        ({"scale_0": (1e-3, 0.1), "scale_1": (1e-3, 2), "scale_2": (1e-3, 0.1)}, {"scales-are-linear"}),
-        ({"f_dc_0": (0, 1), "f_dc_1": (0, 1), "f_dc_2": (0, 1)}, {"colours-are-rgb"}),
-        ({"f_dc_0": (0, 255), "f_dc_1": (0, 255), "f_dc_2": (0, 255)}, {"colours-are-rgb"}),
-    ],
-)
+@pytest.mark.parametrize(("changes", "noted"), [
+    ({"opacity": (0, 1)}, {"opacities-are-alphas"}),
+    ({"opacity": (-0.1, 1)}, set()),
+    ({"opacity": (-1e-7, 1.0000002)}, {"opacities-are-alphas"}),
+    ({"opacity": (0, 255)}, {"opacities-are-alphas"}),
+    ({"scale_0": (0, 0.1), "scale_1": (0, 2), "scale_2": (0, 0.1)}, {"scales-are-linear"}),
+    ({"scale_0": (0.3, 2), "scale_1": (0.5, 3), "scale_2": (1.5, 4)}, set()),  # from 1.3 to 55 in 40
+    ({"scale_0": (1e-3, 0.1), "scale_1": (1e-3, 2), "scale_2": (1e-3, 0.1)}, {"scales-are-linear"}),
+    ({"f_dc_0": (0, 1), "f_dc_1": (0, 1), "f_dc_2": (0, 1)}, {"colours-are-rgb"}),
+    ({"f_dc_0": (0, 255), "f_dc_1": (0, 255), "f_dc_2": (0, 255)}, {"colours-are-rgb"}),
+])  # fmt: skip
 def test_values_after_their_activation_are_noted(path, changes, noted):
     for count in (40, 8):
         rows = good_rows(count)
@@ -413,15 +404,12 @@ def test_values_after_their_activation_are_noted(path, changes, noted):
         read_ply(path, strict=True)
 
 
-@pytest.mark.parametrize(
-    ("names", "after", "message"),
-    [
-        (["x", "y", "z", *COLOURS], [], r"but a point cloud \(it has x, y, z, red, green, blue\): csplat train"),
-        (["x", "y", "z"], ["element face 0", "property list uchar int vertex_indices"], "but a mesh"),
-        (["x", "y", "z", "f_offset_0", "f_anchor_feat_0", "opacity"], [], "but anchors of Scaffold-GS"),
-        ([*without("scale_0", "scale_1", "scale_2"), "scale_x"], [], "no column scale_0, scale_1, scale_2.* it has x"),
-    ],
-)
+@pytest.mark.parametrize(("names", "after", "message"), [
+    (["x", "y", "z", *COLOURS], [], r"but a point cloud \(it has x, y, z, red, green, blue\): csplat train"),
+    (["x", "y", "z"], ["element face 0", "property list uchar int vertex_indices"], "but a mesh"),
+    (["x", "y", "z", "f_offset_0", "f_anchor_feat_0", "opacity"], [], "but anchors of Scaffold-GS"),
+    ([*without("scale_0", "scale_1", "scale_2"), "scale_x"], [], "no column scale_0, scale_1, scale_2.* it has x"),
+])  # fmt: skip
 def test_other_contents_are_named(path, names, after, message):
     rows = good_rows(names=names)
     path.write_bytes(header(rows, after=after) + rows.tobytes())
@@ -453,19 +441,16 @@ def lines_of(rows):
 ROWS = good_rows(4)  # an x of 3.0 in the last row
 
 
-@pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        (lambda lines: "\n".join(lines).replace(".", ","), "decimal commas"),
-        (lambda lines: "\n".join(lines).replace(".", ",").replace(" ", ";"), "decimal commas"),
-        (lambda lines: "\n".join(lines).replace(" ", ", "), "commas or semicolons between numbers"),
-        (lambda lines: "\n" + "\n\n".join(lines) + "\n\n", "blank lines"),
-        (lambda lines: "\n".join(lines).replace("\n3.0 ", "\n3D+00 "), "an exponent as Fortran writes it (1"),
-        (" ".join, "all values in one line"),
-        (lambda lines: "\n".join(lines).replace(" ", "\n"), "4 of vertex in 104 lines"),
-        (lambda lines: "\r".join([" ".join(lines[:2]), " ".join(lines[2:])]), "4 of vertex in 2 lines"),
-    ],
-)
+@pytest.mark.parametrize(("written", "message"), [
+    (lambda lines: "\n".join(lines).replace(".", ","), "decimal commas"),
+    (lambda lines: "\n".join(lines).replace(".", ",").replace(" ", ";"), "decimal commas"),
+    (lambda lines: "\n".join(lines).replace(" ", ", "), "commas or semicolons between numbers"),
+    (lambda lines: "\n" + "\n\n".join(lines) + "\n\n", "blank lines"),
+    (lambda lines: "\n".join(lines).replace("\n3.0 ", "\n3D+00 "), "an exponent as Fortran writes it (1"),
+    (" ".join, "all values in one line"),
+    (lambda lines: "\n".join(lines).replace(" ", "\n"), "4 of vertex in 104 lines"),
+    (lambda lines: "\r".join([" ".join(lines[:2]), " ".join(lines[2:])]), "4 of vertex in 2 lines"),
+])  # fmt: skip
 def test_unambiguous_rows_of_text_are_read(path, written, message):
     path.write_bytes(header(ROWS, kind="ascii") + written(lines_of(ROWS)).encode())
     assert message in found(path)["unusual-rows"].text
@@ -483,15 +468,12 @@ def test_nan_and_infinity_are_read_in_other_spellings(path, word):
     assert 3 == len(read_ply(path))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("\n3.0 ", "\n3,0 ", "row 3 of vertex: x is '3,0', expected a number"),
-        ("\n3.0 ", "\n3.0.0 ", r"row 3 of vertex: x is '3\.0\.0', expected a number"),
-        ("\n3.0 ", "\n", "row 3 of vertex has 25 values, expected 26"),
-        ("\n2.0 ", " 9.0\n", "row 1 of vertex has 27 values, expected 26"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ("\n3.0 ", "\n3,0 ", "row 3 of vertex: x is '3,0', expected a number"),
+    ("\n3.0 ", "\n3.0.0 ", r"row 3 of vertex: x is '3\.0\.0', expected a number"),
+    ("\n3.0 ", "\n", "row 3 of vertex has 25 values, expected 26"),
+    ("\n2.0 ", " 9.0\n", "row 1 of vertex has 27 values, expected 26"),
+])  # fmt: skip
 def test_ambiguous_rows_of_text_are_refused(path, old, new, message):
     path.write_bytes(header(ROWS, kind="ascii") + "\n".join(lines_of(ROWS)).replace(old, new, 1).encode())
     with pytest.raises(InputError, match=message):
@@ -515,18 +497,15 @@ def test_rows_of_text_end_at_the_declared_count(path):
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
-@pytest.mark.parametrize(
-    ("written", "message"),
-    [
-        (lambda head: b"\xef\xbb\xbf" + head, "a byte order mark"),
-        (lambda head: head.replace(b"element", b"\nelement"), "a blank line"),
-        (lambda head: head.replace(b"end_header", b" \n\nend_header"), "2 blank lines"),
-        (lambda head: head.replace(b"vertex", b"Vertex"), "capitals in Vertex"),
-        (lambda head: head.upper(), "capitals in PLY FORMAT"),
-        (lambda head: head.replace(b"end_header", b"end_header \t"), "spaces next to end_header"),
-        (lambda head: head.replace(b"\n", b"\r\n", 4), "line ends of two kinds"),
-    ],
-)
+@pytest.mark.parametrize(("written", "message"), [
+    (lambda head: b"\xef\xbb\xbf" + head, "a byte order mark"),
+    (lambda head: head.replace(b"element", b"\nelement"), "a blank line"),
+    (lambda head: head.replace(b"end_header", b" \n\nend_header"), "2 blank lines"),
+    (lambda head: head.replace(b"vertex", b"Vertex"), "capitals in Vertex"),
+    (lambda head: head.upper(), "capitals in PLY FORMAT"),
+    (lambda head: head.replace(b"end_header", b"end_header \t"), "spaces next to end_header"),
+    (lambda head: head.replace(b"\n", b"\r\n", 4), "line ends of two kinds"),
+])  # fmt: skip
 def test_headers_in_other_spellings_are_read(path, kind, written, message):
     body = ROWS.tobytes() if kind != "ascii" else ("\n".join(lines_of(ROWS)) + "\n").encode()
     path.write_bytes(written(header(ROWS, kind=kind, before=["comment Made by É"])) + body)
@@ -606,15 +585,12 @@ def test_quantised_values_are_refused(path):
         read_ply(path)
 
 
-@pytest.mark.parametrize(
-    ("changed", "kind", "message"),
-    [
-        (["opacity"], "u1", "opacity is of type uint8, expected float: export"),
-        (["f_dc_0", "f_dc_1", "f_dc_2"], "u1", "are of type uint8, expected float: rename colours of 0 to 255 to red"),
-        (["scale_0", "rot_2"], "i4", "scale_0, rot_2 are of type int32, expected float"),
-        (without(*"xyz", "nx", "ny", "nz"), "u2", "are of type uint16, expected float"),  # NaN as halves
-    ],
-)
+@pytest.mark.parametrize(("changed", "kind", "message"), [
+    (["opacity"], "u1", "opacity is of type uint8, expected float: export"),
+    (["f_dc_0", "f_dc_1", "f_dc_2"], "u1", "are of type uint8, expected float: rename colours of 0 to 255 to red"),
+    (["scale_0", "rot_2"], "i4", "scale_0, rot_2 are of type int32, expected float"),
+    (without(*"xyz", "nx", "ny", "nz"), "u2", "are of type uint16, expected float"),  # NaN as halves
+])  # fmt: skip
 def test_integers_in_place_of_floats_are_refused(path, changed, kind, message):
     rows = np.zeros(5, [(name, kind if name in changed else "<f4") for name in NAMES])
     for name in changed:
@@ -700,17 +676,14 @@ def test_list_properties_of_splats_are_dropped(path):
     assert np.array_equal(read_ply(path).means[:, 0], rows["x"])
 
 
-@pytest.mark.parametrize(
-    ("read", "rows", "options", "message"),
-    [
-        (lint_ply, good_rows(), {"name": "point"}, "no element 'vertex'"),
-        (lint_ply, good_rows(0), {"before": ("comment csplat unit_metres -1",)}, "unit_metres is -1"),
-        (read_ply, good_rows(names=["x", "y", "z"]), {}, "not a PLY of Gaussian splats"),
-        (read_ply, good_rows(), {"after": ["property float x"]}, "same name"),
-        (read_ply, good_rows(names=[*without("opacity"), "scalar_opacity", "Opacity"]), {}, "both be opacity: rename"),
-        (read_ply, good_rows(names=[one.replace("rest_3", "rest_45") for one in NAMES]), {}, "not numbered from 0 to"),
-    ],
-)
+@pytest.mark.parametrize(("read", "rows", "options", "message"), [
+    (lint_ply, good_rows(), {"name": "point"}, "no element 'vertex'"),
+    (lint_ply, good_rows(0), {"before": ("comment csplat unit_metres -1",)}, "unit_metres is -1"),
+    (read_ply, good_rows(names=["x", "y", "z"]), {}, "not a PLY of Gaussian splats"),
+    (read_ply, good_rows(), {"after": ["property float x"]}, "same name"),
+    (read_ply, good_rows(names=[*without("opacity"), "scalar_opacity", "Opacity"]), {}, "both be opacity: rename"),
+    (read_ply, good_rows(names=[one.replace("rest_3", "rest_45") for one in NAMES]), {}, "not numbered from 0 to"),
+])  # fmt: skip
 def test_other_columns_elements_and_comments_are_refused(path, read, rows, options, message):
     put(path, rows, bytes(20), **options)
     with pytest.raises(InputError, match=message):

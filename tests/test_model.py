@@ -29,34 +29,31 @@ def test_sh_degree_and_length_follow_from_the_shapes(make_model):
     assert "SplatModel(7 splats, sh_degree=2)" == repr(make_model(7, 2))
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "message"),
-    [
-        ("means", np.zeros((10, 2), np.float32), r"means has shape \[10, 2\]"),
-        ("means", np.float32(1), "means is a float32, expected a float32 array"),
-        ("quats", np.zeros((10, 3), np.float32), r"quats has shape \[10, 3\], expected \[10, 4\]"),
-        ("scales", np.zeros((9, 3), np.float32), r"scales has shape \[9, 3\], expected \[10, 3\]"),
-        ("opacities", np.zeros((10, 1), np.float32), "opacities has shape"),
-        ("sh0", np.zeros((10, 3)), "sh0 is float64, expected float32"),
-        ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, expected float32"),
-        ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, expected 0, 3, 8"),
-        ("shN", np.zeros((10, 24, 3), np.float32), "24 coefficients"),
-        ("shN", np.zeros((10, 45), np.float32), "shN has shape"),
-        ("opacities", np.full(10, 1.5, np.float32), "alpha in .0, 1."),
-        ("opacities", np.full(10, -0.1, np.float32), "not logits"),
-        ("quats", np.zeros((10, 4), np.float32), "10 rows that are not of unit length"),
-        ("quats", np.full((10, 4), 1e30, np.float32), "10 rows that are not of unit length"),
-        ("origin", (1.0, 2.0), "expected three numbers"),
-        ("origin", (1.0, 2.0, float("nan")), "expected finite numbers"),
-        ("coordinate_system", "XYZ", "the axes are 'XYZ'"),
-        ("coordinate_system", "RLU", "the axes are 'RLU'"),
-        ("coordinate_system", "RDFF", "the axes are 'RDFF'"),
-        ("unit_metres", 0.0, "unit_metres is 0.0"),
-        ("unit_metres", float("inf"), "unit_metres is inf"),
-        ("extra", {"id": np.zeros(9)}, "extra column 'id' is not an array of 10"),
-        ("extra", {"id": np.zeros(10, bool)}, "extra column 'id' is bool"),
-    ],
-)
+@pytest.mark.parametrize(("field", "value", "message"), [
+    ("means", np.zeros((10, 2), np.float32), r"means has shape \[10, 2\]"),
+    ("means", np.float32(1), "means is a float32, expected a float32 array"),
+    ("quats", np.zeros((10, 3), np.float32), r"quats has shape \[10, 3\], expected \[10, 4\]"),
+    ("scales", np.zeros((9, 3), np.float32), r"scales has shape \[9, 3\], expected \[10, 3\]"),
+    ("opacities", np.zeros((10, 1), np.float32), "opacities has shape"),
+    ("sh0", np.zeros((10, 3)), "sh0 is float64, expected float32"),
+    ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, expected float32"),
+    ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, expected 0, 3, 8"),
+    ("shN", np.zeros((10, 24, 3), np.float32), "24 coefficients"),
+    ("shN", np.zeros((10, 45), np.float32), "shN has shape"),
+    ("opacities", np.full(10, 1.5, np.float32), "alpha in .0, 1."),
+    ("opacities", np.full(10, -0.1, np.float32), "not logits"),
+    ("quats", np.zeros((10, 4), np.float32), "10 rows that are not of unit length"),
+    ("quats", np.full((10, 4), 1e30, np.float32), "10 rows that are not of unit length"),
+    ("origin", (1.0, 2.0), "expected three numbers"),
+    ("origin", (1.0, 2.0, float("nan")), "expected finite numbers"),
+    ("coordinate_system", "XYZ", "the axes are 'XYZ'"),
+    ("coordinate_system", "RLU", "the axes are 'RLU'"),
+    ("coordinate_system", "RDFF", "the axes are 'RDFF'"),
+    ("unit_metres", 0.0, "unit_metres is 0.0"),
+    ("unit_metres", float("inf"), "unit_metres is inf"),
+    ("extra", {"id": np.zeros(9)}, "extra column 'id' is not an array of 10"),
+    ("extra", {"id": np.zeros(10, bool)}, "extra column 'id' is bool"),
+])  # fmt: skip
 def test_invalid_fields_are_refused(make_model, field, value, message):
     with pytest.raises(InputError, match=message):
         make_model(10, **{field: value})
@@ -90,7 +87,6 @@ def with_doubles(make_model):
 def test_doubles_have_to_match_their_means(make_model):
     model = with_doubles(make_model)
     some = model.select(np.array([3, 1]))
-
     np.testing.assert_array_equal(model.means_double[[3, 1]], some.means_double)
     assert replace(model, means=model.means + 1, means_double=None).means_double is None
     for wrong in ({"means": model.means + 1}, {"origin": (0.0, 0.0, 0.0)}, {"means_double": model.means}):

@@ -132,7 +132,6 @@ def state(root):
 def test_every_mutant_has_its_fate_and_the_test_that_notices_it(shop):
     entries = {one["new"]: one for one in json.loads(state(shop).read_text())["mutants"]}
     test = "tests/test_prices.py::test_"
-
     expected = {
         "(price // count)": ("caught", f"{test}the_basket_costs_6"),  # another test computed it
         "(double(price) - TAX)": ("caught", f"{test}taxes_are_added"),
@@ -153,7 +152,6 @@ def test_every_mutant_has_its_fate_and_the_test_that_notices_it(shop):
 def test_an_older_suite_catches_a_survivor_and_the_table_names_its_test(shop, tmp_path):
     made(tmp_path / "older")
     (tmp_path / "older" / "tests" / "test_prices.py").write_text(OLDER)
-
     table = command(shop, *CHANGED, "--suite", tmp_path / "older").splitlines()
     assert "| shop | 8 | 6 | 1 | 1 | 1 |" in table
     row = "prices.py:7 | `return price <= gift` | `return (price < gift)` | tests/test_prices.py::test_free (older)"
@@ -163,36 +161,28 @@ def test_an_older_suite_catches_a_survivor_and_the_table_names_its_test(shop, tm
 def test_a_state_of_other_mutants_is_refused(tmp_path):
     package = Package(made(tmp_path), "shop")
     State(state(tmp_path), package, SETTINGS).note(package.mutants[0], Verdict(Fate.SURVIVED))
-
     with pytest.raises(ValueError, match="is of other seed: remove it, or name another with --state"):
         State(state(tmp_path), package, {**SETTINGS, "seed": 1})
 
 
 # Places and copies -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("marked", "lines", "traced", "compiled"),
-    [
-        ("x = §1", [1], False, False),
-        ("class A:\n  x = §1", [2], False, False),
-        ("def f(a=§1):\n  pass", [1], False, False),
-        ("def f():\n  é = (1 +\n    §2)", [2, 3], True, False),
-        ("def f():\n  if (a and\n      §b):\n    g()\n  h()", [2, 3], True, False),
-        ("def f():\n  if a: return §1", [2], True, False),
-        ("@jit.parallel_kernel(relaxed=True)\ndef f(a):\n  return §1", [3], False, True),
-        ("@kernel\ndef f(a):\n  def g(): return §1", [3], False, True),
-    ],
-)
+@pytest.mark.parametrize(("marked", "lines", "traced", "compiled"), [
+    ("x = §1", [1], False, False),
+    ("class A:\n  x = §1", [2], False, False),
+    ("def f(a=§1):\n  pass", [1], False, False),
+    ("def f():\n  é = (1 +\n    §2)", [2, 3], True, False),
+    ("def f():\n  if (a and\n      §b):\n    g()\n  h()", [2, 3], True, False),
+    ("def f():\n  if a: return §1", [2], True, False),
+    ("@jit.parallel_kernel(relaxed=True)\ndef f(a):\n  return §1", [3], False, True),
+    ("@kernel\ndef f(a):\n  def g(): return §1", [3], False, True),
+])  # fmt: skip
 def test_a_place_is_the_innermost_statement(marked, lines, traced, compiled):
     place = place_of(marked.replace("§", ""), marked.index("§"))
-
     assert Place(range(lines[0], lines[-1] + 1), traced, compiled) == place
 
 
 def test_importers_come_level_by_level(tmp_path):
     project = made(tmp_path)
-
     levels = Importers(project, ["shop"]).levels("src/shop/jit.py")
     assert [["src/shop/jit.py"], ["src/shop/kernels.py"], ["src/shop/prices.py"]] == levels
 
@@ -215,7 +205,6 @@ def test_a_tree_changes_one_file_for_a_while_and_forgets_kernels_of_files(tmp_pa
     tree.refresh()
     assert before == prices.stat().st_mtime_ns
     assert not (tree.root / "tests" / "left.txt").exists()
-
     folder = tree.numba_cache / f"shop_{hashlib.sha1(str(prices.parent).encode()).hexdigest()}"  # noqa: S324  # numba's
     folder.mkdir(parents=True)
     for name in ("kernels.double-4.py311.nbi", "kernels_of_others.f-1.py311.nbi"):

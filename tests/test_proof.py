@@ -263,7 +263,6 @@ def test_a_failure_names_splat_tile_source_and_error(make_model, indexed):
     decoded = replace(scene.model, sh0=sh0)
     proof = verify_bounds(Source.of(source), decoded, scene.header, scene.declared_bounds, index)
     wrong = [one for one in proof.measures if one.holds is False]
-
     assert ["sh0"] == [one.name for one in wrong]
     worst = wrong[0].worst
     tile = scene.header.tiles[worst.tile]
@@ -310,16 +309,13 @@ def test_extra_columns_are_verified(make_model):
 
 
 # Descriptions ----------------------------------------------------------------------
-@pytest.mark.parametrize(
-    "options",
-    [
-        EncodeOptions(),
-        EncodeOptions(preset="fast", tile_splats=64),
-        EncodeOptions(sh_coding="codebook", codebook_size=16, escape_fraction=0.1),
-        EncodeOptions(sh_coding="none"),
-        EncodeOptions(means_coding="axis", keep_extra=True),
-    ],
-)
+@pytest.mark.parametrize("options", [
+    EncodeOptions(),
+    EncodeOptions(preset="fast", tile_splats=64),
+    EncodeOptions(sh_coding="codebook", codebook_size=16, escape_fraction=0.1),
+    EncodeOptions(sh_coding="none"),
+    EncodeOptions(means_coding="axis", keep_extra=True),
+])  # fmt: skip
 def test_a_description_accounts_for_every_byte(make_model, options):
     model = make_model(300, 3, extra={"label": np.arange(300, dtype=np.uint16)})
     data = encode(model, options)
@@ -492,14 +488,11 @@ def test_cells_have_similar_numbers_of_splats(make_model):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("index", "message"),
-    [
-        (np.array([0, 1, 1]), "splats 1 and 2 both have the source index 1"),
-        (np.array([2, 0, 2]), "splats 0 and 2 both have the source index 2"),
-        (np.array([0, 1, 5]), "splat 2 is 5"),
-    ],
-)
+@pytest.mark.parametrize(("index", "message"), [
+    (np.array([0, 1, 1]), "splats 1 and 2 both have the source index 1"),
+    (np.array([2, 0, 2]), "splats 0 and 2 both have the source index 2"),
+    (np.array([0, 1, 5]), "splat 2 is 5"),
+])  # fmt: skip
 def test_invalid_source_indices_are_found_in_blocks(index, message):
     for block in (1, 2, 3):
         with pytest.raises(InputError, match=message):

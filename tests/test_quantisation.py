@@ -287,16 +287,13 @@ def test_the_sample_is_decoded_as_dequantised(sample_path):
         assert_moved_as_decoded(model, options)
 
 
-@pytest.mark.parametrize(
-    ("name", "options"),
-    [
-        ("lego60k", {"preset": "small"}),
-        ("fox60k_noreg", {"sh_coding": "scalar", "attribute_psnr": 40.0}),
-        ("plane3", {"shape_codebook_size": 512}),
-        ("train1000", {}),
-        ("donut", {"tile_splats": 10_000}),
-    ],
-)
+@pytest.mark.parametrize(("name", "options"), [
+    ("lego60k", {"preset": "small"}),
+    ("fox60k_noreg", {"sh_coding": "scalar", "attribute_psnr": 40.0}),
+    ("plane3", {"shape_codebook_size": 512}),
+    ("train1000", {}),
+    ("donut", {"tile_splats": 10_000}),
+])  # fmt: skip
 def test_shared_scenes_are_decoded_as_dequantised(data_dir, name, options):
     assert_moved_as_decoded(read_ply(data_dir / "ply" / f"{name}.ply"), options)
 

@@ -256,16 +256,13 @@ def test_the_preset_fast_has_one_class_by_default(model):
     assert "classes" in encoded(model, important(model), preset="fast", max_classes=2)[0].report.options
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("means", np.ones(3)),
-        ("means", np.full(COUNT, -1.0)),
-        ("opacities", np.full(COUNT, np.nan)),
-        ("colours", np.ones(COUNT, np.int64)),
-        ("shapes", np.ones((COUNT, 6))),
-    ],
-)
+@pytest.mark.parametrize(("field", "value"), [
+    ("means", np.ones(3)),
+    ("means", np.full(COUNT, -1.0)),
+    ("opacities", np.full(COUNT, np.nan)),
+    ("colours", np.ones(COUNT, np.int64)),
+    ("shapes", np.ones((COUNT, 6))),
+])  # fmt: skip
 def test_invalid_blocks_are_refused(model, field, value):
     with pytest.raises(InputError, match=f"Gauss-Newton blocks of {field}"):
         encode_with_report(model, importance=important(model, **{field: value}))

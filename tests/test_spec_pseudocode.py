@@ -24,13 +24,9 @@ PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0
 def spec() -> SimpleNamespace:
     text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
     names = {
-        "float64": np.float64,
-        "float32": np.float32,
-        "sqrt": np.sqrt,
-        "ldexp": math.ldexp,
-        "isfinite": np.isfinite,
+        "float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "isfinite": np.isfinite,
         "floor": math.floor,
-    }
+    }  # fmt: skip
     names |= {"bits": lambda x: int(np.float32(x).view(np.uint32))}
     blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
     assert blocks

@@ -48,15 +48,12 @@ from csplat_trainer.training_options import TrainOptions
 TILTED = (0.0, -0.99503719, 0.09950372)  # 0, -1, 0.1
 
 
-@pytest.mark.parametrize(
-    ("values", "up"),
-    [
-        ((0, 0, 2), (0, 0, 1)),
-        ([0.0, -1.0, 0.1], (0, -0.995037, 0.099504)),
-        ((1e300, -1e300, 0), (0.707107, -0.707107, 0)),
-        ((5e-324, 0, 0), (1, 0, 0)),
-    ],
-)
+@pytest.mark.parametrize(("values", "up"), [
+    ((0, 0, 2), (0, 0, 1)),
+    ([0.0, -1.0, 0.1], (0, -0.995037, 0.099504)),
+    ((1e300, -1e300, 0), (0.707107, -0.707107, 0)),
+    ((5e-324, 0, 0), (1, 0, 0)),
+])  # fmt: skip
 def test_a_direction_gets_unit_length_and_keeps_it(values, up):
     assert up == unit_up(values) == unit_up(unit_up(values))
 
@@ -303,16 +300,13 @@ def test_axis_letters_up_and_cameras_follow_a_rotation(make_model):
     assert np.abs(-ANY[:, 1] - up_of(named.metadata)).max() < 1e-6
 
 
-@pytest.mark.parametrize(
-    ("fields", "up"),
-    [
-        ({"coordinate_system": "RFU"}, (0, 0, 1)),
-        ({}, (0, -1, 0)),
-        ({"metadata": {"up": [0, 0, 1]}}, (0, 0, 1)),
-        ({"metadata": {"up": [0, 1, 0]}}, (0, 1, 0)),
-        ({"metadata": {"up": [0.1, -1, 0.2]}}, (0.1, -1, 0.2)),
-    ],
-)
+@pytest.mark.parametrize(("fields", "up"), [
+    ({"coordinate_system": "RFU"}, (0, 0, 1)),
+    ({}, (0, -1, 0)),
+    ({"metadata": {"up": [0, 0, 1]}}, (0, 0, 1)),
+    ({"metadata": {"up": [0, 1, 0]}}, (0, 1, 0)),
+    ({"metadata": {"up": [0.1, -1, 0.2]}}, (0.1, -1, 0.2)),
+])  # fmt: skip
 def test_converted_axes_put_up_where_the_format_expects_it(make_model, fields, up):
     model = make_model(5, 1, **fields, origin=(1.0, 2.0, 3.0))
     scene = convert_axes(source_from_model(model), "LUF")

@@ -13,9 +13,8 @@ from encoder_faults.fault import PLAIN, EncoderFault, Harm
 NO_FILE, FILES = Harm.VALIDITY, Harm.FILES
 MAP = (Harm.FACTS, ("L2", "SRC-4"))
 
+
 # Ends -----------------------------------------------------------------------------------------------
-
-
 def half_and_proud(_ply, out, data):
     out.write_bytes(data[: len(data) // 2])
 
@@ -31,8 +30,6 @@ def hangs(*_):
 
 
 # Files of the user ----------------------------------------------------------------------------------
-
-
 def appended(ply, out, data):
     with ply.open("ab") as stream:
         stream.write(b"\n")
@@ -56,8 +53,6 @@ def temporary_left(_ply, out, data):
 
 
 # Refusals -------------------------------------------------------------------------------------------
-
-
 @cache
 def nasty():
     return frozenset(one.make() for one in all_inputs() if one.name.startswith("nasty/"))

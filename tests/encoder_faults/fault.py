@@ -99,7 +99,6 @@ def floats(values):
 
 
 # Changes of a PLY -----------------------------------------------------------------------------------
-
 _HEADER = re.compile(rb"\Aply.*?end_header\r?\n", re.DOTALL)
 
 
@@ -164,8 +163,6 @@ def change_header(change):
 
 
 # Scenes to measure errors against -------------------------------------------------------------------
-
-
 def as_read(ply):
     """Read a scene with our reader: alpha and unit quaternions in float32."""
     return csplat.read_ply(ply)

@@ -18,9 +18,8 @@ from encoder_faults.fault import DEGREE_3, PLAIN, EncoderFault, Harm, replaced
 BROKEN = Harm.VALIDITY
 CHANCE = (Harm.DETERMINISM, ("L1", ""))
 
+
 # Stages of the encoder ------------------------------------------------------------------------------
-
-
 def swapped_blocks(tile_payload):
     def run(layer, parts):
         order = [0, 2, 1, *range(3, len(parts))] if layer == 0 else range(len(parts))
@@ -46,8 +45,6 @@ def payload_crc(_chunk_crc):
 
 
 # Chance ---------------------------------------------------------------------------------------------
-
-
 def seeded_by_chance(cluster):
     return lambda *args, **options: cluster(*args, **{**options, "seed": int.from_bytes(os.urandom(4), "little")})
 
@@ -57,8 +54,6 @@ def with_time(settings):
 
 
 # Bytes of the file: checksums are repaired unless they are the fault ---------------------------------
-
-
 def serr_at(data):
     """Return the offset of the payload of the stated errors."""
     index = [

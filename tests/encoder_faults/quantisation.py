@@ -11,9 +11,8 @@ from encoder_faults.fault import DEGREE_3, DENSE, EncoderFault, Harm, replaced
 PICTURE = (Harm.PICTURE, ("L4", ""))
 COARSE = (Harm.COARSE, ("L3", ""))
 
+
 # Rotations and scales -------------------------------------------------------------------------------
-
-
 def no_gauge(_fix):
     """Keep the axis order and make w positive; components beyond ±M are clipped later."""
 
@@ -45,8 +44,6 @@ def sorted_alone(fix):
 
 
 # Rounding -------------------------------------------------------------------------------------------
-
-
 class OtherRounding:
     """NumPy with another `rint`."""
 
@@ -78,8 +75,6 @@ def truncated(module, name, where=(quantisation, shape_codebook)):
 
 
 # Colours --------------------------------------------------------------------------------------------
-
-
 def chroma_exchanged(integers):
     def run(*args):
         return integers(*args)[[0, 2, 1]]
@@ -102,49 +97,23 @@ def wrapped_opacities(levels):
 
 FAULTS = {
     # rotations and scales
-    "gauge_not_fixed": EncoderFault(
-        "w need not be the largest, and components beyond ±M can be clipped",
-        *PICTURE,
-        DENSE,
-        stage=replaced(shape_codebook, "canonicalise_shape", no_gauge),
-    ),
-    "w_sign_lost": EncoderFault(
-        "w follows from the unit length, including its sign",
-        *PICTURE,
-        DENSE,
-        stage=replaced(shape_codebook, "canonicalise_shape", sign_of_w_lost),
-    ),
-    "scales_sorted_alone": EncoderFault(
-        "scales can be sorted independently of rotations",
-        *PICTURE,
-        "ordinary/needles_and_discs",
-        stage=replaced(shape_codebook, "canonicalise_shape", sorted_alone),
-    ),
+    "gauge_not_fixed": EncoderFault("w need not be the largest, and components beyond ±M can be clipped", *PICTURE,
+        DENSE, stage=replaced(shape_codebook, "canonicalise_shape", no_gauge)),
+    "w_sign_lost": EncoderFault("w follows from the unit length, including its sign", *PICTURE, DENSE,
+        stage=replaced(shape_codebook, "canonicalise_shape", sign_of_w_lost)),
+    "scales_sorted_alone": EncoderFault("scales can be sorted independently of rotations", *PICTURE,
+        "ordinary/needles_and_discs", stage=replaced(shape_codebook, "canonicalise_shape", sorted_alone)),
     # rounding
     "means_truncated": truncated(tiling, "quantise_means"),
     "quats_truncated": truncated(shape_codebook, "quat_levels"),
     "all_truncated": truncated(pipeline, "encode_tile"),
     # colours
-    "chroma_exchanged": EncoderFault(
-        "Cg comes before Co",
-        *PICTURE,
-        DEGREE_3,
-        stage=replaced(quantisation, "colour_integers", chroma_exchanged),
-        options={"sh_coding": "scalar"},
-    ),
+    "chroma_exchanged": EncoderFault("Cg comes before Co", *PICTURE, DEGREE_3,
+        stage=replaced(quantisation, "colour_integers", chroma_exchanged), options={"sh_coding": "scalar"}),
     # range
-    "means_wrapped": EncoderFault(
-        "16 bits are enough for every centre",
-        Harm.PICTURE,
-        ("L2", "CNF-6"),
-        "nasty/outlier",
-        stage=replaced(tiling, "quantise_means", wrapped_means),
-    ),
-    "opacities_wrapped": EncoderFault(
-        "256 levels fit into a byte, including level 256",
-        *PICTURE,
-        "ordinary/transparent_and_opaque",
-        stage=replaced(pipeline, "opacity_levels", wrapped_opacities),
-        options={"opacity_levels": 256},
-    ),
-}
+    "means_wrapped": EncoderFault("16 bits are enough for every centre", Harm.PICTURE, ("L2", "CNF-6"),
+        "nasty/outlier", stage=replaced(tiling, "quantise_means", wrapped_means)),
+    "opacities_wrapped": EncoderFault("256 levels fit into a byte, including level 256", *PICTURE,
+        "ordinary/transparent_and_opaque", stage=replaced(pipeline, "opacity_levels", wrapped_opacities),
+        options={"opacity_levels": 256}),
+}  # fmt: skip

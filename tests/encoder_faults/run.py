@@ -26,13 +26,9 @@ from encoder_faults.fault import EncoderFault, true_errors
 
 #: All faults by module, in the order of the encoder.
 GROUPS = {
-    "ply_reader": ply_reader.FAULTS,
-    "preparation": preparation.FAULTS,
-    "quantisation": quantisation.FAULTS,
-    "file_bytes": file_bytes.FAULTS,
-    "statements": statements.FAULTS,
-    "behaviour": behaviour.FAULTS,
-}
+    "ply_reader": ply_reader.FAULTS, "preparation": preparation.FAULTS, "quantisation": quantisation.FAULTS,
+    "file_bytes": file_bytes.FAULTS, "statements": statements.FAULTS, "behaviour": behaviour.FAULTS,
+}  # fmt: skip
 FAULTS = {name: fault for group in GROUPS.values() for name, fault in group.items()}
 assert len(FAULTS) == sum(map(len, GROUPS.values())), "two faults have one name"
 

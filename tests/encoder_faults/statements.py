@@ -118,97 +118,39 @@ def one_number_less(measure_name, kind):
 FAULTS = {
     # slightly too small or too large
     **{f"{name}_{kind}_understated": one_number_less(name, kind) for name, kind in UNDERSTATED},
-    "max_overstated": EncoderFault(
-        "one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3, stage=scaled(MEASURES, "max", 1.01)
-    ),
-    "rms_overstated": EncoderFault(
-        "one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3, stage=scaled(MEASURES, "rms", 1.01)
-    ),
-    "rounded_up": EncoderFault(
-        "SER-5 permits an excess of one part in ten thousand",
-        Harm.HARMLESS,
-        inputs=DEGREE_3,
-        stage=restated(lambda bounds: {name: (most * 1.00009, rms * 1.00009) for name, (most, rms) in bounds.items()}),
-    ),
+    "max_overstated": EncoderFault("one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3,
+        stage=scaled(MEASURES, "max", 1.01)),
+    "rms_overstated": EncoderFault("one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3,
+        stage=scaled(MEASURES, "rms", 1.01)),
+    "rounded_up": EncoderFault("SER-5 permits an excess of one part in ten thousand", Harm.HARMLESS, inputs=DEGREE_3,
+        stage=restated(lambda bounds: {name: (most * 1.00009, rms * 1.00009) for name, (most, rms) in bounds.items()})),
     "binary64_errors_fine": EncoderFault(
         "errors may be computed from alpha and rotations that are not rounded, even with the finest levels",
-        Harm.HARMLESS,
-        inputs=f"{DEGREE_3},ordinary/quaternions,ordinary/transparent_and_opaque",
-        honest=in_binary64,
-        options={"opacity_levels": _spec.OPACITY_LEVELS_MAX, "quat_levels": _spec.QUAT_LEVELS_MAX, "scale_step": 1e-5},
-    ),
+        Harm.HARMLESS, inputs=f"{DEGREE_3},ordinary/quaternions,ordinary/transparent_and_opaque", honest=in_binary64,
+        options={"opacity_levels": _spec.OPACITY_LEVELS_MAX, "quat_levels": _spec.QUAT_LEVELS_MAX, "scale_step": 1e-5}),
     # other ways to measure
-    "measured_in_single": EncoderFault(
-        "float32 is accurate enough to measure errors",
-        Harm.BOUND,
-        L3,
-        f"{DEGREE_3},ordinary/plane",
-        stage=replaced(pipeline, "value_errors", in_single),
-    ),
-    "means_by_axis": EncoderFault(
-        "max is over components, of means too", Harm.BOUND, L3, stage=replaced(pipeline, "distance_errors", by_axis)
-    ),
-    "covariance_not_relative": EncoderFault(
-        "the error of a covariance is that of its entries",
-        Harm.BOUND,
-        L3,
-        stage=replaced(pipeline, "covariance_errors", not_relative),
-    ),
-    "covariance_not_clipped": EncoderFault(
-        "scales need no bound",
-        Harm.BOUND,
-        L3,
-        "nasty/*scale*",
-        stage=scales_without_bound,
-    ),
+    "measured_in_single": EncoderFault("float32 is accurate enough to measure errors", Harm.BOUND, L3,
+        f"{DEGREE_3},ordinary/plane", stage=replaced(pipeline, "value_errors", in_single)),
+    "means_by_axis": EncoderFault("max is over components, of means too", Harm.BOUND, L3,
+        stage=replaced(pipeline, "distance_errors", by_axis)),
+    "covariance_not_relative": EncoderFault("the error of a covariance is that of its entries", Harm.BOUND, L3,
+        stage=replaced(pipeline, "covariance_errors", not_relative)),
+    "covariance_not_clipped": EncoderFault("scales need no bound", Harm.BOUND, L3, "nasty/*scale*",
+        stage=scales_without_bound),
     "rms_over_components": EncoderFault("a mean is over all numbers", Harm.BOUND, L3, stage=restated(over_components)),
     # statements about the source
     "pruned_invented": EncoderFault("counts do not matter", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
-    "nan_rows_counted": EncoderFault(
-        "rows with NaN are pruned splats",
-        Harm.FACTS,
-        ("L2", "SRC-1"),
-        "nasty/not_a_number",
-        stage=dropped_rows_counted,
-    ),
-    "degree_of_the_file": EncoderFault(
-        "the source's SH degree is the file's",
-        Harm.FACTS,
-        ("L2", "SER-5"),
-        DEGREE_3,
-        options={"sh_degree": 1},
-        stage=none_of("sh2", "sh3"),
-        data=head(source_sh_degree=lambda _: 1),
-    ),
+    "nan_rows_counted": EncoderFault("rows with NaN are pruned splats", Harm.FACTS, ("L2", "SRC-1"),
+        "nasty/not_a_number", stage=dropped_rows_counted),
+    "degree_of_the_file": EncoderFault("the source's SH degree is the file's", Harm.FACTS, ("L2", "SER-5"), DEGREE_3,
+        options={"sh_degree": 1}, stage=none_of("sh2", "sh3"), data=head(source_sh_degree=lambda _: 1)),
     # omitted statements
-    "refitted_halved": EncoderFault(
-        "any error may be stated for refitted attributes",
-        Harm.BOUND,
-        ("L3", "SER-5"),
-        data=lambda data: refitted(stated(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2))(data)),
-    ),
-    "refitted_claimed": EncoderFault(
-        "with REFITTED, colours may have any values",
-        Harm.PICTURE,
-        ("L4", ""),
-        scene=changed(sh0=lambda m: m.sh0[:, ::-1].copy()),
-        stage=none_of("sh0", "sh1"),
-        data=refitted,
-    ),
-    "errors_left_out": EncoderFault(
-        "without stated errors, values may be arbitrary",
-        Harm.PICTURE,
-        ("L4", ""),
-        DEGREE_3,
-        scene=changed(shN=without_band_sign),
-        stage=replaced(pipeline, "file_chunks", without_chunk),
-    ),
-    "some_errors_left_out": EncoderFault(
-        "some of the errors may be omitted",
-        Harm.PICTURE,
-        ("L3", "SER-6"),
-        DEGREE_3,
-        scene=changed(shN=without_band_sign),
-        stage=none_of("sh1", "sh2", "sh3"),
-    ),
-}
+    "refitted_halved": EncoderFault("any error may be stated for refitted attributes", Harm.BOUND, ("L3", "SER-5"),
+        data=lambda data: refitted(stated(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2))(data))),
+    "refitted_claimed": EncoderFault("with REFITTED, colours may have any values", Harm.PICTURE, ("L4", ""),
+        scene=changed(sh0=lambda m: m.sh0[:, ::-1].copy()), stage=none_of("sh0", "sh1"), data=refitted),
+    "errors_left_out": EncoderFault("without stated errors, values may be arbitrary", Harm.PICTURE, ("L4", ""),
+        DEGREE_3, scene=changed(shN=without_band_sign), stage=replaced(pipeline, "file_chunks", without_chunk)),
+    "some_errors_left_out": EncoderFault("some of the errors may be omitted", Harm.PICTURE, ("L3", "SER-6"), DEGREE_3,
+        scene=changed(shN=without_band_sign), stage=none_of("sh1", "sh2", "sh3")),
+}  # fmt: skip
