@@ -1,9 +1,21 @@
-"""The conformance vectors against our own decoder, and the recipes against the vectors."""
+"""The conformance vectors, their manifest, the documents for implementers, and our own decoder against them."""
+
+from __future__ import annotations
 
 import dataclasses
+import fnmatch
 import hashlib
+import json
+import math
+import re
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
+import jsonschema
+import numpy as np
 import pytest
 from tables import differing, failures
 
@@ -11,13 +23,17 @@ import csplat
 from csplat import _spec
 from csplat.decoder import Limits, iter_tiles
 from csplat_authoring._rules import CHOICES, RANGES
+from csplat_authoring.annexes import UNCOVERED, annex, clause_ids, clause_map, example_scene, replace_generated
 from csplat_authoring.boundaries import cases, held
 from csplat_authoring.builder import build, repair
 from csplat_authoring.recipes import sound_recipes
+from csplat_authoring.reference import expected
 from csplat_authoring.samples import rich_scene
 from csplat_conformance import decoder_suite, manifest
 from csplat_conformance.conformance_report import Status
+from csplat_conformance.declared_bounds import Source
 from csplat_conformance.decoder_suite import DecoderSuiteOptions
+from csplat_conformance.encoders.reference_ply import PlyRows, source_of_rows
 from csplat_conformance.manifest import VECTORS, load, summarise
 from csplat_conformance.validator import validate
 from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
@@ -293,3 +309,346 @@ def test_valid_vectors_hold_each_value_of_an_enum_and_no_other(valid):
         assert set(rule.used) == values
 
     assert [] == failures({title(rule): rule for rule in CHOICES}, check)
+
+
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+SCHEMA = json.loads((VECTORS / "manifest.schema.json").read_text(encoding="utf-8"))
+MANIFEST = json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))
+SCENES = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None]
+
+# Clauses that name an error code and cannot be broken by a file alone, or only together with another.
+UNBREAKABLE = {
+    "AXI-1": "the width that STR-2 allows ensures it",
+    "CBK-6": "its refusals name QUA-1, QUA-2 or LAT-4",
+    "CBK-7": "its refusals name QUA-1, QUA-2 or LAT-5",
+}
+
+
+def entry_named(name):
+    return next(entry for entry in MANIFEST["vectors"] if entry["name"] == name)
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="vectors")
+def test_the_manifest_is_valid_by_its_schema():
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    jsonschema.Draft202012Validator(SCHEMA).validate(MANIFEST)
+
+
+@pytest.mark.parametrize(("name", "change"), [
+    ("valid/quats", {"sha256": "0"}),
+    ("valid/quats", {"expect": {}}),
+    ("valid/quats", {"clauses": []}),
+    ("valid/quats", {"note": "more"}),
+    ("valid/quats", {"name": "other/quats"}),
+    ("valid/quats", {"error": {"code": "E_CRC"}}),
+    ("invalid/index_crc", {"error": {}}),
+    ("invalid/index_crc", {"expect": {"header": {}}}),
+    ("render/ellipsoids", {"views": [{"psnr": 40}]}),
+])  # fmt: skip
+def test_the_schema_refuses_invalid_manifests(name, change):
+    wrong = MANIFEST | {"vectors": [entry_named(name) | change]}
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.Draft202012Validator(SCHEMA).validate(wrong)
+
+
+def test_files_and_pictures_are_those_of_the_manifest():
+    listed = {entry["file"]: entry["sha256"] for entry in MANIFEST["vectors"]}
+    listed |= {view["picture"]: view["sha256"] for entry in MANIFEST["vectors"] for view in entry.get("views", ())}
+    found = [path for path in VECTORS.rglob("*") if path.is_file() and not path.name.startswith("manifest")]
+    assert listed == {
+        path.relative_to(VECTORS).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in found
+    }
+
+
+# Clauses -------------------------------------------------------------------------------------------
+def clauses_with_codes():
+    """Yield clause and error code of each requirement that names one: the last code before the id."""
+    body = TEXT.split("## 3 Terms")[1].split("## A Worked example")[0]
+    for match in re.finditer(r"\[([A-Z]{3}-\d+)\]", body):
+        sentence = re.split(r"\n\n|\]", body[: match.start()])[-1]
+        codes = re.findall(r"\((E_[A-Z]+)", sentence)
+        if codes:
+            yield match[1], set(codes)
+
+
+def test_most_clauses_name_an_error_code():
+    assert len(dict(clauses_with_codes())) > 80
+
+
+def test_every_clause_that_can_be_broken_is_broken_by_a_vector():
+    found = {(entry["error"]["clause"], entry["error"]["code"]) for entry in MANIFEST["vectors"] if entry["error"]}
+    unbroken = {clause for clause, codes in clauses_with_codes() if not {(clause, code) for code in codes} & found}
+    assert set() == unbroken - {*UNBREAKABLE}
+    assert set() == {*UNBREAKABLE} & {clause for clause, _ in found}, "no excuse is needed"
+
+
+# The guide -----------------------------------------------------------------------------------------
+GUIDE_AS_WRITTEN = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8")
+
+
+def test_the_guide_names_vectors_that_exist():
+    names = {*re.findall(r"`((?:valid|extreme|invalid)/[a-z0-9_]+)`", GUIDE_AS_WRITTEN)}
+    assert names
+    assert set() == names - {entry["name"] for entry in MANIFEST["vectors"]}
+
+
+def test_patterns_of_the_guide_find_vectors():
+    patterns = {*re.findall(r"'?((?:valid|extreme)/[a-z0-9_]*\*)'?", GUIDE_AS_WRITTEN)}
+    names = [entry["name"] for entry in MANIFEST["vectors"]]
+    assert patterns
+    assert [] == [pattern for pattern in sorted(patterns) if not fnmatch.filter(names, pattern)]
+
+
+def test_the_guide_walks_through_every_chapter_of_clauses():
+    chapters = {clause.split("-")[0] for clause in clause_ids(TEXT)}
+    # Not steps of a decoder: general rules, and groups that their neighbours' steps include.
+    elsewhere = {
+        "NUM", "RES", "ORD", "ATT", "TLE", "CDB", "STR", "TRF", "BLK", "LEV", "AXI", "LAT", "RAW", "MEA", "QUA",
+    }  # fmt: skip
+    assert [] == [chapter for chapter in chapters - elsewhere if chapter not in GUIDE_AS_WRITTEN]
+
+
+def test_every_level_and_status_is_explained():
+    from csplat_conformance.conformance_report import Status
+
+    words = {str(status) for status in Status} - {"skipped"}
+    assert [] == [word for word in words if word not in GUIDE_AS_WRITTEN]
+    assert all(f"L{level}" in GUIDE_AS_WRITTEN for level in (1, 2, 3, 4))
+
+
+# Features ------------------------------------------------------------------------------------------
+def blocks(scene):
+    """Yield the attribute and block of all data in a scene, escapes included."""
+    for tile in scene.tiles:
+        yield from tile.blocks.items()
+        yield from ((_spec.ATTRIBUTE_EXTRA, block) for block in tile.extras)
+
+
+def streams(block):
+    """Yield the coding of each stream of a block."""
+    if block.indices:
+        yield block.index_coding
+    if block.coding != _spec.CODING_CODEBOOK or block.summands:
+        yield block.stream_coding
+    if block.coding == _spec.CODING_SPARSE:
+        assert block.mask_coding.width == 1
+
+
+def ids(names, legal):
+    return {value for value, name in names.items() if name in legal}
+
+
+def test_every_attribute_occurs_in_each_legal_coding():
+    legal = {(a, c) for a, names in _spec.ATTRIBUTE_CODINGS.items() for c in ids(_spec.CODING_NAMES, names)}
+    assert legal == {(attribute, block.coding) for scene in SCENES for attribute, block in blocks(scene)}
+
+
+def test_every_coding_has_streams_of_every_width():
+    legal = {
+        (c, w) for c, most in _spec.CODING_WIDTH_MAX.items() if c in _spec.CODING_NAMES for w in range(1, most + 1)
+    }
+    legal -= {(_spec.CODING_RAW, width) for width in (3, 5, 6, 7)}  # no type has them
+    found = {(b.coding, how.width) for scene in SCENES for _, b in blocks(scene) for how in streams(b)}
+    assert set() == legal - found
+
+
+@pytest.mark.parametrize("coder", ["stored", "deflate_stored", "deflate_fixed", "deflate_dynamic"])
+def test_every_list_of_transforms_meets_every_coder(coder):
+    found = {how.transforms for s in SCENES for _, b in blocks(s) for how in streams(b) if how.coder == coder}
+    assert 16 == len(found)
+
+
+def test_every_mapping_kind_type_flag_direction_measure_and_degree_occurs():
+    mappings = {(a, m) for a, names in _spec.ATTRIBUTE_MAPPINGS.items() for m in ids(_spec.MAPPING_NAMES, names)}
+    assert mappings == {(a, record.mapping) for scene in SCENES for a, record in scene.attributes.items()}
+    assert set(_spec.CODEBOOK_KIND_NAMES) == {book.kind for scene in SCENES for book in scene.codebooks}
+    dtypes = {extra.dtype for scene in SCENES for extra in scene.extras}
+    assert set(_spec.EXTRA_DTYPE_NAMES) == {dtype for dtype in dtypes if dtype < _spec.ANCILLARY_ID_MIN}
+    assert set(_spec.DIRECTION_NAMES) == {axis for scene in SCENES for axis in scene.axes}
+    assert {0, 1, 2, 3} == {scene.sh_degree for scene in SCENES}
+    assert set(_spec.CHUNK_NAMES) - {b"TILE", b"CODB"} <= {chunk.type for scene in SCENES for chunk in scene.chunks}
+    measures = {m for s in SCENES for chunk in s.chunks if chunk.errors for m, _, _ in chunk.errors.records}
+    assert set(_spec.MEASURE_NAMES) == measures
+    for bit in _spec.SCENE_FLAG_NAMES:
+        assert {True, False} == {bool(scene.scene_flags & bit) for scene in SCENES}
+
+
+def test_every_attribute_that_a_codebook_may_serve_has_escapes():
+    escaped = {attribute for scene in SCENES for attribute, block in blocks(scene) if block.escape}
+    assert {a for a, names in _spec.ATTRIBUTE_CODINGS.items() if "codebook" in names} == escaped
+
+
+@pytest.mark.area(name="vectors")
+def test_vectors_and_annexes_are_those_of_the_recipes():
+    words = [sys.executable, "-m", "csplat_authoring", "--check"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (0, "") == (done.returncode, done.stdout + done.stderr)
+
+
+GUIDE = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8").replace("−", "-")
+SPEC = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
+
+
+@pytest.fixture(scope="module")
+def spec():
+    """The spec's pseudo-code."""
+    names = {"float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "floor": math.floor}
+    for block in re.findall(r"```python spec-test\n(.*?)```", SPEC, re.DOTALL):
+        exec(block, names)  # noqa: S102 - the text is the project's own
+    return SimpleNamespace(**names)
+
+
+@pytest.fixture(scope="module")
+def row():
+    """Return a function for the numbers in the row of the example with a given beginning, a list for each splat."""
+    part = GUIDE.split("### Stating errors")[1].split("So SERR states")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line[:1] == "|"]
+    table = {cells[0]: [re.findall(r"-?\d+(?:\.\d+)?", cell) for cell in cells[1:]] for cells in rows}
+
+    def numbers(name):
+        return [[float(number) for number in cell] for cell in table[name]]
+
+    return numbers
+
+
+@pytest.fixture(scope="module")
+def source(row) -> Source:
+    columns = {
+        "means": row("x, y, z"),
+        "quats": row("rot_0 … rot_3"),
+        "scales": row("scale_0 … scale_2"),
+        "logits": [value for (value,) in row("opacity")],
+        "sh0": row("f_dc_0 … f_dc_2"),
+    }
+    arrays = {name: np.array(values, np.float32) for name, values in columns.items()}
+    return source_of_rows(PlyRows(**arrays, shN=np.zeros((2, 0, 3), np.float32)))
+
+
+@pytest.fixture(scope="module")
+def file(spec, row):
+    """Decode the integers of the guide's example with the functions of the guide."""
+    colours = [spec.rgb_from_ycocg(*map(int, one), 0) for one in row("sh0, integers Y, Co, Cg")]
+    lattice = lambda rows, step: np.array(  # noqa: E731
+        [[spec.lattice_value(int(n), step, 0) for n in one] for one in rows], np.float32
+    )
+    return SimpleNamespace(
+        origin=np.zeros(3),
+        means=lattice(row("means, integers"), MEAN_STEP),
+        scales=lattice(row("scales, integers"), SCALE_STEP),
+        quats=np.array([spec.quat(*map(int, one), LEVELS) for one in row("quats, integers")]),
+        opacities=[spec.opacity_square(int(q), ALPHAS) for (q,) in row("opacities, integer")],
+        sh0=lattice(colours, SH0_STEP),
+    )
+
+
+def near(expected, found):
+    np.testing.assert_allclose(np.array(found, np.float64), np.array(expected), rtol=0, atol=6e-8)
+
+
+def test_the_source_equals_the_rows_of_the_example(row, source):
+    near(row("quaternion of the source"), source.quats)
+    near(row("alpha of the source"), source.opacities[:, None])
+
+
+def test_the_integers_are_those_of_annex_e(spec, row, source):
+    for j in range(2):
+        turned = spec.with_w_largest(*map(float, source.quats[j]))
+        near(row("with w largest")[j] or row("quaternion of the source")[j], turned)
+        assert row("quats, integers")[j] == spec.quat_integers(turned, LEVELS)
+        steps = [float(value) / SH0_STEP for value in source.sh0[j]]
+        assert row("sh0, integers Y, Co, Cg")[j] == list(spec.ycocg_from_rgb(*steps, 0))
+        assert row("means, integers")[j] == [math.floor(float(v) / MEAN_STEP + 0.5) for v in source.means[j]]
+        assert row("scales, integers")[j] == [math.floor(float(v) / SCALE_STEP + 0.5) for v in source.scales[j]]
+        assert row("opacities, integer")[j] == [math.floor(math.sqrt(float(source.opacities[j])) * ALPHAS + 0.5)]
+
+
+def test_the_values_equal_those_of_a_decoder(row, file):
+    near(row("decoded quaternion"), file.quats)
+    near(row("decoded alpha"), [[alpha] for alpha in file.opacities])
+    near(row("decoded sh0"), file.sh0)
+
+
+def test_the_code_of_the_guide_gives_the_stated_errors(row, source, file):
+    code = re.search(r"### Stating errors.*?```python\n(.*?)```", GUIDE, re.DOTALL)[1]
+    names = {"source": source, "file": file}
+    exec(code, names)  # noqa: S102 - the text is the project's own
+    for j in range(2):
+        for name, values in names["errors"](j, j):
+            near(row(f"error of {name}")[j], values)
+    part = GUIDE.split("So SERR states")[1].split("## ")[0]
+    table = dict(re.findall(r"^\| (\w+) \| ([\d.]+ \| [\d.]+) \|", part, re.MULTILINE))
+    for name, pair in names["stated"]([0, 1]).items():
+        near([float(number) for number in table[name].split(" | ")], pair)
+
+
+CLAUSES = clause_ids(TEXT)
+COVERED = {clause for vector in load() for clause in vector.clauses}
+
+
+def worked_example_rows():
+    part = TEXT.split("<!-- begin generated: worked example -->")[1].split("<!-- end generated -->")[0]
+    return re.findall(r"^\| (\d+) \| ((?:[0-9A-F]{2} ?)+) \|", part, re.MULTILINE)
+
+
+def test_clause_ids_are_unique():
+    assert len(set(CLAUSES)) == len(CLAUSES)
+
+
+def test_every_must_ends_in_a_clause_id():
+    # An error could not cite a paragraph that has a requirement and no id.
+    body = TEXT.split("## 3 Terms")[1].split("## 10 Versioning")[0]
+    body = re.sub(r"```.*?```", "", body, flags=re.DOTALL)
+    sentences = re.findall(r"[^.\n|][^|]*?MUST(?: NOT)?\b[^|]*?(?:\[[A-Z]{3}-\d+\]|\n\n)", body)
+    assert [] == [sentence for sentence in sentences if not sentence.endswith("]")]
+
+
+def test_every_clause_is_covered_or_excused():
+    assert [] == [clause for clause in CLAUSES if clause not in COVERED and clause not in UNCOVERED]
+
+
+def test_vectors_name_clauses_that_exist():
+    assert set() == COVERED - set(CLAUSES)
+
+
+def test_excuses_are_needed_and_name_clauses_that_exist():
+    assert [] == [clause for clause in UNCOVERED if clause in COVERED or clause not in CLAUSES]
+
+
+@pytest.mark.parametrize("clause", UNCOVERED)
+def test_an_excuse_that_points_at_a_test_finds_the_clause_there(clause):
+    for path in re.findall(r"`(tests/\w+\.py)`", UNCOVERED[clause]):
+        assert clause in (ROOT / path).read_text(encoding="utf-8")
+
+
+def test_the_worked_example_is_its_file_byte_for_byte():
+    rows = worked_example_rows()
+    data = b"".join(bytes.fromhex(digits) for _, digits in rows)
+    assert (VECTORS / "valid" / "worked_example.csplat").read_bytes() == data
+
+
+def test_the_worked_example_states_the_right_offsets():
+    at = 0
+    for offset, digits in worked_example_rows():
+        assert at == int(offset)
+        at += len(bytes.fromhex(digits))
+
+
+def test_the_worked_example_explains_the_right_values():
+    floats = {name: array.tolist() for name, array in expected(example_scene()).floats.items()}
+    half = 0.7071067690849304  # the binary32 that the text writes as 0.70710677
+    assert [1.0, 0.25] == floats["opacities"]
+    assert [[-3.0, -3.0, -3.0], [-2.0, -3.0, -4.0]] == floats["scales"]
+    assert [[1.0, 0.0, 0.0, 0.0], [half, 0.0, 0.0, half]] == floats["quats"]
+    assert [[-0.5, 0.5, 4.0], [0.75, 0.0, 4.25]] == floats["means"]
+    assert [[2.0, 1.0, 1.5], [-0.5, -0.5, -0.5]] == floats["sh0"]
+    zero, red, blue = [0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -0.25]
+    assert [[red, zero, zero], [red, zero, blue]] == floats["shN"]
+
+
+def test_annexes_equal_the_output_of_the_recipes():
+    assert TEXT == replace_generated(
+        replace_generated(TEXT, "worked example", annex()), "clause map", clause_map(TEXT, load())
+    )

@@ -1,22 +1,34 @@
-"""The encoder suite's runs of a program: places, traces, repetitions, refusals, the source index; inputs as files."""
+"""The encoder suite's runs of a program and its verdicts on the file, and their form in reports."""
 
+import dataclasses
 import json
+import re
 import shlex
 import sys
 import time
+import types
+import xml.etree.ElementTree as ET
+from contextlib import contextmanager
+from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import csplat
-from csplat_conformance.conformance_report import Status
-from csplat_conformance.declared_bounds import verify_bounds
+from csplat.decoder import decode_scene
+from csplat.encoder import PRESETS, quantisation, shape_codebook
+from csplat_conformance import encoders
+from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status, to_json, to_junit, to_table
+from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_conformance.encoders import EncoderSuiteOptions, all_inputs, run_encoder, write_inputs
 from csplat_conformance.encoders.encoder_run import REPEAT_SECONDS
-from csplat_conformance.encoders.file_checks import pair_splats
+from csplat_conformance.encoders.error_checks import check_errors, find_truncation
+from csplat_conformance.encoders.file_checks import check_content, pair_splats
+from csplat_conformance.encoders.render_checks import peer_figures
 from csplat_conformance.protocol import ProcessEnd, run_program
 from csplat_tools.cli.app import app
 
@@ -363,3 +375,362 @@ def test_writing_inputs_accepts_no_option_of_a_run(tmp_path, words):
     result = invoke("--write-inputs", tmp_path / "new", *words)
     assert 2 == result.exit_code
     assert not (tmp_path / "new").exists()
+
+
+L3 = ("L1", "L2", "L3")
+
+
+def model_of(name, folder):
+    (folder / "in.ply").write_bytes(INPUTS[name].make())
+    return csplat.read_ply(folder / "in.ply")
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """The plain input, after reading."""
+    return model_of(PLAIN, tmp_path_factory.mktemp("plain"))
+
+
+def judged(name, model, change=lambda scene: scene, **options):
+    """L2 and L3 of our encoder's file, and the reasons why only pictures can judge the rest."""
+    scene = change(decode_scene(csplat.encode(model, csplat.EncodeOptions(**options))))
+    content, pairs = check_content(INPUTS[name], INPUTS[name].source(), scene, None)
+    return content, *check_errors(INPUTS[name], scene, pairs)
+
+
+def stating(**changes):
+    """Return a change of the errors that a scene states."""
+    return lambda scene: dataclasses.replace(
+        scene,
+        declared_bounds=dataclasses.replace(
+            scene.declared_bounds, **{key: make(scene.declared_bounds) for key, make in changes.items()}
+        ),
+    )
+
+
+def without(*names):
+    return lambda stated: tuple(record for record in stated.records if record.measure not in names)
+
+
+def silent(scene):
+    return dataclasses.replace(scene, declared_bounds=None)
+
+
+REFITTED = stating(refitted=lambda _: True, records=without("sh0", "sh1"))
+
+
+# Facts ---------------------------------------------------------------------------------------------
+@pytest.mark.parametrize(("fact", "message"), [
+    ({"coordinate_system": "RDF"}, "axes is RDF"),
+    ({"unit_metres": 1.0}, "unit_metres is 1.0"),
+    ({"antialiased": True}, "antialiased is True"),
+    ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
+])  # fmt: skip
+def test_facts_that_differ_from_the_source_break_their_clause(plain, fact, message):
+    content, *_ = judged(PLAIN, dataclasses.replace(plain, **fact), keep_extra=True)
+    assert (Status.FAILED, ("SRC-3",)) == (content.status, content.clauses)
+    assert message in content.message
+
+
+def test_centres_in_doubles_are_compared_in_doubles():
+    # Four million units away binary32 is a quarter of a unit off, more than splats are apart.
+    one = INPUTS[PLAIN]
+    near = one.source()
+    far = dataclasses.replace(near, means=near.means.astype(np.float64) + np.array([4e6, -4e6, 0.1]))
+    model = dataclasses.replace(
+        csplat.decode(csplat.encode(near.to_model((0.0, 0.0, 0.0)))), origin=(4e6, -4e6, 0.1), extra={}
+    )
+    scene = decode_scene(csplat.encode(model))
+    content, pairs = check_content(dataclasses.replace(one, source=lambda: far), far, scene, None)
+    assert (Status.PASSED, 0) == (content.status, pairs.missing)
+
+
+def test_splats_without_a_near_source_are_named(plain):
+    moved = plain.means.copy()
+    moved[:3, 0] += 7.0
+    moved[5] = moved[6]
+    content, errors, _ = judged(PLAIN, dataclasses.replace(plain, means=moved))
+    assert (Status.FAILED, ("CNF-6", "SER-5")) == (content.status, content.clauses)
+    far, near, _ = content.message.split("; ")
+    assert re.fullmatch(r"3 splats of the file, the first splat \d+, are not within 0.03 of a splat of the source", far)
+    assert re.fullmatch(
+        r"splat \d+ of the file is near a splat of the source that another splat already represents", near
+    )
+    assert Status.SKIPPED is errors.status
+
+
+# Stated errors -------------------------------------------------------------------------------------
+def test_errors_that_are_not_stated_are_not_proved(plain):
+    _, errors, alone = judged(PLAIN, plain, silent)
+    assert (Status.NOT_PROVED, "the file states no errors") == (errors.status, errors.message)
+    assert alone == errors.message
+
+
+def test_refitted_attributes_are_not_proved_and_the_others_are(plain):
+    _, errors, alone = judged(PLAIN, plain, REFITTED)
+    assert (Status.NOT_PROVED, "sh0, sh1: refitted, no error is stated") == (errors.status, errors.message)
+    assert "sh0, sh1 refitted" == alone
+    assert errors.details["means"]["holds"]
+
+
+def test_stated_errors_hold_for_refitted_attributes_too(plain):
+    halved = stating(
+        refitted=lambda _: True,
+        records=lambda stated: tuple(
+            dataclasses.replace(one, max=one.max / 2, rms=one.rms / 2) for one in stated.records
+        ),
+    )
+    _, errors, _ = judged(PLAIN, plain, halved)
+    assert (Status.FAILED, ("SER-5",)) == (errors.status, errors.clauses)
+    assert errors.message.startswith("means: max ")
+    assert ", source splat " in errors.message
+    assert errors.message.endswith("; and 8 more")
+    assert {"splat", "tile", "source_splat", "found"} == set(errors.details["sh1"]["worst"])
+
+
+def test_a_measure_that_is_missing_breaks_its_clause(plain):
+    _, errors, _ = judged(PLAIN, plain, stating(records=without("sh1")))
+    assert (Status.FAILED, ("SER-6",), "the file states no error of sh1") == (
+        errors.status,
+        errors.clauses,
+        errors.message,
+    )
+
+
+def test_an_empty_scene_has_no_errors(tmp_path):
+    _, errors, alone = judged("nasty/empty", model_of("nasty/empty", tmp_path), silent)
+    assert (Status.PASSED, "") == (errors.status, alone)
+
+
+# Coarse --------------------------------------------------------------------------------------------
+def test_our_coarsest_preset_stays_below_half_of_every_bound(monkeypatch, plain):
+    for name in ("MEANS_PER_SEPARATION", "COVARIANCE_MAX", "COVARIANCE_RMS", "OPACITIES_MAX", "SH_MAX"):
+        module = "csplat_conformance.encoders.error_checks"
+        monkeypatch.setattr(f"{module}.{name}", 0.5 * getattr(__import__(module, fromlist=[name]), name))
+    for preset in PRESETS:
+        assert Status.PASSED is judged(PLAIN, plain, preset=preset)[1].status
+
+
+@pytest.mark.parametrize(("fields", "message"), [
+    ({"opacities": lambda m: 1 / (1 + np.exp(-m.opacities))}, "opacities: an error of 0.49"),
+    ({"scales": lambda m: np.exp(m.scales)}, "covariance: an error of "),
+    ({"sh0": lambda m: np.clip(m.sh0, -0.5, 0.5)}, "sh0: an error of 0."),
+    ({"shN": lambda m: 0 * m.shN}, "sh1: an error of 0."),
+])  # fmt: skip
+def test_large_errors_that_are_stated_cause_a_warning(plain, fields, message):
+    wrong = dataclasses.replace(plain, **{name: np.asarray(make(plain), np.float32) for name, make in fields.items()})
+    _, errors, _ = judged(PLAIN, wrong, honest(plain), attribute_psnr=60.0)
+    assert Status.WARNED is errors.status
+    assert message in errors.message
+    assert "beyond" in errors.message
+    assert "source splat" in errors.message
+
+
+def honest(model):
+    """Let a scene state its true errors."""
+    source = Source.of(model)
+
+    def change(scene):
+        from csplat_conformance.declared_bounds import measure_pairs
+        from csplat_conformance.encoders.file_checks import pair_splats
+
+        pairs = pair_splats(
+            source.means.astype(np.float64), scene.model.means.astype(np.float64), INPUTS[PLAIN].separation
+        )
+        measured = measure_pairs(source, scene.model, pairs.source_index)
+        return stating(
+            records=lambda stated: tuple(
+                dataclasses.replace(one, max=measured[one.measure].max, rms=measured[one.measure].rms)
+                for one in stated.records
+            )
+        )(scene)
+
+    return change
+
+
+def test_a_coarse_file_causes_a_warning(plain):
+    _, errors, _ = judged(PLAIN, plain, attribute_psnr=14.0, sh_coding="none")
+    assert Status.WARNED is errors.status
+    assert "is coarse: splat " in errors.message
+
+
+def test_leaving_much_out_causes_a_warning():
+    one = INPUTS["ordinary/degree_0"]
+    source = one.source()
+    for kept, status in ((100, Status.WARNED), (200, Status.PASSED)):
+        model = source.to_model((0.0, 0.0, 0.0)).select(np.arange(kept))
+        scene = stating(source_count=lambda _: 216, pruned_count=lambda _, kept=kept: 216 - kept)(
+            decode_scene(csplat.encode(model))
+        )
+        content, _ = check_content(one, source, scene, None)
+        assert status is content.status
+        assert str(216 - kept) in content.message
+
+
+# Cut -----------------------------------------------------------------------------------------------
+@contextmanager
+def rounding(rint):
+    """Make our encoder round in another way."""
+    numpy = types.ModuleType("numpy")
+    vars(numpy).update(vars(np), rint=rint)
+    with mock.patch.object(quantisation, "np", numpy), mock.patch.object(shape_codebook, "np", numpy):
+        yield
+
+
+def floor(values, out=None):
+    return np.floor(values, out=out)
+
+
+def trunc(values, out=None):
+    return np.trunc(values, out=out)
+
+
+@pytest.mark.parametrize("cut", [floor, trunc])
+@pytest.mark.parametrize("name", ["ordinary/degree_3", "ordinary/quaternions"])
+def test_cut_values_are_distinguished_from_rounded_ones(tmp_path, name, cut):
+    one, model = INPUTS[name], model_of(name, tmp_path)
+    options = csplat.EncodeOptions(sh_coding="scalar", threads=1)
+    with rounding(cut):
+        scene = decode_scene(csplat.encode(model, options))
+    _, pairs = check_content(one, one.source(), scene, None)
+    every = frozenset(("means", "covariance", "opacities", "sh0", "sh1", "sh2", "sh3"))
+    lines = find_truncation(one.source(), scene.model, scene.header, pairs.source_index, every)
+    assert ["means", "opacities", "scales", "quats", "sh0"] == [line.partition(":")[0] for line in lines][:5]
+    assert all(line.endswith("truncated instead of rounded?") for line in lines), lines
+    assert [] == find_truncation(one.source(), scene.model, scene.header, pairs.source_index, frozenset())
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("name", ["ordinary/strong_colours", "ordinary/needles_and_discs"])
+def test_coarse_steps_are_not_cuts(tmp_path, name, preset):
+    for psnr in (20.0, 30.0, 90.0):
+        _, errors, _ = judged(name, model_of(name, tmp_path), preset=preset, attribute_psnr=psnr)
+        assert "cut" not in errors.message
+
+
+# Pictures ------------------------------------------------------------------------------------------
+@pytest.fixture
+def altered(monkeypatch, plain):
+    """Run the suite over our file with altered statements."""
+    data = csplat.encode(plain)
+
+    def run(_command, places, _seconds):
+        Path(places["out"]).write_bytes(data)
+        return ProcessEnd(None, 0, b"", b"", 0.0)
+
+    def report(change, levels=L3, render_score=None, name=PLAIN, **fields):
+        one = dataclasses.replace(INPUTS[name], **fields)
+        monkeypatch.setattr(
+            "csplat_conformance.encoders.file_checks.decode_scene", lambda data: change(decode_scene(data))
+        )
+        monkeypatch.setattr("csplat_conformance.encoders.encoder_suite.all_inputs", lambda: [one])
+        return run_encoder(
+            "x {ply} {out}",
+            EncoderSuiteOptions(name, levels),
+            run=run,
+            render_score=render_score,
+            no_render_reason="no numba",
+        )
+
+    return report
+
+
+def statuses(report):
+    return [(one.level, one.status) for one in report.outcomes]
+
+
+@pytest.mark.parametrize(("change", "why"), [(silent, "the file states no errors"), (REFITTED, "sh0, sh1 refitted")])
+def test_pictures_judge_at_any_level_where_errors_prove_nothing(altered, change, why):
+    seen = altered(change, render_score=lambda *_: 41.0)
+    assert [("L1", Status.PASSED), ("L2", Status.PASSED), ("L3", Status.NOT_PROVED), ("L4", Status.PASSED)] == (
+        statuses(seen)
+    )
+    assert seen.passed
+    bad = altered(change, render_score=lambda *_: 11.0)
+    assert ("L4", Status.FAILED) == statuses(bad)[-1]
+    blind = altered(change)
+    assert ("L4", Status.FAILED) == statuses(blind)[-1]
+    assert f"{why}: only renders can check it, and no numba" == blind.outcomes[-1].message
+
+
+def test_pictures_are_requested_where_they_are_needed_at_the_level_of_errors(altered):
+    assert ["L1", "L2"] == [level for level, _ in statuses(altered(silent, ("L1", "L2")))]
+    assert ("L3", Status.NOT_PROVED) == statuses(altered(silent, renders=False))[-1]
+    assert ("L4", Status.SKIPPED) == statuses(altered(silent, ("L3", "L4"), lambda *_: 9.0, renders=False))[-1]
+    assert ("L3", Status.PASSED) == statuses(altered(lambda scene: scene))[-1]
+    assert ("L4", Status.SKIPPED) == statuses(altered(lambda scene: scene, ("L4",)))[-1]
+
+
+def test_a_picture_with_nan_is_refused(altered):
+    assert ("L4", Status.FAILED) == statuses(altered(lambda scene: scene, ("L4",), lambda *_: float("nan")))[-1]
+
+
+def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypatch):
+    def message(table, psnr=41.2, **fields):
+        monkeypatch.setattr("csplat_conformance.encoders.render_checks.peer_figures", lambda name: table.get(name, {}))
+        return altered(lambda scene: scene, ("L4",), lambda *_: psnr, **fields).outcomes[0]
+
+    ours, spz = {"bytes": 4800, "psnr": 40.9}, {"bytes": 7900, "psnr": 39.1}
+    whole = message({PLAIN: {"csplat": ours, "spz": spz}})
+    assert "41.20 dB in 4,183 bytes (csplat 40.90 in 4,800, SPZ 39.10 in 7,900)" == whole.message
+    assert {"psnr": 41.2, "wanted": 30.0, "bytes": 4183, "beside": {"csplat": ours, "spz": spz}} == whole.details
+    assert "41.20 dB in 4,183 bytes (SPZ in 7,900)" == message({PLAIN: {"spz": {"bytes": 7900}}}).message
+    assert "41.20 dB in 4,183 bytes" == message({"other": {}}).message
+    short = message({PLAIN: {"csplat": ours}}, 25.0, psnr_min=26.0)
+    assert (
+        "25.00 dB, expected at least 26, in 4,183 bytes (csplat 40.90 in 4,800); with the source's means 25.0,"
+        " shapes 25.0, opacities 25.0, colours 25.0"
+    ) == short.message
+
+
+def test_figures_are_those_of_the_file_that_the_suite_ships():
+    shipped = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
+    assert shipped[PLAIN] == peer_figures(PLAIN)
+    assert {} == peer_figures("no/such")
+
+
+def test_a_scene_that_cannot_be_drawn_fails_alone(altered):
+    def far(scene):
+        return dataclasses.replace(scene, model=dataclasses.replace(scene.model, origin=(1e300, 0.0, 0.0)))
+
+    report = altered(far, ("L1", "L2", "L3", "L4"), lambda *_: 40.0)
+    assert [Status.FAILED] == [one.status for one in report.outcomes if one.level == "L4"]
+
+
+# Reports -------------------------------------------------------------------------------------------
+REPORT = ConformanceReport(
+    "encoder",
+    "x",
+    [
+        Outcome("a", "L3", Status.PASSED),
+        Outcome("b", "L3", Status.WARNED, message="coarse <"),
+        Outcome("c", "L3", Status.NOT_PROVED, message="fitted anew"),
+        Outcome("d", "L1", Status.DECLINED, message="refused: no"),
+    ],
+    ("warning: nasty: 1 of 1 declined",),
+    (Status.WARNED, Status.DECLINED, Status.NOT_PROVED),
+)
+
+
+def test_warnings_refusals_and_unproved_errors_are_counted_and_no_failures():
+    assert REPORT.passed
+    table = to_table(REPORT)
+    assert "L3  warned      b  coarse <" in table
+    assert "L3  not proved  c  fitted anew" in table
+    assert "warning: nasty: 1 of 1 declined" in table
+    assert "level  checks  passed  warned  declined  not proved  failed  skipped" in table
+    counts = {"checks": 3, "passed": 1, "warned": 1, "declined": 0, "not proved": 1, "failed": 0, "skipped": 0}
+    assert counts == to_json(REPORT)["levels"]["L3"]
+    assert ["checks", "passed", "failed", "skipped"] == list(
+        ConformanceReport("decoder", "x", REPORT.outcomes[:1]).levels()["L3"]
+    )
+
+
+def test_junit_contains_warnings_and_refusals():
+    root = ET.fromstring(to_junit(REPORT))  # noqa: S314 - our own text
+    assert {"tests": "4", "failures": "0", "errors": "0", "skipped": "2"}.items() <= root.attrib.items()
+    cases = {case.get("name"): case for case in root.iter("testcase")}
+    assert "warning: coarse <" == cases["b"].find("system-out").text
+    assert "not proved: fitted anew" == cases["c"].find("skipped").get("message")
+    assert "declined: refused: no" == cases["d"].find("skipped").get("message")
+    assert "warning: nasty: 1 of 1 declined" in {one.get("value") for one in root.iter("property")}

@@ -1,10 +1,14 @@
-"""The Python interface: names, forms of files, refusals, and the commands that call it."""
+"""The Python interface: names, imports, errors, `SplatModel`, forms of files, and the commands that call it."""
+
+from __future__ import annotations
 
 import doctest
 import gzip
 import io
+import pickle
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +19,9 @@ import csplat
 import csplat_render
 import csplat_tools
 import csplat_trainer
+from csplat import errors
 from csplat.errors import CsplatError, InputError
+from csplat.model import SplatModel, normalise_quats
 from csplat_tools.cli.app import app
 
 
@@ -298,3 +304,228 @@ def test_train_and_finetune_call_the_public_functions(tmp_path, monkeypatch, wor
     raised = CliRunner().invoke(app, [*words, "--quiet"]).exception
     assert isinstance(raised, Called), raised
     assert kind == type(raised.args[0][0]).__name__
+
+
+def modules_after(statement: str) -> set[str]:
+    code = f"import sys\n{statement}\nprint(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
+
+
+def test_importing_csplat_loads_none_of_its_modules():
+    assert set() == {one for one in modules_after("import csplat") if one.startswith("csplat.")}
+
+
+def test_the_decoder_loads_no_other_part_and_works_without_plyfile():
+    loaded = modules_after("sys.modules['plyfile'] = None; import csplat.decoder; from csplat import decode")
+    assert "csplat.decoder" in loaded
+    loaded.remove("plyfile")
+    packages = {name.split(".")[0] for name in loaded}
+    assert not packages & {"plyfile", "torch", "numba", "deflate", "typer", "rich", "csplat_tools"}
+    foreign = ("csplat.encoder", "csplat.ply", "csplat.lint", "csplat.detect", "csplat.disk_files")
+    assert not [name for name in loaded if name.startswith(foreign)]
+
+
+def test_the_reader_loads_neither_encoder_nor_decoder():
+    loaded = modules_after("from csplat import read_ply")
+    assert not [name for name in loaded if name.startswith(("csplat.encoder", "csplat.decoder"))]
+
+
+def test_every_public_name_resolves():
+    assert [] == [name for name in csplat.__all__ if getattr(csplat, name, None) is None]
+
+
+def test_dir_lists_the_public_names():
+    assert sorted(csplat.__all__) == dir(csplat)
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        csplat.nonsense  # noqa: B018 -- the access is the test
+
+
+@pytest.mark.slow
+def test_the_renderer_requires_no_torch():
+    """test_interface.py tests that cameras require no numba."""
+    pytest.importorskip("numba", reason="the renderer requires the extra [render]")
+    loaded = {
+        name.split(".")[0]
+        for name in modules_after("import csplat_render.rasteriser, csplat_render.reference_rasteriser")
+    }
+    assert not loaded & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy
+
+
+def test_a_format_error_names_code_place_clause_and_both_values():
+    error = errors.FormatError("E_CRC", 12, "CRC-1", "found 0x1a2b3c4d, computed 0x5e6f7081")
+    assert "E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081" == str(error)
+    assert ("E_CRC", 12, "CRC-1") == (error.code, error.offset, error.clause)
+
+
+def test_the_message_contains_the_values_found_and_expected():
+    error = errors.FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5")
+    assert "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5" == str(error)
+
+
+def test_a_format_error_may_lack_a_place():
+    assert "E_HASH (SHA-1)" == str(errors.FormatError("E_HASH", None, "SHA-1"))
+
+
+def test_an_unsupported_error_names_the_feature():
+    error = errors.UnsupportedError("version 0.7")
+    assert "E_UNSUPPORTED: version 0.7 is not supported" == str(error)
+    assert ("E_UNSUPPORTED", "version 0.7") == (error.code, error.feature)
+
+
+def test_a_limit_error_names_both_sides():
+    error = errors.LimitError("max_splats", 10, 5)
+    assert "E_LIMIT: max_splats: needs 10, allowed 5" == str(error)
+    assert ("max_splats", 10, 5) == (error.limit, error.wanted, error.allowed)
+
+
+@pytest.mark.parametrize("error", [
+    errors.FormatError("E_CRC", 12, "CRC-1", found=1, wanted=2),
+    errors.UnsupportedError("x", code="E_VERSION", offset=8, clause="VER-1"),
+    errors.LimitError("x", 2, code="E_BUDGET", offset=3),
+    errors.InputError("x"),
+])  # fmt: skip
+def test_errors_survive_another_process_and_have_a_code(error):
+    again = pickle.loads(pickle.dumps(error))  # noqa: S301 -- our own bytes
+    assert str(error) == str(again)
+    assert error.code == again.code
+    assert isinstance(error, errors.CsplatError)
+    assert error.code.startswith("E_")
+
+
+def test_fields_have_defaults(make_model):
+    model = make_model(4, 0)
+    bare = SplatModel(
+        means=model.means, quats=model.quats, scales=model.scales, opacities=model.opacities, sh0=model.sh0
+    )
+    assert (4, 0, 3) == bare.shN.shape
+    assert (0.0, 0.0, 0.0) == bare.origin
+    assert "unspecified" == bare.coordinate_system
+    assert (None, None) == (bare.unit_metres, bare.cameras)
+    assert (False, False) == (bare.antialiased, bare.flat)
+    assert ({}, {}) == (dict(bare.metadata), dict(bare.extra))
+
+
+def test_sh_degree_and_length_follow_from_the_shapes(make_model):
+    assert [0, 1, 2, 3] == [make_model(5, degree).sh_degree for degree in range(4)]
+    assert (7, 0) == (len(make_model(7)), len(make_model(0)))
+    assert "SplatModel(7 splats, sh_degree=2)" == repr(make_model(7, 2))
+
+
+@pytest.mark.parametrize(("field", "value", "message"), [
+    ("means", np.zeros((10, 2), np.float32), r"means has shape \[10, 2\]"),
+    ("means", np.float32(1), "means is a float32, expected a float32 array"),
+    ("quats", np.zeros((10, 3), np.float32), r"quats has shape \[10, 3\], expected \[10, 4\]"),
+    ("scales", np.zeros((9, 3), np.float32), r"scales has shape \[9, 3\], expected \[10, 3\]"),
+    ("opacities", np.zeros((10, 1), np.float32), "opacities has shape"),
+    ("sh0", np.zeros((10, 3)), "sh0 is float64, expected float32"),
+    ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, expected float32"),
+    ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, expected 0, 3, 8"),
+    ("shN", np.zeros((10, 24, 3), np.float32), "24 coefficients"),
+    ("shN", np.zeros((10, 45), np.float32), "shN has shape"),
+    ("opacities", np.full(10, 1.5, np.float32), "alpha in .0, 1."),
+    ("opacities", np.full(10, -0.1, np.float32), "not logits"),
+    ("quats", np.zeros((10, 4), np.float32), "10 rows that are not of unit length"),
+    ("quats", np.full((10, 4), 1e30, np.float32), "10 rows that are not of unit length"),
+    ("origin", (1.0, 2.0), "expected three numbers"),
+    ("origin", (1.0, 2.0, float("nan")), "expected finite numbers"),
+    ("coordinate_system", "XYZ", "the axes are 'XYZ'"),
+    ("coordinate_system", "RLU", "the axes are 'RLU'"),
+    ("coordinate_system", "RDFF", "the axes are 'RDFF'"),
+    ("unit_metres", 0.0, "unit_metres is 0.0"),
+    ("unit_metres", float("inf"), "unit_metres is inf"),
+    ("extra", {"id": np.zeros(9)}, "extra column 'id' is not an array of 10"),
+    ("extra", {"id": np.zeros(10, bool)}, "extra column 'id' is bool"),
+])  # fmt: skip
+def test_invalid_fields_are_refused(make_model, field, value, message):
+    with pytest.raises(InputError, match=message):
+        make_model(10, **{field: value})
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_values_that_are_not_finite_are_refused(make_model, field, value):
+    array = getattr(make_model(), field).copy()
+    array.flat[-1] = value
+    with pytest.raises(InputError, match=f"{field} contains 1 values that are NaN or infinite"):
+        make_model(**{field: array})
+
+
+def test_values_at_their_limits_are_accepted(make_model):
+    means = np.full((10, 3), 3e38, np.float32)  # their sum overflows
+    assert np.array_equal(make_model(means=means).means, means)
+    assert 2 == len(make_model(2, opacities=np.array([0, 1], np.float32)))
+    assert (1e7, 2.0, 3.0) == make_model(origin=np.array([1e7, 2, 3])).origin
+    for letters in ("RDF", "RUB", "LUF", "FRU", "BLD"):
+        assert letters == make_model(coordinate_system=letters).coordinate_system
+
+
+def with_doubles(make_model):
+    doubles = np.random.default_rng(1).normal(0, 1, (10, 3)) + np.array([5e5, 5e6, 300.0])
+    origin = (5e5, 5e6, 300.0)
+    means = (doubles - np.array(origin)).astype(np.float32)
+    return make_model(10, 0, means=means, origin=origin, means_double=doubles)
+
+
+def test_doubles_have_to_match_their_means(make_model):
+    model = with_doubles(make_model)
+    some = model.select(np.array([3, 1]))
+    np.testing.assert_array_equal(model.means_double[[3, 1]], some.means_double)
+    assert replace(model, means=model.means + 1, means_double=None).means_double is None
+    for wrong in ({"means": model.means + 1}, {"origin": (0.0, 0.0, 0.0)}, {"means_double": model.means}):
+        with pytest.raises(InputError, match="means_double"):
+            replace(model, **wrong)
+
+
+def test_arrays_are_not_copied(make_model):
+    model = make_model()
+    again = make_model(means=model.means)
+    assert again.means is model.means
+
+
+@pytest.mark.parametrize("index", [slice(2, 5), np.array([4, 1, 1]), np.arange(10) % 3 == 0, slice(0, 0)])
+def test_select_keeps_rows_of_every_array(make_model, index):
+    model = make_model(10, extra={"id": np.arange(10)}, origin=(1.0, 2.0, 3.0), coordinate_system="RDF")
+    part = model.select(index)
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert np.array_equal(getattr(part, name), getattr(model, name)[index])
+    assert np.array_equal(part.extra["id"], model.extra["id"][index])
+    assert (model.origin, model.coordinate_system) == (part.origin, part.coordinate_system)
+
+
+def test_normalised_quats_have_unit_length_and_stay_unchanged():
+    rng = np.random.default_rng(1)
+    quats = (rng.standard_normal((10_000, 4)) * rng.choice([1e-30, 1, 1e30], (10_000, 1))).astype(np.float32)
+    once = normalise_quats(quats)
+    length = np.sqrt(np.sum(once.astype(np.float64) ** 2, 1))
+    assert np.abs(length - 1).max() < 2**-23
+    assert np.array_equal(normalise_quats(once), once)
+
+
+def test_zero_huge_and_denormal_quats_are_normalised():
+    quats = np.array([[0, 0, 0, 0], [3e38, 0, 3e38, 0], [0, 1e-45, 0, 0], [0, 0, 0, -2]], np.float32)
+    half = np.float32(np.sqrt(0.5))
+    expected = [[1, 0, 0, 0], [half, 0, half, 0], [0, 1, 0, 0], [0, 0, 0, -1]]
+    assert np.array_equal(normalise_quats(quats), np.array(expected, np.float32))
+
+
+@pytest.mark.slow
+def test_checking_a_million_splats_takes_a_fraction_of_a_second():
+    count = 1_000_000
+    fields = {
+        "means": np.ones((count, 3), np.float32),
+        "quats": np.full((count, 4), 0.5, np.float32),
+        "scales": np.ones((count, 3), np.float32),
+        "opacities": np.ones(count, np.float32),
+        "sh0": np.ones((count, 3), np.float32),
+        "shN": np.ones((count, 15, 3), np.float32),
+    }
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        SplatModel(**fields)
+        times.append(time.process_time() - start)
+    assert min(times) < 0.15

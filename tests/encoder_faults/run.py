@@ -21,14 +21,11 @@ from csplat.errors import CsplatError
 from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
 from csplat_conformance.encoders import LEVELS, EncoderSuiteOptions, all_inputs, run_encoder
 from csplat_conformance.protocol import ProcessEnd
-from encoder_faults import behaviour, file_bytes, ply_reader, preparation, quantisation, statements
+from encoder_faults import behaviour, encoding, reading
 from encoder_faults.fault import EncoderFault, true_errors
 
 #: All faults by module, in the order of the encoder.
-GROUPS = {
-    "ply_reader": ply_reader.FAULTS, "preparation": preparation.FAULTS, "quantisation": quantisation.FAULTS,
-    "file_bytes": file_bytes.FAULTS, "statements": statements.FAULTS, "behaviour": behaviour.FAULTS,
-}  # fmt: skip
+GROUPS = {"reading": reading.FAULTS, "encoding": encoding.FAULTS, "behaviour": behaviour.FAULTS}
 FAULTS = {name: fault for group in GROUPS.values() for name, fault in group.items()}
 assert len(FAULTS) == sum(map(len, GROUPS.values())), "two faults have one name"
 
@@ -44,7 +41,7 @@ def encode(fault, ply, out, index=None):
     with np.errstate(all="ignore"):  # a faulty encoder may divide by zero
         data, source_index = _encoded(fault, ply)
     if fault.honest is not None:
-        data = file_bytes.bounded(true_errors(fault.honest(ply), csplat.decode(data), source_index))(data)
+        data = encoding.bounded(true_errors(fault.honest(ply), csplat.decode(data), source_index))(data)
     if fault.data is not None:
         data = fault.data(data)
     if fault.end is None:
