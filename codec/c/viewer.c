@@ -162,7 +162,7 @@ static void put_texture(GLuint program, GLuint unit, const char *name, const flo
     GLint most;
     glGetIntegerv(GL_MAX_TEXTURE_BUFFER_SIZE, &most);
     if (floats / (format == GL_RGBA32F ? 4 : 1) > (size_t)most)
-        die("this GL has no texture of so many values");
+        die("this GL has no texture for this many values");
     glGenBuffers(1, &buffer);
     glBindBuffer(GL_TEXTURE_BUFFER, buffer);
     glBufferData(GL_TEXTURE_BUFFER, (GLsizeiptr)(floats * sizeof(float)), values, GL_STATIC_DRAW);

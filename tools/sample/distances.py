@@ -1,6 +1,6 @@
-"""Distances to the garden's surfaces: what rays are marched by.
+"""Signed distances to the garden's surfaces, for ray marching.
 
-The distance to a part is exact or a little too short, so that no ray steps through the union of all.
+The distance to a part is exact or slightly too short, so that no ray passes through a surface.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ _DISH_EDGE = math.sqrt(DISH_RADIUS**2 - DISH_CENTRE**2)
 _MOUND_RADIUS, _MOUND_TOP = 2.4, 0.10
 _PETALS = 9
 
-#: Compiles a function. Without numba's cache, which would not notice a change of what a function calls.
+#: Compiles a function, without numba's cache, which does not detect changes in called functions.
 compiled = numba.njit(error_model="numpy", nogil=True)
 
 
 @compiled
 def field(g: Garden, x: float, y: float, z: float) -> Found:
-    """Distance to the nearest thing, which part that is, and which one of its kind.
+    """Return the distance to the nearest surface, its part, and its index among parts of this kind.
 
-    What lies in a ball that is farther away than something else is not looked at.
+    Parts inside a bounding ball that is farther away than another surface are skipped.
     """
     best = _dish(math.hypot(x, z), y)
     d = _moss(g.cushions, x, y, z)
@@ -111,7 +111,7 @@ def _shell(ball: F64, shell: F64, x: float, y: float, z: float, found: Found) ->
 
 @compiled
 def _dish(r: float, y: float) -> float:
-    """Dish on a foot, by radius and height."""
+    """Return the distance to the dish and its foot, from radius and height."""
     if DISH_CENTRE * r < _DISH_EDGE * (DISH_CENTRE - y):
         wall = abs(math.hypot(r, y - DISH_CENTRE) - DISH_RADIUS) - 0.035
     else:
@@ -123,16 +123,16 @@ def _dish(r: float, y: float) -> float:
 
 @compiled
 def _moss(cushions: F64, x: float, y: float, z: float) -> float:
-    """A mound with cushions, uneven; it fills the dish."""
+    """Return the distance to the moss: an uneven mound with cushions that fills the dish."""
     d = _ball(x, y, z, 0.0, _MOUND_TOP - _MOUND_RADIUS, 0.0, _MOUND_RADIUS)
     for i in range(cushions.shape[0]):
         c = cushions[i]
         d = _blend(d, _ball(x, y, z, c[0], c[1], c[2], c[3]), 0.16)
     if d < 0.12:
         bumps = noise(9 * x, 9 * y, 9 * z) + 0.5 * noise(23 * x, 23 * y, 23 * z)
-        d = 0.5 * (d - 0.055 * (bumps - 0.75))  # steep bumps: half a step
+        d = 0.5 * (d - 0.055 * (bumps - 0.75))  # half a step, since bumps are steep
     else:
-        d -= 0.05  # as much as bumps may stand out
+        d -= 0.05  # maximum height of bumps
     return (
         max(d, _ball(x, y, z, 0.0, DISH_CENTRE, 0.0, DISH_RADIUS)) if y < 0.0 else max(d, math.hypot(x, z) - _DISH_EDGE)
     )
@@ -140,7 +140,7 @@ def _moss(cushions: F64, x: float, y: float, z: float) -> float:
 
 @compiled
 def _cap(x: float, y: float, z: float, radius: float) -> float:
-    """The cap of a toadstool: a dome, hollow beneath."""
+    """Return the distance to the cap of a toadstool: a dome that is hollow below."""
     dome = _ellipsoid(x, y, z, radius, 0.66 * radius, radius)
     hollow = _ellipsoid(x, y + 0.34 * radius, z, 0.92 * radius, 0.36 * radius, 0.92 * radius)
     kept = _blend(hollow, y + 0.22 * radius, 0.06 * radius)
@@ -149,7 +149,7 @@ def _cap(x: float, y: float, z: float, radius: float) -> float:
 
 @compiled
 def _petals(x: float, y: float, z: float) -> float:
-    """Petals of a flower of radius 1 that looks along y: one, repeated around."""
+    """Return the distance to the petals of a flower of radius 1 that faces along y: one petal, repeated."""
     step = 2 * math.pi / _PETALS
     angle = math.atan2(z, x)
     angle -= step * round(angle / step)
@@ -163,7 +163,7 @@ def _stick(
     x: float, y: float, z: float, ax: float, ay: float, az: float, bx: float, by: float, bz: float,
     thick: float, thin: float,
 ) -> float:  # fmt: skip
-    """Distance to a tapered stick with round ends."""
+    """Return the distance to a tapered stick with round ends."""
     px, py, pz, qx, qy, qz = x - ax, y - ay, z - az, bx - ax, by - ay, bz - az
     t = min(1.0, max(0.0, (px * qx + py * qy + pz * qz) / (qx * qx + qy * qy + qz * qz)))
     px, py, pz = px - t * qx, py - t * qy, pz - t * qz
@@ -172,20 +172,20 @@ def _stick(
 
 @compiled
 def _blend(a: float, b: float, width: float) -> float:
-    """The smaller of two distances, with a fillet."""
+    """Return the smaller of two distances, with a fillet."""
     h = max(width - abs(a - b), 0.0) / width
     return min(a, b) - 0.25 * h * h * width
 
 
 @compiled
 def _ball(x: float, y: float, z: float, cx: float, cy: float, cz: float, radius: float) -> float:
-    """Distance to a ball."""
+    """Return the distance to a ball."""
     return math.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - radius
 
 
 @compiled
 def _ellipsoid(x: float, y: float, z: float, rx: float, ry: float, rz: float) -> float:
-    """Distance to an ellipsoid, to first order (Quilez's bound)."""
+    """Return the distance to an ellipsoid, to first order (Quilez's bound)."""
     k0 = math.sqrt((x / rx) ** 2 + (y / ry) ** 2 + (z / rz) ** 2)
     k1 = math.sqrt((x / (rx * rx)) ** 2 + (y / (ry * ry)) ** 2 + (z / (rz * rz)) ** 2)
     return k0 * (k0 - 1.0) / k1 if k1 > 1e-9 else -min(rx, ry, rz)
@@ -193,7 +193,7 @@ def _ellipsoid(x: float, y: float, z: float, rx: float, ry: float, rz: float) ->
 
 @compiled
 def noise(x: float, y: float, z: float) -> float:
-    """Smooth noise between 0 and 1 with features of length 1: random values on a lattice, interpolated."""
+    """Return smooth noise between 0 and 1: random values on a lattice of spacing 1, interpolated."""
     fx, fy, fz = math.floor(x), math.floor(y), math.floor(z)
     u, v, w = x - fx, y - fy, z - fz
     u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)

@@ -1,4 +1,4 @@
-"""The sample's scene: a dish garden of moss, toadstools, daisies, grass, pebbles and a snail.
+"""The scene of the sample: a dish garden of moss, toadstools, daisies, grass, pebbles and a snail.
 
 An original design, made for this project and dedicated to the public domain (CC0-1.0). Lengths are
 in scene units, y points up; the dish has radius 1.
@@ -30,10 +30,10 @@ class Garden(NamedTuple):
         cushions: [n, 4] balls of moss: x y z, radius.
         pebbles: [n, 8] centre x y z, radii x y z, turn about y (radians), kind.
         strands: [n, 9] tapered sticks: x y z, x y z, radius at either end, part.
-        tufts: [n, 6] ball x y z, radius around the strands from the first index to before the second.
-        daisies: [n, 13] centre, three axes (the second one looks out of the flower), radius.
+        tufts: [n, 6] bounding ball x y z, radius; first index of its strands and the index after the last.
+        daisies: [n, 13] centre, three axes (the second is the normal of the flower), radius.
         shell: [n, 4] balls along a spiral: x y z, radius.
-        shell_ball: [4] around the shell.
+        shell_ball: [4] bounding ball of the shell.
     """
 
     toadstools: F64
@@ -50,7 +50,7 @@ def make_garden(seed: int = 7) -> Garden:
     """Plant the garden.
 
     Args:
-        seed: seed of the blades of grass, which differ a little from each other.
+        seed: seed of the blades of grass, which differ slightly.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
     toadstools = [
@@ -96,7 +96,7 @@ def make_garden(seed: int = 7) -> Garden:
 
 
 def _blade(rng: np.random.Generator, root: Sequence[float], height: float) -> list[list[float]]:
-    """A blade of grass that hangs over to some side."""
+    """Return a blade of grass that bends to a random side."""
     angle, tall = 2 * np.pi * rng.random(), height * (0.65 + 0.5 * rng.random())
     lean = np.array([np.cos(angle), 0.0, np.sin(angle)])
     foot = np.array(root) + 0.06 * rng.random() * lean
@@ -107,7 +107,7 @@ def _blade(rng: np.random.Generator, root: Sequence[float], height: float) -> li
 
 def _curve(foot: Sequence[float], middle: Sequence[float], tip: Sequence[float],
            thick: float, thin: float, part: int) -> list[list[float]]:  # fmt: skip
-    """A quadratic Bézier curve as six tapered sticks."""
+    """Return a quadratic Bézier curve as six tapered sticks."""
     t = np.linspace(0.0, 1.0, 7)[:, None]
     points = (1 - t) ** 2 * np.array(foot) + 2 * t * (1 - t) * np.array(middle) + t**2 * np.array(tip)
     radii = thick + (thin - thick) * t[:, 0] ** 1.5
@@ -115,7 +115,7 @@ def _curve(foot: Sequence[float], middle: Sequence[float], tip: Sequence[float],
 
 
 def _snail() -> list[list[float]]:
-    """The snail's body: foot, neck and horns."""
+    """Return the body of the snail: foot, neck and horns."""
     sticks = [
         ((-0.30, 0.045, 0.72), (-0.02, 0.075, 0.74), 0.02, 0.06),
         ((-0.02, 0.075, 0.74), (0.15, 0.085, 0.73), 0.06, 0.058),
@@ -129,7 +129,7 @@ def _snail() -> list[list[float]]:
 
 
 def _shell(centre: Sequence[float], size: float) -> F64:
-    """A snail's shell: balls along a spiral that grows by the same factor with each turn."""
+    """Return the shell of a snail: balls along a logarithmic spiral."""
     count, turns = 40, 2.6
     along = np.arange(count) / (count - 1)
     growth = 0.13 ** (1 - along)
@@ -141,7 +141,7 @@ def _shell(centre: Sequence[float], size: float) -> F64:
 
 
 def _bundle(strands: list[list[float]], balls: list[list[float]], more: list[list[float]]) -> None:
-    """Add strands, and the ball around them."""
+    """Add strands and their bounding ball."""
     ends = np.array([stick[:3] for stick in more] + [stick[3:6] for stick in more])
     middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
     reach = np.max(np.linalg.norm(ends - middle, axis=1)) + max(max(stick[6:8]) for stick in more)
@@ -150,7 +150,7 @@ def _bundle(strands: list[list[float]], balls: list[list[float]], more: list[lis
 
 
 def _axes(normal: Sequence[float]) -> F64:
-    """Three axes as rows, the second one along the normal."""
+    """Return three axes as rows, the second along the normal."""
     y = np.array(normal) / np.linalg.norm(normal)
     x = np.cross(y, [0.0, 0.0, 1.0] if abs(y[2]) < 0.8 else [1.0, 0.0, 0.0])
     x /= np.linalg.norm(x)

@@ -1,15 +1,15 @@
-"""Make the sample scene that ships with the project: photograph the garden, train splats on the pictures.
+"""Make the sample scene that ships with the project: photograph the garden, then train splats on the images.
 
 The scene is procedural (`garden.py`), rendered here (`photograph.py`), trained by `csplat_trainer`.
-Nobody else's work is in it: scene, pictures and splats are dedicated to the public domain (CC0-1.0).
-The same bytes each time on one machine, at any number of threads; another machine may round
-differently, and training makes that visible.
+It contains no third-party work: scene, images and splats are dedicated to the public domain (CC0-1.0).
+The output is reproducible on one machine at any number of threads. Other machines may round
+differently, which training amplifies.
 
-Some minutes on two cores; requires the packages of the render extra.
+Takes a few minutes on two cores; requires the packages of the render extra.
 
 Usage:
     python tools/sample/make_sample.py [OUT.ply] [--keep FOLDER]
-    python tools/sample/make_sample.py --photographs FOLDER [--views 48] [--size 200]     # the pictures alone
+    python tools/sample/make_sample.py --photographs FOLDER [--views 48] [--size 200]     # only the images
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ _SEED = 20
 _FIELD_OF_VIEW = 42.0
 _FAR, _NEAR = 3.4, 2.3  # scene units; the garden has a radius of 1
 _LOWEST, _HIGHEST = -38.0, 82.0  # degrees
-# Geometry learns at twice the default rates, after so few steps, the higher SH bands at half: they keep
-# less noise where no picture looks, which gains 4 dB after `csplat encode` for 0.7 dB on held-out pictures.
+# Since training is short, geometry learns at twice the default rates. The higher SH bands learn at half of theirs and
+# so keep less noise in unobserved directions: 4 dB more after `csplat encode` for 0.7 dB less on test images.
 _TRAINING = TrainOptions(
     max_splats=9000,
     iterations=8000,
@@ -57,7 +57,7 @@ _TRAINING = TrainOptions(
     lr_sh0=5e-3,
     lr_shN=1.25e-4,
 )
-_FAINT = 0.01  # splats that are more transparent than this do not show
+_FAINT = 0.01  # alpha; fainter splats are invisible
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Recipe:
 
 
 def make_sample(output: Path, folder: Path, recipe: Recipe | None = None) -> TrainResult:
-    """Photograph, train, write.
+    """Photograph the garden, train splats and write them.
 
     Args:
         output: the PLY.
@@ -88,7 +88,7 @@ def make_sample(output: Path, folder: Path, recipe: Recipe | None = None) -> Tra
         recipe: sizes of the sample.
 
     Returns:
-        The scene as it is written, with the log of its training.
+        The scene as written, with the log of its training.
     """
     recipe = recipe or Recipe()
     points, colours = photograph_all(folder, recipe)
@@ -101,22 +101,22 @@ def make_sample(output: Path, folder: Path, recipe: Recipe | None = None) -> Tra
 
 
 def finish(model: SplatModel) -> SplatModel:
-    """Leave out what does not show, and say what the scene is."""
+    """Remove invisible splats and add metadata."""
     shown = np.flatnonzero(model.opacities >= _FAINT)
     facts = {"licence": "CC0-1.0", "comments": list(COMMENTS)}
     return replace(model.select(shown), coordinate_system="RDF", metadata=facts)
 
 
 def photograph_all(folder: Path, recipe: Recipe) -> tuple[F32, F32]:
-    """Write a data set of posed pictures in NeRF-synthetic's layout.
+    """Write a data set of posed images in the layout of NeRF-synthetic.
 
     Args:
-        folder: it must exist.
+        folder: an existing folder.
         recipe: number and size of the images.
 
     Returns:
-        Points on the surfaces that the training pictures show, [P, 3], with colours, [P, 3] in 0..1:
-        what structure from motion would find in photographs.
+        Points on the surfaces in the training images, [P, 3], with colours, [P, 3] in 0..1, like those of structure
+        from motion.
     """
     garden, points, colours = make_garden(), [], []
     rng = np.random.Generator(np.random.PCG64(_SEED))
@@ -141,12 +141,12 @@ def photograph_all(folder: Path, recipe: Recipe) -> tuple[F32, F32]:
 
 
 def cameras(count: int, size: int, *, between: bool) -> list[Camera]:
-    """Cameras spread evenly around the garden; every third one nearer, with something off the middle in view.
+    """Return cameras spread evenly around the garden; every third is nearer and aims off-centre.
 
     Args:
         count: number of cameras.
-        size: width and height of their pictures, pixels.
-        between: place them between the training cameras, none of them near.
+        size: width and height of their images, pixels.
+        between: place them between the training cameras, none of them nearer.
     """
     rng = np.random.Generator(np.random.PCG64(_SEED))
     K = intrinsics(size, size, _FIELD_OF_VIEW)
@@ -165,7 +165,7 @@ def cameras(count: int, size: int, *, between: bool) -> list[Camera]:
 
 
 def camera_to_world(camera: Camera) -> F64:
-    """The pose as NeRF-synthetic has it: camera to world, x to the right, y up, z backwards.
+    """Return the pose in the convention of NeRF-synthetic: camera to world, x right, y up, z backwards.
 
     Returns:
         [4, 4].
@@ -176,13 +176,19 @@ def camera_to_world(camera: Camera) -> F64:
 
 
 def main(words: Sequence[str] | None = None) -> None:
-    """Read the command line, make the sample."""
+    """Parse the command line and make the sample."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("output", nargs="?", type=Path, default=SAMPLE, metavar="OUT.ply")
-    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="leave the pictures there")
-    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="write pictures there and train nothing")
-    parser.add_argument("--views", type=int, default=48, metavar="N", help="of --photographs; a sixth more is held out")
-    parser.add_argument("--size", type=int, default=200, metavar="PIXELS", help="of --photographs: width and height")
+    parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep the images in this folder")
+    parser.add_argument("--photographs", type=Path, metavar="FOLDER", help="only write images to this folder")
+    parser.add_argument(
+        "--views",
+        type=int,
+        default=48,
+        metavar="N",
+        help="training images; a sixth more are test images",
+    )
+    parser.add_argument("--size", type=int, default=200, metavar="PIXELS", help="width and height of --photographs")
     arguments = parser.parse_args(words)
     if arguments.photographs is not None:
         arguments.photographs.mkdir(parents=True, exist_ok=True)
@@ -194,8 +200,8 @@ def main(words: Sequence[str] | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         result = make_sample(arguments.output, folder)
     m = result.metrics
-    assert m is not None, "there are test pictures"
-    print(f"{m['views']} held-out pictures: PSNR {m['psnr']:.2f} dB pooled, SSIM {m['ssim']:.4f}")
+    assert m is not None, "there are test images"
+    print(f"{m['views']} test images: PSNR {m['psnr']:.2f} dB pooled, SSIM {m['ssim']:.4f}")
     print(f"{arguments.output}: {len(result.model)} splats, {arguments.output.stat().st_size} bytes")
 
 

@@ -60,7 +60,7 @@ def material(g: Garden, x: float, y: float, z: float, part: int, item: int) -> M
 
 @compiled
 def _glaze(x: float, y: float, z: float) -> Material:
-    """Teal glaze that runs thin at the lip, with a band of waves in slip, over bare clay."""
+    """Return teal glaze over bare clay, thin at the lip, with a band of slip waves."""
     angle = math.atan2(z, x)
     drip = -0.50 + 0.05 * math.sin(5 * angle + 1.0) + 0.035 * math.sin(11 * angle) - 0.06 * noise(7 * x, 0.0, 7 * z)
     if y < drip:
@@ -78,7 +78,7 @@ def _glaze(x: float, y: float, z: float) -> Material:
 
 @compiled
 def _cap_colour(g: Garden, x: float, y: float, z: float, item: int) -> Material:
-    """Glossy and dotted above, gills beneath."""
+    """Return the material of a cap: glossy with dots above, gills below."""
     t = g.toadstools[item]
     qx, qy, qz, radius = (x - t[3]) / t[6], (y - t[4]) / t[6], (z - t[5]) / t[6], t[6]
     flat = math.hypot(qx, qz)
@@ -86,7 +86,7 @@ def _cap_colour(g: Garden, x: float, y: float, z: float, item: int) -> Material:
         gill = 0.5 + 0.5 * math.cos(36 * math.atan2(qz, qx))
         k = 0.55 + 0.35 * gill
         return (0.95 * k, 0.82 * k, 0.58 * k), 0.0, 1.0
-    # Dots on a Fibonacci spiral over the dome, the more the larger the cap.
+    # Dots on a Fibonacci spiral over the dome; larger caps have more.
     count = 26 if radius > 0.25 else 14
     height = math.sqrt(qx * qx + qz * qz + (qy / 0.66) ** 2) + 1e-9
     ux, uy, uz = qx / height, qy / 0.66 / height, qz / height
@@ -104,6 +104,6 @@ def _cap_colour(g: Garden, x: float, y: float, z: float, item: int) -> Material:
 
 @compiled
 def ramp(low: float, high: float, value: float) -> float:
-    """0 below, 1 above, smooth between; the other way round if low > high."""
+    """Return 0 below `low`, 1 above `high`, smooth between; reversed if low > high."""
     t = min(1.0, max(0.0, (value - low) / (high - low)))
     return t * t * (3.0 - 2.0 * t)

@@ -1,7 +1,7 @@
-"""Photographs of the garden: rays marched through its distances, lit by a lamp and a sky.
+"""Photographs of the garden, ray-marched and lit by a lamp and a sky.
 
-What makes trained colours depend on direction is here: highlights of the lamp, reflections of a
-sky with two bright windows, both weighted as Fresnel has it and hidden by what stands in the way.
+Colours depend on the view direction: highlights of the lamp and reflections of a sky with two bright windows have
+Fresnel weights and can be occluded.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from csplat_render.camera import Camera
 _LAMP = (0.46, 0.76, 0.46)
 _LAMP_COLOUR = (2.7, 2.45, 2.1)
 _EXPOSURE = 1.0
-_ALIKE = 0.04  # differences of two rays, in colour (0 to 1) and depth (scene units), below which two rays suffice
+_ALIKE = 0.04  # difference in colour (0 to 1) and depth (scene units) below which two rays per pixel suffice
 _STEPS = 160
-_HIT = 4e-4  # scene units
+_HIT = 4e-4  # scene units; a ray this close has hit the surface
 
 
 def photograph(garden: Garden, camera: Camera) -> tuple[U8, F64]:
-    """Take one picture, two rays to a pixel, four if these two do not agree.
+    """Render one image with two rays per pixel, or four if these two disagree.
 
     Args:
-        garden: the garden; it stands upright in a world with y down.
+        garden: the garden, placed upright in a world with y down.
         camera: the camera.
 
     Returns:
-        Picture [H, W, 4] uint8, straight alpha: the share of a pixel's rays that hit something; and
-        where in the world each pixel's last ray hit, [H, W, 3], meaningless where it did not.
+        Image [H, W, 4] uint8 with straight alpha, the share of a pixel's rays that hit a surface; and the
+        world position that each pixel's last ray hit, [H, W, 3], undefined if it hit nothing.
     """
     viewmat = np.array(camera.viewmat)
     pixels, points = np.empty((camera.H, camera.W, 4), np.uint8), np.empty((camera.H, camera.W, 3))
@@ -45,7 +45,7 @@ def photograph(garden: Garden, camera: Camera) -> tuple[U8, F64]:
 
 @numba.njit(parallel=True, error_model="numpy", nogil=True)
 def _expose(g: Garden, viewmat: F64, K: F64, pixels: U8, points: F64) -> None:
-    """Fill a picture, with places in the camera's axes; a thread takes a run of rows."""
+    """Render an image, with positions in camera axes; rows are rendered in parallel."""
     for row in prange(pixels.shape[0]):
         for column in range(pixels.shape[1]):
             red, green, blue, hits, rays = 0.0, 0.0, 0.0, 0, 0
@@ -70,7 +70,7 @@ def _expose(g: Garden, viewmat: F64, K: F64, pixels: U8, points: F64) -> None:
 @compiled
 def _trace(g: Garden, V: F64, u: float, v: float) -> tuple[float, float, float, float]:
     """Return what a ray hits: depth along the camera's axis (0: nothing), and a display colour, 0 to 1."""
-    # Camera to world, then y and z turned: the garden's y points up.
+    # Camera to world, then y and z negated: the garden's y points up.
     length = math.sqrt(u * u + v * v + 1.0)
     dx = (V[0, 0] * u + V[1, 0] * v + V[2, 0]) / length
     dy = -(V[0, 1] * u + V[1, 1] * v + V[2, 1]) / length
@@ -88,7 +88,7 @@ def _trace(g: Garden, V: F64, u: float, v: float) -> tuple[float, float, float, 
         if d < _HIT or t > end:
             break
         t += d
-    if t > end:  # a ray that ran out of steps creeps along a surface: it counts as a hit
+    if t > end:  # nothing hit; rays that run out of steps graze a surface and count as hits
         return 0.0, 0.0, 0.0, 0.0
     red, green, blue = _shade(g, ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz)
     return t / length, _display(red), _display(green), _display(blue)
@@ -96,7 +96,7 @@ def _trace(g: Garden, V: F64, u: float, v: float) -> tuple[float, float, float, 
 
 @compiled
 def _shade(g: Garden, x: float, y: float, z: float, dx: float, dy: float, dz: float) -> Colour:
-    """Light from a point of the surface back along a ray that came from the camera."""
+    """Return the light from a surface point back along a ray from the camera."""
     _, part, item = field(g, x, y, z)
     e = 8e-4
     a, b = field(g, x + e, y - e, z - e)[0], field(g, x - e, y - e, z + e)[0]

@@ -26,7 +26,7 @@ test('flipped bits of the worked example are refused', async () => {
 });
 
 test('other content that servers send in place of a file is named', async () => {
-  for (const [text, says] of [
+  for (const [text, pattern] of [
     ['version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n', /pointer of Git LFS/],
     ['\n<!DOCTYPE html><html><head></head><body>Not Found</body></html>', /web page/],
     ['ply\nformat binary_little_endian 1.0\nelement vertex 1\n', /a PLY/],
@@ -34,7 +34,7 @@ test('other content that servers send in place of a file is named', async () => 
   ]) {
     const { code, message } = await refusal(() => decode(new TextEncoder().encode(text)));
     assert.equal(code, 'E_MAGIC');
-    assert.match(message, says);
+    assert.match(message, pattern);
   }
 });
 

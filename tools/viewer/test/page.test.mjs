@@ -115,13 +115,13 @@ for (const [what, file] of Object.entries(FOREIGN)) {
 test('invalid cameras of other programs are refused', async () => {
   const { frames, ...document } = FOREIGN['transforms.json'];
   const turned = [{ transform_matrix: [0, 1, 2, 3].map((k) => frames[0].transform_matrix.map((row) => row[k])) }];
-  for (const [wrong, says] of [
+  for (const [wrong, pattern] of [
     [{ ...document, frames: turned }, /transform_matrix has the last row 1 2 3 1, expected 0 0 0 1/],
     [{ ...document, frames: [{}] }, /transform_matrix is not/],
     [{ ...FOREIGN['a camera path of nerfstudio'], camera_type: 'equirectangular' }, /camera_type is equirectangular/],
     [[{ rotation: [1] }], /rotation and position/],
   ]) {
-    await assert.rejects(fetchCameras(JSON.stringify(wrong)), says);
+    await assert.rejects(fetchCameras(JSON.stringify(wrong)), pattern);
   }
 });
 
