@@ -278,6 +278,34 @@ def test_errors_of_a_store_contain_no_secrets(store, status, error, message):
     assert "password" not in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    ("url", "shown"),
+    [
+        ("simplecache::https://user:pw@host/f.csplat?X-Amz-Signature=abc", "simplecache::https://host/f.csplat"),
+        ("zip://f.csplat::https://user:pw@host/a.zip?sig=abc#abc", "zip://f.csplat::https://host/a.zip"),
+        (
+            "zip://f.csplat?abc::simplecache::s3://user:pw@bucket/a.zip",
+            "zip://f.csplat::simplecache::s3://bucket/a.zip",
+        ),
+        ("https://user:pw@[2001:db8::1]:8443/f.csplat?sig=abc", "https://[2001:db8::1]:8443/f.csplat"),
+        ("https://user:p@pw@host/f@2.csplat", "https://host/f@2.csplat"),
+        ("s3://bucket/f.csplat", "s3://bucket/f.csplat"),
+    ],
+)
+def test_each_part_of_a_chained_url_is_redacted(store, url, shown):
+    store.answer = Refused("no")
+    store.answer.status = 500
+    with pytest.raises(StoreError) as raised:
+        csplat.open(url)
+    assert f"{shown}: HTTP status 500" == str(raised.value)
+
+
+def test_urls_in_the_message_of_an_exception_are_redacted(store):
+    store.answer = Refused("cannot reach https://somebody:password@host/f?sig=secret, nor s3://somebody:password@f")
+    with pytest.raises(StoreError, match=r"store://f: cannot reach https://host/f nor s3://f$"):
+        csplat.open("store://f")
+
+
 class Refused(Exception):  # noqa: N818  # named like errors of libraries
     """An error that a store raises."""
 

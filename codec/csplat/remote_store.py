@@ -9,13 +9,16 @@ import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-from urllib.parse import urlsplit, urlunsplit
 
 from csplat.byte_store import DiskStore, MemoryStore, Store
 from csplat.errors import InputError, StoreError, missing_package
 from csplat.file_source import File
 
 _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(://|::)")
+#: A character of a URL before the next URL of a chain, as in `simplecache::https://host/file`.
+_LINK = r"(?!::[A-Za-z][A-Za-z0-9+.-]*(?:://|::))"
+#: A URL in any text: scheme, user and password, host and path, query and fragment.
+_URL_IN_TEXT = re.compile(rf"([A-Za-z][A-Za-z0-9+.-]*://)(?:[^\s/?#]*@)?((?:{_LINK}[^\s?#])*)(?:[?#](?:{_LINK}\S)*)?")
 #: Protocols of servers that may ignore a range request and send the whole file.
 _WEB = {"http", "https"}
 #: Fields that identify a version of a file, under the names of fsspec's file systems.
@@ -127,8 +130,8 @@ class RemoteStore(Store):
             number = errno.EACCES
         if number:
             return OSError(number, os.strerror(number), self._shown)  # creates the subclass for the number
-        text = f"HTTP status {status}" if status else str(error)  # aiohttp's text contains the URL with its secrets
-        return StoreError(f"{self._shown}: {' '.join(text.split()) or type(error).__name__}")
+        text = f"HTTP status {status}" if status else _message(error)
+        return StoreError(f"{self._shown}: {text or type(error).__name__}")
 
 
 def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
@@ -142,15 +145,17 @@ def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
     try:
         fs, path = url_to_fs(url, **options)
     except ImportError as error:  # fsspec's message names the package
-        raise InputError(f"{_redact(url)}: {error}; for HTTP and S3: pip install 'csplat[remote]'") from None
+        raise InputError(f"{_redact(url)}: {_message(error)}; for HTTP and S3: pip install 'csplat[remote]'") from None
     except (ValueError, TypeError) as error:
-        raise InputError(f"{_redact(url)}: {' '.join(str(error).split())}") from None
+        raise InputError(f"{_redact(url)}: {_message(error)}") from None
     return fs, path
 
 
-def _redact(url: str) -> str:
-    """Return a URL for messages, without passwords and signatures."""
-    parts = urlsplit(url)
-    if not parts.netloc:
-        return url
-    return urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
+def _message(error: BaseException) -> str:
+    """Return the text of a library's exception as one line; it may contain the URL."""
+    return _redact(" ".join(str(error).split()))
+
+
+def _redact(text: str) -> str:
+    """Remove passwords and queries, which contain signatures, from all URLs in a text."""
+    return _URL_IN_TEXT.sub(r"\1\2", text)

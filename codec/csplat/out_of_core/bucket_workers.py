@@ -23,7 +23,7 @@ from csplat.encoder.pipeline import EncodedTile, encode_tile
 from csplat.encoder.sh_codebook import FileCodebooks, assign_splats
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import missing_package
-from csplat.out_of_core.spill_files import Bucket, SplatLayout, bucket_path, damaged_file, read_splats
+from csplat.out_of_core.spill_files import Bucket, SplatLayout, damaged_file, read_splats, spill_path
 from csplat.system import map_in_processes
 
 
@@ -56,7 +56,7 @@ def code_bucket(folder: Path, bucket: Bucket, coding: BucketCoding) -> None:
     """
     if _record_path(folder, bucket).exists():
         return
-    model = clip_scales(read_splats(bucket_path(folder, bucket.place), coding.layout, bucket.rows))
+    model = clip_scales(read_splats(spill_path(folder, bucket.file_index), coding.layout, bucket.rows))
     sh_plan = assign_splats(coding.books, model, coding.plan, threads=1)
     records, size = [], 0
     with atomic_writer(_chunks_path(folder, bucket)) as stream:
@@ -89,15 +89,15 @@ def read_coded_bucket(folder: Path, bucket: Bucket) -> list[EncodedTile] | None:
 
 
 def _chunks_path(folder: Path, bucket: Bucket) -> Path:
-    return folder / f"chunks-{bucket.number:06}"
+    return folder / f"chunks-{bucket.index:06}"
 
 
 def _record_path(folder: Path, bucket: Bucket) -> Path:
-    return folder / f"tiles-{bucket.number:06}"
+    return folder / f"tiles-{bucket.index:06}"
 
 
 def _record(coded: EncodedTile, start: int) -> dict[str, Any]:
-    """Return a coded tile as JSON, with offset, size and CRC in place of each payload."""
+    """Return a coded tile as JSON, with offset, size and CRC instead of each payload."""
     layers, at = {}, start
     for layer, payload in coded.tile.layers.items():
         assert isinstance(payload, bytes)

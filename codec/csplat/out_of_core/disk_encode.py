@@ -22,7 +22,7 @@ from csplat.encoder.sh_codebook import FileCodebooks, final_parameters, largest_
 from csplat.encoder.tiling import BUCKET_SPLATS, BucketCurve, contrast_buckets, sample_rows
 from csplat.errors import InputError
 from csplat.out_of_core.bucket_workers import BucketCoding, code_here, code_on_cluster, read_coded_bucket
-from csplat.out_of_core.spill_files import BucketWriter, SplatLayout, Survey, WorkingFolder, bucket_path, read_splats
+from csplat.out_of_core.spill_files import SpillWriter, SplatLayout, Survey, WorkingFolder, read_splats, spill_path
 from csplat.scene_source import SceneSource, with_progress
 from csplat.system import default_memory_bytes
 from csplat.types import Progress, null_progress
@@ -171,16 +171,16 @@ class _Encoding:
 
     def run(self) -> EncodeReport:
         work = self.work
-        if "counts" not in work.state:
-            work.clear_buckets()
+        if work.state.counts is None:
+            work.clear_spill_files()
             self._check_space()
             self._sort()
-        if "contrast" not in work.state:
+        if work.state.contrast is None:
             buckets = work.buckets
-            some = (buckets[number] for number in contrast_buckets(len(buckets)))
-            work.note(
+            some = (buckets[index] for index in contrast_buckets(len(buckets)))
+            work.record_progress(
                 contrast=measure_contrast(
-                    read_splats(bucket_path(work.folder, one.place), work.layout, one.rows) for one in some
+                    read_splats(spill_path(work.folder, one.file_index), work.layout, one.rows) for one in some
                 )
             )
         draft, books = self._decide()
@@ -194,28 +194,28 @@ class _Encoding:
         try:
             check_free_space(work.folder, self.needs.disk_bytes, "this scene is encoded: --work names another folder")
         except InputError:
-            if "curve" not in work.state:  # no work would be lost
+            if work.state.curve is None:  # no work would be lost
                 work.remove()
             raise
 
     def _sort(self) -> None:
         """Read the scene twice: survey it, then sort its splats into buckets."""
-        work, survey = self.work, self.work.survey
+        work, survey = self.work, self.work.read_survey()
         if survey is None:
             survey = take_survey(with_progress(self.scene, "looking", self.progress), work.layout)
-            work.keep(survey)
-        writer = BucketWriter(work.folder, work.layout, survey.curve, _PENDING)
+            work.write_survey(survey)
+        writer = SpillWriter(work.folder, work.layout, survey.curve, _PENDING)
         del survey
         for block in with_progress(self.scene, "sorting", self.progress).blocks():
             writer.add(block)
         writer.flush()
-        work.note(counts=writer.counts.tolist())
+        work.record_progress(counts=writer.counts.tolist())
 
     def _decide(self) -> tuple[EncodePlan, FileCodebooks]:
         """Choose parameters and codebooks on the sample; return them without the sample's splats."""
-        work, survey = self.work, self.work.survey
+        work, survey = self.work, self.work.read_survey()
         assert survey is not None
-        sample = EncodePlan.of(survey.sample, self.options, contrast=work.state["contrast"], progress=self.progress)
+        sample = EncodePlan.of(survey.sample, self.options, contrast=work.state.contrast, progress=self.progress)
         plan, books = replace(sample, parameters=final_parameters(sample.parameters, survey.largest)).choose_sh_coding(
             self.progress
         )
@@ -231,19 +231,19 @@ class _Encoding:
 
     def _code(self, coding: BucketCoding) -> None:
         folder, buckets = self.work.folder, self.work.buckets
-        left = {one.number: one for one in buckets if read_coded_bucket(folder, one) is None}
+        left = {one.index: one for one in buckets if read_coded_bucket(folder, one) is None}
         for bucket in buckets:
-            if bucket.number not in left:
-                self.work.drop(bucket, list(left.values()))
-        done = sum(one.stop - one.start for one in buckets if one.number not in left)
+            if bucket.index not in left:
+                self.work.remove_spill_file(bucket, list(left.values()))
+        done = sum(one.stop - one.start for one in buckets if one.index not in left)
         pending = list(left.values())
         if self.cluster is None:
             found = code_here(folder, pending, coding, self.needs.workers)
         else:
             found = code_on_cluster(folder, pending, coding, self.cluster)
         for bucket in found:
-            del left[bucket.number]
-            self.work.drop(bucket, list(left.values()))
+            del left[bucket.index]
+            self.work.remove_spill_file(bucket, list(left.values()))
             done += bucket.stop - bucket.start
             self.progress("coding", done / self.scene.count)
 

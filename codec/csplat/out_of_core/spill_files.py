@@ -1,7 +1,8 @@
-"""Keep the state of an encoding in a working folder: the splats of each bucket, and progress for resuming.
+"""Keep the state of an encoding in a working folder: splats in spill files, and progress for resuming.
 
-A bucket file is a sequence of frames. A frame consists of the number of its splats, a CRC, and the arrays of a model
-one after the other. Files use the byte order of the machine, which is also the one that reads them.
+Each section of the bucket curve has a spill file. A large section is split into several buckets, which are ranges of
+rows in its file. A spill file is a sequence of frames. A frame consists of the number of its splats, a CRC, and the
+arrays of a model one after the other. Files use the byte order of the machine, which is also the one that reads them.
 """
 
 from __future__ import annotations
@@ -74,19 +75,19 @@ class Bucket:
     """A bucket: splats that are coded together.
 
     Attributes:
-        number: index among all buckets.
-        place: index of the file with its splats.
+        index: index among all buckets.
+        file_index: index of the spill file with its splats.
         start, stop: range of its rows in that file.
     """
 
-    number: int
-    place: int
+    index: int
+    file_index: int
     start: int
     stop: int
 
     @property
     def rows(self) -> slice:
-        """The bucket's rows in its file."""
+        """The bucket's rows in its spill file."""
         return slice(self.start, self.stop)
 
 
@@ -106,15 +107,15 @@ class Survey:
 
 
 @dataclass(eq=False)
-class BucketWriter:
-    """A buffered writer that appends splats to the files of their buckets.
+class SpillWriter:
+    """A buffered writer that appends splats to spill files.
 
     Attributes:
-        folder: an existing folder without bucket files.
+        folder: an existing folder without spill files.
         layout: layout of the splats.
-        curve: the curve that assigns splats to buckets.
+        curve: the curve that assigns splats to files.
         pending_bytes_max: maximum size of the buffer.
-        counts: [buckets], number of splats added so far.
+        counts: [files], number of splats added so far.
     """
 
     folder: Path
@@ -122,31 +123,31 @@ class BucketWriter:
     curve: BucketCurve
     pending_bytes_max: int
     counts: NDArray[np.int64] = field(init=False)
-    _waiting: list[list[list[NDArray[Any]]]] = field(init=False)
-    _waiting_bytes: int = field(init=False, default=0)
+    _pending: list[list[list[NDArray[Any]]]] = field(init=False)
+    _pending_bytes: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
         self.counts = np.zeros(self.curve.count, np.int64)
-        self._waiting = [[] for _ in range(self.curve.count)]
+        self._pending = [[] for _ in range(self.curve.count)]
 
     def add(self, model: SplatModel) -> None:
-        """Add splats; within a bucket they keep their order.
+        """Add splats; within a file they keep their order.
 
         Raises:
             OSError: the splats cannot be written.
         """
-        bucket = self.curve.bucket_of(model.means)
-        order = np.argsort(bucket, kind="stable")
-        sizes = np.bincount(bucket, minlength=self.curve.count)
+        file_indices = self.curve.bucket_of(model.means)
+        order = np.argsort(file_indices, kind="stable")
+        sizes = np.bincount(file_indices, minlength=self.curve.count)
         arrays = [array[order] for array in self.layout.arrays(model)]
         start = 0
-        for place in np.flatnonzero(sizes):
-            end = start + int(sizes[place])
-            self._waiting[place].append([array[start:end] for array in arrays])
+        for file_index in np.flatnonzero(sizes):
+            end = start + int(sizes[file_index])
+            self._pending[file_index].append([array[start:end] for array in arrays])
             start = end
         self.counts += sizes
-        self._waiting_bytes += sum(array.nbytes for array in arrays)
-        if self._waiting_bytes > self.pending_bytes_max:
+        self._pending_bytes += sum(array.nbytes for array in arrays)
+        if self._pending_bytes > self.pending_bytes_max:
             self.flush()
 
     def flush(self) -> None:
@@ -155,17 +156,17 @@ class BucketWriter:
         Raises:
             OSError: the splats cannot be written.
         """
-        for place, waiting in enumerate(self._waiting):
-            if waiting:
-                with bucket_path(self.folder, place).open("ab") as stream:
-                    _append(stream, [np.concatenate(parts) for parts in zip(*waiting, strict=True)])
-                waiting.clear()
-        self._waiting_bytes = 0
+        for file_index, pending in enumerate(self._pending):
+            if pending:
+                with spill_path(self.folder, file_index).open("ab") as stream:
+                    _append(stream, [np.concatenate(parts) for parts in zip(*pending, strict=True)])
+                pending.clear()
+        self._pending_bytes = 0
 
 
-def bucket_path(folder: Path, place: int) -> Path:
-    """Return the file of a bucket."""
-    return folder / f"bucket-{place:06}"
+def spill_path(folder: Path, file_index: int) -> Path:
+    """Return the path of a spill file."""
+    return folder / f"bucket-{file_index:06}"
 
 
 def read_splats(path: Path, layout: SplatLayout, part: slice | None = None) -> SplatModel:
@@ -237,6 +238,47 @@ _STATE = "state.json"
 _SAMPLE = "sample"
 
 
+@dataclass(frozen=True, eq=False)
+class EncodingState:
+    """The progress of an encoding. Fields of later stages are `None` until their stage is complete.
+
+    Attributes:
+        key: identifies scene and options, JSON-compatible.
+        curve: the curve of the survey; known after the first pass.
+        largest: largest magnitude of all SH coefficients; known after the first pass.
+        counts: number of splats in each spill file; known after the second pass.
+        contrast: contrast of the scene; measured after the second pass.
+    """
+
+    key: dict[str, Any]
+    curve: BucketCurve | None = None
+    largest: float | None = None
+    counts: list[int] | None = None
+    contrast: float | None = None
+
+    def to_json(self) -> bytes:
+        """Format the known fields as JSON."""
+        stored: dict[str, Any] = {name: value for name, value in vars(self).items() if value is not None}
+        if (curve := self.curve) is not None:
+            bounds = curve.bounds.tolist()
+            stored["curve"] = {"corner": curve.corner.tolist(), "scale": curve.scale, "bounds": bounds}
+        return json.dumps(stored).encode()
+
+    @classmethod
+    def from_json(cls, data: bytes) -> EncodingState:
+        """Parse the JSON of `to_json`.
+
+        Raises:
+            ValueError, TypeError, KeyError: the data is damaged.
+        """
+        state = cls(**json.loads(data))
+        if state.curve is None:
+            return state
+        stored: Any = state.curve
+        curve = BucketCurve(np.array(stored["corner"]), stored["scale"], np.array(stored["bounds"], np.int64))
+        return replace(state, curve=curve)
+
+
 @dataclass(eq=False)
 class WorkingFolder:
     """A working folder: the state of an encoding that can be resumed.
@@ -244,13 +286,12 @@ class WorkingFolder:
     Attributes:
         folder: path of the folder.
         layout: layout of the splats in it.
-        state: progress so far: `key` identifies scene and options; `curve` and `largest` follow after the first pass,
-            `counts`, the number of splats of each bucket, after the second pass; then `contrast`.
+        state: progress so far, as in the folder's state file.
     """
 
     folder: Path
     layout: SplatLayout
-    state: dict[str, Any] = field(default_factory=dict)
+    state: EncodingState
 
     @classmethod
     def create(cls, folder: Path, layout: SplatLayout, key: dict[str, Any], *, resume: bool) -> WorkingFolder:
@@ -261,51 +302,51 @@ class WorkingFolder:
                 has other content.
             OSError: the folder cannot be created or read.
         """
-        work = cls(folder, layout)
         if (folder / _STATE).exists():
             if not resume:
                 raise InputError(
                     f"{folder} is left from an interrupted encoding: continue with `--resume`, or remove it"
                 )
             try:
-                work.state = json.loads((folder / _STATE).read_text())
-            except ValueError:
+                state = EncodingState.from_json((folder / _STATE).read_bytes())
+            except (ValueError, TypeError, KeyError):
                 raise damaged_file(folder / _STATE) from None
             for name, value in key.items():
-                if (found := work.state["key"].get(name)) != value:
-                    raise InputError(f"{folder} was started with {name} {found}, now {value}: remove it")
-            return work
+                if (found := state.key.get(name)) != value:
+                    raise InputError(
+                        f"{folder} was started with {name} {found}, now {value}: continue with the former {name}, "
+                        "or remove the folder to start again"
+                    )
+            return cls(folder, layout, state)
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise InputError(f"{folder} is not empty: the working folder is removed afterwards, choose a new one")
         folder.mkdir(exist_ok=True)
-        work.note(key=key)
+        work = cls(folder, layout, EncodingState(key))
+        work.record_progress()
         return work
 
-    def note(self, **done: Any) -> None:
-        """Record progress.
+    def record_progress(self, **done: Any) -> None:
+        """Set fields of the state and write the state file.
 
         Raises:
             OSError: the state cannot be written.
         """
-        self.state.update(done)
+        self.state = replace(self.state, **done)
         with atomic_writer(self.folder / _STATE) as stream:
-            stream.write(json.dumps(self.state).encode())
+            stream.write(self.state.to_json())
 
-    @property
-    def survey(self) -> Survey | None:
-        """Results of the first pass; `None` if it is not complete.
+    def read_survey(self) -> Survey | None:
+        """Read the results of the first pass; return `None` if it is not complete.
 
         Raises:
             InputError: the sample file is damaged.
             OSError: the sample file cannot be read.
         """
-        if "curve" not in self.state:
+        if self.state.curve is None or self.state.largest is None:
             return None
-        stored = self.state["curve"]
-        curve = BucketCurve(np.array(stored["corner"]), stored["scale"], np.array(stored["bounds"], np.int64))
-        return Survey(read_splats(self.folder / _SAMPLE, self.layout), self.state["largest"], curve)
+        return Survey(read_splats(self.folder / _SAMPLE, self.layout), self.state.largest, self.state.curve)
 
-    def keep(self, survey: Survey) -> None:
+    def write_survey(self, survey: Survey) -> None:
         """Record the results of the first pass.
 
         Raises:
@@ -313,27 +354,29 @@ class WorkingFolder:
         """
         with (self.folder / _SAMPLE).open("wb") as stream:
             _append(stream, self.layout.arrays(survey.sample))
-        curve = survey.curve
-        stored = {"corner": curve.corner.tolist(), "scale": curve.scale, "bounds": curve.bounds.tolist()}
-        self.note(curve=stored, largest=survey.largest)
+        self.record_progress(curve=survey.curve, largest=survey.largest)
 
     @property
     def buckets(self) -> list[Bucket]:
         """All buckets in the order of the output file; known after the second pass."""
+        assert self.state.counts is not None
         parts = [
-            (place, part) for place, count in enumerate(self.state["counts"]) if count for part in bucket_slices(count)
+            (file_index, part)
+            for file_index, count in enumerate(self.state.counts)
+            if count
+            for part in bucket_slices(count)
         ]
-        return [Bucket(number, place, part.start, part.stop) for number, (place, part) in enumerate(parts)]
+        return [Bucket(index, file_index, part.start, part.stop) for index, (file_index, part) in enumerate(parts)]
 
-    def clear_buckets(self) -> None:
-        """Remove the files of an interrupted second pass."""
+    def clear_spill_files(self) -> None:
+        """Remove the spill files of an interrupted second pass."""
         for path in self.folder.glob("bucket-*"):
             path.unlink()
 
-    def drop(self, bucket: Bucket, left: Sequence[Bucket]) -> None:
-        """Remove the file of a coded bucket unless buckets in `left`, which are not coded, share it."""
-        if all(other.place != bucket.place for other in left):
-            bucket_path(self.folder, bucket.place).unlink(missing_ok=True)
+    def remove_spill_file(self, bucket: Bucket, left: Sequence[Bucket]) -> None:
+        """Remove the spill file of a coded bucket unless buckets in `left`, which are not coded, share it."""
+        if all(other.file_index != bucket.file_index for other in left):
+            spill_path(self.folder, bucket.file_index).unlink(missing_ok=True)
 
     def remove(self) -> None:
         """Remove the folder after the output is complete."""

@@ -1,11 +1,9 @@
-"""The log of violations, records with their positions, and the error code of each clause (spec 2 to 8)."""
+"""Results of a validation, readers of structures with their offsets, the log of violations, and codes of clauses."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Final, Generic, TypeVar
 
 from csplat import _spec
@@ -81,33 +79,90 @@ class Validation:
         return not self.violations
 
 
-class TooManyViolationsError(Exception):
-    """Raised at VIOLATIONS_MAX, to end the validation."""
-
-
 @dataclass(frozen=True)
 class PlacedRecord(Generic[T]):
-    """A structure of the registry and its place in the file.
+    """A structure of the registry with its offset in the file.
 
     Attributes:
         record: the fields.
         offset: offset in the file.
         name: prefix of the names of its fields, `tile[0]`.
-        places: offset of each field within the structure.
+        field_offsets: offset of each field within the structure.
     """
 
     record: T
     offset: int
     name: str
-    places: dict[str, int]
+    field_offsets: dict[str, int]
 
     def at(self, key: str, within: int = 0) -> int:
         """Return the offset in the file of a field, or of a byte within it."""
-        return self.offset + self.places[key] + within
+        return self.offset + self.field_offsets[key] + within
 
     def path(self, key: str) -> str:
         """Return the full name of a field."""
         return f"{self.name}.{key}"
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """The layout of a structure of the registry.
+
+    Attributes:
+        unpack: reads the structure at an offset.
+        size: size in bytes.
+        offsets: offset of each field within the structure.
+    """
+
+    unpack: Callable[[memoryview, int], Any]
+    size: int
+    offsets: dict[str, int]
+
+
+_LAYOUTS: Final[dict[type[Any], _Layout]] = {
+    _spec.Header: _Layout(_spec.unpack_header, _spec.HEADER_SIZE, _spec.HEADER_OFFSETS),
+    _spec.IndexHead: _Layout(_spec.unpack_index_head, _spec.INDEX_HEAD_SIZE, _spec.INDEX_HEAD_OFFSETS),
+    _spec.AttributeRecord: _Layout(
+        _spec.unpack_attribute_record, _spec.ATTRIBUTE_RECORD_SIZE, _spec.ATTRIBUTE_RECORD_OFFSETS
+    ),
+    _spec.CodebookRecord: _Layout(
+        _spec.unpack_codebook_record, _spec.CODEBOOK_RECORD_SIZE, _spec.CODEBOOK_RECORD_OFFSETS
+    ),
+    _spec.ExtraRecord: _Layout(_spec.unpack_extra_record, _spec.EXTRA_RECORD_SIZE, _spec.EXTRA_RECORD_OFFSETS),
+    _spec.DirectoryRecord: _Layout(
+        _spec.unpack_directory_record, _spec.DIRECTORY_RECORD_SIZE, _spec.DIRECTORY_RECORD_OFFSETS
+    ),
+    _spec.TileRecord: _Layout(_spec.unpack_tile_record, _spec.TILE_RECORD_SIZE, _spec.TILE_RECORD_OFFSETS),
+    _spec.LayerRecord: _Layout(_spec.unpack_layer_record, _spec.LAYER_RECORD_SIZE, _spec.LAYER_RECORD_OFFSETS),
+    _spec.ChunkHeader: _Layout(_spec.unpack_chunk_header, _spec.CHUNK_HEADER_SIZE, _spec.CHUNK_HEADER_OFFSETS),
+    _spec.TileHead: _Layout(_spec.unpack_tile_head, _spec.TILE_HEAD_SIZE, _spec.TILE_HEAD_OFFSETS),
+    _spec.CodebookHead: _Layout(_spec.unpack_codebook_head, _spec.CODEBOOK_HEAD_SIZE, _spec.CODEBOOK_HEAD_OFFSETS),
+    _spec.BlockHead: _Layout(_spec.unpack_block_head, _spec.BLOCK_HEAD_SIZE, _spec.BLOCK_HEAD_OFFSETS),
+    _spec.LatticeParams: _Layout(_spec.unpack_lattice_params, _spec.LATTICE_PARAMS_SIZE, _spec.LATTICE_PARAMS_OFFSETS),
+    _spec.MortonParams: _Layout(_spec.unpack_morton_params, _spec.MORTON_PARAMS_SIZE, _spec.MORTON_PARAMS_OFFSETS),
+    _spec.CodebookParams: _Layout(
+        _spec.unpack_codebook_params, _spec.CODEBOOK_PARAMS_SIZE, _spec.CODEBOOK_PARAMS_OFFSETS
+    ),
+    _spec.SparseParams: _Layout(_spec.unpack_sparse_params, _spec.SPARSE_PARAMS_SIZE, _spec.SPARSE_PARAMS_OFFSETS),
+    _spec.RawParams: _Layout(_spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS),
+    _spec.StreamHead: _Layout(_spec.unpack_stream_head, _spec.STREAM_HEAD_SIZE, _spec.STREAM_HEAD_OFFSETS),
+    _spec.StatedErrorsHead: _Layout(
+        _spec.unpack_stated_errors_head, _spec.STATED_ERRORS_HEAD_SIZE, _spec.STATED_ERRORS_HEAD_OFFSETS
+    ),
+    _spec.StatedErrorRecord: _Layout(
+        _spec.unpack_stated_error_record, _spec.STATED_ERROR_RECORD_SIZE, _spec.STATED_ERROR_RECORD_OFFSETS
+    ),
+}
+
+
+def read_record(view: memoryview, kind: type[T], at: int, name: str) -> PlacedRecord[T]:
+    """Read a structure that is known to fit into the data."""
+    layout = _LAYOUTS[kind]
+    return PlacedRecord(layout.unpack(view, at), at, name, layout.offsets)
+
+
+class TooManyViolationsError(Exception):
+    """Raised at VIOLATIONS_MAX, to end the validation."""
 
 
 @dataclass
@@ -134,7 +189,7 @@ class ViolationLog:
         """
         self.violations.append(Violation(clause, code or CODES[clause], offset, name, message))
         if len(self.violations) >= VIOLATIONS_MAX:
-            self.remarks.append(f"more than {VIOLATIONS_MAX} violations: the rest of the file was not checked")
+            self.remarks.append(f"at least {VIOLATIONS_MAX} violations: the rest of the file was not checked")
             raise TooManyViolationsError
 
     def add_field(
@@ -145,7 +200,7 @@ class ViolationLog:
 
     def check_reserved(self, placed: PlacedRecord[Any]) -> None:
         """Check RES-1: "A reserved field or bit MUST be 0"."""
-        for key in placed.places:
+        for key in placed.field_offsets:
             value = getattr(placed.record, key)
             if key.startswith("reserved_") and value != 0:
                 self.add_field("RES-1", placed, key, f"{value} in a reserved field, expected 0")
@@ -157,20 +212,6 @@ class ViolationLog:
 
 class UnreadableError(Exception):
     """Raised if a wrong length or type makes the position of the rest unknown; the violation was already added."""
-
-
-@cache
-def _layout(kind: str) -> tuple[Callable[[memoryview, int], Any], int, dict[str, int]]:
-    """Return the unpacking function, the size in bytes and the field offsets of a structure by its class name."""
-    name = re.sub(r"(?<!^)(?=[A-Z])", "_", kind)
-    upper = name.upper()
-    return getattr(_spec, f"unpack_{name.lower()}"), getattr(_spec, f"{upper}_SIZE"), getattr(_spec, f"{upper}_OFFSETS")
-
-
-def read_record(view: memoryview, kind: type[T], at: int, name: str) -> PlacedRecord[T]:
-    """Read a structure that is known to fit into the data."""
-    unpack, _, places = _layout(kind.__name__)
-    return PlacedRecord(unpack(view, at), at, name, places)
 
 
 class Payload:
@@ -215,7 +256,7 @@ class Payload:
 
     def structure(self, kind: type[T], what: str) -> PlacedRecord[T]:
         """Read the next structure, named after the chunk and `what`, and check its reserved fields."""
-        at = self.take(_layout(kind.__name__)[1], what)
+        at = self.take(_LAYOUTS[kind].size, what)
         placed = read_record(self.view, kind, at, f"{self.name}/{what}")
         self.log.check_reserved(placed)
         return placed
