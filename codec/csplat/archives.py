@@ -30,7 +30,7 @@ DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeErr
 #: File name suffixes of scenes.
 _SCENES = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".gltf", ".csplat", ".pt", ".ckpt", ".pth")
 #: Locations of scenes in the output folders of INRIA's trainer, gsplat and nerfstudio.
-_PLACES = ("*", "iteration_*/*", "point_cloud/iteration_*/*", "ply/*", "ckpts/*", "nerfstudio_models/*")
+_PATTERNS = ("*", "iteration_*/*", "point_cloud/iteration_*/*", "ply/*", "ckpts/*", "nerfstudio_models/*")
 _POINTS = "input.ply"  # initial points of INRIA's trainer, not a scene
 _NAMED = 5  # maximum number of scenes listed in a message
 
@@ -60,7 +60,7 @@ def zip_refusal(path: Path) -> str:
 
 def folder_refusal(path: Path) -> str:
     """Return the error message for a folder that is not a scene, naming the newest scene that a trainer left in it."""
-    found = {one for place in _PLACES for one in path.glob(place) if one.name.lower().endswith(_SCENES)}
+    found = {one for pattern in _PATTERNS for one in path.glob(pattern) if one.name.lower().endswith(_SCENES)}
     scenes = sorted(one.relative_to(path).as_posix() for one in found if one.name != _POINTS)
     if not scenes:
         return f"{path} is a folder, not a scene"

@@ -316,7 +316,7 @@ def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
     found = ((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1)
     if not found.any():
         raise InputError(f"no tile touches the box {_corner_text(low)} to {_corner_text(high)}: {_extent_text(boxes)}")
-    return [header.tiles[place] for place in np.flatnonzero(found)]
+    return [header.tiles[index] for index in np.flatnonzero(found)]
 
 
 def _corner_text(corner: F64) -> str:

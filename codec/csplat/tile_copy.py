@@ -87,19 +87,19 @@ class ChunkPrefetcher:
         self._batch = min(window.store.sizes.batch, _ALL // files)
         self._here = range(0)
 
-    def take(self, place: int, extra: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:
+    def take(self, index: int, extra: Sequence[_spec.DirectoryRecord] = ()) -> _spec.LayerRecord:
         """Return the record of a chunk; if it is not in the window, fetch it with the next batch and `extra`."""
-        if place not in self._here:
-            stop, size = place + 1, self._records[place].size
+        if index not in self._here:
+            stop, size = index + 1, self._records[index].size
             while stop < len(self._records) and size + self._records[stop].size <= self._batch:
                 size += self._records[stop].size
                 stop += 1
             if self._here:
                 self._window.forget()
             ranges = [(one.offset, one.size) for one in extra]
-            self._window.fetch(ranges + [(one.offset, one.size) for one in self._records[place:stop]])
-            self._here = range(place, stop)
-        return self._records[place]
+            self._window.fetch(ranges + [(one.offset, one.size) for one in self._records[index:stop]])
+            self._here = range(index, stop)
+        return self._records[index]
 
 
 class TileCopier:
@@ -123,10 +123,10 @@ class TileCopier:
         """
         layers: dict[int, Payload] = dict(changed or {})
         for layer in _spec.LAYER_NAMES.keys() & tile.layers.keys() - layers.keys():
-            record, places = tile.layers[layer], self._records[layer]
-            read = partial(self._read, layer, len(places))
+            record, records = tile.layers[layer], self._records[layer]
+            read = partial(self._read, layer, len(records))
             layers[layer] = LazyPayload(record.size - _spec.CHUNK_HEADER_SIZE, record.crc, read)
-            places.append(record)
+            records.append(record)
         return FileTile(
             tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.codebook_ids
         )  # fmt: skip
@@ -142,9 +142,9 @@ class TileCopier:
         records = [one for records in self._records.values() for one in records]
         return ChunkPrefetcher(self._window, records, self._files), starts
 
-    def _read(self, layer: int, place: int) -> bytes:
+    def _read(self, layer: int, index: int) -> bytes:
         chunks, starts = self._chunks
-        return chunk_payload(self._window, chunks.take(starts[layer] + place))
+        return chunk_payload(self._window, chunks.take(starts[layer] + index))
 
 
 def chunk_payload(window: FileWindow, record: _spec.DirectoryRecord | _spec.LayerRecord) -> bytes:

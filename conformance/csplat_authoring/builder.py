@@ -272,7 +272,7 @@ def _tail(out: Writer, tail: bytes) -> None:
 # Blocks and streams --------------------------------------------------------------------------------
 
 
-def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, place: int) -> None:
+def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, column: int) -> None:
     out.structure(name, "block_head", [attribute, block.coding, 0])
     if block.coding in (_spec.CODING_OFFSET, _spec.CODING_SIGNED):
         _lattice(out, name, block)
@@ -288,7 +288,7 @@ def _block(out: Writer, name: str, scene: Scene, attribute: int, block: Block, p
         _codebook_block(out, name, scene, attribute, block)
     else:
         if block.coding == _spec.CODING_RAW:
-            out.structure(f"{name}.params", "raw_params", [place, 0])
+            out.structure(f"{name}.params", "raw_params", [column, 0])
         _stream(out, f"{name}.stream", transpose(block.rows), block.stream_coding)
     if block.tail:
         out.raw(f"{name}.tail", block.tail)

@@ -98,7 +98,7 @@ def invalid_recipe(
     """
     built = build(base) if isinstance(base, Scene) else base
     changes = dict(changes or {})
-    place = built.fields[at or next(iter(changes))].offset + within
+    offset = built.fields[at or next(iter(changes))].offset + within
     payloads = {_unread(field) for field in (changes if changes and not cut else (at,))}
     optional = payloads.pop() if len(payloads) == 1 else ""
 
@@ -107,7 +107,7 @@ def invalid_recipe(
             return repair(built.patched(changes | _sizes(built, cut), repaired=False)[:-cut])
         return built.patched(changes) if changes else built.data
 
-    return Recipe(f"invalid/{name}", why, tuple(clauses.split()), data, None, code, place, also, optional)
+    return Recipe(f"invalid/{name}", why, tuple(clauses.split()), data, None, code, offset, also, optional)
 
 
 def _unread(field: str) -> str:

@@ -149,13 +149,13 @@ def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome
     """
     result, notes = list(outcomes), []
     for kind in sorted({one.details["payload"] for one in result if "payload" in one.details}):
-        places = [i for i, one in enumerate(result) if one.details.get("payload") == kind]
-        accepted = [i for i in places if result[i].details["accepted"]]
-        if len(accepted) == len(places):
+        chosen = [i for i, one in enumerate(result) if one.details.get("payload") == kind]
+        accepted = [i for i in chosen if result[i].details["accepted"]]
+        if len(accepted) == len(chosen):
             notes.append(f"leaves {kind} unread (CHK-6)")
         elif accepted:
             names = ", ".join(result[i].name for i in accepted)
-            counts = f"{len(places) - len(accepted)} refused, {len(accepted)} accepted"
+            counts = f"{len(chosen) - len(accepted)} refused, {len(accepted)} accepted"
             notes.append(
                 f"reads {kind}: {counts}: each accepted one is an error if your decoder reads {kind} (CHK-7): {names}"
             )

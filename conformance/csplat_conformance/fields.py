@@ -15,7 +15,7 @@ _CRC_SIZE = 4
 
 @dataclass(frozen=True)
 class Field:
-    """The place of a field: offset, struct format, and the structure that it belongs to."""
+    """The position of a field: offset, struct format, and the structure that it belongs to."""
 
     offset: int
     format: str
@@ -29,7 +29,7 @@ class Field:
 
 @dataclass
 class Writer:
-    """A writer of bytes that records the places of fields."""
+    """A writer of bytes that records the positions of fields."""
 
     data: bytearray = field(default_factory=bytearray)
     fields: dict[str, Field] = field(default_factory=dict)
@@ -115,8 +115,10 @@ def read_fields(data: bytes) -> tuple[dict[str, Field], dict[str, tuple[int, int
     if len(out.data) + _CRC_SIZE != _spec.HEADER_SIZE + index_size:
         raise ValueError("the records do not fill the index")
     for name, (offset, _) in spans.items():
-        for key, place in _spec.CHUNK_HEADER_OFFSETS.items():
-            out.fields[f"{name}/header.{key}"] = Field(offset + place, "<H" if key in ("flags", "reserved_0") else "<I")
+        for key, field_offset in _spec.CHUNK_HEADER_OFFSETS.items():
+            out.fields[f"{name}/header.{key}"] = Field(
+                offset + field_offset, "<H" if key in ("flags", "reserved_0") else "<I"
+            )
     return out.fields, dict(sorted(spans.items(), key=lambda item: item[1]))
 
 

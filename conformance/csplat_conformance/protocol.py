@@ -8,8 +8,8 @@ Or it exits with status 1, its last line on standard output is JSON, `{"code": "
 
 `run_program` runs any program with a time limit:
 
-    >>> places = {"input": "a b.ply", "out": "x"}
-    >>> end = run_program("my-tool {input} {out}", places, timeout_seconds=60)    # doctest: +SKIP
+    >>> values = {"input": "a b.ply", "out": "x"}
+    >>> end = run_program("my-tool {input} {out}", values, timeout_seconds=60)    # doctest: +SKIP
     >>> end.status, end.returncode                                                # doctest: +SKIP
     (None, 0)
 
@@ -157,45 +157,50 @@ def split_command(command: str, names: tuple[str, ...], optional: tuple[str, ...
         InputError: a quote is not closed, there is no program, or a name is missing or unknown.
     """
     try:
-        words = split_words(command)
-        missing = [name for name in names if not any(f"{{{name}}}" in word for word in words)]
-        for word in words:
-            word.format(**dict.fromkeys((*names, *optional), ""))
+        arguments = split_words(command)
+        missing = [name for name in names if not any(f"{{{name}}}" in argument for argument in arguments)]
+        for argument in arguments:
+            argument.format(**dict.fromkeys((*names, *optional), ""))
     except (ValueError, LookupError, AttributeError) as error:
         raise InputError(f"the command {command!r} cannot be used: {error}") from None
-    if missing or not words:
+    if missing or not arguments:
         raise InputError(f"the command {command!r} lacks {', '.join(f'{{{name}}}' for name in missing) or 'a program'}")
-    return words
+    return arguments
 
 
 def run_program(
-    command: str, places: Mapping[str, str], timeout_seconds: float, *, cwd: Path | None = None
+    command: str, values: Mapping[str, str], timeout_seconds: float, *, cwd: Path | None = None
 ) -> ProcessEnd:
     """Run a command line in a process group of its own, which is killed at the end or after the time limit.
 
     Args:
-        command: with the keys of `places` in braces.
-        places: values to insert, by name.
+        command: with the keys of `values` in braces.
+        values: text to insert, by name.
         timeout_seconds: wall-clock limit.
         cwd: working directory. Paths are still relative to this process's directory: the program if it contains a
-            slash, and words, or values of options after `=`, that look like a path (with a slash or a suffix) and
+            slash, and arguments, or values of options after `=`, that look like a path (with a slash or a suffix) and
             exist.
 
     Raises:
         InputError: the command line cannot be used, or there is no such program.
     """
-    words = split_command(command, tuple(places))
+    arguments = split_command(command, tuple(values))
     if cwd is not None:
-        words = [_absolute_path(words[0]) if _has_separator(words[0]) else words[0], *map(_make_absolute, words[1:])]
-    words = [word.format(**places) for word in words]
+        arguments = [
+            _absolute_path(arguments[0]) if _has_separator(arguments[0]) else arguments[0],
+            *map(_make_absolute, arguments[1:]),
+        ]
+    arguments = [argument.format(**values) for argument in arguments]
     start = time.perf_counter()
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         try:
             process = subprocess.Popen(  # noqa: S603 - runs the caller's command on purpose
-                words, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True, cwd=cwd
+                arguments, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True, cwd=cwd
             )
         except OSError as error:
-            raise InputError(f"{words[0]}: {error.strerror or error}; is it installed and spelled correctly?") from None
+            raise InputError(
+                f"{arguments[0]}: {error.strerror or error}; is it installed and spelled correctly?"
+            ) from None
         status: Status | None = None
         try:
             returncode = process.wait(timeout_seconds)
@@ -217,13 +222,13 @@ def run_program(
         return ProcessEnd(status, returncode, _tail(out), _tail(err), seconds, message)
 
 
-def _make_absolute(word: str) -> str:
-    """Make a word absolute if it is an existing path."""
-    option, equals, path = word.partition("=") if word.startswith("-") else ("", "", word)
+def _make_absolute(argument: str) -> str:
+    """Make an argument absolute if it is an existing path."""
+    option, equals, path = argument.partition("=") if argument.startswith("-") else ("", "", argument)
     like_a_path = _has_separator(path) or bool(Path(path).suffix)
-    # Path.exists() raises an error for words that are too long for a path.
+    # Path.exists() raises an error for arguments that are too long for a path.
     found = like_a_path and os.path.exists(path)  # noqa: PTH110 - see above
-    return option + equals + _absolute_path(path) if found else word
+    return option + equals + _absolute_path(path) if found else argument
 
 
 def _absolute_path(path: str) -> str:

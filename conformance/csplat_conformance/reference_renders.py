@@ -99,8 +99,8 @@ def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Ou
         outdir.mkdir()
         camera.write_text(json.dumps([vector.views[number]["camera"]]), encoding="utf-8")
         out = {"outdir": outdir} if "{outdir}" in command else {"out": outdir / "0.png"}
-        places = {"input": VECTORS / vector.file, "camera": camera, **out}
-        end = run_program(command, {key: str(path) for key, path in places.items()}, timeout)
+        values = {"input": VECTORS / vector.file, "camera": camera, **out}
+        end = run_program(command, {key: str(path) for key, path in values.items()}, timeout)
         seconds = end.seconds
         if end.status is not None:
             return _outcome(vector, number, end.status, end.message + last_words(end), seconds)

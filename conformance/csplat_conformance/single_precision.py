@@ -145,7 +145,7 @@ def _gpu_values(
 ) -> Iterator[tuple[str, F32]]:
     """Yield names and values: means, scales, sh0 and the bands, opacities by quotient and by factor, w and the rest."""
     tiles = np.repeat(np.arange(len(integers["tile_splats"])), integers["tile_splats"])
-    for place, record in enumerate(header.attributes):
+    for index, record in enumerate(header.attributes):
         name = _spec.ATTRIBUTE_NAMES[record.attribute]
         n = integers[name]
         if record.attribute == _spec.ATTRIBUTE_OPACITIES:
@@ -157,8 +157,8 @@ def _gpu_values(
             yield "quats, x, y, z", values[:, 1:]
         else:
             out = np.empty(n.shape, np.float32)
-            for exponent in np.unique(integers["exponents"][:, place]):
-                chosen = (integers["exponents"][:, place] == exponent)[tiles]
+            for exponent in np.unique(integers["exponents"][:, index]):
+                chosen = (integers["exponents"][:, index] == exponent)[tiles]
                 out[chosen] = lattice_values(n[chosen], record.step, int(exponent), gpu)
             yield name, out
 

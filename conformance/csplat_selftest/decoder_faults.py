@@ -387,7 +387,7 @@ def _no_summand(right: Wrong, block: blocks.CodebookBlock, *args: Any) -> Any:
 
 def _mask_from_the_top(right: Wrong, cursor: Any, context: Any, attribute: int) -> Any:
     block = right(cursor, context, attribute)
-    return replace(block, places=np.minimum(block.places ^ 7, context.tile.splat_count - 1))
+    return replace(block, splat_indices=np.minimum(block.splat_indices ^ 7, context.tile.splat_count - 1))
 
 
 # Numbers -------------------------------------------------------------------------------------------

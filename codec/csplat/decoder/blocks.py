@@ -97,13 +97,13 @@ class Indices:
     Attributes:
         book: the codebook.
         attribute: attribute id of the first block.
-        places: [n], the entry of each splat; the codebook's size for escaped splats.
+        entry_indices: [n], the entry of each splat; the codebook's size for escaped splats.
         escaped: indices of the escaped splats, ascending.
     """
 
     book: Codebook
     attribute: int
-    places: Ints
+    entry_indices: Ints
     escaped: NDArray[np.intp]
 
 
@@ -137,14 +137,14 @@ class CodebookBlock:
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
         """Return the integers of some splats; see `ColumnBlock.rows`."""
         # The index of an escaped splat is the codebook's size: `clip` assigns the last entry for now.
-        rows = np.take(self.entries, self.indices.places[start:stop], axis=0, mode="clip")
+        rows = np.take(self.entries, self.indices.entry_indices[start:stop], axis=0, mode="clip")
         out = np.ascontiguousarray(rows.T, dtype)
         if self.summand:
             out += self.summand.rows(start, stop, dtype)
         if self.escapes:
             first, last = np.searchsorted(self.indices.escaped, (start, stop))
-            places = self.indices.escaped[first:last] - start
-            out[:, places] = self.escapes.rows(int(first), int(last), dtype)
+            escaped = self.indices.escaped[first:last] - start
+            out[:, escaped] = self.escapes.rows(int(first), int(last), dtype)
         return out
 
 
@@ -154,11 +154,11 @@ class SparseBlock:
 
     Attributes:
         values: integers of the masked splats.
-        places: indices of these splats, ascending.
+        splat_indices: indices of these splats, ascending.
     """
 
     values: ColumnBlock
-    places: NDArray[np.intp]
+    splat_indices: NDArray[np.intp]
 
     @property
     def at(self) -> int:
@@ -178,8 +178,8 @@ class SparseBlock:
     def rows(self, start: int, stop: int, dtype: np.dtype[np.signedinteger]) -> Ints:
         """Return the integers of some splats; see `ColumnBlock.rows`."""
         out = np.zeros((len(self.values.elements), stop - start), dtype)
-        first, last = np.searchsorted(self.places, (start, stop))
-        out[:, self.places[first:last] - start] = self.values.rows(int(first), int(last), dtype)
+        first, last = np.searchsorted(self.splat_indices, (start, stop))
+        out[:, self.splat_indices[first:last] - start] = self.values.rows(int(first), int(last), dtype)
         return out
 
 
@@ -217,22 +217,22 @@ def runs(count: int, columns: int) -> Iterator[tuple[int, int]]:
 
 def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | None = None) -> int:
     """Read a block head and return the coding; for an escape block, `legal` codings are given."""
-    at, places = cursor.take(_spec.BLOCK_HEAD_SIZE), _spec.BLOCK_HEAD_OFFSETS
+    at, offsets = cursor.take(_spec.BLOCK_HEAD_SIZE), _spec.BLOCK_HEAD_OFFSETS
     head = _spec.unpack_block_head(cursor.view, at)
-    check_reserved(head, at, places)
-    place = at + places["coding"]
+    check_reserved(head, at, offsets)
+    coding_at = at + offsets["coding"]
     if head.attribute != attribute:
         clause = "CBK-5" if legal else "TLE-2"
-        refuse_field(_spec.ERROR_STREAM, clause, head, at, places, "attribute", attribute)
+        refuse_field(_spec.ERROR_STREAM, clause, head, at, offsets, "attribute", attribute)
     if head.coding not in _spec.CODING_NAMES:
-        raise UnsupportedError(f"attribute coding {head.coding}", offset=place, clause="BLK-1")
+        raise UnsupportedError(f"attribute coding {head.coding}", offset=coding_at, clause="BLK-1")
     if legal is not None and head.coding not in legal:
         detail = "coding of an escape block"
-        raise FormatError(_spec.ERROR_STREAM, place, "CBK-5", detail, found=head.coding, wanted=legal)
+        raise FormatError(_spec.ERROR_STREAM, coding_at, "CBK-5", detail, found=head.coding, wanted=legal)
     found, allowed = _spec.CODING_NAMES[head.coding], _spec.ATTRIBUTE_CODINGS[attribute]
     if found not in allowed:
         detail = f"coding of {_spec.ATTRIBUTE_NAMES[attribute]}"
-        raise FormatError(_spec.ERROR_VALUE, place, "BLK-1", detail, found=found, wanted=" or ".join(allowed))
+        raise FormatError(_spec.ERROR_VALUE, coding_at, "BLK-1", detail, found=found, wanted=" or ".join(allowed))
     return head.coding
 
 

@@ -204,7 +204,7 @@ def read_file_header(view: memoryview) -> _spec.Header:
             refuse_length(_spec.ERROR_TRUNCATED, "HDR-11", "the data ends within the header", view, _spec.HEADER_SIZE)
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-11", found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
     header = _spec.unpack_header(view)
-    places = _spec.HEADER_OFFSETS
+    offsets = _spec.HEADER_OFFSETS
     if header.magic != _spec.MAGIC:
         instead = describe_substitute(bytes(view[:_SUBSTITUTE_SIZE]))
         detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
@@ -214,17 +214,17 @@ def read_file_header(view: memoryview) -> _spec.Header:
         raise UnsupportedError(
             f"version {version[0]}.{version[1]} (this decoder reads {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR})",
             _spec.ERROR_VERSION,
-            places["version_major"],
+            offsets["version_major"],
             "HDR-2",
         )
-    crc_at = places["header_crc"]
+    crc_at = offsets["header_crc"]
     _check_crc(view[:crc_at], header.header_crc, crc_at, "HDR-3")
     if header.profile not in _spec.PROFILE_NAMES:
-        raise UnsupportedError(f"profile {header.profile}", offset=places["profile"], clause="HDR-4")
-    check_reserved(header, 0, places)
+        raise UnsupportedError(f"profile {header.profile}", offset=offsets["profile"], clause="HDR-4")
+    check_reserved(header, 0, offsets)
     least, most = _spec.INDEX_HEAD_SIZE + _CRC_SIZE, header.file_size - _spec.HEADER_SIZE
     if not least <= header.index_size <= most:
-        refuse_field(_spec.ERROR_VALUE, "HDR-7", header, 0, places, "index_size", f"{least} to {most}")
+        refuse_field(_spec.ERROR_VALUE, "HDR-7", header, 0, offsets, "index_size", f"{least} to {most}")
     return header
 
 
@@ -263,12 +263,12 @@ def open_chunk(
     offset, end = record.offset, record.offset + record.size
     _check_crc(view[offset:end], record.crc, offset, "CHK-1")
     head = _spec.unpack_chunk_header(view, offset)
-    places = _spec.CHUNK_HEADER_OFFSETS
-    check_reserved(head, offset, places)
+    offsets = _spec.CHUNK_HEADER_OFFSETS
+    check_reserved(head, offset, offsets)
     payload_size = record.size - _spec.CHUNK_HEADER_SIZE
     for name, wanted in (("type", kind), ("flags", flags), ("payload_size", payload_size)):
         if getattr(head, name) != wanted:
-            refuse_field(_spec.ERROR_INDEX, "CHK-3", head, offset, places, name, wanted)
+            refuse_field(_spec.ERROR_INDEX, "CHK-3", head, offset, offsets, name, wanted)
     return Cursor(view, offset + _spec.CHUNK_HEADER_SIZE, end, clause)
 
 

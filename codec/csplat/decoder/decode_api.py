@@ -198,7 +198,7 @@ def decode_scene(
     arrays = _allocate(count, lambda: SplatArrays.empty(count, degree, header), request)
     table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
 
-    def write(_place: int, start: int, source: TileBlocks) -> None:
+    def write(_index: int, start: int, source: TileBlocks) -> None:
         part = arrays.part(start, start + source.tile.splat_count)
         write_tile(source, header, degree, table, part)
 
@@ -226,9 +226,9 @@ def decode_integers(
     out = _allocate(count, lambda: empty_integers(count, len(request.tiles), degree), request)
     out["tile_splats"][:] = [tile.splat_count for tile in request.tiles]
 
-    def write(place: int, start: int, source: TileBlocks) -> None:
+    def write(index: int, start: int, source: TileBlocks) -> None:
         part = integer_part(out, start, start + source.tile.splat_count)
-        write_integers(source, header, part, out["exponents"][place])
+        write_integers(source, header, part, out["exponents"][index])
 
     read_side_chunks(request)
     _read_texts(request)
@@ -352,8 +352,8 @@ def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], N
     for tile in request.tiles:
         starts.append(starts[-1] + tile.splat_count)
 
-    def convert(place: int, source: TileBlocks) -> None:
-        write(place, starts[place], source)
+    def convert(index: int, source: TileBlocks) -> None:
+        write(index, starts[index], source)
 
     for _ in _each_tile(request, convert, threads, ahead=len(request.tiles)):
         pass
@@ -365,7 +365,7 @@ def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile
     table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
     pages = PageReleaser(request.view)
 
-    def convert(_place: int, source: TileBlocks) -> tuple[Tile, SplatArrays]:
+    def convert(_index: int, source: TileBlocks) -> tuple[Tile, SplatArrays]:
         arrays = SplatArrays.empty(source.tile.splat_count, request.degree, header)
         write_tile(source, header, request.degree, table, arrays)
         return source.tile, arrays
@@ -393,21 +393,21 @@ def _each_tile(
     with np.errstate(all="ignore"):
         books = read_codebooks(view, header, tiles, degree)
 
-    def decode_tile(place: int) -> _T:
+    def decode_tile(index: int) -> _T:
         # No warnings: the reconstruction checks for overflow itself.
         with np.errstate(all="ignore"):
-            return convert(place, read_tile(view, header, tiles[place], degree, books))
+            return convert(index, read_tile(view, header, tiles[index], degree, books))
 
-    places = range(len(tiles))
+    indices = range(len(tiles))
     count = _thread_count(threads, len(tiles))
     if count == 1:
-        yield from map(decode_tile, places)
+        yield from map(decode_tile, indices)
         return
     waiting: deque[Future[_T]] = deque()
     with ThreadPoolExecutor(count, "csplat") as pool:
         try:
-            for place in places:
-                waiting.append(pool.submit(decode_tile, place))
+            for index in indices:
+                waiting.append(pool.submit(decode_tile, index))
                 if len(waiting) >= count + ahead:
                     yield waiting.popleft().result()
             while waiting:

@@ -16,7 +16,7 @@ from csplat.errors import FormatError, LimitError, UnsupportedError
 #: Integers of any width.
 Ints = NDArray[Any]
 
-_PLACES = _spec.STREAM_HEAD_OFFSETS
+_OFFSETS = _spec.STREAM_HEAD_OFFSETS
 #: Clauses by the last word of zlib's message; otherwise COD-2.
 _ZLIB_CLAUSES = {
     "symbols": "COD-5",  # too many length or distance symbols
@@ -48,7 +48,7 @@ def read_stream(
     head = _spec.unpack_stream_head(cursor.view, at)
     _check_head(head, at, count, width_max)
     if count_max is not None and head.count > count_max:
-        raise LimitError("json_bytes", head.count, count_max, offset=at + _PLACES["count"], clause="STR-8")
+        raise LimitError("json_bytes", head.count, count_max, offset=at + _OFFSETS["count"], clause="STR-8")
     if head.coded_size > cursor.end - cursor.at:
         _refuse(at, "coded_size", "STR-6", head.coded_size, f"at most {cursor.end - cursor.at}")
     start = cursor.take(head.coded_size)
@@ -60,7 +60,7 @@ def read_stream(
 
 
 def _check_head(head: _spec.StreamHead, at: int, count: int | None, width_max: int) -> None:
-    check_reserved(head, at, _PLACES)
+    check_reserved(head, at, _OFFSETS)
     wanted = max(1, head.count) if count is None else count
     if head.count != wanted:
         _refuse(at, "count", "STR-1", head.count, wanted)
@@ -68,11 +68,11 @@ def _check_head(head: _spec.StreamHead, at: int, count: int | None, width_max: i
         _refuse(at, "width", "STR-2", head.width, f"1 to {width_max}")
     used = head.transforms.rstrip(b"\0")
     if any(transform not in _spec.TRANSFORM_NAMES for transform in used):
-        raise UnsupportedError(f"transform {max(used)}", offset=at + _PLACES["transforms"], clause="RES-2")
+        raise UnsupportedError(f"transform {max(used)}", offset=at + _OFFSETS["transforms"], clause="RES-2")
     if any(a >= b for a, b in pairwise(b"\0" + used)):
         _refuse(at, "transforms", "STR-3", list(head.transforms), "ascending values, then zeros")
     if head.coder not in _spec.CODER_NAMES:
-        raise UnsupportedError(f"coder {head.coder}", offset=at + _PLACES["coder"], clause="RES-2")
+        raise UnsupportedError(f"coder {head.coder}", offset=at + _OFFSETS["coder"], clause="RES-2")
     size = head.count * head.width
     if _spec.TRANSFORM_RUN_LENGTH not in used:
         if head.packed_size != size:
@@ -82,7 +82,7 @@ def _check_head(head: _spec.StreamHead, at: int, count: int | None, width_max: i
 
 
 def _refuse(at: int, name: str, clause: str, found: object, wanted: object) -> None:
-    raise FormatError(_spec.ERROR_STREAM, at + _PLACES[name], clause, name, found=found, wanted=wanted)
+    raise FormatError(_spec.ERROR_STREAM, at + _OFFSETS[name], clause, name, found=found, wanted=wanted)
 
 
 # Coders ------------------------------------------------------------------------------------------

@@ -83,11 +83,11 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
     at += head.codebook_count * head.codebook_size
     extras = read_extras(view, at, head)
     at += head.extra_count * head.extra_size
-    places = range(at, at + head.directory_count * head.directory_size, head.directory_size)
-    directory = read_directory(view, places)
-    check_codebook_chunks(directory, places, codebooks)
-    tiles = read_tiles(view, places.stop, end - 4, head, attributes[_spec.ATTRIBUTE_MEANS - 1].step, codebooks)
-    check_coverage(directory, places, tiles, head, end, file.file_size)
+    directory_at = range(at, at + head.directory_count * head.directory_size, head.directory_size)
+    directory = read_directory(view, directory_at)
+    check_codebook_chunks(directory, directory_at, codebooks)
+    tiles = read_tiles(view, directory_at.stop, end - 4, head, attributes[_spec.ATTRIBUTE_MEANS - 1].step, codebooks)
+    check_coverage(directory, directory_at, tiles, head, end, file.file_size)
     letters = "".join(_spec.DIRECTION_LETTER[direction] for direction in head.axes)
     return SceneHeader(
         version=(file.version_major, file.version_minor),
@@ -110,27 +110,27 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
 
 
 def _check_head(head: _spec.IndexHead, at: int) -> None:
-    places = _spec.INDEX_HEAD_OFFSETS
-    check_reserved(head, at, places)
+    offsets = _spec.INDEX_HEAD_OFFSETS
+    check_reserved(head, at, offsets)
     for name, least in _RECORD_SIZES.items():
         if getattr(head, name) < least:
-            refuse_field(_spec.ERROR_VALUE, "IDX-8", head, at, places, name, f"at least {least}")
+            refuse_field(_spec.ERROR_VALUE, "IDX-8", head, at, offsets, name, f"at least {least}")
     if head.sh_degree > _spec.SH_DEGREE_MAX:
-        raise UnsupportedError(f"SH degree {head.sh_degree}", offset=at + places["sh_degree"], clause="IDX-3")
+        raise UnsupportedError(f"SH degree {head.sh_degree}", offset=at + offsets["sh_degree"], clause="IDX-3")
     if head.scene_flags & ~(sum(_spec.SCENE_FLAG_NAMES) | _spec.ANCILLARY_SCENE_FLAGS):
         raise FormatError(
-            _spec.ERROR_RESERVED, at + places["scene_flags"], "RES-1", "scene_flags", found=f"{head.scene_flags:#04x}"
+            _spec.ERROR_RESERVED, at + offsets["scene_flags"], "RES-1", "scene_flags", found=f"{head.scene_flags:#04x}"
         )
     # Directions 1 and 2, 3 and 4, 5 and 6 are opposite.
     lines = {(direction + 1) // 2 for direction in head.axes}
     if any(head.axes) and lines != {1, 2, 3}:
         wanted = "three zeros, or directions along three different lines"
-        raise FormatError(_spec.ERROR_VALUE, at + places["axes"], "IDX-4", "axes", found=[*head.axes], wanted=wanted)
+        raise FormatError(_spec.ERROR_VALUE, at + offsets["axes"], "IDX-4", "axes", found=[*head.axes], wanted=wanted)
     if not (0.0 <= head.unit_metres < math.inf):
-        refuse_field(_spec.ERROR_VALUE, "IDX-5", head, at, places, "unit_metres")
+        refuse_field(_spec.ERROR_VALUE, "IDX-5", head, at, offsets, "unit_metres")
     for axis, value in enumerate(head.origin):
         if not math.isfinite(value):
-            raise FormatError(_spec.ERROR_VALUE, at + places["origin"] + 8 * axis, "IDX-6", "origin", found=value)
+            raise FormatError(_spec.ERROR_VALUE, at + offsets["origin"] + 8 * axis, "IDX-6", "origin", found=value)
 
 
 def _check_room(head: _spec.IndexHead, index_size: int) -> None:
@@ -158,37 +158,39 @@ def _read_attributes(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[
         refuse_field(_spec.ERROR_INDEX, "ATT-1", head, _spec.HEADER_SIZE, offsets, "attribute_count", len(wanted))
     records = []
     for i, attribute in enumerate(wanted):
-        place = at + i * head.attribute_size
-        record = _spec.unpack_attribute_record(view, place)
+        record_at = at + i * head.attribute_size
+        record = _spec.unpack_attribute_record(view, record_at)
         if record.attribute != attribute:
-            raise FormatError(_spec.ERROR_INDEX, place, "ATT-1", "attribute", found=record.attribute, wanted=attribute)
-        _check_attribute(record, place, bytes(view[place + 8 : place + 16]))
+            raise FormatError(
+                _spec.ERROR_INDEX, record_at, "ATT-1", "attribute", found=record.attribute, wanted=attribute
+            )
+        _check_attribute(record, record_at, bytes(view[record_at + 8 : record_at + 16]))
         records.append(record)
     return tuple(records)
 
 
 def _check_attribute(record: _spec.AttributeRecord, at: int, step_bits: bytes) -> None:
-    places = _spec.ATTRIBUTE_RECORD_OFFSETS
-    check_reserved(record, at, places)
+    offsets = _spec.ATTRIBUTE_RECORD_OFFSETS
+    check_reserved(record, at, offsets)
     legal = _spec.ATTRIBUTE_MAPPINGS[record.attribute]
     if _spec.MAPPING_NAMES.get(record.mapping) not in legal:
-        refuse_field(_spec.ERROR_VALUE, "ATT-2", record, at, places, "mapping", " or ".join(legal))
+        refuse_field(_spec.ERROR_VALUE, "ATT-2", record, at, offsets, "mapping", " or ".join(legal))
     if _spec.ATTRIBUTE_KIND[record.attribute] == "levels":
         quats = record.attribute == _spec.ATTRIBUTE_QUATS
         low, high = (_spec.QUAT_LEVELS_MIN, _spec.QUAT_LEVELS_MAX) if quats else (1, _spec.OPACITY_LEVELS_MAX)
         if not low <= record.levels <= high:
             clause = "ATT-4" if quats else "ATT-3"
-            refuse_field(_spec.ERROR_VALUE, clause, record, at, places, "levels", f"{low} to {high}")
+            refuse_field(_spec.ERROR_VALUE, clause, record, at, offsets, "levels", f"{low} to {high}")
         if any(step_bits):
-            refuse_field(_spec.ERROR_RESERVED, "ATT-7", record, at, places, "step", 0)
+            refuse_field(_spec.ERROR_RESERVED, "ATT-7", record, at, offsets, "step", 0)
     else:
         if record.levels != 0:
-            refuse_field(_spec.ERROR_RESERVED, "ATT-5", record, at, places, "levels", 0)
+            refuse_field(_spec.ERROR_RESERVED, "ATT-5", record, at, offsets, "levels", 0)
         if not STEP_MIN <= record.step < math.inf:
-            refuse_field(_spec.ERROR_VALUE, "ATT-6", record, at, places, "step", "2^-1022 or more")
+            refuse_field(_spec.ERROR_VALUE, "ATT-6", record, at, offsets, "step", "2^-1022 or more")
         if record.attribute != _spec.ATTRIBUTE_MEANS and not _is_single(record.step):
             wanted = "a binary32 value of 2^-126 or more"
-            refuse_field(_spec.ERROR_VALUE, "ATT-10", record, at, places, "step", wanted)
+            refuse_field(_spec.ERROR_VALUE, "ATT-10", record, at, offsets, "step", wanted)
     _check_chroma(record, at)
 
 
@@ -201,58 +203,60 @@ def _is_single(step: float) -> bool:
 
 
 def _check_chroma(record: _spec.AttributeRecord, at: int) -> None:
-    places, most = _spec.ATTRIBUTE_RECORD_OFFSETS, _spec.CHROMA_SHIFT_MAX
+    offsets, most = _spec.ATTRIBUTE_RECORD_OFFSETS, _spec.CHROMA_SHIFT_MAX
     if record.chroma_shift > most:
-        refuse_field(_spec.ERROR_VALUE, "ATT-8", record, at, places, "chroma_shift", f"at most {most}")
+        refuse_field(_spec.ERROR_VALUE, "ATT-8", record, at, offsets, "chroma_shift", f"at most {most}")
     if record.chroma_shift and record.mapping != _spec.MAPPING_YCOCG:
-        refuse_field(_spec.ERROR_VALUE, "ATT-9", record, at, places, "chroma_shift", 0)
+        refuse_field(_spec.ERROR_VALUE, "ATT-9", record, at, offsets, "chroma_shift", 0)
 
 
 def read_codebook_records(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[_spec.CodebookRecord, ...]:
     """Read the codebook records, which begin at `at`; IDX-2 has been checked."""
     records: list[_spec.CodebookRecord] = []
-    places = _spec.CODEBOOK_RECORD_OFFSETS
+    offsets = _spec.CODEBOOK_RECORD_OFFSETS
     for i in range(head.codebook_count):
-        place = at + i * head.codebook_size
-        record = _spec.unpack_codebook_record(view, place)
-        check_reserved(record, place, places)
+        record_at = at + i * head.codebook_size
+        record = _spec.unpack_codebook_record(view, record_at)
+        check_reserved(record, record_at, offsets)
         if records and record.codebook_id <= (last := records[-1].codebook_id):
-            refuse_field(_spec.ERROR_INDEX, "CBR-1", record, place, places, "codebook_id", f"more than {last}")
+            refuse_field(_spec.ERROR_INDEX, "CBR-1", record, record_at, offsets, "codebook_id", f"more than {last}")
         if record.kind not in _spec.CODEBOOK_KIND_NAMES:
-            raise UnsupportedError(f"codebook kind {record.kind}", offset=place + places["kind"], clause="RES-2")
-        _check_codebook(record, place, head.sh_degree)
+            raise UnsupportedError(f"codebook kind {record.kind}", offset=record_at + offsets["kind"], clause="RES-2")
+        _check_codebook(record, record_at, head.sh_degree)
         records.append(record)
     return tuple(records)
 
 
 def _check_codebook(record: _spec.CodebookRecord, at: int, sh_degree: int) -> None:
-    places = _spec.CODEBOOK_RECORD_OFFSETS
+    offsets = _spec.CODEBOOK_RECORD_OFFSETS
     bands = (record.band_first, record.band_last)
     if record.kind == _spec.CODEBOOK_KIND_SH:
         legal = 1 <= bands[0] <= bands[1] <= sh_degree
     else:
         legal = bands == (0, 0)
     if not legal:
-        raise FormatError(_spec.ERROR_VALUE, at + places["band_first"], "CBR-2", "bands", found=bands)
+        raise FormatError(_spec.ERROR_VALUE, at + offsets["band_first"], "CBR-2", "bands", found=bands)
     if not 1 <= record.size <= _spec.CODEBOOK_ENTRIES_MAX:
-        refuse_field(_spec.ERROR_VALUE, "CBR-4", record, at, places, "size", f"1 to {_spec.CODEBOOK_ENTRIES_MAX}")
+        refuse_field(_spec.ERROR_VALUE, "CBR-4", record, at, offsets, "size", f"1 to {_spec.CODEBOOK_ENTRIES_MAX}")
 
 
 def read_extras(view: memoryview, at: int, head: _spec.IndexHead) -> tuple[ExtraColumn, ...]:
     """Read the extra column records, which begin at `at`; IDX-2 has been checked."""
     columns: dict[str, ExtraColumn] = {}
-    places = _spec.EXTRA_RECORD_OFFSETS
+    offsets = _spec.EXTRA_RECORD_OFFSETS
     for i in range(head.extra_count):
-        place = at + i * head.extra_size
-        record = _spec.unpack_extra_record(view, place)
+        record_at = at + i * head.extra_size
+        record = _spec.unpack_extra_record(view, record_at)
         if record.dtype < _spec.ANCILLARY_ID_MIN and record.dtype not in _spec.EXTRA_DTYPE_NAMES:
-            raise UnsupportedError(f"type {record.dtype} of an extra column", offset=place, clause="RES-2")
+            raise UnsupportedError(f"type {record.dtype} of an extra column", offset=record_at, clause="RES-2")
         if not 1 <= record.name_size <= _spec.EXTRA_NAME_MAX:
             wanted = f"1 to {_spec.EXTRA_NAME_MAX}"
-            refuse_field(_spec.ERROR_VALUE, "EXR-1", record, place, places, "name_size", wanted)
-        name = _column_name(record, place + places["name"])
+            refuse_field(_spec.ERROR_VALUE, "EXR-1", record, record_at, offsets, "name_size", wanted)
+        name = _column_name(record, record_at + offsets["name"])
         if name in columns:
-            raise FormatError(_spec.ERROR_VALUE, place + places["name"], "EXR-2", f"a second column is named {name!r}")
+            raise FormatError(
+                _spec.ERROR_VALUE, record_at + offsets["name"], "EXR-2", f"a second column is named {name!r}"
+            )
         kind = _spec.EXTRA_DTYPE_NAMES.get(record.dtype)
         columns[name] = ExtraColumn(name, kind and f"<{kind[0]}{_spec.EXTRA_DTYPE_BYTES[record.dtype]}")
     return tuple(columns.values())
@@ -275,46 +279,46 @@ def read_directory(view: memoryview, at: range) -> tuple[_spec.DirectoryRecord, 
     """Read the directory records at the offsets `at`; IDX-2 has been checked."""
     records = []
     seen = set()
-    places = _spec.DIRECTORY_RECORD_OFFSETS
-    for place in at:
-        record = _spec.unpack_directory_record(view, place)
-        check_reserved(record, place, places)
-        _check_chunk_type(record, place)
-        _check_chunk_size(record, place, places)
+    offsets = _spec.DIRECTORY_RECORD_OFFSETS
+    for record_at in at:
+        record = _spec.unpack_directory_record(view, record_at)
+        check_reserved(record, record_at, offsets)
+        _check_chunk_type(record, record_at)
+        _check_chunk_size(record, record_at, offsets)
         if record.type in _SINGLE_CHUNKS:
             if record.type in seen or record.id or record.layer:
                 detail = f"chunk {record.type.decode()} occurs twice, or has an id or a layer"
                 found = f"id {record.id}, layer {record.layer}"
-                raise FormatError(_spec.ERROR_INDEX, place, "DIR-4", detail, found=found)
+                raise FormatError(_spec.ERROR_INDEX, record_at, "DIR-4", detail, found=found)
             seen.add(record.type)
         records.append(record)
     return tuple(records)
 
 
-def _check_chunk_size(record: _spec.DirectoryRecord | _spec.LayerRecord, at: int, places: Mapping[str, int]) -> None:
+def _check_chunk_size(record: _spec.DirectoryRecord | _spec.LayerRecord, at: int, offsets: Mapping[str, int]) -> None:
     if record.size < _spec.CHUNK_HEADER_SIZE:
-        refuse_field(_spec.ERROR_INDEX, "CHK-3", record, at, places, "size", f"at least {_spec.CHUNK_HEADER_SIZE}")
+        refuse_field(_spec.ERROR_INDEX, "CHK-3", record, at, offsets, "size", f"at least {_spec.CHUNK_HEADER_SIZE}")
 
 
 def _check_chunk_type(record: _spec.DirectoryRecord, at: int) -> None:
     if record.type == _spec.CHUNK_TILE or not all(0x20 <= byte <= 0x7E for byte in record.type):
         raise FormatError(_spec.ERROR_VALUE, at, "DIR-1", "type", found=record.type)
-    place = at + _spec.DIRECTORY_RECORD_OFFSETS["flags"]
+    flags_at = at + _spec.DIRECTORY_RECORD_OFFSETS["flags"]
     flags = record.flags & ~_spec.ANCILLARY_CHUNK_FLAGS
     if flags & ~sum(_spec.CHUNK_FLAG_NAMES):
-        raise FormatError(_spec.ERROR_RESERVED, place, "RES-1", "flags", found=f"{record.flags:#06x}")
+        raise FormatError(_spec.ERROR_RESERVED, flags_at, "RES-1", "flags", found=f"{record.flags:#06x}")
     name = record.type.decode("ascii")
     if record.type in _spec.CHUNK_NAMES:
         registered = sum(
-            flag for flag, word in _spec.CHUNK_FLAG_NAMES.items() if word in _spec.CHUNK_FLAGS[record.type]
+            flag for flag, flag_name in _spec.CHUNK_FLAG_NAMES.items() if flag_name in _spec.CHUNK_FLAGS[record.type]
         )
         if flags != registered:
-            raise FormatError(_spec.ERROR_VALUE, place, "CHK-4", f"flags of {name}", found=flags, wanted=registered)
+            raise FormatError(_spec.ERROR_VALUE, flags_at, "CHK-4", f"flags of {name}", found=flags, wanted=registered)
     elif record.type == _spec.CHUNK_TREE:
         raise UnsupportedError(f"chunk type {name}", offset=at, clause="RES-2")
     elif flags & _spec.CHUNK_FLAG_CRITICAL:
         if name[0].islower():
-            raise FormatError(_spec.ERROR_VALUE, place, "DIR-6", f"the private chunk type {name} is critical")
+            raise FormatError(_spec.ERROR_VALUE, flags_at, "DIR-6", f"the private chunk type {name} is critical")
         raise UnsupportedError(f"critical chunk type {name}", offset=at, clause="DIR-2")
 
 
@@ -323,13 +327,13 @@ def check_codebook_chunks(
 ) -> None:
     """Check DIR-5 for the directory records at `at`: one CODB chunk per codebook or, for the kind SH, per band."""
     wanted = {(book.codebook_id, layer) for book in codebooks for layer in range(book.band_first, book.band_last + 1)}
-    for place, record in zip(at, directory, strict=True):
+    for record_at, record in zip(at, directory, strict=True):
         if record.type != _spec.CHUNK_CODEBOOK:
             continue
         key = (record.id, record.layer)
         if key not in wanted:
             detail = "CODB chunk without a codebook record, or occurring twice"
-            raise FormatError(_spec.ERROR_INDEX, place, "DIR-5", detail, found=f"id {key[0]}, layer {key[1]}")
+            raise FormatError(_spec.ERROR_INDEX, record_at, "DIR-5", detail, found=f"id {key[0]}, layer {key[1]}")
         wanted.remove(key)
     if wanted:
         missing = min(wanted)
@@ -384,8 +388,10 @@ def check_coverage(
     file_size: int,
 ) -> None:
     """Check COV-1: chunks are contiguous from `index_end` to `file_size`; directory records are at `directory_at`."""
-    place = _spec.DIRECTORY_RECORD_OFFSETS["offset"]
-    chunks = [(record.offset, record.size, at + place) for at, record in zip(directory_at, directory, strict=True)]
+    field_offset = _spec.DIRECTORY_RECORD_OFFSETS["offset"]
+    chunks = [
+        (record.offset, record.size, at + field_offset) for at, record in zip(directory_at, directory, strict=True)
+    ]
     for tile in tiles:
         layer_at = tile.offset + head.tile_size + _spec.LAYER_RECORD_OFFSETS["offset"]
         for i, layer in enumerate(tile.layers.values()):
@@ -437,18 +443,18 @@ def _ends_early(at: int) -> NoReturn:
 
 def _read_layers(view: memoryview, at: int, count: int, head: _spec.IndexHead) -> dict[int, _spec.LayerRecord]:
     layers: dict[int, _spec.LayerRecord] = {}
-    places, last = _spec.LAYER_RECORD_OFFSETS, -1
+    offsets, last = _spec.LAYER_RECORD_OFFSETS, -1
     for i in range(count):
-        place = at + i * head.layer_size
-        record = _spec.unpack_layer_record(view, place)
-        check_reserved(record, place, places)
+        record_at = at + i * head.layer_size
+        record = _spec.unpack_layer_record(view, record_at)
+        check_reserved(record, record_at, offsets)
         if record.layer <= last or (i == 0 and record.layer != _spec.LAYER_GEOMETRY):
-            refuse_field(_spec.ERROR_INDEX, "TIL-2", record, place, places, "layer", "0, then ascending")
+            refuse_field(_spec.ERROR_INDEX, "TIL-2", record, record_at, offsets, "layer", "0, then ascending")
         if record.layer < _spec.ANCILLARY_ID_MIN and record.layer not in _spec.LAYER_NAMES:
-            raise UnsupportedError(f"layer {record.layer}", offset=place, clause="RES-2")
+            raise UnsupportedError(f"layer {record.layer}", offset=record_at, clause="RES-2")
         if head.sh_degree < record.layer <= _spec.SH_DEGREE_MAX:
-            refuse_field(_spec.ERROR_INDEX, "TIL-3", record, place, places, "layer", f"at most {head.sh_degree}")
-        _check_chunk_size(record, place, places)
+            refuse_field(_spec.ERROR_INDEX, "TIL-3", record, record_at, offsets, "layer", f"at most {head.sh_degree}")
+        _check_chunk_size(record, record_at, offsets)
         last = record.layer
         layers[last] = record
     if not layers:
@@ -460,21 +466,21 @@ def _read_layers(view: memoryview, at: int, count: int, head: _spec.IndexHead) -
 
 
 def _check_tile(tile: Tile, means_step: float) -> None:
-    places = _spec.TILE_RECORD_OFFSETS
+    offsets = _spec.TILE_RECORD_OFFSETS
     if not 1 <= tile.splat_count <= _spec.TILE_SPLATS_MAX:
         wanted = f"1 to {_spec.TILE_SPLATS_MAX}"
-        refuse_field(_spec.ERROR_VALUE, "TIL-1", tile, tile.offset, places, "splat_count", wanted)
+        refuse_field(_spec.ERROR_VALUE, "TIL-1", tile, tile.offset, offsets, "splat_count", wanted)
     for axis, (corner, extent) in enumerate(zip(tile.corner, tile.extent, strict=True)):
         if abs(corner) > _spec.INTEGER_MAX or abs(corner + extent) > _spec.INTEGER_MAX:
-            at, detail = tile.offset + places["corner"] + 8 * axis, "corner and corner + extent"
+            at, detail = tile.offset + offsets["corner"] + 8 * axis, "corner and corner + extent"
             found, wanted = (corner, corner + extent), f"at most {_spec.INTEGER_MAX} in magnitude"
             raise FormatError(_spec.ERROR_VALUE, at, "TIL-7", detail, found=found, wanted=wanted)
         if extent >> _spec.AXIS_BITS_MAX:
-            at, wanted = tile.offset + places["extent"] + 4 * axis, f"below 2^{_spec.AXIS_BITS_MAX}"
+            at, wanted = tile.offset + offsets["extent"] + 4 * axis, f"below 2^{_spec.AXIS_BITS_MAX}"
             raise FormatError(_spec.ERROR_VALUE, at, "TIL-8", "extent", found=extent, wanted=wanted)
     if scaled_step(means_step, tile.exponent) is None:
         detail = f"{means_step} x 2^{tile.exponent} is not positive, finite and at least 2^-1022"
-        raise FormatError(_spec.ERROR_VALUE, tile.offset + places["exponent"], "TIL-9", detail)
+        raise FormatError(_spec.ERROR_VALUE, tile.offset + offsets["exponent"], "TIL-9", detail)
 
 
 def _check_codebook_ids(tile: Tile, known: set[int], at: int) -> None:

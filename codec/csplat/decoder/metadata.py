@@ -220,12 +220,12 @@ def _check_tree(value: Any) -> None:
 
 def _check_bound_record(record: _spec.StatedErrorRecord, at: int, last: int) -> int:
     """Check SER-1 and SER-2; return the measure."""
-    places = _spec.STATED_ERROR_RECORD_OFFSETS
-    check_reserved(record, at, places)
+    offsets = _spec.STATED_ERROR_RECORD_OFFSETS
+    check_reserved(record, at, offsets)
     if record.measure not in _spec.MEASURE_NAMES or record.measure <= last:
-        refuse_field(_spec.ERROR_VALUE, "SER-1", record, at, places, "measure", "registered ids, ascending")
+        refuse_field(_spec.ERROR_VALUE, "SER-1", record, at, offsets, "measure", "registered ids, ascending")
     bound = record.max * math.sqrt(_BOUND_COMPONENTS[record.measure]) * _SLACK
     if not (0.0 <= record.max < math.inf and 0.0 <= record.rms < math.inf and record.rms <= bound):
         detail = f"max and rms of {_spec.MEASURE_NAMES[record.measure]}"
-        raise FormatError(_spec.ERROR_VALUE, at + places["max"], "SER-2", detail, found=(record.max, record.rms))
+        raise FormatError(_spec.ERROR_VALUE, at + offsets["max"], "SER-2", detail, found=(record.max, record.rms))
     return record.measure

@@ -290,7 +290,7 @@ def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeReco
             part[:] = 0.0
         elif isinstance(block, SparseBlock):
             part[:] = 0.0
-            _write_some(block.places, block.values, record, part)
+            _write_some(block.splat_indices, block.values, record, part)
         elif not copied:
             write_colour(block, record, part)
         elif isinstance(block, CodebookBlock) and block.escapes:
@@ -308,14 +308,14 @@ def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRe
         return False
     if not all(isinstance(block, CodebookBlock) and block.indices is indices for block in blocks.values()):
         return False
-    np.take(values, indices.places, axis=0, out=out, mode="clip")
+    np.take(values, indices.entry_indices, axis=0, out=out, mode="clip")
     return True
 
 
-def _write_some(places: NDArray[np.intp], columns: ColumnBlock, record: _spec.AttributeRecord, out: F32) -> None:
-    values = np.empty((len(places), *out.shape[1:]), np.float32)
+def _write_some(splat_indices: NDArray[np.intp], columns: ColumnBlock, record: _spec.AttributeRecord, out: F32) -> None:
+    values = np.empty((len(splat_indices), *out.shape[1:]), np.float32)
     write_colour(columns, record, values)
-    out[places] = values
+    out[splat_indices] = values
 
 
 def _scale(integers: Ints, step: float, out: F32, *, wide: bool = False) -> None:

@@ -87,10 +87,10 @@ def read_tile(
                 if _spec.ATTRIBUTE_LAYER[record.attribute] == layer.layer
             ]
         _read_tile_head(view, cursor.take(_spec.TILE_HEAD_SIZE), layer.layer, len(wanted))
-        for place, attribute in enumerate(wanted):
+        for index, attribute in enumerate(wanted):
             if attribute == _spec.ATTRIBUTE_EXTRA:
-                bits = read_raw(cursor, context, place)
-                if header.extras[place].dtype:
+                bits = read_raw(cursor, context, index)
+                if header.extras[index].dtype:
                     result.extra.append(bits)
             else:
                 result.blocks[attribute] = read_block(cursor, context, attribute)
@@ -127,12 +127,12 @@ def codebook_references(view: memoryview, header: SceneHeader, layer: _spec.Laye
 
 def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> None:
     head = _spec.unpack_tile_head(view, at)
-    places = _spec.TILE_HEAD_OFFSETS
-    check_reserved(head, at, places)
+    offsets = _spec.TILE_HEAD_OFFSETS
+    check_reserved(head, at, offsets)
     if head.layer != layer:
-        refuse_field(_spec.ERROR_INDEX, "TLE-1", head, at, places, "layer", layer)
+        refuse_field(_spec.ERROR_INDEX, "TLE-1", head, at, offsets, "layer", layer)
     if head.block_count != block_count:  # always the case for more than 255 extra columns: the count is one byte
-        refuse_field(_spec.ERROR_STREAM, "TLE-2", head, at, places, "block_count", block_count)
+        refuse_field(_spec.ERROR_STREAM, "TLE-2", head, at, offsets, "block_count", block_count)
 
 
 def read_block(cursor: Cursor, context: TileContext, attribute: int) -> Block:
@@ -151,13 +151,13 @@ def read_block(cursor: Cursor, context: TileContext, attribute: int) -> Block:
 
 def read_sparse(cursor: Cursor, context: TileContext, attribute: int) -> SparseBlock:
     """Read the rest of a SPARSE block; check SPA-1 to SPA-3, LAT-1 and LAT-4."""
-    at, places = cursor.take(_spec.SPARSE_PARAMS_SIZE), _spec.SPARSE_PARAMS_OFFSETS
+    at, offsets = cursor.take(_spec.SPARSE_PARAMS_SIZE), _spec.SPARSE_PARAMS_OFFSETS
     params = _spec.unpack_sparse_params(cursor.view, at)
-    check_reserved(params, at, places)
+    check_reserved(params, at, offsets)
     record, count = context.header.attribute(attribute), context.tile.splat_count
-    check_step(record, params.exponent, at + places["exponent"])
+    check_step(record, params.exponent, at + offsets["exponent"])
     if not 1 <= params.present_count <= count:
-        refuse_field(_spec.ERROR_VALUE, "SPA-1", params, at, places, "present_count", f"1 to {count}")
+        refuse_field(_spec.ERROR_VALUE, "SPA-1", params, at, offsets, "present_count", f"1 to {count}")
     mask_at = cursor.at
     bits = np.unpackbits(read_stream(cursor, (count + 7) >> 3, 1), bitorder="little")
     if bits[count:].any():
@@ -190,12 +190,12 @@ def read_means(cursor: Cursor, context: TileContext, coding: int) -> ColumnBlock
     tile = context.tile
     count, width_max = tile.splat_count, _spec.CODING_WIDTH_MAX[coding]
     if coding == _spec.CODING_MORTON:
-        params_at, places = cursor.take(_spec.MORTON_PARAMS_SIZE), _spec.MORTON_PARAMS_OFFSETS
+        params_at, offsets = cursor.take(_spec.MORTON_PARAMS_SIZE), _spec.MORTON_PARAMS_OFFSETS
         params = _spec.unpack_morton_params(cursor.view, params_at)
-        check_reserved(params, params_at, places)
+        check_reserved(params, params_at, offsets)
         if not 1 <= params.bits <= _spec.MORTON_BITS_MAX:
             wanted = f"1 to {_spec.MORTON_BITS_MAX}"
-            refuse_field(_spec.ERROR_VALUE, "MOR-1", params, params_at, places, "bits", wanted)
+            refuse_field(_spec.ERROR_VALUE, "MOR-1", params, params_at, offsets, "bits", wanted)
         at = cursor.at
         codes = read_stream(cursor, count, width_max)
         _check_bits(codes, 3 * params.bits, at, "MOR-2")
@@ -273,16 +273,16 @@ def _read_indices(
 ) -> Indices:
     count = context.tile.splat_count
     size, stream_at = book.record.size, cursor.at
-    places = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
-    largest = int(places.max())
+    entry_indices = read_stream(cursor, count, _spec.CODING_WIDTH_MAX[_spec.CODING_CODEBOOK])
+    largest = int(entry_indices.max())
     if largest > size:
         wanted = f"at most {size}"
         raise FormatError(_spec.ERROR_CODEBOOK, stream_at, "CBK-2", "index of an entry", found=largest, wanted=wanted)
-    escaped = np.flatnonzero(places == size)
+    escaped = np.flatnonzero(entry_indices == size)
     if len(escaped) != escape_count:
         at += _spec.CODEBOOK_PARAMS_OFFSETS["escape_count"]
         raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-3", "escape_count", found=escape_count, wanted=len(escaped))
-    return Indices(book, attribute, places, escaped)
+    return Indices(book, attribute, entry_indices, escaped)
 
 
 def _read_summand(cursor: Cursor, context: TileContext, attribute: int) -> ColumnBlock:

@@ -115,7 +115,7 @@ def merge(
         raise InputError("merge takes a list of two files or more")
     with ExitStack() as stack:
         scenes = [stack.enter_context(opened(file, storage=storage)) for file in files]
-        names = [scene.name or f"file {place}" for place, scene in enumerate(scenes, 1)]
+        names = [scene.name or f"file {number}" for number, scene in enumerate(scenes, 1)]
         for words, field in _SHARED_FIELDS:
             _refuse_contradiction(words, [getattr(scene.header, field) for scene in scenes], names)
         windows = [scene.window() for scene in scenes]
@@ -359,8 +359,8 @@ def renumber_tiles(
         if layer in _naming_layers(header, tile, ids) & tile.layers.keys()
     ]
     turn = ChunkPrefetcher(window, [record for _, record in naming], files)
-    for place, (tile, record) in enumerate(naming):
-        turn.take(place)
+    for index, (tile, record) in enumerate(naming):
+        turn.take(index)
         if stored := _rewrite_ids(window, header, record, ids, spool):
             changed.setdefault(tile.index, {})[record.layer] = stored
     window.forget()
@@ -387,12 +387,12 @@ def _rewrite_ids(
 ) -> LazyPayload | None:
     """Replace the ids in a chunk and store it; return `None` if it references no codebook."""
     with window.store.named_errors():
-        places = list(codebook_references(window.view, header, record))
-    if not places:
+        references = list(codebook_references(window.view, header, record))
+    if not references:
         return None
     payload = bytearray(chunk_payload(window, record))
     begin = record.offset + _spec.CHUNK_HEADER_SIZE
-    for at, id in places:
+    for at, id in references:
         payload[at - begin : at - begin + _ID_SIZE] = _as_bytes(ids[id])
     return spool.put(_spec.CHUNK_TILE, bytes(payload))
 

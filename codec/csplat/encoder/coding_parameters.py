@@ -357,8 +357,8 @@ def _neighbour_runs(means: F32, centre: NDArray[Any], reach: float) -> list[NDAr
     shift = np.float32(0.5) - (centre / reach).astype(np.float32)
     for at in range(0, len(means), _STATISTICS_SAMPLE):
         with np.errstate(over="ignore"):  # infinity is clipped to the reach
-            place = means[at : at + _STATISTICS_SAMPLE].T * scale + shift[:, None]
-        codes[at : at + _STATISTICS_SAMPLE] = morton_codes((np.clip(place, 0, 1) * top).astype(np.int32))
+            positions = means[at : at + _STATISTICS_SAMPLE].T * scale + shift[:, None]
+        codes[at : at + _STATISTICS_SAMPLE] = morton_codes((np.clip(positions, 0, 1) * top).astype(np.int32))
     if len(means) <= 2 * _STATISTICS_SAMPLE:
         return [np.argsort(codes, kind="stable")]
     bounds = np.sort(codes[:: len(codes) // _STATISTICS_SAMPLE])

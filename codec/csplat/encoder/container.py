@@ -100,12 +100,12 @@ def file_pieces(scene: SceneFields, tiles: Sequence[FileTile]) -> Iterator[bytes
     offset = _spec.HEADER_SIZE + index_size
     directory: list[_spec.DirectoryRecord] = []
     layers: dict[tuple[int, int], _spec.LayerRecord] = {}
-    for place, chunk in _ordered_chunks(scene, tiles):
+    for layer_key, chunk in _ordered_chunks(scene, tiles):
         where = (_spec.CHUNK_HEADER_SIZE + len(chunk.payload), offset, chunk_crc(chunk.type, chunk.payload))
-        if place is None:
+        if layer_key is None:
             directory.append(_spec.DirectoryRecord(chunk.type, _flags(chunk.type), chunk.id, chunk.layer, 0, 0, *where))
         else:
-            layers[place] = _spec.LayerRecord(chunk.layer, 0, 0, *where)
+            layers[layer_key] = _spec.LayerRecord(chunk.layer, 0, 0, *where)
         offset += where[0]
     index = _index(scene, tiles, directory, layers)
     assert len(index) == index_size

@@ -161,7 +161,7 @@ class EncodePlan:
         cls, model: SplatModel, options: EncodeOptions, origin: Origin, progress: Progress | None
     ) -> EncodePlan:
         buckets = bucket_rows(model.means)
-        contrast = measure_contrast(model.select(buckets[place]) for place in contrast_buckets(len(buckets)))
+        contrast = measure_contrast(model.select(buckets[index]) for index in contrast_buckets(len(buckets)))
         sample = cls.of(model.select(sample_rows(len(model))), options, contrast=contrast, progress=progress)
         sample = replace(sample, parameters=final_parameters(sample.parameters, largest_sh(model.shN)))
         tiles, extras = cut_scene(model, sample.parameters, buckets=buckets), extra_records(model, options)

@@ -189,7 +189,7 @@ def covariance_entries(quats: Floats, variances: F64) -> F64:
     rows = rotation_rows(quats)
     scaled = [tuple(entry * variance for entry, variance in zip(row, variances, strict=True)) for row in rows]
     result = np.empty((6, quats.shape[1]))
-    for place, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
+    for index, (i, j) in enumerate(((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))):
         a, b = scaled[i], rows[j]
-        result[place] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+        result[index] = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return result

@@ -273,8 +273,8 @@ def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I
         index = reassign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
         entries = _solve_entries(points, metric, entries, index)
     index = reassign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
-    flat, place = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
-    index = place.reshape(-1)[index]
+    flat, inverse = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
+    index = inverse.reshape(-1)[index]
     used, index = np.unique(index, return_inverse=True)
     return flat[used].reshape(-1, *entries.shape[1:]), index.reshape(-1)
 
@@ -531,8 +531,8 @@ def _solve_entries(points: Floats, metric: ErrorMetric, entries: I32, index: I64
     upper_i, upper_j = np.triu_indices(size)
     weights = metric.weights.astype(np.float64)
     matrices = np.zeros((count, size, size))
-    for place, (i, j) in enumerate(zip(upper_i, upper_j, strict=True)):
-        sums = np.bincount(index, weights * metric.triangles[:, place], count)
+    for column, (i, j) in enumerate(zip(upper_i, upper_j, strict=True)):
+        sums = np.bincount(index, weights * metric.triangles[:, column], count)
         matrices[:, i, j] = matrices[:, j, i] = sums
     right = np.empty((count, size, channels))
     products = np.empty((len(points), size, channels))

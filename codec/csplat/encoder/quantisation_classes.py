@@ -124,23 +124,23 @@ def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
     """
     sample = errors[:: max(1, len(errors) // _SAMPLE)]
     energy = (integers * np.log(np.maximum(sample, np.finfo(np.float64).tiny))).sum(axis=1)
-    places = np.empty(len(sample), np.uint8)
-    places[np.argsort(energy, kind="stable")] = np.arange(len(sample)) * count // len(sample)
-    octaves = _octaves(sample, places, integers)
+    classes = np.empty(len(sample), np.uint8)
+    classes[np.argsort(energy, kind="stable")] = np.arange(len(sample)) * count // len(sample)
+    octaves = _octaves(sample, classes, integers)
     for _ in range(_ROUNDS_MAX):
-        before, places = places, _assign_classes(sample, integers, octaves)
-        if (places == before).all():
+        before, classes = classes, _assign_classes(sample, integers, octaves)
+        if (classes == before).all():
             break
-        octaves = _octaves(sample, places, integers)
-    splats = np.bincount(places)[np.unique(places)] * (len(errors) / len(sample))
+        octaves = _octaves(sample, classes, integers)
+    splats = np.bincount(classes)[np.unique(classes)] * (len(errors) / len(sample))
     large: F64 = octaves[splats >= min(_CLASS_SPLATS_MIN, splats.max())]
     return large[np.argsort((integers * large).sum(axis=1), kind="stable")]
 
 
-def _octaves(errors: F64, places: U8, integers: F64) -> F64:
+def _octaves(errors: F64, classes: U8, integers: F64) -> F64:
     """Return the octaves of each used class at which an integer adds an error of 1 on average."""
-    counts = np.bincount(places)
-    sums = np.stack([np.bincount(places, column) for column in errors.T], axis=1)
+    counts = np.bincount(classes)
+    sums = np.stack([np.bincount(classes, column) for column in errors.T], axis=1)
     means = sums[counts > 0] / counts[counts > 0, None]
     best: F64 = 0.5 * np.log2(integers / np.maximum(means, np.finfo(np.float64).tiny))
     return np.clip(best, -_FINER, _COARSER)

@@ -400,8 +400,8 @@ def _refine(
     count = points.shape[1] // 3
     targets = np.clip(shN[:, :count] * np.float32(1.0 / parameters.sh_step), -_CLIP, _CLIP)
     start = entries.reshape(-1, count, 3)
-    entries, places = refine_by_metric(targets, metric, start, index.astype(np.int64), threads)
-    return np.clip(entries, -_CLIP, _CLIP).reshape(len(entries), -1), places.astype(np.uint32)
+    entries, refined = refine_by_metric(targets, metric, start, index.astype(np.int64), threads)
+    return np.clip(entries, -_CLIP, _CLIP).reshape(len(entries), -1), refined.astype(np.uint32)
 
 
 def _lattice_points(shN: F32, parameters: CodingParameters) -> I16:

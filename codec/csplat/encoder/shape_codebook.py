@@ -429,8 +429,8 @@ def _entropy(values: NDArray[Any]) -> float:
 
 def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> ShapeCodebook:
     """Escape the splats that are not assigned, drop unused entries, and sort the others by frequency."""
-    used, place = np.unique(index[assigned], return_inverse=True)
-    ranked, order = rank_by_frequency(place.astype(np.uint32), np.ascontiguousarray(entries[:, used].T))
+    used, inverse = np.unique(index[assigned], return_inverse=True)
+    ranked, order = rank_by_frequency(inverse.astype(np.uint32), np.ascontiguousarray(entries[:, used].T))
     full = np.full(len(index), len(used), np.int32)
     full[assigned] = ranked.astype(np.int32)
     return ShapeCodebook(np.ascontiguousarray(order.T), full, np.where(assigned, summand, 0).astype(np.int32))

@@ -354,6 +354,6 @@ def _symmetric_product(a: F64, b: F64) -> F64:
 def _quadratic_form(triangles: F64, vectors: F64) -> F64:
     """Return vᵀ H v, [n], of upper triangles [21, n] and vectors [6, n]."""
     total = np.zeros(vectors.shape[1])
-    for place, (i, j) in enumerate(zip(*np.triu_indices(6), strict=True)):
-        total += (1.0 if i == j else 2.0) * triangles[place] * vectors[i] * vectors[j]
+    for column, (i, j) in enumerate(zip(*np.triu_indices(6), strict=True)):
+        total += (1.0 if i == j else 2.0) * triangles[column] * vectors[i] * vectors[j]
     return total

@@ -223,8 +223,8 @@ class BucketCurve:
         curve = cls(low, _CURVE_TOP / side if side > 0.0 else 0.0, np.zeros(0, np.int64))
         buckets = math.ceil(count / (_BUCKET_FILL * BUCKET_SPLATS))
         codes = np.sort(curve._codes(means))
-        places = np.arange(1, buckets, dtype=np.int64) * len(codes) // buckets
-        return cls(curve.corner, curve.scale, np.unique(codes[places]))
+        starts = np.arange(1, buckets, dtype=np.int64) * len(codes) // buckets
+        return cls(curve.corner, curve.scale, np.unique(codes[starts]))
 
     @property
     def count(self) -> int:
@@ -270,7 +270,7 @@ def sample_rows(count: int) -> I64:
 
 def contrast_buckets(buckets: int) -> list[int]:
     """Return the buckets in which the contrast is measured; a sample of the scene has no neighbours for it."""
-    return sorted({place * buckets // _CONTRAST_BUCKETS for place in range(_CONTRAST_BUCKETS)})
+    return sorted({index * buckets // _CONTRAST_BUCKETS for index in range(_CONTRAST_BUCKETS)})
 
 
 def _cut_groups(

@@ -189,8 +189,8 @@ def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, 
         names = sh.dtype.names or ()
         codes = sh.view(np.uint8).reshape(count, len(names))  # all columns are bytes, without gaps
         each = len(names) // 3
-        places = [names.index(f"f_rest_{channel * each + index}") for channel in range(3) for index in range(kept)]
-        shN = _sh_values()[codes[:, places].reshape(count, 3, -1).transpose(0, 2, 1)]
+        columns = [names.index(f"f_rest_{channel * each + index}") for channel in range(3) for index in range(kept)]
+        shN = _sh_values()[codes[:, columns].reshape(count, 3, -1).transpose(0, 2, 1)]
     return {
         "means": between(_split_words(words["packed_position"]), 0).astype(np.float32),
         "scales": between(_split_words(words["packed_scale"]), 1).astype(np.float32),
@@ -219,14 +219,14 @@ def _write(path: Path, scene: SceneSource) -> None:
     rest = 3 * scene.metadata_model.shN.shape[1]
     header = _build_header(scene.metadata_model, scene.count, rest)
     sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-scene.count // _CHUNK), 4 * len(_PACKED_COLUMNS) * scene.count
-    places = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
+    offsets = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
     with atomic_writer(path) as stream, sorted_along_curve(scene, path.parent) as ordered:
         stream.write(header)
         for model in ordered.blocks():
             bounds, words = _pack_words(model)
             for index, part in enumerate((bounds.astype("<f4"), words, _sh_codes(model))):
-                stream.seek(places[index])
-                places[index] += stream.write(part.tobytes())
+                stream.seek(offsets[index])
+                offsets[index] += stream.write(part.tobytes())
 
 
 def _pack_words(model: SplatModel) -> tuple[F32, U32]:

@@ -27,7 +27,8 @@ _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4)
 _LARGEST_LOG = np.float32(88.0)  # its exponential fits in float32
 _QUAT_ZERO = 128  # byte of a component of 0; 1 would be 256
 _SAMPLE = 4096  # number of splats that `_doubt` checks
-_PLACES = (1e-12, 1e12)  # scene units; plausible largest coordinates other than 0; a quarter of random bytes is inside
+#: Plausible largest coordinates other than 0, scene units; a quarter of random bytes is inside.
+_COORDINATES = (1e-12, 1e12)
 _LONGEST_QUAT = 250  # units of 1/128; four bytes of 0 have length 256
 _MOST_IS_TEXT = 0.95  # minimum fraction of printable bytes in a text
 _PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(256)])
@@ -59,7 +60,7 @@ def _doubt(path: Path) -> str:
     if share >= _MOST_IS_TEXT:
         return f"it is text, and begins with {bytes(data[:24]).decode('ascii', 'replace')!a}"
     far = np.abs(sample["means"]).max(axis=1)  # NaN if a coordinate is NaN
-    placed = (far == 0) | ((far > _PLACES[0]) & (far < _PLACES[1]))
+    placed = (far == 0) | ((far > _COORDINATES[0]) & (far < _COORDINATES[1]))
     lengths = np.linalg.norm(np.subtract(sample["quats"], _QUAT_ZERO, dtype=np.float32), axis=1)
     rotated = lengths < _LONGEST_QUAT
     has_both_signs = (sample["scales"] < 0).any(axis=1) & (sample["scales"] > 0).any(axis=1)  # neither lengths nor logs

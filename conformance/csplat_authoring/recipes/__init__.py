@@ -48,8 +48,8 @@ def all_recipes() -> list[Recipe]:
 
 def _ordered(recipes: list[Recipe]) -> list[Recipe]:
     """Return recipes in the order of the manifest, new ones last, so that changes of the manifest stay small."""
-    places = {vector.name: place for place, vector in enumerate(load())}
-    return sorted(recipes, key=lambda recipe: places.get(recipe.name, math.inf))
+    positions = {vector.name: position for position, vector in enumerate(load())}
+    return sorted(recipes, key=lambda recipe: positions.get(recipe.name, math.inf))
 
 
 @lru_cache(maxsize=8)

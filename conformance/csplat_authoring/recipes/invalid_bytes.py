@@ -129,9 +129,9 @@ def _arrays_beyond_budget() -> Recipe:
                 changes[f"{stream}.count"] = n * len(block.rows[0])
         return built.patched(changes)
 
-    place = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
+    offset = _spec.HEADER_SIZE + _spec.INDEX_HEAD_OFFSETS["splat_count"]
     why = "arrays of a little more than 8 GiB, the default budget"
-    return Recipe("invalid/arrays_beyond_budget", why, ("LIM-1",), data, None, "E_LIMIT", place)
+    return Recipe("invalid/arrays_beyond_budget", why, ("LIM-1",), data, None, "E_LIMIT", offset)
 
 
 def _surplus_codebooks() -> list[Recipe]:

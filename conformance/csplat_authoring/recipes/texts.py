@@ -182,7 +182,7 @@ def _bad(name: str, kind: bytes, text: bytes, why: str) -> Recipe:
 
 
 def _bad_error(name: str, why: str, measure: str, largest: float, rms: float) -> Recipe:
-    ids = {word: value for value, word in _spec.MEASURE_NAMES.items()}
+    ids = {name: value for value, name in _spec.MEASURE_NAMES.items()}
     errors = StatedErrors(2, records=((ids[measure], largest, rms),))
     made = scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))
     return invalid_recipe(name, why, "SER-2", "E_VALUE", made, at=f"SERR/record[{measure}].max")

@@ -284,10 +284,10 @@ def _reduce(values: F64, start: int) -> tuple[float, float, int]:
     BLAS is not used, because its sums depend on the number of threads.
     """
     magnitudes = np.abs(values)
-    place = int(magnitudes.argmax())
+    worst = int(magnitudes.argmax())
     with np.errstate(over="ignore"):
         squares = float(np.square(values).sum())
-    return float(magnitudes.flat[place]), squares, start + place // values.shape[1]
+    return float(magnitudes.flat[worst]), squares, start + worst // values.shape[1]
 
 
 def _subtract(a: NDArray[Any], b: NDArray[Any]) -> F64:

@@ -286,9 +286,9 @@ class _OutOfCoreComparison:
             models = list(self.opened.models(group))
             decoded = join_blocks(models[0], models)
             ((source, numbers),) = self._spool.sources(key, len(decoded))
-            places = np.argsort(numbers)
-            parts.append((int(firsts[key]), len(decoded), measure_pairs(source, decoded, places)))
-            lines.update(dict.fromkeys(find_wrong_extras(source, decoded, places)))
+            order = np.argsort(numbers)
+            parts.append((int(firsts[key]), len(decoded), measure_pairs(source, decoded, order)))
+            lines.update(dict.fromkeys(find_wrong_extras(source, decoded, order)))
         return PairErrors(merge_errors(parts), list(lines), self._reach)
 
     def _groups(self) -> list[list[int]]:

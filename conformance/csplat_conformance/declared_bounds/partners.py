@@ -155,19 +155,19 @@ def _search_grid(
         keys = _hash([pair[probe >> axis & 1][left] for axis, pair in enumerate(cells)])
         order = np.argsort(keys)  # halves the time, because neighbouring keys are then adjacent in memory
         left, keys = left[order], keys[order]
-        place = np.searchsorted(grid.keys, keys)
+        slots = np.searchsorted(grid.keys, keys)
         for nth in range(candidates_max + 1):
-            more = (place < len(grid.keys)) & (grid.keys[np.minimum(place, len(grid.keys) - 1)] == keys)
-            left, keys, place = left[more], keys[more], place[more]
+            more = (slots < len(grid.keys)) & (grid.keys[np.minimum(slots, len(grid.keys) - 1)] == keys)
+            left, keys, slots = left[more], keys[more], slots[more]
             if not len(left):
                 break
             if nth == candidates_max:
                 found[left] = UNDECIDED
                 break
-            candidates = grid.order[place]
+            candidates = grid.order[slots]
             good = _pairs_within(source, decoded, candidates, rows[left], bounds)
             found[left[good]] = candidates[good]
-            left, keys, place = left[~good], keys[~good], place[~good] + 1
+            left, keys, slots = left[~good], keys[~good], slots[~good] + 1
     return found
 
 

@@ -55,11 +55,11 @@ def join_lines(lines: tuple[str, ...]) -> str:
     return "; ".join(lines[:_LINES_MAX]) + rest
 
 
-#: Runs a command line in this process; called with the line, the values of its places, and the time limit in seconds.
+#: Runs a command line in this process; called with the line, its values and the time limit, seconds.
 CommandRunner = Callable[[str, Mapping[str, str], float], ProcessEnd]
 
-#: Required and optional places of a command line.
-PLACES, OPTIONAL_PLACES = ("ply", "out"), ("index",)
+#: Required and optional placeholders of a command line.
+PLACEHOLDERS, OPTIONAL_PLACEHOLDERS = ("ply", "out"), ("index",)
 REPEAT_SECONDS = 1.1  #: between a run and its repetition, so that time stamps in seconds differ
 
 _NAMES = {"ply": "in.ply", "out": "out.csplat", "index": "out.npy"}
@@ -72,7 +72,7 @@ class EncoderRun:
     Attributes:
         end: the end of the process.
         out: path of the output.
-        index: path of the source index; `None` if the command line has no place for it.
+        index: path of the source index; `None` if the command line has no placeholder for it.
         traces: a line for each side effect of the run.
         started: start time by `time.monotonic`, seconds.
     """
@@ -106,14 +106,14 @@ def run_once(command: str, case: EncoderInput, folder: Path, seconds: float, run
     if folder.is_dir():
         shutil.rmtree(folder)  # from an earlier run
     folder.mkdir(parents=True)
-    places = {
+    paths = {
         name: folder / _NAMES[name]
-        for name in (*PLACES, *OPTIONAL_PLACES)
-        if name in PLACES or _has_place(command, name)
+        for name in (*PLACEHOLDERS, *OPTIONAL_PLACEHOLDERS)
+        if name in PLACEHOLDERS or _has_placeholder(command, name)
     }
-    with atomic_writer(places["ply"]) as stream:
+    with atomic_writer(paths["ply"]) as stream:
         stream.write(ply)
-    named = {name: str(path) for name, path in places.items()}
+    named = {name: str(path) for name, path in paths.items()}
     traces: list[str] = []
     started = time.monotonic()
     if run is not None:
@@ -125,11 +125,11 @@ def run_once(command: str, case: EncoderInput, folder: Path, seconds: float, run
     # A refusal that leaves an output is reported by `check_end`.
     outputs = {_NAMES["ply"], _NAMES["out"]} | ({_NAMES["index"]} if end.returncode == 0 else set())
     left = [name for name in _names(folder) if name not in outputs]
-    traces = [*_input_changes(places["ply"], ply), *(f"left {name} next to the output" for name in left), *traces]
-    return EncoderRun(end, places["out"], places.get("index"), tuple(traces), started)
+    traces = [*_input_changes(paths["ply"], ply), *(f"left {name} next to the output" for name in left), *traces]
+    return EncoderRun(end, paths["out"], paths.get("index"), tuple(traces), started)
 
 
-def _has_place(command: str, name: str) -> bool:
+def _has_placeholder(command: str, name: str) -> bool:
     return f"{{{name}}}" in command
 
 

@@ -20,8 +20,8 @@ from csplat.errors import InputError
 from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
 from csplat_conformance.encoders.encoder_inputs import PSNR_MIN, EncoderInput, all_inputs
 from csplat_conformance.encoders.encoder_run import (
-    OPTIONAL_PLACES,
-    PLACES,
+    OPTIONAL_PLACEHOLDERS,
+    PLACEHOLDERS,
     REPEAT_SECONDS,
     CommandRunner,
     EncoderRun,
@@ -96,7 +96,7 @@ def run_encoder(
         InputError: the command line cannot be used, there is no such program or level, or a pattern matches no input.
     """
     options = options or EncoderSuiteOptions()
-    split_command(command, PLACES, OPTIONAL_PLACES)
+    split_command(command, PLACEHOLDERS, OPTIONAL_PLACEHOLDERS)
     unknown = [level for level in options.levels if level not in LEVELS]
     if unknown:
         raise InputError(f"the level is {', '.join(unknown)}, expected {', '.join(LEVELS)}")
@@ -226,8 +226,8 @@ def _run_all(
     def again(case: EncoderInput, first: EncoderRun) -> EncoderRun:
         if run is None:
             time.sleep(max(0.0, first.started + REPEAT_SECONDS - time.monotonic()))
-        place = _input_folder(folder, case)
-        return run_once(command, case, place.with_name(place.name + _REPEATED), seconds, run)
+        first_folder = _input_folder(folder, case)
+        return run_once(command, case, first_folder.with_name(first_folder.name + _REPEATED), seconds, run)
 
     begun = [pool.submit(run_once, command, case, _input_folder(folder, case), seconds, run) for case in inputs]
     firsts = []
@@ -241,8 +241,8 @@ def _run_all(
 def _remove_repetition(folder: Path, case: EncoderInput, first: EncoderRun, again: EncoderRun | None) -> None:
     """Remove a repetition if it gave the same file."""
     if again is not None and again.wrote and first.out.read_bytes() == again.out.read_bytes():
-        place = _input_folder(folder, case)
-        shutil.rmtree(place.with_name(place.name + _REPEATED))
+        first_folder = _input_folder(folder, case)
+        shutil.rmtree(first_folder.with_name(first_folder.name + _REPEATED))
 
 
 def _declined_notes(declined: dict[str, bool]) -> list[str]:
@@ -251,8 +251,8 @@ def _declined_notes(declined: dict[str, bool]) -> list[str]:
     for group in dict.fromkeys(name.partition("/")[0] for name in declined):
         those = [was_declined for name, was_declined in declined.items() if name.partition("/")[0] == group]
         if any(those):
-            word = "warning: " if all(those) and len(those) > 1 else ""
-            notes.append(f"{word}{group}: {sum(those)} of {len(those)} declined")
+            prefix = "warning: " if all(those) and len(those) > 1 else ""
+            notes.append(f"{prefix}{group}: {sum(those)} of {len(those)} declined")
     return notes
 
 

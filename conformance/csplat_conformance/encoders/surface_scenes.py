@@ -77,11 +77,11 @@ def _box(side: int) -> list[Surface]:
     """Return the faces of a flat box below the others."""
     half = np.array((1.5, 0.12, 1.5))
     spacing = 2.0 * half[0] / side
-    places = [(np.arange(count) + 0.5) / count * 2.0 - 1.0 for count in (side, 2, side)]
+    positions = [(np.arange(count) + 0.5) / count * 2.0 - 1.0 for count in (side, 2, side)]
     faces = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
-            ends = [np.array((sign,)) if other == axis else places[other] for other in range(3)]
+            ends = [np.array((sign,)) if other == axis else positions[other] for other in range(3)]
             points = np.stack([one.ravel() for one in np.meshgrid(*ends, indexing="ij")], axis=1)
             normals = np.tile(sign * np.eye(3)[axis], (len(points), 1))
             faces.append((points * half + (0.0, 0.6, 0.0), normals, spacing))
@@ -127,8 +127,8 @@ def _highlights(normals: F64) -> F64:
     """Return coefficients of bands 1 to 3, [N, 15, 3]: for each light, a lobe about its mirror direction."""
     shares = np.repeat(_LOBE, (3, 5, 7))
     total = np.zeros((len(normals), 15, 3))
-    for place, colour in zip(_LIGHTS, _LIGHT_COLOURS, strict=True):
-        light = place / np.sqrt(np.square(place).sum())
+    for position, colour in zip(_LIGHTS, _LIGHT_COLOURS, strict=True):
+        light = position / np.sqrt(np.square(position).sum())
         facing = normals @ light
         # Directions point from the camera to the splat.
         mirrored = light - 2.0 * facing[:, None] * normals

@@ -111,8 +111,8 @@ class _Scanner:
             return self.object(depth + 1) if first == "{" else self.array(depth + 1)
         if first == '"':
             return self.string()
-        for word, value in _LITERALS.items():
-            if self.taken(word):
+        for literal, value in _LITERALS.items():
+            if self.taken(literal):
                 return value
         return self.number()
 

@@ -145,7 +145,7 @@ def _read_attributes(view: memoryview, at: int, end: int, index: Index, log: Vio
         placed = read_record(view, _spec.AttributeRecord, at, name)
         log.check_reserved(placed)
         if count == len(expected) and index.degree is not None and attribute != expected[i]:
-            log.add_field("ATT-1", placed, "attribute", f"{attribute}, expected {expected[i]} in place {i}")
+            log.add_field("ATT-1", placed, "attribute", f"{attribute}, expected {expected[i]} at index {i}")
         if attribute in _spec.ATTRIBUTE_NAMES and attribute not in index.attributes:
             index.attributes[attribute] = placed
             _check_attribute(log, placed, index)
@@ -485,14 +485,14 @@ class Tile:
     """A tile record with its layers and codebook ids.
 
     Attributes:
-        place: index of the tile, from 0.
+        index: index of the tile, from 0.
         record: the tile record.
         chunks: TILE chunks in the order of the layer records.
         codebook_ids: ids of the codebooks that the tile lists.
         box_sound: whether corner, extent and exponent obey TIL-7 to TIL-9.
     """
 
-    place: int
+    index: int
     record: PlacedRecord[_spec.TileRecord]
     chunks: list[Chunk] = field(default_factory=list)
     codebook_ids: set[int] = field(default_factory=set)
@@ -590,7 +590,7 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
             log.add_field("RES-2", placed, "layer", f"{layer} is not a layer of this version")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
             log.add_field("TIL-3", placed, "layer", f"band {layer}, expected at most sh_degree, {index.degree}")
-        chunk = Chunk(f"TILE.{tile.place}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.place, layer)
+        chunk = Chunk(f"TILE.{tile.index}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.index, layer)
         tile.chunks.append(check_chunk_size(log, chunk))
         last = max(last, layer)
         at += index.size_of("layer")

@@ -26,7 +26,7 @@ class Stream:
     """A stream that was read.
 
     Attributes:
-        head: the stream head and its place.
+        head: the stream head with its offset.
         elements: [count], `None` if a violation prevents decoding.
     """
 

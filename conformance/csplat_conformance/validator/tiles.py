@@ -89,7 +89,7 @@ class TileChecker:
     def _expected_blocks(self, layer: int) -> list[int]:
         if layer == _spec.LAYER_EXTRA:
             return [_spec.ATTRIBUTE_EXTRA] * self.index.head.record.extra_count
-        return [attribute for attribute, place in _spec.ATTRIBUTE_LAYER.items() if place == layer]
+        return [attribute for attribute, attribute_layer in _spec.ATTRIBUTE_LAYER.items() if attribute_layer == layer]
 
     def _read_block(self, payload: Payload, expected: int, number: int) -> None:
         at = payload.at
@@ -97,7 +97,7 @@ class TileChecker:
         name = f"extra[{number}]" if attribute == _spec.ATTRIBUTE_EXTRA else _spec.ATTRIBUTE_NAMES.get(attribute, "?")
         head = read_block_head(payload, name)
         if attribute != expected:
-            message = f"{attribute}, expected {expected} ({_spec.ATTRIBUTE_NAMES[expected]}) in place {number}"
+            message = f"{attribute}, expected {expected} ({_spec.ATTRIBUTE_NAMES[expected]}) at index {number}"
             self.log.add_field("TLE-2", head, "attribute", message)
             if attribute not in _spec.ATTRIBUTE_NAMES:
                 raise UnreadableError

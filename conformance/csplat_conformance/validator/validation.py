@@ -221,7 +221,7 @@ def _read_tile_chunks(
 ) -> None:
     let_go = PageReleaser(view)
     for tile in tiles:
-        progress(_STAGE, tile.place / len(tiles))
+        progress(_STAGE, tile.index / len(tiles))
         let_go.after(sum(chunk.size for chunk in tile.chunks))
         reader = TileChecker(view, index, tile, books, log)
         for chunk in sorted(tile.chunks, key=lambda chunk: chunk.layer):

@@ -274,9 +274,9 @@ def _twice(rng: random.Random, data: bytearray, at: int) -> None:
 
 def _digit(rng: random.Random, data: bytearray, at: int) -> None:
     """Change a number of a text within the next 200 bytes."""
-    for place in range(at, min(at + 200, len(data))):
-        if 48 <= data[place] < 58:
-            data[place : place + 1] = rng.choice((b"0", b"-1", b"9999999999", b"1e400", b"null", b"[]", b'"x"'))
+    for index in range(at, min(at + 200, len(data))):
+        if 48 <= data[index] < 58:
+            data[index : index + 1] = rng.choice((b"0", b"-1", b"9999999999", b"1e400", b"null", b"[]", b'"x"'))
             return
 
 
@@ -444,8 +444,8 @@ def _word_changes(rng: random.Random, ply: Ply) -> Ply:
     lines = list(ply.lines)
     at = rng.randrange(min(4, len(lines))) if rng.random() < 0.5 else rng.randrange(len(lines))
     words = lines[at].split(b" ")
-    word = rng.randrange(len(words) + 1)
-    words[word : word + rng.choice((0, 1, 1, 1))] = [rng.choice(_WORDS)]
+    index = rng.randrange(len(words) + 1)
+    words[index : index + rng.choice((0, 1, 1, 1))] = [rng.choice(_WORDS)]
     lines[at] = b" ".join(words)
     return Ply(tuple(lines), ply.body, ply.newline)
 

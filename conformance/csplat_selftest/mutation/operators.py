@@ -130,7 +130,7 @@ class _Module:
 
     def replaced(self, node: ast.AST, new: str) -> Mutant:
         start, end = self.span(node)
-        return Mutant(self.file, node.lineno, start, self.text[start:end], new)  # type: ignore[attr-defined]  # has a place
+        return Mutant(self.file, node.lineno, start, self.text[start:end], new)  # type: ignore[attr-defined]  # has a position
 
     def source(self, node: ast.AST) -> str:
         start, end = self.span(node)
@@ -138,9 +138,9 @@ class _Module:
 
     def span(self, node: ast.AST) -> tuple[int, int]:
         """Return the character range of a node; the tree counts bytes of lines in UTF-8."""
-        places = (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)  # type: ignore[attr-defined]  # has a place
+        ends = (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)  # type: ignore[attr-defined]  # has a position
         start, end = (
-            self.starts[line - 1] + len(self.lines[line - 1].encode()[:column].decode()) for line, column in places
+            self.starts[line - 1] + len(self.lines[line - 1].encode()[:column].decode()) for line, column in ends
         )
         return start, end
 

@@ -35,7 +35,7 @@ Image = NDArray[np.float32]
 DEGREE = 3
 WIDTH, HEIGHT = 320, 240  # pixels; SwiftShader is slow
 
-_PLACES = 8  # around a scene
+_CAMERAS = 8  # around a scene
 _PACKAGES = {
     "three": "0.187", "playcanvas": "2.23", "@babylonjs/core": "9", "@babylonjs/loaders": "9", "@adobe/spz": "0.2",
     "@sparkjsdev/spark": "2.2",
@@ -144,10 +144,10 @@ def served(
         folder = Path(name)
         (folder / "node_modules").symlink_to(packages.resolve())
         (folder / "pages").symlink_to(Path(__file__).parent / "subjects" / "pages")
-        for place in ("codec/js", "tools/viewer"):  # the viewer's modules import the decoder's by this path
-            (folder / place).parent.mkdir()
-            (folder / place).symlink_to(ROOT / place)
-        imports = {word: f"/node_modules/{path}" for word, path in _IMPORTS.items()}
+        for path in ("codec/js", "tools/viewer"):  # the viewer's modules import the decoder's by this path
+            (folder / path).parent.mkdir()
+            (folder / path).symlink_to(ROOT / path)
+        imports = {name: f"/node_modules/{path}" for name, path in _IMPORTS.items()}
         imports |= {f"csplat-decoder/{name}": f"/codec/js/engines/{name}.mjs" for name in ENGINES}
         scopes = {key: {"three": "/node_modules/three/build/three.module.js"} for key in _CLASSIC}
         (folder / "page.html").write_text(_PAGE % (json.dumps(imports), json.dumps(scopes)))
@@ -157,7 +157,7 @@ def served(
 def chosen_view(scene: Scene) -> tuple[SplatModel, Camera]:
     """Return a scene with one camera: the one of eight around it in whose render SH changes most."""
     model = read_ply(scene.path)
-    cameras = orbit_cameras(model, _PLACES, WIDTH, HEIGHT)
+    cameras = orbit_cameras(model, _CAMERAS, WIDTH, HEIGHT)
     chosen = min(
         cameras,
         key=lambda camera: psnr(screen_render(model, camera), screen_render(model, camera, sh_degree=0)),

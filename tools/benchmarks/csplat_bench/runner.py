@@ -31,8 +31,8 @@ def run_suite(
         True if every case gave a row without an error, or was left out because something is not installed.
     """
     fine = True
-    for place in scenes:
-        scene = scene_name(place)
+    for name_or_path in scenes:
+        scene = scene_name(name_or_path)
         cases = suite.cases_on(scene, only)
         missing = [case for case in cases if not results.is_known(scene, case)]
         if not missing:
@@ -42,7 +42,7 @@ def run_suite(
         cases = [case for case in cases if case.get("reference", case.name) in references]
         note(f"{suite.name} {scene}: {len(cases)} cases")
         try:
-            with subject(setup, place, cases) as measure:
+            with subject(setup, name_or_path, cases) as measure:
                 for case, row in _take_turns(suite, cases, measure, scene):
                     fine &= "error" not in row
                     results.add(scene, case, row)
@@ -53,9 +53,9 @@ def run_suite(
     return fine
 
 
-def scene_name(place: str) -> str:
+def scene_name(name_or_path: str) -> str:
     """Return the name of a scene in results: the last part of its path, without .ply or .csplat."""
-    name = Path(place).name if "/" in place and Path(place).exists() else place
+    name = Path(name_or_path).name if "/" in name_or_path and Path(name_or_path).exists() else name_or_path
     return name.removesuffix(".ply").removesuffix(".csplat")
 
 

@@ -101,7 +101,7 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
     rows: list[Row] = [flatten(row) for name in _listed(spec["source"]) for row in _read(folder / name, key)]
     rows = [{"series": row["case"], **row} if "case" in row else row for row in rows]
     for field, values in reversed(spec.get("where", {}).items()):
-        order = {value: place for place, value in enumerate(_listed(values))}
+        order = {value: position for position, value in enumerate(_listed(values))}
         rows = sorted((row for row in rows if row.get(field) in order), key=lambda row: order[row[field]])
     if "group" in spec:
         rows = _grouped(rows, _listed(spec["group"]), spec["by"])
@@ -201,8 +201,8 @@ def _draw_panel(axis: Any, spec: Mapping[str, Any], rows: Sequence[Row]) -> None
         colour, style = styles.get(name, (_COLOURS[number % len(_COLOURS)], "o-"))
         x, y, notes = zip(*points, strict=True)
         axis.plot(x, y, style, color=colour, markersize=4.5, linewidth=1.5, label=labels.get(name, name))
-        for *place, note in zip(x, y, notes, strict=True):
-            axis.annotate(note, place, (5, -3), textcoords="offset points", fontsize=8, color=colour)
+        for *point, note in zip(x, y, notes, strict=True):
+            axis.annotate(note, point, (5, -3), textcoords="offset points", fontsize=8, color=colour)
     if "ticks" in spec:
         axis.set_xticks(spec["ticks"], [f"{tick:g}" for tick in spec["ticks"]])
         axis.set_xticks([], minor=True)

@@ -67,17 +67,17 @@ class PlacedPrimitive:
 
     Attributes:
         primitive: JSON of the primitive.
-        place: path of the primitive in the JSON.
+        json_path: path of the primitive in the JSON.
         matrix: [4, 4] from the primitive to the world, for column vectors.
         node: JSON of the node.
-        node_place: path of the node in the JSON.
+        node_path: path of the node in the JSON.
     """
 
     primitive: dict[str, Any]
-    place: JsonPath
+    json_path: JsonPath
     matrix: F64
     node: dict[str, Any]
-    node_place: JsonPath
+    node_path: JsonPath
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,12 @@ class GltfDocument:
     short: dict[int, str] = field(default_factory=dict)
     _buffers: dict[int, memoryview] = field(default_factory=dict)
 
-    def error(self, place: JsonPath, reason: str) -> InputError:
+    def error(self, json_path: JsonPath, reason: str) -> InputError:
         """Return the error for a path in the JSON."""
-        return InputError(f"{self.path.name}, {'/'.join(map(str, place))}: {reason}")
+        return InputError(f"{self.path.name}, {'/'.join(map(str, json_path))}: {reason}")
 
     def get(
-        self, holder: dict[str, Any], place: JsonPath, key: str, kind: type | tuple[type, ...], default: Any = None
+        self, holder: dict[str, Any], json_path: JsonPath, key: str, kind: type | tuple[type, ...], default: Any = None
     ) -> Any:
         """Return a member of a JSON object, or `default` if it is absent.
 
@@ -113,18 +113,18 @@ class GltfDocument:
         """
         value = holder.get(key, default)
         if value is not default and (not isinstance(value, kind) or (type(value) is bool) != (kind is bool)):
-            raise self.error((*place, key), f"found {_shorten(value)}")
+            raise self.error((*json_path, key), f"found {_shorten(value)}")
         return value
 
-    def integer(self, holder: dict[str, Any], place: JsonPath, key: str, default: int | None = None) -> int:
+    def integer(self, holder: dict[str, Any], json_path: JsonPath, key: str, default: int | None = None) -> int:
         """Return an integer member >= 0, which is required unless there is a default.
 
         Raises:
             InputError: the member is absent or has another value.
         """
-        value: Any = self.get(holder, place, key, int, default)
+        value: Any = self.get(holder, json_path, key, int, default)
         if value is None or not 0 <= value < 1 << 53:
-            raise self.error((*place, key), f"found {_shorten(value)}, expected a whole number")
+            raise self.error((*json_path, key), f"found {_shorten(value)}, expected a whole number")
         number: int = value
         return number
 
@@ -148,85 +148,88 @@ class GltfDocument:
             InputError: the accessor does not exist, has another type, or exceeds its buffer.
         """
         record = self.item("accessors", index)
-        place = ("accessors", _shorten(index))
-        dtype, kind = _DTYPES.get(self.integer(record, place, "componentType")), self.get(record, place, "type", str)
+        json_path = ("accessors", _shorten(index))
+        dtype = _DTYPES.get(self.integer(record, json_path, "componentType"))
+        kind = self.get(record, json_path, "type", str)
         if dtype is None or _WIDTHS.get(kind) != width:
-            raise self.error(place, f"found {_shorten(kind)} of {record['componentType']}, expected {width} numbers")
+            raise self.error(
+                json_path, f"found {_shorten(kind)} of {record['componentType']}, expected {width} numbers"
+            )
         if "sparse" in record or "bufferView" not in record:
             raise self.error(
-                place, "sparse accessors are not supported" if "sparse" in record else "found no bufferView"
+                json_path, "sparse accessors are not supported" if "sparse" in record else "found no bufferView"
             )
-        count, offset = self.integer(record, place, "count"), self.integer(record, place, "byteOffset", 0)
+        count, offset = self.integer(record, json_path, "count"), self.integer(record, json_path, "byteOffset", 0)
         data, stride = self.view(record["bufferView"])
         size = np.dtype(dtype).itemsize * width
         stride = stride or size
         if stride < size:
-            raise self.error(place, f"rows of {size} bytes have a stride of {stride}")
+            raise self.error(json_path, f"rows of {size} bytes have a stride of {stride}")
         if offset + stride * (count - 1) + size > len(data) and count:
-            raise self.error(place, f"{counted(count, 'row')} of {size} bytes in a view of {len(data)} bytes")
+            raise self.error(json_path, f"{counted(count, 'row')} of {size} bytes in a view of {len(data)} bytes")
         rows: NDArray[Any] = np.zeros((0, width), dtype)
         if count:
             rows = np.ndarray((count, width), dtype, data, offset, (stride, size // width))
-        return Accessor(rows, self.get(record, place, "normalized", bool, False))
+        return Accessor(rows, self.get(record, json_path, "normalized", bool, False))
 
     def view(self, index: object) -> tuple[memoryview, int]:
         """Return the bytes of a buffer view and its stride, 0 if rows are adjacent."""
-        record, place = self.item("bufferViews", index), ("bufferViews", _shorten(index))
+        record, json_path = self.item("bufferViews", index), ("bufferViews", _shorten(index))
         if record.get("extensions"):
             raise self.error(
-                (*place, "extensions"),
+                (*json_path, "extensions"),
                 f"{_list_names(record['extensions'])}: packed buffers are not supported, gltf-transform unpacks them",
             )
-        buffer = self._buffer(self.integer(record, place, "buffer"))
-        start, length = self.integer(record, place, "byteOffset", 0), self.integer(record, place, "byteLength")
+        buffer = self._buffer(self.integer(record, json_path, "buffer"))
+        start, length = self.integer(record, json_path, "byteOffset", 0), self.integer(record, json_path, "byteLength")
         if start + length > len(buffer):
             short = ": the file is truncated" if record["buffer"] in self.short else ""
-            raise self.error(place, f"bytes {start} to {start + length} of a buffer of {len(buffer)}{short}")
-        return buffer[start : start + length], self.integer(record, place, "byteStride", 0)
+            raise self.error(json_path, f"bytes {start} to {start + length} of a buffer of {len(buffer)}{short}")
+        return buffer[start : start + length], self.integer(record, json_path, "byteStride", 0)
 
     def _buffer(self, index: int) -> memoryview:
         if index not in self._buffers:
-            record, place = self.item("buffers", index), ("buffers", index)
-            uri, length = self.get(record, place, "uri", str), self.integer(record, place, "byteLength")
+            record, json_path = self.item("buffers", index), ("buffers", index)
+            uri, length = self.get(record, json_path, "uri", str), self.integer(record, json_path, "byteLength")
             if uri is not None:
-                data = self._read_uri(uri, (*place, "uri"))
+                data = self._read_uri(uri, (*json_path, "uri"))
             elif index == 0 and self.binary is not None:
                 data = self.binary
             else:
-                raise self.error(place, "it has neither a uri nor a BIN chunk")
+                raise self.error(json_path, "it has neither a uri nor a BIN chunk")
             if length > len(data):  # the part that splats use may still be present
                 self.short[index] = f"found {len(data):,} bytes, expected {length:,}"
             self._buffers[index] = data[:length]
         return self._buffers[index]
 
-    def _read_uri(self, uri: str, place: JsonPath) -> memoryview:
+    def _read_uri(self, uri: str, json_path: JsonPath) -> memoryview:
         if uri.startswith("data:"):
             kind, _, text = uri.partition(",")
             if not kind.endswith(";base64"):
-                raise self.error(place, "found a data URI of another encoding, expected base64")
+                raise self.error(json_path, "found a data URI of another encoding, expected base64")
             try:
                 return memoryview(base64.b64decode(text, validate=True))
             except (binascii.Error, ValueError) as error:
-                raise self.error(place, f"found invalid base64: {error}") from None
+                raise self.error(json_path, f"found invalid base64: {error}") from None
         folder = self.path.resolve().parent
         name = unquote(uri)
         if "\\" in name and not (folder / name).exists():  # written on Windows
             name = name.replace("\\", "/")
         if not name.isprintable() or ":" in name or "\\" in name:
-            raise self.error(place, f"found {_shorten(uri)}, expected a file in the same folder")
+            raise self.error(json_path, f"found {_shorten(uri)}, expected a file in the same folder")
         try:
             target = (folder / name).resolve()
             if not target.is_relative_to(folder):  # refuses .., absolute paths and links that lead out
-                raise self.error(place, f"{_shorten(uri)} is outside the folder of {self.path.name}")
+                raise self.error(json_path, f"{_shorten(uri)} is outside the folder of {self.path.name}")
             if not target.is_file():
                 same = [path.name for path in folder.iterdir() if path.name.casefold() == target.name.casefold()]
                 hint = f", but {_shorten(same[0])}: rename it" if same else ""
-                raise self.error(place, f"there is no file {_shorten(uri)}{hint}")
+                raise self.error(json_path, f"there is no file {_shorten(uri)}{hint}")
             data = memoryview(map_file(target))
         except (OSError, RuntimeError) as error:  # RuntimeError: circular links
-            raise self.error(place, f"{_shorten(uri)} cannot be read: {error}") from None
+            raise self.error(json_path, f"{_shorten(uri)} cannot be read: {error}") from None
         if instead := describe_substitute(bytes(data[:64])):
-            raise self.error(place, f"{_shorten(uri)} is {instead}")
+            raise self.error(json_path, f"{_shorten(uri)} is {instead}")
         return data
 
     def size(self) -> int:
@@ -252,15 +255,15 @@ class GltfDocument:
         stack = [(index, np.eye(4)) for index in reversed(roots)]
         while stack:
             index, above = stack.pop()
-            node, place = self.item("nodes", index), ("nodes", _shorten(index))
+            node, json_path = self.item("nodes", index), ("nodes", _shorten(index))
             if _extension(node, "KHR_node_visibility").get("visible") is False:
                 continue
             if index in seen:
-                raise self.error(place, "it has more than one parent")
+                raise self.error(json_path, "it has more than one parent")
             seen.add(index)
             with np.errstate(all="ignore"):
-                matrix = above @ self._transform(node, place)
-            stack += [(child, matrix) for child in reversed(self._list(node, place, "children"))]
+                matrix = above @ self._transform(node, json_path)
+            stack += [(child, matrix) for child in reversed(self._list(node, json_path, "children"))]
             if "mesh" in node:
                 mesh = self.item("meshes", node["mesh"])
                 for at, primitive in enumerate(self._list(mesh, ("meshes", node["mesh"]), "primitives")):
@@ -270,7 +273,7 @@ class GltfDocument:
                         raise self.error(spot, f"found {_shorten(primitive)}, expected an object")
                     if shown > _MAX_PRIMITIVES:
                         raise self.error(spot, f"it is number {shown}, the scene may show {_MAX_PRIMITIVES}")
-                    yield PlacedPrimitive(primitive, spot, matrix, node, place)
+                    yield PlacedPrimitive(primitive, spot, matrix, node, json_path)
 
     def other_scenes(self) -> str:
         """Describe the scenes that `placed_primitives` ignores because no default is set; "" if there are none."""
@@ -287,40 +290,40 @@ class GltfDocument:
         extension = _extension(placed.node, _INSTANCING)
         if not extension:
             return placed.matrix[None]
-        place = (*placed.node_place, "extensions", _INSTANCING)
-        attributes = self.get(extension, place, "attributes", dict, {})
+        json_path = (*placed.node_path, "extensions", _INSTANCING)
+        attributes = self.get(extension, json_path, "attributes", dict, {})
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
         rows = {name: self.accessor(attributes[name], width) for name, width in widths.items() if name in attributes}
         counts = {len(one.rows) for one in rows.values()}
         if len(counts) != 1:
-            raise self.error(place, f"its attributes have {sorted(counts)} rows, expected one number of instances")
+            raise self.error(json_path, f"its attributes have {sorted(counts)} rows, expected one number of instances")
         values = {name: one.values(slice(None)).astype(np.float64) for name, one in rows.items()}
         matrices = np.tile(np.eye(4), (counts.pop(), 1, 1))
         for index, quat in enumerate(values.get("ROTATION", ())):
-            matrices[index, :3, :3] = self._rotation(quat.tolist(), (*place, "attributes", "ROTATION"))
+            matrices[index, :3, :3] = self._rotation(quat.tolist(), (*json_path, "attributes", "ROTATION"))
         matrices[:, :3, :3] *= values.get("SCALE", np.ones((len(matrices), 3)))[:, None]
         matrices[:, :3, 3] = values.get("TRANSLATION", 0.0)
         found: NDArray[np.float64] = placed.matrix @ matrices
         return found
 
-    def _list(self, holder: dict[str, Any], place: JsonPath, key: str) -> list[Any]:
-        values: list[Any] = self.get(holder, place, key, list, [])
+    def _list(self, holder: dict[str, Any], json_path: JsonPath, key: str) -> list[Any]:
+        values: list[Any] = self.get(holder, json_path, key, list, [])
         return values
 
-    def _transform(self, node: dict[str, Any], place: JsonPath) -> F64:
+    def _transform(self, node: dict[str, Any], json_path: JsonPath) -> F64:
         if "matrix" in node:
-            return self._numbers(node, place, "matrix", np.eye(4).ravel()).reshape(4, 4).T
+            return self._numbers(node, json_path, "matrix", np.eye(4).ravel()).reshape(4, 4).T
         matrix = np.eye(4)
-        quat = self._numbers(node, place, "rotation", (0.0, 0.0, 0.0, 1.0)).tolist()
-        matrix[:3, :3] = self._rotation(quat, (*place, "rotation"))
-        matrix[:3, :3] *= self._numbers(node, place, "scale", (1.0, 1.0, 1.0))
-        matrix[:3, 3] = self._numbers(node, place, "translation", _NO_TRANSLATION)
+        quat = self._numbers(node, json_path, "rotation", (0.0, 0.0, 0.0, 1.0)).tolist()
+        matrix[:3, :3] = self._rotation(quat, (*json_path, "rotation"))
+        matrix[:3, :3] *= self._numbers(node, json_path, "scale", (1.0, 1.0, 1.0))
+        matrix[:3, 3] = self._numbers(node, json_path, "translation", _NO_TRANSLATION)
         return matrix
 
-    def _rotation(self, quat: list[float], place: JsonPath) -> list[list[float]]:
+    def _rotation(self, quat: list[float], json_path: JsonPath) -> list[list[float]]:
         length = math.hypot(*quat)
         if not 0.0 < length < math.inf:
-            raise self.error(place, f"found {quat}, expected a unit quaternion")
+            raise self.error(json_path, f"found {quat}, expected a unit quaternion")
         x, y, z, w = (one / length for one in quat)
         return [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -328,11 +331,11 @@ class GltfDocument:
             [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
         ]
 
-    def _numbers(self, holder: dict[str, Any], place: JsonPath, key: str, default: Any) -> F64:
+    def _numbers(self, holder: dict[str, Any], json_path: JsonPath, key: str, default: Any) -> F64:
         values = holder.get(key, list(default))
         good = isinstance(values, list) and len(values) == len(default)
         if not good or not all(type(value) in (int, float) and abs(value) < 1e300 for value in values):
-            raise self.error((*place, key), f"found {_shorten(values)}, expected {len(default)} numbers")
+            raise self.error((*json_path, key), f"found {_shorten(values)}, expected {len(default)} numbers")
         return np.array(values, np.float64)
 
 

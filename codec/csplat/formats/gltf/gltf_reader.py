@@ -112,20 +112,20 @@ class _GltfReading:
 
     def instances(self, placed: PlacedPrimitive) -> Iterator[_Instance]:
         """Yield each instance of a primitive; none if the primitive has no splats."""
-        place = (*placed.place, "extensions")
-        extensions = self.file.get(placed.primitive, placed.place, "extensions", dict, {})
-        extension = self.file.get(extensions, place, EXTENSION, dict, {})
-        within = self.file.get(extension, (*place, EXTENSION), "extensions", dict, {})
+        json_path = (*placed.json_path, "extensions")
+        extensions = self.file.get(placed.primitive, placed.json_path, "extensions", dict, {})
+        extension = self.file.get(extensions, json_path, EXTENSION, dict, {})
+        within = self.file.get(extension, (*json_path, EXTENSION), "extensions", dict, {})
         packed = next((one for one in _SPZ if one in within or one in extensions), "")
         if EXTENSION not in extensions and not packed:
             return
         unknown = [name for name in within if name not in _SPZ]
         unknown += [one for one in extensions if one in self.required and one not in {EXTENSION, *_SPZ, *_HARMLESS}]
         if unknown:
-            raise self.file.error(place, f"the splats use {', '.join(map(str, unknown))}, which is not supported")
-        self._check(placed, extension, (*place, EXTENSION), packed=bool(packed))
+            raise self.file.error(json_path, f"the splats use {', '.join(map(str, unknown))}, which is not supported")
+        self._check(placed, extension, (*json_path, EXTENSION), packed=bool(packed))
         if packed:
-            inner = (*place, packed) if packed in extensions else (*place, EXTENSION, "extensions", packed)
+            inner = (*json_path, packed) if packed in extensions else (*json_path, EXTENSION, "extensions", packed)
             holder = within if packed in within else extensions
             view = self.file.integer(self.file.get(holder, inner[:-1], packed, dict), inner, "bufferView")
             block, count = self._packed_block(placed, view, draft="kernel" not in extension)
@@ -147,7 +147,7 @@ class _GltfReading:
             with np.errstate(all="ignore"):
                 lengths = np.linalg.svd(linear)[1] if np.isfinite(matrix).all() else np.zeros(3)
             if not 1e-30 < lengths.max() < 1e30 or lengths.min() < 1e-9 * lengths.max():
-                raise self.file.error(placed.place, "the transform of its node is singular or exceeds float32")
+                raise self.file.error(placed.json_path, "the transform of its node is singular or exceeds float32")
             yield _Instance(block, count, linear, translation)
 
     def _report(self, finding: Finding) -> None:
@@ -158,28 +158,28 @@ class _GltfReading:
                 return
         self.findings.append(finding)
 
-    def _check(self, placed: PlacedPrimitive, extension: dict[str, Any], place: JsonPath, *, packed: bool) -> None:
+    def _check(self, placed: PlacedPrimitive, extension: dict[str, Any], json_path: JsonPath, *, packed: bool) -> None:
         """Refuse unknown kernels, colour spaces and projections; drafts with SPZ may omit them."""
         absent = {None} if packed else set()
         known = {"kernel": {"ellipse"} | absent, "colorSpace": {COLOURS, _LINEAR} | absent}
-        attributes = self.file.get(placed.primitive, placed.place, "attributes", dict, {})
+        attributes = self.file.get(placed.primitive, placed.json_path, "attributes", dict, {})
         if not packed and "kernel" not in extension and f"{EXTENSION}:OPACITY" not in attributes:
             draft = f"an early draft of {EXTENSION} (2025) without kernel and with opacities in COLOR_0"
-            raise self.file.error(place, f"{draft}: export it again with a newer version of the program")
+            raise self.file.error(json_path, f"{draft}: export it again with a newer version of the program")
         for key, values in (*known.items(), ("projection", {"perspective", None})):
-            found = self.file.get(extension, place, key, str)
+            found = self.file.get(extension, json_path, key, str)
             if found not in values:
                 expected = " or ".join(sorted(one for one in values if one))
-                raise self.file.error((*place, key), f"found {found!r}, expected {expected}")
+                raise self.file.error((*json_path, key), f"found {found!r}, expected {expected}")
 
     def _plain_block(self, placed: PlacedPrimitive) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
-        file, place = self.file, (*placed.place, "attributes")
-        attributes = file.get(placed.primitive, placed.place, "attributes", dict, {})
+        file, json_path = self.file, (*placed.json_path, "attributes")
+        attributes = file.get(placed.primitive, placed.json_path, "attributes", dict, {})
 
         def array(name: str, width: int) -> Accessor:
             key = name if name == "POSITION" else f"{EXTENSION}:{name}"
             if key not in attributes:
-                raise file.error(place, f"there is no {key}")
+                raise file.error(json_path, f"there is no {key}")
             return file.accessor(attributes[key], width)
 
         widths = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1, **dict.fromkeys(sh_names(0), 3)}
@@ -191,9 +191,9 @@ class _GltfReading:
         count = len(arrays["POSITION"].rows)
         for name, accessor in arrays.items():
             if len(accessor.rows) != count:
-                raise file.error(place, f"{name} has {len(accessor.rows)} rows, POSITION {count}")
+                raise file.error(json_path, f"{name} has {len(accessor.rows)} rows, POSITION {count}")
         if any(f"{EXTENSION}:{name}" in attributes for name in sh_names(4)) and self.sh_degree is None:
-            raise file.error(place, too_many_bands(4))
+            raise file.error(json_path, too_many_bands(4))
         return partial(_decode_block, self, arrays, degree), count, self._survey(arrays, count)
 
     def _survey(self, arrays: dict[str, Accessor], count: int) -> tuple[int, int]:
@@ -245,11 +245,11 @@ class _GltfReading:
             self.antialiased.append(bool(packed.flags & ANTIALIASED))
         packed = self.packed[view]
         degree = packed.degree if self.sh_degree is None else min(packed.degree, self.sh_degree)
-        attributes = file.get(placed.primitive, placed.place, "attributes", dict, {})
+        attributes = file.get(placed.primitive, placed.json_path, "attributes", dict, {})
         positions = file.item("accessors", attributes["POSITION"]) if "POSITION" in attributes else {}
         count = positions.get("count", packed.count)
         if count != packed.count:
-            raise file.error((*placed.place, "attributes", "POSITION"), f"{count} rows, its SPZ has {packed.count}")
+            raise file.error((*placed.json_path, "attributes", "POSITION"), f"{count} rows, its SPZ has {packed.count}")
         rotation = axes_rotation(packed.axes, AXES)
         stored, by = self._lies_as_stored(packed, positions, rotation, draft=draft)
         if stored:

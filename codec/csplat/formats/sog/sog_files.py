@@ -125,10 +125,10 @@ class SogParts:
         title = f"{self.title}: {name[:80]}"
         if self.folder is None:
             return find_parts(self.file(name), title)
-        place = self._inside(name)
-        if place.suffix.lower() != ".json":
+        path = self._inside(name)
+        if path.suffix.lower() != ".json":
             self.refuse(f"{name[:80]} is a zip within a zip: unpack {self.title} and name its {_LEVELS}")
-        return SogParts(self.path, title, self.folder / place.parent, self.zip), place.name
+        return SogParts(self.path, title, self.folder / path.parent, self.zip), path.name
 
     def read(self, name: str, most: int = _LARGEST_PART) -> bytes:
         """Read a part.
@@ -156,10 +156,10 @@ class SogParts:
         return path
 
     def _inside(self, name: str) -> PurePosixPath:
-        place = PurePosixPath(name)
-        if place.is_absolute() or ".." in place.parts or len(name) > _LONGEST_NAME or set(name) & {"\\", ":", "\0"}:
+        path = PurePosixPath(name)
+        if path.is_absolute() or ".." in path.parts or len(name) > _LONGEST_NAME or set(name) & {"\\", ":", "\0"}:
             self.refuse(f"the part {name[:80]!r} would be outside of it")
-        return place
+        return path
 
     def _unzipped(self, name: str, most: int) -> bytes:
         assert self.zip is not None, "`folder` is only set within a zip"
@@ -196,44 +196,46 @@ class JsonValue:
     """A JSON value and its path; methods raise `InputError` if it has another type."""
 
     parts: SogParts
-    place: str
+    json_path: str
     value: Any
 
     def __contains__(self, name: str) -> bool:
         return isinstance(self.value, dict) and self.value.get(name) is not None
 
     def __getitem__(self, name: str) -> JsonValue:
-        inside = JsonValue(self.parts, f"{self.place} {name}", None)
+        inside = JsonValue(self.parts, f"{self.json_path} {name}", None)
         if name not in self:
-            self.parts.refuse(f"{inside.place} is missing")
-        return JsonValue(self.parts, inside.place, self.value[name])
+            self.parts.refuse(f"{inside.json_path} is missing")
+        return JsonValue(self.parts, inside.json_path, self.value[name])
 
     def list(self) -> list[JsonValue]:
         """Return the values of a list."""
         if not isinstance(self.value, list):
-            self.parts.refuse(f"{self.place} is not a list")
-        return [JsonValue(self.parts, self.place, one) for one in self.value]
+            self.parts.refuse(f"{self.json_path} is not a list")
+        return [JsonValue(self.parts, self.json_path, one) for one in self.value]
 
     def text(self) -> str:
         """Return a string."""
         if not isinstance(self.value, str):
-            self.parts.refuse(f"{self.place} is not a string")
+            self.parts.refuse(f"{self.json_path} is not a string")
         return self.value
 
     def whole(self, most: int) -> int:
         """Return an integer from 0 to `most`."""
         if type(self.value) is not int or not 0 <= self.value <= most:
-            self.parts.refuse(f"{self.place} is {str(self.value)[:40]}, expected an integer from 0 to {most:,}")
+            self.parts.refuse(f"{self.json_path} is {str(self.value)[:40]}, expected an integer from 0 to {most:,}")
         return int(self.value)
 
     def numbers(self, least: int, most: int) -> NDArray[np.float64]:
         """Return `least` to `most` finite numbers; a single number needs no brackets."""
         values = self.value if isinstance(self.value, list) else [self.value]
         if not least <= len(values) <= most:
-            self.parts.refuse(f"{self.place} has {len(values)} numbers, expected {least if least == most else most}")
+            self.parts.refuse(
+                f"{self.json_path} has {len(values)} numbers, expected {least if least == most else most}"
+            )
         for one in values:
             if type(one) not in (int, float) or not abs(one) <= 1e30 or not math.isfinite(one):
-                self.parts.refuse(f"{self.place} contains {str(one)[:40]}, expected finite numbers")
+                self.parts.refuse(f"{self.json_path} contains {str(one)[:40]}, expected finite numbers")
         return np.array(values, np.float64)
 
 
@@ -274,18 +276,18 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
 
 def _report_others(parts: SogParts, only: PurePosixPath, names: Sequence[str]) -> list[Finding]:
     """Report scenes of other formats in the folder of the SOG; refuse a zip with scenes in other folders."""
-    places = [place for place in map(PurePosixPath, map(use_slashes, names)) if _OF_MACOS not in place.parts]
-    others = [PurePosixPath(one) for one in scenes_of(map(str, places))]
+    paths = [path for path in map(PurePosixPath, map(use_slashes, names)) if _OF_MACOS not in path.parts]
+    others = [PurePosixPath(one) for one in scenes_of(map(str, paths))]
     if not others:
         return []
     if not all(one.is_relative_to(only.parent) for one in others):
         _refuse_several(parts, [only, *others])
-    text = f"the zip also holds {_list_places(others)}: not read"
+    text = f"the zip also holds {_list_paths(others)}: not read"
     return [Finding("other-scenes", len(others), text, "note")]
 
 
-def _is_manifest(place: PurePosixPath) -> bool:
-    return place.name.lower() in (_ONE, _LEVELS) and _OF_MACOS not in place.parts
+def _is_manifest(path: PurePosixPath) -> bool:
+    return path.name.lower() in (_ONE, _LEVELS) and _OF_MACOS not in path.parts
 
 
 def _only_scene(parts: SogParts, found: Sequence[PurePosixPath]) -> PurePosixPath:
@@ -310,11 +312,11 @@ def _only_scene(parts: SogParts, found: Sequence[PurePosixPath]) -> PurePosixPat
 
 def _refuse_several(parts: SogParts, scenes: Sequence[PurePosixPath]) -> NoReturn:
     remedy = "name one of these files" if parts.folder is None else "unpack it and name one of these files"
-    parts.refuse(f"it contains {len(scenes)} scenes, expected one ({_list_places(scenes)}): {remedy}")
+    parts.refuse(f"it contains {len(scenes)} scenes, expected one ({_list_paths(scenes)}): {remedy}")
 
 
-def _list_places(places: Sequence[PurePosixPath]) -> str:
-    return ", ".join(str(one)[:80] for one in sorted(places)[:_NAMED]) + (", ..." if len(places) > _NAMED else "")
+def _list_paths(paths: Sequence[PurePosixPath]) -> str:
+    return ", ".join(str(one)[:80] for one in sorted(paths)[:_NAMED]) + (", ..." if len(paths) > _NAMED else "")
 
 
 def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:

@@ -149,10 +149,10 @@ def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict
             continue
         lods = node["lods"].value
         if not isinstance(lods, dict):
-            parts.refuse(f"{node.place} lods is not an object")
+            parts.refuse(f"{node.json_path} lods is not an object")
         leaf: dict[int, _Range] = {}
         for level, value in lods.items():
-            reference = JsonValue(parts, f"{node.place} lods", value)
+            reference = JsonValue(parts, f"{node.json_path} lods", value)
             file = reference["file"].whole(len(names) - 1)
             start = reference["offset"].whole(_MAX_OFFSET)
             if not (level.isdecimal() and level.isascii() and len(level) < 3):
@@ -270,7 +270,7 @@ def read_meta(parts: SogParts, name: str) -> SogMeta:
 def _read_bounds(means: JsonValue) -> NDArray[np.float64]:
     bounds = np.stack(_read_ends(means, 3))
     if np.abs(bounds).max() > _LARGEST_LOG:
-        means.parts.refuse(f"the bounds of {means.place} exceed float32")
+        means.parts.refuse(f"the bounds of {means.json_path} exceed float32")
     return bounds
 
 
@@ -278,7 +278,7 @@ def _read_ends(section: JsonValue, channels: int) -> tuple[NDArray[np.float64], 
     low, high = (section[name].numbers(channels, channels) for name in ("mins", "maxs"))
     for channel in np.flatnonzero(crossed_bounds(low, high))[:1]:
         reason = f"mins {low[channel]:.6g}, expected at most maxs {high[channel]:.6g}"
-        section.parts.refuse(f"{section.place} has {reason}")
+        section.parts.refuse(f"{section.json_path} has {reason}")
     return low, high
 
 
@@ -291,7 +291,7 @@ def _read_codebook(section: JsonValue) -> F32:
     values = section["codebook"].value
     if isinstance(values, list) and len(values) == 256 and values[0] is None:
         # Early writers omitted the first entry; it is extrapolated as in PlayCanvas' engine.
-        after = JsonValue(section.parts, section.place, values[1:]).numbers(255, 255)
+        after = JsonValue(section.parts, section.json_path, values[1:]).numbers(255, 255)
         section.value["codebook"] = [float(after[0] + (after[0] - after[-1]) / 255), *values[1:]]
     codebook = np.full(256, np.nan, np.float32)
     numbers = section["codebook"].numbers(1, 256)
@@ -402,7 +402,7 @@ def _look_up(tables: F32, codes: NDArray[Any]) -> F32:
 def _list_files(section: JsonValue, count: int) -> list[str]:
     names = [one.text() for one in section["files"].list()]
     if len(names) != count or len(set(names)) != count:
-        section.parts.refuse(f"{section.place} files has {len(set(names))} names, expected {count}")
+        section.parts.refuse(f"{section.json_path} files has {len(set(names))} names, expected {count}")
     return names
 
 

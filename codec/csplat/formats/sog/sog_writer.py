@@ -91,9 +91,9 @@ def _encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
 
     codes = {name: np.empty((count, channels), np.uint8) for name, channels in _CHANNELS.items()}
     for rows, model in scene.numbered():
-        places = np.rint((_signed_logs(model.means) - low) * (65535 / np.where(high > low, high - low, 1.0)))
+        quantised = np.rint((_signed_logs(model.means) - low) * (65535 / np.where(high > low, high - low, 1.0)))
         largest, three = encode_smallest_three(model.quats)
-        codes["means_l.webp"][rows], codes["means_u.webp"][rows] = places % 256, places // 256
+        codes["means_l.webp"][rows], codes["means_u.webp"][rows] = quantised % 256, quantised // 256
         codes["quats.webp"][rows, :3] = np.clip(np.rint((three * np.float32(2**0.5) + 1) * np.float32(127.5)), 0, 255)
         codes["quats.webp"][rows, 3] = largest + LEAST_TAG
         codes["scales.webp"][rows] = _nearest_codes(scales, model.scales)

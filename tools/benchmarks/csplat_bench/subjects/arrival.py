@@ -2,13 +2,13 @@
 
 A case has a `viewer` (a page of subjects/pages) and a `form` of the file, all forms made from the same PLY. Options:
 `mbits`, million bits per second over all connections together; `latency_ms` before each answer. Page, modules and
-renderer are in the browser before. A small image of the canvas is kept after each frame and compared with the finished
-one, the last in this viewer, when all has come and nothing changes.
+renderer are already loaded. A small image of the canvas is recorded after each frame. The last image, when everything
+has arrived and nothing changes, is the finished one, with which the others are compared.
 
     first       the first image that is not black
     good        the first with 25 dB against the finished one
     whole       the finished one
-    asked_bytes all that was sent: less than the files if the viewer leaves some out, more if it asks twice
+    asked_bytes bytes sent in all: fewer than the files have if the viewer omits some, more if it requests some twice
 
 Times count from the first request for the scene; bytes are those sent by then. SwiftShader, a GL on the CPU, draws and
 shares the cores with decoders: with a GPU, a first image takes fewer bytes. The images of each case are written to the
@@ -56,7 +56,7 @@ _BEGIN = """async ([viewer, url, camera]) => {
   arrival.begin(viewer, url, camera);
 }"""
 
-#: Writes a scene into an empty folder, returns the file that viewers open; the words are splat-transform's command.
+#: Writes a scene into an empty folder and returns the file that viewers open. The function finds splat-transform.
 Writer = Callable[[Scene, Path, Callable[[], Sequence[str]]], Path]
 
 
@@ -110,15 +110,15 @@ def measure_arrival(setup: Setup, name: str, cases: Sequence[Case]) -> Iterator[
         def measure(case: Case) -> Mapping[str, Any]:
             form = case["form"]
             axes, writer = FORMS[form]
-            place = folder / SLOW.strip("/") / f"{scene.name}-{form}"
+            target = folder / SLOW.strip("/") / f"{scene.name}-{form}"
             if form not in files:
-                place.mkdir(parents=True)
-                files[form] = writer(scene, place, lambda: find_splat_transform(setup.peers))
+                target.mkdir(parents=True)
+                files[form] = writer(scene, target, lambda: find_splat_transform(setup.peers))
             _, camera = placed_in(format_by_name(axes), model)
             url = f"{address}{files[form].relative_to(folder)}"
             record = _watch(page, line, case["viewer"], url, pinhole(camera, model))
             _keep_images(setup.work / "arrival" / f"{scene.name}-{case.name.replace(' ', '-')}.png", record)
-            size = sum(path.stat().st_size for path in place.rglob("*") if path.is_file())
+            size = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
             return {"splats": scene.splat_count, "file_bytes": size, **record.values()}
 
         yield measure
@@ -157,24 +157,24 @@ def _keep_images(path: Path, record: Record) -> None:
 
 
 def _as_csplat(preset: PresetName) -> Writer:
-    def written(scene: Scene, folder: Path, _: object) -> Path:
+    def write_form(scene: Scene, folder: Path, _: object) -> Path:
         path = folder / f"{scene.name}.csplat"
         path.write_bytes(encode(read_ply(scene.path), EncodeOptions(preset=preset)))
         return path
 
-    return written
+    return write_form
 
 
-def _converted(format: str) -> Writer:
-    def written(scene: Scene, folder: Path, _: object) -> Path:
+def _convert(format: str) -> Writer:
+    def write_form(scene: Scene, folder: Path, _: object) -> Path:
         path = folder / f"{scene.name}.{format}"
         write(path, read_ply(scene.path), format)
         return path
 
-    return written
+    return write_form
 
 
-def _transformed(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> Path:
+def _transform(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> Path:
     path = folder / f"{scene.name}.spz"
     run_program([*transform(), "-q", "-w", "--spz-version", "3", scene.path, path])
     return path
@@ -216,8 +216,8 @@ def _in_levels(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]
 FORMS: dict[str, tuple[str, Writer]] = {
     "balanced": ("csplat", _as_csplat("balanced")),
     "small": ("csplat", _as_csplat("small")),
-    "spz": ("spz", _converted("spz")),  # SPZ 3 of csplat
-    "spz-default": ("ply", _transformed),  # SPZ 3 of splat-transform, with fewer bits for SH
-    "sog": ("sog", _converted("sog")),
+    "spz": ("spz", _convert("spz")),  # SPZ 3 of csplat
+    "spz-default": ("ply", _transform),  # SPZ 3 of splat-transform, with fewer bits for SH
+    "sog": ("sog", _convert("sog")),
     "sog-levels": ("sog", _in_levels),  # streamed SOG of three levels
 }

@@ -43,8 +43,8 @@ _ENDS: dict[str, Callable[[subprocess.Popen[str]], None]] = {
 def measure_batches(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that runs a loop or a batch."""
     options = setup.options
-    with tempfile.TemporaryDirectory(prefix="csplat-batch-") as place:
-        folder = Path(place)
+    with tempfile.TemporaryDirectory(prefix="csplat-batch-") as name:
+        folder = Path(name)
         source = read_ply(find_scene(name, setup.data, setup.work).path)
         make_scenes(folder / "scenes", source, options["count"], options["invalid"], options["splats"])
 
@@ -144,7 +144,7 @@ def _done(out: Path) -> set[str]:
 
 
 def _children(pid: int) -> list[int]:
-    return [int(word) for one in Path(f"/proc/{pid}/task").glob("*/children") for word in one.read_text().split()]
+    return [int(child) for one in Path(f"/proc/{pid}/task").glob("*/children") for child in one.read_text().split()]
 
 
 def compare_folders(expected: Path, found: Path) -> None:

@@ -61,14 +61,14 @@ def measure_browsers(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Mea
     path = setup.work / f"{scene.name}.browsers.csplat"
     path.write_bytes(encode(read_ply(scene.path), EncodeOptions(preset="balanced")))
     with ExitStack() as stack:
-        places = stack.enter_context(_served_places(path))
+        addresses = stack.enter_context(_serve_pages(path))
         drives: dict[str, Drive] = {}
 
         def measure(case: Case) -> Mapping[str, Any]:
             if case["browser"] not in drives:
                 drives[case["browser"]] = stack.enter_context(_BROWSERS[case["browser"]](setup.chromium))
             version, go, ask = drives[case["browser"]]
-            seconds = _open_once(places[case["place"]], path.read_bytes(), go, ask)
+            seconds = _open_once(addresses[case["place"]], path.read_bytes(), go, ask)
             return {"splats": scene.splat_count, "version": version, "seconds": seconds}
 
         yield measure
@@ -99,7 +99,7 @@ def _open_once(url: str, data: bytes, go: Callable[[str], Any], ask: Callable[[s
 
 
 @contextmanager
-def _served_places(source: Path) -> Iterator[dict[str, str]]:
+def _serve_pages(source: Path) -> Iterator[dict[str, str]]:
     """Yield the addresses at which the scene can be opened, by name."""
     with tempfile.TemporaryDirectory() as folder, open_viewer_scene(str(source), preset="fast") as scene:
         page = Path(folder, "page.html")

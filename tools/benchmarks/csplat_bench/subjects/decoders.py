@@ -6,7 +6,9 @@ SPZ, SPLAT and KSPLAT are written by their owners' libraries with their defaults
 A case has
     place       native, python, node or chromium
     driver      csplat, csplat-own, spz (programs, built on demand), serve.py, csplat.mjs or others.mjs (bundled)
-    word        argument of the driver: an export of the module, a number of threads (0: all cores), floats or packed
+    threads     for csplat, csplat-own and serve.py: number of threads (0: all cores)
+    output      for spz: floats or packed
+    export      for a module: the exported function that makes the decoder
     file        suffix of its file: PRESET.csplat, v2.spz to v4.spz, splat, ksplat
     delivers    description of the arrays
     reference   the case that it is compared with, in the same turn
@@ -63,8 +65,8 @@ _LOAD = """async ([timing, module, name, url]) => {
 def measure_decoders(setup: Setup, name: str, cases: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that lets a decoder decode once; the first time gives `first_seconds` and memory, too."""
     scene = find_scene(name, setup.data, setup.work)
-    with tempfile.TemporaryDirectory(prefix="csplat-decoders-") as place, ExitStack() as stack:
-        folder = Path(place)
+    with tempfile.TemporaryDirectory(prefix="csplat-decoders-") as name, ExitStack() as stack:
+        folder = Path(name)
         start = _starter(setup, folder, stack, any(case["place"] == "chromium" for case in cases))
         running: dict[str, Process | Tab] = {}
 
@@ -130,7 +132,7 @@ class Tab:
         folder = f"{address}peers/decoders" if module == "others.mjs" else drivers
         self._page = browser.new_page()
         self._page.goto(f"{address}files/")
-        words = [f"{drivers}/timing.mjs", f"{folder}/{module}", case["word"], f"{address}files/scene.{case['file']}"]
+        words = [f"{drivers}/timing.mjs", f"{folder}/{module}", case["export"], f"{address}files/scene.{case['file']}"]
         self._page.evaluate(_LOAD, words)
 
     def __enter__(self) -> Self:
@@ -162,25 +164,29 @@ def _starter(setup: Setup, folder: Path, stack: ExitStack, in_browser: bool) -> 
         browser = stack.enter_context(open_page(setup.chromium, gpu=False)).context.browser
 
     def start(case: Case) -> Process | Tab:
-        driver, word, file = case["driver"], case["word"], folder / f"scene.{case['file']}"
+        driver, file = case["driver"], folder / f"scene.{case['file']}"
         if driver in _BUILDERS:
             build(driver, setup.peers)
-        if word == 0:
-            word = min(os.cpu_count() or 1, _THREADS_MAX)
         running: Process | Tab
         if case["place"] == "chromium":
             running = Tab(browser, address, driver, case)
         elif case["place"] == "node":
-            place = setup.peers / "decoders" if driver == "others.mjs" else DRIVERS
-            running = Process(["node", "--expose-gc", DRIVERS / "node.mjs", place / driver, word, file])
+            modules = setup.peers / "decoders" if driver == "others.mjs" else DRIVERS
+            running = Process(["node", "--expose-gc", DRIVERS / "node.mjs", modules / driver, case["export"], file])
         elif case["place"] == "python":
-            running = Process([sys.executable, DRIVERS / driver, file, word])
+            running = Process([sys.executable, DRIVERS / driver, file, _thread_count(case)])
         else:
-            running = Process([_program(setup.peers, driver), file, word])
+            argument = case["output"] if driver == "spz" else _thread_count(case)
+            running = Process([_program(setup.peers, driver), file, argument])
         stack.enter_context(running)
         return running
 
     return start
+
+
+def _thread_count(case: Case) -> int:
+    threads: int = case["threads"]
+    return threads or min(os.cpu_count() or 1, _THREADS_MAX)
 
 
 def _write_file(scene: Scene, suffix: str, peers: Path, folder: Path) -> None:

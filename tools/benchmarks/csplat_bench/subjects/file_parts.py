@@ -28,8 +28,8 @@ from csplat_tools.present.viewer_server import ViewerScene, open_server
 _BUCKET = "scenes"
 _KEYS = {"key": "nobody", "secret": "nothing"}
 
-#: Address of a file, and the options of its store.
-Place = tuple[str, Mapping[str, Any] | None]
+#: URL or path of a file, and the options of its store.
+Address = tuple[str, Mapping[str, Any] | None]
 
 
 @contextmanager
@@ -42,12 +42,12 @@ def measure_parts(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measur
         header, size = file.header, file.size
         box = middle_box(file, setup.options.get("share", 0.01))
     with ExitStack() as stack:
-        places: dict[str, Place] = {}
+        addresses: dict[str, Address] = {}
 
         def measure(case: Case) -> Mapping[str, Any]:
-            if case["place"] not in places:
-                places[case["place"]] = stack.enter_context(_PLACES[case["place"]](path))
-            read = read_part(places[case["place"]], box, min(case["sh_degree"], header.sh_degree))
+            if case["place"] not in addresses:
+                addresses[case["place"]] = stack.enter_context(_SERVERS[case["place"]](path))
+            read = read_part(addresses[case["place"]], box, min(case["sh_degree"], header.sh_degree))
             return {"splats": header.splat_count, "tiles": len(header.tiles), "size_bytes": size, **read}
 
         yield measure
@@ -67,10 +67,10 @@ def middle_box(file: csplat.SplatFile, share: float) -> tuple[float, ...]:
     return (*(centre - half).tolist(), *(centre + half).tolist())
 
 
-def read_part(place: Place, box: tuple[float, ...], degree: int) -> dict[str, Any]:
+def read_part(address: Address, box: tuple[float, ...], degree: int) -> dict[str, Any]:
     """Open a file and read a box; return splats, requests, bytes and seconds."""
-    address, storage = place
-    file, opening = timed(csplat.open, address, storage=storage)
+    url, storage = address
+    file, opening = timed(csplat.open, url, storage=storage)
     with file:
         model, reading = timed(file.read, box, sh_degree=degree)
         return {
@@ -80,18 +80,18 @@ def read_part(place: Place, box: tuple[float, ...], degree: int) -> dict[str, An
 
 
 @contextmanager
-def _on_disk(file: Path) -> Iterator[Place]:
+def _on_disk(file: Path) -> Iterator[Address]:
     yield str(file), None
 
 
 @contextmanager
-def _by_http(file: Path) -> Iterator[Place]:
+def _by_http(file: Path) -> Iterator[Address]:
     with _process(_serve_web, str(file)) as address:
         yield address, None
 
 
 @contextmanager
-def _from_s3(file: Path) -> Iterator[Place]:
+def _from_s3(file: Path) -> Iterator[Address]:
     try:
         from s3fs import S3FileSystem
     except ModuleNotFoundError as error:
@@ -104,7 +104,7 @@ def _from_s3(file: Path) -> Iterator[Place]:
         yield f"s3://{_BUCKET}/{file.name}", storage
 
 
-_PLACES = {"disk": _on_disk, "HTTP": _by_http, "S3": _from_s3}
+_SERVERS = {"disk": _on_disk, "HTTP": _by_http, "S3": _from_s3}
 
 
 @contextmanager

@@ -23,12 +23,12 @@ from csplat_bench.suites import Case
 def measure_commands(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that runs a command; made scenes and files are removed afterwards."""
     scene = find_scene(name, setup.data, setup.work)
-    places = {"scene": scene.path, "file": setup.work / "large.csplat", "back": setup.work / "large.ply"}
+    paths = {"scene": scene.path, "file": setup.work / "large.csplat", "back": setup.work / "large.ply"}
 
     def measure(case: Case) -> Mapping[str, Any]:
-        words = [word.format(**places) for word in shlex.split(case["command"])]
-        if "{file}" in case["command"] and case.get("output") != "file" and not places["file"].exists():
-            run_program([*setup.csplat, "encode", scene.path, places["file"], "--preset", "fast", "--quiet"])
+        words = [argument.format(**paths) for argument in shlex.split(case["command"])]
+        if "{file}" in case["command"] and case.get("output") != "file" and not paths["file"].exists():
+            run_program([*setup.csplat, "encode", scene.path, paths["file"], "--preset", "fast", "--quiet"])
         force = ["--force"] if "output" in case.settings else []
         used = run_program([*setup.csplat, *words, *force, "--quiet"], sample_tree=True)
         values: dict[str, Any] = {
@@ -36,15 +36,15 @@ def measure_commands(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Mea
             "seconds": used.wall, "cpu_seconds": used.cpu, "peak_bytes": used.tree_bytes,
         }  # fmt: skip
         if "output" in case.settings:
-            written = places[case["output"]]
+            written = paths[case["output"]]
             values |= {"size_bytes": written.stat().st_size, "crc32": _crc(written)}
         return values
 
     try:
         yield measure
     finally:
-        for place, path in places.items():
-            if place != "scene" or path.parent == setup.work:
+        for key, path in paths.items():
+            if key != "scene" or path.parent == setup.work:
                 path.unlink(missing_ok=True)
 
 

@@ -57,7 +57,7 @@ class _Set:
         """The set for the command line's functions."""
         return DataOptions(str(self.path), self.size, test_every=_TEST_EVERY)
 
-    def place(self, case: str, suffix: str) -> Path:
+    def path_of(self, case: str, suffix: str) -> Path:
         """Return the path of a case's file."""
         return self.work / f"{self.name}-{case.replace(' ', '')}{suffix}"
 
@@ -67,9 +67,9 @@ def measure_photographs(setup: Setup, name: str, cases: Sequence[Case]) -> Itera
     """Yield the function that trains or makes a file, and scores it."""
     sizes = setup.options.get("sizes", {})
     path, size = find_data_set(setup, name), sizes.get(Path(name).name)
-    place = _Set(Path(name).name, path, None if size is None else (size[0], size[1]), setup.work / "photographs")
-    place.work.mkdir(parents=True, exist_ok=True)
-    data = load(path, place.size, test_every=_TEST_EVERY)
+    data_set = _Set(Path(name).name, path, None if size is None else (size[0], size[1]), setup.work / "photographs")
+    data_set.work.mkdir(parents=True, exist_ok=True)
+    data = load(path, data_set.size, test_every=_TEST_EVERY)
     if not data.test:
         raise InputError(f"{path} holds out no photographs to score by")
     lpips = None if setup.lpips is None else load_lpips(None if setup.lpips == "auto" else setup.lpips)
@@ -79,21 +79,23 @@ def measure_photographs(setup: Setup, name: str, cases: Sequence[Case]) -> Itera
         if training not in trainings:
             raise InputError(f"the training {training!r} is not among the cases of this run")
         after = trainings[training].get("after")
-        if not place.place(training, ".ply").exists():
+        if not data_set.path_of(training, ".ply").exists():
             if after is not None:
                 ensure_trained(after)
-            _train(place, trainings[training])
+            _train(data_set, trainings[training])
 
     def measure(case: Case) -> Mapping[str, Any]:
         if "train" in case.settings:
             ensure_trained(case.name)
-            ply = place.place(case.name, ".ply")
-            report = json.loads(place.place(case.name, ".json").read_text())
+            ply = data_set.path_of(case.name, ".ply")
+            report = json.loads(data_set.path_of(case.name, ".json").read_text())
             return {"by": "train", **report, "ply_bytes": ply.stat().st_size, **_scores(read_ply(ply), data, lpips)}
         if case["of"] in trainings:
             ensure_trained(case["of"])
-        file = place.place(case.name, ".csplat")
-        values = _by_command(setup, place, case, file) if "command" in case.settings else _finish(place, case, file)
+        file = data_set.path_of(case.name, ".csplat")
+        values = (
+            _by_command(setup, data_set, case, file) if "command" in case.settings else _finish(data_set, case, file)
+        )
         series = f"csplat {values['by']}{', without ' + case['without'] if 'without' in case.settings else ''}"
         return {"training": case["of"], "series": series, **values, **_scores(decode(file.read_bytes()), data, lpips)}
 
@@ -112,28 +114,28 @@ def find_data_set(setup: Setup, name: str) -> Path:
     raise AbsentError(f"there is no data set {name} in {setup.data}")
 
 
-def _train(place: _Set, case: Case) -> None:
+def _train(data_set: _Set, case: Case) -> None:
     """Train in a process of its own; write PLY, checkpoint and a report for the row."""
-    checkpoint, after = place.place(case.name, ".npz"), case.get("after")
-    resume = checkpoint if checkpoint.exists() else None if after is None else place.place(after, ".npz")
+    checkpoint, after = data_set.path_of(case.name, ".npz"), case.get("after")
+    resume = checkpoint if checkpoint.exists() else None if after is None else data_set.path_of(after, ".npz")
     files = Outputs(str(checkpoint), resume=None if resume is None else str(resume))
-    ply, start = place.place(case.name, ".ply"), time.perf_counter()
-    report = alone(run_training, place.options, str(ply), TrainOptions(**case["train"]), files, quiet=True)
+    ply, start = data_set.path_of(case.name, ".ply"), time.perf_counter()
+    report = alone(run_training, data_set.options, str(ply), TrainOptions(**case["train"]), files, quiet=True)
     row = {
         "seconds": time.perf_counter() - start, "splats": report["splat_count"], "steps": len(report["losses"]),
         "peak_memory_bytes": report["peak_memory_bytes"],
     }  # fmt: skip
-    place.place(case.name, ".json").write_text(json.dumps(row))
+    data_set.path_of(case.name, ".json").write_text(json.dumps(row))
 
 
-def _finish(place: _Set, case: Case, file: Path) -> dict[str, Any]:
+def _finish(data_set: _Set, case: Case, file: Path) -> dict[str, Any]:
     """Make a file by the end of a training, in a process of its own; see `csplat train` for the defaults."""
-    training = place.place(case["of"], ".npz")
+    training = data_set.path_of(case["of"], ".npz")
     if not training.exists():
         raise InputError(f"{training} does not exist, expected the checkpoint of the training {case['of']!r}")
     size = None if "target_size" not in case.settings else parse_size_bytes(case["target_size"])
     start = time.perf_counter()
-    report = alone(finish_training, place.options, str(training), str(file), dict(case.settings), size)
+    report = alone(finish_training, data_set.options, str(training), str(file), dict(case.settings), size)
     return {"by": "train", **_described(report["file"], time.perf_counter() - start, file)}
 
 
@@ -163,9 +165,9 @@ def finish_training(
     )  # fmt: skip
 
 
-def _by_command(setup: Setup, place: _Set, case: Case, file: Path) -> dict[str, Any]:
-    ply = place.place(case["of"], ".ply")
-    words = [word.format(ply=ply, file=file, data=place.path) for word in shlex.split(case["command"])]
+def _by_command(setup: Setup, data_set: _Set, case: Case, file: Path) -> dict[str, Any]:
+    ply = data_set.path_of(case["of"], ".ply")
+    words = [argument.format(ply=ply, file=file, data=data_set.path) for argument in shlex.split(case["command"])]
     used = run_program([*setup.csplat, *words, "--force", "--quiet", "--json"])
     return {"by": words[0], **_described(json.loads(used.stdout), used.wall, file)}
 
