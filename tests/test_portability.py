@@ -213,7 +213,7 @@ def test_programs_end_or_are_killed_without_process_groups():
 
 class _Echo(DecoderProcess):
     def ask(self, data: bytes) -> bytes | Answer:
-        return self._answered(data)
+        return self._request(data)
 
 
 def test_a_decoder_answers_without_poll_and_select(monkeypatch):

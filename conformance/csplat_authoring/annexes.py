@@ -145,13 +145,13 @@ def annex() -> str:
         label = name.removeprefix(f"{heading}.").removeprefix(f"{prefix}/")
         value = _value(entry, raw)
         if name.endswith(".crc"):
-            start, end = _covered(built, name)
+            start, end = _covered_range(built, name)
             value = f"of the bytes {start} to {end - 1}"
         parts.append(f"| {entry.offset} | {raw.hex(' ').upper()} | `{label}` | {(value + note).removeprefix('; ')} |\n")
     return "".join(parts) + "\n" + _OUTRO
 
 
-def _covered(built: Built, name: str) -> tuple[int, int]:
+def _covered_range(built: Built, name: str) -> tuple[int, int]:
     """Return the byte range that a CRC covers: the index before its CRC, or the chunk that a record refers to."""
     if name == "index.crc":
         return _spec.HEADER_SIZE, built.fields[name].offset

@@ -182,17 +182,17 @@ def _chunks(scene: Scene) -> dict[str, Writer]:
     out = {}
     for name, chunk in zip(_ancillary_names(scene), scene.chunks, strict=True):
         flags = chunk.flags if chunk.flags is not None else _flags(chunk.type)
-        out[name] = _framed(chunk.type, flags, _ancillary(chunk))
+        out[name] = _frame_chunk(chunk.type, flags, _ancillary(chunk))
     for layer in sorted({*_spec.LAYER_NAMES, *(layer for tile in scene.tiles for layer in tile.layers)}):
         for book in scene.codebooks:
             if layer in book.layers:
-                out[f"CODB.{book.id}.{layer}"] = _framed(
+                out[f"CODB.{book.id}.{layer}"] = _frame_chunk(
                     _spec.CHUNK_CODEBOOK, _flags(_spec.CHUNK_CODEBOOK), _codebook(book, layer)
                 )
         for i, tile in enumerate(scene.tiles):
             if layer in tile.layers:
                 payload = _tile(scene, tile, layer) if layer in _spec.LAYER_NAMES else _unknown(tile, layer)
-                out[f"TILE.{i}.{layer}"] = _framed(_spec.CHUNK_TILE, _flags(_spec.CHUNK_TILE), payload)
+                out[f"TILE.{i}.{layer}"] = _frame_chunk(_spec.CHUNK_TILE, _flags(_spec.CHUNK_TILE), payload)
     return out
 
 
@@ -209,7 +209,7 @@ def _flags(kind: bytes) -> int:
     return sum(values[name] for name in _spec.CHUNK_FLAGS.get(kind, ()))
 
 
-def _framed(kind: bytes, flags: int, payload: Writer) -> Writer:
+def _frame_chunk(kind: bytes, flags: int, payload: Writer) -> Writer:
     out = Writer()
     out.structure("header", "chunk_header", [kind, flags, 0, len(payload.data)])
     out.append(payload)
@@ -326,7 +326,7 @@ def _stream(out: Writer, name: str, values: Sequence[int], coding: Stream) -> No
     packed = (
         coders.apply_transforms(values, coding.width, coding.transforms) if coding.packed is None else coding.packed
     )
-    coded = _coded(packed, coding) if coding.coded is None else coding.coded
+    coded = _encode_stream(packed, coding) if coding.coded is None else coding.coded
     transforms = bytes(coding.transforms).ljust(_spec.TRANSFORMS_MAX, b"\0")
     coder = _CODERS[coding.coder.split("_")[0]]
     head = [coding.width, coder, transforms, 0, len(values), len(packed), len(coded)]
@@ -334,7 +334,7 @@ def _stream(out: Writer, name: str, values: Sequence[int], coding: Stream) -> No
     out.raw(f"{name}.coded", coded)
 
 
-def _coded(packed: bytes, coding: Stream) -> bytes:
+def _encode_stream(packed: bytes, coding: Stream) -> bytes:
     if coding.coder == "stored":
         return packed
     coder = {

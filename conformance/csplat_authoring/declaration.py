@@ -131,7 +131,7 @@ def _invalid(name: str, table: dict[str, Any], base: Built) -> Recipe:
     assert not unknown, f"{name}: {unknown}"
     changes = {field: _value(base, field, value) for field, value in table.get("set", {}).items()}
     if "swap" in table:
-        changes |= _swapped(base, *table["swap"])
+        changes |= _swap_fields(base, *table["swap"])
     cut = table.get("cut", 0)
     if not isinstance(cut, int):
         cut = len(base.data) - base.fields[cut["in"]].offset - cut["left"]
@@ -169,7 +169,7 @@ def _relative(
     return tuple(value + more for value, more in zip(values, plus if isinstance(plus, list) else [plus], strict=True))
 
 
-def _swapped(base: Built, one: str, other: str) -> dict[str, Any]:
+def _swap_fields(base: Built, one: str, other: str) -> dict[str, Any]:
     keys = [f"{name}.{key}" for name in (one, other) for key in ("layer", "size", "offset")]
     values = [struct.unpack_from(base.fields[k].format, base.data, base.fields[k].offset) for k in keys]
     return dict(zip(keys, values[3:] + values[:3], strict=True))

@@ -96,14 +96,14 @@ def _all_rows(scene: Scene, attribute: int) -> list[list[list[int]]]:
         block = tile.blocks.get(attribute)
         rows = block_rows(scene, tile, attribute, block) if block else [zero] * tile.splat_count
         if attribute in _COLOURS:
-            rows = _lifted(scene, attribute, rows)
+            rows = _lift(scene, attribute, rows)
         if attribute == _spec.ATTRIBUTE_MEANS:
             rows = [[c + q for c, q in zip(tile.corner, row, strict=True)] for row in rows]
         result.append(rows)
     return result
 
 
-def _lifted(scene: Scene, attribute: int, rows: Rows) -> list[list[int]]:
+def _lift(scene: Scene, attribute: int, rows: Rows) -> list[list[int]]:
     """Return the columns R, G, B of each coefficient in the order of the file's columns (spec 7.1)."""
     record = scene.attributes[attribute]
     if record.mapping != _spec.MAPPING_YCOCG:

@@ -42,7 +42,7 @@ def answer(data: bytes, limits: Limits | None = None, threads: int | None = None
     """
     began = time.monotonic()
     try:
-        header, arrays = _decoded(data, limits, threads)
+        header, arrays = _decode(data, limits, threads)
     except CsplatError as error:
         code, clause, offset = _place(error)
         seconds = time.monotonic() - began
@@ -74,7 +74,7 @@ class _DifferError(Exception):
     """Raised if the two ways of decoding disagree, which is a defect of the decoder."""
 
 
-def _decoded(data: bytes, limits: Limits | None, threads: int | None) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _decode(data: bytes, limits: Limits | None, threads: int | None) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Return header fields, and raw values by `part.name`."""
     from csplat import decoder  # not needed to read the manifest
 
@@ -132,7 +132,7 @@ def main(words: Sequence[str] | None = None) -> int:
     parser.add_argument("outdir", type=Path)
     args = parser.parse_args(words)
     try:
-        header, arrays = _decoded(args.input.read_bytes(), None, None)
+        header, arrays = _decode(args.input.read_bytes(), None, None)
     except CsplatError as error:
         code, clause, offset = _place(error)
         sys.stdout.write(json.dumps({"code": code, "offset": offset, "clause": clause}) + "\n")

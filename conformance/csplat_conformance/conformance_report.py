@@ -144,13 +144,13 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
         verbose: include a line for every check.
     """
     shown = [one for one in report.outcomes if verbose or one.message or not one.good]
-    lines = _aligned([(one.level, _word(one.status), one.name, _remark(one)) for one in shown])
+    lines = _align_columns([(one.level, _word(one.status), one.name, _remark(one)) for one in shown])
     lines += [""] * bool(lines)
     lines += [*report.notes]
     counts = [*report.levels().items(), ("all", report.counts())]
     header = ("level", *counts[-1][1])
     rows = [(level, *map(str, count.values())) for level, count in counts]
-    return "\n".join([*lines, *_aligned([header, *rows], right=True)])
+    return "\n".join([*lines, *_align_columns([header, *rows], right=True)])
 
 
 def _word(status: Status) -> str:
@@ -166,7 +166,7 @@ def _remark(one: Outcome) -> str:
     return f"{message} ({where})" if message else f"({where})"
 
 
-def _aligned(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
+def _align_columns(rows: Sequence[Sequence[str]], *, right: bool = False) -> list[str]:
     """Align columns to the left or, except for the first, to the right."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
     lines = []

@@ -56,11 +56,11 @@ class Vector:
 
 def load(path: Path = VECTORS / "manifest.json") -> list[Vector]:
     """Read the manifest, once per process."""
-    return list(_loaded(path))
+    return list(_load_file(path))
 
 
 @cache
-def _loaded(path: Path) -> tuple[Vector, ...]:
+def _load_file(path: Path) -> tuple[Vector, ...]:
     return tuple(Vector(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))["vectors"])
 
 

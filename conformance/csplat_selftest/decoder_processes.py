@@ -73,10 +73,10 @@ class DecoderProcess:
             return 0
         return pages * mmap.PAGESIZE
 
-    def _answered(self, request: bytes) -> bytes | Answer:
+    def _request(self, request: bytes) -> bytes | Answer:
         """Send a request; return the line of the answer, or the failure."""
         began = time.monotonic()
-        process = self._started()
+        process = self._start()
         assert process.stdin
         try:
             process.stdin.write(request)
@@ -92,7 +92,7 @@ class DecoderProcess:
             return Answer(Status.CRASHED, f"the process ended with status {process.returncode}")
         return line
 
-    def _started(self) -> subprocess.Popen[bytes]:
+    def _start(self) -> subprocess.Popen[bytes]:
         if self._process is None:
             self._process = subprocess.Popen(  # noqa: S603 - the decoder's own adapter
                 self._words,
@@ -218,7 +218,7 @@ class CDecoder(DecoderProcess):
         self._input.write_bytes(data)
         self._outdir.mkdir()
         try:
-            line = self._answered(f"{self._input}\n{self._outdir}\n".encode())
+            line = self._request(f"{self._input}\n{self._outdir}\n".encode())
             if isinstance(line, Answer):
                 return line
             ended = ProcessEnd(None, line != b"{}\n", line, b"", time.monotonic() - began)
@@ -292,7 +292,7 @@ class JsDecoder(DecoderProcess):
     def ask(self, data: bytes) -> Answer:
         """Decode a file to floats and to integers."""
         began = time.monotonic()
-        line = self._answered(struct.pack("<I", len(data)) + data)
+        line = self._request(struct.pack("<I", len(data)) + data)
         if isinstance(line, Answer):
             return line
         return _js_answer(json.loads(line, parse_int=whole_number), time.monotonic() - began)

@@ -181,7 +181,7 @@ def pooled(errors: ArrayLike, pixels: Sequence[int]) -> float:
 
 def squared_error(reference: NDArray[Any], image: NDArray[Any]) -> F64:
     """Return the squared difference of two images, [H, W, 3] float64, both clipped to [0, 1]."""
-    a, b = _clipped(reference, image)
+    a, b = _clip(reference, image)
     result: F64 = (a - b) ** 2
     return result
 
@@ -202,7 +202,7 @@ def ssim(reference: NDArray[Any], image: NDArray[Any]) -> float:
     """Return the SSIM of two images, [H, W, 3] each; 1 if they are equal."""
     from csplat_render.metric_kernels import mean_ssim  # numba takes a second to import
 
-    return mean_ssim(*_clipped(reference, image))
+    return mean_ssim(*_clip(reference, image))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -211,7 +211,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     return math.fsum(known) / len(known) if known else None
 
 
-def _clipped(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
+def _clip(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
     for name, array in (("reference", reference), ("image", image)):
         if array.ndim != 3 or array.shape[2] != 3 or array.size == 0:
             raise InputError(f"the {name} has shape {list(array.shape)}, expected [H, W, 3]")
@@ -238,7 +238,7 @@ def flip(reference: NDArray[Any], image: NDArray[Any]) -> float:
     Raises:
         InputError: the images cannot be compared, or the package is not installed.
     """
-    a, b = (array.astype(np.float32) for array in _clipped(reference, image))
+    a, b = (array.astype(np.float32) for array in _clip(reference, image))
     try:
         package: Any = importlib.import_module("flip_evaluator")
     except ImportError as error:

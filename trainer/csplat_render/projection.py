@@ -413,7 +413,7 @@ _MAX_GRADIENT = 1e37  # gradients are clamped to ± this so that sums of them fi
 
 
 @device_function
-def _clamped(value: float) -> float:
+def _clamp(value: float) -> float:
     if not (abs(value) <= _MAX_GRADIENT):
         if value > 0.0:
             return _MAX_GRADIENT
@@ -513,7 +513,7 @@ def project_backward(
             s0_, sx, sy, sxx, sxy, syy, red, green, blue, far = sum_records(
                 offsets[i], offsets[i + 1], records, record_tiles, tiles_x, shape, i
             )
-            g_means2d[i] = _clamped(math.sqrt(sx * sx + sy * sy))
+            g_means2d[i] = _clamp(math.sqrt(sx * sx + sy * sy))
 
             # Recompute intermediate values of `project`.
             X, Y, Z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
@@ -548,18 +548,18 @@ def project_backward(
                     gA += g * (C - ratio * (C + DILATION))
                     gC += g * (A - ratio * (A + DILATION))
                     gB -= g * 2.0 * B * (1.0 - ratio)
-            g_opacities[i] = _clamped(s0_ / np.float64(opacities[i]))
+            g_opacities[i] = _clamp(s0_ / np.float64(opacities[i]))
 
             # g_u and g_v, then g_log(s), g_r and the quaternion, g_p and g_q, g_J.
             du0, dv0 = 2.0 * gA * u0 + gB * v0, 2.0 * gC * v0 + gB * u0
             du1, dv1 = 2.0 * gA * u1 + gB * v1, 2.0 * gC * v1 + gB * u1
             du2, dv2 = 2.0 * gA * u2 + gB * v2, 2.0 * gC * v2 + gB * u2
             if abs(scales[i, 0]) < LOG_SCALE_LIMIT:
-                g_scales[i, 0] = _clamped(du0 * u0 + dv0 * v0)
+                g_scales[i, 0] = _clamp(du0 * u0 + dv0 * v0)
             if abs(scales[i, 1]) < LOG_SCALE_LIMIT:
-                g_scales[i, 1] = _clamped(du1 * u1 + dv1 * v1)
+                g_scales[i, 1] = _clamp(du1 * u1 + dv1 * v1)
             if abs(scales[i, 2]) < LOG_SCALE_LIMIT:
-                g_scales[i, 2] = _clamped(du2 * u2 + dv2 * v2)
+                g_scales[i, 2] = _clamp(du2 * u2 + dv2 * v2)
             du0, dv0, du1, dv1, du2, dv2 = du0 * s0, dv0 * s0, du1 * s1, dv1 * s1, du2 * s2, dv2 * s2
             r00, r10, r20 = du0 * p0 + dv0 * q0, du0 * p1 + dv0 * q1, du0 * p2 + dv0 * q2
             r01, r11, r21 = du1 * p0 + dv1 * q0, du1 * p1 + dv1 * q1, du1 * p2 + dv1 * q2
@@ -569,10 +569,10 @@ def project_backward(
             gy = 2.0 * (qw * (r02 - r20) + qx * (r10 + r01) + qz * (r21 + r12)) - 4.0 * qy * (r00 + r22)
             gz = 2.0 * (qw * (r10 - r01) + qx * (r20 + r02) + qy * (r21 + r12)) - 4.0 * qz * (r00 + r11)
             radial = gw * qw + gx * qx + gy * qy + gz * qz
-            g_quats[i, 0] = _clamped((gw - radial * qw) * q_inverse)
-            g_quats[i, 1] = _clamped((gx - radial * qx) * q_inverse)
-            g_quats[i, 2] = _clamped((gy - radial * qy) * q_inverse)
-            g_quats[i, 3] = _clamped((gz - radial * qz) * q_inverse)
+            g_quats[i, 0] = _clamp((gw - radial * qw) * q_inverse)
+            g_quats[i, 1] = _clamp((gx - radial * qx) * q_inverse)
+            g_quats[i, 2] = _clamp((gy - radial * qy) * q_inverse)
+            g_quats[i, 3] = _clamp((gz - radial * qz) * q_inverse)
             gp0 = du0 * r[0] + du1 * r[1] + du2 * r[2]
             gp1 = du0 * r[3] + du1 * r[4] + du2 * r[5]
             gp2 = du0 * r[6] + du1 * r[7] + du2 * r[8]
@@ -601,18 +601,18 @@ def project_backward(
             red = red if shape[i, 6] > 0.0 else 0.0
             green = green if shape[i, 7] > 0.0 else 0.0
             blue = blue if shape[i, 8] > 0.0 else 0.0
-            g_sh0[i, 0] = _clamped(basis[0] * red)
-            g_sh0[i, 1] = _clamped(basis[0] * green)
-            g_sh0[i, 2] = _clamped(basis[0] * blue)
+            g_sh0[i, 0] = _clamp(basis[0] * red)
+            g_sh0[i, 1] = _clamp(basis[0] * green)
+            g_sh0[i, 2] = _clamp(basis[0] * blue)
             weights[0] = 0.0
             for k in range(higher):
-                g_shN[i, k, 0] = _clamped(basis[k + 1] * red)
-                g_shN[i, k, 1] = _clamped(basis[k + 1] * green)
-                g_shN[i, k, 2] = _clamped(basis[k + 1] * blue)
+                g_shN[i, k, 0] = _clamp(basis[k + 1] * red)
+                g_shN[i, k, 1] = _clamp(basis[k + 1] * green)
+                g_shN[i, k, 2] = _clamp(basis[k + 1] * blue)
                 weights[k + 1] = red * shN[i, k, 0] + green * shN[i, k, 1] + blue * shN[i, k, 2]
             wx, wy, wz = sh_basis_gradient(degree, dx, dy, dz, weights)
             radial = wx * dx + wy * dy + wz * dz
             wx, wy, wz = (wx - radial * dx) * inverse, (wy - radial * dy) * inverse, (wz - radial * dz) * inverse
-            g_means[i, 0] = _clamped(view[0] * cx + view[3] * cy + view[6] * cz + wx)
-            g_means[i, 1] = _clamped(view[1] * cx + view[4] * cy + view[7] * cz + wy)
-            g_means[i, 2] = _clamped(view[2] * cx + view[5] * cy + view[8] * cz + wz)
+            g_means[i, 0] = _clamp(view[0] * cx + view[3] * cy + view[6] * cz + wx)
+            g_means[i, 1] = _clamp(view[1] * cx + view[4] * cy + view[7] * cz + wy)
+            g_means[i, 2] = _clamp(view[2] * cx + view[5] * cy + view[8] * cz + wz)

@@ -72,7 +72,7 @@ class StoredSensitivity:
             found.view_count,
             missed_share,
             _over_mean(found.shape_metric, found.shape_squares / 6.0),
-            None if found.metric is None or not model.sh_degree else _packed(found.metric),
+            None if found.metric is None or not model.sh_degree else _pack(found.metric),
         )
 
     @property
@@ -84,7 +84,7 @@ class StoredSensitivity:
         """Return the importance for the encoder."""
         matrices = self.matrices, self.shape_matrices
         return Importance(
-            self._floored("colour_squares"), self._floored("shape_squares"), *matrices, self._curvatures()
+            self._apply_floor("colour_squares"), self._apply_floor("shape_squares"), *matrices, self._curvatures()
         )
 
     def _curvatures(self) -> GaussNewtonBlocks:
@@ -94,7 +94,7 @@ class StoredSensitivity:
             opacity, self.shape_matrices * (shape / _SHAPE)[:, None], means, self.groups["colour_squares"]
         )
 
-    def _floored(self, name: str) -> NDArray[np.float32]:
+    def _apply_floor(self, name: str) -> NDArray[np.float32]:
         weights = self.groups[name]
         positive = weights[weights > 0.0]
         least = np.float32(_FLOOR * float(np.median(positive))) if len(positive) else np.float32(1.0)
@@ -172,7 +172,7 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
     return found
 
 
-def _packed(metric: NDArray[np.float32]) -> NDArray[np.float16]:
+def _pack(metric: NDArray[np.float32]) -> NDArray[np.float16]:
     """Return the upper triangles of the bands above 0, divided by the mean of their diagonals."""
     rows, columns = np.triu_indices(_matrix_size(metric))
     mean = metric[:, (rows == columns) & (rows > 0)].mean(axis=1, dtype=np.float64)

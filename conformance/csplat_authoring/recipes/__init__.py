@@ -36,17 +36,17 @@ def sound_recipes() -> list[Recipe]:
         good_text_recipes,
         rendered_recipes,
     )
-    return _ordered([*declared_recipes("valid", "extreme"), *(recipe for make in makers for recipe in make())])
+    return _sort_by_manifest([*declared_recipes("valid", "extreme"), *(recipe for make in makers for recipe in make())])
 
 
 def all_recipes() -> list[Recipe]:
     """Return every recipe, in the order of the manifest."""
     makers = (boundary_recipes, invalid_deflate_recipes, bad_text_recipes, invalid_bytes_recipes)
     invalid = [*declared_recipes("invalid"), *(recipe for make in makers for recipe in make())]
-    return _ordered([*sound_recipes(), *invalid])
+    return _sort_by_manifest([*sound_recipes(), *invalid])
 
 
-def _ordered(recipes: list[Recipe]) -> list[Recipe]:
+def _sort_by_manifest(recipes: list[Recipe]) -> list[Recipe]:
     """Return recipes in the order of the manifest, new ones last, so that changes of the manifest stay small."""
     positions = {vector.name: position for position, vector in enumerate(load())}
     return sorted(recipes, key=lambda recipe: positions.get(recipe.name, math.inf))

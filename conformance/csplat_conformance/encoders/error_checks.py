@@ -167,17 +167,19 @@ def _truncated_attributes(
     rows = np.linspace(0, len(decoded) - 1, min(len(decoded), _ROWS_MAX)).astype(np.int64)
     theirs = index[rows]
     # Axes may be permuted: compare sorted scales.
-    yield from _one_sided(
+    yield from _compare_one_sided(
         "covariance", "scales", *(np.sort(a, axis=1) for a in (source.scales[theirs], decoded.scales[rows]))
     )
-    yield from _one_sided("covariance", "quats", *_aligned_quats(source.quats[theirs], decoded.quats[rows]))
-    yield from _one_sided(
+    yield from _compare_one_sided("covariance", "quats", *_aligned_quats(source.quats[theirs], decoded.quats[rows]))
+    yield from _compare_one_sided(
         "sh0", "sh0", *_coded_colours(source.sh0[theirs], decoded.sh0[rows], header, _spec.ATTRIBUTE_SH0)
     )
     for band in range(1, min(decoded.sh_degree, source.sh_degree) + 1):
         coefficients = slice(band * band - 1, (band + 1) ** 2 - 1)
         pair = source.shN[theirs, coefficients], decoded.shN[rows, coefficients]
-        yield from _one_sided(f"sh{band}", f"sh{band}", *_coded_colours(*pair, header, _spec.ATTRIBUTE_SH0 + band))
+        yield from _compare_one_sided(
+            f"sh{band}", f"sh{band}", *_coded_colours(*pair, header, _spec.ATTRIBUTE_SH0 + band)
+        )
 
 
 # Steps ---------------------------------------------------------------------------------------------
@@ -210,7 +212,7 @@ def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, ind
 # Sides ---------------------------------------------------------------------------------------------
 
 
-def _one_sided(
+def _compare_one_sided(
     measure: str, name: str, source: NDArray[np.floating], decoded: NDArray[np.floating]
 ) -> Iterator[tuple[str, str]]:
     """Yield a line if nearly all errors have one sign."""

@@ -39,14 +39,14 @@ def surface_scene(gloss: float, noise: float, seed: int) -> PlyRows:
     texture = np.sin(means @ rng.normal(0.0, 5.0, (3, 3))) + 0.8 * np.sign(np.sin(12.0 * means))
     logits = rng.normal(4.0, 1.5, count)
     logits[rng.random(count) < 0.3] -= 4.0
-    quats, scales = _permuted(_facing(normals, rng), np.log(np.stack([long, short, 0.1 * long], axis=1)), rng)
+    quats, scales = _permute_axes(_facing(normals, rng), np.log(np.stack([long, short, 0.1 * long], axis=1)), rng)
     return PlyRows(
         means=means.astype(np.float32),
         quats=quats.astype(np.float32),
         scales=scales.astype(np.float32),
         logits=logits.astype(np.float32),
         sh0=(0.7 * texture + rng.normal(0.0, 0.3, (count, 3))).astype(np.float32),
-        shN=(gloss * _highlights(_faceted(normals)) + rng.normal(0.0, noise, (count, 15, 3))).astype(np.float32),
+        shN=(gloss * _highlights(_snap_to_facets(normals)) + rng.normal(0.0, noise, (count, 15, 3))).astype(np.float32),
     )
 
 
@@ -100,7 +100,7 @@ def _facing(normals: F64, rng: np.random.Generator) -> F64:
     return quats
 
 
-def _permuted(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F64]:
+def _permute_axes(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F64]:
     """Return the same splats with their axes in a random order, as in trained scenes."""
     quats, scales = quats.copy(), scales.copy()
     for first in (0, 1, 0):
@@ -116,7 +116,7 @@ def _permuted(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F
 # Colours -------------------------------------------------------------------------------------------
 
 
-def _faceted(normals: F64) -> F64:
+def _snap_to_facets(normals: F64) -> F64:
     """Return for each normal the nearest facet normal, so that splats of one facet have the same highlights."""
     facets = _ball(_FACETS)[1]
     nearest: F64 = facets[np.argmax(normals @ facets.T, axis=1)]

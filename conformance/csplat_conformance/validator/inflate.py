@@ -51,7 +51,7 @@ class Inflater:
         while not final:
             final, kind = self._number(1), self._number(2)
             if kind == _STORED:
-                self._stored()
+                self._read_stored()
             elif kind == _FIXED:
                 self._matches(_Code(_FIXED_LENGTHS), _Code(_FIXED_DISTANCES), size)
             elif kind == _DYNAMIC:
@@ -79,7 +79,7 @@ class Inflater:
         piece = int.from_bytes(self._coded[at >> 3 : (end + 7) >> 3], "little")
         return piece >> (at & 7) & (1 << count) - 1
 
-    def _stored(self) -> None:
+    def _read_stored(self) -> None:
         self._at = 8 * self.used
         size, complement = self._number(16), self._number(16)
         if size ^ complement != 0xFFFF:

@@ -77,14 +77,14 @@ def _check_lattice(
     if scale is None:
         return
     if record.mapping == _spec.MAPPING_YCOCG:
-        rows = _lifted(rows, record.chroma_shift)
+        rows = _lift(rows, record.chroma_shift)
     for extreme in (int(rows.min()), int(rows.max())):
         if not is_finite(extreme, scale):
             log.add("LAT-5", *where, f"{extreme} x {scale} is not finite in binary32")
             return
 
 
-def _lifted(rows: I64, chroma_shift: int) -> I64:
+def _lift(rows: I64, chroma_shift: int) -> I64:
     """Return R, G, B of Y, Co, Cg (7.1). LAT-4 bounds all intermediate values by 2^53."""
     y, co, cg = np.split(rows, 3)
     co, cg = co << chroma_shift, cg << chroma_shift

@@ -176,7 +176,7 @@ def _laid_out(rng: random.Random, base: Built, data: bytearray, bases: Sequence[
     name = rng.choice(list(chunks))
     change = rng.randrange(6)
     if change == 0:
-        chunks[name] = _with_payload(chunks[name], _edited(rng, _payload(chunks[name])))
+        chunks[name] = _with_payload(chunks[name], _edit(rng, _payload(chunks[name])))
     elif change == 1:
         donor = rng.choice(bases)
         if donor.spans:
@@ -190,8 +190,8 @@ def _laid_out(rng: random.Random, base: Built, data: bytearray, bases: Sequence[
         rng.shuffle(order)
         chunks = {key: chunks[key] for key in order}
     else:
-        chunks[name] = _recoded(rng, base, name, chunks[name])
-    return _assembled(base, data, chunks)
+        chunks[name] = _recode(rng, base, name, chunks[name])
+    return _assemble(base, data, chunks)
 
 
 def _payload(chunk: bytes) -> bytes:
@@ -203,7 +203,7 @@ def _with_payload(chunk: bytes, payload: bytes) -> bytes:
     return chunk[:at] + struct.pack("<I", len(payload)) + payload
 
 
-def _edited(rng: random.Random, payload: bytes) -> bytes:
+def _edit(rng: random.Random, payload: bytes) -> bytes:
     """Remove, duplicate or insert some bytes."""
     at = rng.randrange(len(payload) + 1)
     end = min(len(payload), at + rng.choice((1, 2, 4, 20, 1000)))
@@ -211,7 +211,7 @@ def _edited(rng: random.Random, payload: bytes) -> bytes:
     return payload[:at] + middle + payload[end:]
 
 
-def _recoded(rng: random.Random, base: Built, name: str, chunk: bytes) -> bytes:
+def _recode(rng: random.Random, base: Built, name: str, chunk: bytes) -> bytes:
     """Replace the coded bytes of a stream of the chunk, and set coder and sizes to match."""
     heads = [key for key in base.fields if key.startswith(f"{name}/") and key.endswith(".coded_size")]
     if not heads:
@@ -235,7 +235,7 @@ def _recoded(rng: random.Random, base: Built, name: str, chunk: bytes) -> bytes:
     return _with_payload(payload[: _spec.CHUNK_HEADER_SIZE], payload[_spec.CHUNK_HEADER_SIZE :])
 
 
-def _assembled(base: Built, data: bytearray, chunks: dict[str, bytes]) -> bytes:
+def _assemble(base: Built, data: bytearray, chunks: dict[str, bytes]) -> bytes:
     """Join header, index and chunks, and update sizes and offsets in the records."""
     first = min(offset for offset, _ in base.spans.values())
     out = bytearray(data[:first])

@@ -87,7 +87,7 @@ class DecoderTarget:
                 model = decoder.decode(data, limits=LIMITS, threads=1 if chance % 16 else None)
                 if len(model) > LIMITS.splats:
                     return "finding", "more splats than the limits permit"
-                return _agreed(data, len(model)) if chance % 8 == 1 else ("decoded", "")
+                return _compare_decoders(data, len(model)) if chance % 8 == 1 else ("decoded", "")
         except CsplatError as error:
             return error.code, ""
 
@@ -195,7 +195,7 @@ def _built(data: bytes) -> Built | None:
     return found if inside else None
 
 
-def _agreed(data: bytes, count: int) -> tuple[str, str]:
+def _compare_decoders(data: bytes, count: int) -> tuple[str, str]:
     """Decode a valid file with the other decoding functions, which must accept it, too."""
     try:
         integers = decoder.decode_integers(data, limits=LIMITS, threads=1)

@@ -30,7 +30,7 @@ class Edges:
         """Call a function; return its result and the number of new edges."""
         before = len(self.seen)
         outer = sys.gettrace()
-        sys.settrace(self._called)
+        sys.settrace(self._trace_call)
         try:
             result = run()
         finally:
@@ -52,7 +52,7 @@ class Edges:
                 found |= {(str(file), line) for line in lines}
         return found
 
-    def _called(self, frame: FrameType, _event: str, _value: Any) -> _Trace | None:
+    def _trace_call(self, frame: FrameType, _event: str, _value: Any) -> _Trace | None:
         code = frame.f_code
         traced = self._traced.get(code)
         if traced is None:

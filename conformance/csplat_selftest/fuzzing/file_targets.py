@@ -77,7 +77,7 @@ class PlyTarget(FileTarget):
         chance = zlib.crc32(data)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            errors = _linted(self._file)
+            errors = _lint(self._file)
             try:
                 model = read_ply(self._file, keep_extra=chance % 4 == 0)
             except InputError as error:
@@ -123,7 +123,7 @@ class PlyTarget(FileTarget):
 # Checks --------------------------------------------------------------------------------------------
 
 
-def _linted(path: Path) -> list[str] | None:
+def _lint(path: Path) -> list[str] | None:
     """Return the ids of the errors that lint reports, None if it refuses the file."""
     try:
         return [finding.id for finding in lint_ply(path) if finding.kind == "error"]
@@ -193,7 +193,7 @@ class FormatTarget(FileTarget):
     def case(self, rng: random.Random, corpus: Sequence[Seed]) -> FuzzCase:
         """Damage a file or its compressed contents."""
         seed = rng.choice(corpus)
-        change = _inside if rng.random() < 0.6 else _damaged
+        change = _inside if rng.random() < 0.6 else _damage
         changed = Seed(seed.ending, change(rng, seed.content))
         return FuzzCase(changed.data, lambda: changed)
 
@@ -225,12 +225,12 @@ def _inside(rng: random.Random, data: bytes) -> bytes:
     """Damage the contents of a gzip stream or of a member of an archive, with a valid checksum."""
     if data[:2] == b"\x1f\x8b":
         try:
-            return gzip.compress(_damaged(rng, gzip.decompress(data)), 1, mtime=0)
+            return gzip.compress(_damage(rng, gzip.decompress(data)), 1, mtime=0)
         except (OSError, EOFError, zlib.error):
-            return _damaged(rng, data)
+            return _damage(rng, data)
     if data[:4] == b"PK\x03\x04":
         return _archive(rng, data)
-    return _damaged(rng, data, 64)  # most structure is in the header
+    return _damage(rng, data, 64)  # most structure is in the header
 
 
 def _archive(rng: random.Random, data: bytes) -> bytes:
@@ -241,13 +241,13 @@ def _archive(rng: random.Random, data: bytes) -> bytes:
             chosen = "meta.json" if "meta.json" in names and rng.random() < 0.5 else rng.choice(names)
             for name in names:
                 content = before.read(name)
-                after.writestr(name, _damaged(rng, content) if name == chosen else content)
+                after.writestr(name, _damage(rng, content) if name == chosen else content)
     except (zipfile.BadZipFile, OSError, ValueError, IndexError, NotImplementedError, RuntimeError, zlib.error):
-        return _damaged(rng, data)
+        return _damage(rng, data)
     return out.getvalue()
 
 
-def _damaged(rng: random.Random, data: bytes, reach: int | None = None) -> bytes:
+def _damage(rng: random.Random, data: bytes, reach: int | None = None) -> bytes:
     """Change, remove, insert or duplicate a few of the first `reach` bytes."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 2, 5))):

@@ -62,7 +62,7 @@ class PythonDecoder:
         self._mutants: list[Mutant] = []
         self._folder = Path(decoder.__file__).parent
         self.texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(self._folder.glob("*.py"))}
-        self._codes = {file: self._compiled(file, text) for file, text in self.texts.items()}
+        self._codes = {file: self._compile(file, text) for file, text in self.texts.items()}
         self._expected = [verdict(_fuzzed_answer(data)) for data in files]
 
     @property
@@ -75,7 +75,7 @@ class PythonDecoder:
     def valid(self, mutant: Mutant) -> bool:
         """Return True if the mutant compiles."""
         try:
-            self._compiled(mutant.file, mutant.apply(self.texts[mutant.file]))
+            self._compile(mutant.file, mutant.apply(self.texts[mutant.file]))
         except SyntaxError:
             return False
         return True
@@ -114,12 +114,12 @@ class PythonDecoder:
             _tell(writing, f"the import: {type(error).__name__}")
             return
         # One thread is five times faster; then use all threads, which have separate code.
-        caught = next((name for threads in (1, None) if (name := failing(_asked(threads)))), "")
+        caught = next((name for threads in (1, None) if (name := failing(_ask(threads)))), "")
         _tell(writing, caught)
         if not caught:
             _tell(writing, difference(_fuzzed_answer, self._files, self._expected))
 
-    def _compiled(self, file: str, text: str) -> CodeType:
+    def _compile(self, file: str, text: str) -> CodeType:
         return compile(text, str(self._folder / file), "exec", dont_inherit=True)
 
     def _load(self, mutant: Mutant) -> None:
@@ -130,12 +130,12 @@ class PythonDecoder:
         codes = {}
         for file, code in self._codes.items():
             name = package if file == "__init__.py" else f"{package}.{file.removesuffix('.py')}"
-            codes[name] = self._compiled(file, mutant.apply(self.texts[file])) if file == mutant.file else code
+            codes[name] = self._compile(file, mutant.apply(self.texts[file])) if file == mutant.file else code
         sys.meta_path.insert(0, _Finder(codes, package))
         __import__(package)
 
 
-def _asked(threads: int | None) -> Any:
+def _ask(threads: int | None) -> Any:
     def ask(data: bytes) -> Answer:
         try:
             return adapter.answer(data, threads=threads)

@@ -152,8 +152,8 @@ def choose_images(folder: SceneFolder, size: tuple[int, int] | None, downscale: 
     sizes = {image_size(shot.path) for shot in (*found.train, *found.test)}
     own = image_size((found.train or found.test)[0].path)
     scaled_here = factor if images == "images" else 1  # there is no folder of that size: the large ones are scaled
-    papers = _scaled(own, max(scaled_here, own[0] / _WIDTH_MAX))
-    chosen = size or _scaled(papers, downscale)
+    papers = _scale(own, max(scaled_here, own[0] / _WIDTH_MAX))
+    chosen = size or _scale(papers, downscale)
     remarks = []
     if scaled_here > 1:
         remarks.append(f"there is no images_{factor}: images are scaled here")
@@ -233,7 +233,7 @@ def _images(folder: SceneFolder, factor: int) -> tuple[str | None, UnreadDataSet
     return images, read_colmap(folder.path, model[0], None, images, TEST_EVERY)
 
 
-def _scaled(size: tuple[int, int], divisor: float) -> tuple[int, int]:
+def _scale(size: tuple[int, int], divisor: float) -> tuple[int, int]:
     return max(1, round(size[0] / divisor)), max(1, round(size[1] / divisor))
 
 

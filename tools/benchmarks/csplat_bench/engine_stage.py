@@ -74,7 +74,7 @@ class Engine:
 
     def render(self, model: SplatModel, camera: Camera, sh_degree: int) -> Image:
         """Render by these rules."""
-        shown = _coloured(model, camera, min(sh_degree, model.sh_degree)) if self.clips else model
+        shown = _colour(model, camera, min(sh_degree, model.sh_degree)) if self.clips else model
         if self.thin:  # twice as large, then every other pixel, with centres where they were
             K = 2.0 * camera.K
             K[2] = 0.0, 0.0, 1.0
@@ -193,7 +193,7 @@ def screen_render(
     return np.clip(render(model, camera, antialiased=antialiased, sh_degree=sh_degree).rgb, 0.0, 1.0)
 
 
-def _coloured(model: SplatModel, camera: Camera, degree: int) -> SplatModel:
+def _colour(model: SplatModel, camera: Camera, degree: int) -> SplatModel:
     """Return the splats with the clipped colours that a camera sees, without SH."""
     directions = model.means - camera.position
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -92,7 +92,7 @@ def find_scene(name: str, data: Path, work: Path) -> Scene:
     """
     work.mkdir(parents=True, exist_ok=True)
     if name.endswith(".ply"):
-        return _described(Path(name).stem, Path(name), [])
+        return _describe(Path(name).stem, Path(name), [])
     made = _MADE.fullmatch(name)
     base = made["base"] if made else name
     cameras = data / "psnr_cameras" / f"{base}.json"
@@ -102,7 +102,7 @@ def find_scene(name: str, data: Path, work: Path) -> Scene:
         source, path = path, work / f"{name}.ply"
         if not path.exists():
             _make(path, read_ply(source), given, made)
-    return _described(name, path, given)
+    return _describe(name, path, given)
 
 
 def _base_path(name: str, data: Path, work: Path) -> Path:
@@ -129,7 +129,7 @@ def _make(path: Path, model: SplatModel, given: Sequence[Camera], made: re.Match
     write_scene_ply(path, SceneSource(count, model.select(slice(0, 0)), partial(copies, model, count)))
 
 
-def _described(name: str, path: Path, cameras: Sequence[Camera]) -> Scene:
+def _describe(name: str, path: Path, cameras: Sequence[Camera]) -> Scene:
     if not path.exists():
         raise AbsentError(f"{path} does not exist")
     count = rest = 0

@@ -140,7 +140,7 @@ def _parse(name: str, table: Mapping[str, Any], subjects: Sequence[str]) -> Suit
         raise InputError(f"subject is {table['subject']!r}, expected one of {', '.join(subjects)}")
     if table.get("repeats", 1) < 1:
         raise InputError(f"repeats is {table['repeats']}, expected 1 or more")
-    cases = [case for one in table["cases"] for case in _expanded(one)]
+    cases = [case for one in table["cases"] for case in _expand(one)]
     names = [case.name for case in cases]
     for case in cases:
         if names.count(case.name) > 1 and all("scenes" not in one.settings for one in cases if one.name == case.name):
@@ -151,24 +151,24 @@ def _parse(name: str, table: Mapping[str, Any], subjects: Sequence[str]) -> Suit
     return Suite(name=name, cases=cases, columns=table.get("table", {}).get("columns", ()), **plain)
 
 
-def _expanded(table: Mapping[str, Any]) -> Iterator[Case]:
+def _expand(table: Mapping[str, Any]) -> Iterator[Case]:
     """Yield a case for every combination of the values of `each`."""
     if not isinstance(table, Mapping) or not isinstance(table.get("name"), str):
         raise InputError("a case has no name")
     each = table.get("each", {})
     for values in itertools.product(*each.values()):
         chosen = dict(zip(each, values, strict=True))
-        settings = {key: _filled(value, chosen) for key, value in table.items() if key != "each"}
+        settings = {key: _fill(value, chosen) for key, value in table.items() if key != "each"}
         name = str(settings.pop("name"))
         yield Case(name, {**settings, **chosen})
 
 
-def _filled(value: Any, chosen: Mapping[str, Any]) -> Any:
+def _fill(value: Any, chosen: Mapping[str, Any]) -> Any:
     """Replace {KEY} in all strings; a string that is nothing but {KEY} becomes the value itself."""
     if isinstance(value, list):
-        return [_filled(one, chosen) for one in value]
+        return [_fill(one, chosen) for one in value]
     if isinstance(value, dict):
-        return {key: _filled(one, chosen) for key, one in value.items()}
+        return {key: _fill(one, chosen) for key, one in value.items()}
     if isinstance(value, str):
         if value[1:-1] in chosen and value == f"{{{value[1:-1]}}}":
             return chosen[value[1:-1]]

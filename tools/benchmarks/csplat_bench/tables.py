@@ -98,13 +98,13 @@ def select_rows(spec: Mapping[str, Any], folder: Path) -> list[Row]:
         ValueError: no row is left.
     """
     key = spec.get("rows", "rows")
-    rows: list[Row] = [flatten(row) for name in _listed(spec["source"]) for row in _read(folder / name, key)]
+    rows: list[Row] = [flatten(row) for name in _as_list(spec["source"]) for row in _read(folder / name, key)]
     rows = [{"series": row["case"], **row} if "case" in row else row for row in rows]
     for field, values in reversed(spec.get("where", {}).items()):
-        order = {value: position for position, value in enumerate(_listed(values))}
+        order = {value: position for position, value in enumerate(_as_list(values))}
         rows = sorted((row for row in rows if row.get(field) in order), key=lambda row: order[row[field]])
     if "group" in spec:
-        rows = _grouped(rows, _listed(spec["group"]), spec["by"])
+        rows = _group(rows, _as_list(spec["group"]), spec["by"])
     if not rows:
         raise ValueError(f"{spec['source']}: no row is left, expected some with {spec.get('where', {})}")
     return rows
@@ -131,7 +131,7 @@ def _read(path: Path, key: str) -> list[Row]:
     return found
 
 
-def _grouped(rows: Iterable[Row], group: Sequence[str], by: str) -> list[Row]:
+def _group(rows: Iterable[Row], group: Sequence[str], by: str) -> list[Row]:
     merged: dict[tuple[Any, ...], dict[str, Any]] = {}
     for row in rows:
         one = merged.setdefault(tuple(row.get(field) for field in group), {field: row.get(field) for field in group})
@@ -139,7 +139,7 @@ def _grouped(rows: Iterable[Row], group: Sequence[str], by: str) -> list[Row]:
     return list(merged.values())
 
 
-def _listed(value: Any) -> list[Any]:
+def _as_list(value: Any) -> list[Any]:
     return list(value) if isinstance(value, list | tuple) else [value]
 
 

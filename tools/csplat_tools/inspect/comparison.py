@@ -193,7 +193,7 @@ def compare(
         if pictures is not None:
             names = image_names([camera.image for camera in views.test])
             viewers.append(_ImageWriter(os.fspath(pictures), names, image_scorer, amplification, force=force))
-        first, second, errors = _measured(source, other, views.test, source_index, progress)
+        first, second, errors = _measure(source, other, views.test, source_index, progress)
         if prepare is not None:
             prepare()
         image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
@@ -337,7 +337,7 @@ def _views(source: LoadedModel | OpenedScene, background: Colour | None, progres
     return find_view_set(model, background=background, count=0, every=every)
 
 
-def _measured(
+def _measure(
     source: LoadedModel | OpenedScene,
     other: LoadedModel | OpenedScene,
     cameras: Sequence[Camera],

@@ -96,7 +96,7 @@ def _scores(compared: Comparison) -> str:
     views = describe_views(len(quality.each), compared.cameras)
     head, *others = format_table(("pictures", views), rows).splitlines()
     lines = [head, *(f"{line}  {_SCORE_EXPLANATIONS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
-    lines += _ignored(compared)
+    lines += _ignored_lines(compared)
     if compared.a.metadata_model.antialiased != compared.b.metadata_model.antialiased:
         lines.append(
             f"only {'A' if compared.a.metadata_model.antialiased else 'B'} is antialiased, and was rendered so"
@@ -114,7 +114,7 @@ def _image_scores(scores: dict[str, Any]) -> str:
     return format_table(header, rows)
 
 
-def _ignored(compared: Comparison) -> list[str]:
+def _ignored_lines(compared: Comparison) -> list[str]:
     return [
         f"{counted(count, 'splat')} of {name} with NaN or infinities, not drawn"
         for name, count in zip("AB", (compared.ignored, compared.quality.ignored), strict=True)

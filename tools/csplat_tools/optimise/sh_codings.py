@@ -184,7 +184,7 @@ class _TriedCodings:
         ways = ((1 / _ENTRIES_STEP, above < -_FAR_OFF or stalled), (_ENTRIES_STEP, above > _FAR_OFF))
         for factor in [factor for factor, is_wrong in ways if not is_wrong]:
             coding, gained = book, False
-            while (after := _resized(coding, factor)) is not None:
+            while (after := _resize(coding, factor)) is not None:
                 # If a codebook is too small for any precision, larger ones are tried even if this one did not pay.
                 pays = self.add(after) < self.add(coding)
                 if not pays and not (factor > 1.0 and self.search.is_stalled(self.found[after])):
@@ -215,7 +215,7 @@ class _TriedCodings:
         return known.quality - self.search.margin(known)
 
 
-def _resized(book: CodingChoice, factor: float) -> CodingChoice | None:
+def _resize(book: CodingChoice, factor: float) -> CodingChoice | None:
     """Return the coding with `factor` times the codebook entries, within limits; `None` if they change too little."""
     before = book.entries_per_splat or 0.0
     entries_per_splat = min(max(before * factor, _ENTRIES_PER_SPLAT[0]), _ENTRIES_PER_SPLAT[1])

@@ -93,7 +93,7 @@ class Pruner:
     psnr: float | None
     kept_count: int | None = None
     _session: PruningSession | None = field(default=None, init=False)
-    _fitted: RefittedSubset | None = field(default=None, init=False)
+    _fitted_subset: RefittedSubset | None = field(default=None, init=False)
     _before: tuple[int, float] | None = field(default=None, init=False)
 
     @property
@@ -125,10 +125,10 @@ class Pruner:
         if pruned_count > len(self.session.order.rows):
             self._extend(kept_count, math.inf)
         pruned_count = min(pruned_count, len(self.session.order.rows))
-        self._fitted = RefittedSubset(
-            self.session, pruned_count, allowed, psnr_of, self.use_classes, self.progress, self._fitted
+        self._fitted_subset = RefittedSubset(
+            self.session, pruned_count, allowed, psnr_of, self.use_classes, self.progress, self._fitted_subset
         )
-        return self._fitted
+        return self._fitted_subset
 
     def first_at_psnr(self, psnr: float, slope: float, psnr_of: PsnrOf) -> int:
         """Return the first splat count to try for the smallest file of a PSNR.
@@ -140,7 +140,7 @@ class Pruner:
             slope: fraction of the bytes that a decibel costs.
             psnr_of: measures the PSNR of a subset of the source on the validation views, dB.
         """
-        return self._calibrated(_at_psnr(psnr, slope), psnr_of)
+        return self._calibrate(_at_psnr(psnr, slope), psnr_of)
 
     def first_at_size(self, size_bytes: int, near: tuple[int, float] | None, slope: float, psnr_of: PsnrOf) -> int:
         """Return the first splat count to try for the best file of a size.
@@ -153,7 +153,7 @@ class Pruner:
         if near is None:
             usual = (size_bytes - _FRAME_BYTES) / _USUAL_BYTES[self.source.sh_degree > 0]
             return max(1, min(len(self.source), int(usual)))
-        return self._calibrated(_at_size(near[0], error_of_psnr(near[1]), slope), psnr_of)
+        return self._calibrate(_at_size(near[0], error_of_psnr(near[1]), slope), psnr_of)
 
     def next_at_psnr(self, kept_count: int, fitted_psnr: float, psnr: float, slope: float) -> tuple[int, float]:
         """Predict the splat count for the smallest file of a PSNR, and the saving in log bytes.
@@ -188,7 +188,7 @@ class Pruner:
         kept_count, least = self._least(cost, known, power)
         return kept_count, float(cost(*map(np.atleast_1d, known))[0]) - least
 
-    def _calibrated(self, cost: Cost, psnr_of: PsnrOf) -> int:
+    def _calibrate(self, cost: Cost, psnr_of: PsnrOf) -> int:
         gain = error_of_psnr(self._refit_gain)
         kept_count, _ = self._least(cost, None)
         for _ in range(_CALIBRATIONS):
@@ -313,7 +313,7 @@ class RefittedSubset:
     @property
     def model(self) -> SplatModel:
         """The refitted splats before quantisation."""
-        return self._fitted
+        return self._fitted_model
 
     @cached_property
     def fitted_psnr(self) -> float:
@@ -386,7 +386,7 @@ class RefittedSubset:
         return self.psnr_of(self.banded[0])
 
     @cached_property
-    def _fitted(self) -> SplatModel:
+    def _fitted_model(self) -> SplatModel:
         session, steps = self.session, FIT_STEPS
         start = session.source.select(self.rows)
         if not (session.options.refit and self.pruned_count):
@@ -394,7 +394,7 @@ class RefittedSubset:
         if self.before is not None:
             start, steps = _with_values_of(self.before.model, self.before.rows, start, self.rows), _CARRIED_STEPS
         self.before = None  # frees memory: as large as the scene
-        return self._refitted(start, steps)
+        return self._refit(start, steps)
 
     def _without_bands(self, error: float) -> tuple[SplatModel, Mask]:
         """Return the splats without bands that are not worth their bits at a squared error, and the kept bands."""
@@ -402,10 +402,10 @@ class RefittedSubset:
         kept_bands = choose_bands(self._pruning_error, error * self._pruning_error.value_count / max(1, len(model)))
         banded = drop_bands(model, kept_bands)
         if session.options.refit and not kept_bands.all():
-            banded = self._refitted(banded, BAND_STEPS, coefficient_mask(kept_bands))
+            banded = self._refit(banded, BAND_STEPS, coefficient_mask(kept_bands))
         return banded, kept_bands
 
-    def _refitted(self, model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
+    def _refit(self, model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
         """Refit the splats; with `free`, only these SH coefficients beyond the first."""
         session = self.session
         return refit_splats(
@@ -416,9 +416,9 @@ class RefittedSubset:
     def _importance(self, options: EncodeOptions, *, use_classes: bool) -> NDArray[Any] | Importance:
         has_classes = use_classes and max_class_count(len(self.rows), options) > 1
         if has_classes and (self.classifiable or options.max_classes is not None):
-            return self._measured
+            return self._measured_importance
         weights = self._pruning_error.squared_weight
-        return replace(self._measured, blocks=None) if options.shape_codebook_size else weights
+        return replace(self._measured_importance, blocks=None) if options.shape_codebook_size else weights
 
     @cached_property
     def _pruning_error(self) -> PruningError:
@@ -430,7 +430,7 @@ class RefittedSubset:
         )  # fmt: skip
 
     @cached_property
-    def _measured(self) -> Importance:
+    def _measured_importance(self) -> Importance:
         """The importance of the splats, with Gauss–Newton blocks of the other attributes."""
         session, count = self.session, _SENSITIVITY_VIEWS[self.model.sh_degree > 0]
         found = measure_sensitivity(
@@ -444,16 +444,16 @@ def _with_values_of(before: SplatModel, its_rows: I64, start: SplatModel, rows: 
     """Return splats of the source with the values of another refit if it has them; `rows` ascend."""
     _, there, here = np.intersect1d(its_rows, rows, assume_unique=True, return_indices=True)
 
-    def carried(own: NDArray[np.float32], its: NDArray[np.float32]) -> NDArray[np.float32]:
+    def carry(own: NDArray[np.float32], its: NDArray[np.float32]) -> NDArray[np.float32]:
         own = own.copy()
         own[here] = its[there]
         return own
 
     return replace(
         start,
-        quats=carried(start.quats, before.quats),
-        scales=carried(start.scales, before.scales),
-        opacities=carried(start.opacities, before.opacities),
-        sh0=carried(start.sh0, before.sh0),
-        shN=carried(start.shN, before.shN),
+        quats=carry(start.quats, before.quats),
+        scales=carry(start.scales, before.scales),
+        opacities=carry(start.opacities, before.opacities),
+        sh0=carry(start.sh0, before.sh0),
+        shN=carry(start.shN, before.shN),
     )

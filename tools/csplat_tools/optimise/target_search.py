@@ -335,7 +335,7 @@ class TargetSearch:
             if goal.psnr is not None:
                 # The error of dropped bands does not depend on the number of splats.
                 allowed = search.validation_goal(subset)
-                goal_psnr = _subtracted(allowed, error_of_psnr(subset.psnr) - error_of_psnr(subset.fitted_psnr))
+                goal_psnr = _subtract(allowed, error_of_psnr(subset.psnr) - error_of_psnr(subset.fitted_psnr))
                 kept_count, saved = pruner.next_at_psnr(len(subset.rows), subset.fitted_psnr, goal_psnr, slope)
             else:
                 kept_count, saved = pruner.next_at_size(
@@ -431,7 +431,7 @@ def _next_larger(splats: int) -> int:
     return math.ceil(splats / _FEWER)
 
 
-def _subtracted(psnr: float, error: float) -> float:
+def _subtract(psnr: float, error: float) -> float:
     """Return the PSNR of the error that remains after another error is subtracted from that of a PSNR."""
     allowed = error_of_psnr(psnr)
     return psnr_of_mse(max(allowed - max(error, 0.0), _LEAST_REST * allowed))

@@ -120,7 +120,7 @@ def render_folder(
     is_new = not Path(folder).exists()
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
-    with _removed_if_empty(target if is_new else None):
+    with _remove_if_empty(target if is_new else None):
         renders = _renders(model, cameras, background, mode, prepare, progress)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
@@ -193,7 +193,7 @@ def _renders(
 
 
 @contextmanager
-def _removed_if_empty(folder: Path | None) -> Iterator[None]:
+def _remove_if_empty(folder: Path | None) -> Iterator[None]:
     """Remove a new folder if an error occurs while it is empty."""
     try:
         yield

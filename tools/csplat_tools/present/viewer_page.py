@@ -142,10 +142,10 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
         f"<script>{script}</script>\n"
     )
     page = texts[PAGE]
-    page = _replaced(page, _STYLE, f"<style>{style}</style>")
-    page = _replaced(page, _SCRIPT, "")
-    page = _replaced(page, "<title>csplat viewer</title>", f"<title>{html.escape(name)} – csplat viewer</title>")
-    page = _replaced(page, "</body>", f"{body}</body>")
+    page = _replace_once(page, _STYLE, f"<style>{style}</style>")
+    page = _replace_once(page, _SCRIPT, "")
+    page = _replace_once(page, "<title>csplat viewer</title>", f"<title>{html.escape(name)} – csplat viewer</title>")
+    page = _replace_once(page, "</body>", f"{body}</body>")
     page, found = _POLICY.subn(lambda match: match[1] + _policy(style, script) + match[2], page)
     assert found == 1, "the page has one policy"
     data = page.encode("ascii", "xmlcharrefreplace")
@@ -252,6 +252,6 @@ def _policy(style: str, script: str) -> str:
     )
 
 
-def _replaced(text: str, old: str, new: str) -> str:
+def _replace_once(text: str, old: str, new: str) -> str:
     assert text.count(old) == 1, f"the page has {old!r} once"
     return text.replace(old, new)

@@ -136,7 +136,7 @@ def open_viewer_scene(path: str, *, preset: PresetName, progress: Progress | Non
     """
     with local_path(path) as local:
         stem = "scene" if path == STANDARD_STREAM else Path(path).stem or "scene"
-        yield _checked(local, stem) if is_csplat(local) else _encoded(local, stem, preset, progress)
+        yield _check_scene(local, stem) if is_csplat(local) else _encode_scene(local, stem, preset, progress)
 
 
 @contextmanager
@@ -243,7 +243,7 @@ def _join(up: Direction) -> str:
     return ",".join(f"{value:g}" for value in up)
 
 
-def _checked(path: Path, stem: str) -> ViewerScene:
+def _check_scene(path: Path, stem: str) -> ViewerScene:
     with mapped_csplat(str(path)) as data:
         header, size = read_header(data), len(data)
     if size != header.file_size:
@@ -265,7 +265,7 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
         return None  # the page shows the intact part, and reports the error
 
 
-def _encoded(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewerScene:
+def _encode_scene(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewerScene:
     source = read_source(str(path), progress=progress)
     data = encode_with_report(source.model, EncodeOptions(preset=preset), progress=progress).data
     header, up = read_header(data), estimate_up(source.model)
@@ -355,7 +355,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 
 def _file(path: Path, ending: str = "") -> _Resource:
-    def opened() -> tuple[BinaryIO, int]:
+    def open_file() -> tuple[BinaryIO, int]:
         stream = path.open("rb")
         return stream, os.fstat(stream.fileno()).st_size
 
@@ -363,7 +363,7 @@ def _file(path: Path, ending: str = "") -> _Resource:
         status = os.fstat(stream.fileno())
         return f'"{status.st_size:x}-{status.st_mtime_ns:x}-{status.st_ino:x}"'
 
-    return _Resource(opened, _TYPES[ending or path.suffix], tag)
+    return _Resource(open_file, _TYPES[ending or path.suffix], tag)
 
 
 def _bytes(data: bytes, ending: str) -> _Resource:

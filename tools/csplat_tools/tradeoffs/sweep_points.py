@@ -314,9 +314,9 @@ class Measurer:
         made = point.make(clock.listening(progress))
         encode_seconds = time.perf_counter() - start
         setting, header = self._setting, read_header(made.data)
-        decoded, decode_seconds = self._decoded(made.data, None)
+        decoded, decode_seconds = self._decode(made.data, None)
         hardest = HardestPlaceSearch()
-        quality, image_scores = self._compared(decoded, hardest)
+        quality, image_scores = self._compare(decoded, hardest)
         if self._shown_scorer is not None:
             self._shown_scorer.scores(decoded, ssim=False, on_view=hardest.examine)
         modes: dict[str, ModeTime] = {mode: self._mode_time(decoded, mode) for mode in self._modes}
@@ -347,8 +347,8 @@ class Measurer:
         return [self._part(made.data, header, degree) for degree in range(header.sh_degree + 1)]
 
     def _part(self, data: bytes, header: SceneHeader, degree: int) -> PartialFetch:
-        decoded, seconds = self._decoded(data, degree)
-        quality, _ = self._compared(decoded, None)
+        decoded, seconds = self._decode(data, degree)
+        quality, _ = self._compare(decoded, None)
         return PartialFetch(
             sh_degree=degree,
             size_bytes=fetched_bytes(header, degree),
@@ -357,7 +357,7 @@ class Measurer:
             render_milliseconds=self._mode_time(decoded, "standard").milliseconds,
         )
 
-    def _decoded(self, data: bytes, sh_degree: int | None) -> tuple[SplatModel, float]:
+    def _decode(self, data: bytes, sh_degree: int | None) -> tuple[SplatModel, float]:
         """Decode the file, and return the scene and the median time in seconds; the first run is included."""
         seconds, models = [], list[SplatModel]()
         for _ in range(DECODE_RUNS):
@@ -366,7 +366,7 @@ class Measurer:
             seconds.append(time.perf_counter() - start)
         return models[0], statistics.median(seconds)
 
-    def _compared(self, decoded: SplatModel, hardest: HardestPlaceSearch | None) -> tuple[Scores, Scores | None]:
+    def _compare(self, decoded: SplatModel, hardest: HardestPlaceSearch | None) -> tuple[Scores, Scores | None]:
         """Score against the source's renders; with a `HardestPlaceSearch`, also by LPIPS and against images."""
         distance = None if hardest is None else self._setting.distance
         each = list[ViewScore]()

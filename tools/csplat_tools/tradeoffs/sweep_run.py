@@ -185,7 +185,7 @@ def tradeoff(
         points = list[SweepPoint | SweepFailure]()
         for number, candidate in enumerate(tried):
             report("the sweep", sum(costs[:number]) / sum(costs))
-            points.append(_measured(measurer, candidate, lambda _stage, done: report("this file", done)))
+            points.append(_measure(measurer, candidate, lambda _stage, done: report("this file", done)))
             show(_line(points[-1], number + 1, len(tried)))
     first = points[0]
     if isinstance(first, SweepFailure) and all(isinstance(one, SweepFailure) for one in points):
@@ -202,7 +202,7 @@ def estimated_seconds(kind: str, setting: SweepSetting, sweep: SweepOptions, mod
     return each + by_splats * len(setting.source) / 1e6 + by_renders * steps * 8.0 * milliseconds / 1000.0
 
 
-def _measured(measurer: Measurer, candidate: PlannedPoint, progress: Progress) -> SweepPoint | SweepFailure:
+def _measure(measurer: Measurer, candidate: PlannedPoint, progress: Progress) -> SweepPoint | SweepFailure:
     try:
         return measurer.measure(candidate, progress)
     except CsplatError as error:
@@ -228,8 +228,8 @@ def plan_points(setting: SweepSetting, sweep: SweepOptions) -> list[PlannedPoint
         "precision": _precisions,
         "strategies": _strategies,
         "targets": _targets,
-        "simplify": _simplified,
-        "finetune": _tuned,
+        "simplify": _plan_simplified,
+        "finetune": _plan_tuned,
     }
     return [one for family, list_of in makers.items() if family in sweep.what for one in list_of(setting, sweep)]
 
@@ -288,13 +288,13 @@ def _target(
     return PlannedPoint(name, "targets", command, partial(_reach, setting, sweep, psnr=psnr, size=size))
 
 
-def _simplified(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
+def _plan_simplified(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
     for keep in sweep.keep:
         command = target_command(setting, f"keep {keep:g}", sweep.preset, keep=keep)
         yield PlannedPoint(f"keep {keep:g}", "simplify", command, partial(_reach, setting, sweep, keep=keep))
 
 
-def _tuned(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
+def _plan_tuned(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
     one_keep = sweep.keep[len(sweep.keep) // 2 :][:1]  # only the middle one: each takes minutes
     for keep in (None, *one_keep):
         name = "tuned" if keep is None else f"tuned, keep {keep:g}"

@@ -62,7 +62,7 @@ def run_training(
         InputError: a package is missing, or the data set is invalid or does not fit the options.
         OSError: a file cannot be read or written.
     """
-    result = _trained(data, options, files, plot=plot, threads=threads, quiet=quiet)
+    result = _train(data, options, files, plot=plot, threads=threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
@@ -109,9 +109,9 @@ def run_training_to_file(
         OSError: a file cannot be read or written.
     """
     tuning_files = _tuning_outputs(files, options)
-    for one in _loaded(data).val:  # training does not read these; finds damaged ones before it
+    for one in _load(data).val:  # training does not read these; finds damaged ones before it
         _ = one.pixels, one.mask
-    result = _trained(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
+    result = _train(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply(result.model)
     views = find_view_set(model, data=data, validation_count=default_validation_count(0, cameras=None, data=data))
     known = None
@@ -160,12 +160,12 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
     return replace(outputs, resume=checkpoint) if is_same and has_ended else outputs
 
 
-def _trained(
+def _train(
     data: DataOptions, options: TrainOptions, files: Outputs, *, plot: str | None, threads: int | None, quiet: bool
 ) -> TrainResult:
     """Read the data set, train, plot the loss, and print a summary."""
     _check_inputs(options, files)
-    data_set = _loaded(data)
+    data_set = _load(data)
     for line in () if quiet else data_set.report:
         note(line)
     data_set.read()  # before kernels are compiled, to find damaged images early
@@ -181,7 +181,7 @@ def _trained(
     return result
 
 
-def _loaded(data: DataOptions) -> DataSet:
+def _load(data: DataOptions) -> DataSet:
     every = 8 if data.test_every is None else data.test_every
     return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
 

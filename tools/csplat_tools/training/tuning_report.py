@@ -337,15 +337,15 @@ def _tuning_plot(file: Mapping[str, Any] | None) -> str:
 def _options(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) -> dict[str, str]:
     words = {}
     if training is not None:
-        words["training"] = _joined(training["options"])
+        words["training"] = _join(training["options"])
     if file is not None:
-        words |= {"encoding": _joined(file["encoding"]), "tuning": _joined(file["log"]["options"])}
-        words["seconds"] = _joined(file["seconds"])
+        words |= {"encoding": _join(file["encoding"]), "tuning": _join(file["log"]["options"])}
+        words["seconds"] = _join(file["seconds"])
     memory = (file["log"] if file else training or {}).get("peak_memory_bytes")
     if memory is not None:
         words["peak memory"] = format_bytes(memory)
     return words
 
 
-def _joined(options: Mapping[str, Any]) -> str:
+def _join(options: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {value}" for name, value in options.items() if isinstance(value, str | int | float))

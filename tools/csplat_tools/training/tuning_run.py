@@ -471,7 +471,7 @@ def choose_splats(
     model, pruning = source.select(rows), {"unseen": len(source) - len(rows)}
     if keep is not None:
         simplify_views = with_validation_views(replace(views, training=measuring, test=()))
-        model, kept = _pruned(model, simplify_views, keep * len(source) / len(rows), threads, progress)
+        model, kept = _prune(model, simplify_views, keep * len(source) / len(rows), threads, progress)
         rows, pruning = rows[kept], {**pruning, "simplified_from": len(rows)}
     if given is not None:
         return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], pruning)
@@ -491,7 +491,7 @@ def _read_importance(importance: str | None, source: SplatModel) -> NDArray[Any]
     return given
 
 
-def _pruned(
+def _prune(
     model: SplatModel, views: ViewSet, keep: float, threads: int | None, progress: Progress | None
 ) -> tuple[SplatModel, I64]:
     """Return a fraction of the splats, refitted, and their indices."""

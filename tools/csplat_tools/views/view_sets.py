@@ -381,7 +381,7 @@ def _views_of_data(
     found = load(options.path, options.size, images=options.images, test_every=every, near=options.near)
     shift = np.subtract(source.origin, found.origin)
     parts = (found.train, found.test, evenly_spaced(found.val, _VALIDATION_MAX))
-    train, test, val = (_shifted(part, shift) for part in parts)
+    train, test, val = (_shift(part, shift) for part in parts)
     colour, more = _choose_background(background, record, images=True)
     if split == "train":
         train, test, val = [], train, []
@@ -435,7 +435,7 @@ def _colour_name(colour: Colour) -> str:
     return {BLACK: "black", WHITE: "white"}.get(colour) or ",".join(f"{value:g}" for value in colour)
 
 
-def _shifted(images: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
+def _shift(images: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
     return [replace(one, camera=relative_to(shift, one.camera)) for one in images]
 
 

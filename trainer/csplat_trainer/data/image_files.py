@@ -169,7 +169,7 @@ def match_names(
             break
         loose: dict[str, str] = {}
         for listed_key, known_key in rules:
-            found = _matched(left, free, listed_key, known_key, where)
+            found = _match(left, free, listed_key, known_key, where)
             for name, to in found.items():
                 del left[name], free[to]
             matched |= found
@@ -184,24 +184,24 @@ def match_names(
 def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
     """Yield the rules in order: a description, and functions that map matching listed and known names to equal keys."""
 
-    def decoded(name: str) -> str:
+    def decode(name: str) -> str:
         return normalise_name(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
 
-    def folded(name: str) -> str:
-        return unicodedata.normalize("NFC", decoded(name)).casefold()
+    def fold(name: str) -> str:
+        return unicodedata.normalize("NFC", decode(name)).casefold()
 
-    def unended(name: str) -> str:
-        path = PurePosixPath(decoded(name))
+    def strip_ending(name: str) -> str:
+        path = PurePosixPath(decode(name))
         return str(path.with_suffix("") if path.suffix.lower() in IMAGE_ENDINGS else path)
 
     def parts(name: str) -> list[str]:
-        return decoded(name).strip("/").split("/")
+        return decode(name).strip("/").split("/")
 
     def in_any_case(listed: _Key, known: _Key) -> list[tuple[_Key, _Key]]:
         """Compare names in any case; then with any ending, too."""
         return [
-            (lambda name: folded(listed(name)), lambda name: folded(known(name))),
-            (lambda name: folded(unended(listed(name))), lambda name: folded(unended(known(name)))),
+            (lambda name: fold(listed(name)), lambda name: fold(known(name))),
+            (lambda name: fold(strip_ending(listed(name))), lambda name: fold(strip_ending(known(name)))),
         ]
 
     def without_first(count: int) -> _Key:
@@ -212,9 +212,9 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
 
     yield "", [(_as_written, _as_written)]
     yield "with / for \\, without surrounding spaces", [(normalise_name, normalise_name)]
-    yield "as a URL", [(decoded, normalise_name)]
-    yield "in another case", [(folded, folded)]
-    yield "with another ending", [(unended, unended), (lambda name: folded(unended(name)),) * 2]
+    yield "as a URL", [(decode, normalise_name)]
+    yield "in another case", [(fold, fold)]
+    yield "with another ending", [(strip_ending, strip_ending), (lambda name: fold(strip_ending(name)),) * 2]
     if not folders:
         return
     depths = {len(parts(name)) for name in names}
@@ -228,7 +228,7 @@ def _as_written(name: str) -> str:
     return PurePosixPath(name).as_posix()
 
 
-def _matched(
+def _match(
     names: Iterable[str],
     known: Iterable[str],
     listed_key: _Key,

@@ -92,7 +92,7 @@ def read_transforms(path: Path, test_every: int, images: str | None = None) -> U
     if "test_frames" in document:  # ScanNet++
         test = _shots(document, path, images, report, key="test_frames", needed=False)
         return UnreadDataSet("transforms.json set", shots, test, points, colours, report)
-    lists = {role: names for role in ROLES if (names := _listed(document, f"{role}_filenames", path))}
+    lists = {role: names for role in ROLES if (names := _read_list(document, f"{role}_filenames", path))}
     files = path.name
     if not lists:
         lists, files = read_split_lists((path.parent,))
@@ -284,7 +284,7 @@ def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> t
     return read_point_cloud(cloud)
 
 
-def _listed(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
+def _read_list(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
     names = document.get(key)
     if names is None:
         return []

@@ -115,7 +115,7 @@ def finetune(
     if isinstance(views, DataSet):
         views = _views_of(views, model)
     if importance is None:
-        importance = _measured(model, views, encoding, progress)
+        importance = _measure(model, views, encoding, progress)
     with timer.stage("encoding"):
         draft = EncodePlan.of(
             model, encoding, importance=importance, origin=origin, allow_classes=False, progress=progress
@@ -161,7 +161,7 @@ def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
     return split_views(training, np.array(background, np.float32))
 
 
-def _measured(
+def _measure(
     model: SplatModel, views: TuningViews, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
 ) -> Importance:
     """Measure the importance of each splat in the training views."""

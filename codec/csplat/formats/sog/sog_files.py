@@ -41,7 +41,7 @@ class _ZipDirectory:
     def __init__(self, path: Path, title: str) -> None:
         self._path, self._title = path, title
         self._archive: zipfile.ZipFile | None = None
-        with self._opened() as archive:
+        with self._open_archive() as archive:
             self.members = archive.infolist()
         self._named: list[dict[str, list[zipfile.ZipInfo]]] = []
         for key in _NAME_KEYS:
@@ -53,7 +53,7 @@ class _ZipDirectory:
     @contextmanager
     def kept_open(self) -> Iterator[None]:
         """Keep the archive open until the context ends; otherwise each `read` opens it."""
-        with self._opened() as archive:
+        with self._open_archive() as archive:
             self._archive = archive
             try:
                 yield
@@ -74,7 +74,7 @@ class _ZipDirectory:
         with zipfile.ZipFile(self._path) as archive:
             return archive.read(info)
 
-    def _opened(self) -> zipfile.ZipFile:
+    def _open_archive(self) -> zipfile.ZipFile:
         try:
             return zipfile.ZipFile(self._path)
         except DAMAGED as error:
@@ -138,7 +138,7 @@ class SogParts:
             OSError: it cannot be read.
         """
         if self.folder is not None:
-            data = self._unzipped(str(self.folder / self._inside(name)), most)
+            data = self._unzip(str(self.folder / self._inside(name)), most)
         else:
             with self.file(name).open("rb") as stream:
                 data = stream.read(most + 1)
@@ -161,7 +161,7 @@ class SogParts:
             self.refuse(f"the part {name[:80]!r} would be outside of it")
         return path
 
-    def _unzipped(self, name: str, most: int) -> bytes:
+    def _unzip(self, name: str, most: int) -> bytes:
         assert self.zip is not None, "`folder` is only set within a zip"
         found = self.zip.find(name)
         if not found:

@@ -125,7 +125,7 @@ def _firefox(_: str) -> Iterator[Drive]:
             f'user_pref("marionette.port", {port});\nuser_pref("webgl.force-enabled", true);\n', encoding="utf-8"
         )
         words = ["firefox-esr", "--marionette", "--no-remote", "--profile", profile]
-        with _started(words), _connected(port) as wire, wire.makefile("rb") as answers:
+        with _start(words), _connect(port) as wire, wire.makefile("rb") as answers:
 
             def answer() -> Any:
                 length = b"".join(iter(lambda: answers.read(1), b":"))
@@ -168,8 +168,8 @@ def _webkit(_: str) -> Iterator[Drive]:
 
     options = {"binary": str(browsers[-1]), "args": ["--automation"]}
     # As root there is no sandbox; only our own pages are opened.
-    with _started(["WebKitWebDriver", f"--port={port}"], WEBKIT_DISABLE_SANDBOX_THIS_IS_DANGEROUS="1"):
-        with _connected(port):
+    with _start(["WebKitWebDriver", f"--port={port}"], WEBKIT_DISABLE_SANDBOX_THIS_IS_DANGEROUS="1"):
+        with _connect(port):
             pass
         session = call("", capabilities={"alwaysMatch": {"webkitgtk:browserOptions": options}})
         at = f"/{session['sessionId']}"
@@ -187,7 +187,7 @@ _BROWSERS: dict[str, Callable[[str], AbstractContextManager[Drive]]] = {
 
 
 @contextmanager
-def _started(words: list[str], **environment: str) -> Iterator[None]:
+def _start(words: list[str], **environment: str) -> Iterator[None]:
     """Run a program on a virtual screen; end it and its children."""
     for program in (_SCREEN[0], words[0]):
         if shutil.which(program) is None:
@@ -203,7 +203,7 @@ def _started(words: list[str], **environment: str) -> Iterator[None]:
         process.wait()
 
 
-def _connected(port: int) -> socket.socket:
+def _connect(port: int) -> socket.socket:
     """Connect to a program as soon as it listens."""
     end = time.monotonic() + 60.0
     while True:

@@ -61,7 +61,7 @@ def measure_data_set(setup: Setup, key: str, _: Sequence[Case]) -> Iterator[Meas
         raise InputError(f"{folder.path} holds out no images to score by")
     lpips = None if setup.lpips is None else load_lpips(None if setup.lpips == "auto" else setup.lpips)
     ply = setup.work / "data_sets" / f"{key}.ply"
-    training = _trained(ply, data, TrainOptions(**setup.options.get("train", {})))
+    training = _train(ply, data, TrainOptions(**setup.options.get("train", {})))
     source, scorer = read_ply(ply), image_scorer(data.test, data.background, origin=(0.0, 0.0, 0.0))
     camera = data.test[0].camera
     pixels = (camera.W, camera.H)
@@ -83,7 +83,7 @@ def measure_data_set(setup: Setup, key: str, _: Sequence[Case]) -> Iterator[Meas
     yield measure
 
 
-def _trained(ply: Path, data: DataSet, options: TrainOptions) -> dict[str, Any]:
+def _train(ply: Path, data: DataSet, options: TrainOptions) -> dict[str, Any]:
     """Train a scene unless its PLY exists; return its options and seconds, empty if another trainer made it."""
     record = ply.with_suffix(".training.json")
     if ply.exists():

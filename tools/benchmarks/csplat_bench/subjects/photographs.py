@@ -136,7 +136,7 @@ def _finish(data_set: _Set, case: Case, file: Path) -> dict[str, Any]:
     size = None if "target_size" not in case.settings else parse_size_bytes(case["target_size"])
     start = time.perf_counter()
     report = alone(finish_training, data_set.options, str(training), str(file), dict(case.settings), size)
-    return {"by": "train", **_described(report["file"], time.perf_counter() - start, file)}
+    return {"by": "train", **_describe(report["file"], time.perf_counter() - start, file)}
 
 
 def finish_training(
@@ -169,10 +169,10 @@ def _by_command(setup: Setup, data_set: _Set, case: Case, file: Path) -> dict[st
     ply = data_set.path_of(case["of"], ".ply")
     words = [argument.format(ply=ply, file=file, data=data_set.path) for argument in shlex.split(case["command"])]
     used = run_program([*setup.csplat, *words, "--force", "--quiet", "--json"])
-    return {"by": words[0], **_described(json.loads(used.stdout), used.wall, file)}
+    return {"by": words[0], **_describe(json.loads(used.stdout), used.wall, file)}
 
 
-def _described(report: Mapping[str, Any], seconds: float, file: Path) -> dict[str, Any]:
+def _describe(report: Mapping[str, Any], seconds: float, file: Path) -> dict[str, Any]:
     """Return fields of a file's row; `seconds` leaves out the time of scoring."""
     stages = report.get("seconds") if isinstance(report.get("seconds"), dict) else {}
     return {

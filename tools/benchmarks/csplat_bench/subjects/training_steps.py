@@ -86,7 +86,7 @@ def _walk(
     """Train for some steps; return the seconds of each stage, the mean squared errors, and the engine."""
     spent: dict[str, float] = {}
 
-    def clocked(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+    def clock(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
         def run(*args: Any, **keywords: Any) -> Any:
             start = time.perf_counter()
             result = call(*args, **keywords)
@@ -98,17 +98,17 @@ def _walk(
     engine, rng, extent = CpuEngine(parameters, options), np.random.default_rng(1), measure_extent(images).extent
     rasteriser, loss_for = engine._rasteriser, engine._loss_for  # noqa: SLF001  # its stages are timed
 
-    def clocked_loss(camera: Any) -> Any:
+    def clock_loss(camera: Any) -> Any:
         loss, *others = loss_for(camera)
-        return clocked("loss", loss), *others
+        return clock("loss", loss), *others
 
     times: dict[str, list[float]] = {name: [] for name in ("step", "step_cpu", *_STAGES)}
     errors, background = [], np.ones(3, np.float32)
     with (
-        patch.object(rasteriser, "forward", clocked("forward", rasteriser.forward)),
-        patch.object(rasteriser, "backward", clocked("backward", rasteriser.backward)),
-        patch("csplat_trainer.engine.adam_step", clocked("adam", adam_step)),
-        patch.object(engine, "_loss_for", clocked_loss),
+        patch.object(rasteriser, "forward", clock("forward", rasteriser.forward)),
+        patch.object(rasteriser, "backward", clock("backward", rasteriser.backward)),
+        patch("csplat_trainer.engine.adam_step", clock("adam", adam_step)),
+        patch.object(engine, "_loss_for", clock_loss),
     ):
         for step in range(steps):
             spent.clear()

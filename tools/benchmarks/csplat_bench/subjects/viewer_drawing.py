@@ -74,7 +74,7 @@ def measure_drawing(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Meas
 def draw(page: Any, path: Path) -> dict[str, Any]:
     """Open a file in the engine, and draw it from all views."""
     cameras = virtual_cameras(decode(path.read_bytes()), _VIEWS, _WIDTH, _HEIGHT)
-    with _opened(page, path, _pinhole(cameras[0], _SORT_ZOOM)) as opened:
+    with _open_viewer(page, path, _pinhole(cameras[0], _SORT_ZOOM)) as opened:
         sorts, frames = [], list[float]()
         for camera in cameras:
             page.evaluate(_LOOK, _pinhole(camera, _SORT_ZOOM))
@@ -89,7 +89,7 @@ def draw(page: Any, path: Path) -> dict[str, Any]:
 
 
 @contextmanager
-def _opened(page: Any, path: Path, view: list[Any]) -> Iterator[Any]:
+def _open_viewer(page: Any, path: Path, view: list[Any]) -> Iterator[Any]:
     """Serve a file as `csplat view` does, and open it; yield the engine's report."""
     with open_viewer_scene(str(path), preset="balanced") as scene, open_server(scene) as server:
         thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
