@@ -204,7 +204,7 @@ def test_options_are_refused_before_any_work(scenes, tmp_path):
     assert "--report is not for all" in refused("encode", "--report", "a.json")
     assert "--ending" in refused("convert")
     assert "IN and OUT" in refused("info")
-    assert "no command" in refused("nonsense")
+    assert "not a command" in refused("nonsense")
     assert "--help" in refused("encode", "--help")
     assert not (tmp_path / "out").exists()
     line = refused("encode", "--target-psnr", "40", "--target-size", "1MB")  # the first scene finds it out

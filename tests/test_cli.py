@@ -614,7 +614,7 @@ def test_info_accounts_for_every_byte_and_prints_text(csplat_file):
     text = call("info", csplat_file)
     assert "splats       200, SH degree 2" in text
     assert "bits/splat" in text
-    assert "stated error" in text
+    assert "declared error" in text
 
 
 def test_info_refuses_every_prefix(tmp_path, csplat_file):
@@ -658,19 +658,19 @@ def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
     assert f"at byte {at}, index.scene_flags: bits 0x08 are reserved" in lines[2]
     assert result.stderr.splitlines() == [
         f"error: {csplat_file}: 4 violations of HDR-3, IDX-1, RES-1; copy or make it again (E_CRC, E_RESERVED)",
-        "error: the stated errors were not looked at",
+        "error: the declared errors were not checked",
     ]
     assert invoke("verify", csplat_file, "--quiet").stdout == ""
 
 
-def test_verify_proves_the_stated_errors(tmp_path, ply, csplat_file):
+def test_verify_proves_the_declared_errors(tmp_path, ply, csplat_file):
     with_index = ("--source", ply, "--source-index", tmp_path / "index.npy")
-    assert "the stated errors hold" in call("verify", csplat_file, *with_index)
+    assert "the declared errors hold" in call("verify", csplat_file, *with_index)
     report = json.loads(call("verify", csplat_file, *with_index, "--json"))
     assert report["proof"]["rms_and_counts_proved"]
     assert all(one["holds"] for one in report["proof"]["measures"].values())
     text = call("verify", csplat_file, "--source", ply)
-    assert "the stated maxima hold" in text
+    assert "the declared maxima hold" in text
     assert "rms and counts are not proved" in text
 
 

@@ -249,8 +249,8 @@ def test_a_packed_scene_is_unpacked_once(tmp_path, make_model, monkeypatch):
         return read(*words, any_degree=any_degree)
 
     monkeypatch.setattr(spz, "read_spz_file", counting)
-    scale = OutOfCoreOptions(out_of_core=True)
-    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), scale=scale)
+    limits = OutOfCoreOptions(always=True)
+    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), out_of_core=limits)
     assert 1 == len(unpacked)
     with open_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
         assert 50 == one.count

@@ -313,15 +313,16 @@ def ply(model, tmp_path):
 
 
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
-    target, scale = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, out_of_core=True)
+    target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
-    foretold = estimate_cost(ply, options, scale)
+    foretold = estimate_cost(ply, options, limits)
     assert (COUNT, 1, False) == (foretold.count, foretold.sh_degree, foretold.needs.in_memory)
     assert 0 < foretold.needs.memory_bytes <= 300e6
     stages = []
-    encoded = encode_out_of_core(
-        ply, str(target), options, None, scale, strict=False, progress=lambda stage, _done: stages.append(stage)
-    )
+    with open_scene(ply, sh_degree=3) as scene:
+        encoded = encode_out_of_core(
+            scene, ply, str(target), options, limits, progress=lambda stage, _done: stages.append(stage)
+        )
     assert {"sorting", "coding"} <= set(stages)
     assert encoded.report.size_bytes == target.stat().st_size
     with open_scene(ply) as scene:
@@ -331,8 +332,9 @@ def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
 def test_the_command_passes_out_of_core_options(ply, tmp_path, monkeypatch):
     target, asked = tmp_path / "out.csplat", []
 
-    def encode_here(_local, _target, _options, _facts, scale, **_):
-        asked.append(scale)
+    def encode_here(reader, local, target, options, limits, **others):
+        asked.append(limits)
+        return encode_out_of_core(reader, local, target, options, limits, **others)
 
     monkeypatch.setattr("csplat_tools.encode_file.encode_out_of_core", encode_here)
     run = CliRunner().invoke

@@ -19,7 +19,7 @@ from command_line import call, change_views, invoke
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.reference_rasteriser import Decisions, render_exact
 from csplat_render.scene_frame import scene_frame
-from csplat_tools.encode_file import encode_file
+from csplat_tools.encode_file import OutOfCoreOptions, encode_file
 from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
@@ -399,6 +399,20 @@ def test_invalid_options_are_refused(tmp_path, sample_path, camera_file):
     done = invoke("encode", sample_path, tmp_path / "o.csplat", "--importance", tmp_path / "w.npy", "-q")
     assert 1 == done.exit_code
     assert 1 == len(done.stderr.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"prune_unseen": True}, "requires a file of `csplat sensitivity`"),
+        ({"prune_unseen": True, "out_of_core": OutOfCoreOptions(always=True)}, "requires a file of"),
+        ({"importance": "w.npy", "encoder": print}, "an encoder and an importance"),
+        ({"importance": "w.npy", "out_of_core": OutOfCoreOptions(resume=True)}, "larger than memory"),
+    ],
+)
+def test_contradictory_arguments_are_refused_before_the_scene_is_read(tmp_path, arguments, message):
+    with pytest.raises(InputError, match=message):
+        encode_file(str(tmp_path / "missing.ply"), str(tmp_path / "out.csplat"), EncodeOptions(), **arguments)
 
 
 def test_cameras_without_splats_in_view_are_refused(tmp_path, camera_file):

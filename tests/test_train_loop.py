@@ -352,7 +352,7 @@ def test_the_command_trains_to_a_file(file_runs):
     assert 30 == len(report["training"]["losses"])
     assert (len(model), len(data)) == (report["file"]["splats"], report["file"]["size_bytes"])
     assert {"source", "before tuning", "file"} == set(report["file"]["scores"])
-    assert "held-out photographs" in file_runs.messages
+    assert "held-out images" in file_runs.messages
     assert (1.0, 1.0, 1.0) == TrainingRecord.of(model.metadata).background
     assert (file_runs.folder / "run.tuning.npz").exists()
 

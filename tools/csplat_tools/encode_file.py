@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from csplat.lint import Finding, refuse
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.out_of_core import ResourceNeeds, encode_scene, estimate_needs
 from csplat.ply.column_names import dropped_columns
+from csplat.scene_source import SceneSource
 from csplat.system import default_memory_bytes
 from csplat.types import Progress
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
@@ -48,31 +49,22 @@ class OutOfCoreOptions:
         folder: working folder; `None`: next to the file.
         resume: continue from the content of the working folder.
         cluster: address of a Dask scheduler.
-        out_of_core: encode scenes of several buckets out of core, even if they fit in memory.
+        always: encode scenes of several buckets out of core, even if they fit in memory.
     """
 
     memory_bytes: int | None = None
     folder: str | None = None
     resume: bool = False
     cluster: str | None = None
-    out_of_core: bool = False
+    always: bool = False
 
     def may_exceed_memory(self, path: Path) -> bool:
         """Return True if a scene may not fit in memory, which can only be decided after opening it."""
-        if self.cluster is not None or self.resume or self.out_of_core:
+        if self.cluster is not None or self.resume or self.always:
             return True
         bound = default_memory_bytes() if self.memory_bytes is None else self.memory_bytes
         size = size_on_disk(path)
         return size > _SMALL and (detect_format(path).name != "ply" or size * _MEMORY_FACTOR > bound)
-
-
-@dataclass(frozen=True)
-class OutOfCoreResult:
-    """The outcome of encoding a scene out of core."""
-
-    metadata: SplatModel
-    report: EncodeReport
-    findings: tuple[Finding, ...]
 
 
 def read_degree(options: EncodeOptions) -> int | None:
@@ -82,65 +74,6 @@ def read_degree(options: EncodeOptions) -> int | None:
     models support can be read only if bands are dropped.
     """
     return None if options.sh_degree is None else MAX_SH_DEGREE
-
-
-def encode_out_of_core(
-    local: Path,
-    target: str,
-    options: EncodeOptions,
-    overrides: MetadataOverrides | None,
-    scale: OutOfCoreOptions,
-    *,
-    strict: bool,
-    progress: Progress | None,
-) -> OutOfCoreResult | LoadedModel | None:
-    """Encode a scene out of core, or return it if it fits in memory.
-
-    Args:
-        local: the scene, in any format.
-        target: the file to write.
-        options, overrides, scale, strict, progress: as for `encode_file`.
-
-    Returns:
-        The outcome of the encoding. If the scene fits in memory: the loaded scene, or `None` if `read_source` reads it
-        faster.
-
-    Raises:
-        CsplatError: as for `encode_scene`; or a scene larger than memory is to be written to standard output.
-        OSError: as for `encode_scene`.
-    """
-    if progress is not None:
-        progress("opening", 0.0)
-    with open_scene(local, sh_degree=read_degree(options)) as reader:
-        in_memory = estimate_needs(reader, options, scale.memory_bytes, by_disk=scale.out_of_core).in_memory
-        if in_memory and scale.cluster is None and not scale.resume:
-            if reader.format in CHEAP_TO_REOPEN:
-                return None
-            findings: list[Finding] = []
-            if progress is not None:
-                progress("reading", 0.0)
-            model = read_all(reader, strict=strict, keep_extra=options.keep_extra, report=findings)
-            model = (overrides or MetadataOverrides()).apply(model)
-            return LoadedModel(model, size_on_disk(local), name=local.name, findings=tuple(findings))
-        if target == STANDARD_STREAM:
-            raise InputError("the scene does not fit in memory, and cannot be written to standard output: name a file")
-        findings = [*reader.findings]
-        if reader.metadata_model.extra and not options.keep_extra:
-            findings.append(dropped_columns(list(reader.metadata_model.extra)))
-        refuse(findings, strict=strict)
-        scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
-        try:
-            report = encode_scene(
-                scene, target, options, memory_bytes=scale.memory_bytes, by_disk=scale.out_of_core, folder=scale.folder,
-                resume=scale.resume, cluster=scale.cluster, progress=progress,
-                source={"name": local.name, "size": size_on_disk(local), "changed": local.stat().st_mtime_ns},
-            )  # fmt: skip
-        except (KeyboardInterrupt, OSError):
-            folder = Path(scale.folder or f"{target}.work")
-            if folder.exists():
-                note(f"{folder} holds the finished part: --resume continues from it")
-            raise
-        return OutOfCoreResult(scene.metadata_model, report, tuple(findings))
 
 
 @dataclass(frozen=True)
@@ -174,7 +107,7 @@ class CostEstimate:
         }
 
 
-def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) -> CostEstimate:
+def estimate_cost(local: Path, options: EncodeOptions, limits: OutOfCoreOptions) -> CostEstimate:
     """Estimate the cost of encoding a scene, without reading its splats.
 
     Raises:
@@ -182,7 +115,7 @@ def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) 
         OSError: the scene cannot be read.
     """
     with open_scene(local, sh_degree=read_degree(options)) as reader:
-        needs = estimate_needs(reader, options, scale.memory_bytes, by_disk=scale.out_of_core)
+        needs = estimate_needs(reader, options, limits.memory_bytes, by_disk=limits.always)
         count = reader.count
         degree = (
             reader.metadata_model.sh_degree
@@ -197,18 +130,16 @@ def estimate_cost(local: Path, options: EncodeOptions, scale: OutOfCoreOptions) 
 
 @dataclass(frozen=True)
 class EncoderOutcome:
-    """An encoded file, with the report of the search that made it, if any.
+    """The result of an encoder, with the report of the search that chose it, if any.
 
     Attributes:
         result: the encoder's result.
-        key: key of `report` in the JSON of the command; "": none.
-        report: the target, the candidates and the choice, JSON-compatible.
+        search_report: the target, the candidates and the choice, JSON-compatible; empty without a search.
         lines: remarks for the user, a sentence each.
     """
 
     result: EncodeResult
-    key: str = ""
-    report: Mapping[str, Any] = field(default_factory=dict)
+    search_report: Mapping[str, Any] = field(default_factory=dict)
     lines: tuple[str, ...] = ()
 
 
@@ -217,12 +148,12 @@ EncodeFunction = Callable[[SplatModel, EncodeOptions, Progress | None], EncoderO
 
 @dataclass(frozen=True)
 class EncodedFile:
-    """The outcome of an encoding.
+    """A written file, with its source and reports.
 
     Attributes:
         source: the encoded scene; only its metadata if it was encoded out of core.
         report: choices and errors.
-        outcome: the encoded file; `None` if it was encoded out of core.
+        outcome: the encoder's outcome; `None` if the scene was encoded out of core.
         findings: lint findings in the source.
         source_bytes: size of the source.
         seconds: time of reading, encoding and writing.
@@ -235,9 +166,14 @@ class EncodedFile:
     source_bytes: int
     seconds: float
 
+    @property
+    def search_report(self) -> Mapping[str, Any]:
+        """The report of the target search; empty without a search."""
+        return {} if self.outcome is None else self.outcome.search_report
+
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
-        report, outcome = self.report, self.outcome
+        report = self.report
         count = report.splat_count
         return {
             "splats": count,
@@ -251,7 +187,7 @@ class EncodedFile:
             "notes": list(report.notes),
             "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
             "options": report.options,
-            **({outcome.key: dict(outcome.report)} if outcome is not None and outcome.key else {}),
+            **({"target": dict(self.search_report)} if self.search_report else {}),
         }
 
 
@@ -266,10 +202,12 @@ def encode_file(
     prune_unseen: bool = False,
     source_index: str | None = None,
     encoder: EncodeFunction | None = None,
-    scale: OutOfCoreOptions | None = None,
+    out_of_core: OutOfCoreOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodedFile:
     """Read a scene file, encode it, and write the .csplat file.
+
+    `encoder`, `importance` and `source_index` require the scene in memory, and exclude `out_of_core`.
 
     Args:
         source: a scene in any format, or `-`.
@@ -278,26 +216,39 @@ def encode_file(
         overrides: overrides of the scene's metadata.
         strict: refuse defects that would be repaired.
         importance: a .npy file with one weight per splat of the source, or a file of `csplat sensitivity`.
-        prune_unseen: prune the splats that no view of the sensitivities saw.
+        prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
-        encoder: called instead of the encoder, such as a target search; `importance` is ignored then.
-        scale: memory, disk and workers. `encoder`, `importance` and `source_index` require the scene in memory.
+        encoder: called instead of the encoder, such as a target search; excludes `importance`.
+        out_of_core: memory, disk and workers.
         progress: progress callback.
 
     Raises:
+        InputError: arguments contradict each other.
         CsplatError: the scene or the options are not valid.
         OSError: a file cannot be read or written.
     """
-    start, scale = time.perf_counter(), scale or OutOfCoreOptions()
     in_memory = encoder is not None or importance is not None or source_index is not None
+    limits = out_of_core or OutOfCoreOptions()
+    if prune_unseen and importance is None:
+        raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
+    if encoder is not None and importance is not None:
+        raise InputError("an encoder and an importance are given, expected only one of them")
+    if in_memory and limits != OutOfCoreOptions():
+        raise InputError("an encoder, an importance and a source index exclude options for scenes larger than memory")
+    start = time.perf_counter()
     read: LoadedModel | None = None
     with source_path(source) as local:
-        if not in_memory and scale.may_exceed_memory(local):
-            done = encode_out_of_core(local, target, options, overrides, scale, strict=strict, progress=progress)
-            if isinstance(done, OutOfCoreResult):
-                seconds = time.perf_counter() - start
-                return EncodedFile(done.metadata, done.report, None, done.findings, size_on_disk(local), seconds)
-            read = done
+        if not in_memory and limits.may_exceed_memory(local):
+            if progress is not None:
+                progress("opening", 0.0)
+            with open_scene(local, sh_degree=read_degree(options)) as reader:
+                if _exceeds_memory(reader, options, limits):
+                    encoded = encode_out_of_core(
+                        reader, local, target, options, limits, overrides=overrides, strict=strict, progress=progress
+                    )
+                    return replace(encoded, seconds=time.perf_counter() - start)
+                if reader.format not in CHEAP_TO_REOPEN:
+                    read = _load_opened(reader, local, options, overrides, strict=strict, progress=progress)
         if read is None:
             read = read_source(
                 local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
@@ -306,22 +257,93 @@ def encode_file(
     model = read.model
     if encoder is not None:
         outcome = encoder(model, options, progress)
-    elif importance is None:
-        if prune_unseen:
-            raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
-        outcome = EncoderOutcome(encode_with_report(model, options, progress=progress))
-    else:
+    elif importance is not None:
         from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
 
         outcome = EncoderOutcome(
             encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress)
         )
+    else:
+        outcome = EncoderOutcome(encode_with_report(model, options, progress=progress))
     write_bytes(target, outcome.result.data)
     if source_index is not None:
         write_array(source_index, outcome.result.source_index)
     return EncodedFile(
         model, outcome.result.report, outcome, read.findings, read.size_bytes, time.perf_counter() - start
     )
+
+
+def _exceeds_memory(reader: SceneSource, options: EncodeOptions, limits: OutOfCoreOptions) -> bool:
+    """Return True if a scene is to be encoded out of core."""
+    if limits.cluster is not None or limits.resume:
+        return True
+    return not estimate_needs(reader, options, limits.memory_bytes, by_disk=limits.always).in_memory
+
+
+def _load_opened(
+    reader: SceneSource,
+    local: Path,
+    options: EncodeOptions,
+    overrides: MetadataOverrides | None,
+    *,
+    strict: bool,
+    progress: Progress | None,
+) -> LoadedModel:
+    """Read an opened scene into memory."""
+    findings: list[Finding] = []
+    if progress is not None:
+        progress("reading", 0.0)
+    model = read_all(reader, strict=strict, keep_extra=options.keep_extra, report=findings)
+    model = (overrides or MetadataOverrides()).apply(model)
+    return LoadedModel(model, size_on_disk(local), name=local.name, findings=tuple(findings))
+
+
+def encode_out_of_core(
+    reader: SceneSource,
+    local: Path,
+    target: str,
+    options: EncodeOptions,
+    limits: OutOfCoreOptions,
+    *,
+    overrides: MetadataOverrides | None = None,
+    strict: bool = False,
+    progress: Progress | None = None,
+) -> EncodedFile:
+    """Encode an opened scene out of core, and write the .csplat file.
+
+    Args:
+        reader: the scene.
+        local: its file.
+        target: the file to write.
+        options, overrides, strict, progress: as for `encode_file`.
+        limits: memory, disk and workers.
+
+    Raises:
+        InputError: the file is to be written to standard output.
+        CsplatError: as for `encode_scene`.
+        OSError: as for `encode_scene`.
+    """
+    start = time.perf_counter()
+    if target == STANDARD_STREAM:
+        raise InputError("the scene does not fit in memory, and cannot be written to standard output: name a file")
+    findings = [*reader.findings]
+    if reader.metadata_model.extra and not options.keep_extra:
+        findings.append(dropped_columns(list(reader.metadata_model.extra)))
+    refuse(findings, strict=strict)
+    scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
+    size = size_on_disk(local)
+    try:
+        report = encode_scene(
+            scene, target, options, memory_bytes=limits.memory_bytes, by_disk=limits.always, folder=limits.folder,
+            resume=limits.resume, cluster=limits.cluster, progress=progress,
+            source={"name": local.name, "size": size, "changed": local.stat().st_mtime_ns},
+        )  # fmt: skip
+    except (KeyboardInterrupt, OSError):
+        folder = Path(limits.folder or f"{target}.work")
+        if folder.exists():
+            note(f"{folder} holds the finished part: --resume continues from it")
+        raise
+    return EncodedFile(scene.metadata_model, report, None, tuple(findings), size, time.perf_counter() - start)
 
 
 def format_cost(found: CostEstimate) -> str:
@@ -337,9 +359,11 @@ def format_cost(found: CostEstimate) -> str:
 
 def format_declared_errors(errors: Mapping[str, tuple[float, float]]) -> list[str]:
     """Format declared errors, maximum and RMS by measure, as a table; return nothing if there are none."""
+    if not errors:
+        return []
     names = sorted(errors, key=list(MEASURE_NAMES.values()).index)
     rows = [(name, *(f"{value:.4g}" for value in errors[name])) for name in names]
-    return [format_table(("stated error", "max", "rms"), rows)] * bool(rows)
+    return [format_table(("declared error", "max", "rms"), rows)]
 
 
 def format_encoding(encoded: EncodedFile, psnr: float | None, source: str, output: str) -> str:
@@ -355,7 +379,7 @@ def format_encoding(encoded: EncodedFile, psnr: float | None, source: str, outpu
     ratio = encoded.source_bytes / report.size_bytes
     splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
     sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
-    quality, found = "", None if encoded.outcome is None else encoded.outcome.report.get("psnr")
+    quality, found = "", encoded.search_report.get("psnr")
     if psnr is not None:
         quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
     elif found is not None:

@@ -1,4 +1,4 @@
-"""Write renders as PNG files or as a film."""
+"""Write renders as PNG files or as a video."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def _stem(image: str | None) -> str:
 
 _MP4 = "MP4"
 
-#: File name endings of films, with pillow's names of the formats; pillow does not write MP4.
+#: File name endings of videos, with pillow's names of the formats; pillow does not write MP4.
 FILM_ENDINGS = {".webp": "WEBP", ".gif": "GIF", ".png": "PNG", ".apng": "PNG", ".mp4": _MP4}
 
 #: Frames per second.
@@ -133,12 +133,12 @@ _LIMITED_RANGE = 1  # black is 16, which players expect
 
 
 def is_film(path: str) -> bool:
-    """Return True if a path has the name of a film."""
+    """Return True if a path has the name of a video."""
     return Path(path).suffix.lower() in FILM_ENDINGS
 
 
 def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
-    """Refuse a film that cannot be written, before it is rendered.
+    """Refuse a video that cannot be written, before it is rendered.
 
     Args:
         path: a path for which `is_film` is true.
@@ -155,7 +155,7 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
     else:
         require_images()
     if len(set(sizes)) > 1:
-        raise InputError(f"the cameras have {len(set(sizes))} sizes, expected one for a film: set --size")
+        raise InputError(f"the cameras have {len(set(sizes))} sizes, expected one for a video: set --size")
     width, height = sizes[0]
     if kind == _MP4 and min(width, height) < 2:
         raise InputError(f"frames have {width}x{height} pixels, expected at least 2 per side for MP4")
@@ -164,14 +164,14 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
     if len(sizes) * width * height * 3 > _MAX_BYTES:
         raise InputError(
             f"{len(sizes)} frames of {width}x{height} need more than {_MAX_BYTES >> 30} GiB: render into a folder, "
-            "and make the film with ffmpeg"
+            "and make the video with ffmpeg"
         )
     if fps > min(MAX_FPS, _TICKS[kind]):
         raise InputError(f"{fps:g} frames per second, expected at most {MAX_FPS:g}")
 
 
 def write_film(path: str, frames: Sequence[U8], fps: float) -> None:
-    """Write a film; the file appears when it is complete. An animation repeats for ever.
+    """Write a video; the file appears when it is complete. An animation repeats for ever.
 
     Args:
         path: its ending determines the format. WebP loses a little, GIF has 256 colours a frame, PNG loses nothing.
@@ -213,9 +213,9 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
     height, width = (side - side % 2 for side in frames[0].shape[:2])  # even, since chroma has half the resolution
     rate = Fraction(fps).limit_denominator(1001)
     with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
-        film = Path(folder) / "film.mp4"  # a file, since PyAV rewrites it to put the index first
+        path = Path(folder) / "video.mp4"  # a file, since PyAV rewrites it to put the index first
         options = {"movflags": "+faststart", "fflags": "+bitexact"}
-        with av.open(film, "w", format="mp4", options=options) as container:
+        with av.open(path, "w", format="mp4", options=options) as container:
             try:
                 stream = container.add_stream("libx264", rate, options=_X264)
             except ValueError:  # PyAV knows no such codec
@@ -228,7 +228,7 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
                 frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels[:height, :width]), format="rgb24")
                 container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=_BT709)))
             container.mux(stream.encode())
-        return film.read_bytes()
+        return path.read_bytes()
 
 
 def _durations(count: int, fps: float, ticks: int) -> list[int]:

@@ -71,7 +71,18 @@ def _imported(name: str) -> Any:
         alone.add_typer(found, name=name, rich_help_panel=panel)
     else:
         alone.command(name, rich_help_panel=panel)(found)
-    return get_group(alone).commands[name]
+    command = get_group(alone).commands[name]
+    _hide_flag_types(command)
+    return command
+
+
+def _hide_flag_types(command: Any) -> None:
+    """Show no type next to flags in help: `<bool>` reads like a value that they take."""
+    for one in getattr(command, "commands", {}).values():
+        _hide_flag_types(one)
+    for option in (*command.params, command.get_help_option(typer.Context(command))):
+        if getattr(option, "is_flag", False):
+            option.metavar = ""
 
 
 app = typer.Typer(

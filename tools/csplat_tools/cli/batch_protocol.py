@@ -11,7 +11,6 @@ import io
 import json
 import os
 import queue
-import re
 import signal
 import sys
 import threading
@@ -30,13 +29,21 @@ from csplat_tools.batches.batch_page import prepare_thumbnails, write_thumbnail
 from csplat_tools.batches.scene_job import inspect_scene
 from csplat_tools.cli.app import app
 from csplat_tools.cli.encode import IN_MEMORY
-from csplat_tools.cli.error_lines import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, UsageError, usage_message
+from csplat_tools.cli.error_lines import (
+    EXIT_FAILED,
+    EXIT_INTERRUPTED,
+    EXIT_USAGE,
+    ReportedError,
+    UsageError,
+    report_errors,
+    usage_message,
+)
 
 _ERROR = "error: "
-_CODE = re.compile(r"\b(E_[A-Z0-9_]+)\b|\((E[A-Z]+)\)$")
 _REMARKS_MAX = 20
 _OWN = ("force", "report", "as_json", "quiet")  # options that the batch gives itself
-_FILES = ("page", "source_index", "checkpoint", "resume", "dry_run")  # a file for all scenes, or no work
+#: Options that a batch refuses: each names one file, which all scenes would share, or leaves no output.
+_REFUSED = ("page", "source_index", "checkpoint", "resume", "dry_run")
 
 
 def main() -> None:
@@ -85,10 +92,10 @@ def _check(words: Sequence[str]) -> dict[str, Any]:
     group: Any = get_command(app)
     command = group.get_command(typer.Context(group), name)
     if command is None or hasattr(command, "commands"):
-        return {"wrong": f"{name} is no command with an input and an output; `csplat --help` lists the commands"}
+        return {"wrong": f"{name} is not a command that can run in batch; `csplat --help` lists the commands"}
     arguments = {one.name: one for one in command.params if one.param_type_name == "argument"}
     if list(arguments) != ["source", "output"]:
-        return {"wrong": f"csplat {name} does not take IN and OUT alone"}
+        return {"wrong": f"`csplat {name}` cannot run in batch: it must take exactly IN and OUT"}
     try:
         with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
             context = command.make_context(f"csplat {name}", ["IN", "OUT", *rest])
@@ -97,7 +104,7 @@ def _check(words: Sequence[str]) -> dict[str, Any]:
     except (typer.Exit, SystemExit):
         return {"wrong": f"csplat {name}: --help and --help-all do no work"}
     given = [one for one in context.params if _is_given(context, one)]
-    taken = [one for one in given if one in (*_OWN, *_FILES)]
+    taken = [one for one in given if one in (*_OWN, *_REFUSED)]
     if taken:
         option = "--" + {"as_json": "json"}.get(taken[0], taken[0]).replace("_", "-")
         return {"wrong": f"csplat {name}: {option} is not for all scenes of a batch"}
@@ -129,37 +136,46 @@ def _run(words: Sequence[str], thumbnail: str = "", scenes: Sequence[str] = ()) 
     out, err = io.StringIO(), io.StringIO()
     _forget_peak()
     begun = time.perf_counter()
-    status = EXIT_FAILED
     with redirect_stdout(out), redirect_stderr(err):
-        try:
-            app(list(words), prog_name="csplat")
-        except SystemExit as end:
-            status = end.code if isinstance(end.code, int) else EXIT_FAILED if end.code else 0
-        except Exception as error:  # noqa: BLE001  # a defect of csplat: it is reported for this scene, and the batch goes on
-            err.write(traceback.format_exc() + f"{_ERROR}a defect of csplat: {error!r} (E_DEFECT)\n")
+        status, error, code = _invoke(words)
     seconds = time.perf_counter() - begun
     if status == EXIT_INTERRUPTED:
         raise KeyboardInterrupt
     lines = [line for line in err.getvalue().splitlines() if line.strip()]
-    errors = [line for line in lines if line.startswith(_ERROR)]
-    error_line = errors[-1].removeprefix(_ERROR) if errors else ""
-    if status and not error_line:
-        error_line = lines[-1] if lines else f"status {status}"
+    if status and not error:
+        error = lines[-1].removeprefix(_ERROR) if lines else f"status {status}"
     if status == 0 and thumbnail and prepare_thumbnails():
         write_thumbnail(Path(thumbnail), [Path(one) for one in scenes])
-    if status == EXIT_USAGE:  # the batch reports it as its own error
-        error_line = error_line.partition("; `csplat ")[0]
-    found = _CODE.search(error_line)
-    code = next(filter(None, found.groups())) if found else "E_FAILED"
     return {
         "status": status,
-        "error": error_line.removesuffix(f" ({code})"),
-        "code": code if status else "",
-        "remarks": [line for line in lines if line not in errors][-_REMARKS_MAX:],
+        "error": error,
+        "code": (code or "E_FAILED") if status else "",
+        "remarks": [line for line in lines if not line.startswith(_ERROR)][-_REMARKS_MAX:],
         "result": _json(out.getvalue()),
         "seconds": seconds,
         "memory_bytes": _peak(),
     }
+
+
+def _invoke(words: Sequence[str]) -> tuple[int, str, str]:
+    """Run a command line, and return its status, its error in one line, and the error's code; "": none."""
+    group: Any = get_command(app)
+    try:
+        with report_errors(), group.make_context("csplat", list(words)) as context:
+            group.invoke(context)
+    except ReportedError as failure:
+        return failure.exit_code, failure.message, failure.code
+    except UsageError as failure:
+        command = "csplat" if failure.ctx is None else failure.ctx.command_path  # type: ignore[attr-defined]
+        return EXIT_USAGE, f"{command}: {usage_message(failure)}", "E_USAGE"
+    except typer.Exit as end:
+        return end.exit_code, "", ""
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else EXIT_FAILED if end.code else 0, "", ""
+    except Exception as failure:  # noqa: BLE001  # a defect of csplat: it is reported for this scene, and the batch goes on
+        traceback.print_exc()
+        return EXIT_FAILED, f"a defect of csplat: {failure!r}", "E_DEFECT"
+    return 0, "", ""
 
 
 def _json(text: str) -> Any:

@@ -67,12 +67,15 @@ def decoder(
     render_program: Annotated[
         str | None, typer.Option("--render-cmd", metavar="COMMAND", help="Renderer: {input} {camera} {out}.")
     ] = None,
-    level: Annotated[str | None, typer.Option(metavar="LEVEL", help="Up to this, or some: 1,3. Default: 3.")] = None,
+    level: Annotated[str | None, typer.Option(metavar="N", help="Levels 1 to N, or a list: 1,3. Default: 3.")] = None,
     filters: Annotated[
         list[str] | None, typer.Option("--filter", metavar="PATTERN", help="Names 'invalid/*', clauses 'HDR-*'.")
     ] = None,
     by: Annotated[
-        str, typer.Option("--class", metavar="CLASS", show_default=False, help="exact or renderer. Default: exact.")
+        str,
+        typer.Option(
+            "--class", metavar="CLASS", show_default=False, help="Tolerance: exact, renderer. Default: exact."
+        ),
     ] = EXACT,
     jobs: _Jobs = None,
     timeout: _Timeout = None,
@@ -121,7 +124,7 @@ def encoder(
     program: Annotated[
         str | None, typer.Option("--cmd", metavar="COMMAND", help="Encoder: {ply} {out}, maybe {index}.")
     ] = None,
-    level: Annotated[str | None, typer.Option(metavar="LEVEL", help="Up to this, or some: 1,3. Default: 4.")] = None,
+    level: Annotated[str | None, typer.Option(metavar="N", help="Levels 1 to N, or a list: 1,3. Default: 4.")] = None,
     min_psnr: Annotated[
         float | None, typer.Option(metavar="DB", help=f"Least PSNR at L4. Default: {PSNR_MIN:g}.")
     ] = None,

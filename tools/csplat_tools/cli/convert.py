@@ -35,7 +35,7 @@ def convert(
     no_loss: Annotated[bool, typer.Option("--no-loss", help="Refuse if anything would be lost.")] = False,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Report losses and size, write nothing.")] = False,
     to_axes: Annotated[
-        str | None, typer.Option(metavar="RDF", hidden=True, help="Turn +x, +y, +z to these directions.")
+        str | None, typer.Option(metavar="RDF", hidden=True, help="Turn to other axes, e.g. RDF, RUB.")
     ] = None,
     axes: Annotated[
         str | None, typer.Option(metavar="RDF", hidden=True, help="Directions of +x, +y, +z: R/L, U/D, F/B.")
@@ -56,9 +56,9 @@ def convert(
 ) -> None:
     """Convert a scene to another format, and change it.
 
-    Changes are made in this order: --to-axes, --rotate, --scale,
-    --translate, --crop, --drop-floaters, --sh-degree. A line reports what
-    the format cannot hold. `csplat formats` lists the formats; for .csplat
+    Changes are made in this order: --to-axes (in --help-all), --rotate,
+    --scale, --translate, --crop, --drop-floaters, --sh-degree. A line reports
+    what the format cannot hold. `csplat formats` lists the formats; for .csplat
     files, `csplat encode` has presets and targets.
 
     Examples:

@@ -64,7 +64,7 @@ class _TargetSearch:
     @property
     def is_rendered(self) -> bool:
         """True if meeting the target requires rendering."""
-        return (self.psnr, self.size, self.max_psnr_drop, self.keep) != (None, None, None, None)
+        return any(value is not None for value in (self.psnr, self.size, self.max_psnr_drop, self.keep))
 
     def target(self, unit_metres: float | None) -> Target | None:
         """Return the target; `None` if no option specifies one.
@@ -93,7 +93,7 @@ def encode(
     target_psnr: shared.TargetPsnr = None,
     target_size: shared.TargetSize = None,
     max_psnr_drop: shared.MaxPsnrDrop = None,
-    max_error: Annotated[str | None, typer.Option(metavar="NAME=MAX", help="Largest errors. Default: none.")] = None,
+    max_error: Annotated[str | None, typer.Option(metavar="NAME=MAX", help="E.g. means=0.001,sh0=0.02.")] = None,
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
     data: shared.Data = None,
     up: shared.Up = None,
@@ -139,7 +139,8 @@ def encode(
     --target-psnr, --target-size, --max-psnr-drop (with --data) and --keep
     chooses the precision and prunes splats, and requires the render extra;
     --max-error limits errors of means, covariance, opacities, sh0 to sh3. Views
-    are virtual without --data or --cameras.
+    are virtual without --data or --cameras. --help-all shows --keep, --cameras
+    and all other options.
 
     Examples:
       csplat encode scene.ply scene.csplat
@@ -174,19 +175,20 @@ def encode(
     search = _TargetSearch(psnr, target_size, drop, keep, max_error, no_prune, effort, views, importance)
     shared.checked(search.target, 1.0)  # errors of the target that do not depend on the scene
     overrides = shared.parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased or None, licence=licence)
-    scale = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, cluster=dask)
+    limits = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, cluster=dask)
     with out.bar() as progress, assume_format(read_as):
         if dry_run:
-            _publish_estimate(source, options, scale, out)
+            _publish_estimate(source, options, limits, out)
             return
         out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
         check_name(output, ".csplat", "encode", source)
         if search.is_rendered:
             require_renderer()
-        reaching: EncodeFunction = partial(_encode_to_target, search, out)
+        has_target = search.is_rendered or max_error is not None
+        encoder: EncodeFunction | None = partial(_encode_to_target, search, out) if has_target else None
         encoded = encode_file(
-            source, output, options, overrides=overrides, importance=importance, source_index=source_index,
-            encoder=reaching if search.is_rendered or max_error is not None else None, scale=scale, progress=progress,
+            source, output, options, overrides=overrides, importance=None if has_target else importance,
+            source_index=source_index, encoder=encoder, out_of_core=limits, progress=progress,
         )  # fmt: skip
         _publish(encoded, source, output, threads, out, up=up, progress=progress)
 
@@ -217,10 +219,10 @@ def _publish(
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 
 
-def _publish_estimate(source: str, options: EncodeOptions, scale: OutOfCoreOptions, out: Output) -> None:
+def _publish_estimate(source: str, options: EncodeOptions, limits: OutOfCoreOptions, out: Output) -> None:
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local:
-        found = estimate_cost(local, options, scale)
+        found = estimate_cost(local, options, limits)
     out.publish(found.as_json(), format_cost(found))
 
 
@@ -255,12 +257,12 @@ def _encode_to_target(
         errors=target.max_error, views=around, options=encoding, no_prune=search.no_prune, importance=weights,
         simplifying=simplifying, progress=progress,
     )  # fmt: skip
-    return EncoderOutcome(made.result, "target", made.report.as_json(), made.report.lines())
+    return EncoderOutcome(made.result, made.report.as_json(), made.report.lines())
 
 
 def _psnr(encoded: EncodedFile, threads: int | None) -> float | None:
     """Return an approximate PSNR in dB; `None` if it is known already, or if measuring it would take long."""
     outcome = encoded.outcome
-    if outcome is None or outcome.report.get("psnr") is not None or find_spec("numba") is None:
+    if outcome is None or outcome.search_report.get("psnr") is not None or find_spec("numba") is None:
         return None
     return estimate_psnr(encoded.source, outcome.result.data, threads=threads)

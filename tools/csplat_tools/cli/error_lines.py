@@ -105,6 +105,20 @@ RENAMED_OPTIONS = {
 }
 
 
+class ReportedError(typer.Exit):
+    """The exit with status 1 after an error was printed.
+
+    Attributes:
+        message: the error in one line, without its code.
+        code: error code of the format or of the system; "": none.
+    """
+
+    def __init__(self, message: str, code: str) -> None:
+        super().__init__(EXIT_FAILED)
+        self.message = message
+        self.code = code
+
+
 @contextmanager
 def report_errors() -> Iterator[None]:
     """Turn expected errors into one line on standard error and status 1.
@@ -112,22 +126,23 @@ def report_errors() -> Iterator[None]:
     Defects of csplat itself still end in a traceback: a bug report needs it.
 
     Raises:
-        typer.Exit: with the status.
+        ReportedError: an error was printed.
+        typer.Exit: the command was interrupted, or the reader of standard output is gone.
     """
     try:
         yield
         sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
     except CsplatError as error:
-        _fail(_csplat_error(error))
+        _fail(_csplat_error(error), error.code)
     except BrokenPipeError:
         _drop_stdout()
         raise typer.Exit(EXIT_FAILED) from None
     except OSError as error:
         if error.filename is None and error.errno in _FULL:
             _drop_stdout()  # all other writers name their file
-        _fail(_os_error(error))
+        _fail(_os_error(error), errno.errorcode.get(error.errno or 0, ""))
     except MemoryError:
-        _fail("out of memory")
+        _fail("out of memory", "")
     except KeyboardInterrupt:
         note("interrupted")
         raise typer.Exit(EXIT_INTERRUPTED) from None
@@ -151,30 +166,29 @@ def refuse_command_line(error: Any) -> NoReturn:
     sys.exit(EXIT_USAGE)
 
 
-def _fail(message: str) -> NoReturn:
-    note("error: " + " ".join(message.split()))
-    raise typer.Exit(EXIT_FAILED) from None
+def _fail(message: str, code: str) -> NoReturn:
+    message = " ".join(message.split())
+    note(f"error: {message}" + (f" ({code})" if code and not re.search(rf"\b{code}\b", message) else ""))
+    raise ReportedError(message, code) from None
 
 
 def _csplat_error(error: CsplatError) -> str:
-    """Return the message of an error: the file, the defect in plain words, the details, the remedy, and the code."""
+    """Return the message of an error: the file, the defect in plain words, the details, and the remedy."""
     what, advice = _DEFECTS.get(error.code, ("", "") if isinstance(error, InputError) else _INVALID)
     message = str(error)
     parts = [error.path] if error.path is not None and Path(error.path).name not in message else []
     parts += [part for part in (what, message) if part]
-    code = "" if error.code in message else f" ({error.code})"
-    return ": ".join(parts) + (f"; {advice}" if advice else "") + code
+    return ": ".join(parts) + (f"; {advice}" if advice else "")
 
 
 def _os_error(error: OSError) -> str:
     reason = error.strerror or str(error) or type(error).__name__
     number = error.errno or 0
-    code = f" ({errno.errorcode[number]})" if number in errno.errorcode else ""
     if error.filename is None:
-        return (f"standard output: {reason}; what it holds is not whole" if number in _FULL else reason) + code
+        return f"standard output: {reason}; what it holds is not whole" if number in _FULL else reason
     if number == errno.ENOENT and (url := _LOST_URL.match(str(error.filename))):
-        return f"{url[1]}://{url[2]} is a URL, expected a file: download it first; extract and batch read URLs" + code
-    return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "") + code
+        return f"{url[1]}://{url[2]} is a URL, expected a file: download it first; extract and batch read URLs"
+    return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "")
 
 
 def _drop_stdout() -> None:

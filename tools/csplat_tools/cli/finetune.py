@@ -66,7 +66,7 @@ def finetune(
     shared.refuse_together(by_psnr, {"--keep": keep, "--checkpoint": checkpoint, "--resume": resume})
     shared.refuse_together({"--lambda": byte_cost}, {"--target-size": target_size, **by_psnr})
     shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
-    shared.parse_share(keep)
+    shared.parse_fraction(keep)
     size_bytes = shared.checked(shared.parse_bytes, target_size)
     require_trainer(plots=page is not None)
     from csplat_tools.training import tuning_run as tuning

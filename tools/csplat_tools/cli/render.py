@@ -20,13 +20,13 @@ from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.scene_files import load_model
 from csplat_tools.views import DataOptions
 
-_OTHER_FILMS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
+_OTHER_VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
 
 
 def render(
     source: shared.SceneArgument,
     output: Annotated[
-        str, typer.Argument(metavar="OUT", help="A folder for PNG files; or NAME.mp4, .webp, .gif, .png: a film.")
+        str, typer.Argument(metavar="OUT", help="A folder for PNG files; or NAME.mp4, .webp, .gif, .png: a video.")
     ],
     cameras: Annotated[str | None, typer.Option(metavar="FILE.json", help="Cameras, in a format listed above.")] = None,
     data: Annotated[str | None, typer.Option(metavar="DATA", help="Cameras of a data set's test images.")] = None,
@@ -50,7 +50,7 @@ def render(
     quiet: shared.Quiet = False,
     _all: shared.HelpAll = False,
 ) -> None:
-    """Render a scene to PNG files, or to a film.
+    """Render a scene to PNG files, or to a video.
 
     Renders are named after the images of their cameras, or numbered. Camera
     files: our own list of {K, viewmat, W, H, near, image}, INRIA's
@@ -65,18 +65,18 @@ def render(
       csplat render scene.ply views --cameras test.json --background white
     """
     out = Output(force, report, as_json, quiet)
-    film, views = is_film(output), shared.ViewOptions(cameras, data, background)
-    if (cameras, orbit, data) == (None, None, None):
+    is_video, views = is_film(output), shared.ViewOptions(cameras, data, background)
+    if cameras is None and orbit is None and data is None:
         raise typer.BadParameter("expected cameras: --orbit 120 for a path around the scene, or --cameras, or --data")
-    if output == STANDARD_STREAM or Path(output).suffix.lower() in _OTHER_FILMS:
-        raise typer.BadParameter(f"OUT is {output}, expected a folder, or a film: NAME.mp4, .webp, .gif or .png")
-    if film and (depth or alpha):
-        raise typer.BadParameter("--depth and --alpha require a folder, not a film")
+    if output == STANDARD_STREAM or Path(output).suffix.lower() in _OTHER_VIDEOS:
+        raise typer.BadParameter(f"OUT is {output}, expected a folder, or a video: NAME.mp4, .webp, .gif or .png")
+    if is_video and (depth or alpha):
+        raise typer.BadParameter("--depth and --alpha require a folder, not a video")
     shared.check_range("--fps", fps, 0.1, MAX_FPS)
     shared.require_one({"--up": up}, {"--orbit": orbit})
     pixels, overrides = None if size is None else shared.parse_size(size), shared.parse_overrides(up)
-    out.check(output if film else None, inputs=(source, *views.inputs))
-    if not film:
+    out.check(output if is_video else None, inputs=(source, *views.inputs))
+    if not is_video:
         check_name(output, ".webp", "render", source)
     require_renderer()
     with out.bar() as progress:
@@ -88,7 +88,7 @@ def render(
         out.remark(*notes)
         if orbit is not None:
             shared.take_estimated_up(estimate_up(model), out, given=up)
-        write = partial(render_film, fps=fps) if film else partial(render_folder, depth=depth, alpha=alpha)
+        write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet), progress=progress,
@@ -96,6 +96,8 @@ def render(
     if rendered.ignored_count:
         note(f"{counted(rendered.ignored_count, 'splat')} with NaN or infinities, not drawn")
     out.remark(
-        f"{counted(len(shots), 'frame')} in {output}" if film else f"{counted(len(rendered.files), 'file')} in {output}"
+        f"{counted(len(shots), 'frame')} in {output}"
+        if is_video
+        else f"{counted(len(rendered.files), 'file')} in {output}"
     )
     out.publish({"files": [str(file) for file in rendered.files], "ignored_splats": rendered.ignored_count})

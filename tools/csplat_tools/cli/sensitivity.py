@@ -35,7 +35,7 @@ def sensitivity(
     virtual views are added until they agree. Requires the render extra.
 
     Examples:
-      csplat sensitivity scene.ply scene.npz --data photographs
+      csplat sensitivity scene.ply scene.npz --data capture
       csplat encode scene.ply scene.csplat --importance scene.npz
     """
     out = Output(force, report, as_json, quiet)

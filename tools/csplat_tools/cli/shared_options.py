@@ -103,11 +103,11 @@ SmallPreset = Annotated[
 ]
 TargetPsnr = Annotated[str | None, typer.Option(metavar="DB", help="Least PSNR, e.g. 40dB. Default: none.")]
 TargetSize = Annotated[str | None, typer.Option(metavar="BYTES", help="Largest file, e.g. 5MB. Default: none.")]
-MaxPsnrDrop = Annotated[str | None, typer.Option(metavar="DB", help="Largest PSNR drop. Default: none.")]
+MaxPsnrDrop = Annotated[str | None, typer.Option(metavar="DB", help="Largest loss on images, e.g. 0.3dB.")]
 _effort = typer.Option("--effort", metavar="1..9", help="Work for fewer bytes. Default: 3.")
 Effort = Annotated[int | None, _effort]
 HiddenEffort = Annotated[int | None, hidden(_effort)]
-_keep = typer.Option("--keep", metavar="SHARE", help="Share of splats to keep. Default: all.")
+_keep = typer.Option("--keep", metavar="FRACTION", help="Fraction of splats to keep, e.g. 0.5.")
 Keep = Annotated[float | None, _keep]
 HiddenKeep = Annotated[float | None, hidden(_keep)]
 Page = Annotated[str | None, typer.Option(metavar="FILE.html", help="Write an HTML report.")]
@@ -117,7 +117,7 @@ Checkpoint = Annotated[
 Resume = Annotated[
     str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from a checkpoint. Default: none.")
 ]
-_memory = typer.Option("--memory", metavar="BYTES", help="Memory limit, e.g. 8GB. Default: free.")
+_memory = typer.Option("--memory", metavar="BYTES", help="E.g. 8GB. Default: the free memory.")
 Memory = Annotated[str | None, _memory]
 HiddenMemory = Annotated[str | None, hidden(_memory)]
 _dask = typer.Option("--dask", metavar="ADDRESS", help="Dask cluster, tcp://host:8786. Default: none.")
@@ -367,10 +367,10 @@ def check_range(option: str, value: N, low: float, high: float) -> N:
     return value
 
 
-def parse_share(keep: float | None) -> float | None:
-    """Check the share of splats to keep: above 0, at most 1."""
+def parse_fraction(keep: float | None) -> float | None:
+    """Check the fraction of splats to keep: above 0, at most 1."""
     if keep is not None and not 0.0 < keep <= 1.0:
-        raise typer.BadParameter(f"--keep is {keep:g}, expected a share above 0, at most 1")
+        raise typer.BadParameter(f"--keep is {keep:g}, expected a fraction above 0, at most 1")
     return keep
 
 

@@ -14,7 +14,7 @@ from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import load_model
 
 #: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
-#: for the share to keep (20 and 45); half of the cost is fitting.
+#: for the fraction to keep (20 and 45); half of the cost is fitting.
 _PASSES = (20.0, 45.0)
 
 
@@ -51,7 +51,7 @@ def simplify(
     shared.refuse_together({"--keep": keep, "--target-psnr": target_psnr, "--max-psnr-drop": max_psnr_drop})
     shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
     shared.check_range("--effort", effort, 1, 9)
-    if (keep, target_psnr, max_psnr_drop) == (None, None, None):
+    if keep is None and target_psnr is None and max_psnr_drop is None:
         raise typer.BadParameter("expected --keep, --target-psnr or --max-psnr-drop")
     require_renderer()
     import csplat_tools
@@ -84,5 +84,5 @@ def simplify(
             model, keep=keep, psnr=psnr, max_psnr_drop=drop, views=around, options=options, progress=progress
         )
     write_model(output, result.model, absolute=False)
-    out.remark(*format_simplification(result.report))
+    out.remark(*result.notes, *format_simplification(result.report))
     out.publish(result.report)

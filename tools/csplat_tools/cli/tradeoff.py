@@ -38,7 +38,7 @@ def tradeoff(
       presets, strategies
       precision=36:44     PSNR of attributes, dB
       targets=38:1MB      PSNR of renders, or sizes; slow
-      simplify=0.5        shares of the splats
+      simplify=0.5        fractions of the splats
       finetune            takes minutes; not part of `usual`
     PSNR is measured against the source's renders, as by `csplat compare`,
     and against the images of --data. Requires the render extra.
@@ -47,7 +47,7 @@ def tradeoff(
       csplat tradeoff scene.ply
       csplat tradeoff scene.ply -o report.html --report report.json
       csplat tradeoff scene.ply --what presets,precision=36:44:52
-      csplat tradeoff scene.ply --data photographs --what usual,finetune
+      csplat tradeoff scene.ply --data capture --what usual,finetune
     """
     out = Output(force, report, as_json, quiet)
     options, views = shared.checked(parse_sweep, what, preset=preset), shared.ViewOptions(cameras, data)

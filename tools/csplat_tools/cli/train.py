@@ -33,7 +33,9 @@ def train(
         int, typer.Option(metavar="N", show_default=False, help="Training steps. Default: 7,000.")
     ] = _DEFAULT.iterations,
     preset: shared.SmallPreset = None,
-    keep: Annotated[float | None, typer.Option(metavar="SHARE", help="Share in OUT.csplat. Default: 0.8.")] = None,
+    keep: Annotated[
+        float | None, typer.Option(metavar="FRACTION", help="Splats kept in OUT.csplat. Default: 0.8.")
+    ] = None,
     target_size: shared.TargetSize = None,
     target_psnr: shared.TargetPsnr = None,
     device: Annotated[
@@ -68,13 +70,14 @@ def train(
     DATA is a NeRF-synthetic folder, a transforms.json or its folder, a COLMAP
     folder, or the folder of images in one of them (garden/images_4). The test
     images of the set, or every 8th image, are held out. OUT.csplat is tuned as
-    by `csplat finetune`, with --preset, --keep or a target: one training, kept by
-    --checkpoint, makes files of several sizes.
+    by `csplat finetune`, with --preset, --keep or a target. To make files of
+    several sizes, train once with --checkpoint, then use --resume (--help-all
+    shows both).
 
     Examples:
       csplat train lego lego.ply --max-splats 10000
       csplat train garden/images_4 garden.ply --report garden.json
-      csplat train lego lego.csplat --target-size 800KB --page lego.html
+      csplat train lego lego.csplat --target-size 800KB --checkpoint run.npz
       csplat train lego small.csplat --resume run.npz --target-size 400KB
     """
     out = Output(force, report, as_json, quiet)
@@ -84,7 +87,7 @@ def train(
     for name, value in {"--preset": preset, **targets}.items():
         if value is not None and not to_file:
             raise typer.BadParameter(f"{name} is for files, expected OUT.csplat")
-    shared.parse_share(keep)
+    shared.parse_fraction(keep)
     size_bytes, overrides = shared.checked(shared.parse_bytes, target_size), shared.parse_overrides(up)
     data = DataOptions(source, None if size is None else shared.parse_size(size), test_every=test_every)
     require_trainer(plots=page is not None)
@@ -94,7 +97,7 @@ def train(
     from csplat_trainer.training_checkpoint import load_checkpoint
 
     share = 1.0 if not to_file or psnr is not None else _KEEP if keep is None else keep
-    if (size_bytes, psnr) != (None, None) and max_splats is None and resume is not None:
+    if (size_bytes is not None or psnr is not None) and max_splats is None and resume is not None:
         max_splats = load_checkpoint(resume).options.get("max_splats")
     if size_bytes is not None:
         left = max(1, size_bytes // SPLAT_BYTES)

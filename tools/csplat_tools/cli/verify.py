@@ -62,6 +62,6 @@ def _print_reasons(verified: Verification, path: str, *, unverified: bool) -> No
         clauses, codes = (", ".join(sorted({getattr(one, name) for one in violations})) for name in ("clause", "code"))
         note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; copy or make it again ({codes})")
     if unverified:
-        note("error: the stated errors were not looked at")
+        note("error: the declared errors were not checked")
     for failure in verified.proof.failures if verified.proof is not None else ():
         note(f"error: {failure}")

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _PAIRING = {
     "index": "pairs from the source index",
     "order": "pairs by their order",
-    "search": "pairs found within the stated errors",
+    "search": "pairs found within the declared errors",
 }
 _SCORE_EXPLANATIONS = {
     "psnr": "of the squared error over all views; differences are visible at 30 dB, hardly at 40",
@@ -38,7 +38,7 @@ _SCORE_EXPLANATIONS = {
     "psnr_covered": "of pixels that show more than the background",
     "ssim": "structural similarity, 1 at best",
     "lpips": "perceptual distance by a trained network, 0 at best",
-    "cover": "share of the pixels that show more than the background",
+    "cover": "fraction of the pixels that show more than the background",
 }
 _GROUPS = {"colour": "colour (largest of the SH coefficients)", "opacity": "opacity", "shape": "shape, over its size"}
 
@@ -94,7 +94,7 @@ def _scores(compared: Comparison) -> str:
     }
     rows = [(name, text) for name, text in values.items() if text is not None]
     views = describe_views(len(quality.each), compared.cameras)
-    head, *others = format_table(("pictures", views), rows).splitlines()
+    head, *others = format_table(("renders", views), rows).splitlines()
     lines = [head, *(f"{line}  {_SCORE_EXPLANATIONS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored_lines(compared)
     if compared.a.metadata_model.antialiased != compared.b.metadata_model.antialiased:
@@ -110,7 +110,7 @@ def _image_scores(scores: dict[str, Any]) -> str:
         a, b = scores["a"][name], scores["b"][name]
         if a is not None and b is not None:
             rows.append((name, f"{a:.{digits}f}", f"{b:.{digits}f}", f"{b - a:+.{digits}f}"))
-    header = (f"against {scores['a']['views']} {scores['split']} photographs", "A", "B", "B - A")
+    header = (f"against {scores['a']['views']} {scores['split']} images", "A", "B", "B - A")
     return format_table(header, rows)
 
 
@@ -175,14 +175,14 @@ def _codebook(codebook: CodebookSummary) -> str:
     return f"codebook {codebook.id}: {codebook.kind}{bands}, {size}"
 
 
-def _declared_errors(stated: DeclaredBounds) -> str:
-    source = f"{counted(stated.source_count, 'splat')}, SH degree {stated.source_sh_degree}"
-    lines = [f"source: {source}; {stated.pruned_count} pruned"]
-    if stated.refitted:
+def _declared_errors(declared: DeclaredBounds) -> str:
+    source = f"{counted(declared.source_count, 'splat')}, SH degree {declared.source_sh_degree}"
+    lines = [f"source: {source}; {declared.pruned_count} pruned"]
+    if declared.refitted:
         lines.append("attributes were refitted: those without an error here are checked by renders only")
-    if stated.records:
-        rows = [(one.measure, f"{one.max:.6g}", f"{one.rms:.6g}") for one in stated.records]
-        lines.append(format_table(("stated error", "max", "rms"), rows))
+    if declared.records:
+        rows = [(one.measure, f"{one.max:.6g}", f"{one.rms:.6g}") for one in declared.records]
+        lines.append(format_table(("declared error", "max", "rms"), rows))
     return "\n".join(lines)
 
 
@@ -193,7 +193,9 @@ def format_verification(verified: Verification) -> str:
     if validation.conforms:
         lines.append(f"intact: {counted(validation.splat_count, 'splat')}; checked: {', '.join(validation.checks)}")
     if proof is not None:
-        lines += [_measures(proof)] * bool(proof.measures) + list(proof.notes)
+        if proof.measures:
+            lines.append(_measures(proof))
+        lines += proof.notes
         if proof.holds:
             lines.append(_verdict(proof))
     return "\n".join(lines)
@@ -201,13 +203,13 @@ def format_verification(verified: Verification) -> str:
 
 def _verdict(proof: BoundsVerification) -> str:
     if not any(one.holds for one in proof.measures):
-        return "nothing is stated that could be proved"
-    return "the stated errors hold" if proof.rms_verified else "the stated maxima hold"
+        return "the file declares no errors that could be verified"
+    return "the declared errors hold" if proof.rms_verified else "the declared maxima hold"
 
 
 def _measures(proof: BoundsVerification) -> str:
     if proof.rms_verified:
-        header = ("error", "stated max", "found max", "stated rms", "found rms", "")
+        header = ("error", "declared max", "found max", "declared rms", "found rms", "")
         rows = [
             (
                 one.name,
@@ -218,7 +220,7 @@ def _measures(proof: BoundsVerification) -> str:
         ]
         return format_table(header, rows)
     rows = [(one.name, _number(one.declared_max), _word(one)) for one in proof.measures]
-    return format_table(("error", "stated max", ""), rows)
+    return format_table(("error", "declared max", ""), rows)
 
 
 def _word(measure: MeasureVerification) -> str:
@@ -251,12 +253,12 @@ def format_simplification(report: Mapping[str, Any]) -> list[str]:
         rows.append((f"{report['test_views']['views']} test views", f"{report['psnr']:.2f}"))
     if "photographs" in report:
         scores = report["photographs"]
-        rows.append(("held-out photographs, source", f"{scores['source']:.2f}"))
-        rows.append(("held-out photographs", f"{scores['psnr']:.2f}"))
+        rows.append(("held-out images, source", f"{scores['source']:.2f}"))
+        rows.append(("held-out images", f"{scores['psnr']:.2f}"))
     lines.append(format_table(("PSNR", "dB"), rows))
     if report["zero_bands"]:
-        shares = [f"{band}: {100.0 * count / after:.0f} %" for band, count in report["zero_bands"].items()]
-        lines.append(f"splats without SH band {', '.join(shares)}")
+        percentages = [f"{band}: {100.0 * count / after:.0f} %" for band, count in report["zero_bands"].items()]
+        lines.append(f"splats without SH band {', '.join(percentages)}")
     return lines
 
 

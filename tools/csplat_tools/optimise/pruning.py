@@ -35,6 +35,7 @@ from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient
 
 _TRIES = 3  # largest number of refits in the search for a target PSNR
 _AGREE_ON = 0.5  # least fraction of the splats on whose pruning views must agree, since refits need views in any case
+_NOT_PRUNED = f"none of up to {_TRIES} pruned scenes reached the target: all splats are kept, unchanged"
 _NEAR = 0.05  # dB; a result this close to the target PSNR is not improved
 _BANDS_WORTH = 1.0  # dB that dropping SH bands may cost; a refit that loses more has failed
 
@@ -49,6 +50,7 @@ class Simplified:
         threshold: the largest error of a pruned splat.
         kept_bands: [N, d], mask of the kept SH bands; `None` if bands were not chosen.
         report: pruned splats by reason, predicted and measured errors, views, seconds; JSON-compatible.
+        notes: remarks for the user, a sentence each.
     """
 
     model: SplatModel
@@ -56,6 +58,7 @@ class Simplified:
     threshold: float
     kept_bands: NDArray[np.bool_] | None
     report: dict[str, Any]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +194,8 @@ def simplify(
         progress: progress callback.
 
     Returns:
-        The simplified scene; its splats are in the source's order.
+        The simplified scene; its splats are in the source's order. If the search for a PSNR finds no pruned scene that
+        reaches it, that is the unchanged source, with a remark in `notes`.
 
     Examples:
         >>> import csplat_tools
@@ -206,7 +210,7 @@ def simplify(
         OSError: the file cannot be read.
     """
     require_renderer()
-    target = Target(psnr, None, max_psnr_drop, keep)
+    target = Target(psnr=psnr, max_psnr_drop=max_psnr_drop, keep=keep)
     source = load_model(scene).model
     options = options or SimplifyOptions()
     if not len(source):
@@ -223,38 +227,41 @@ def simplify(
     session.seconds["fit"] = time.perf_counter() - start
     threshold = session.threshold(result.pruned_count)
     report = {**_report(session, result, target), **_test_scores(session, result.model)}
-    return Simplified(result.model, result.rows, threshold, result.kept_bands, report)
+    notes = (_NOT_PRUNED,) if result.is_source else ()
+    return Simplified(result.model, result.source_index, threshold, result.kept_bands, report, notes)
 
 
 @dataclass(frozen=True, eq=False)
 class _PrunedScene:
-    """A pruned and refitted scene with its scores; names that end in `pruned_psnr` are scores before the refit.
+    """A pruned and refitted scene with its scores.
 
     Attributes:
-        model, rows, kept_bands: as in `Simplified`; `rows` is its source index.
+        model, source_index, kept_bands: as in `Simplified`.
         pruned_count: number of pruned splats.
-        check_pruned_psnr, check_psnr: PSNR on held-out views, dB.
-        is_refused: the refit made held-out views worse, and was discarded.
-        validation_pruned_psnr, validation_psnr: PSNR on validation views, dB; `None` if not measured.
+        check_psnr_before_refit, check_psnr: PSNR on held-out views, dB.
+        refit_refused: the refit made held-out views worse, and was discarded.
+        validation_psnr_before_refit, validation_psnr: PSNR on validation views, dB; `None` if not measured.
+        is_source: the unchanged source, since no pruned scene reached the target.
     """
 
     model: SplatModel
-    rows: I64
+    source_index: I64
     kept_bands: NDArray[np.bool_] | None
     pruned_count: int
-    check_pruned_psnr: float
+    check_psnr_before_refit: float
     check_psnr: float
-    is_refused: bool = False
-    validation_pruned_psnr: float | None = None
+    refit_refused: bool = False
+    validation_psnr_before_refit: float | None = None
     validation_psnr: float | None = None
+    is_source: bool = False
 
     def scores(self) -> dict[str, Any]:
         """Return the scores for the report."""
         scores = {
-            "check_psnr_pruned": self.check_pruned_psnr,
+            "check_psnr_pruned": self.check_psnr_before_refit,
             "check_psnr": self.check_psnr,
-            "refit_refused": self.is_refused or None,
-            "validation_psnr_pruned": self.validation_pruned_psnr,
+            "refit_refused": self.refit_refused or None,
+            "validation_psnr_pruned": self.validation_psnr_before_refit,
             "validation_psnr": self.validation_psnr,
         }
         return {name: value for name, value in scores.items() if value is not None}
@@ -289,18 +296,34 @@ def _prune_and_refit(
 ) -> _PrunedScene:
     rows = session.kept_rows(pruned_count)
     pruned, refit = session.source.select(rows), session.refit(rows, progress)
-    check_pruned, check = session.check_scorer.psnr(pruned), session.check_scorer.psnr(refit.model)
+    before_refit, after_refit = session.check_scorer.psnr(pruned), session.check_scorer.psnr(refit.model)
     model, kept_bands = refit.model, refit.kept_bands
     allowed = 0.0 if kept_bands is None else _BANDS_WORTH
-    is_refused = check < check_pruned - allowed and session.options.refit
-    if is_refused:  # overfitted: held-out views are worse than before
-        model, kept_bands, check = pruned, None, check_pruned
-    validation = (None, None) if scorer is None else (scorer.psnr(pruned), scorer.psnr(model))
-    return _PrunedScene(model, rows, kept_bands, pruned_count, check_pruned, check, is_refused, *validation)
+    refit_refused = after_refit < before_refit - allowed and session.options.refit
+    if refit_refused:  # overfitted: held-out views are worse than before
+        model, kept_bands, after_refit = pruned, None, before_refit
+    return _PrunedScene(
+        model,
+        source_index=rows,
+        kept_bands=kept_bands,
+        pruned_count=pruned_count,
+        check_psnr_before_refit=before_refit,
+        check_psnr=after_refit,
+        refit_refused=refit_refused,
+        validation_psnr_before_refit=None if scorer is None else scorer.psnr(pruned),
+        validation_psnr=None if scorer is None else scorer.psnr(model),
+    )
 
 
 def _search_fewest(session: PruningSession, scorer: Scorer, goal: float, progress: Progress | None) -> _PrunedScene:
-    """Find the fewest splats that reach a PSNR, by bisection without refits, corrected by the gain of a refit."""
+    """Find the fewest splats that reach a PSNR, by bisection without refits, corrected by the gain of a refit.
+
+    Returns:
+        The smallest of up to `_TRIES` scenes that reaches the PSNR; the unchanged source if none does.
+
+    Raises:
+        InputError: even the source misses the PSNR.
+    """
     if scorer.psnr(session.source) < goal:
         raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
     best, gain = None, 0.0
@@ -308,7 +331,7 @@ def _search_fewest(session: PruningSession, scorer: Scorer, goal: float, progres
     for _ in range(_TRIES):
         pruned_count = _most_prunable(session, scorer, goal - gain, lowest)
         result = _prune_and_refit(session, pruned_count, scorer, progress)
-        before, reached = result.validation_pruned_psnr, result.validation_psnr
+        before, reached = result.validation_psnr_before_refit, result.validation_psnr
         assert before is not None
         assert reached is not None
         if reached >= goal:
@@ -321,7 +344,16 @@ def _search_fewest(session: PruningSession, scorer: Scorer, goal: float, progres
     if best is not None:
         return best
     source, check = session.source, session.check_scorer.psnr(session.source)
-    return _PrunedScene(source, np.arange(len(source)), None, 0, check, check, validation_psnr=scorer.psnr(source))
+    return _PrunedScene(
+        source,
+        source_index=np.arange(len(source)),
+        kept_bands=None,
+        pruned_count=0,
+        check_psnr_before_refit=check,
+        check_psnr=check,
+        validation_psnr=scorer.psnr(source),
+        is_source=True,
+    )
 
 
 def _most_prunable(session: PruningSession, scorer: Scorer, goal: float, lowest: int) -> int:
@@ -346,7 +378,7 @@ def _most_prunable(session: PruningSession, scorer: Scorer, goal: float, lowest:
 def _report(session: PruningSession, result: _PrunedScene, target: Target) -> dict[str, Any]:
     source, views = session.source, session.views
     pruned = np.ones(len(source), bool)
-    pruned[result.rows] = False
+    pruned[result.source_index] = False
     invisible = source.opacities < ALPHA_MIN
     unseen = ~total_error(session.view_groups).seen & ~invisible
     predicted = float(session.order.errors[: result.pruned_count].sum()) / session.value_count

@@ -1,1 +1,1 @@
-"""Renders, films, the viewer and its page."""
+"""Renders, videos, the viewer and its page."""

@@ -1,4 +1,4 @@
-"""Render a scene to PNG files in a folder, or to a film, as `csplat render` does."""
+"""Render a scene to PNG files in a folder, or to a video, as `csplat render` does."""
 
 from __future__ import annotations
 
@@ -64,15 +64,17 @@ def find_cameras(
         InputError: none of the three is given, or both a file and a set; the file or the set is invalid; `size` has
             another aspect ratio.
     """
-    if (path, orbit_count, data) == (None, None, None) or None not in (path, data):
+    if path is None and orbit_count is None and data is None:
         raise InputError("expected cameras: a file, a data set, or a number for an orbit")
+    if path is not None and data is not None:
+        raise InputError("a camera file and a data set are given, expected only one of them")
     cameras: list[Camera] = []
     if path is not None:
         cameras = load_cameras(path, report, model.origin)
     elif data is not None:
-        # An orbit uses the positions of the cameras, but not the size of their images.
-        full_size = data if orbit_count is None else replace(data, size=None)
-        found = find_view_set(model, data=full_size, count=0, split=split)
+        # An orbit uses the positions of the cameras, but not the size of their images: `size` is that of the orbit.
+        data_set = data if orbit_count is None else replace(data, size=None)
+        found = find_view_set(model, data=data_set, count=0, split=split)
         cameras = [*found.test, *(() if orbit_count is None else (*found.training, *found.validation))]
         if not cameras:
             raise InputError(f"{data.path} has no {split} views")
@@ -99,7 +101,7 @@ def render_folder(
     Args:
         model: the scene.
         cameras: the views. Renders are named after their images, or by numbers.
-        folder: the folder for the files; it is made if need be.
+        folder: the folder for the files; it is made if missing.
         background: red, green, blue, 0..1; `None`: that of the scene's training if known, else black.
         mode: `exact`, `standard` or `fast`.
         depth: write NAME.depth.npy, too, [H, W] float32: mean depth along the camera's axis, scene units; 0 in pixels

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 #: Scores that are reported, with their number of digits after the decimal point.
 SCORES = {"psnr": 2, "psnr_mean": 2, "ssim": 4, "lpips": 4}
 
-_TEST_IMAGES = "held-out photographs"
+_TEST_IMAGES = "held-out photographs"  # in JSON; texts call them images
 
 
 @dataclass(frozen=True)
@@ -108,8 +108,8 @@ def make_tuning_report(
         seconds: time by stage.
         pruning: report on the splats that were pruned.
     """
-    shares = bytes_by_attribute(result.data, read_header(result.data))
-    overhead = shares.pop("overhead")
+    bytes_of = bytes_by_attribute(result.data, read_header(result.data))
+    overhead = bytes_of.pop("overhead")
     size, count = len(result.data), len(source)
     return {
         "source_splats": count,
@@ -120,7 +120,7 @@ def make_tuning_report(
         "size_bytes_before_tuning": len(plain.data),
         "bytes_per_source_splat": size / count,
         "ratio": count * ply_splat_bytes(source.sh_degree) / size,
-        "bytes_by_attribute": shares,
+        "bytes_by_attribute": bytes_of,
         "overhead_bytes": overhead,
         "test_reference": None if test is None else test.reference,
         "test_view_count": 0 if test is None else test.view_count,
@@ -152,7 +152,7 @@ def format_tuning_report(report: Mapping[str, Any]) -> str:
     ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
     lines = [f"{counted(report['source_splats'], 'splat')}{left_out}: {size}, {ratio}"]
     if report["scores"]:
-        header = (f"{report['test_view_count']} {report['test_reference']}", *SCORES)
+        header = (f"{report['test_view_count']} {_reference_text(report['test_reference'])}", *SCORES)
         lines += ["", format_table(header, score_rows(report["scores"]))]
     parts = [*report["bytes_by_attribute"].items(), ("everything else", report["overhead_bytes"])]
     rows_bytes = [(name, size, f"{size / report['source_splats']:.2f}") for name, size in parts]
@@ -206,7 +206,7 @@ def show_views(
     places = evenly_spaced(range(len(views.test)), _SHOWN_VIEWS)
     views = replace(views, test=[views.test[place] for place in places])
     scorer = views.image_test_scorer(threads=threads) if views.images else views.test_scorer(source, threads=threads)
-    reference = "photograph" if views.images else "the source"
+    reference = "image" if views.images else "the source"
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():
         if model is source and not views.images:
@@ -277,10 +277,14 @@ def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) 
     else:
         return ""
     text = (
-        f"Measured on {views} {by}, which had no part in the training. psnr is pooled over all pixels, dB; psnr_mean"
+        f"Measured on {views} {_reference_text(by)}, which had no part in the training. psnr is pooled over all pixels, dB; psnr_mean"
         " is the mean over the views, as in papers; ssim is 1 at best, lpips 0."
     )
     return html.section("Scores", html.paragraph(text), html.table(("", *SCORES), score_rows(scores)))
+
+
+def _reference_text(reference: str) -> str:
+    return "held-out images" if reference == _TEST_IMAGES else reference
 
 
 def _images(shown: Sequence[ShownView]) -> str:
