@@ -118,7 +118,7 @@ def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
 def test_the_table_has_a_column_for_each_scene(scene, files, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False)
     text = call("compare", *files, "--data", data, "--pictures", tmp_path / "out")
-    for word in ("2 views of capture", "against 2 test photographs", "B - A", "psnr_mean"):
+    for word in ("2 views of capture", "against 2 test images", "B - A", "psnr_mean"):
         assert word in text
     with Image.open(tmp_path / "out" / "view8.png") as sheet:
         assert (4 * W, H) == sheet.size

@@ -221,6 +221,14 @@ def test_a_target_psnr_is_reached(source, given, goal, refit):
     assert len(result.model) < len(source)
 
 
+def test_the_source_is_kept_with_a_remark_if_no_pruned_scene_reaches_the_target(source, given, monkeypatch):
+    monkeypatch.setattr("csplat_tools.optimise.pruning._TRIES", 0)
+    result = simplify(source, psnr=35.0, views=given, options=replace(SMALL, bands=False, refit=False))
+    assert source is result.model
+    (remark,) = result.notes
+    assert "all splats are kept, unchanged" in remark
+
+
 @pytest.mark.slow
 def test_a_larger_psnr_drop_prunes_more_splats(source):
     cameras = camera_sequence(source, 16, (48, 36), seed=5)
