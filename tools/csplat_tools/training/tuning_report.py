@@ -277,8 +277,8 @@ def _scores(training: Mapping[str, Any] | None, file: Mapping[str, Any] | None) 
     else:
         return ""
     text = (
-        f"Measured on {views} {_reference_text(by)}, which had no part in the training. psnr is pooled over all pixels, dB; psnr_mean"
-        " is the mean over the views, as in papers; ssim is 1 at best, lpips 0."
+        f"Measured on {views} {_reference_text(by)}, which had no part in the training. psnr is pooled over all pixels,"
+        " dB; psnr_mean is the mean over the views, as in papers; ssim is 1 at best, lpips 0."
     )
     return html.section("Scores", html.paragraph(text), html.table(("", *SCORES), score_rows(scores)))
 
