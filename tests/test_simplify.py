@@ -222,7 +222,10 @@ def test_a_target_psnr_is_reached(source, given, goal, refit):
 
 
 def test_the_source_is_kept_with_a_remark_if_no_pruned_scene_reaches_the_target(source, given, monkeypatch):
-    monkeypatch.setattr("csplat_tools.optimise.pruning._TRIES", 0)
+    def make_black(pruned, *_, **__):
+        return RefitResult(replace(pruned, sh0=np.full_like(pruned.sh0, -10.0)), None)
+
+    monkeypatch.setattr("csplat_tools.optimise.pruning.refit_with_bands", make_black)
     result = simplify(source, psnr=35.0, views=given, options=replace(SMALL, bands=False, refit=False))
     assert source is result.model
     (remark,) = result.notes
