@@ -115,7 +115,7 @@ _SPLATS_MAX = 300_000  # splats to draw; of larger scenes every Nth, scaled up t
 
 @cache
 def prepare_thumbnails() -> bool:
-    """Load the renderer, and compile it if need be, which takes up to a minute.
+    """Load the renderer, and compile it if necessary, which takes up to a minute.
 
     Returns:
         True if thumbnails can be drawn here; this requires the extra `render`.

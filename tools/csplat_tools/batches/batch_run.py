@@ -106,7 +106,7 @@ def batch(
 
     Args:
         scenes: a folder, with its subfolders; or a manifest, see `find_tasks`.
-        folder: the folder for outputs, `batch.jsonl` and `index.html`; it is made if need be.
+        folder: the folder for outputs, `batch.jsonl` and `index.html`; it is made if missing.
         command: a command that takes a scene and an output, with its options.
         ending: file name ending of the outputs; `None`: that of the command.
         match: shell pattern of names within a folder, such as `*.ply`.

@@ -434,7 +434,9 @@ def _number_text(value: Any) -> str:
 def _has_own_data_options(setting: SweepSetting) -> bool:
     """Return True if the data set has options that only programs can set."""
     data = setting.data
-    return data is not None and (data.size, data.test_every, data.near) != (None, None, None)
+    if data is None:
+        return False
+    return any(value is not None for value in (data.size, data.test_every, data.near))
 
 
 def _view_words(setting: SweepSetting) -> list[str]:

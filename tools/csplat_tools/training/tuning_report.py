@@ -146,7 +146,11 @@ def format_tuning_report(report: Mapping[str, Any]) -> str:
     """Return the report as text."""
     unseen = report["unseen"]
     others = report["source_splats"] - report["splats"] - unseen
-    words = [f"{unseen} that no view shows"] * bool(unseen) + [f"{others} of low importance"] * bool(others)
+    words = []
+    if unseen:
+        words.append(f"{unseen} that no view shows")
+    if others:
+        words.append(f"{others} of low importance")
     left_out = f" ({' and '.join(words)} pruned)" if words else ""
     size = f"{format_bytes(report['size_bytes'])}, {report['bytes_per_source_splat']:.2f} bytes per source splat"
     ratio = f"{report['ratio']:.1f} times smaller than a PLY of {ply_splat_bytes(report['sh_degree'])} bytes per splat"
