@@ -2763,7 +2763,7 @@ static int read_stated_errors(csplat *d, csplat_stated_errors *out)
     return at_end(d, &c);
 }
 
-/* What a caller calls --------------------------------------------------------------------------------------------------- */
+/* Public functions ------------------------------------------------------------------------------------------------------ */
 
 static csplat_code done(csplat *d, int worked)
 {

@@ -39,7 +39,7 @@ const ENTRY_WIDTH_MAX = 4; // STR-2
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  */
 
-/** @param {string} name of an attribute */
+/** @param {string} name name of an attribute */
 function columnsOf(name) {
   const id = Object.entries(spec.ATTRIBUTE_NAMES).find((entry) => entry[1] === name)?.[0];
   return spec.ATTRIBUTE_COLUMNS[/** @type {keyof typeof spec.ATTRIBUTE_COLUMNS} */ (Number(id))];

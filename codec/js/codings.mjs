@@ -17,7 +17,7 @@ const { ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
  * @property {{id: number, table: Table, index: Uint32Array, escaped: Uint32Array}} [lookup] a colour codebook, the entry
  *   of each splat, and the splats without an entry
  * @property {Uint32Array} [present] the splats that the columns cover, the others are 0; if absent, all splats
- * @property {number} exponent of the tile's lattice for this attribute
+ * @property {number} exponent exponent of the tile's lattice for this attribute
  * @property {number} bound maximum magnitude of the integers
  * @property {number} offset offset in the file of the stream or block, reported in errors about the integers
  *

@@ -77,7 +77,7 @@ export function readFileHeader(bytes) {
 }
 
 /**
- * @param {number} size of the data
+ * @param {number} size size of the data
  * @param {FileHeader} header
  */
 export function checkFileSize(size, { fileSize }) {
@@ -110,7 +110,7 @@ export function openChunk(chunk, place) {
   const header = spec.unpackChunkHeader(new DataView(chunk.buffer, chunk.byteOffset, chunk.byteLength), 0);
   const type = typeName(header.type);
   if (type !== place.type) {
-    throw fault(spec.ERROR_INDEX, offset, 'CHK-3', `a chunk ${JSON.stringify(type)} where the index has ${place.type}`);
+    throw fault(spec.ERROR_INDEX, offset, 'CHK-3', `a chunk ${JSON.stringify(type)}, the index has ${place.type}`);
   }
   if (header.flags !== place.flags) {
     throw fault(

@@ -297,7 +297,7 @@ function readExtra(index, recordSize, names) {
   names.add(name);
   const rest = fields.name.subarray(size).find((byte) => byte !== 0);
   if (rest !== undefined)
-    throw fault(ERROR_RESERVED, offset + places.name + size, 'EXR-3', `a byte of ${rest} behind the name`);
+    throw fault(ERROR_RESERVED, offset + places.name + size, 'EXR-3', `a byte of ${rest} after the name`);
   if (dtype === undefined) return { name, dtype: null, bytes: 0 };
   const bytes = spec.EXTRA_DTYPE_BYTES[/** @type {keyof typeof spec.EXTRA_DTYPE_BYTES} */ (fields.dtype)];
   return { name, dtype: /** @type {ExtraRecord['dtype']} */ (dtype), bytes };

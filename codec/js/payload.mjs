@@ -68,7 +68,7 @@ export class Payload {
 /**
  * Check RES-1: "A reserved field or bit MUST be 0".
  *
- * @param {Record<string, unknown>} fields of a structure
+ * @param {Record<string, unknown>} fields fields of a structure
  * @param {number} at offset of the structure in the file
  * @param {Readonly<Record<string, number>>} reserved offsets of its reserved fields
  * @param {string} what name for the message

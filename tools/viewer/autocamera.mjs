@@ -34,7 +34,7 @@ const NEARER = 0.9; // weight of the detail of a view, compared with the next fa
 const HIDING = 0.4; // extents; samples nearer to a camera in surroundings only occlude
 const JUDGED = 3000; // maximum number of samples used to compare views
 const SNAP = 0.94; // cosine of the angle within which the cameras' up direction snaps to an axis
-const ROTATION_TOLERANCE = 1e-2; // of the entries of R Rᵀ − 1; camera files have few digits
+const ROTATION_TOLERANCE = 1e-2; // maximum of the entries of R Rᵀ − 1; camera files have few digits
 
 /** Letters of directions, as used in files, and their opposites. */
 const OPPOSITE = /** @type {Record<string, string>} */ ({ R: 'L', L: 'R', U: 'D', D: 'U', F: 'B', B: 'F' });

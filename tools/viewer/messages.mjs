@@ -31,18 +31,18 @@ const WORDS = {
   E_JSON: BROKEN,
   E_UNSUPPORTED: { title: 'This file uses a feature that this viewer does not support.', advice: NEWER },
   E_LIMIT: { title: 'This scene is too large for this viewer.', advice: 'Use a scene with fewer splats.' },
-  E_INPUT: { title: 'The file could not be read.', advice: 'Check its address and the connection, then try again.' },
+  E_INPUT: { title: 'The file could not be read.', advice: 'Check the address and the connection, then try again.' },
   E_WEBGL2: {
     title: 'This browser cannot draw the scene: it has no WebGL 2.',
-    advice: 'A current version of Chrome, Edge, Firefox or Safari has; hardware acceleration may be switched off.',
+    advice: 'Use a current version of Chrome, Edge, Firefox or Safari, and check that hardware acceleration is on.',
   },
   E_CONTEXT: {
-    title: 'The graphics card gave up on this page.',
-    advice: 'If the picture does not come back, load the page again, and close others that use the card.',
+    title: 'The browser has lost access to the graphics card.',
+    advice: 'If the picture does not return, reload the page and close other pages that use the graphics card.',
   },
   E_WORKER: {
-    title: 'A part of this page could not start.',
-    advice: 'Load the page again; a current version of Chrome, Edge, Firefox or Safari is wanted.',
+    title: 'Part of this page could not start.',
+    advice: 'Reload the page, in a current version of Chrome, Edge, Firefox or Safari.',
   },
 };
 
@@ -54,7 +54,7 @@ const WORDS = {
  * @returns {Message} a title for all users, advice, and the details for a bug report
  */
 export function explain({ code, message, offset, clause }, name = '') {
-  let words = WORDS[code] ?? { title: 'Something went wrong.', advice: 'Load the page again.' };
+  let words = WORDS[code] ?? { title: 'Something went wrong.', advice: 'Reload the page.' };
   if (code === 'E_MAGIC' && /\.ply$/i.test(name)) {
     words = {
       title: 'This is a PLY, not a .csplat file.',

@@ -11,7 +11,7 @@ import { unitDirection } from './vectors.mjs';
  * @property {import('./vectors.mjs').Vec3 | null} up up direction, a unit vector; overrides the file's
  * @property {import('./vectors.mjs').Vec3 | null} seems up direction if nothing else specifies it
  * @property {string | null} axes directions of +x, +y, +z; override the file's
- * @property {{width: number, height: number} | null} size of the drawing buffer, pixels
+ * @property {{width: number, height: number} | null} size size of the drawing buffer, pixels
  * @property {[number, number, number] | null} background 0 to 1; overrides the file's
  * @property {boolean} ui false to show only the scene
  *

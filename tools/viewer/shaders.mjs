@@ -75,7 +75,7 @@ void main() {
   uint slot = texelFetch(uOrder, place(i), 0).x;
   uint tile = texelFetch(uBlocks, place(slot / ${BLOCK_SPLATS}u), 0).x;
   uint row = tile * ${TILE_TEXELS}u;
-  uvec4 layout0 = texelFetch(uTiles, place(row), 0); // bits, bits, texel of the store, words there | first slot
+  uvec4 layout0 = texelFetch(uTiles, place(row), 0); // bits, bits, texel of the store, number of words | first slot
   uvec4 scaleLattice = texelFetch(uTiles, place(row + 1u), 0);
   uvec4 colourLattice = texelFetch(uTiles, place(row + 2u), 0);
   vec4 corner = texelFetch(uPlaces, place(tile), 0);

@@ -1,6 +1,6 @@
 /* Tests beyond the conformance suite: failing callbacks, budgets, invalid arguments, a lower degree.
  *
- *     interface FILE...        status 0, or the number of a line that does not hold, on standard error */
+ *     interface FILE...        status 0, or the line number of a failed check on standard error */
 #include "csplat.h"
 
 #include <stdio.h>

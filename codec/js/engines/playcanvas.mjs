@@ -20,9 +20,9 @@ const BANDS = [1, 2, 3];
 const AXES = 'xyz';
 
 const GLSL = /* glsl */ `
-uniform vec4 csShape; // lowest integer and step of scales, levels of alpha, whether it is a square
-uniform vec4 csOther; // lowest integer and step of colours, lowest of quats and their unit
-uniform vec4 csLows;  // of SH bands; whether splats are discs
+uniform vec4 csShape; // lowest integer and step of scales, levels of alpha, whether alpha is squared
+uniform vec4 csOther; // lowest integer and step of colours, lowest integer and unit of quats
+uniform vec4 csLows;  // lowest integers of SH bands; whether splats are discs
 uniform vec4 csSteps;
 #ifndef GSPLAT_WORKBUFFER_GEOMETRY
 vec3 getCenter() {
