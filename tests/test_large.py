@@ -21,6 +21,7 @@ from csplat.encoder import encode_plan, encode_tiles, tiling
 from csplat.encoder.tiling import BucketCurve, bucket_rows
 from csplat.formats import open_scene
 from csplat.out_of_core import disk_encode, encode_scene
+from csplat.out_of_core.spill_files import EncodingState
 from csplat.scene_source import source_from_model
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
@@ -140,7 +141,9 @@ def test_an_interrupted_encoding_is_resumed(model, whole, tmp_path, stage, after
     assert (tmp_path / "out.csplat.work").is_dir()
     with pytest.raises(InputError, match="left from an interrupted encoding"):
         encode_large(scene, target, FAST)
-    with pytest.raises(InputError, match="started with options"):
+    with pytest.raises(
+        InputError, match=r"started with options .*: continue with the former options, or remove the folder"
+    ):
         encode_large(scene, target, replace(FAST, seed=1), resume=True)
     coded = []
     encode_large(scene, target, FAST, resume=True, progress=lambda stage, _done: coded.append(stage))
@@ -202,6 +205,21 @@ def test_a_damaged_work_file_is_named(model, tmp_path, kind):
     with pytest.raises(InputError, match=f"{kind} is damaged: remove out.csplat.work"):
         encode_large(source_from_model(model), target, FAST, resume=True)
     assert not target.exists()
+
+
+@pytest.mark.parametrize(
+    "done",
+    [
+        "",
+        ', "curve": {"corner": [0.5, 0.0, -1.0], "scale": 2.0, "bounds": [3, 9]}, "largest": 1.5',
+        ', "curve": {"corner": [0.5], "scale": 2.0, "bounds": [7]}, "largest": 0.0, "counts": [5], "contrast": 0.0',
+    ],
+    ids=["new", "surveyed", "measured"],
+)
+def test_the_state_of_an_encoding_is_written_as_the_json_that_was_read(done):
+    text = f'{{"key": {{"splats": 5}}{done}}}'
+
+    assert text == EncodingState.from_json(text.encode()).to_json().decode()
 
 
 def test_a_folder_with_other_files_is_refused_and_kept(model, tmp_path):

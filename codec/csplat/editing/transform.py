@@ -68,14 +68,14 @@ def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
     """
     matrix = _rotation_to(scene.metadata_model, axes)
 
-    def place(model: SplatModel) -> SplatModel:
+    def transform_block(model: SplatModel) -> SplatModel:
         return replace(rotate_scene(model, matrix), coordinate_system=axes)
 
     def blocks() -> Iterator[SplatModel]:
-        yield from map(place, scene.blocks())
+        yield from map(transform_block, scene.blocks())
 
     same = scene.metadata_model.coordinate_system == axes
-    return scene if same else SceneSource(scene.count, place(scene.metadata_model), blocks, scene.findings)
+    return scene if same else SceneSource(scene.count, transform_block(scene.metadata_model), blocks, scene.findings)
 
 
 def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:

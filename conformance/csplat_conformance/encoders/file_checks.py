@@ -55,7 +55,7 @@ def check_content(
         case: the input.
         source: the scene of the input.
         scene: the decoded scene.
-        index: path of the encoder's source index, `None` if the command has no place for it.
+        index: path of the encoder's source index, `None` if the command has no placeholder for it.
 
     Returns:
         The verdict, and the pairs of splats: by the encoder's index if it is correct.
