@@ -62,11 +62,7 @@ def distortion(points, weights, entries, index):
 
 
 # Nearest entries.
-@pytest.mark.parametrize("entry_count", [1, 2, 300, kmeans._PRODUCT_COLUMNS + 3])
-def test_assign_finds_the_first_nearest_entry(entry_count):
-    rng = np.random.default_rng(1)
-    points = rng.integers(-3, 4, (600, 4)).astype(np.int16)  # many equal distances
-    entries = rng.integers(-3, 4, (entry_count, 4)).astype(np.int32)
+def assert_search_is_exact(points, entries):
     expected = squared_distances(points, entries)
     index, error = search_nearest(points, entries)
     assert index.dtype == np.uint32
@@ -74,15 +70,20 @@ def test_assign_finds_the_first_nearest_entry(entry_count):
     np.testing.assert_array_equal(expected.min(1), error)
 
 
+@pytest.mark.parametrize("entry_count", [1, 2, 300, kmeans._PRODUCT_COLUMNS + 3])
+def test_assign_finds_the_first_nearest_entry(entry_count):
+    rng = np.random.default_rng(1)
+    points = rng.integers(-3, 4, (600, 4)).astype(np.int16)  # many equal distances
+    entries = rng.integers(-3, 4, (entry_count, 4)).astype(np.int32)
+    assert_search_is_exact(points, entries)
+
+
 def test_search_is_exact_just_below_the_bound():
     rng = np.random.default_rng(2)
     points = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
     entries = points[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)
     assert kmeans._shift(points, entries) == 0
-    expected = squared_distances(points, entries)
-    index, error = search_nearest(points, entries)
-    np.testing.assert_array_equal(expected.argmin(1), index)
-    np.testing.assert_array_equal(expected.min(1), error)
+    assert_search_is_exact(points, entries)
 
 
 @pytest.mark.parametrize("largest", [4000, 2**20, 2**31 - 1])
@@ -196,16 +197,14 @@ def test_weights_matter_by_ratio_only():
     points, weights = blobs()
     first = cluster(points, weights, 30, seed=0, iterations=3)
     second = cluster(points, weights * np.float32(2**-40), 30, seed=0, iterations=3)
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
+    np.testing.assert_equal(second, first)
 
 
 def test_weights_of_only_zeros_are_equal_weights():
     points, _ = blobs()
     first = cluster(points, ones(points), 30, seed=0, iterations=3)
     second = cluster(points, 0 * ones(points), 30, seed=0, iterations=3)
-    np.testing.assert_array_equal(first[0], second[0])
-    np.testing.assert_array_equal(first[1], second[1])
+    np.testing.assert_equal(second, first)
 
 
 @pytest.mark.parametrize("positive", [0, 1, 5, 20])
@@ -369,8 +368,7 @@ def test_refining_does_not_depend_on_threads():
     points, _, metric, entries = scene(3000, 5, 3, 200)
     start = np.zeros(len(points), np.int64)
     one, two = (refine_by_metric(points, metric, entries, start, threads) for threads in (1, 2))
-    np.testing.assert_array_equal(one[0], two[0])
-    np.testing.assert_array_equal(one[1], two[1])
+    np.testing.assert_equal(two, one)
 
 
 def test_entries_of_points_without_weight_do_not_move():

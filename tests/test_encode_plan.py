@@ -14,7 +14,7 @@ from checked import measure_errors
 
 from csplat import EncodeOptions, _spec, decode, encode
 from csplat.decoder import decode_scene, read_declared_bounds, read_options
-from csplat.encoder import EncodePlan, Origin, encode_tiles, encode_with_report, fix_quantisation
+from csplat.encoder import EncodePlan, Origin, encode_tiles, encode_with_report
 from csplat.encoder.coding_parameters import Lattice
 from csplat.encoder.entropy import DeflateSettings, signed_stream, unsigned_stream
 from csplat.encoder.quantisation import quantise_means
@@ -153,17 +153,6 @@ def test_errors_may_be_declared_against_another_scene(make_model):
         stated = result.report.errors[name]
         assert largest <= stated[0] <= largest * 1.0001 + 1e-11
         assert rms <= stated[1] <= rms * 1.0001 + 1e-11
-
-
-def test_fixed_quantisation_of_unchanged_values_gives_the_same_splats(make_model):
-    model = make_model(300, 2)
-    plan = EncodePlan.of(model, EncodeOptions(sh_coding="scalar"))
-    fixed = fix_quantisation(plan)
-    plain, thawed = encode_tiles(plan).write(), fixed.encode(fixed.start()).write()
-    assert np.array_equal(plain.source_index, thawed.source_index)
-    one, other = decode(plain.data), decode(thawed.data)
-    for name in ("means", "opacities", *COLOURS):
-        assert np.array_equal(getattr(one, name), getattr(other, name)), name
 
 
 # Absent bands.

@@ -78,6 +78,11 @@ def first(report):
     return outcome.status, outcome.clauses, outcome.message
 
 
+def outcome_of(encoded, change, choice=FILES):
+    """Return status, clauses and message of our own encoder followed by `change`."""
+    return first(run_encoder(COMMAND, choice, run=running(encoded, change)))
+
+
 # Traces --------------------------------------------------------------------------------------------
 def test_ours_passes_in_this_process(encoded):
     report = run_encoder(COMMAND, EncoderSuiteOptions(PLAIN, ("L1", "L2", "L3")), run=running(encoded, lambda _: None))
@@ -91,8 +96,7 @@ def test_ours_passes_in_this_process(encoded):
     (lambda at: (at.out.parent / "cache").mkdir(), "left cache next to the output"),
 ])  # fmt: skip
 def test_side_effects_of_a_run_are_failures(encoded, change, message):
-    report = run_encoder(COMMAND, FILES, run=running(encoded, change))
-    assert (Status.FAILED, (), message) == first(report)
+    assert (Status.FAILED, (), message) == outcome_of(encoded, change)
 
 
 @pytest.mark.parametrize("name", ["nasty/empty", "broken/cut"])
@@ -102,19 +106,16 @@ def test_a_refusal_leaves_nothing(encoded, name):
         (at.out.parent / "x.tmp").touch()
         return 1
 
-    report = run_encoder(COMMAND, EncoderSuiteOptions(name, ("L1",)), run=running(encoded, refuse))
     message = "refused, but left out.npy next to the output; refused, but left x.tmp next to the output"
-    assert (Status.FAILED, (), message) == first(report)
+    assert (Status.FAILED, (), message) == outcome_of(encoded, refuse, EncoderSuiteOptions(name, ("L1",)))
 
 
 def test_the_working_directory_stays_empty():
     writes = program("import sys; open('core', 'w'); open(sys.argv[2], 'w'); sys.exit(0)")
     refuses = program("import sys; open('log', 'w'); sys.exit('error: no')")
     assert "file is empty" in first(run_encoder(writes, FILES))[2]  # an invalid file needs no further report
-    assert (
-        "refused, but left log in its working directory"
-        == first(run_encoder(refuses, EncoderSuiteOptions("nasty/empty", ("L1",))))[2]
-    )
+    refusal = run_encoder(refuses, EncoderSuiteOptions("nasty/empty", ("L1",)))
+    assert "refused, but left log in its working directory" == first(refusal)[2]
     assert not Path("core").exists()
 
 
@@ -136,9 +137,8 @@ def test_a_program_with_a_slash_is_one_of_the_callers_directory(tmp_path, monkey
     (tmp_path / "enc").chmod(0o755)
     (tmp_path / "other").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert (
-        f"{tmp_path}/other\n".encode() == run_program("./enc {ply}", {"ply": "x"}, 30.0, cwd=tmp_path / "other").stdout
-    )
+    ended = run_program("./enc {ply}", {"ply": "x"}, 30.0, cwd=tmp_path / "other")
+    assert f"{tmp_path}/other\n".encode() == ended.stdout
 
 
 # Repetitions ---------------------------------------------------------------------------------------
@@ -162,29 +162,26 @@ def flip(place):
 
 
 def test_a_second_run_gives_the_same_bytes(encoded):
-    differs = run_encoder(COMMAND, FILES, run=running(encoded, changed_the_second_time(flip(150))))
-    status, clauses, message = first(differs)
+    status, clauses, message = outcome_of(encoded, changed_the_second_time(flip(150)))
     assert (Status.FAILED, ("CNF-10",)) == (status, clauses)
     assert message.startswith("two runs gave different files: first at byte 150, in attribute[")
 
 
 def test_the_chunk_that_differs_is_named(encoded):
     for place, name in ((-1, "TILE.0.1"), (encoded[0].rfind(b"SERR") + 30, "SERR (directory[")):
-        report = run_encoder(COMMAND, FILES, run=running(encoded, changed_the_second_time(flip(place))))
-        assert f"in the chunk {name}" in first(report)[2]
+        assert f"in the chunk {name}" in outcome_of(encoded, changed_the_second_time(flip(place)))[2]
 
 
 def test_differing_lengths_are_reported(encoded):
     longer = changed_the_second_time(lambda at: at.out.write_bytes(encoded[0] + b"12345") and None)
-    message = first(run_encoder(COMMAND, FILES, run=running(encoded, longer)))[2]
+    message = outcome_of(encoded, longer)[2]
     assert f"({len(encoded[0]):,} and {len(encoded[0]) + 5:,} bytes): first at byte {len(encoded[0])}" in message
 
 
 def test_a_second_run_gives_the_same_index(encoded):
     other = changed_the_second_time(lambda at: np.save(at.index, encoded[1][::-1]))
-    assert (Status.FAILED, ("CNF-10",), "two runs gave the same file but different source indices") == first(
-        run_encoder(COMMAND, FILES, run=running(encoded, other))
-    )
+    message = "two runs gave the same file but different source indices"
+    assert (Status.FAILED, ("CNF-10",), message) == outcome_of(encoded, other)
 
 
 def test_a_second_run_ends_as_the_first(encoded):
@@ -192,8 +189,8 @@ def test_a_second_run_ends_as_the_first(encoded):
         at.out.unlink()
         return 1
 
-    report = run_encoder(COMMAND, FILES, run=running(encoded, changed_the_second_time(refuse)))
-    assert "a second run ended differently: exit status 1, no file; its last line: error: no" == first(report)[2]
+    message = "a second run ended differently: exit status 1, no file; its last line: error: no"
+    assert message == outcome_of(encoded, changed_the_second_time(refuse))[2]
 
 
 def test_processes_run_again_in_another_second(encoded, tmp_path):
@@ -222,10 +219,8 @@ def test_only_kept_files_remain_in_folders_of_their_own(encoded, tmp_path):
 def test_files_of_an_earlier_run_are_not_accepted(encoded, tmp_path):
     choice = EncoderSuiteOptions(PLAIN, ("L1",), keep=tmp_path)
     for _ in range(2):
-        report = run_encoder(
-            COMMAND, choice, run=running(encoded, lambda at: (at.out.parent / "tmp").write_text("") and None)
-        )
-        assert "left tmp next to the output" in first(report)[2]
+        message = outcome_of(encoded, lambda at: (at.out.parent / "tmp").write_text("") and None, choice)[2]
+        assert "left tmp next to the output" in message
 
 
 # The source index ----------------------------------------------------------------------------------
@@ -240,8 +235,7 @@ def test_files_of_an_earlier_run_are_not_accepted(encoded, tmp_path):
     (lambda index: np.where(np.arange(216) == 5, 2**40, index), "is 1099511627776, expected 0 to 215"),
 ])  # fmt: skip
 def test_a_wrong_index_is_reported(encoded, change, message):
-    report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at: np.save(at.index, change(encoded[1]))))
-    status, clauses, found = first(report)
+    status, clauses, found = outcome_of(encoded, lambda at: np.save(at.index, change(encoded[1])), MAPS)
     assert (Status.FAILED, ("SRC-4",)) == (status, clauses)
     assert message in found
 
@@ -271,9 +265,9 @@ def npy(text):
     (lambda path: path.write_bytes(npy(b"{[]: 1}")), "is not a NumPy array file"),
 ])  # fmt: skip
 def test_an_index_is_an_npy_file(encoded, write, message):
-    report = run_encoder(COMMAND, MAPS, run=running(encoded, lambda at: write(at.index) and None))
-    assert ("SRC-4",) == first(report)[1]
-    assert message in first(report)[2]
+    _, clauses, found = outcome_of(encoded, lambda at: write(at.index) and None, MAPS)
+    assert ("SRC-4",) == clauses
+    assert message in found
 
 
 def test_any_integer_type_is_accepted(encoded):

@@ -60,9 +60,8 @@ def test_every_listed_name_exists(package):
 
 
 def test_importing_the_packages_loads_no_renderer_or_command_line():
-    code = "import csplat, csplat_tools, csplat_trainer, sys; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    assert not {"numba", "numpy", "typer", "rich", "torch", "csplat_render"} & set(loaded)
+    loaded = modules_after("import csplat, csplat_tools, csplat_trainer")
+    assert not {"numba", "numpy", "typer", "rich", "torch", "csplat_render"} & loaded
 
 
 # Examples of the documentation.
@@ -331,10 +330,6 @@ def test_the_reader_loads_neither_encoder_nor_decoder():
     assert not [name for name in loaded if name.startswith(("csplat.encoder", "csplat.decoder"))]
 
 
-def test_every_public_name_resolves():
-    assert [] == [name for name in csplat.__all__ if getattr(csplat, name, None) is None]
-
-
 def test_dir_lists_the_public_names():
     assert sorted(csplat.__all__) == dir(csplat)
 
@@ -346,40 +341,27 @@ def test_an_unknown_name_is_an_attribute_error():
 
 @pytest.mark.slow
 def test_the_renderer_requires_no_torch():
-    """test_interface.py tests that cameras require no numba."""
     pytest.importorskip("numba", reason="the renderer requires the extra [render]")
-    loaded = {
-        name.split(".")[0]
-        for name in modules_after("import csplat_render.rasteriser, csplat_render.reference_rasteriser")
-    }
-    assert not loaded & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy
+    loaded = modules_after("import csplat_render.rasteriser, csplat_render.reference_rasteriser")
+    packages = {name.split(".")[0] for name in loaded}
+    assert not packages & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy
 
 
-def test_a_format_error_names_code_place_clause_and_both_values():
-    error = errors.FormatError("E_CRC", 12, "CRC-1", "found 0x1a2b3c4d, computed 0x5e6f7081")
-    assert "E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081" == str(error)
-    assert ("E_CRC", 12, "CRC-1") == (error.code, error.offset, error.clause)
-
-
-def test_the_message_contains_the_values_found_and_expected():
-    error = errors.FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5")
-    assert "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5" == str(error)
-
-
-def test_a_format_error_may_lack_a_place():
-    assert "E_HASH (SHA-1)" == str(errors.FormatError("E_HASH", None, "SHA-1"))
-
-
-def test_an_unsupported_error_names_the_feature():
-    error = errors.UnsupportedError("version 0.7")
-    assert "E_UNSUPPORTED: version 0.7 is not supported" == str(error)
-    assert ("E_UNSUPPORTED", "version 0.7") == (error.code, error.feature)
-
-
-def test_a_limit_error_names_both_sides():
-    error = errors.LimitError("max_splats", 10, 5)
-    assert "E_LIMIT: max_splats: needs 10, allowed 5" == str(error)
-    assert ("max_splats", 10, 5) == (error.limit, error.wanted, error.allowed)
+@pytest.mark.parametrize(("error", "message", "fields"), [
+    (errors.FormatError("E_CRC", 12, "CRC-1", "found 0x1a2b3c4d, computed 0x5e6f7081"),
+        "E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081",
+        {"code": "E_CRC", "offset": 12, "clause": "CRC-1"}),
+    (errors.FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5"),
+        "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5", {}),
+    (errors.FormatError("E_HASH", None, "SHA-1"), "E_HASH (SHA-1)", {}),
+    (errors.UnsupportedError("version 0.7"), "E_UNSUPPORTED: version 0.7 is not supported",
+        {"code": "E_UNSUPPORTED", "feature": "version 0.7"}),
+    (errors.LimitError("max_splats", 10, 5), "E_LIMIT: max_splats: needs 10, allowed 5",
+        {"limit": "max_splats", "wanted": 10, "allowed": 5}),
+])  # fmt: skip
+def test_an_error_names_code_place_and_values(error, message, fields):
+    assert message == str(error)
+    assert fields == {name: getattr(error, name) for name in fields}
 
 
 @pytest.mark.parametrize("error", [

@@ -67,6 +67,17 @@ def no_torch(monkeypatch):
     return replace_by
 
 
+@pytest.fixture
+def read_holding(no_torch):
+    """Return a function that reads a checkpoint that holds an object."""
+
+    def read(said, **options):
+        no_torch(lambda *_, **__: said)
+        return csplat.read(STORED["gsplat.pt"], **options)
+
+    return read
+
+
 def made_splats(make_model, degree):
     """Return a scene as gsplat's dictionary of tensors."""
     return {name: tensor(values) for name, values in to_gsplat(make_model(5, degree)).items()}
@@ -107,30 +118,26 @@ def test_a_stored_checkpoint_is_read(no_torch, name):
     of_checkpoint(STORED[name])
 
 
-def test_colours_that_splatfacto_trained_without_sh_are_logits(no_torch, make_model):
+def test_colours_that_splatfacto_trained_without_sh_are_logits(read_holding, make_model):
     splats = made_splats(make_model, 0)
-    found = []
-    for said in ({"splats": splats}, of_splatfacto(splats)):
-        no_torch(lambda *_, said=said, **__: said)
-        found.append(csplat.read(STORED["gsplat.pt"]))
+    found = [read_holding(said) for said in ({"splats": splats}, of_splatfacto(splats))]
     colours = 0.5 + 0.28209479177387814 * found[1].sh0
     assert np.allclose(1.0 / (1.0 + np.exp(-found[0].sh0)), colours, atol=1e-6)
     assert (found[0].means == found[1].means).all()
 
 
-def test_sh_bands_above_the_requested_degree_are_left_out(no_torch, make_model):
+def test_sh_bands_above_the_requested_degree_are_left_out(read_holding, make_model):
     splats = made_splats(make_model, 3)
     many = tensor(np.concatenate([splats["shN"], np.ones((5, 9, 3), np.float32)], axis=1))
     for said in ({"splats": {**splats, "shN": many}}, of_splatfacto({**splats, "shN": many})):
-        no_torch(lambda *_, said=said, **__: said)
         with pytest.raises(InputError, match=r"shN has SH degree 4, expected at most 3: --sh-degree 3 of csplat"):
-            csplat.read(STORED["gsplat.pt"])
+            read_holding(said)
         for degree in (3, 1):
-            read = csplat.read(STORED["gsplat.pt"], sh_degree=degree)
+            read = read_holding(said, sh_degree=degree)
             assert np.array_equal(splats["shN"][:, : (degree + 1) ** 2 - 1], read.shN)
 
 
-def test_a_checkpoint_without_splats_is_refused(no_torch, make_model):
+def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
     splats = made_splats(make_model, 1)
     many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)
     for said, says in (
@@ -143,9 +150,8 @@ def test_a_checkpoint_without_splats_is_refused(no_torch, make_model):
         ({"splats": {"means": splats["means"]}}, "no quats"),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
     ):
-        no_torch(lambda *_, said=said, **__: said)
         with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{says}"):
-            csplat.read(STORED["gsplat.pt"])
+            read_holding(said)
 
 
 def renamed(splats, prefix):
@@ -161,10 +167,9 @@ def of_inria(splats):
     return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
 
 
-def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(no_torch, make_model):
+def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(read_holding, make_model):
     splats = made_splats(make_model, 3)
-    no_torch(lambda *_, **__: {"splats": splats})
-    expected = csplat.read(STORED["gsplat.pt"])
+    expected = read_holding({"splats": splats})
     for said in (
         {"step": 1, "pipeline": renamed(splats, "_model.")},  # nerfstudio before 1.1
         {"step": 1, "pipeline": renamed(splats, "module._model.gauss_params.")},
@@ -173,19 +178,17 @@ def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(no_torch
         splats,
         of_inria(splats),
     ):
-        no_torch(lambda *_, said=said, **__: said)
-        read = csplat.read(STORED["gsplat.pt"])
+        read = read_holding(said)
         assert all(np.array_equal(getattr(expected, name), getattr(read, name)) for name in ARRAYS)
 
 
-def test_several_models_in_one_checkpoint_are_refused(no_torch, make_model):
+def test_several_models_in_one_checkpoint_are_refused(read_holding, make_model):
     splats = made_splats(make_model, 1)
     few = {name: values[:2] for name, values in splats.items()}
     pipeline = {**renamed(splats, "_model.gauss_params."), **renamed(few, "_model.background.gauss_params.")}
-    no_torch(lambda *_, **__: {"pipeline": pipeline})
     words = r"2 models of splats, .*: _model\.gauss_params\.\* \(5 splats\), _model\.background\.gauss_params\.\* \(2 s"
     with pytest.raises(InputError, match=words):
-        csplat.read(STORED["gsplat.pt"])
+        read_holding({"pipeline": pipeline})
 
 
 def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_path):
@@ -209,13 +212,12 @@ def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_pat
     assert ("ranks", "note", True) == (report[-1].id, report[-1].kind, report[-1].usual)
 
 
-def read_splats(no_torch, splats):
-    no_torch(lambda *_, **__: {"splats": splats})
+def read_splats(read_holding, splats):
     report = []
-    return csplat.read(STORED["gsplat.pt"], report=report), {one.id: one for one in report}
+    return read_holding({"splats": splats}, report=report), {one.id: one for one in report}
 
 
-def test_values_are_checked_like_those_of_a_ply(no_torch):
+def test_values_are_checked_like_those_of_a_ply(read_holding):
     rng = np.random.default_rng(0)
     numbers = {"means": 3, "quats": 4, "scales": 3, "sh0": 3}
     splats = {name: rng.standard_normal((20, width)).astype(np.float32) for name, width in numbers.items()}
@@ -223,25 +225,25 @@ def test_values_are_checked_like_those_of_a_ply(no_torch):
     splats |= {"sh0": splats["sh0"][:, None], "opacities": tensor(np.linspace(0, 1, 20, dtype=np.float32))}
     splats["scales"] = tensor(np.abs(splats["scales"]) * np.float32(0.1))
     splats["quats"][3] = 0
-    model, found = read_splats(no_torch, {**splats, "filter_3D": tensor(np.ones(20))})
+    model, found = read_splats(read_holding, {**splats, "filter_3D": tensor(np.ones(20))})
     assert {"zero-quats", "opacities-are-alphas", "scales-are-linear", "filter-3d"} <= set(found)
     assert "repair" == found["zero-quats"].kind == found["filter-3d"].kind
     assert [1, 0, 0, 0] == model.quats[3].tolist()
 
 
-def test_two_scales_are_discs(no_torch, make_model):
+def test_two_scales_are_discs(read_holding, make_model):
     splats = made_splats(make_model, 0)
-    model, found = read_splats(no_torch, {**splats, "scales": splats["scales"][:, :2]})
+    model, found = read_splats(read_holding, {**splats, "scales": splats["scales"][:, :2]})
     assert "flat-scales" in found
     assert model.flat
     assert np.array_equal(splats["scales"][:, :2], model.scales[:, :2])
     np.testing.assert_allclose(model.scales[:, 2], splats["scales"][:, :2].min() - np.log(100), rtol=1e-6)
 
 
-def test_positions_in_doubles_get_an_origin(no_torch, make_model):
+def test_positions_in_doubles_get_an_origin(read_holding, make_model):
     splats = made_splats(make_model, 0)
     far = tensor(splats["means"].astype(np.float64) + 1e7 + 0.3)
-    model, found = read_splats(no_torch, {**splats, "means": far})
+    model, found = read_splats(read_holding, {**splats, "means": far})
     assert "double-means" in found
     assert np.float32 == model.means.dtype
     np.testing.assert_allclose(model.means + np.array(model.origin), far, rtol=0, atol=1e-6)

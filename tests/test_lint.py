@@ -48,6 +48,10 @@ def found(path):
     return {one.id: one for one in lint_ply(path)}
 
 
+def put_text(path, text, rows=None, **words):
+    path.write_bytes(header(ROWS if rows is None else rows, kind="ascii", **words) + text.encode())
+
+
 def without(*names):
     return [name for name in NAMES if name not in names]
 
@@ -84,13 +88,12 @@ def test_rows_damaged_by_a_text_mode_transfer_are_refused(path):
 
 
 def test_trailing_lines_of_an_ascii_file_are_counted(path):
-    rows = good_rows(2)
-    lines = "".join(" ".join(map(str, row)) + "\n" for row in rows.tolist()).encode()
-    path.write_bytes(header(rows, kind="ascii") + lines + b"\n")
+    lines = "\n".join(lines_of(ROWS)) + "\n"
+    put_text(path, f"{lines}\n")
     assert "trailing-bytes" not in found(path)
-    path.write_bytes(header(rows, kind="ascii") + lines + b"1 2 3\n")
+    put_text(path, f"{lines}1 2 3\n")
     assert 5 == found(path)["trailing-bytes"].count
-    assert 2 == len(read_ply(path))
+    assert 4 == len(read_ply(path))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -174,8 +177,7 @@ def test_rotations_of_any_length_are_normalised(path, length):
 
 @pytest.mark.parametrize("missing", [("x",), ("opacity",), ("f_dc_0", "f_dc_2"), ("scale_0",), ("rot_3",)])
 def test_missing_columns_are_named_and_refused(path, missing):
-    rows = good_rows(names=without(*missing))
-    put(path, rows)
+    put(path, good_rows(names=without(*missing)))
     finding = found(path)["missing-columns"]
     assert (len(missing), False) == (finding.count, finding.repairable)
     with pytest.raises(InputError, match=f"no column {', '.join(missing)}"):
@@ -196,8 +198,7 @@ def test_two_scales_are_read_as_discs(path):
 def test_other_numbers_of_sh_columns_are_refused(path, count):
     names = without(*(name for name in NAMES if name.startswith("f_rest")))
     names += [f"f_rest_{i}" for i in range(count)]
-    rows = good_rows(names=names)
-    put(path, rows)
+    put(path, good_rows(names=names))
     assert count == found(path)["sh-columns"].count
     with pytest.raises(InputError, match=f"{count} f_rest columns match no SH degree, expected 0, 9, 24 or 45"):
         read_ply(path)
@@ -225,7 +226,7 @@ def test_degree_4_is_read_with_fewer_bands(path):
 
 
 def test_fewer_bands_are_read_on_request(path):
-    path.write_bytes(header(good_rows()) + good_rows().tobytes())
+    put(path, good_rows())
     report = []
     assert 0 == read_ply(path, sh_degree=0, strict=True, report=report).sh_degree
     assert [] == report
@@ -251,7 +252,7 @@ def renamed(rows, name_of):
 )
 def test_column_names_of_other_programs_are_read(path, name_of):
     plain, rows = good_rows(), renamed(good_rows(), name_of)
-    path.write_bytes(header(plain) + plain.tobytes())
+    put(path, plain)
     expected = read_ply(path)
     put(path, rows)
     report = []
@@ -290,8 +291,7 @@ def coloured(kind, values, names=COLOURS, count=3):
     ("<f8", 1, ("r", "g", "b")),
 ])  # fmt: skip
 def test_red_green_and_blue_replace_f_dc(path, kind, largest, names):
-    rows = coloured(kind, (0, largest, largest // 5), names)
-    put(path, rows)
+    put(path, coloured(kind, (0, largest, largest // 5), names))
     assert ["rgb-colours"] == list(found(path))
     expected = (np.array([0, 1, (largest // 5) / largest]) - 0.5) / 0.28209479177387814
     model = read_ply(path, strict=True)
@@ -305,16 +305,14 @@ def test_red_green_and_blue_replace_f_dc(path, kind, largest, names):
     ("<i4", (0, 17, 255), "of type int32, int32, int32, expected uint8, uint16 or float"),
 ])  # fmt: skip
 def test_colours_of_another_range_are_refused(path, kind, values, message):
-    rows = coloured(kind, values)
-    put(path, rows)
+    put(path, coloured(kind, values))
     assert ["colour-columns"] == [one.id for one in found(path).values() if one.kind == "error"]
     with pytest.raises(InputError, match=message):
         read_ply(path)
 
 
 def test_colours_of_16_bits_up_to_255_are_read_as_bytes(path):
-    rows = coloured("<u2", (0, 17, 255))
-    put(path, rows)
+    put(path, coloured("<u2", (0, 17, 255)))
     assert "in steps of 1/255: they have 16 bits, but are at most 255" in found(path)["rgb-colours"].text
     expected = (np.array([0, 17 / 255, 1]) - 0.5) / 0.28209479177387814
     np.testing.assert_allclose(read_ply(path, strict=True).sh0, [expected] * 3, rtol=1e-6)
@@ -362,9 +360,7 @@ def test_the_filter_of_discs_is_not_fused(path):
 
 
 def test_integer_positions_are_reported(path):
-    rows = good_rows()
-    kinds = [(name, "<i4" if name in "xyz" else "<f4") for name in NAMES]
-    path.write_bytes(header(rows.astype(kinds)) + rows.astype(kinds).tobytes())
+    put(path, good_rows().astype([(name, "<i4" if name in "xyz" else "<f4") for name in NAMES]))
     assert "positions are integers: 5 means are float32" in found(path)["double-means"].text
 
 
@@ -411,25 +407,20 @@ def test_values_after_their_activation_are_noted(path, changes, noted):
     ([*without("scale_0", "scale_1", "scale_2"), "scale_x"], [], "no column scale_0, scale_1, scale_2.* it has x"),
 ])  # fmt: skip
 def test_other_contents_are_named(path, names, after, message):
-    rows = good_rows(names=names)
-    path.write_bytes(header(rows, after=after) + rows.tobytes())
+    put(path, good_rows(names=names), after=after)
     with pytest.raises(InputError, match=message):
         read_ply(path)
 
 
 def test_columns_of_dynamic_splats_are_named(path):
     for names in (["motion_0", "trbf_center"], ["t", "scale_t"]):
-        rows = good_rows(names=[*NAMES, *names])
-        put(path, rows)
-        message = (
-            f"{', '.join(names)} are not splat attributes: dropped; the file contains dynamic (4D) splats: their time"
-        )
-        assert message in found(path)["extra-columns"].text
+        put(path, good_rows(names=[*NAMES, *names]))
+        message = "are not splat attributes: dropped; the file contains dynamic (4D) splats: their time"
+        assert f"{', '.join(names)} {message}" in found(path)["extra-columns"].text
 
 
 def test_elements_of_dynamic_splats_are_named(path):
-    rows = good_rows()
-    path.write_bytes(header(rows, after=["element delta_vertex_0 1", "property float x"]) + rows.tobytes() + bytes(4))
+    put(path, good_rows(), bytes(4), after=["element delta_vertex_0 1", "property float x"])
     assert "of which the first frame is kept" in found(path)["other-elements"].text
     assert 5 == len(read_ply(path))
 
@@ -452,7 +443,7 @@ ROWS = good_rows(4)  # an x of 3.0 in the last row
     (lambda lines: "\r".join([" ".join(lines[:2]), " ".join(lines[2:])]), "4 of vertex in 2 lines"),
 ])  # fmt: skip
 def test_unambiguous_rows_of_text_are_read(path, written, message):
-    path.write_bytes(header(ROWS, kind="ascii") + written(lines_of(ROWS)).encode())
+    put_text(path, written(lines_of(ROWS)))
     assert message in found(path)["unusual-rows"].text
     model = read_ply(path)
     assert np.array_equal(model.means[:, 0], ROWS["x"])
@@ -462,8 +453,7 @@ def test_unambiguous_rows_of_text_are_read(path, written, message):
 
 @pytest.mark.parametrize("word", ["-nan(ind)", "nan(snan)", "-1.#IND", "1.#QNAN0", "-1.#INF00"])
 def test_nan_and_infinity_are_read_in_other_spellings(path, word):
-    lines = lines_of(ROWS)
-    path.write_bytes(header(ROWS, kind="ascii") + "\n".join(lines).replace("3.0", word, 1).encode())
+    put_text(path, "\n".join(lines_of(ROWS)).replace("3.0", word, 1))
     assert {"unusual-rows": 1, "nonfinite-rows": 1} == {one.id: one.count for one in lint_ply(path)}
     assert 3 == len(read_ply(path))
 
@@ -475,24 +465,23 @@ def test_nan_and_infinity_are_read_in_other_spellings(path, word):
     ("\n2.0 ", " 9.0\n", "row 1 of vertex has 27 values, expected 26"),
 ])  # fmt: skip
 def test_ambiguous_rows_of_text_are_refused(path, old, new, message):
-    path.write_bytes(header(ROWS, kind="ascii") + "\n".join(lines_of(ROWS)).replace(old, new, 1).encode())
+    put_text(path, "\n".join(lines_of(ROWS)).replace(old, new, 1))
     with pytest.raises(InputError, match=message):
         read_ply(path)
 
 
 def test_numbers_with_thousands_separators_are_refused(path):
-    lines = [line.replace(".0", "") for line in lines_of(good_rows(2, names=without("nx", "ny", "nz")))]
-    whole = [" ".join("1,000" for _ in line.split()) for line in lines]
-    path.write_bytes(header(good_rows(2, names=without("nx", "ny", "nz")), kind="ascii") + "\n".join(whole).encode())
+    rows = good_rows(2, names=without("nx", "ny", "nz"))
+    put_text(path, "\n".join([" ".join(["1,000"] * len(rows.dtype.names))] * 2), rows)
     with pytest.raises(InputError, match="x is '1,000', expected a number"):
         read_ply(path)
 
 
 def test_rows_of_text_end_at_the_declared_count(path):
     text = "\n\n".join(lines_of(ROWS))
-    path.write_bytes(header(ROWS, kind="ascii") + text.encode() + b"\n\nand more")
+    put_text(path, f"{text}\n\nand more")
     assert 8 == found(path)["trailing-bytes"].count
-    path.write_bytes(header(ROWS, kind="ascii", count=6) + text.encode())
+    put_text(path, text, count=6)
     assert 2 == found(path)["truncated"].count
 
 
@@ -536,7 +525,7 @@ def test_half_floats_in_columns_of_integers_are_read(path, order):
     for name in NAMES:
         halves[name] = rows[name].astype(f"{order}f2").view(f"{order}u2")
     kind = "binary_little_endian" if order == "<" else "binary_big_endian"
-    path.write_bytes(header(halves, kind=kind) + halves.tobytes())
+    put(path, halves, kind=kind)
     assert len(NAMES) == found(path)["half-floats"].count
     model = read_ply(path)
     assert np.array_equal(model.scales[:, 1], rows["scale_1"])
@@ -554,8 +543,7 @@ def halves_of(rows, names):
 def test_non_finite_half_floats_are_dropped_like_floats(path):
     rows = good_rows(60)
     rows["f_dc_1"][7], rows["opacity"][9] = np.nan, np.inf
-    halves = halves_of(rows, NAMES)
-    path.write_bytes(header(halves) + halves.tobytes())
+    put(path, halves_of(rows, NAMES))
     assert {"half-floats", "nonfinite-rows", "infinite-logits"} <= set(found(path))
     assert 59 == len(read_ply(path))
 
@@ -566,12 +554,12 @@ def test_only_positions_may_be_half_floats(path):
     for name in NAMES:
         rows[name] = rng.normal(size=60)
     halves = halves_of(rows, ["x", "y", "z"])
-    path.write_bytes(header(halves) + halves.tobytes())
+    put(path, halves)
     assert 3 == found(path)["half-floats"].count
     np.testing.assert_allclose(read_ply(path).means[:, 1], rows["y"], rtol=1e-3)
     for values in (rng.integers(0, 30_000, 60), rng.integers(0, 1000, 60), rng.integers(64_000, 65_536, 60)):
         halves["x"] = halves["y"] = halves["z"] = values
-        path.write_bytes(header(halves) + halves.tobytes())
+        put(path, halves)
         with pytest.raises(InputError, match=r"integer-columns: x, y, z are 16-bit integers other than half floats"):
             read_ply(path)
 
@@ -630,16 +618,13 @@ def test_a_truncated_file_is_refused_with_the_count(path):
 
 
 def test_a_truncated_ascii_file_is_refused(path):
-    rows = good_rows(1)
-    line = " ".join(map(str, rows.tolist()[0]))
-    path.write_bytes(header(rows, kind="ascii", count=3) + f"{line}\n".encode())
+    put_text(path, "\n".join(lines_of(ROWS)[:1]) + "\n", count=3)
     assert 2 == found(path)["truncated"].count
 
 
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
 def test_a_huge_count_allocates_nothing(path, kind):
-    rows = good_rows()
-    path.write_bytes(header(rows, kind=kind, count=10**15) + rows.tobytes())
+    put(path, good_rows(), kind=kind, count=10**15)
     assert found(path)["truncated"].repairable is False
 
 
@@ -660,7 +645,7 @@ def test_other_elements_are_named_and_dropped(path):
     rows = good_rows()
     faces = ["element face 2", "property list uchar int vertex_indices"]
     face = b"\x03" + np.arange(3, dtype="<i4").tobytes()
-    path.write_bytes(header(rows, after=faces) + rows.tobytes() + face * 2)
+    put(path, rows, face * 2, after=faces)
     assert ["other-elements"] == list(found(path))
     assert np.array_equal(read_ply(path).means[:, 0], rows["x"])
     with pytest.raises(InputError, match=r"other-elements: .* face"):
@@ -703,7 +688,7 @@ def test_doubles_beyond_float32_are_dropped(path):
 def test_the_report_names_repairs_even_if_strict_reading_fails(path):
     rows = good_rows()
     rows["x"][0] = np.nan
-    path.write_bytes(header(rows) + rows.tobytes() + b"!")
+    put(path, rows, b"!")
     report = []
     with pytest.raises(InputError):
         read_ply(path, strict=True, report=report)

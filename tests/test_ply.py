@@ -39,6 +39,14 @@ def write_rows(path, names, rows, *, kind="binary_little_endian", comments=(), a
     path.write_bytes(data + body + after)
 
 
+def written(path, degree, count=7, **options):
+    """Write a PLY of random rows; return its columns and rows."""
+    names = columns_of(degree)
+    rows = random_rows(names, count)
+    write_rows(path, names, rows, **options)
+    return names, rows
+
+
 def columns_of(degree, *, normals=True):
     names = ["x", "y", "z"] + (["nx", "ny", "nz"] if normals else [])
     names += ["f_dc_0", "f_dc_1", "f_dc_2"]
@@ -92,9 +100,7 @@ def test_reads_every_degree_and_encoding(tmp_path, degree, normals, kind):
 
 
 def test_reads_more_rows_than_one_block(tmp_path):
-    names = columns_of(3)
-    rows = random_rows(names, 10_000)
-    write_rows(tmp_path / "a.ply", names, rows)
+    names, rows = written(tmp_path / "a.ply", 3, 10_000)
     assert_holds(read_ply(tmp_path / "a.ply"), names, rows)
 
 
@@ -110,19 +116,14 @@ def test_reads_columns_by_name_in_any_order(tmp_path):
 
 
 def test_reads_a_header_with_windows_line_ends(tmp_path):
-    names = columns_of(0)
-    rows = random_rows(names)
-    write_rows(tmp_path / "a.ply", names, rows)
+    names, rows = written(tmp_path / "a.ply", 0)
     head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
     crlf = head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body
-    (tmp_path / "b.ply").write_bytes(crlf)
-    report = []
-    assert_holds(read_ply(tmp_path / "b.ply", strict=True, report=report), names, rows)
+    assert_holds(read_ply(crlf, strict=True), names, rows)
 
 
 def test_keeps_header_comments(tmp_path):
-    names = columns_of(0)
-    write_rows(tmp_path / "a.ply", names, random_rows(names), comments=["made by", "a machine"])
+    written(tmp_path / "a.ply", 0, comments=["made by", "a machine"])
     model = read_ply(tmp_path / "a.ply")
     assert ["made by", "a machine"] == model.metadata["comments"]
     write_ply(tmp_path / "b.ply", model)
@@ -131,18 +132,14 @@ def test_keeps_header_comments(tmp_path):
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
 def test_a_comment_of_end_header_does_not_end_the_header(tmp_path, kind):
-    names = columns_of(0)
-    rows = random_rows(names)
-    write_rows(tmp_path / "a.ply", names, rows, kind=kind, comments=["end_header", "é end_header"])
+    names, rows = written(tmp_path / "a.ply", 0, kind=kind, comments=["end_header", "é end_header"])
     report = []
     assert_holds(read_ply(tmp_path / "a.ply", strict=True, report=report), names, rows)
     assert {"non-ascii-header", "unnormalised-quats"} == {one.id for one in report}
 
 
 def test_a_header_outside_ascii_is_read_with_question_marks(tmp_path):
-    names = columns_of(0)
-    rows = random_rows(names)
-    write_rows(tmp_path / "a.ply", names, rows, comments=["café"])
+    names, rows = written(tmp_path / "a.ply", 0, comments=["café"])
     report = []
     model = read_ply(tmp_path / "a.ply", report=report)
     assert_holds(model, names, rows)
@@ -152,8 +149,7 @@ def test_a_header_outside_ascii_is_read_with_question_marks(tmp_path):
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
 def test_reads_a_file_without_splats(tmp_path, kind):
-    names = columns_of(3)
-    write_rows(tmp_path / "a.ply", names, np.zeros((0, len(names))), kind=kind)
+    written(tmp_path / "a.ply", 3, 0, kind=kind)
     model = read_ply(tmp_path / "a.ply", strict=True)
     assert (0, 3) == (len(model), model.sh_degree)
 
@@ -248,8 +244,7 @@ def test_antialiasing_comments_of_other_programs_are_read(tmp_path, make_model):
     (["csplat coordinate_system RUB", "Vertical Axis: z"], None, ["Vertical Axis: z"], False),
 ])  # fmt: skip
 def test_a_comment_on_the_vertical_axis_sets_up(tmp_path, comments, up, kept, noted):
-    names = columns_of(0)
-    write_rows(tmp_path / "a.ply", names, random_rows(names), comments=comments)
+    written(tmp_path / "a.ply", 0, comments=comments)
     report = []
     model = read_ply(tmp_path / "a.ply", strict=True, report=report)
     assert (up, kept) == (model.metadata.get("up"), model.metadata.get("comments", []))
@@ -269,7 +264,8 @@ def test_absolute_positions_are_doubles_and_keep_the_origin(tmp_path, make_model
     np.testing.assert_allclose(again.means, model.means, rtol=1e-6, atol=2e-9)
 
 
-def write_doubles(path, positions):
+def read_doubles(path, positions, **options):
+    """Read a PLY of these positions in doubles."""
     names = columns_of(0, normals=False)
     rows = np.zeros(len(positions), [(n, "<f8" if n in "xyz" else "<f4") for n in names])
     for axis, name in enumerate("xyz"):
@@ -278,14 +274,14 @@ def write_doubles(path, positions):
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
     lines += [f"property {'double' if n in 'xyz' else 'float'} {n}" for n in names]
     path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
+    return read_ply(path, **options)
 
 
 @pytest.mark.parametrize("centre", [(0, 0, 0), (1e7, 5e6, -2e6), (3.0, 1e7, 0)])
 def test_an_origin_keeps_positions_in_doubles(tmp_path, centre):
     positions = np.random.default_rng(3).standard_normal((500, 3)) + centre
-    write_doubles(tmp_path / "a.ply", positions)
     report = []
-    model = read_ply(tmp_path / "a.ply", strict=True, report=report)
+    model = read_doubles(tmp_path / "a.ply", positions, strict=True, report=report)
     assert "double-means" in {one.id for one in report}
     assert any(centre) == any(model.origin)
     restored = model.means.astype(np.float64) + np.array(model.origin)
@@ -295,8 +291,7 @@ def test_an_origin_keeps_positions_in_doubles(tmp_path, centre):
 def test_an_outlier_does_not_move_the_origin(tmp_path):
     positions = np.random.default_rng(3).standard_normal((500, 3)) + 1e7
     positions[0] = -1e12
-    write_doubles(tmp_path / "a.ply", positions)
-    model = read_ply(tmp_path / "a.ply")
+    model = read_doubles(tmp_path / "a.ply", positions)
     assert np.abs(np.array(model.origin) - 1e7).max() < 1
     restored = model.means[1:].astype(np.float64) + np.array(model.origin)
     assert np.abs(restored - positions[1:]).max() < 1e-6
@@ -304,8 +299,7 @@ def test_an_outlier_does_not_move_the_origin(tmp_path):
 
 def test_doubles_that_float32_does_not_hold_are_kept_and_written_back(tmp_path):
     positions = np.random.default_rng(3).normal(0, 5, (20, 3)) + np.array([481_250.0, 5_467_100.0, 310.0])
-    write_doubles(tmp_path / "a.ply", positions)
-    model = read_ply(tmp_path / "a.ply")
+    model = read_doubles(tmp_path / "a.ply", positions)
     write_ply(tmp_path / "b.ply", model, absolute=True)
     np.testing.assert_array_equal(positions, model.means_double)
     np.testing.assert_array_equal(positions, read_ply(tmp_path / "b.ply").means_double)
@@ -313,16 +307,14 @@ def test_doubles_that_float32_does_not_hold_are_kept_and_written_back(tmp_path):
 
 def test_doubles_that_are_floats_keep_origin_zero(tmp_path):
     positions = np.float32(1e7) + np.arange(30.0).reshape(10, 3)
-    write_doubles(tmp_path / "a.ply", positions)
-    model = read_ply(tmp_path / "a.ply")
+    model = read_doubles(tmp_path / "a.ply", positions)
     assert (0.0, 0.0, 0.0) == model.origin
     assert np.array_equal(model.means, positions)
 
 
 def test_splats_in_one_point_far_away_are_exact(tmp_path):
     positions = np.full((10, 3), 1e7 + 0.1)
-    write_doubles(tmp_path / "a.ply", positions)
-    model = read_ply(tmp_path / "a.ply")
+    model = read_doubles(tmp_path / "a.ply", positions)
     assert np.array_equal(model.means + np.array(model.origin), positions)
 
 
@@ -367,11 +359,9 @@ COMMENTS = {
 
 
 def test_invalid_comments_of_csplat_are_refused(tmp_path):
-    names = columns_of(0)
-
     def check(case):
         comment, message = case
-        write_rows(tmp_path / "a.ply", names, random_rows(names), comments=[f"csplat {comment}"])
+        written(tmp_path / "a.ply", 0, comments=[f"csplat {comment}"])
         with pytest.raises(InputError, match=message):
             read_ply(tmp_path / "a.ply")
 
@@ -502,13 +492,11 @@ def test_other_files_are_refused(tmp_path, data):
 
 
 def test_every_prefix_of_a_file_is_refused(tmp_path):
-    names = columns_of(0)
-    write_rows(tmp_path / "a.ply", names, random_rows(names, 2))
+    written(tmp_path / "a.ply", 0, 2)
     data = (tmp_path / "a.ply").read_bytes()
     for length in range(len(data)):
-        (tmp_path / "b.ply").write_bytes(data[:length])
         with pytest.raises(InputError):
-            read_ply(tmp_path / "b.ply")
+            read_ply(data[:length])
 
 
 @pytest.mark.slow
@@ -541,9 +529,7 @@ def test_a_missing_file_is_an_os_error(tmp_path):
 def many(tmp_path_factory):
     """A PLY of 400,000 splats."""
     path = tmp_path_factory.mktemp("many") / "a.ply"
-    names = columns_of(3)
-    block = random_rows(names, 10_000)
-    write_rows(path, names, block)
+    written(path, 3, 10_000)
     data = path.read_bytes().replace(b"vertex 10000\n", b"vertex 400000\n")
     head = data.index(b"end_header\n") + 11
     with path.open("wb") as stream:
