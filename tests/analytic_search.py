@@ -161,14 +161,10 @@ class AnalyticScene:
         entries = (asked.codebook_size or max(16, self.splats // 32)) if coding == "codebook" else 0
         quality = asked.attribute_psnr or PRESETS[asked.preset].quality[coding == "none"]
         return {
-            "sh_coding": coding,
-            "sh_degree": degree,
-            "codebook_size": min(entries, contents.splats),
-            "quality": quality,
-            "adaptive": asked.adaptive or 0.0,
-            "deflate_level": asked.deflate_level or 12,
+            "sh_coding": coding, "sh_degree": degree, "codebook_size": min(entries, contents.splats),
+            "quality": quality, "adaptive": asked.adaptive or 0.0, "deflate_level": asked.deflate_level or 12,
             "opacity_levels": 255,
-        } | ({"classes": {"splats": [contents.splats // 2] * 2}} if contents.graded else {})
+        } | ({"classes": {"splats": [contents.splats // 2] * 2}} if contents.graded else {})  # fmt: skip
 
     def size_of(self, contents: Contents, quality: Any = None) -> Any:
         """Return the size of a file in bytes, or of one file for each of some qualities."""

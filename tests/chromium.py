@@ -212,13 +212,9 @@ class EnginePage:
         """Set camera, size, background and degree."""
         K = camera.K
         pinhole = {
-            "viewmat": camera.viewmat.ravel().tolist(),
-            "fx": K[0, 0],
-            "fy": K[1, 1],
-            "cx": K[0, 2],
-            "cy": K[1, 2],
+            "viewmat": camera.viewmat.ravel().tolist(), "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2],
             "near": camera.near,
-        }
+        }  # fmt: skip
         self.page.evaluate("(given) => look(...given)", [pinhole, camera.W, camera.H, list(background), degree])
 
     def picture(self, camera: Any, background: tuple[float, ...] = (0, 0, 0), degree: int = 3) -> np.ndarray:
@@ -243,23 +239,14 @@ SERVED = ("tools/viewer", "codec/js", "conformance/csplat_conformance/vectors")
 
 #: WebGL2 on the CPU, with float render targets and float blending; deterministic pictures at one pixel per pixel.
 ARGUMENTS = [
-    "--no-sandbox",
-    "--use-gl=angle",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-    "--disable-dev-shm-usage",
-    "--force-device-scale-factor=1",
-    "--force-color-profile=srgb",
-    "--no-proxy-server",
-]
+    "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--disable-dev-shm-usage", "--force-device-scale-factor=1", "--force-color-profile=srgb", "--no-proxy-server",
+]  # fmt: skip
 
 TYPES = {
-    ".html": "text/html; charset=utf-8",
-    ".css": "text/css; charset=utf-8",
-    ".mjs": "text/javascript; charset=utf-8",
-    ".js": "text/javascript; charset=utf-8",
-    ".json": "application/json",
-}
+    ".html": "text/html; charset=utf-8", ".css": "text/css; charset=utf-8", ".mjs": "text/javascript; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8", ".json": "application/json",
+}  # fmt: skip
 
 
 @dataclass

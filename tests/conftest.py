@@ -156,10 +156,10 @@ def make_model():
 
 @pytest.fixture(scope="session")
 def trained_scene(once, tmp_path_factory):
-    """A scene trained for 300 steps on small photographs, see trained.py; all workers share its files."""
+    """A scene trained for 300 steps on small photographs, see captures.py; all workers share its files."""
     pytest.importorskip("numba", reason="training requires the extra [render]")
     pytest.importorskip("scipy", reason="data sets require the extra [render]")
-    from trained import make_trained, run_here
+    from captures import make_trained, run_here
 
     return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained"), run_here))
 
@@ -167,7 +167,7 @@ def trained_scene(once, tmp_path_factory):
 @pytest.fixture(scope="session")
 def tuned_file(once, trained_scene, tmp_path_factory):
     """A file of the trained scene, tuned for 100 steps; all workers share its files."""
-    from trained import make_tuned, run_here
+    from captures import make_tuned, run_here
 
     return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene, run_here))
 
@@ -204,9 +204,9 @@ def _searched(once, name: str, **goal: float):
 
 @pytest.fixture(scope="session")
 def file_runs(once, tmp_path_factory):
-    """Runs of `csplat train` to files, see trained.py."""
+    """Runs of `csplat train` to files, see captures.py."""
     pytest.importorskip("numba", reason="training requires the extra [render]")
     pytest.importorskip("scipy", reason="data sets require the extra [render]")
-    from trained import FileRuns
+    from captures import FileRuns
 
     return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))

@@ -74,18 +74,14 @@ def test_degree_4_is_converted_encoded_and_fixed_with_fewer_bands(tmp_path, ply)
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("a.xyz",), "no format has that ending"),
-        (("-",), "standard output"),
-        (("a.ply", "--to", "zzz"), "expected one of "),
-        (("a.ply", "--rotate", "1,2"), "expected 3 numbers"),
-        (("a.ply", "--crop", "0,0,0,-1"), "radius"),
-        (("a.ply", "--crop", "0,0,0,1,2"), "expected 6 or 4 numbers"),
+        (("a.xyz",), "no format has that ending"), (("-",), "standard output"),
+        (("a.ply", "--to", "zzz"), "expected one of "), (("a.ply", "--rotate", "1,2"), "expected 3 numbers"),
+        (("a.ply", "--crop", "0,0,0,-1"), "radius"), (("a.ply", "--crop", "0,0,0,1,2"), "expected 6 or 4 numbers"),
         (("a.ply", "--crop-sphere", "0,0,0,1"), "--crop-sphere is part of --crop now"),
-        (("a.ply", "--scale", "0"), "above 0"),
-        (("a.ply", "--to-axes", "XYZ"), "axes are"),
+        (("a.ply", "--scale", "0"), "above 0"), (("a.ply", "--to-axes", "XYZ"), "axes are"),
         (("in.ply", "--force"), "is the input"),
     ],
-)
+)  # fmt: skip
 def test_invalid_arguments_are_refused(tmp_path, ply, monkeypatch, words, message):
     monkeypatch.chdir(tmp_path)
     before = ply.read_bytes()

@@ -329,13 +329,11 @@ def test_a_blender_set_may_have_no_test_frames(blender):
     [
         ("test.txt", "\"0003.png\"\n'0005.png'\n", (7, 0, 2)),
         ("test.txt", "# held out\nimages/0003.png, images/0005.png,\n", (7, 0, 2)),
-        ("test_list.txt", "images\\0003.png\n", (8, 0, 1)),
-        ("val.txt", "images/0003\n", (8, 1, 0)),
-        ("train.txt", "images/0003.png\nimages/0005.png\n", (2, 0, 0)),
-        ("train.txt", "other.png\n", (9, 0, 0)),
+        ("test_list.txt", "images\\0003.png\n", (8, 0, 1)), ("val.txt", "images/0003\n", (8, 1, 0)),
+        ("train.txt", "images/0003.png\nimages/0005.png\n", (2, 0, 0)), ("train.txt", "other.png\n", (9, 0, 0)),
         ("train_test_lists.json", '{"train": ["images/0001.png"], "test": ["0003.png"]}', (1, 0, 1)),
     ],
-)
+)  # fmt: skip
 def test_lists_of_images_may_be_next_to_transforms_json(ngp, name, text, split):
     (ngp / name).write_text(text)
     data = load(ngp)
@@ -625,15 +623,12 @@ def test_models_are_found_in_several_folders(colmap_set, model):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"frames": []}, "lists no frames"),
-        ({"frames": [{"transform_matrix": []}]}, "frame 0 has no file_path"),
-        ({"fl_x": -5}, "fl_x is -5, expected above 0"),
-        ({"fl_x": "wide"}, "fl_x is 'wide'"),
+        ({"frames": []}, "lists no frames"), ({"frames": [{"transform_matrix": []}]}, "frame 0 has no file_path"),
+        ({"fl_x": -5}, "fl_x is -5, expected above 0"), ({"fl_x": "wide"}, "fl_x is 'wide'"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is EQUIRECTANGULAR, expected one of PINHOLE"),
-        ({"w": 0}, "w and h are 0 and 32"),
-        ({"k1": -30.0}, "cannot be undone"),
+        ({"w": 0}, "w and h are 0 and 32"), ({"k1": -30.0}, "cannot be undone"),
     ],
-)
+)  # fmt: skip
 def test_invalid_fields_of_transforms_json_are_refused(ngp, change, message):
     change_transforms(ngp, **change)
     with pytest.raises(InputError, match=message):

@@ -14,7 +14,7 @@ pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[r
 
 # These imports need numba and scipy.
 from captures import views_of
-from extremes_chain import (
+from extremes import (
     FEW,
     QUICK,
     SHORT,

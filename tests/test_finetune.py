@@ -108,13 +108,11 @@ def fine():
 @pytest.mark.parametrize(
     "encoding",
     [
-        COARSE,
-        EncodeOptions(attribute_psnr=28.0, sh_coding="scalar"),
-        replace(COARSE, shape_codebook_size=32),
+        COARSE, EncodeOptions(attribute_psnr=28.0, sh_coding="scalar"), replace(COARSE, shape_codebook_size=32),
         EncodeOptions(attribute_psnr=28.0, sh_coding="none", tile_splats=80),
     ],
     ids=["codebook", "scalar", "shapes", "no SH"],
-)
+)  # fmt: skip
 def test_tuning_increases_the_psnr_at_nearly_the_same_size(source, views, encoding):
     fixed = fix_quantisation(EncodePlan.of(source, encoding))
     before = fixed.encode(fixed.start()).write().data

@@ -107,13 +107,10 @@ def transforms(tmp_path):
 @pytest.mark.parametrize(
     ("folder", "note"),
     [
-        ("Images", "images from Images"),
-        ("input", "images from input"),
-        ("images_2", "images from images_2"),
-        (".", "images from the folder itself"),
-        ("images/deeper", "9 names of images.txt found in folders below"),
+        ("Images", "images from Images"), ("input", "images from input"), ("images_2", "images from images_2"),
+        (".", "images from the folder itself"), ("images/deeper", "9 names of images.txt found in folders below"),
     ],
-)
+)  # fmt: skip
 def test_images_of_colmap_are_found_in_several_folders(colmap_set, folder, note):
     rename_in_images_txt(colmap_set, "im {:03}.png".format)
     move(colmap_set / "images", colmap_set / folder)
@@ -160,20 +157,13 @@ def test_the_message_names_the_folders_that_were_tried(colmap_set):
 @pytest.mark.parametrize(
     ("path", "folder"),
     [
-        ("images\\{:04}.png", "images"),
-        ("./uploads\\images/{:04}.png", "uploads/images"),
-        ("C:\\Users\\me\\scan\\images\\{:04}.png", "images"),
-        ("/home/me/scan/images/{:04}.png", "images"),
-        ("../scan/images/{:04}.png", "images"),
-        ("images/{:04}.png", "images_4"),
-        ("images/{:04}.png", "Images"),
-        ("images/{:04}.png", "input"),
-        ("images/{:04}.png", "."),
-        ("{:04}.png", "images"),
-        ("photos/{:04}.JPG", "photos"),
-        ("photos/{:04}", "PHOTOS"),
+        ("images\\{:04}.png", "images"), ("./uploads\\images/{:04}.png", "uploads/images"),
+        ("C:\\Users\\me\\scan\\images\\{:04}.png", "images"), ("/home/me/scan/images/{:04}.png", "images"),
+        ("../scan/images/{:04}.png", "images"), ("images/{:04}.png", "images_4"), ("images/{:04}.png", "Images"),
+        ("images/{:04}.png", "input"), ("images/{:04}.png", "."), ("{:04}.png", "images"),
+        ("photos/{:04}.JPG", "photos"), ("photos/{:04}", "PHOTOS"),
     ],
-)
+)  # fmt: skip
 def test_paths_of_frames_of_another_machine_are_found(transforms, path, folder):
     move(transforms / "images", transforms / folder)
     frames = [{"file_path": path.format(i), "transform_matrix": matrix} for i, matrix in enumerate(POSES)]

@@ -81,13 +81,9 @@ class Spz:
 
     def write(self, model, path, format):
         flat = {
-            "positions": model.means,
-            "scales": model.scales,
-            "rotations": model.quats[:, [1, 2, 3, 0]],
-            "alphas": np.log(model.opacities / (1 - model.opacities)),
-            "colors": model.sh0,
-            "sh": model.shN,
-        }
+            "positions": model.means, "scales": model.scales, "rotations": model.quats[:, [1, 2, 3, 0]],
+            "alphas": np.log(model.opacities / (1 - model.opacities)), "colors": model.sh0, "sh": model.shN,
+        }  # fmt: skip
         cloud = {name: values.ravel().tolist() for name, values in flat.items()}
         cloud |= {"numPoints": len(model), "shDegree": model.sh_degree, "antialiased": model.antialiased}
         cloud |= {"extensions": [], "version": 4 if format == "spz4" else 3}

@@ -39,25 +39,15 @@ ONE_FOCAL = [100.0, 61.0, 44.0]
 
 #: Parameters of COLMAP's models with the distortions of ordinary lenses; None for models that are refused.
 MODELS = {
-    "SIMPLE_PINHOLE": ONE_FOCAL,
-    "PINHOLE": FOCAL,
-    "SIMPLE_RADIAL": [*ONE_FOCAL, 0.05],
-    "RADIAL": [*ONE_FOCAL, -0.08, 0.02],
-    "OPENCV": [*FOCAL, 0.05, -0.02, 0.001, -0.002],
+    "SIMPLE_PINHOLE": ONE_FOCAL, "PINHOLE": FOCAL, "SIMPLE_RADIAL": [*ONE_FOCAL, 0.05],
+    "RADIAL": [*ONE_FOCAL, -0.08, 0.02], "OPENCV": [*FOCAL, 0.05, -0.02, 0.001, -0.002],
     "OPENCV_FISHEYE": [*FOCAL, 0.05, -0.02, 0.01, -0.003],
-    "FULL_OPENCV": [*FOCAL, 0.1, -0.05, 0.002, -0.003, 0.04, 0.2, -0.1, 0.03],
-    "FOV": [*FOCAL, 0.6],
-    "SIMPLE_RADIAL_FISHEYE": [*ONE_FOCAL, -0.04],
-    "RADIAL_FISHEYE": [*ONE_FOCAL, 0.04, -0.01],
+    "FULL_OPENCV": [*FOCAL, 0.1, -0.05, 0.002, -0.003, 0.04, 0.2, -0.1, 0.03], "FOV": [*FOCAL, 0.6],
+    "SIMPLE_RADIAL_FISHEYE": [*ONE_FOCAL, -0.04], "RADIAL_FISHEYE": [*ONE_FOCAL, 0.04, -0.01],
     "THIN_PRISM_FISHEYE": [*FOCAL, 0.03, -0.01, 0.001, -0.002, 0.01, -0.004, 0.003, -0.002],
-    "RAD_TAN_THIN_PRISM_FISHEYE": None,
-    "SIMPLE_DIVISION": None,
-    "DIVISION": None,
-    "SIMPLE_FISHEYE": ONE_FOCAL,
-    "FISHEYE": FOCAL,
-    "EUCM": None,
-    "EQUIRECTANGULAR": None,
-}
+    "RAD_TAN_THIN_PRISM_FISHEYE": None, "SIMPLE_DIVISION": None, "DIVISION": None, "SIMPLE_FISHEYE": ONE_FOCAL,
+    "FISHEYE": FOCAL, "EUCM": None, "EQUIRECTANGULAR": None,
+}  # fmt: skip
 
 
 def colmap_pixel(model, parameters, x, y):
@@ -251,12 +241,10 @@ def test_distortion_agrees_with_opencv():
 @pytest.mark.parametrize(
     ("radial", "tangential"),
     [
-        ((0.06, -0.08), (-0.001, 0.0002)),
-        ((-0.3, 0.1), (0.0, 0.0)),
-        ((0.2,), (0.01, 0.01)),
+        ((0.06, -0.08), (-0.001, 0.0002)), ((-0.3, 0.1), (0.0, 0.0)), ((0.2,), (0.01, 0.01)),
         ((0.0, 0.0, 0.1), (0.0, 0.0)),
     ],
-)
+)  # fmt: skip
 def test_undistortion_stays_within_the_image(radial, tangential):
     lens = Lens(540, 960, 688.0, 687.0, 277.0, 482.0, radial, tangential)
     v, u = np.mgrid[0:960, 0:540] + 0.5

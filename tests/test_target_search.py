@@ -20,17 +20,11 @@ HARDLY_ANY_SH = AnalyticScene(shown=(48.0, 52.0, 56.0))
 WITHOUT_SH = AnalyticScene(sh_degree=0, shown=())
 JUMPING = AnalyticScene(jump=0.5)
 SCENES = {
-    "plain": PLAIN,
-    "many unneeded splats": UNNEEDED,
-    "no splat to spare": NONE_TO_SPARE,
-    "useless codebooks": NO_CODEBOOK,
-    "without SH": WITHOUT_SH,
-    "jumps": JUMPING,
-    "cheap codebooks": AnalyticScene(index_bytes=0.5, entry_bytes=2.0),
-    "few bytes per dB": AnalyticScene(rate=0.03),
-    "many bytes per dB": AnalyticScene(rate=0.07),
-    "quality far from renders": AnalyticScene(lost=16.0),
-}
+    "plain": PLAIN, "many unneeded splats": UNNEEDED, "no splat to spare": NONE_TO_SPARE,
+    "useless codebooks": NO_CODEBOOK, "without SH": WITHOUT_SH, "jumps": JUMPING,
+    "cheap codebooks": AnalyticScene(index_bytes=0.5, entry_bytes=2.0), "few bytes per dB": AnalyticScene(rate=0.03),
+    "many bytes per dB": AnalyticScene(rate=0.07), "quality far from renders": AnalyticScene(lost=16.0),
+}  # fmt: skip
 
 MOST_TRIES = 20  # candidates; a codebook that has to grow takes some more
 LARGER = 1.1  # times the size of the smallest possible file; the limit of a search for a PSNR

@@ -275,15 +275,10 @@ def test_stages_are_timed_by_their_names():
 
 # The Pareto front.
 FRONTS = (
-    ([], []),
-    ([(10, 30.0)], [0]),
-    ([(10, 30.0), (20, 40.0), (15, 35.0)], [0, 2, 1]),
-    ([(10, 30.0), (20, 29.0)], [0]),
-    ([(10, 30.0), (10, 31.0)], [1]),
-    ([(10, 30.0), (20, 30.0)], [0]),
-    ([(10, 30.0), (10, 30.0)], [0]),
+    ([], []), ([(10, 30.0)], [0]), ([(10, 30.0), (20, 40.0), (15, 35.0)], [0, 2, 1]), ([(10, 30.0), (20, 29.0)], [0]),
+    ([(10, 30.0), (10, 31.0)], [1]), ([(10, 30.0), (20, 30.0)], [0]), ([(10, 30.0), (10, 30.0)], [0]),
     ([(30, 50.0), (20, 45.0), (25, 40.0), (10, 20.0)], [3, 1, 0]),
-)
+)  # fmt: skip
 
 
 def test_the_front_consists_of_files_that_no_other_beats():
@@ -558,23 +553,12 @@ def test_a_scene_without_splats_is_refused(tmp_path, make_model):
 
 
 WRONG = (
-    ["--what", "presets,everything"],
-    ["--what", ""],
-    ["--what", "strategies", "--preset", "huge"],
-    ["--what", "precision=forty"],
-    ["--what", "precision=500"],
-    ["--what", "presets=3"],
-    ["--what", "precision=36,precision=44"],
-    ["--what", "targets=100"],
-    ["--what", "targets=5 parsecs"],
-    ["--what", "simplify=0"],
-    ["--what", "simplify=1.5"],
-    ["--what", "strategies=nan"],
-    ["--what", "strategies=70000"],
-    ["--data", "x", "--cameras", "y"],
-    ["--plots", "x"],
-    ["-o", "-"],
-)
+    ["--what", "presets,everything"], ["--what", ""], ["--what", "strategies", "--preset", "huge"],
+    ["--what", "precision=forty"], ["--what", "precision=500"], ["--what", "presets=3"],
+    ["--what", "precision=36,precision=44"], ["--what", "targets=100"], ["--what", "targets=5 parsecs"],
+    ["--what", "simplify=0"], ["--what", "simplify=1.5"], ["--what", "strategies=nan"], ["--what", "strategies=70000"],
+    ["--data", "x", "--cameras", "y"], ["--plots", "x"], ["-o", "-"],
+)  # fmt: skip
 
 
 def test_a_wrong_command_line_has_status_2(capture):

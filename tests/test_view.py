@@ -156,21 +156,10 @@ def test_a_file_that_changes_has_another_tag(scene_path, make_model):
 
 
 ELSEWHERE = [
-    "/scene/",
-    "/scene/other.csplat",
-    "/scene/../secret.txt",
-    "/scene/..%2fsecret.txt",
-    "/scene/%2e%2e/secret.txt",
-    "/tools/viewer/",
-    "/tools/viewer/../../../secret.txt",
-    "/tools/viewer/..%5c..%5csecret.txt",
-    "//etc/passwd",
-    "/etc/passwd",
-    "/codec/js/package.json",
-    "/codec/js/test/adapter.mjs",
-    "/tools/viewer/main.mjs%00.html",
-    "/%",
-]
+    "/scene/", "/scene/other.csplat", "/scene/../secret.txt", "/scene/..%2fsecret.txt", "/scene/%2e%2e/secret.txt",
+    "/tools/viewer/", "/tools/viewer/../../../secret.txt", "/tools/viewer/..%5c..%5csecret.txt", "//etc/passwd",
+    "/etc/passwd", "/codec/js/package.json", "/codec/js/test/adapter.mjs", "/tools/viewer/main.mjs%00.html", "/%",
+]  # fmt: skip
 
 
 def test_other_paths_are_not_served(scene_path):
@@ -230,13 +219,11 @@ def test_invalid_directions_are_refused(up):
 @pytest.mark.parametrize(
     ("words", "wishes"),
     [
-        ({"up": None}, {}),
-        ({"up": None, "axes": "RFU"}, {"axes": "RFU"}),
-        ({"up": "-y"}, {"up": "0,-1,0"}),
+        ({"up": None}, {}), ({"up": None, "axes": "RFU"}, {"axes": "RFU"}), ({"up": "-y"}, {"up": "0,-1,0"}),
         ({"up": "+Z"}, {"up": "0,0,1"}),
         ({"up": "0,-2,0.2", "axes": "RDF"}, {"up": "0,-0.995037,0.099504", "axes": "RDF"}),
     ],
-)
+)  # fmt: skip
 def test_the_page_receives_the_given_up_direction(words, wishes):
     assert wishes == page_parameters(None, parse_overrides(**words))
 

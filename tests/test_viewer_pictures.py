@@ -77,12 +77,10 @@ def make(means, **fields):
     """Return a model of splats with these means; fields that are not given make small grey balls."""
     n = len(means)
     arrays = {
-        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-        "scales": np.full((n, 3), -2.0, np.float32),
-        "opacities": np.full(n, 0.9, np.float32),
-        "sh0": np.zeros((n, 3), np.float32),
+        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)), "scales": np.full((n, 3), -2.0, np.float32),
+        "opacities": np.full(n, 0.9, np.float32), "sh0": np.zeros((n, 3), np.float32),
         "shN": np.zeros((n, 0, 3), np.float32),
-    }
+    }  # fmt: skip
     given = {name: np.asarray(value, np.float32) for name, value in fields.items()}
     if "quats" in given:
         given["quats"] = normalise_quats(given["quats"])
@@ -163,15 +161,12 @@ def unlike(engine, scenes, camera_of, least):
 
 
 CODINGS = {
-    "scalar": {"sh_coding": "scalar"},
-    "wide integers": {"sh_coding": "scalar", "sh_step": 1e-6},
-    "codebook": {"sh_coding": "codebook", "codebook_size": 300, "escape_fraction": 0.2},
-    "degree 1": {"sh_degree": 1},
-    "degree 0": {"sh_degree": 0},
-    "tiles": {"tile_splats": 300},
+    "scalar": {"sh_coding": "scalar"}, "wide integers": {"sh_coding": "scalar", "sh_step": 1e-6},
+    "codebook": {"sh_coding": "codebook", "codebook_size": 300, "escape_fraction": 0.2}, "degree 1": {"sh_degree": 1},
+    "degree 0": {"sh_degree": 0}, "tiles": {"tile_splats": 300},
     "records of several texels": {"means_coding": "axis", "position_step": 1e-6, "scale_step": 1e-5, "sh0_step": 1e-6},
     "widest levels": {"opacity_levels": 65535, "quat_levels": 32767},
-}
+}  # fmt: skip
 
 
 def test_every_coding_is_drawn(engine, sample, camera):
