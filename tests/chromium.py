@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
@@ -49,8 +49,8 @@ def read_pixels(page: Any, pixels: str, width: int, height: int) -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), np.uint8).reshape(height, width, 4)
 
 
-class ViewerPage:
-    """The viewer's page in a tab.
+class _ServedPage:
+    """A page in a tab.
 
     Attributes:
         tab: the tab; `tab.problems` are its complaints.
@@ -58,11 +58,42 @@ class ViewerPage:
         site: the server of scenes.
     """
 
-    SIZE: ClassVar = (240, 180)  # size of the window: the tools take up most of a smaller one
-
     def __init__(self, tab: Tab, site: Site) -> None:
         self.tab, self.page, self.site = tab, tab.page, site
         self._numbers = itertools.count()
+
+    @classmethod
+    @contextmanager
+    def opened(cls, context: Any) -> Iterator[Self]:
+        """Load the page in a tab of its own, with a server."""
+        site = Site()
+        try:
+            with open_tab(context) as tab:
+                page = cls(tab, site)
+                page.load()
+                yield page
+        finally:
+            site.close()
+
+    def load(self) -> None:
+        """Load the page anew."""
+        raise NotImplementedError
+
+    @contextmanager
+    def watched(self, request: pytest.FixtureRequest) -> Iterator[Self]:
+        """Let a test use the page; load it anew if the test fails, which it also does by complaints of the page."""
+        failures = request.session.testsfailed
+        yield self
+        problems, self.tab.problems[:] = list(self.tab.problems), []
+        if problems or request.session.testsfailed > failures:
+            self.load()
+        assert problems == []
+
+
+class ViewerPage(_ServedPage):
+    """The viewer's page."""
+
+    SIZE: ClassVar = (240, 180)  # size of the window: the tools take up most of a smaller one
 
     def load(self, query: str = "") -> None:
         """Load the served page with parameters, and wait until it shows its scene or an error."""
@@ -182,23 +213,14 @@ window.isLoaded = true;
 </script>"""
 
 
-class EnginePage:
-    """A page with the engine alone.
-
-    Attributes:
-        tab: the tab; `tab.problems` are its complaints.
-        page: playwright's page.
-        site: the server of scenes.
-    """
-
-    def __init__(self, tab: Tab, site: Site) -> None:
-        self.tab, self.page, self.site = tab, tab.page, site
-        site.add("/engine.html", _ENGINE.encode())
+class EnginePage(_ServedPage):
+    """A page with the engine alone."""
 
     def load(self) -> None:
-        """Load the page."""
-        self.page.goto(self.site.url("/engine.html"))
+        """Load the page, and make the engine."""
+        self.page.goto(self.site.add("/engine.html", _ENGINE.encode()))
         self.page.wait_for_function("window.isLoaded")
+        self.start()
 
     def start(self, options: str = "{}") -> None:
         """Make the engine."""
@@ -444,50 +466,28 @@ def site() -> Iterator[Site]:
 @pytest.fixture(scope="session")
 def viewer_page(context: Any) -> Iterator[ViewerPage]:
     """The viewer's page, loaded once; tests take `viewer`."""
-    site = Site()
-    try:
-        with open_tab(context) as tab:
-            page = ViewerPage(tab, site)
-            page.load()
-            yield page
-    finally:
-        site.close()
+    with ViewerPage.opened(context) as page:
+        yield page
 
 
 @pytest.fixture
 def viewer(request: pytest.FixtureRequest, viewer_page: ViewerPage) -> Iterator[ViewerPage]:
     """The viewer's page, loaded already; what the last test left open is closed. A failed test leaves a fresh page."""
-    failures = request.session.testsfailed
     viewer_page.rest()
-    yield viewer_page
-    problems, viewer_page.tab.problems[:] = list(viewer_page.tab.problems), []
-    if problems or request.session.testsfailed > failures:
-        viewer_page.load()
-    assert problems == []
+    with viewer_page.watched(request) as page:
+        yield page
 
 
 @pytest.fixture(scope="session")
 def engine_page(context: Any) -> Iterator[EnginePage]:
     """A page with the engine alone, loaded once; tests take `engine`."""
-    site = Site()
-    try:
-        with open_tab(context) as tab:
-            page = EnginePage(tab, site)
-            page.load()
-            page.start()
-            yield page
-    finally:
-        site.close()
+    with EnginePage.opened(context) as page:
+        yield page
 
 
 @pytest.fixture
 def engine(request: pytest.FixtureRequest, engine_page: EnginePage) -> Iterator[EnginePage]:
     """The engine, made already; a failed test leaves a fresh page."""
-    failures = request.session.testsfailed
     engine_page.page.evaluate("void (errors.length = 0)")
-    yield engine_page
-    problems, engine_page.tab.problems[:] = list(engine_page.tab.problems), []
-    if problems or request.session.testsfailed > failures:
-        engine_page.load()
-        engine_page.start()
-    assert problems == []
+    with engine_page.watched(request) as page:
+        yield page

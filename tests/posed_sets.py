@@ -142,3 +142,9 @@ def frames_of(folder):
 def change_transforms(folder, **changes):
     file = folder / "transforms.json"
     file.write_text(json.dumps({**json.loads(file.read_text()), **changes}))
+
+
+def change_frames(folder, numbers, **changes):
+    """Change fields of some frames of transforms.json."""
+    frames = [{**frame, **changes} if i in numbers else frame for i, frame in enumerate(frames_of(folder))]
+    change_transforms(folder, frames=frames)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from command_line import invoke
+from command_line import call
 
 from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.encoder import encode_with_report
@@ -56,14 +56,8 @@ def compare_models(source, other, cameras, **words):
     return Scorer.of_source(source, cameras).scores(other, **words)
 
 
-def loaded(model):
-    return LoadedModel(model, 1000)
-
-
-def call(*words):
-    result = invoke(*words)
-    assert result.exit_code == 0, (result.stderr, result.exception)
-    return result.stdout
+def errors_of(source, other, index=None):
+    return attribute_errors(LoadedModel(source, 1000), LoadedModel(other, 1000), index)
 
 
 # Estimates.
@@ -85,36 +79,36 @@ def test_no_psnr_is_estimated_before_kernels_are_compiled(scene, monkeypatch):
 # Pairs.
 def test_a_source_index_pairs_shuffled_splats(scene):
     order = np.random.default_rng(1).permutation(len(scene))
-    errors = attribute_errors(loaded(scene), loaded(scene.select(order)), order)
+    errors = errors_of(scene, scene.select(order), order)
     assert ("index", len(scene), 0) == (errors.pairing, errors.matched, errors.unmatched)
     assert {(0.0, 0.0)} == set(errors.errors.values())
 
 
 def test_a_wrong_source_index_is_refused(scene):
     with pytest.raises(InputError, match="source index"):
-        attribute_errors(loaded(scene), loaded(scene), np.arange(3))
+        errors_of(scene, scene, np.arange(3))
 
 
 def test_scenes_in_the_same_order_are_paired_by_it(scene):
     moved = replace(scene, means=scene.means + np.float32(0.001))
-    errors = attribute_errors(loaded(scene), loaded(moved))
+    errors = errors_of(scene, moved)
     assert "order" == errors.pairing
     assert errors.errors["means"][1] == pytest.approx(0.001 * 3**0.5, rel=1e-3)
 
 
 def test_shuffled_splats_of_a_ply_are_not_paired(scene):
     order = np.random.default_rng(1).permutation(len(scene))
-    assert attribute_errors(loaded(scene), loaded(scene.select(order))) is None
-    assert attribute_errors(loaded(scene), loaded(scene.select(slice(0, 300)))) is None
+    assert errors_of(scene, scene.select(order)) is None
+    assert errors_of(scene, scene.select(slice(0, 300))) is None
 
 
 def test_splats_of_a_file_are_paired_within_its_declared_errors(scene, tmp_path):
     result = encode_with_report(scene, EncodeOptions(preset="balanced"))
     path = tmp_path / "scene.csplat"
     path.write_bytes(result.data)
-    found = attribute_errors(loaded(scene), load_model(str(path)))
+    found = attribute_errors(LoadedModel(scene, 1000), load_model(str(path)))
     assert ("search", len(scene), 0) == (found.pairing, found.matched, found.unmatched)
-    known = attribute_errors(loaded(scene), load_model(str(path)), result.source_index)
+    known = attribute_errors(LoadedModel(scene, 1000), load_model(str(path)), result.source_index)
     assert known.errors["means"] == pytest.approx(found.errors["means"])
 
 
@@ -223,13 +217,13 @@ def files(scene, tmp_path):
 
 
 def test_the_table_has_sizes_errors_and_scores(files, camera_file):
-    text = call("compare", *files, "--cameras", camera_file)
+    text = call("compare", *files, "--cameras", camera_file).stdout
     for word in ("a.ply", "times smaller", "covariance", "pairs found", "psnr_worst", "ssim", "cover", " dB", " s\n"):
         assert word in text
 
 
 def test_json_has_psnr_at_the_top(files, camera_file):
-    result = json.loads(call("compare", *files, "--cameras", camera_file, "--json"))
+    result = json.loads(call("compare", *files, "--cameras", camera_file, "--json").stdout)
     assert 20.0 < result["psnr"] < 99.0
     assert 3 == len(result["views"])
     assert ["cameras.json", "standard", [0.0, 0.0, 0.0]] == [result[key] for key in ("cameras", "mode", "background")]
@@ -244,7 +238,7 @@ def test_virtual_cameras_are_the_default_and_the_estimate_agrees(files, scene):
     from csplat_render.warmup import warm_up
 
     warm_up(gradients=False)
-    result = json.loads(call("compare", *files, "--json"))
+    result = json.loads(call("compare", *files, "--json").stdout)
     assert "virtual" == result["cameras"]
     assert 8 == len(result["views"])
     assert abs(result["psnr"] - estimate_psnr(scene, files[1].read_bytes())) < 0.3
@@ -258,20 +252,18 @@ def test_renders_are_written_side_by_side(files, camera_file, tmp_path):
     assert ["0000.png", "0002.png", "side.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
     with Image.open(tmp_path / "out" / "side.png") as picture:
         assert (3 * 64, 48) == picture.size
-    again = invoke("compare", *files, "--cameras", camera_file, "--pictures", tmp_path / "out")
-    assert 1 == again.exit_code
+    again = call("compare", *files, "--cameras", camera_file, "--pictures", tmp_path / "out", status=1)
     assert "--force replaces it" in again.stderr
 
 
 @pytest.mark.usefixtures("renderer")
 def test_an_absent_file_is_reported(files, tmp_path):
-    result = invoke("compare", files[0], tmp_path / "nothing.csplat")
-    assert 1 == result.exit_code
+    result = call("compare", files[0], tmp_path / "nothing.csplat", status=1)
     assert "nothing.csplat" in result.stderr
     assert 1 == result.stderr.count("\n")
 
 
 def test_lpips_reads_its_weights(files, camera_file, data_dir):
     weights = data_dir / "lpips" / "lpips_alex.npz"
-    result = json.loads(call("compare", *files, "--cameras", camera_file, "--lpips", weights, "--json"))
+    result = json.loads(call("compare", *files, "--cameras", camera_file, "--lpips", weights, "--json").stdout)
     assert 0.0 < result["lpips"] < 1.0

@@ -10,18 +10,17 @@ import pytest
 
 from csplat.errors import InputError
 
-pytest.importorskip("numba", reason="the trainer needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="undistortion needs scipy: pip install 'csplat[render]'")
-Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
-from PIL import ExifTags, ImageFile  # noqa: E402
-from posed_sets import (  # noqa: E402  # noqa: E402  # noqa: E402
+from PIL import ExifTags, Image, ImageFile
+from posed_sets import (
     COLOURS,
     POINTS,
     H,
     W,
     assert_dots_are_where_points_fall,
     cameras,
+    change_frames,
     change_transforms,
     frames_of,
     rename_in_images_txt,
@@ -33,10 +32,10 @@ from posed_sets import (  # noqa: E402  # noqa: E402  # noqa: E402
     write_transforms,
 )
 
-from csplat_render.camera import relative_to  # noqa: E402
-from csplat_trainer.data import load  # noqa: E402
-from csplat_trainer.data.colmap import read_images, read_points  # noqa: E402
-from csplat_trainer.initial_splats import measure_extent  # noqa: E402
+from csplat_render.camera import relative_to
+from csplat_trainer.data import load
+from csplat_trainer.data.colmap import read_images, read_points
+from csplat_trainer.initial_splats import measure_extent
 
 
 @pytest.fixture
@@ -105,9 +104,8 @@ def test_transforms_json_may_name_its_test_images(ngp):
 
 def test_frames_may_have_intrinsics_of_their_own_and_a_world_scale(ngp):
     frames = frames_of(ngp)
-    frames[1] |= {"fl_x": 77.0, "fl_y": 77.0}
-    frames[1]["transform_matrix"] = (np.array(frames[1]["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
-    change_transforms(ngp, frames=frames)
+    scaled = (np.array(frames[1]["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
+    change_frames(ngp, [1], fl_x=77.0, fl_y=77.0, transform_matrix=scaled)
     picture = next(p for p in load(ngp).train if p.camera.image == "images/0001.png")
     assert 77.0 == picture.camera.K[0, 0]
     assert np.allclose(cameras(10)[1].viewmat, picture.camera.viewmat)
@@ -185,11 +183,15 @@ def test_transforms_json_may_list_its_split(ngp, lists, split, message):
     assert data.test_every is None
 
 
+def write_points(path, columns, *rows):
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(rows)}", *(f"property {one}" for one in columns)]
+    path.write_text("\n".join([*lines, "end_header", *rows, ""]))
+
+
 def test_points_are_read_from_ply_file_path(ngp):
-    rows = "".join(f"{x} {y} {z} {r} {g} {b}\n" for (x, y, z), (r, g, b) in zip(POINTS, COLOURS, strict=True))
-    columns = "".join(f"property float {name}\n" for name in "xyz")
-    columns += "".join(f"property uchar {name}\n" for name in ("red", "green", "blue"))
-    (ngp / "cloud.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 3\n{columns}end_header\n{rows}")
+    rows = [f"{x} {y} {z} {r} {g} {b}" for (x, y, z), (r, g, b) in zip(POINTS, COLOURS, strict=True)]
+    columns = ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue")
+    write_points(ngp / "cloud.ply", columns, *rows)
     change_transforms(ngp, ply_file_path="cloud.ply")
     data = load(ngp)
     assert np.allclose(POINTS, data.points)
@@ -197,14 +199,13 @@ def test_points_are_read_from_ply_file_path(ngp):
     assert "points from cloud.ply" in data.report
     change_transforms(ngp, ply_file_path="absent.ply")
     assert any("ply_file_path absent.ply does not exist" in line for line in load(ngp).report)
-    (ngp / "absent.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float y\nend_header\n1\n")
+    write_points(ngp / "absent.ply", ("float y",), "1")
     with pytest.raises(InputError, match=r"absent\.ply has columns y, expected x, y, z"):
         load(ngp)
 
 
 def test_points_of_a_blender_set_are_read_if_nothing_is_transparent(blender):
-    columns = "".join(f"property float {name}\n" for name in "xyz")
-    (blender / "points3d.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}end_header\n1 2 3\n")
+    write_points(blender / "points3d.ply", ("float x", "float y", "float z"), "1 2 3")
     data = load(blender)
     assert data.points is None
     assert any("points3d.ply is ignored" in line for line in data.report)
@@ -217,8 +218,7 @@ def test_points_of_colmap_may_be_a_ply(colmap_set):
     model = colmap_set / "sparse" / "0"
     (model / "points3D.bin").unlink()
     assert load(colmap_set).points is None
-    columns = "".join(f"property double {name}\n" for name in "xyz")
-    (model / "points3D.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 1\n{columns}end_header\n1 2 3\n")
+    write_points(model / "points3D.ply", ("double x", "double y", "double z"), "1 2 3")
     data = load(colmap_set)
     assert [[1.0, 2.0, 3.0]] == data.points.tolist()
     assert data.points_rgb is None
@@ -277,9 +277,7 @@ def test_a_duplicated_image_of_a_model_is_refused(colmap_set):
 )
 def test_unusable_frames_are_left_out(tmp_path, change, words, count):
     write_transforms(tmp_path)
-    frames = frames_of(tmp_path)
-    frames[3] |= change
-    change_transforms(tmp_path, frames=frames)
+    change_frames(tmp_path, [3], **change)
     data = load(tmp_path, test_every=0)
     assert count == len(data.train)
     assert not words or f"transforms.json: {words}" in data.report
@@ -288,7 +286,7 @@ def test_unusable_frames_are_left_out(tmp_path, change, words, count):
 def test_intrinsics_of_other_programs_are_read(ngp):
     document = json.loads((ngp / "transforms.json").read_text())
     matrix = [[60.0, 0, 25.0, 0], [0, 61.0, 17.0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
-    change_transforms(ngp, frames=[{**frame, "intrinsic_matrix": matrix} for frame in document["frames"]])
+    change_frames(ngp, range(10), intrinsic_matrix=matrix)
     assert [[60.0, 0, 25.0], [0, 61.0, 17.0], [0, 0, 1]] == load(ngp).train[0].camera.K.tolist()
     bare = {name: value for name, value in document.items() if name not in ("fl_x", "fl_y")}
     (ngp / "transforms.json").write_text(json.dumps({**bare, "x_fov": 50.0}))
@@ -385,8 +383,7 @@ def test_names_may_be_numbers_and_keypoints_may_be_nan(tmp_path):
 
 
 def test_test_images_that_are_training_images_are_reported(ngp):
-    frames = frames_of(ngp)
-    change_transforms(ngp, test_frames=frames[:2])
+    change_transforms(ngp, test_frames=frames_of(ngp)[:2])
     assert any("2 test images used for training, too" in line for line in load(ngp).report)
 
 
@@ -402,8 +399,7 @@ def test_numbers_beyond_float64_are_refused(ngp):
 
 
 def test_names_with_control_characters_are_refused(ngp):
-    frames = frames_of(ngp)
-    change_transforms(ngp, frames=[{**frames[0], "file_path": "a\nb.png"}])
+    change_frames(ngp, [0], file_path="a\nb.png")
     with pytest.raises(InputError, match="frame 0: file_path has control characters"):
         load(ngp)
     write_colmap(ngp / "model", cameras(2))
@@ -421,8 +417,7 @@ def test_a_last_row_may_be_rounded(ngp):
 
 
 def test_distortion_params_of_nerfstudio_are_read(ngp):
-    frames = frames_of(ngp)
-    change_transforms(ngp, frames=[{**frame, "distortion_params": [0.1, 0, 0, 0, 0, 0]} for frame in frames])
+    change_frames(ngp, range(10), distortion_params=[0.1, 0, 0, 0, 0, 0])
     assert any("lens distortion is undone" in line for line in load(ngp).report)
 
 
@@ -507,8 +502,7 @@ def test_a_folder_of_images_may_be_given_for_its_set(tmp_path, monkeypatch):
 
 
 def test_a_smaller_size_scales_each_axis_by_itself(blender):
-    data = load(blender, (24, 8))
-    picture = data.train[0]
+    picture = load(blender, (24, 8)).train[0]
     assert (8, 24, 4) == picture.pixels.shape
     assert np.allclose(np.diag([0.5, 0.25, 1.0]) @ cameras(5)[0].K, picture.camera.K)
 
@@ -595,7 +589,7 @@ def test_a_camera_beyond_float32_is_refused(tmp_path):
         load(tmp_path)
 
 
-def test_other_files_and_folders_are_refused(tmp_path):
+def test_other_files_and_folders_and_invalid_json_are_refused(tmp_path):
     with pytest.raises(InputError, match="is not a data set"):
         load(tmp_path)
     with pytest.raises(InputError, match="neither a folder"):
@@ -603,6 +597,10 @@ def test_other_files_and_folders_are_refused(tmp_path):
     (tmp_path / "set.zip").write_bytes(b"PK")
     with pytest.raises(InputError, match="unpack it"):
         load(tmp_path / "set.zip")
+    (tmp_path / "transforms.json").write_text("{")
+    with pytest.raises(InputError, match="not a JSON file"):
+        load(tmp_path)
+    (tmp_path / "transforms.json").unlink()
     (tmp_path / "database.db").write_bytes(b"")
     with pytest.raises(InputError, match="run `colmap mapper`"):
         load(tmp_path)
@@ -639,9 +637,7 @@ def test_invalid_fields_of_transforms_json_are_refused(ngp, change, message):
     "matrix", [[], [[1]], np.zeros((4, 4)).tolist(), np.diag([1.0, 1, -1, 1]).tolist(), [["x"] * 4] * 4]
 )
 def test_invalid_poses_are_refused(ngp, matrix):
-    frames = frames_of(ngp)
-    frames[2]["transform_matrix"] = matrix
-    change_transforms(ngp, frames=frames)
+    change_frames(ngp, [2], transform_matrix=matrix)
     with pytest.raises(InputError, match="frame 2"):
         load(ngp)
 
@@ -711,9 +707,7 @@ def _hide(path, size):
 def test_a_mask_excludes_pixels(request, kind, size, sides):
     folder = request.getfixturevalue("ngp" if kind == "ngp" else "colmap_set")
     if kind == "ngp":
-        frames = frames_of(folder)
-        frames[1]["mask_path"] = "masks/one.png"
-        change_transforms(folder, frames=frames)
+        change_frames(folder, [1], mask_path="masks/one.png")
         _hide(folder / "masks" / "one.png", sides)
     else:
         _hide(folder / "masks" / "im 001.png.png", sides)
@@ -727,9 +721,7 @@ def test_a_mask_excludes_pixels(request, kind, size, sides):
 
 
 def test_a_missing_or_black_mask_is_refused(ngp):
-    frames = frames_of(ngp)
-    frames[1]["mask_path"] = "masks/one.png"
-    change_transforms(ngp, frames=frames)
+    change_frames(ngp, [1], mask_path="masks/one.png")
     with pytest.raises(InputError, match=r"mask 'masks/one\.png' of images/0001\.png does not exist"):
         load(ngp)
     (ngp / "masks").mkdir()
@@ -788,12 +780,6 @@ def test_a_blender_set_in_other_coordinates_has_unspecified_axes(tmp_path):
     data = load(tmp_path)
     assert ("unspecified", (0, -1, 0)) == (data.coordinate_system, data.up)
     assert any("usually have other axes" in line for line in data.report)
-
-
-def test_invalid_json_is_refused(tmp_path):
-    (tmp_path / "transforms.json").write_text("{")
-    with pytest.raises(InputError, match="not a JSON file"):
-        load(tmp_path)
 
 
 @pytest.mark.slow

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("numba", reason="our own pictures require the extra [render]")
-pytest.importorskip("PIL.Image", reason="pictures require the extra [render]")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 from chromium import absent
 

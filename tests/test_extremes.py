@@ -10,8 +10,7 @@ import re
 import numpy as np
 import pytest
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 from checked import measure_errors
 from command_line import change_views

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from extremes import COUNT, EXPECTED, NAMES, encoded, scorer
 
-pytest.importorskip("numba", reason="training needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 # These imports need numba and scipy.
 from captures import views_of

@@ -13,9 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-pytest.importorskip("numba", reason="fine-tuning needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 from captures import H, W, cameras, photograph, shell
 from command_line import call, change_options, invoke

@@ -13,8 +13,8 @@ from posed_sets import (
     W,
     assert_dots_are_where_points_fall,
     cameras,
+    change_frames,
     change_transforms,
-    frames_of,
     rename_in_images_txt,
     to_opengl,
     write_blender,
@@ -27,8 +27,7 @@ from tables import failures
 
 from csplat.errors import InputError
 
-pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-pytest.importorskip("PIL", reason="data sets need pillow: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 from csplat_trainer.data import load
@@ -502,8 +501,7 @@ def test_masks_of_every_kind_are_read_alike(tmp_path):
 def test_masks_of_0_and_1_are_reported_and_grey_ones_refused(tmp_path):
     write_transforms(tmp_path)
     Image.fromarray(LABELS).save(tmp_path / "mask.png")
-    frames = frames_of(tmp_path)
-    change_transforms(tmp_path, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
+    change_frames(tmp_path, range(10), mask_path="mask.png")
     data = load(tmp_path)
     assert "masks such as mask.png: values are 0 and 1: 1 counts as white" in data.report
     assert (data.train[0].mask == SHAPE).all()

@@ -7,29 +7,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import invoke
+from command_line import call, invoke
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat.errors import InputError
 
-pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-Image = pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
-# These modules import the packages above.
-from csplat_render import render  # noqa: E402
-from csplat_render.camera import intrinsics, look_at, relative_to  # noqa: E402
-from csplat_tools.inspect.comparison import compare  # noqa: E402
-from csplat_tools.views import DataOptions, find_view_set  # noqa: E402
-from csplat_trainer.posed_images import PosedImage, image_scorer  # noqa: E402
+from PIL import Image
+
+from csplat_render import render
+from csplat_render.camera import intrinsics, look_at, relative_to
+from csplat_tools.inspect.comparison import compare
+from csplat_tools.views import DataOptions, find_view_set
+from csplat_trainer.posed_images import PosedImage, image_scorer
 
 W, H = 64, 48
-
-
-def call(*words):
-    result = invoke(*words)
-    assert result.exit_code == 0, (result.stderr, result.exception)
-    return result.stdout
 
 
 @pytest.fixture
@@ -72,9 +65,18 @@ def files(scene, tmp_path):
     return tmp_path / "a.ply", tmp_path / "b.csplat"
 
 
-def test_both_scenes_are_scored_on_the_test_images(scene, files, tmp_path):
-    data = write_set(tmp_path / "capture", scene, alpha=False)
-    result = json.loads(call("compare", *files, "--data", data, "--json"))
+@pytest.fixture
+def data(scene, tmp_path):
+    """The set of the scene without alpha."""
+    return write_set(tmp_path / "capture", scene, alpha=False)
+
+
+def compared(*words):
+    return json.loads(call("compare", *words, "--json").stdout)
+
+
+def test_both_scenes_are_scored_on_the_test_images(files, data):
+    result = compared(*files, "--data", data)
     assert ["view0.png", "view8.png"] == [view["image"].removeprefix("images/") for view in result["views"]]
     assert ["capture", [0.0, 0.0, 0.0]] == [result["cameras"], result["background"]]
     scores = result["photographs"]
@@ -86,20 +88,19 @@ def test_both_scenes_are_scored_on_the_test_images(scene, files, tmp_path):
     assert scores["a"]["lpips"] is None
 
 
-def test_training_images_are_the_others(scene, files, tmp_path):
-    data = write_set(tmp_path / "capture", scene, alpha=False)
-    result = json.loads(call("compare", *files, "--data", data, "--split", "train", "--test-every", 3, "--json"))
+def test_training_images_are_the_others(files, data):
+    result = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
     assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in result["views"]]
     assert 6 == result["photographs"]["a"]["views"]
 
 
 def test_a_background_is_composited_behind_images_and_scene(scene, files, tmp_path):
     data = write_set(tmp_path / "object", scene, alpha=True)
-    result = json.loads(call("compare", *files, "--data", data, "--json"))
+    result = compared(*files, "--data", data)
     assert [0.0, 0.0, 0.0] == result["background"]
     assert result["photographs"]["a"]["psnr"] > 45.0
     assert result["photographs"]["a"]["psnr_covered"] is not None
-    white = json.loads(call("compare", *files, "--data", data, "--background", "white", "--json"))
+    white = compared(*files, "--data", data, "--background", "white")
     assert [1.0, 1.0, 1.0] == white["background"]
     assert white["photographs"]["a"]["psnr"] > 45.0
 
@@ -108,42 +109,39 @@ def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
     shift = (100.0, -20.0, 7.0)
     data = write_set(tmp_path / "capture", scene, alpha=False, shift=shift)
     write_ply(tmp_path / "moved.ply", replace(scene, origin=shift))
-    result = json.loads(call("compare", tmp_path / "moved.ply", tmp_path / "moved.ply", "--data", data, "--json"))
+    result = compared(tmp_path / "moved.ply", tmp_path / "moved.ply", "--data", data)
     assert result["photographs"]["a"]["psnr"] > 50.0
     call("render", tmp_path / "moved.ply", "--data", data, tmp_path / "out")
-    with Image.open(tmp_path / "out" / "view0.png") as ours, Image.open(data / "images" / "view0.png") as photograph:
-        assert np.abs(np.asarray(ours).astype(int) - np.asarray(photograph)).max() <= 1
+    assert_equal_images(tmp_path / "out" / "view0.png", data / "images" / "view0.png")
 
 
-def test_the_table_has_a_column_for_each_scene(scene, files, tmp_path):
-    data = write_set(tmp_path / "capture", scene, alpha=False)
-    text = call("compare", *files, "--data", data, "--pictures", tmp_path / "out")
+def assert_equal_images(path, other):
+    with Image.open(path) as one, Image.open(other) as two:
+        assert (W, H) == one.size
+        assert np.abs(np.asarray(one).astype(int) - np.asarray(two)).max() <= 1
+
+
+def test_the_table_has_a_column_for_each_scene(files, data, tmp_path):
+    text = call("compare", *files, "--data", data, "--pictures", tmp_path / "out").stdout
     for word in ("2 views of capture", "against 2 test images", "B - A", "psnr_mean"):
         assert word in text
     with Image.open(tmp_path / "out" / "view8.png") as sheet:
         assert (4 * W, H) == sheet.size
 
 
-def test_lpips_is_computed_with_weights(scene, files, tmp_path, data_dir):
-    data = write_set(tmp_path / "capture", scene, alpha=False)
+def test_lpips_is_computed_with_weights(files, data, data_dir):
     weights = data_dir / "lpips" / "lpips_alex.npz"
-    scores = json.loads(call("compare", *files, "--data", data, "--lpips", weights, "--json"))["photographs"]
+    scores = compared(*files, "--data", data, "--lpips", weights)["photographs"]
     assert 0.0 <= scores["a"]["lpips"] < scores["b"]["lpips"] < 1.0
 
 
-def test_renders_have_the_names_and_sizes_of_the_test_images(scene, files, tmp_path):
-    data = write_set(tmp_path / "capture", scene, alpha=False)
+def test_renders_have_the_names_and_sizes_of_the_test_images(files, data, tmp_path):
     call("render", files[0], "--data", data, tmp_path / "out")
     assert ["view0.png", "view8.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
-    name = "view0.png"
-    with Image.open(tmp_path / "out" / name) as ours, Image.open(data / "images" / name) as photograph:
-        assert (W, H) == ours.size
-        assert np.abs(np.asarray(ours).astype(int) - np.asarray(photograph)).max() <= 1
+    assert_equal_images(tmp_path / "out" / "view0.png", data / "images" / "view0.png")
 
 
-def test_a_set_without_test_images_is_refused(scene, tmp_path):
-    data = write_set(tmp_path / "capture", scene, alpha=False)
-    write_ply(tmp_path / "a.ply", scene)
+def test_a_set_without_test_images_is_refused(scene, data):
     with pytest.raises(InputError, match="has no test views"):
         compare(scene, scene, views=find_view_set(scene, data=DataOptions(str(data), test_every=0)))
 
@@ -199,12 +197,8 @@ def test_an_origin_moves_the_camera_in_the_opposite_direction():
 def no_compiling(monkeypatch):
     """Compiling the renderer fails the test."""
 
-    def refuse(*_, **__):
-        pytest.fail("the renderer was compiled before the inputs were checked")
-
-    monkeypatch.setattr("csplat_tools.cli.compare.prepare_renderer", refuse)
-    monkeypatch.setattr("csplat_tools.cli.render.prepare_renderer", refuse)
-    monkeypatch.setattr("csplat_render.warmup.warm_up", refuse)
+    for place in ("tools.cli.compare.prepare_renderer", "tools.cli.render.prepare_renderer", "render.warmup.warm_up"):
+        monkeypatch.setattr(f"csplat_{place}", lambda *_, **__: pytest.fail("compiled before the inputs were checked"))
 
 
 @pytest.mark.usefixtures("no_compiling")
@@ -240,14 +234,9 @@ def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypa
 
 def test_the_renderer_is_prepared_once_after_reading(files, tmp_path):
     calls = []
-    data = cameras(2)
-    (tmp_path / "cameras.json").write_text(json.dumps([camera.to_json() for camera in data]))
-    compare(
-        files[0],
-        files[1],
-        views=find_view_set(read_ply(files[0]), cameras=str(tmp_path / "cameras.json"), count=0),
-        prepare=lambda: calls.append("prepare"),
-        progress=lambda stage, _: calls.append(stage),
-    )
+    (tmp_path / "cameras.json").write_text(json.dumps([camera.to_json() for camera in cameras(2)]))
+    views = find_view_set(read_ply(files[0]), cameras=str(tmp_path / "cameras.json"), count=0)
+    note = {"prepare": lambda: calls.append("prepare"), "progress": lambda stage, _: calls.append(stage)}
+    compare(*files, views=views, **note)
     assert 1 == calls.count("prepare")
     assert calls.index("prepare") < calls.index("comparing")

@@ -32,16 +32,22 @@ def shell():
     return shell(8)
 
 
+@pytest.fixture
+def views_of():
+    """Return a function for training and validation views of the shell: `views_of(count)`."""
+    from captures import cameras, views_of
+
+    return lambda count: views_of(cameras(count))
+
+
 def stored(source, result):
     """Verify a file against its source; return the decoded scene."""
     scene = decode_scene(result.data)
     proof = verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, result.source_index)
     assert () == proof.failures
     assert proof.rms_verified
-    assert (len(source), source.sh_degree) == (
-        scene.declared_bounds.source_count,
-        scene.declared_bounds.source_sh_degree,
-    )
+    bounds = scene.declared_bounds
+    assert (len(source), source.sh_degree) == (bounds.source_count, bounds.source_sh_degree)
     return scene
 
 
@@ -148,9 +154,8 @@ def test_a_pruned_file_is_verified_and_records_the_reduction(source):
     result = encode_reduced(source, Reduction(prune_opacity=0.5, sh_degree=1))
     scene = stored(source, result)
     assert {"splats": 150, "prune_opacity": 0.5, "sh_degree": 1, "sh": "truncated"} == scene.options["reduced"]
-    assert (int(np.sum(source.opacities <= 0.5)), False) == (
-        scene.declared_bounds.pruned_count, scene.declared_bounds.refitted,
-    )  # fmt: skip
+    bounds = scene.declared_bounds
+    assert (int(np.sum(source.opacities <= 0.5)), False) == (bounds.pruned_count, bounds.refitted)
     assert (source.opacities[result.source_index] > 0.5).all()
     measures = [record.measure for record in scene.declared_bounds.records]
     assert ["means", "covariance", "opacities", "sh0", "sh1", "sh2"] == measures
@@ -185,14 +190,12 @@ def test_files_are_deterministic(source):
 
 
 @pytest.mark.slow
-def test_distilling_raises_the_psnr(shell):
-    from captures import cameras, views_of
-
+def test_distilling_raises_the_psnr(shell, views_of):
     from csplat_render.scorer import Scorer
 
     truncated = encode_reduced(shell, Reduction(sh_degree=0), EncodeOptions(attribute_psnr=60.0))
     reduction = Reduction(sh_degree=0, distil=True)
-    views = views_of(cameras(24))
+    views = views_of(24)
     distilled = encode_reduced(shell, reduction, EncodeOptions(attribute_psnr=60.0), views=views)
     scene = stored(shell, distilled)
     assert ["means", "covariance", "opacities"] == [record.measure for record in scene.declared_bounds.records]
@@ -205,33 +208,27 @@ def test_distilling_raises_the_psnr(shell):
     assert after > before + 1.0
 
 
-def test_distilled_and_clustered_colours_declare_no_error(shell):
-    from captures import cameras, views_of
-
+def test_distilled_and_clustered_colours_declare_no_error(shell, views_of):
     reduction = Reduction(prune_opacity=0.15, sh_degree=1, distil=True, kmeans=64)
-    scene = stored(shell, encode_reduced(shell, reduction, views=views_of(cameras(9))))
+    scene = stored(shell, encode_reduced(shell, reduction, views=views_of(9)))
     assert ["means", "covariance", "opacities"] == [record.measure for record in scene.declared_bounds.records]
     assert {"kmeans", "check_psnr", "views", "prune_opacity"} <= set(scene.options["reduced"])
     assert 64 >= len(np.unique(np.round(scene.model.opacities, 5)))
 
 
 @pytest.mark.slow
-def test_a_scene_of_one_splat_can_be_distilled(shell):
-    from captures import cameras, views_of
-
+def test_a_scene_of_one_splat_can_be_distilled(shell, views_of):
     one = shell.select(slice(0, 1))
-    result = encode_reduced(one, Reduction(sh_degree=0, distil=True), views=views_of(cameras(9)))
+    result = encode_reduced(one, Reduction(sh_degree=0, distil=True), views=views_of(9))
     assert 1 == len(stored(one, result).model)
 
 
-def test_given_cameras_are_used_and_one_is_refused(shell):
-    from captures import cameras, views_of
-
+def test_given_cameras_are_used_and_one_is_refused(shell, views_of):
     reduction = Reduction(sh_degree=1, distil=True)
-    scene = stored(shell, encode_reduced(shell, reduction, views=views_of(cameras(9))))
+    scene = stored(shell, encode_reduced(shell, reduction, views=views_of(9)))
     assert 8 == scene.options["reduced"]["views"]
     with pytest.raises(InputError, match="requires at least one camera"):
-        encode_reduced(shell, reduction, views=views_of(cameras(1)))
+        encode_reduced(shell, reduction, views=views_of(1))
 
 
 def test_impossible_reductions_are_refused(make_model):

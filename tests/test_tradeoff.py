@@ -13,10 +13,7 @@ import numpy as np
 import pytest
 from command_line import call, invoke
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
-pytest.importorskip("matplotlib", reason="plots need matplotlib: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 from captures import cameras, photograph, shell
 from matplotlib.backends.backend_agg import FigureCanvasAgg

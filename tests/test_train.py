@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="training needs scipy: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 from command_line import call
 from PIL import Image
+from posed_sets import to_opengl
 
 from csplat import decode, read_ply, write_ply
 from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, fix_quantisation
@@ -68,21 +68,18 @@ def training_images(make_model, *, alpha: bool = True) -> DataSet:
     return DataSet("made", shots[:9], shots[9:])
 
 
-@pytest.fixture(scope="module")
-def make_data():
-    cache: dict[bool, DataSet] = {}
+@pytest.fixture
+def data(make_model):
+    return training_images(make_model)
 
-    def make(make_model, *, alpha: bool = True) -> DataSet:
-        if alpha not in cache:
-            cache[alpha] = training_images(make_model, alpha=alpha)
-        return cache[alpha]
 
-    return make
+@pytest.fixture
+def opaque(make_model):
+    return training_images(make_model, alpha=False)
 
 
 @pytest.mark.slow
-def test_masked_pixels_do_not_influence_training(make_data, make_model):
-    data = make_data(make_model, alpha=False)
+def test_masked_pixels_do_not_influence_training(opaque):
     mask = np.ones((SIZE, SIZE), bool)
     mask[10:30, :20] = False
 
@@ -91,7 +88,7 @@ def test_masked_pixels_do_not_influence_training(make_data, make_model):
             pixels = np.where(mask[..., None], picture.pixels, np.uint8(value))
             return PosedImage(picture.camera, pixels, mask)
 
-        return DataSet("masked", [shown(one) for one in data.train], [shown(one) for one in data.test])
+        return DataSet("masked", [shown(one) for one in opaque.train], [shown(one) for one in opaque.test])
 
     first, second = (train(hidden(value), TrainOptions(**QUICK, init="box")) for value in (0, 200))
     assert np.array_equal(first.model.means, second.model.means)
@@ -102,8 +99,7 @@ def test_masked_pixels_do_not_influence_training(make_data, make_model):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
-def test_training_prunes_to_the_final_share(make_data, make_model, tmp_path, strategy):
-    data = make_data(make_model)
+def test_training_prunes_to_the_final_share(data, tmp_path, strategy):
     options = TrainOptions(**QUICK, strategy=strategy, final_share=0.5, refine_stop=0.5)
     whole, _ = assert_resumes_identically(data, options, tmp_path)
     counts = [entry["splat_count"] for entry in whole.log["entries"]]
@@ -113,8 +109,7 @@ def test_training_prunes_to_the_final_share(make_data, make_model, tmp_path, str
 
 @pytest.mark.slow
 @pytest.mark.parametrize("steps", [38, 42, 60])  # while splats are pruned, after that, at the end
-def test_a_run_resumed_late_prunes_to_the_final_share(make_data, make_model, tmp_path, steps):
-    data = make_data(make_model)
+def test_a_run_resumed_late_prunes_to_the_final_share(data, tmp_path, steps):
     trunk = TrainOptions(**{**QUICK, "iterations": steps}, refine_stop=0.5)
     whole = train(data, trunk, outputs=Outputs(tmp_path / "trunk.npz"))
     options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.75)  # two prunings
@@ -122,7 +117,7 @@ def test_a_run_resumed_late_prunes_to_the_final_share(make_data, make_model, tmp
     assert 0.75 * len(whole.model) == pytest.approx(len(left.model), abs=3)
 
 
-def test_training_starts_with_images_of_half_the_size(make_data, make_model, tmp_path, monkeypatch):
+def test_training_starts_with_images_of_half_the_size(data, tmp_path, monkeypatch):
     widths: list[int] = []
     step = CpuEngine.step
 
@@ -132,14 +127,13 @@ def test_training_starts_with_images_of_half_the_size(make_data, make_model, tmp
 
     monkeypatch.setattr(CpuEngine, "step", watched)
     options = TrainOptions(**QUICK, half_size=0.5)
-    assert_resumes_identically(make_data(make_model), options, tmp_path)
+    assert_resumes_identically(data, options, tmp_path)
     assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # of the run without interruption
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
-def test_training_reduces_the_loss(make_data, make_model, strategy):
-    data = make_data(make_model)
+def test_training_reduces_the_loss(data, strategy):
     options = TrainOptions(**{**QUICK, "iterations": 150, "refine_every": 30}, strategy=strategy, lr_means=4e-3)
     result = train(data, options)
     losses = result.log["losses"]
@@ -148,8 +142,7 @@ def test_training_reduces_the_loss(make_data, make_model, strategy):
     assert len(result.model) <= 80
 
 
-def test_the_same_seed_gives_the_same_file(make_data, make_model, tmp_path):
-    data = make_data(make_model)
+def test_the_same_seed_gives_the_same_file(data, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         write_ply(tmp_path / name, train(data, TrainOptions(**QUICK, seed=seed, background="random")).model)
     first, second, other = ((tmp_path / name).read_bytes() for name in "abc")
@@ -158,13 +151,13 @@ def test_the_same_seed_gives_the_same_file(make_data, make_model, tmp_path):
 
 
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
-def test_a_resumed_run_equals_an_uninterrupted_one(make_data, make_model, tmp_path, strategy):
-    assert_resumes_identically(make_data(make_model), TrainOptions(**QUICK, strategy=strategy), tmp_path)
+def test_a_resumed_run_equals_an_uninterrupted_one(data, tmp_path, strategy):
+    assert_resumes_identically(data, TrainOptions(**QUICK, strategy=strategy), tmp_path)
 
 
-def test_a_scene_has_the_origin_of_its_data_set(make_data, make_model, tmp_path):
+def test_a_scene_has_the_origin_of_its_data_set(data, tmp_path):
     # Also if the run is resumed with images that have another origin.
-    data, place = make_data(make_model), np.array((500123.0, 4649876.0, 214.0))
+    place = np.array((500123.0, 4649876.0, 214.0))
     options = TrainOptions(**{**QUICK, "iterations": 30})
     plain = train(data, options).model
     moved = train(replace(data, origin=tuple(place)), options, outputs=Outputs(tmp_path / "c.npz")).model
@@ -178,8 +171,7 @@ def test_a_scene_has_the_origin_of_its_data_set(make_data, make_model, tmp_path)
     assert np.allclose(plain.means - shift, again.means, atol=1e-5)
 
 
-def test_an_outlier_camera_does_not_change_the_extent(make_data, make_model):
-    data = make_data(make_model)
+def test_an_outlier_camera_does_not_change_the_extent(data):
     away = replace(data.train[0], camera=relative_to((3e4, 0.0, 0.0), data.train[0].camera))
     far = replace(data, train=[away, *data.train[1:]])
     assert data.train == data.inliers
@@ -189,8 +181,7 @@ def test_an_outlier_camera_does_not_change_the_extent(make_data, make_model):
 
 
 @pytest.mark.slow
-def test_large_units_do_not_change_the_scene(make_data, make_model):
-    data = make_data(make_model)
+def test_large_units_do_not_change_the_scene(data):
 
     def larger(picture: PosedImage) -> PosedImage:
         viewmat = picture.camera.viewmat.copy()
@@ -220,8 +211,7 @@ def assert_resumes_identically(data, options, folder):
     return whole, stopped
 
 
-def test_a_run_resumes_with_another_number_of_splats(make_data, make_model, tmp_path):
-    data = make_data(make_model)
+def test_a_run_resumes_with_another_number_of_splats(data, tmp_path):
     train(data, TrainOptions(**QUICK, strategy="fixed"), outputs=Outputs(checkpoint=tmp_path / "c.npz"))
     for count in (50, 120):
         options = TrainOptions(**{**QUICK, "max_splats": count, "iterations": 70, "sh_degree": 2}, strategy="fixed")
@@ -229,10 +219,10 @@ def test_a_run_resumes_with_another_number_of_splats(make_data, make_model, tmp_
         assert (count, 2) == (len(result.model), result.model.sh_degree)
 
 
-def test_progress_log_and_previews_are_written(make_data, make_model, tmp_path):
+def test_progress_log_and_previews_are_written(data, tmp_path):
     seen = []
     outputs = Outputs(previews=tmp_path / "p", preview_every=30)
-    result = train(make_data(make_model), TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
+    result = train(data, TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
     assert [20, 40, 60] == [now.iteration for now in seen]
     assert seen[-1].seconds_left == 0
     assert ["000030.png", "000060.png"] == sorted(path.name for path in (tmp_path / "p").iterdir())
@@ -241,8 +231,7 @@ def test_progress_log_and_previews_are_written(make_data, make_model, tmp_path):
     assert {"psnr", "ssim", "lpips", "psnr_mean"} <= set(log["metrics"])
 
 
-def test_splats_start_within_the_hull_of_all_masks(make_data, make_model):
-    data = make_data(make_model)
+def test_splats_start_within_the_hull_of_all_masks(data):
     scene = measure_extent(data.train)
     assert np.linalg.norm(scene.focus) < 0.1
     found = place_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="hull")
@@ -250,19 +239,18 @@ def test_splats_start_within_the_hull_of_all_masks(make_data, make_model):
     assert np.linalg.norm(found["means"], axis=1).mean() < np.linalg.norm(boxed["means"], axis=1).mean()
 
 
-def test_images_without_alpha_start_in_a_box(make_data, make_model):
-    data = make_data(make_model, alpha=False)
-    result = train(data, TrainOptions(**QUICK))
+def test_images_without_alpha_start_in_a_box(opaque):
+    result = train(opaque, TrainOptions(**QUICK))
     assert np.isfinite(result.model.means).all()
     assert (0.0, 0.0, 0.0) == TrainingRecord.of(result.model.metadata).background
     with pytest.raises(InputError, match="requires images with alpha"):
-        train(data, TrainOptions(**QUICK, init="hull"))
+        train(opaque, TrainOptions(**QUICK, init="hull"))
     with pytest.raises(InputError, match="requires points"):
-        train(data, TrainOptions(**QUICK, init="points"))
+        train(opaque, TrainOptions(**QUICK, init="points"))
 
 
-def test_the_first_view_of_surroundings_is_a_training_camera(make_data, make_model):
-    data, options = make_data(make_model), TrainOptions(**{**QUICK, "iterations": 1, "strategy": "none"})
+def test_the_first_view_of_surroundings_is_a_training_camera(data):
+    options = TrainOptions(**{**QUICK, "iterations": 1, "strategy": "none"})
     assert "view" not in train(data, options).model.metadata  # an object
     rng = np.random.default_rng(0)
     far = rng.standard_normal((60, 3)) * 40.0
@@ -274,8 +262,7 @@ def test_the_first_view_of_surroundings_is_a_training_camera(make_data, make_mod
     assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)
 
 
-def test_splats_start_at_the_points(make_data, make_model):
-    data = make_data(make_model)
+def test_splats_start_at_the_points(data):
     points = np.random.default_rng(0).standard_normal((20, 3)).astype(np.float32)
     given = DataSet("made", data.train, [], points, np.full((20, 3), 0.25, np.float32))
     result = train(given, TrainOptions(**{**QUICK, "iterations": 1}, lr_means=0.0, lr_means_final=0.0, noise=0.0))
@@ -283,22 +270,20 @@ def test_splats_start_at_the_points(make_data, make_model):
     assert result.metrics is None
 
 
-def test_points_outside_all_images_are_refused(make_data, make_model):
-    data = replace(make_data(make_model), points=np.full((5, 3), 4e6, np.float32))
+def test_points_outside_all_images_are_refused(data):
+    data = replace(data, points=np.full((5, 3), 4e6, np.float32))
     with pytest.raises(InputError, match="no camera sees any of the data set's 5 points, expected both in the same"):
         train(data, TrainOptions(**QUICK))
     assert train(data, TrainOptions(**{**QUICK, "iterations": 1}, init="box")).log["losses"]
 
 
 @pytest.mark.slow
-def test_the_command_trains_from_a_folder(make_data, make_model, tmp_path):
+def test_the_command_trains_from_a_folder(data, tmp_path):
     (tmp_path / "train").mkdir()
     frames = []
-    data = make_data(make_model)
     for number, picture in enumerate(data.train):
         Image.fromarray(picture.pixels).save(tmp_path / "train" / f"{number}.png")
-        pose = np.linalg.inv(picture.camera.viewmat) @ np.diag([1, -1, -1, 1])
-        frames.append({"file_path": f"./train/{number}", "transform_matrix": pose.tolist()})
+        frames.append({"file_path": f"./train/{number}", "transform_matrix": to_opengl(picture.camera)})
     angle = 2 * np.arctan(0.5 * SIZE / data.train[0].camera.K[0, 0])
     (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     run = ("train", tmp_path, tmp_path / "o.ply")
@@ -316,8 +301,7 @@ def write_set(folder, data):
     frames = []
     for number, picture in enumerate((*data.train, *data.test)):
         Image.fromarray(picture.pixels).save(folder / f"{number:02}.png")
-        pose = np.linalg.inv(picture.camera.viewmat) @ np.diag([1, -1, -1, 1])
-        frames.append({"file_path": f"{number:02}.png", "transform_matrix": pose.tolist()})
+        frames.append({"file_path": f"{number:02}.png", "transform_matrix": to_opengl(picture.camera)})
     document = {"fl_x": data.train[0].camera.K[0, 0], "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document))
     return folder
@@ -331,8 +315,8 @@ FEW_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 5)
     ("alpha", "background", "every", "size"),
     [(True, "auto", 5, None), (False, "auto", 10, "24x20"), (False, "white", 8, None), (True, "random", 8, "24x24")],
 )
-def test_compare_agrees_with_the_metrics_of_train(make_data, make_model, tmp_path, alpha, background, every, size):
-    folder = write_set(tmp_path, make_data(make_model, alpha=alpha))
+def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, background, every, size):
+    folder = write_set(tmp_path, training_images(make_model, alpha=alpha))
     reading = ["--test-every", every, *(() if size is None else ("--size", size))]
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
     result = call("train", folder, ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
@@ -409,8 +393,8 @@ def test_tuning_after_a_long_training_takes_more_and_smaller_steps():
     assert usual.lr_scales / brief.lr_scales == pytest.approx(1 / 3)
 
 
-def test_damaged_images_are_refused_before_training(make_data, make_model, tmp_path, monkeypatch):
-    folder = write_set(tmp_path, make_data(make_model))
+def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch):
+    folder = write_set(tmp_path, data)
     (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
     monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
     assert "11.png is not an image that can be read" in call("train", folder, tmp_path / "a.ply", status=1).stderr
@@ -833,11 +817,6 @@ def test_masked_pixels_do_not_change_the_loss(weights):
 
 GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of training images; of test images: 1
 LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
-
-
-@pytest.fixture
-def data(make_model):
-    return training_images(make_model)
 
 
 @pytest.fixture

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from checked import cloud
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.decoder import read_header
-from csplat.model import SplatModel, normalise_quats
+from csplat.model import normalise_quats
 
 pytest.importorskip("numba", reason="pictures need the rasteriser: pip install 'csplat[render]'")
 
@@ -75,16 +76,11 @@ def in_front(distance=3.0, size=128, fov=50.0, **fields):
 
 def make(means, **fields):
     """Return a model of splats with these means; fields that are not given make small grey balls."""
-    n = len(means)
-    arrays = {
-        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)), "scales": np.full((n, 3), -2.0, np.float32),
-        "opacities": np.full(n, 0.9, np.float32), "sh0": np.zeros((n, 3), np.float32),
-        "shN": np.zeros((n, 0, 3), np.float32),
-    }  # fmt: skip
     given = {name: np.asarray(value, np.float32) for name, value in fields.items()}
     if "quats" in given:
         given["quats"] = normalise_quats(given["quats"])
-    return SplatModel(means=np.asarray(means, np.float32).reshape(n, 3), **{**arrays, **given})
+    means = np.reshape(means, (-1, 3))
+    return cloud(means, **{"scales": np.full(means.shape, -2.0, np.float32), **given})
 
 
 def test_the_sample_looks_as_the_rasteriser_draws_it_at_a_fraction_of_its_memory(engine, sample):

@@ -14,9 +14,7 @@ from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat.training_record import TRAINING, TrainingRecord
 
-pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
-pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
+pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 from csplat_render.camera import relative_to, resized
@@ -275,43 +273,31 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
     record = TrainingRecord.of(read_ply(ply).metadata)
     assert ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0), SIZE) == (record.background, record.size)
     trained = json.loads(log.read_text())["metrics"]
-    found = {name: SCORES[name](ply, data, tmp_path) for name in commands}
+    found = {name: score_of(name, ply, data, tmp_path) for name in commands}
     assert {held_out} == {trained["views"]} | {views for views, _ in found.values() if views is not None}
     scores = {"train": trained["psnr"], **{name: psnr for name, (_, psnr) in found.items()}}
     assert max(scores.values()) - min(scores.values()) < 0.01, scores
 
 
-def score_of_compare(ply, data, _):
-    scores = json.loads(call("compare", ply, ply, "--data", data, "--json").stdout)["photographs"]["a"]
-    return scores["views"], scores["psnr"]
-
-
-def score_of_finetune(ply, data, folder):
-    report = folder / "score_of_finetune.json"
-    words = ("finetune", ply, "--data", data, folder / "t.csplat", "--iterations", 1)
-    call(*words, "--report", report, "-q")
-    return None, json.loads(report.read_text())["scores"]["source"]["psnr"]
-
-
-def score_of_simplify(ply, data, folder):
-    report = folder / "simplified.json"
-    words = ("simplify", ply, folder / "less.ply", "--data", data, "--keep", 0.9)
-    call(*words, "--report", report, "-q")
-    return None, json.loads(report.read_text())["photographs"]["source"]
-
-
-def score_of_tradeoff(ply, data, _):
-    scores = json.loads(call("tradeoff", ply, "--data", data, "--what", "presets", "--json", "-q").stdout)
-    return scores["source"]["photographs"]["views"], scores["source"]["photographs"]["psnr"]
-
-
-def score_of_encode(ply, data, folder):
-    words = ("encode", ply, folder / "e.csplat", "--data", data, "--max-psnr-drop", 3, "--no-prune", "--preset", "fast")
-    report = json.loads(call(*words, "--json").stdout)["target"]
-    return report["views"], report["photographs"]["source"]
-
-
+#: Words of a command after its name, and where its JSON has the scores.
 SCORES = {
-    "compare": score_of_compare, "finetune": score_of_finetune, "simplify": score_of_simplify,
-    "tradeoff": score_of_tradeoff, "encode": score_of_encode,
-}  # fmt: skip
+    "compare": (("PLY", "PLY"), ("photographs", "a")),
+    "finetune": (("PLY", "OUT/t.csplat", "--iterations", 1), ("scores", "source")),
+    "simplify": (("PLY", "OUT/less.ply", "--keep", 0.9), ("photographs", "source")),
+    "tradeoff": (("PLY", "--what", "presets"), ("source", "photographs")),
+    "encode": (
+        ("PLY", "OUT/e.csplat", "--max-psnr-drop", 3, "--no-prune", "--preset", "fast"),
+        ("target", "photographs", "source"),
+    ),
+}
+
+
+def score_of(name, ply, data, folder):
+    """Return the score of the source in the JSON of a command, and the number of views, if it is there."""
+    words, place = SCORES[name]
+    given = [str(word).replace("PLY", str(ply)).replace("OUT", str(folder)) for word in words]
+    found = report = json.loads(call(name, *given, "--data", data, "--json").stdout)
+    for key in place:
+        found = found[key]
+    scores = found if isinstance(found, dict) else {"psnr": found}
+    return report["target"]["views"] if name == "encode" else scores.get("views"), scores["psnr"]
