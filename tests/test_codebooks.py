@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import runpy
 import shutil
 import subprocess
 import sys
@@ -279,7 +278,7 @@ def test_ranks_follow_frequency_and_keep_the_order_of_equals():
 
 # The same bytes at any thread count.
 def digest(threads=None):
-    """Return a SHA-256 of clusters by two kinds of search; the subprocess below calls it, too."""
+    """Return a SHA-256 of clusters by two kinds of search."""
     points, weights = blobs(1500, 45, 150, 12.0)
     state = hashlib.sha256()
     for near_groups, scale in ((0, 1), (6, 1), (0, 300)):
@@ -289,22 +288,22 @@ def digest(threads=None):
     return state.hexdigest()
 
 
+def printed(code, blas_threads):
+    """Run code in another process, with this module as `module`; return the words that it prints."""
+    environment = {**os.environ, **dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"), str(blas_threads))}
+    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    command = [sys.executable, "-c", f"import runpy; module = runpy.run_path({__file__!r}); {code}"]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
+    return run.stdout.split()
+
+
 @pytest.mark.slow
 def test_threads_of_csplat_and_blas_do_not_change_the_bytes():
-    program = (
-        "import runpy, sys; from csplat.encoder import kmeans\n"
-        f"digest = runpy.run_path({__file__!r})['digest']\n"
-        "print(digest())\n"
-        "kmeans._openblas = lambda: None  # its threads cannot be set\n"
-        "print(digest())"
-    )
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2"}
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
-    command = [sys.executable, "-c", program]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
+    # The threads of an OpenBLAS that is not found cannot be set.
+    code = "print(module['digest']()); module['kmeans']._openblas = lambda: None; print(module['digest']())"
     expected = digest(1)
     assert expected == digest(2) == digest(5)
-    assert [expected, expected] == run.stdout.split()
+    assert [expected, expected] == printed(code, blas_threads=2)
 
 
 @pytest.mark.slow
@@ -507,46 +506,31 @@ def test_axes_are_recovered_from_covariances():
     np.testing.assert_allclose(np.sort(scales - sizes[:, None], axis=1), np.sort(found.T, axis=1), atol=1e-3)
 
 
-#: Prints the SHA-256 of files with both kinds of codebooks, with an importance and without.
-DIGEST = """
-import hashlib, sys
-import numpy as np
-from csplat import EncodeOptions, SplatModel
-from csplat.encoder import Importance, encode_with_report
-from csplat.model import normalise_quats
+def file_digests(threads):
+    """Return SHA-256s of files with both kinds of codebooks, with an importance and without."""
+    rng, n = np.random.default_rng(4), 1500
+    normal = lambda *shape: rng.standard_normal((n, *shape)).astype(np.float32)  # noqa: E731
+    model = csplat.SplatModel(means=normal(3), quats=normalise_quats(normal(4)), scales=normal(3) - 4,
+        opacities=rng.random(n).astype(np.float32), sh0=normal(3), shN=normal(8, 3))  # fmt: skip
 
-def digest(threads):
-    rng = np.random.default_rng(4)
-    n = 1500
-    normal = lambda *shape: rng.standard_normal((n, *shape)).astype(np.float32)
-    model = SplatModel(means=normal(3), quats=normalise_quats(normal(4)), scales=normal(3) - 4,
-                       opacities=rng.random(n).astype(np.float32), sh0=normal(3), shN=normal(8, 3))
     def matrices(size):
         roots = rng.normal(size=(n, size, 3))
-        full = roots @ roots.transpose(0, 2, 1) / 3
         rows, columns = np.triu_indices(size)
-        return full[:, rows, columns]
+        return (roots @ roots.transpose(0, 2, 1) / 3)[:, rows, columns]
+
     importance = Importance(rng.random(n), rng.random(n), matrices(8), matrices(6))
-    options = EncodeOptions(sh_coding="codebook", codebook_size=64, shape_codebook_size=150, tile_splats=1000,
-                            threads=threads)
+    options = EncodeOptions(
+        sh_coding="codebook", codebook_size=64, shape_codebook_size=150, tile_splats=1000, threads=threads
+    )
     made = [encode_with_report(model, options, importance=one) for one in (importance, None)]
     assert all(one.report.options["codebook_size"] and one.report.options["shape_codebook_size"] for one in made)
     return [hashlib.sha256(one.data).hexdigest() for one in made]
 
-if __name__ == "__main__":
-    print(*digest(3))
-"""
-
 
 @pytest.mark.slow
-def test_the_number_of_threads_does_not_change_the_bytes(tmp_path):
-    program = tmp_path / "digest.py"
-    program.write_text(DIGEST)
-    blas = "1" if (os.cpu_count() or 1) > 1 else "2"  # another number than in this process
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": blas, "OMP_NUM_THREADS": blas}
-    environment["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
-    done = subprocess.run([sys.executable, program], env=environment, capture_output=True, text=True, check=True)
-    assert runpy.run_path(str(program))["digest"](1) == done.stdout.split()
+def test_the_number_of_threads_does_not_change_the_bytes():
+    blas = 1 if (os.cpu_count() or 1) > 1 else 2  # another number than in this process
+    assert file_digests(1) == printed("print(*module['file_digests'](3))", blas)
 
 
 @pytest.mark.slow

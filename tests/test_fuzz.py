@@ -70,6 +70,13 @@ def attempt(data):
     return fuzz.attempt(DecoderTarget(), data)
 
 
+def raising(error):
+    def run(*_args, **_options):
+        raise error
+
+    return run
+
+
 # Mutants of csplat files ---------------------------------------------------------------------------
 def test_cases_are_the_same_for_a_seed():
     first = cases(DecoderTarget(), 5, 50, BASES)
@@ -110,10 +117,7 @@ def test_a_file_of_any_origin_is_a_base():
 # What is a finding ---------------------------------------------------------------------------------
 @pytest.mark.parametrize("error", [KeyError("a"), MemoryError(), RecursionError(), ValueError("b"), SystemExit(0)])
 def test_another_exception_is_a_finding(monkeypatch, error):
-    def broken(*_args, **_options):
-        raise error
-
-    monkeypatch.setattr(decoder, "decode", broken)
+    monkeypatch.setattr(decoder, "decode", raising(error))
     assert "finding" == attempt(b"")[0]
 
 
@@ -123,10 +127,7 @@ def test_a_warning_is_a_finding(monkeypatch):
 
 
 def test_a_refusal_is_no_finding(monkeypatch):
-    def refuse(*_args, **_options):
-        raise FormatError("E_CRC", 0, "CHK-1")
-
-    monkeypatch.setattr(decoder, "decode", refuse)
+    monkeypatch.setattr(decoder, "decode", raising(FormatError("E_CRC", 0, "CHK-1")))
     assert ("E_CRC", "") == attempt(b"")
 
 
@@ -247,18 +248,12 @@ def test_damaged_plies_are_read_and_refused_and_nothing_else(ply_target):
 
 @pytest.mark.parametrize(("name", "wrong"), [("read_ply", ValueError("x")), ("lint_ply", IndexError("y"))])
 def test_another_exception_of_the_reader_is_a_finding(monkeypatch, ply_target, name, wrong):
-    def broken(*_args, **_options):
-        raise wrong
-
-    monkeypatch.setattr(file_targets, name, broken)
+    monkeypatch.setattr(file_targets, name, raising(wrong))
     assert type(wrong).__name__ in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
 
 
 def test_a_reader_that_disagrees_with_lint_is_a_finding(monkeypatch, ply_target):
-    def refuse(*_args, **_options):
-        raise InputError("no")
-
-    monkeypatch.setattr(file_targets, "read_ply", refuse)
+    monkeypatch.setattr(file_targets, "read_ply", raising(InputError("no")))
     assert "lint reports no error" in fuzz.attempt(ply_target, ply_target.seeds([])[0].data)[1]
 
 

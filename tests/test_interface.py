@@ -250,6 +250,19 @@ class Called(Exception):  # noqa: N818  # not an error
     """Ends a command when it calls the interface; carries the arguments."""
 
 
+def arguments_of(monkeypatch, module, name, words):
+    """Run a command until it calls a public function; return the arguments."""
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)
+
+    def called(*args, **named):
+        raise Called(args, named)
+
+    monkeypatch.setattr(module, name, called)
+    raised = CliRunner().invoke(app, [*words, "--quiet"]).exception
+    assert isinstance(raised, Called), raised
+    return raised.args
+
+
 @pytest.mark.parametrize(("words", "name", "given"), [
     (["encode", "scene.ply", "o", "--max-error", "means=0.01"], "encode_to", {"errors": {"means": 0.01}}),
     (["encode", "scene.ply", "o", "--target-psnr", "40"], "encode_to", {"psnr": 40.0, "no_prune": False}),
@@ -261,15 +274,7 @@ class Called(Exception):  # noqa: N818  # not an error
 @pytest.mark.usefixtures("views_once")
 def test_commands_call_the_public_functions(files, monkeypatch, words, name, given):
     monkeypatch.chdir(files[1].parent)
-    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)
-
-    def called(*args, **named):
-        raise Called(args, named)
-
-    monkeypatch.setattr(csplat_tools, name, called)
-    raised = CliRunner().invoke(app, [*words, "--quiet"]).exception
-    assert isinstance(raised, Called), raised
-    scene, named = raised.args[0][0], raised.args[1]
+    (scene, *_), named = arguments_of(monkeypatch, csplat_tools, name, words)
     assert_same(csplat.read_ply(files[1]), getattr(scene, "model", getattr(scene, "source", scene)))
     assert given.items() <= named.items()
 
@@ -294,15 +299,8 @@ def test_train_and_finetune_call_the_public_functions(tmp_path, monkeypatch, wor
     from captures import photograph, shell
 
     monkeypatch.chdir(photograph(shell(3), tmp_path))
-    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)
-
-    def called(*args, **named):
-        raise Called(args, named)
-
-    monkeypatch.setattr(csplat_trainer, name, called)
-    raised = CliRunner().invoke(app, [*words, "--quiet"]).exception
-    assert isinstance(raised, Called), raised
-    assert kind == type(raised.args[0][0]).__name__
+    (given, *_), _ = arguments_of(monkeypatch, csplat_trainer, name, words)
+    assert kind == type(given).__name__
 
 
 def modules_after(statement: str) -> set[str]:

@@ -38,10 +38,7 @@ COARSE = (Harm.COARSE, ("L3", ""))
 def no_gauge(_fix):
     """Keep the axis order and make w positive; components beyond ±M are clipped later."""
 
-    def run(quats, scales):
-        return (quats * np.where(quats[:, :1] < 0, np.float32(-1), np.float32(1))).T, scales.T
-
-    return run
+    return lambda quats, scales: ((quats * np.where(quats[:, :1] < 0, np.float32(-1), np.float32(1))).T, scales.T)
 
 
 def sign_of_w_lost(fix):
@@ -58,11 +55,7 @@ def sign_of_w_lost(fix):
 def sorted_alone(fix):
     """Sort the scales without exchanging the axes of the rotation."""
 
-    def run(quats, scales):
-        rotation, _ = fix(quats, np.zeros_like(scales))
-        return rotation, -np.sort(-scales, axis=1).T
-
-    return run
+    return lambda quats, scales: (fix(quats, np.zeros_like(scales))[0], -np.sort(-scales, axis=1).T)
 
 
 # Rounding -------------------------------------------------------------------------------------------
@@ -98,10 +91,7 @@ def truncated(module, name, where=(quantisation, shape_codebook)):
 
 # Colours --------------------------------------------------------------------------------------------
 def chroma_exchanged(integers):
-    def run(*args):
-        return integers(*args)[[0, 2, 1]]
-
-    return run
+    return lambda *args: integers(*args)[[0, 2, 1]]
 
 
 def wrapped(bits):
@@ -158,12 +148,9 @@ def with_time(settings):
 # Bytes of the file: checksums are repaired unless they are the fault ---------------------------------
 def serr_at(data):
     """Return the offset of the payload of the stated errors."""
-    index = [
-        entry
-        for name, entry in built_from(data).fields.items()
-        if name.startswith("directory[") and name.endswith("type")
-    ]
-    (record,) = (entry.offset for entry in index if data[entry.offset :].startswith(_spec.CHUNK_STATED_ERRORS))
+    fields = built_from(data).fields.items()
+    types = [entry.offset for name, entry in fields if name.startswith("directory[") and name.endswith("type")]
+    (record,) = (offset for offset in types if data[offset:].startswith(_spec.CHUNK_STATED_ERRORS))
     return _spec.unpack_directory_record(data, record).offset + _spec.CHUNK_HEADER_SIZE
 
 
@@ -189,10 +176,8 @@ def head(**fields):
         built, at = built_from(data), serr_at(data)
         old = _spec.unpack_stated_errors_head(data, at)
         new = old._replace(**{name: make(getattr(old, name)) for name, make in fields.items()})
-        packed = _spec.pack_stated_errors_head(new)
-        return dataclasses.replace(built, data=data[:at] + packed + data[at + _spec.STATED_ERRORS_HEAD_SIZE :]).patched(
-            {}
-        )
+        changed_data = data[:at] + _spec.pack_stated_errors_head(new) + data[at + _spec.STATED_ERRORS_HEAD_SIZE :]
+        return dataclasses.replace(built, data=changed_data).patched({})
 
     return run
 
@@ -269,16 +254,10 @@ def restated(change):
 def scaled(only, kind, factor):
     """Return a stage that multiplies the max or the rms of some measures by a factor."""
 
-    def run(bounds):
-        return {
-            name: (
-                most * (factor if kind == "max" and name in only else 1.0),
-                rms * (factor if kind == "rms" and name in only else 1.0),
-            )
-            for name, (most, rms) in bounds.items()
-        }
-
-    return restated(run)
+    by = np.array([factor, 1.0] if kind == "max" else [1.0, factor])
+    return restated(
+        lambda bounds: {name: tuple((pair * by).tolist()) if name in only else pair for name, pair in bounds.items()}
+    )
 
 
 def in_single(_errors):
