@@ -413,15 +413,10 @@ def _run(args: argparse.Namespace, project: Project, states: Sequence[State], fo
         with contextlib.suppress(LookupError):
             project.folder_of(one)
             packages.add(one)
-    suite = Suite.load(
-        project,
+    suite = Suite.load(project,
         [Tree(folder / "trees" / f"{name or 'own'}-{job}", project, checkout) for job in range(args.jobs)],
-        sorted(packages),
-        expression=usual if args.expression is None else args.expression,
-        patterns=args.tests,
-        budget=args.budget,
-        folder=folder / "maps",
-    )
+        sorted(packages), expression=usual if args.expression is None else args.expression, patterns=args.tests,
+        budget=args.budget, folder=folder / "maps")  # fmt: skip
     _say(f"{len(suite.map.tests)} tests judge; {len(suite.map.failed)} fail on the unchanged tree and judge nothing")
     for failed in suite.map.failed:
         _say(f"  {failed}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import fnmatch
 import hashlib
 import json
@@ -156,7 +155,7 @@ def test_a_wrong_hash_fails_the_run(monkeypatch):
     vector = named("valid/quats")
     digest = vector.expect["floats"]["quats"]
     wrong = vector.expect | {"floats": vector.expect["floats"] | {"quats": [*digest[:2], "0" * 64]}}
-    monkeypatch.setattr(decoder_suite, "load", lambda: [dataclasses.replace(vector, expect=wrong)])
+    monkeypatch.setattr(decoder_suite, "load", lambda: [replace(vector, expect=wrong)])
     (failure,) = decoder_suite.run_builtin().failures
     assert ("L3", Status.FAILED, "floats.quats differs") == (failure.level, failure.status, failure.message)
 
@@ -164,7 +163,7 @@ def test_a_wrong_hash_fails_the_run(monkeypatch):
 def test_an_accepted_broken_file_fails_the_run(monkeypatch):
     vector = named("valid/quats")
     error = {"code": "E_RANGE", "clause": "QUA-2", "offset": 0, "also": [], "optional": ""}
-    monkeypatch.setattr(decoder_suite, "load", lambda: [dataclasses.replace(vector, expect={}, error=error)])
+    monkeypatch.setattr(decoder_suite, "load", lambda: [replace(vector, expect={}, error=error)])
     (failure,) = decoder_suite.run_builtin().failures
     assert (Status.FAILED, "accepted", "QUA-2") == (failure.status, failure.message, failure.clauses[0])
 
@@ -194,7 +193,7 @@ def beyond():
     Vectors are run by all decoders and the validator anyway: for a mask the first bit and the last. Of the bits
     between them in reserved fields every third is here, in flags all.
     """
-    vectors = {vector.data: vector.error for vector in load() if vector.error}
+    vectors = {vector.data: vector.error for vector in INVALID}
     found = {}
     for number, case in enumerate(cases()):
         if case.rule.field.startswith("reserved_") and number % 3:
@@ -303,6 +302,7 @@ def test_valid_vectors_hold_each_value_of_an_enum_and_no_other(valid):
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+GUIDE_AS_WRITTEN = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8")
 SCHEMA = json.loads((VECTORS / "manifest.schema.json").read_text(encoding="utf-8"))
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))
 SCENES = [recipe.scene for recipe in sound_recipes() if recipe.scene is not None]
@@ -375,7 +375,6 @@ def test_every_clause_that_can_be_broken_is_broken_by_a_vector():
 
 
 # The guide -----------------------------------------------------------------------------------------
-GUIDE_AS_WRITTEN = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8")
 
 
 def test_the_guide_names_vectors_that_exist():
@@ -475,8 +474,7 @@ def test_vectors_and_annexes_are_those_of_the_recipes():
     assert (0, "") == (done.returncode, done.stdout + done.stderr)
 
 
-GUIDE = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8").replace("−", "-")
-SPEC = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+GUIDE = GUIDE_AS_WRITTEN.replace("−", "-")
 LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
 
 
@@ -484,7 +482,7 @@ LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
 def spec():
     """The spec's pseudo-code."""
     names = {"float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "floor": math.floor}
-    for block in re.findall(r"```python spec-test\n(.*?)```", SPEC, re.DOTALL):
+    for block in re.findall(r"```python spec-test\n(.*?)```", TEXT, re.DOTALL):
         exec(block, names)  # noqa: S102 - the text is the project's own
     return SimpleNamespace(**names)
 
@@ -573,7 +571,7 @@ def test_the_code_of_the_guide_gives_the_stated_errors(row, source, file):
 
 
 CLAUSES = clause_ids(TEXT)
-COVERED = {clause for vector in load() for clause in vector.clauses}
+COVERED = {clause for vector in VECTOR_LIST for clause in vector.clauses}
 
 
 def worked_example_rows():
@@ -638,5 +636,5 @@ def test_the_worked_example_explains_the_right_values():
 
 def test_annexes_equal_the_output_of_the_recipes():
     assert TEXT == replace_generated(
-        replace_generated(TEXT, "worked example", annex()), "clause map", clause_map(TEXT, load())
+        replace_generated(TEXT, "worked example", annex()), "clause map", clause_map(TEXT, VECTOR_LIST)
     )

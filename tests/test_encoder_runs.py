@@ -1,6 +1,5 @@
 """The encoder suite's runs of a program and its verdicts on the file, and their form in reports."""
 
-import dataclasses
 import json
 import re
 import shlex
@@ -9,6 +8,7 @@ import time
 import types
 import xml.etree.ElementTree as ET
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
@@ -394,9 +394,9 @@ def judged(name, model, change=lambda scene: scene, **options):
 
 def stating(**changes):
     """Return a change of the errors that a scene states."""
-    return lambda scene: dataclasses.replace(
+    return lambda scene: replace(
         scene,
-        declared_bounds=dataclasses.replace(
+        declared_bounds=replace(
             scene.declared_bounds, **{key: make(scene.declared_bounds) for key, make in changes.items()}
         ),
     )
@@ -407,7 +407,7 @@ def without(*names):
 
 
 def silent(scene):
-    return dataclasses.replace(scene, declared_bounds=None)
+    return replace(scene, declared_bounds=None)
 
 
 REFITTED = stating(refitted=lambda _: True, records=without("sh0", "sh1"))
@@ -421,7 +421,7 @@ REFITTED = stating(refitted=lambda _: True, records=without("sh0", "sh1"))
     ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
 ])  # fmt: skip
 def test_facts_that_differ_from_the_source_break_their_clause(plain, fact, message):
-    content, *_ = judged(PLAIN, dataclasses.replace(plain, **fact), keep_extra=True)
+    content, *_ = judged(PLAIN, replace(plain, **fact), keep_extra=True)
     assert (Status.FAILED, ("SRC-3",)) == (content.status, content.clauses)
     assert message in content.message
 
@@ -430,12 +430,10 @@ def test_centres_in_doubles_are_compared_in_doubles():
     # Four million units away binary32 is a quarter of a unit off, more than splats are apart.
     one = INPUTS[PLAIN]
     near = one.source()
-    far = dataclasses.replace(near, means=near.means.astype(np.float64) + np.array([4e6, -4e6, 0.1]))
-    model = dataclasses.replace(
-        csplat.decode(csplat.encode(near.to_model((0.0, 0.0, 0.0)))), origin=(4e6, -4e6, 0.1), extra={}
-    )
+    far = replace(near, means=near.means.astype(np.float64) + np.array([4e6, -4e6, 0.1]))
+    model = replace(csplat.decode(csplat.encode(near.to_model((0.0, 0.0, 0.0)))), origin=(4e6, -4e6, 0.1), extra={})
     scene = decode_scene(csplat.encode(model))
-    content, pairs = check_content(dataclasses.replace(one, source=lambda: far), far, scene, None)
+    content, pairs = check_content(replace(one, source=lambda: far), far, scene, None)
     assert (Status.PASSED, 0) == (content.status, pairs.missing)
 
 
@@ -443,7 +441,7 @@ def test_splats_without_a_near_source_are_named(plain):
     moved = plain.means.copy()
     moved[:3, 0] += 7.0
     moved[5] = moved[6]
-    content, errors, _ = judged(PLAIN, dataclasses.replace(plain, means=moved))
+    content, errors, _ = judged(PLAIN, replace(plain, means=moved))
     assert (Status.FAILED, ("CNF-6", "SER-5")) == (content.status, content.clauses)
     far, near, _ = content.message.split("; ")
     assert re.fullmatch(r"3 splats of the file, the first splat \d+, are not within 0.03 of a splat of the source", far)
@@ -470,9 +468,7 @@ def test_refitted_attributes_are_not_proved_and_the_others_are(plain):
 def test_stated_errors_hold_for_refitted_attributes_too(plain):
     halved = stating(
         refitted=lambda _: True,
-        records=lambda stated: tuple(
-            dataclasses.replace(one, max=one.max / 2, rms=one.rms / 2) for one in stated.records
-        ),
+        records=lambda stated: tuple(replace(one, max=one.max / 2, rms=one.rms / 2) for one in stated.records),
     )
     _, errors, _ = judged(PLAIN, plain, halved)
     assert (Status.FAILED, ("SER-5",)) == (errors.status, errors.clauses)
@@ -512,7 +508,7 @@ def test_our_coarsest_preset_stays_below_half_of_every_bound(monkeypatch, plain)
     ({"shN": lambda m: 0 * m.shN}, "sh1: an error of 0."),
 ])  # fmt: skip
 def test_large_errors_that_are_stated_cause_a_warning(plain, fields, message):
-    wrong = dataclasses.replace(plain, **{name: np.asarray(make(plain), np.float32) for name, make in fields.items()})
+    wrong = replace(plain, **{name: np.asarray(make(plain), np.float32) for name, make in fields.items()})
     _, errors, _ = judged(PLAIN, wrong, honest(plain), attribute_psnr=60.0)
     assert Status.WARNED is errors.status
     assert message in errors.message
@@ -534,8 +530,7 @@ def honest(model):
         measured = measure_pairs(source, scene.model, pairs.source_index)
         return stating(
             records=lambda stated: tuple(
-                dataclasses.replace(one, max=measured[one.measure].max, rms=measured[one.measure].rms)
-                for one in stated.records
+                replace(one, max=measured[one.measure].max, rms=measured[one.measure].rms) for one in stated.records
             )
         )(scene)
 
@@ -613,18 +608,13 @@ def altered(monkeypatch, plain):
         return ProcessEnd(None, 0, b"", b"", 0.0)
 
     def report(change, levels=L3, render_score=None, name=PLAIN, **fields):
-        one = dataclasses.replace(INPUTS[name], **fields)
+        one = replace(INPUTS[name], **fields)
         monkeypatch.setattr(
             "csplat_conformance.encoders.file_checks.decode_scene", lambda data: change(decode_scene(data))
         )
         monkeypatch.setattr("csplat_conformance.encoders.encoder_suite.all_inputs", lambda: [one])
-        return run_encoder(
-            "x {ply} {out}",
-            EncoderSuiteOptions(name, levels),
-            run=run,
-            render_score=render_score,
-            no_render_reason="no numba",
-        )
+        return run_encoder("x {ply} {out}", EncoderSuiteOptions(name, levels), run=run, render_score=render_score,
+            no_render_reason="no numba")  # fmt: skip
 
     return report
 
@@ -685,7 +675,7 @@ def test_figures_are_those_of_the_file_that_the_suite_ships():
 
 def test_a_scene_that_cannot_be_drawn_fails_alone(altered):
     def far(scene):
-        return dataclasses.replace(scene, model=dataclasses.replace(scene.model, origin=(1e300, 0.0, 0.0)))
+        return replace(scene, model=replace(scene.model, origin=(1e300, 0.0, 0.0)))
 
     report = altered(far, ("L1", "L2", "L3", "L4"), lambda *_: 40.0)
     assert [Status.FAILED] == [one.status for one in report.outcomes if one.level == "L4"]

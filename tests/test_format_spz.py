@@ -251,12 +251,8 @@ def test_tests_of_its_repository_pass_except_for_known_differences(tmp_path):
     paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     run = subprocess.run(
         [sys.executable, "-Bc", code, "-q", "-p", "no:cacheprovider", "--tb=no", "--rootdir=.", "tests/python"],
-        cwd=folder,
-        env={**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+        cwd=folder, env={**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": paths}, capture_output=True, text=True,
+        check=False)  # fmt: skip
     failed = re.findall(r"^FAILED \S+::(\S+)", run.stdout, re.MULTILINE)
     assert re.search(r"\d{2,} passed", run.stdout), run.stdout + run.stderr
     assert FAIL_ON_CSPLAT == {start for start in FAIL_ON_CSPLAT for name in failed if name.startswith(start)}

@@ -261,13 +261,8 @@ def installed(tmp_path):
         (tmp_path / "other_plugin.py").write_text(PLUGIN, "utf-8")
         paths = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
         code = f"import csplat, csplat.formats, sys, numpy as np\n{statement}"
-        done = subprocess.run(
-            [sys.executable, "-c", code],
-            env={**os.environ, "PYTHONPATH": paths},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths},
+            capture_output=True, text=True, check=True)  # fmt: skip
         return done.stdout.strip()
 
     return run
@@ -375,16 +370,12 @@ def test_arrays_come_back(tmp_path):
     found.check({"n": 1}, {"n": int})
 
 
-@pytest.mark.parametrize(
-    ("data", "why"),
-    [
-        (b"hello", "facts is not an array"),
-        (BROKEN.ljust(128, b" "), "not a file of tests"),
-        (b"\x93NUMPY\x09\x09", "not a file of tests"),
-        (b"", "not a file of tests"),
-    ],
-    ids=["bytes", "open bracket", "version", "empty"],
-)
+@pytest.mark.parametrize(("data", "why"), [
+    (b"hello", "facts is not an array"),
+    (BROKEN.ljust(128, b" "), "not a file of tests"),
+    (b"\x93NUMPY\x09\x09", "not a file of tests"),
+    (b"", "not a file of tests"),
+], ids=["bytes", "open bracket", "version", "empty"])  # fmt: skip
 def test_members_that_are_no_arrays_are_refused(tmp_path, data, why):
     with pytest.raises(InputError, match=why):
         read_archive(archive(tmp_path / "a.npz", data), KIND)

@@ -201,15 +201,8 @@ def test_writes_rows_that_plain_numpy_reads(tmp_path, make_model):
 
 
 def test_metadata_survive_a_ply(tmp_path, make_model):
-    model = make_model(
-        4,
-        origin=(4.5e6, -1.25, 0.1),
-        coordinate_system="RUB",
-        unit_metres=0.01,
-        antialiased=True,
-        flat=True,
-        metadata={"licence": "CC0-1.0", "comments": ["hello"]},
-    )
+    model = make_model(4, origin=(4.5e6, -1.25, 0.1), coordinate_system="RUB", unit_metres=0.01, antialiased=True,
+        flat=True, metadata={"licence": "CC0-1.0", "comments": ["hello"]})  # fmt: skip
     write_ply(tmp_path / "a.ply", model)
     again = read_ply(tmp_path / "a.ply", strict=True)
     for name in ("origin", "coordinate_system", "unit_metres", "antialiased", "flat", "metadata"):

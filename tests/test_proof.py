@@ -16,6 +16,7 @@ from mmap import mmap
 import numpy as np
 import pytest
 from checked import covariances, disturbed, measure_errors
+from tables import failures
 from typer.testing import CliRunner
 
 from csplat import _spec
@@ -374,23 +375,23 @@ def states(stated, **changes):
 @pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
 def test_both_paths_verify_correct_files(make_model, indexed):
-    source = make_model(450, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(450, dtype=np.int32)})
-    result = encode_with_report(source, OPTIONS)
-    found = both(source, result.data, index=result.source_index if indexed else None)
-    assert not found["failures"]
-    assert indexed == found["rms_and_counts_proved"]
+    model, origin = make_model(500, 0), (5e5, 4e6, 30.0)
+    doubles = model.means.astype(np.float64) + np.array(origin)
+    near = (doubles - origin).astype(np.float32)
+    scenes = {
+        "ordinary": make_model(450, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(450, dtype=np.int32)}),
+        "means in doubles": replace(model, means_double=doubles, means=near, origin=origin),
+        "empty": make_model(0, 1),
+        "one large part of splats at one place": make_model(900, 0, means=np.full((900, 3), 0.5, np.float32)),
+    }
 
+    def check(source):
+        result = encode_with_report(source, OPTIONS)
+        found = both(source, result.data, index=result.source_index if indexed else None)
+        assert not found["failures"]
+        assert indexed == found["rms_and_counts_proved"]
 
-@pytest.mark.slow
-@pytest.mark.parametrize("indexed", [True, False])
-def test_both_paths_use_means_in_doubles(make_model, indexed):
-    model = make_model(500, 0)
-    doubles = model.means.astype(np.float64) + np.array([5e5, 4e6, 30.0])
-    source = replace(model, means_double=doubles, means=(doubles - [5e5, 4e6, 30.0]).astype(np.float32),
-                     origin=(5e5, 4e6, 30.0))  # fmt: skip
-    result = encode_with_report(source, OPTIONS)
-    found = both(source, result.data, index=result.source_index if indexed else None)
-    assert not found["failures"]
+    assert [] == failures(scenes, check)
 
 
 @pytest.mark.slow
@@ -453,22 +454,6 @@ def test_another_scene_is_reported_without_any_splat(make_model):
     result = encode_with_report(make_model(400, 1), OPTIONS)
     found = both(make_model(401, 0), result.data)
     assert len(found["failures"]) == 2
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("indexed", [True, False])
-def test_an_empty_scene_is_verified(make_model, indexed):
-    source = make_model(0, 1)
-    result = encode_with_report(source, OPTIONS)
-    both(source, result.data, index=result.source_index if indexed else None)
-
-
-@pytest.mark.slow
-def test_a_part_of_splats_at_one_place_may_be_large(make_model):
-    source = make_model(900, 0, means=np.full((900, 3), 0.5, np.float32))
-    result = encode_with_report(source, OPTIONS)
-    found = both(source, result.data)
-    assert not found["failures"]
 
 
 @pytest.mark.slow

@@ -376,33 +376,19 @@ def without_up(**fields):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("make", "words", "axes", "up"),
-    [
-        (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
-        (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),
-        (TRANSFORMS, [], "unspecified", (1, 0, 0)),
-        (TRANSFORMS, ["--up", "-y"], "unspecified", (0, -1, 0)),
-        (without_up(), [], "unspecified", None),
-        (without_up(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
-        (without_up(coordinate_system="LUF"), [], "LUF", (0, 1, 0)),
-        (without_up(metadata={"up": [1, 0, 0]}, coordinate_system="RDF"), ["--up", "-y"], "RDF", (0, -1, 0)),
-        (without_up(coordinate_system="RDF"), ["--up", "z"], "unspecified", (0, 0, 1)),
-        (lambda _folder, make_model: rotate_scene(make_model(60, 1), TURN), ["--up", "z"], "unspecified", (0, 0, 1)),
-    ],
-    ids=[
-        "blender",
-        "colmap",
-        "transforms",
-        "transforms-up",
-        "ply",
-        "ply-up",
-        "ply-axes",
-        "up-axes",
-        "axes-up",
-        "turned",
-    ],
-)
+@pytest.mark.parametrize(("make", "words", "axes", "up"), [
+    (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
+    (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),
+    (TRANSFORMS, [], "unspecified", (1, 0, 0)),
+    (TRANSFORMS, ["--up", "-y"], "unspecified", (0, -1, 0)),
+    (without_up(), [], "unspecified", None),
+    (without_up(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
+    (without_up(coordinate_system="LUF"), [], "LUF", (0, 1, 0)),
+    (without_up(metadata={"up": [1, 0, 0]}, coordinate_system="RDF"), ["--up", "-y"], "RDF", (0, -1, 0)),
+    (without_up(coordinate_system="RDF"), ["--up", "z"], "unspecified", (0, 0, 1)),
+    (lambda _folder, make_model: rotate_scene(make_model(60, 1), TURN), ["--up", "z"], "unspecified", (0, 0, 1)),
+], ids=["blender", "colmap", "transforms", "transforms-up", "ply", "ply-up", "ply-axes", "up-axes",
+    "axes-up", "turned"])  # fmt: skip
 def test_all_commands_agree_on_up(tmp_path, make_model, make, words, axes, up):
     write_ply(tmp_path / "scene.ply", make(tmp_path, make_model))
     call("encode", tmp_path / "scene.ply", tmp_path / "a.csplat", *words, "--preset", "fast", "-q")

@@ -6,11 +6,11 @@ Errors are measured after the conversion, so the files state them honestly.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import struct
 import time
 import zlib
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -164,7 +164,7 @@ def stated(change):
             place = at + _spec.STATED_ERRORS_HEAD_SIZE + i * _spec.STATED_ERROR_RECORD_SIZE
             record = change(_spec.unpack_stated_error_record(data, place))
             out[place : place + _spec.STATED_ERROR_RECORD_SIZE] = _spec.pack_stated_error_record(record)
-        return dataclasses.replace(built, data=bytes(out)).patched({})
+        return replace(built, data=bytes(out)).patched({})
 
     return run
 
@@ -177,7 +177,7 @@ def head(**fields):
         old = _spec.unpack_stated_errors_head(data, at)
         new = old._replace(**{name: make(getattr(old, name)) for name, make in fields.items()})
         changed_data = data[:at] + _spec.pack_stated_errors_head(new) + data[at + _spec.STATED_ERRORS_HEAD_SIZE :]
-        return dataclasses.replace(built, data=changed_data).patched({})
+        return replace(built, data=changed_data).patched({})
 
     return run
 
@@ -221,7 +221,7 @@ def swapped_layers(data):
     size = _spec.LAYER_RECORD_SIZE
     out = bytearray(data)
     out[first : first + size], out[second : second + size] = data[second : second + size], data[first : first + size]
-    return dataclasses.replace(built, data=bytes(out)).patched({})
+    return replace(built, data=bytes(out)).patched({})
 
 
 def crc_from_the_start(data):

@@ -1,12 +1,11 @@
 """The type of a fault, ways to make one, and the scenes that stated errors are measured against."""
 
 import contextlib
-import dataclasses
 import io
 import re
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
@@ -86,7 +85,7 @@ class EncoderFault:
 
 def changed(**fields: Callable[[Scene], Any]) -> Callable[[Scene], Scene]:
     """Return a change of a scene: each function maps the original scene to a new value of its field."""
-    return lambda model: dataclasses.replace(model, **{name: make(model) for name, make in fields.items()})
+    return lambda model: replace(model, **{name: make(model) for name, make in fields.items()})
 
 
 def replaced(module, name, make):
