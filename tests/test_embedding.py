@@ -380,7 +380,7 @@ def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_th
 def test_errors_are_shown_as_text(tab, site, blog):
     site.add("/cut.csplat", site._files["/scene.csplat"][:-20])
     cases = [
-        ("/cut.csplat", "E_TRUNCATED", "ends too early", POLICY),
+        ("/cut.csplat", "E_TRUNCATED", "is incomplete", POLICY),
         ("/none.csplat", "E_INPUT", "could not be read.*404", POLICY),
         ("/scene.csplat", "E_WORKER", "could not start.*worker-src", POLICY.replace("blob:", "'none'")),
         ("/scene.csplat", "E_WEBGL2", "no WebGL 2", POLICY),
