@@ -27,6 +27,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from checked import cloud
 
 from csplat import EncodeOptions, SplatModel
 from csplat.encoder import PRESETS
@@ -142,15 +143,8 @@ class AnalyticScene:
 
     def model(self) -> SplatModel:
         """Return a model with this number of splats; their values do not matter."""
-        n, bands = self.splats, (self.sh_degree + 1) ** 2 - 1
-        return SplatModel(
-            means=np.zeros((n, 3), np.float32),
-            quats=np.tile(np.array([1, 0, 0, 0], np.float32), (n, 1)),
-            scales=np.zeros((n, 3), np.float32),
-            opacities=np.ones(n, np.float32),
-            sh0=np.zeros((n, 3), np.float32),
-            shN=np.zeros((n, bands, 3), np.float32),
-        )
+        bands = (self.sh_degree + 1) ** 2 - 1
+        return cloud(np.zeros((self.splats, 3)), shN=np.zeros((self.splats, bands, 3), np.float32))
 
     def options_of(self, contents: Contents) -> dict[str, Any]:
         """Return the encoder's choices, under the names of a file's options."""

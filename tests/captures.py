@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import cloud
 from command_line import call, change_options
 from PIL import Image
+from posed_sets import to_opengl
 from scipy.spatial.transform import Rotation
 
 from csplat import write_ply
@@ -65,8 +66,7 @@ def photograph(scene, folder):
     for number, camera in enumerate(cameras(16)):
         pixels = np.clip(render(scene, camera).rgb, 0.0, 1.0)
         Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / "images" / f"view{number:02}.png")
-        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/view{number:02}.png", "transform_matrix": pose.tolist()})
+        frames.append({"file_path": f"images/view{number:02}.png", "transform_matrix": to_opengl(camera)})
     K = intrinsics(W, H, 60.0)
     document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
     (folder / "transforms.json").write_text(json.dumps(document))
@@ -101,8 +101,7 @@ def photograph_object(scene, folder):
             straight = np.clip(seen.rgb / np.maximum(seen.alpha, 1e-6)[..., None], 0.0, 1.0)
             pixels = np.concatenate([straight, seen.alpha[..., None]], axis=2)
             Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / part / f"r_{number}.png")
-            pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
-            frames.append({"file_path": f"./{part}/r_{number}", "transform_matrix": pose.tolist()})
+            frames.append({"file_path": f"./{part}/r_{number}", "transform_matrix": to_opengl(camera)})
         angle = 2.0 * math.atan(W / 2 / cameras(1)[0].K[0, 0])
         (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     return folder
@@ -114,13 +113,12 @@ SMALL = (32, 24)  # pixels of a view; a search then takes a second
 def crowded():
     """Return a shell and 600 nearly invisible splats."""
     rng, scene = np.random.default_rng(1), shell(3)
-    faint = {
-        "means": (0.5 * rng.standard_normal((600, 3))).astype(np.float32),
-        "quats": np.tile(np.array([1, 0, 0, 0], np.float32), (600, 1)), "scales": np.full((600, 3), -4.0, np.float32),
-        "opacities": np.full(600, 0.02, np.float32), "sh0": np.zeros((600, 3), np.float32),
-        "shN": np.zeros((600, 3, 3), np.float32),
-    }  # fmt: skip
-    return SplatModel(**{name: np.concatenate([getattr(scene, name), array]) for name, array in faint.items()})
+    faint = cloud(
+        0.5 * rng.standard_normal((600, 3)), scales=np.full((600, 3), -4.0, np.float32),
+        opacities=np.full(600, 0.02, np.float32), shN=np.zeros((600, 3, 3), np.float32),
+    )  # fmt: skip
+    arrays = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    return SplatModel(**{name: np.concatenate([getattr(scene, name), getattr(faint, name)]) for name in arrays})
 
 
 def around(source, count=24):
@@ -161,7 +159,6 @@ VIEWS = 16  # every eighth is a test view
 DISTANCE = 3.2  # distance of the cameras from the centre of a ball of radius 1
 _SAMPLES = 3  # rays per pixel and axis
 TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1)
-Run = Callable[..., str]
 
 
 @dataclass(frozen=True)
@@ -234,28 +231,25 @@ def _photograph(pose: np.ndarray) -> np.ndarray:
     return np.rint(255.0 * means).astype(np.uint8)
 
 
-def run_here(*words: object) -> str:
-    """Run `csplat WORDS` in this process, which has its kernels loaded, and return its stderr."""
-    return call(*words).stderr
-
-
-def make_trained(folder: Path, run: Run = run_here) -> TrainedScene:
+def make_trained(folder: Path) -> TrainedScene:
     """Write the images and train the scene."""
     data, ply, report, checkpoint = (folder / name for name in ("photographs", "a.ply", "train.json", "train.npz"))
     write_photographs(data)
     with pytest.MonkeyPatch.context() as patch:
         change_options(patch, "csplat_tools.cli.train.TrainOptions", refine_start=50, refine_every=25, lr_means=1e-3)
-        messages = run("train", data, ply, *TRAIN, "--report", report, "--checkpoint", checkpoint)
+        words = ("train", data, ply, *TRAIN, "--report", report, "--checkpoint", checkpoint)
+        messages = call(*words).stderr
     return TrainedScene(data, ply, report, checkpoint, messages)
 
 
-def make_tuned(folder: Path, source: TrainedScene, run: Run = run_here) -> TunedFile:
+def make_tuned(folder: Path, source: TrainedScene) -> TunedFile:
     """Tune a file of the trained scene."""
     path, report = folder / "a.csplat", folder / "finetune.json"
     with pytest.MonkeyPatch.context() as patch:
         change_options(patch, "csplat_tools.cli.finetune.EncodeOptions", attribute_psnr=28.0, seed=1, threads=1)
         change_options(patch, "csplat_trainer.tuning.tuning_options.FinetuneOptions", seed=1)
-        messages = run("finetune", source.ply, path, "--data", source.data, "--iterations", 100, "--report", report)
+        words = ("finetune", source.ply, path, "--data", source.data, "--iterations", 100, "--report", report)
+        messages = call(*words).stderr
     return TunedFile(source, path, report, messages)
 
 
@@ -282,5 +276,6 @@ class FileRuns:
             change_options(patch, "csplat_tools.cli.train.TrainOptions", log_every=10, **options)
             brief = lambda **given: replace(tuning_after(**given), iterations=self.TUNED)  # noqa: E731
             patch.setattr(training_run, "tuning_after", brief)
-            messages = run_here("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)
+            words = ("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)
+            messages = call(*words).stderr
         return json.loads(report.read_text()), messages

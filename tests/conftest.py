@@ -159,17 +159,17 @@ def trained_scene(once, tmp_path_factory):
     """A scene trained for 300 steps on small photographs, see captures.py; all workers share its files."""
     pytest.importorskip("numba", reason="training requires the extra [render]")
     pytest.importorskip("scipy", reason="data sets require the extra [render]")
-    from captures import make_trained, run_here
+    from captures import make_trained
 
-    return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained"), run_here))
+    return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained")))
 
 
 @pytest.fixture(scope="session")
 def tuned_file(once, trained_scene, tmp_path_factory):
     """A file of the trained scene, tuned for 100 steps; all workers share its files."""
-    from captures import make_tuned, run_here
+    from captures import make_tuned
 
-    return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene, run_here))
+    return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene))
 
 
 @pytest.fixture(scope="session")

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import covariances
 from chromium import absent, read_pixels
-from typer.testing import CliRunner
+from command_line import call, invoke
 
 from csplat import EncodeOptions, decode, encode, read_ply
-from csplat_tools.cli.app import app
 from csplat_tools.present.viewer_page import export_element
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -167,18 +167,8 @@ def test_the_samples_in_javascript(results):
 
 
 def check_covariances(found, scene):
-    w, x, y, z = scene.quats.astype(np.float64).T
-    R = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-    variances = np.exp(2.0 * scene.scales.astype(np.float64)).T
-    full = np.einsum("ikn,kn,jkn->nij", R, variances, R)
-    wanted = full[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
-    largest = variances.max(axis=0)[:, None]
+    wanted = covariances(scene.quats, scene.scales)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    largest = np.exp(2.0 * scene.scales.astype(np.float64)).max(axis=1, keepdims=True)
     np.testing.assert_allclose(found / largest, wanted / largest, atol=1e-6)
 
 
@@ -259,7 +249,6 @@ def test_links_have_a_target():
 
 
 POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src blob:; connect-src 'self'; img-src data:"
-GUIDE = (Path(__file__).resolve().parent.parent / "codec" / "EMBEDDING.md").read_text("utf-8")
 STYLE = "csplat-view { width: 160px; height: 120px }"
 ONE_FILE = '<script src="../scripts/csplat-view.js"></script>'
 MODULE = '<script type="module" src="/tools/viewer/element.mjs"></script>'
@@ -277,9 +266,8 @@ for (const type of ['load', 'error']) {
 @pytest.fixture
 def blog(tab, site, make_model):
     """Return a function that opens a page with a text; scenes are /scene.csplat (60 splats) and /other.csplat (90)."""
-    fast = EncodeOptions(preset="fast")
-    site.add("/scene.csplat", encode(make_model(60, 0, scales=np.full((60, 3), -2, "f")), fast))
-    site.add("/other.csplat", encode(make_model(90, 0, scales=np.full((90, 3), -2, "f")), fast))
+    for name, count in (("scene", 60), ("other", 90)):
+        site.add(f"/{name}.csplat", encode(make_model(count, 0, scales=np.full((count, 3), -2, "f")), FAST))
     site.add("/scripts/csplat-view.js", export_element())
     site.add("/blog/style.css", STYLE.encode())
 
@@ -400,15 +388,13 @@ def test_errors_are_shown_as_text(tab, site, blog):
 @pytest.mark.area(name="chromium")
 def test_the_script_is_written_once(tmp_path):
     out = tmp_path / "csplat-view.js"
-    done = CliRunner().invoke(app, ["export-element", str(out)])
-    assert 0 == done.exit_code, done.output
+    call("export-element", out)
     assert out.read_bytes() == export_element()
     assert export_element().isascii()
-    said = re.search(r"self-contained script \((\d+) kB, (\d+) kB gzipped\)", GUIDE)
+    said = re.search(r"self-contained script \((\d+) kB, (\d+) kB gzipped\)", TEXT)
     assert [pytest.approx(int(kilobytes), rel=0.05) for kilobytes in said.groups()] == [
         len(data) / 1000 for data in (export_element(), gzip.compress(export_element()))
     ]
-    again = CliRunner().invoke(app, ["export-element", str(out)])
-    assert (1, True) == (again.exit_code, "--force replaces it" in again.stderr)
-    wrong = CliRunner().invoke(app, ["export-element", "scene.csplat"])
+    assert "--force replaces it" in call("export-element", out, status=1).stderr
+    wrong = invoke("export-element", "scene.csplat")
     assert "did you mean `csplat export-element scene.js`" in wrong.stderr

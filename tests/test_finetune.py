@@ -533,6 +533,11 @@ def no_fits(monkeypatch):
     monkeypatch.setattr("csplat_tools.training.tuning_run.SimplifyOptions", bare)
 
 
+def tuned_facts(capture, out, *words):
+    """Tune the scene of the capture to its images; return the JSON of the command."""
+    return json.loads(call("finetune", capture / "scene.ply", "--data", capture, out, *words, "--json").stdout)
+
+
 @pytest.mark.slow
 def test_the_command_tunes_and_reports(tuned_file):
     facts, data = json.loads(tuned_file.report.read_text()), tuned_file.path.read_bytes()
@@ -574,8 +579,7 @@ def test_verify_names_undeclared_attributes_of_a_tuned_file(tuned_file):
 @pytest.mark.slow
 def test_unseen_splats_are_pruned_and_counted(capture, tmp_path):
     out = tmp_path / "s.csplat"
-    told = call("finetune", capture / "scene.ply", "--data", capture, out, *BRIEF, "--json")
-    facts = json.loads(told.stdout)
+    facts = tuned_facts(capture, out, *BRIEF)
     assert (301, 300, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
     stated = read_declared_bounds(out.read_bytes())
     assert (301, 1) == (stated.source_count, stated.pruned_count)
@@ -644,11 +648,7 @@ def test_renders_for_tuning_may_use_a_camera_file(capture, tmp_path, monkeypatch
 @pytest.mark.usefixtures("brief_fits")
 def test_keep_prunes_splats_with_the_least_effect(capture, tmp_path):
     out = tmp_path / "s.csplat"
-    result = call(
-        "finetune", capture / "scene.ply", "--data", capture, "--keep", 0.5, out, *BRIEF,
-        "--json",
-    )  # fmt: skip
-    facts = json.loads(result.stdout)
+    facts = tuned_facts(capture, out, "--keep", 0.5, *BRIEF)
     assert (301, 150, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
     stated = read_declared_bounds(out.read_bytes())
     assert (301, 151) == (stated.source_count, stated.pruned_count)
@@ -664,10 +664,9 @@ SCALAR = {"sh_coding": "scalar", "shape_codebook_size": 0}
 @pytest.fixture(scope="module")
 def whole(capture, tmp_path_factory):
     """Return the report on a file that was tuned without a target."""
-    words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL)
     with pytest.MonkeyPatch.context() as patch:
         change_options(patch, ENCODE_OPTIONS, **SCALAR)
-        return json.loads(call(*words, tmp_path_factory.mktemp("whole") / "w.csplat", "--json").stdout)
+        return tuned_facts(capture, tmp_path_factory.mktemp("whole") / "w.csplat", *SMALL)
 
 
 @pytest.mark.slow
@@ -676,8 +675,7 @@ def whole(capture, tmp_path_factory):
 def test_a_target_size_is_met(capture, whole, tmp_path, share, splats, monkeypatch):
     change_options(monkeypatch, ENCODE_OPTIONS, **SCALAR)
     size, out = int(share * whole["size_bytes"]), tmp_path / "s.csplat"
-    words = ("finetune", capture / "scene.ply", "--data", capture, *SMALL, out, "--json")
-    facts = json.loads(call(*words, "--target-size", f"{size}B").stdout)
+    facts = tuned_facts(capture, out, *SMALL, "--target-size", f"{size}B")
     assert 0.85 * size < out.stat().st_size == facts["size_bytes"] <= size
     assert splats[0] <= facts["splats"] <= splats[1]
 
@@ -804,41 +802,24 @@ def test_invalid_options_have_status_2(capture, tmp_path, words, message):
 
 
 @pytest.mark.parametrize(
-    "words", [("--report", "r.json", "--source-index", "./r.json"), ("--report", "r", "--checkpoint", "r", "--force")]
+    ("out", "words", "message"),
+    [
+        ("new", "--self --report r.json --source-index ./r.json", "is given for two outputs"),
+        ("new", "--self --report r --checkpoint r --force", "is given for two outputs"),
+        ("old", "--self", "--force replaces it"),
+        ("new", "--self --checkpoint scene.ply --force", "is the input"),
+        ("new", "--data . --resume absent.npz", "absent.npz: No such file"),
+    ],
 )
-def test_two_outputs_at_one_path_are_refused(capture, tmp_path, monkeypatch, words):
+def test_a_refused_run_writes_and_replaces_nothing(source, tmp_path, monkeypatch, out, words, message):
     monkeypatch.chdir(tmp_path)
-    result = invoke("finetune", capture / "scene.ply", "--self", tmp_path / "s.csplat", *words)
+    write_ply(tmp_path / "scene.ply", source)
+    (tmp_path / "old.csplat").write_bytes(b"old")
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    result = invoke("finetune", "scene.ply", f"{out}.csplat", *words.split(), *BRIEF)
     assert 1 == result.exit_code
-    assert "is given for two outputs" in result.stderr
-    assert [] == list(tmp_path.iterdir())
-
-
-def test_files_are_not_replaced_without_force(capture, tmp_path):
-    out = tmp_path / "s.csplat"
-    out.write_bytes(b"old")
-    result = invoke("finetune", capture / "scene.ply", "--self", out)
-    assert 1 == result.exit_code
-    assert "--force replaces it" in result.stderr
-    assert b"old" == out.read_bytes()
-
-
-def test_a_checkpoint_does_not_replace_the_input(source, tmp_path):
-    scene = tmp_path / "scene.ply"
-    write_ply(scene, source)
-    before = scene.read_bytes()
-    words = ("finetune", scene, "--self", tmp_path / "s.csplat", *BRIEF)
-    result = invoke(*words, "--checkpoint", scene, "--force")
-    assert 1 == result.exit_code
-    assert "is the input" in result.stderr
-    assert before == scene.read_bytes()
-
-
-def test_missing_files_are_reported_first(capture, tmp_path):
-    out, absent = tmp_path / "s.csplat", tmp_path / "absent.npz"
-    result = invoke("finetune", capture / "scene.ply", "--data", tmp_path, out, "--resume", absent)
-    assert 1 == result.exit_code
-    assert "absent.npz: No such file" in result.stderr
+    assert message in result.stderr
+    assert before == {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
 
 def test_cameras_without_splats_in_view_are_refused(source, tmp_path, monkeypatch):

@@ -16,14 +16,13 @@ pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[
 import extremes
 from analytic_search import AnalyticScene, analytic_removal
 from captures import around, cameras, crowded, found_within, judged_by, photograph, photographed, shell, views_of
-from checked import measure_errors
+from checked import cloud, measure_errors
 from command_line import call, change_views, invoke
 
 from csplat import EncodeOptions, decode, write_ply
 from csplat.decoder import decode_scene
 from csplat.encoder import Importance, encode_with_report
 from csplat.errors import InputError
-from csplat.model import SplatModel
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.camera_files import save_cameras
@@ -389,14 +388,10 @@ def unequal():
     rng = np.random.default_rng(3)
     means = rng.standard_normal((9000, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
-    return SplatModel(
-        means=means.astype(np.float32),
-        quats=np.tile(np.array([1, 0, 0, 0], np.float32), (9000, 1)),
-        scales=np.repeat(rng.normal(-4.0, 0.8, (9000, 1)), 3, axis=1).astype(np.float32),
-        opacities=rng.uniform(0.05, 0.95, 9000).astype(np.float32),
-        sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
-        shN=np.zeros((9000, 0, 3), np.float32),
-    )
+    return cloud(
+        means, scales=np.repeat(rng.normal(-4.0, 0.8, (9000, 1)), 3, axis=1).astype(np.float32),
+        opacities=rng.uniform(0.05, 0.95, 9000).astype(np.float32), sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -585,13 +580,14 @@ def test_an_impossible_bound_is_refused(scene):
 
 
 def test_an_option_that_contradicts_a_bound_is_refused(scene):
-    with pytest.raises(InputError, match="position_step is determined"):
-        meet_bounds(scene, EncodeOptions(position_step=0.1), {"means": 0.1})
-    for fixed in (EncodeOptions(sh_coding="none"), EncodeOptions(adaptive=0.5)):
-        with pytest.raises(InputError, match="error"):
-            meet_bounds(scene, fixed, {"sh1": 0.1})
-    with pytest.raises(InputError, match="codebook excludes a bound"):
-        meet_bounds(scene, EncodeOptions(sh_coding="codebook"), {"sh1": 0.1})
+    for fixed, measure, message in (
+        ({"position_step": 0.1}, "means", "position_step is determined"),
+        ({"sh_coding": "none"}, "sh1", "error"),
+        ({"adaptive": 0.5}, "sh1", "error"),
+        ({"sh_coding": "codebook"}, "sh1", "codebook excludes a bound"),
+    ):
+        with pytest.raises(InputError, match=message):
+            meet_bounds(scene, EncodeOptions(**fixed), {measure: 0.1})
 
 
 # The command.

@@ -60,6 +60,11 @@ def one_splat(alpha=0.5, scale=-2.0, colour=(1.0, 0.5, 0.25), mean=(0.0, 0.0, 0.
     )
 
 
+def stacked(*models):
+    arrays = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    return SplatModel(**{name: np.concatenate([getattr(one, name) for one in models]) for name in arrays})
+
+
 def scene(count=400, degree=3, seed=0):
     """Return random splats of all shapes without degenerate ones."""
     rng = np.random.default_rng(seed)
@@ -111,13 +116,16 @@ def test_renders_of_the_sample_agree_with_the_twin(sample_path):
     assert_same_render(model.select(slice(0, None, 8)), view)
 
 
-@pytest.mark.parametrize("name", ["donut", "lego60k", "fox60k_noreg"])
-def test_renders_of_shared_scenes_agree_with_the_twin(data_dir, name):
+def shared_scene(data_dir, name):
     path, cameras = data_dir / "ply" / f"{name}.ply", data_dir / "psnr_cameras" / f"{name}.json"
     if not (path.exists() and cameras.exists()):
         pytest.skip(f"{name} is absent")
-    model = read_ply(path)
-    views = [Camera.from_json(entry) for entry in json.loads(cameras.read_text())]
+    return read_ply(path), [Camera.from_json(entry) for entry in json.loads(cameras.read_text())]
+
+
+@pytest.mark.parametrize("name", ["donut", "lego60k", "fox60k_noreg"])
+def test_renders_of_shared_scenes_agree_with_the_twin(data_dir, name):
+    model, views = shared_scene(data_dir, name)
     assert_same_render(model.select(slice(0, None, 4)), cropped(views[1], 64, 48))
 
 
@@ -163,8 +171,7 @@ def test_the_background_shines_through():
 
 def test_splats_are_drawn_by_depth_then_by_index():
     red, blue = one_splat(0.9, -1.0, (1, 0, 0), (0, 0, 0.5)), one_splat(0.9, -1.0, (0, 0, 1), (0, 0, -0.5))
-    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
-    both = SplatModel(**{name: np.concatenate([getattr(red, name), getattr(blue, name)]) for name in names})
+    both = stacked(red, blue)
     pixel = render(both, camera()).rgb[24, 32]
     assert pixel[2] > 5 * pixel[0]
     level = replace(both, means=np.zeros((2, 3), np.float32))
@@ -173,10 +180,7 @@ def test_splats_are_drawn_by_depth_then_by_index():
 
 
 def test_a_pixel_is_finished_before_transmittance_falls_below_the_limit():
-    count = 5
-    one = one_splat(alpha=0.95, scale=0.0, colour=(1, 1, 1))
-    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
-    stack = SplatModel(**{name: np.repeat(getattr(one, name), count, axis=0) for name in names})
+    stack = stacked(*[one_splat(alpha=0.95, scale=0.0, colour=(1, 1, 1))] * 5)
     alpha = render(stack, camera(65, 49)).alpha[24, 32]
     # 0.05⁴ is below 1e-4: three are drawn.
     assert alpha == pytest.approx(1 - 0.05**3, abs=1e-6)
@@ -265,20 +269,18 @@ def test_results_belong_to_the_caller():
 def test_invalid_arrays_and_options_are_refused():
     model = scene(count=5)
     bad = UncheckedSplats(model.means, model.quats[:4], model.scales, model.opacities, model.sh0, model.shN)
-    with pytest.raises(InputError, match="quats has shape"):
-        Rasteriser().forward(bad, camera())
-    with pytest.raises(InputError, match="coefficients"):
-        Rasteriser().forward(UncheckedSplats(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]}), camera())
-    with pytest.raises(InputError, match="mode"):
-        render(model, camera(), mode="slow")
-    with pytest.raises(InputError, match="dtype"):
-        Rasteriser(dtype=np.float16)
-    with pytest.raises(InputError, match="forward"):
-        Rasteriser().backward(np.zeros((2, 2, 3)))
-    with pytest.raises(InputError, match="background"):
-        render(model, camera(), background=(0.0, float("nan"), 0.0))
-    with pytest.raises(InputError, match="threads"):
-        render(model, camera(), threads=0)
+    short = UncheckedSplats(**{**vars(bad), "quats": model.quats, "shN": model.shN[:, :4]})
+    for message, call in {
+        "quats has shape": lambda: Rasteriser().forward(bad, camera()),
+        "coefficients": lambda: Rasteriser().forward(short, camera()),
+        "mode": lambda: render(model, camera(), mode="slow"),
+        "dtype": lambda: Rasteriser(dtype=np.float16),
+        "forward": lambda: Rasteriser().backward(np.zeros((2, 2, 3))),
+        "background": lambda: render(model, camera(), background=(0.0, float("nan"), 0.0)),
+        "threads": lambda: render(model, camera(), threads=0),
+    }.items():
+        with pytest.raises(InputError, match=message):
+            call()
 
 
 def test_the_twin_accepts_the_same_arguments():
@@ -483,7 +485,10 @@ def test_gradients_agree_with_autograd(degree, antialiased):
 @pytest.mark.area(name="rasteriser")
 def test_float32_gradients_agree_with_float64_on_the_sample(sample_path):
     model = read_ply(sample_path)
-    (view,) = virtual_cameras(model, 1, 160, 120)
+    assert_gradients_agree_with_float64(model, virtual_cameras(model, 1, 160, 120)[0])
+
+
+def assert_gradients_agree_with_float64(model, view):
     flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
     assert flipped <= 10
     assert most(errors) <= 1e-4, errors
@@ -492,13 +497,8 @@ def test_float32_gradients_agree_with_float64_on_the_sample(sample_path):
 @pytest.mark.area(name="rasteriser")
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox120k"])
 def test_float32_gradients_agree_with_float64_on_shared_scenes(data_dir, name):
-    path, cameras = data_dir / "ply" / f"{name}.ply", data_dir / "psnr_cameras" / f"{name}.json"
-    if not (path.exists() and cameras.exists()):
-        pytest.skip(f"{name} is absent")
-    model, view = read_ply(path), Camera.from_json(json.loads(cameras.read_text())[0])
-    flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
-    assert flipped <= 10
-    assert most(errors) <= 1e-4, errors
+    model, views = shared_scene(data_dir, name)
+    assert_gradients_agree_with_float64(model, views[0])
 
 
 @pytest.mark.area(name="rasteriser")

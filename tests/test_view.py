@@ -16,12 +16,10 @@ import numpy as np
 import pytest
 import typer
 from chromium import ViewerPage
-from command_line import heed_interrupts
-from typer.testing import CliRunner
+from command_line import heed_interrupts, invoke
 
 from csplat import decode, encode, read_ply, write_ply
 from csplat.errors import FormatError, InputError
-from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_axes, parse_overrides, parse_up
 from csplat_tools.present.viewer_page import web_files
 from csplat_tools.present.viewer_server import byte_range, open_server, open_viewer_scene, page_parameters
@@ -204,16 +202,14 @@ def test_cameras_are_served_with_the_scene(tmp_path, scene_path):
         assert [500.0, 500.0] == [one["K"][0][0] for one in json.loads(body)]
 
 
-@pytest.mark.parametrize("axes", ["RL", "RDX", "RUD", "rdf", "RDFF"])
-def test_invalid_axes_are_refused(axes):
-    with pytest.raises(typer.BadParameter, match="expected three letters"):
-        parse_axes(axes)
-
-
-@pytest.mark.parametrize("up", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"])
-def test_invalid_directions_are_refused(up):
-    with pytest.raises(typer.BadParameter, match="three numbers as"):
-        parse_up(up)
+def test_invalid_axes_and_directions_are_refused():
+    for parse, message, texts in (
+        (parse_axes, "expected three letters", ["RL", "RDX", "RUD", "rdf", "RDFF"]),
+        (parse_up, "three numbers as", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"]),
+    ):
+        for text in texts:
+            with pytest.raises(typer.BadParameter, match=message):
+                parse(text)
 
 
 @pytest.mark.parametrize(
@@ -266,26 +262,15 @@ def test_another_format_is_refused(tmp_path):
     assert "no format that csplat knows" in refused(path)
 
 
-def test_a_port_in_use_is_refused(scene_path):
-    with socket.socket() as other:
+def test_a_port_in_use_and_an_address_of_another_machine_are_refused(scene_path):
+    with socket.socket() as other, open_viewer_scene(str(scene_path), preset="fast") as scene:
         other.bind(("127.0.0.1", 0))
         other.listen()
         port = other.getsockname()[1]
-        with (
-            open_viewer_scene(str(scene_path), preset="fast") as scene,
-            pytest.raises(InputError, match=f"port {port} is in use"),
-            open_server(scene, port=port),
-        ):
-            pass
-
-
-def test_an_address_of_another_machine_is_refused(scene_path):
-    with (
-        open_viewer_scene(str(scene_path), preset="fast") as scene,
-        pytest.raises(InputError, match=r"203\.0\.113\.1 is not an address of this machine"),
-        open_server(scene, host="203.0.113.1"),
-    ):
-        pass
+        elsewhere = r"203\.0\.113\.1 is not an address of this machine"
+        for place, message in (({"port": port}, f"port {port} is in use"), ({"host": "203.0.113.1"}, elsewhere)):
+            with pytest.raises(InputError, match=message), open_server(scene, **place):
+                pass
 
 
 @pytest.mark.slow
@@ -303,15 +288,9 @@ def test_the_page_runs_from_the_server(tab, site, tmp_path, make_model):
 @contextmanager
 def command(*words):
     environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(
-        [sys.executable, "-m", "csplat_tools", "view", *map(str, words)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-        preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
-    )
+    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, "-m", "csplat_tools", "view", *map(str, words)]
+    process = subprocess.Popen(command, **streams, env=environment, preexec_fn=heed_interrupts)  # noqa: PLW1509
     with process:
         try:
             yield process
@@ -348,6 +327,6 @@ def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
 )
 def test_errors_of_the_command_are_reported(sample_path, words, status, expected):
     given = [str(sample_path) if word == "SAMPLE" else word for word in words]
-    done = CliRunner().invoke(app, ["view", *given, "--no-browser"])
+    done = invoke("view", *given, "--no-browser")
     assert (status, "") == (done.exit_code, done.stdout)
     assert expected in " ".join(done.stderr.split())
