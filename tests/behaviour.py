@@ -12,7 +12,7 @@ not touch this file. `csplat view` serves until it is interrupted, and is left o
 
 A golden records what it may depend on: versions of libraries, and for whatever is rendered the processor. If a file or
 report differs and one of these differs, too, then sizes are compared to 2 %, PSNR to 0.1 dB and numbers to 5 %, and the
-test says so at the end of the run.
+test reports it at the end of the run.
 
     python tests/behaviour.py renew           # make all goldens anew; list what changed
     python tests/behaviour.py renew encode    # one group: encode, fit, report or shared

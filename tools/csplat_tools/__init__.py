@@ -5,7 +5,7 @@
     >>> compared = csplat_tools.compare("scene.ply", found.data)  # doctest: +SKIP
 
 The commands call these functions. A *scene* is a `SplatModel`, or a file of either kind: a path, an open binary file,
-or bytes. Functions that render require the packages of the extra `render`, and raise an error that says so. The names
+or bytes. Functions that render require the packages of the extra `render`, and raise an error without them. The names
 load their modules when first used.
 """
 

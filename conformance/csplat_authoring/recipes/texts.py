@@ -133,7 +133,7 @@ def good_text_recipes() -> list[Recipe]:
         _good("json_deep_again", "the deepest nesting three times, one after the other", *deep),
         _stated("error_rms_at_bounds", "each rms as large as its max allows", StatedErrors(2, 0, 3, 0, at_bounds)),
         _stated("error_rms_zero", "an rms of 0 and a max of 0, of every measure", StatedErrors(2, 0, 3, 0, zeros)),
-        _stated("error_minus_zero", "max and rms of −0, together and beside 0", StatedErrors(2, 0, 3, 0, signs)),
+        _stated("error_minus_zero", "max and rms of −0, together and next to 0", StatedErrors(2, 0, 3, 0, signs)),
         _valid(
             "error_counts_of_none",
             "all splats of the source are gone",
@@ -163,7 +163,7 @@ def bad_text_recipes() -> list[Recipe]:
     return [
         *result,
         _bad_error("error_rms_nan", "an rms that is no number", "means", 1.0, math.nan),
-        _bad_error("error_rms_infinite", "an infinite rms beside a large max", "sh3", 1e308, math.inf),
+        _bad_error("error_rms_infinite", "an infinite rms with a large max", "sh3", 1e308, math.inf),
         _bad_error("error_rms_of_nothing", "an rms above a max of 0", "sh3", 0.0, 5e-324),
     ]
 

@@ -105,7 +105,8 @@ class SearchReport:
     def _elsewhere(self, psnr: float) -> list[str]:
         if not self.elsewhere:
             return []
-        scores = ", ".join(f"{found:.2f} {kind}" for kind, found in self.elsewhere.items())
+        kinds = {"beside": "at other positions"}
+        scores = ", ".join(f"{found:.2f} {kinds.get(kind, kind)}" for kind, found in self.elsewhere.items())
         less = psnr - min(self.elsewhere.values())
         worse = f": up to {less:.1f} dB less than on the test views" if less > _LESS else ""
         return [f"PSNR on virtual views that were not used in the search: {scores}{worse}"]

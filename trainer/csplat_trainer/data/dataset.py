@@ -157,7 +157,7 @@ def near_plane(shots: Sequence[Shot], points: F64 | None = None) -> float:
     return min(DEFAULT_NEAR, _NEAR_FRACTION * distance) if distance > 0.0 else DEFAULT_NEAR
 
 
-_SCANNET = "train_test_lists.json"  # of ScanNet++
+_SCANNET = "train_test_lists.json"  # split file of ScanNet++
 
 #: Roles by names of lists.
 ROLES = {"train": "training", "val": "validation", "test": "test"}
