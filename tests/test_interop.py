@@ -140,7 +140,7 @@ def test_sh_bands_above_the_requested_degree_are_left_out(read_holding, make_mod
 def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
     splats = made_splats(make_model, 1)
     many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)
-    for said, says in (
+    for said, expected in (
         ([1], "it holds a list"),
         (([1, 2], 3), "it holds a tuple"),
         ({"model": 3}, "it holds model: neither"),
@@ -150,7 +150,7 @@ def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
         ({"splats": {"means": splats["means"]}}, "no quats"),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
     ):
-        with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{says}"):
+        with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{expected}"):
             read_holding(said)
 
 
@@ -251,22 +251,22 @@ def test_positions_in_doubles_get_an_origin(read_holding, make_model):
 
 def test_other_files_are_refused_before_torch_loads_them(no_torch, tmp_path):
     no_torch(lambda *_, **__: pytest.fail("it was loaded"))
-    for data, says in (
+    for data, expected in (
         (b"404: Not Found", "not a checkpoint of torch: it begins with b'404: Not'"),
         (b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS"),
     ):
         (tmp_path / "a.pt").write_bytes(data)
-        with pytest.raises(InputError, match=rf"^a\.pt is {says}[^\n]*$"):
+        with pytest.raises(InputError, match=rf"^a\.pt is {expected}[^\n]*$"):
             csplat.read(tmp_path / "a.pt")
         (tmp_path / "b_rank0.pt").write_bytes(STORED["gsplat.pt"].read_bytes())
         (tmp_path / "b_rank1.pt").write_bytes(data)
         no_torch(lambda path, **_: load_plainly(path) if path.stem == "b_rank0" else pytest.fail("it was loaded"))
-        with pytest.raises(InputError, match=rf"^b_rank1\.pt is {says}[^\n]*$"):
+        with pytest.raises(InputError, match=rf"^b_rank1\.pt is {expected}[^\n]*$"):
             csplat.read(tmp_path / "b_rank0.pt")
 
 
 def test_files_that_torch_cannot_load_are_refused(no_torch):
-    for error, says in (
+    for error, expected in (
         (pickle.UnpicklingError("Weights only load failed"), "contains objects that could run code"),
         (RuntimeError("PytorchStreamReader failed"), "is a truncated or damaged checkpoint"),
     ):
@@ -275,7 +275,7 @@ def test_files_that_torch_cannot_load_are_refused(no_torch):
             raise error
 
         no_torch(load)
-        with pytest.raises(InputError, match=rf"^gsplat\.pt {says}[^\n]*$"):
+        with pytest.raises(InputError, match=rf"^gsplat\.pt {expected}[^\n]*$"):
             csplat.read(STORED["gsplat.pt"])
 
 
@@ -401,7 +401,7 @@ def test_shn_may_be_left_out(model):
     assert 0 == csplat.from_gsplat(splats).sh_degree
 
 
-@pytest.mark.parametrize(("change", "says"), [
+@pytest.mark.parametrize(("change", "expected"), [
     ({"sh0": None}, "have no sh0"),
     ({"sh0": None, "features": 1}, "appearance features"),
     ({"means": np.zeros((20, 2))}, r"means has shape \[20, 2\]"),
@@ -411,10 +411,10 @@ def test_shn_may_be_left_out(model):
     ({"quats": np.zeros((20, 3))}, r"quats has shape \[20, 3\]"),
     ({"shN": "text"}, "shN is a str"),
 ])  # fmt: skip
-def test_from_gsplat_refuses_invalid_arrays(model, change, says):
+def test_from_gsplat_refuses_invalid_arrays(model, change, expected):
     splats = {**csplat.to_gsplat(model), **change}
     splats = {name: value for name, value in splats.items() if value is not None}
-    with pytest.raises(InputError, match=says):
+    with pytest.raises(InputError, match=expected):
         csplat.from_gsplat(splats)
 
 

@@ -232,7 +232,7 @@ def test_a_page_shows_a_training_and_its_file(file_runs):
     ] == headings(page)  # fmt: skip
     for scores in file_runs.report["file"]["scores"].values():
         assert f"<td>{scores['psnr_mean']:.2f}</td>" in page
-    assert ["photograph", "source", "before tuning", "file"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
+    assert ["image", "source", "before tuning", "file"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
     assert 8 == page.count('src="data:image/')
     assert not re.search("(src|href)=.http", page)
 
@@ -243,7 +243,7 @@ def test_a_page_of_a_training_without_a_file_agrees_with_compare(file_runs, tmp_
     file_runs.made("a.ply", "--resume", file_runs.checkpoint, "--page", path)
     page = path.read_text()
     assert ["Scores", "Renders", "Training", "Options"] == headings(page)
-    assert ["photograph", "trained scene"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
+    assert ["image", "trained scene"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
     both = (file_runs.folder / name for name in ("a.ply", "a.csplat"))
     call("compare", *both, "--data", file_runs.data, "--report", compared)
     judged = json.loads(compared.read_text())["photographs"]
