@@ -343,7 +343,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(source, views, tmp_path):
 
     def keep(now):
         if now.iteration == 8:
-            middle.append(file.read_bytes())  # of step 6
+            middle.append(file.read_bytes())  # the checkpoint of step 6
 
     whole = tune(fixed, views, FEW, progress=keep, checkpoint=file, checkpoint_every=3)
     file.write_bytes(middle[0])

@@ -218,7 +218,8 @@ def test_markers_and_file_name_the_same_areas():
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("codec", "trainer", "tools", "conformance", "tests", "spec")
 
-#: Phrases that the project's prose avoids, and what to write instead. Words in quotation marks, such as JSON keys, are exempt.
+#: Phrases that the project's prose avoids, and what to write instead. Words in quotation marks, such as JSON keys, are
+#: exempt.
 BANNED = {
     r'^\s*r?"""(?:What|Who|Whom|Whose|Whether|Which|Where|Of|How|Why|When)\b': "a verb in the imperative",
     r"# (?:of|as of|those) ": "a whole phrase: unit, meaning, reason",
@@ -232,7 +233,7 @@ BANNED = {
     r"\bstands\b": "is in",
     r"\bwants\b": "requires",
 }
-PAGES = ("*.md", ".github/*.md", "conformance/*.md", "codec/*.md", "codec/*/README.md", "tools/docs/*/*.md", "spec/*.md")
+PAGES = ("*.md", ".github/*.md", "conformance/*.md", "codec/*.md", "codec/*/*.md", "tools/docs/*/*.md", "spec/*.md")
 
 
 @pytest.fixture(scope="module")

@@ -128,7 +128,7 @@ def test_training_starts_with_images_of_half_the_size(data, tmp_path, monkeypatc
     monkeypatch.setattr(CpuEngine, "step", watched)
     options = TrainOptions(**QUICK, half_size=0.5)
     assert_resumes_identically(data, options, tmp_path)
-    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # of the run without interruption
+    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # sizes in the run without interruption
 
 
 @pytest.mark.slow
@@ -200,7 +200,7 @@ def assert_resumes_identically(data, options, folder):
 
     def stop(now):
         if now.iteration == 40:
-            stopped.write_bytes((folder / "c.npz").read_bytes())  # of step 25
+            stopped.write_bytes((folder / "c.npz").read_bytes())  # the checkpoint of step 25
 
     whole = train(data, options, on_step=stop, outputs=outputs)
     again = train(data, options, outputs=Outputs(resume=stopped))
@@ -536,7 +536,7 @@ def test_parameters_of_a_model_convert_back(make_model):
 @pytest.mark.parametrize("count", [2, 3, 10, 51])
 @pytest.mark.parametrize("alpha", [0.05, 0.5, 0.9])
 def test_shared_splats_cover_as_one(alpha, count):
-    # n equal splats cover a line through their centre as much as the one, by the integral.
+    # n equal splats have the coverage of one splat along a line through their centre, by the integral.
     shared, factor = share_opacity(np.array([alpha]), np.array([count]))
     x = np.linspace(-12, 12, 20_001)
     one = alpha * np.exp(-(x**2) / 2)
@@ -815,7 +815,7 @@ def test_masked_pixels_do_not_change_the_loss(weights):
     assert value.mse == pytest.approx(float(np.square(x - y)[mask].mean()), rel=1e-5)
 
 
-GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # of training images; of test images: 1
+GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # gains of training images
 LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
 
 
@@ -855,7 +855,7 @@ def test_gradients_of_gains_agree_with_finite_differences():
 def test_gains_are_estimated_with_a_mean_of_0(uneven):
     options = TrainOptions(**{**LONGER, "iterations": 450})
     plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
-    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # of training images
+    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # PSNR of training images
     found = np.array(corrected.log["exposures"])
     assert np.abs(found.mean(axis=0)).max() < 1e-4
     assert np.corrcoef(np.exp(found[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.5  # 80 splats represent the scene poorly

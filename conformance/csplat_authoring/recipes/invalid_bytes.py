@@ -147,6 +147,6 @@ def _surplus_codebooks() -> list[Recipe]:
         return invalid_recipe(name, why, "DIR-5", "E_INDEX", made, at="directory[CODB].type")
 
     return [
-        surplus("codebook_chunk_unasked", "a chunk of a codebook that has no record, in addition to all required chunks", 4),
+        surplus("codebook_chunk_unasked", "a chunk of a codebook that has no record, besides all required chunks", 4),
         surplus("codebook_chunk_again", "the same chunk of a codebook twice", 3),
     ]

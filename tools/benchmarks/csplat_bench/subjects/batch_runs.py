@@ -43,8 +43,8 @@ _ENDS: dict[str, Callable[[subprocess.Popen[str]], None]] = {
 def measure_batches(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that runs a loop or a batch."""
     options = setup.options
-    with tempfile.TemporaryDirectory(prefix="csplat-batch-") as name:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory(prefix="csplat-batch-") as temporary:
+        folder = Path(temporary)
         source = read_ply(find_scene(name, setup.data, setup.work).path)
         make_scenes(folder / "scenes", source, options["count"], options["invalid"], options["splats"])
 

@@ -65,8 +65,8 @@ _LOAD = """async ([timing, module, name, url]) => {
 def measure_decoders(setup: Setup, name: str, cases: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that lets a decoder decode once; the first time gives `first_seconds` and memory, too."""
     scene = find_scene(name, setup.data, setup.work)
-    with tempfile.TemporaryDirectory(prefix="csplat-decoders-") as name, ExitStack() as stack:
-        folder = Path(name)
+    with tempfile.TemporaryDirectory(prefix="csplat-decoders-") as temporary, ExitStack() as stack:
+        folder = Path(temporary)
         start = _starter(setup, folder, stack, any(case["place"] == "chromium" for case in cases))
         running: dict[str, Process | Tab] = {}
 
