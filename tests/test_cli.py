@@ -501,13 +501,13 @@ def test_a_full_disk_leaves_no_file_and_the_error_names_it(tmp_path, csplat_file
         line = refused("decode", csplat_file, folder / "back.ply")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
-    assert line.startswith(f"error: {folder / 'back.ply'}: File too large; no half of a file was left")
+    assert line.startswith(f"error: {folder / 'back.ply'}: File too large; no partial file was left")
     assert line.endswith("(EFBIG)\n")
     assert [] == list(folder.iterdir())
 
 
 def test_a_full_standard_output_is_one_line(csplat_file, monkeypatch, capsys):
-    line = "error: standard output: No space left on device; what it holds is not whole (ENOSPC)\n"
+    line = "error: standard output: No space left on device; the output is incomplete (ENOSPC)\n"
     for words in (("info", csplat_file), ("--version",)):
         full = Path("/dev/full").open("w", encoding="utf-8")  # noqa: SIM115  # what closes it fails as well
         monkeypatch.setattr(sys, "stdout", full)

@@ -223,7 +223,6 @@ FOLDERS = ("codec", "trainer", "tools", "conformance", "tests", "spec")
 BANNED = {
     r'^\s*r?"""(?:What|Who|Whom|Whose|Whether|Which|Where|Of|How|Why|When)\b': "a verb in the imperative",
     r"# (?:of|as of|those) ": "a whole phrase: unit, meaning, reason",
-    r"\bso-manieth\b": "every Nth",
     r"\bso many\b|\bso much\b|\bas many as\b|\bas much as\b": "N, at most N",
     r'(?<!["\w])[Bb]eside\b(?!")': "next to, compared with, in addition to",
     r"\b(?:is|are) told\b": "is called with",

@@ -266,7 +266,7 @@ def _clustered(values: F64, entries: int, threads: int | None, show: Any) -> tup
         weights = np.ones(len(points), np.float32)
         index = cluster(points, weights, entries, seed=0, near_groups=near, threads=threads, progress=show)[1]
     count = int(index.max()) + 1
-    sums = [np.bincount(index, column, count) for column in values.T]  # in the order of the splats
+    sums = [np.bincount(index, column, count) for column in values.T]  # bincount adds in splat order: reproducible
     means = np.stack(sums, axis=1) / np.maximum(np.bincount(index, minlength=count), 1)[:, None]
     return means[index], count
 

@@ -46,16 +46,16 @@ _LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # a URL read as a path, whi
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 _OS_ADVICE = {
     errno.ENOENT: "is the name right?",
-    errno.EACCES: "you are not allowed to",
+    errno.EACCES: "check its permissions",
     errno.EISDIR: "name a file",
-    errno.ENOSPC: "no half of a file was left; make room, or name another place",
-    errno.EFBIG: "no half of a file was left; name another place",
-    errno.EDQUOT: "no half of a file was left; make room, or name another place",
+    errno.ENOSPC: "no partial file was left; free some space, or choose another location",
+    errno.EFBIG: "no partial file was left; choose another location",
+    errno.EDQUOT: "no partial file was left; free some space, or choose another location",
 }
 _EMPTY_PHRASES = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in typer's messages
 
 _IN_PYTHON = "is an argument of {} in Python now"
-#: Options of earlier versions that went, and where to find what they did. They are refused in this way for one version.
+#: Removed options, and what replaces them. They are refused with this message for one version.
 RENAMED_OPTIONS = {
     **dict.fromkeys(
         ("--max-classes", "--deflate-level", "--attribute-psnr", "--threads", "--seed"),
@@ -127,7 +127,7 @@ def report_errors() -> Iterator[None]:
 
     Raises:
         ReportedError: an error was printed.
-        typer.Exit: the command was interrupted, or the reader of standard output is gone.
+        typer.Exit: the command was interrupted, or standard output was closed.
     """
     try:
         yield
@@ -149,7 +149,7 @@ def report_errors() -> Iterator[None]:
 
 
 def usage_message(error: Any) -> str:
-    """Return the message of an error in a command line, in one line; for an option that is gone, its replacement."""
+    """Return the message of an error in a command line, in one line; for a removed option, its replacement."""
     option = getattr(error, "option_name", None) or ""
     if option in RENAMED_OPTIONS and "No such option" in error.format_message():
         return f"{option} {RENAMED_OPTIONS[option]}"
@@ -185,7 +185,7 @@ def _os_error(error: OSError) -> str:
     reason = error.strerror or str(error) or type(error).__name__
     number = error.errno or 0
     if error.filename is None:
-        return f"standard output: {reason}; what it holds is not whole" if number in _FULL else reason
+        return f"standard output: {reason}; the output is incomplete" if number in _FULL else reason
     if number == errno.ENOENT and (url := _LOST_URL.match(str(error.filename))):
         return f"{url[1]}://{url[2]} is a URL, expected a file: download it first; extract and batch read URLs"
     return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "")
