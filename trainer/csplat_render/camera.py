@@ -19,7 +19,7 @@ DEFAULT_NEAR = 0.2
 #: Maximum width and height of an image, pixels.
 MAX_IMAGE_SIZE = 1 << 15
 
-_ROTATION_TOLERANCE = 1e-3  # for the entries of R Rᵀ − 1; camera files have few digits
+_ROTATION_TOLERANCE = 1e-3  # largest |entry| of R Rᵀ − 1; camera files have few digits
 
 
 @dataclass(frozen=True, eq=False)

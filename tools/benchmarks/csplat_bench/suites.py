@@ -8,7 +8,7 @@ warmups = 1                             # turns before them that do not count. D
 warmup_splats = 1000000                 # more such turns for small scenes: one per scene size in this number
 ratio = "decode_seconds"                # times_as_fast: the `reference` case's value over a case's own
 
-[options]                               # for the subject
+[options]                               # arguments that the subject reads
 metrics = ["psnr"]
 
 [[cases]]
