@@ -13,6 +13,8 @@ pytest.importorskip("numba", reason="simplification requires the extra [render]"
 from captures import views_of
 from command_line import call, change_options, change_views, invoke
 
+from csplat import EncodeOptions
+from csplat.encoder import EncodePlan, fix_quantisation
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
@@ -24,7 +26,15 @@ from csplat_render.virtual_cameras import is_clear
 from csplat_tools.cli.shared_options import parse_decibels
 from csplat_tools.optimise.pruning import simplify
 from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_error
-from csplat_tools.optimise.splat_refit import RefitResult, choose_bands, coefficient_mask, drop_bands, refit_splats
+from csplat_tools.optimise.splat_refit import (
+    RefitResult,
+    choose_bands,
+    coefficient_mask,
+    drop_bands,
+    quantisation_aware_refit,
+    refit_splats,
+    unrounded_model,
+)
 from csplat_tools.views import (
     VIEW_COUNT,
     VIEW_SIZE,
@@ -210,6 +220,46 @@ def test_alphas_of_a_refit_stay_within_0_and_1(source):
     adjusted = refit_splats(extreme, cameras, wanted, SMALL, steps=8)
     assert np.isfinite(adjusted.scales).all()
     assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0
+
+
+ENCODINGS = [
+    EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32),
+    EncodeOptions(attribute_psnr=28.0, sh_coding="scalar"),
+    EncodeOptions(attribute_psnr=28.0, sh_degree=1),
+]
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS, ids=["codebooks", "scalar", "degree 1"])
+def test_an_unrounded_model_holds_the_values_before_quantisation(source, encoding):
+    fixed = fix_quantisation(EncodePlan.of(source, encoding))
+    values = fixed.start()
+    values.opacities *= np.float32(0.999)
+    free = unrounded_model(fixed, values)
+    order = np.argsort(fixed.source_index)
+    np.testing.assert_array_equal(values.opacities[order], free.opacities)
+    np.testing.assert_array_equal(source.means, free.means)
+    exact = np.ones(len(source), bool) if fixed.shapes is None else fixed.shapes.escaped[order]
+    np.testing.assert_allclose(
+        np.sort(source.scales, axis=1)[exact], np.sort(free.scales, axis=1)[exact], rtol=0, atol=1e-6
+    )
+    if fixed.book is None:
+        np.testing.assert_array_equal(values.sh[order], free.shN[:, : values.sh.shape[1]])
+
+
+def test_a_second_quantised_refit_continues_from_the_first(source):
+    cameras, coarse = camera_sequence(source, 6, (48, 36)), EncodeOptions(attribute_psnr=26.0)
+    wanted = render_all(source, cameras)
+    fixed = fix_quantisation(EncodePlan.of(source, coarse))
+    values = quantisation_aware_refit(fixed, cameras, wanted, SMALL, steps=40)
+    finer = replace(coarse, attribute_psnr=27.0)
+
+    def error(start):
+        plan = fix_quantisation(EncodePlan.of(start, finer), source)
+        seen = plan.dequantise(quantisation_aware_refit(plan, cameras, wanted, SMALL, steps=4))
+        rendered = render_all(replace(plan.encode_plan.model, **vars(seen), means_double=None), cameras)
+        return sum(np.square(one - other).sum() for one, other in zip(rendered, wanted, strict=True))
+
+    assert error(unrounded_model(fixed, values)) < error(source)
 
 
 @pytest.mark.slow

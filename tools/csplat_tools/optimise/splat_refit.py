@@ -139,6 +139,39 @@ def quantisation_aware_refit(
     return values.tuned.free_values.copy()
 
 
+def unrounded_model(fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
+    """Return the splats with values as they are before quantisation, from which another `EncodePlan` may start.
+
+    Args:
+        fixed: the encoder's quantisation.
+        values: its values, for example of `quantisation_aware_refit`.
+
+    Returns:
+        The splats in the order of their indices in the source, in canonical axis order. Splats of a codebook's entry
+        share its values; SH bands beyond the degree kept are zero.
+    """
+    model, book, shapes = fixed.encode_plan.model, fixed.book, fixed.shapes
+    sh, quats, scales = values.sh, values.quats, values.scales
+    if book is not None:
+        sh = sh[_rows_of(book.index, book.size)]
+    if shapes is not None:
+        rows = _rows_of(shapes.index, shapes.size)
+        quats, scales = quats[rows], scales[rows] + values.sizes[:, None]
+    shN = np.zeros_like(model.shN)
+    shN[:, : sh.shape[1]] = sh
+    model = replace(
+        model, means=values.means, quats=quats, scales=scales, opacities=values.opacities, sh0=values.sh0, shN=shN,
+        means_double=None,
+    )  # fmt: skip
+    return model.select(np.argsort(fixed.source_index))
+
+
+def _rows_of(index: NDArray[np.int32], size: int) -> NDArray[np.int64]:
+    """Return each splat's row of `FreeValues`: its entry, or its own row behind the entries if it is escaped."""
+    escaped = index == size
+    return np.where(escaped, size - 1 + np.cumsum(escaped), index)
+
+
 @dataclass(frozen=True, eq=False)
 class RefitResult:
     """A refitted scene.
