@@ -30,15 +30,14 @@ import numpy as np
 from checked import cloud
 
 from csplat import EncodeOptions, SplatModel
-from csplat.encoder import PRESETS
+from csplat.encoder import PRESETS, SearchReport, Target
 from csplat_tools.optimise.candidates import CandidatePool
 from csplat_tools.optimise.precision_search import PrecisionSearch
 from csplat_tools.optimise.pruning_order import PruningOrder, SimplifyOptions
-from csplat_tools.optimise.search_report import SearchReport, make_report
+from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.sh_codings import CodingSearch
 from csplat_tools.optimise.subsets import Pruner
 from csplat_tools.optimise.target_search import TargetSearch, find_goal
-from csplat_tools.optimise.targets import Target
 
 USUAL_QUALITY = 42.0  # dB per attribute at which bytes per splat are those of the scene
 QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, the qualities that a search may request

@@ -19,13 +19,13 @@ from PIL import Image
 from posed_sets import to_opengl
 from scipy.spatial.transform import Rotation
 
-from csplat import write_ply
+from csplat import EncodeOptions, Target, write_ply
 from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.scorer import renderer
 from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.target_encoding import encode_to
+from csplat_tools.optimise.target_encoding import meet_target
 from csplat_tools.training import training_run
 from csplat_tools.training.training_run import tuning_after
 from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_validation_views
@@ -150,8 +150,9 @@ def found_within(source, views=None, encoding=None, *, no_prune=False, importanc
     # Larger views take fewer steps of a fit. The size only matters if virtual views are added.
     size = SMALL if views.virtual else (960, 720)
     simplifying = SimplifyOptions(effort=1, rounds=2, view_size=size, refit=refit)
-    chosen = {"no_prune": no_prune, "importance": importance, "simplifying": simplifying}
-    return encode_to(source, views=views, options=encoding, **chosen, **goal)
+    target = Target(prune=not no_prune, **goal)
+    chosen = {"importance": importance, "simplifying": simplifying}
+    return meet_target(source, encoding or EncodeOptions(), target=target, views=views, **chosen)
 
 
 FOCAL = 42.0  # pixels

@@ -174,19 +174,19 @@ def tuned_file(once, trained_scene, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def search_at_psnr(once):
-    """The smallest file of `captures.crowded()` at 30 dB, by a real search: `Optimised`."""
+    """The smallest file of `captures.crowded()` at 30 dB, by a real search."""
     return _searched(once, "psnr", psnr=30.0)
 
 
 @pytest.fixture(scope="session")
 def search_at_size(once):
-    """The best file of `captures.crowded()` within 1,500 bytes, by a real search: `Optimised`."""
-    return _searched(once, "size", size=1500)
+    """The best file of `captures.crowded()` within 1,500 bytes, by a real search."""
+    return _searched(once, "size", size_bytes=1500)
 
 
 @pytest.fixture(scope="session")
 def search_at_loss(once):
-    """The smallest file of `captures.crowded()` that loses 0.5 dB against photographs of it: `Optimised`."""
+    """The smallest file of `captures.crowded()` that loses 0.5 dB against photographs of it."""
     return _searched(once, "loss", max_psnr_drop=0.5)
 
 

@@ -20,7 +20,14 @@ from captures import cameras, views_of
 
 from csplat import EncodeOptions, decode, read_ply
 from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder import EncodePlan, EncodeResult, FixedQuantisation, encode_with_report, fix_quantisation
+from csplat.encoder import (
+    EncodePlan,
+    EncodeResult,
+    FixedQuantisation,
+    Target,
+    encode_with_report,
+    fix_quantisation,
+)
 from csplat.errors import InputError
 from csplat.lint import Finding
 from csplat.model import SplatModel, normalise_quats
@@ -345,7 +352,7 @@ def verify(source: SplatModel, result: EncodeResult, decoded: SplatModel) -> Bou
 
 def _learn(source: SplatModel) -> Learnt:
     views = cameras(9)
-    half = simplify(source, keep=0.5, views=views_of(views), options=SimplifyOptions(rounds=1, effort=1)).model
+    half = simplify(source, Target(keep=0.5), views=views_of(views), options=SimplifyOptions(rounds=1, effort=1)).model
     options = replace(QUICK, iterations=40, refine_start=10, refine_every=10)
     trained = train(images_of(source, views, source.means[:COUNT]), options)
     try:
@@ -388,7 +395,7 @@ def small_scorer(name: str) -> Scorer:
 @cache
 def half(name: str) -> Simplified:
     """Simplify a condition to half its splats."""
-    return simplify(small_scene(name), keep=0.5, options=FEW)
+    return simplify(small_scene(name), Target(keep=0.5), options=FEW)
 
 
 def images(name: str, points: np.ndarray | None = None) -> DataSet:

@@ -29,11 +29,11 @@ from extremes import (
 )
 
 from csplat import EncodeOptions, decode, encode
-from csplat.encoder import encode_with_report
+from csplat.encoder import Target, encode_with_report
 from csplat.errors import InputError
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.pruning import simplify
-from csplat_tools.optimise.target_encoding import encode_to
+from csplat_tools.optimise.target_encoding import meet_target
 from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap import read_points
 from csplat_trainer.parameters import Parameters, from_model
@@ -64,7 +64,8 @@ def test_half_the_splats_keep_the_psnr_of_the_results(name):
 def test_a_simplified_file_is_within_its_declared_bounds(name):
     source = small_scene(name)
     views, options = find_view_set(source, count=10, size=(60, 45)), FEW
-    result = encode_to(source, keep=0.5, views=views, simplifying=options).result
+    target = Target(keep=0.5)
+    result = meet_target(source, EncodeOptions(), target=target, views=views, simplifying=options)
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
     assert () == verify(source, result, decoded).failures
@@ -77,7 +78,7 @@ def test_a_simplified_file_is_within_its_declared_bounds(name):
 )
 def test_a_target_psnr_is_reached(name, most):
     source = small_scene(name)
-    found = simplify(source, psnr=33.0, views=views_of(virtual_cameras(source, 16, 60, 45)), options=FEW)
+    found = simplify(source, Target(psnr=33.0), views=views_of(virtual_cameras(source, 16, 60, 45)), options=FEW)
     assert found.report["validation_psnr"] >= 33.0
     assert len(found.model) <= most * len(source)
 
@@ -85,7 +86,7 @@ def test_a_target_psnr_is_reached(name, most):
 @LONG
 def test_a_refit_misled_by_saturated_colours_is_refused():
     """The loss of the refit includes colours above 1, which images clip."""
-    found = simplify(small_scene("saturated SH"), keep=0.97, options=FEW)
+    found = simplify(small_scene("saturated SH"), Target(keep=0.97), options=FEW)
     assert found.report["check_psnr"] >= found.report["check_psnr_pruned"] - 1.0
     assert found.report["refit_refused"]
 

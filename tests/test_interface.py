@@ -18,10 +18,12 @@ from typer.testing import CliRunner
 import csplat
 import csplat_render
 import csplat_tools
+import csplat_tools.encode_file
 import csplat_trainer
 from csplat import errors
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel, normalise_quats
+from csplat.plugins import load_plugins
 from csplat_tools.cli.app import app
 
 
@@ -178,10 +180,11 @@ from csplat_render.virtual_cameras import virtual_cameras
 assert not {{"scipy", "torch"}} & set(sys.modules)
 path = {str(files[1])!r}
 model = csplat.read_ply(path)
-csplat_tools.encode_to(path, errors={{"means": 0.01}})
+bounds = csplat.Target(max_error={{"means": 0.01}})
+csplat.encode(model, target=bounds)
 for call in (
-    lambda: csplat_tools.encode_to(path, psnr=40.0),
-    lambda: csplat_tools.simplify(path, keep=0.5),
+    lambda: csplat.encode(model, target=csplat.Target(psnr=40.0)),
+    lambda: csplat_tools.simplify(path, csplat.Target(keep=0.5)),
     lambda: csplat_tools.compare(path, path),
     lambda: csplat_tools.tradeoff(path),
     lambda: csplat_trainer.train(path),
@@ -199,31 +202,64 @@ for call in (
 
 
 # Targets.
-def test_targets_of_a_model_and_a_file_give_the_same_bytes(files):
-    _, ply, _ = files
-    stages = []
+def test_a_target_of_largest_errors_needs_no_search(files, tmp_path):
+    model, stages = files[0], []
 
     def progress(stage, done):
         stages.append((stage, done))
 
-    first = csplat_tools.encode_to(csplat.read_ply(ply), errors={"means": 0.01}, progress=progress)
-    assert first.data == csplat_tools.encode_to(ply.read_bytes(), errors={"means": 0.01}).data
-    assert first.report.reached["means"] <= 0.01
+    target = csplat.Target(max_error={"means": 0.01})
+    found = csplat.encode_with_report(model, target=target)
+    assert found.data == csplat.encode(model, target=target, progress=progress)
+    assert found.report.search.reached["means"] <= 0.01
+    assert (len(found.data), None) == (found.size_bytes, found.psnr)
+    assert f"EncodeResult({found.size_bytes:,} bytes, 60 splats)" == repr(found)
+    found.save(tmp_path / "found.csplat")
+    assert found.data == (tmp_path / "found.csplat").read_bytes()
     assert stages
     assert all(isinstance(stage, str) and 0.0 <= done <= 1.0 for stage, done in stages)
 
 
-@pytest.mark.parametrize(("asked", "message"), [
-    ({}, "no target"),
-    ({"psnr": 40.0, "size": 1000}, "one of them"),
-    ({"size": "5 parsecs"}, "expected bytes"),
-    ({"errors": {"colour": 1.0}}, "not a measure"),
-    ({"errors": {"means": "2mm"}}, "means is '2mm', expected a number"),
-    ({"psnr": "40"}, "psnr is '40', expected a number"),
+def test_a_search_is_called_by_its_entry_point(files, monkeypatch):
+    def search(*given, **named):
+        raise Called(given, named)
+
+    monkeypatch.setattr(
+        "csplat.encoder.encode_api.load_plugins", lambda group: {"csplat.search": {"target": search}}[group]
+    )
+    target, weights = csplat.Target(psnr=40.0), np.ones(60)
+    with pytest.raises(Called) as raised:
+        csplat.encode_with_report(files[0], target=target, views="views", importance=weights)
+    (model, options), named = raised.value.args
+    assert (files[0], csplat.EncodeOptions()) == (model, options)
+    assert {"target": target, "views": "views", "importance": weights, "progress": None} == named
+    monkeypatch.setattr("csplat.encoder.encode_api.load_plugins", lambda _: {})
+    with pytest.raises(InputError, match=r"needs a renderer: pip install 'csplat\[render\]'"):
+        csplat.encode(files[0], target=target)
+
+
+def test_the_search_is_an_entry_point_of_this_package():
+    from csplat_tools.optimise.target_encoding import meet_target
+
+    assert {"target": meet_target} == load_plugins("csplat.search")
+
+
+@pytest.mark.parametrize(("named", "message"), [
+    ({"target": 40.0}, r"target is 40.0, expected csplat\.Target\(psnr=\.\.\.\)"),
+    ({"views": "views"}, "views are given without a target"),
+    ({"target": csplat.Target(psnr=40.0), "metadata": {"a": 1}}, "a target excludes origin and metadata"),
+    ({"target": csplat.Target(psnr=40.0), "options": "small"}, r"EncodeOptions\(preset="),
 ])  # fmt: skip
-def test_an_invalid_target_is_refused_before_reading_the_scene(asked, message):
+def test_arguments_that_contradict_a_target_are_refused(files, named, message):
     with pytest.raises(InputError, match=message):
-        csplat_tools.encode_to("absent.ply", **asked)
+        csplat.encode_with_report(files[0], **named)
+
+
+def test_old_names_name_their_successors():
+    with pytest.raises(InputError, match=r"csplat\.Target\(psnr=38\)"):
+        csplat_tools.encode_to("scene.ply", psnr=38.0)
+    with pytest.raises(AttributeError, match=r"csplat\.EncodeResult"):
+        csplat_tools.Optimised  # noqa: B018 -- the access is the test
 
 
 # Commands.
@@ -264,10 +300,7 @@ def arguments_of(monkeypatch, module, name, words):
 
 
 @pytest.mark.parametrize(("words", "name", "given"), [
-    (["encode", "scene.ply", "o", "--max-error", "means=0.01"], "encode_to", {"errors": {"means": 0.01}}),
-    (["encode", "scene.ply", "o", "--target-psnr", "40"], "encode_to", {"psnr": 40.0, "no_prune": False}),
-    (["encode", "scene.ply", "o", "--target-size", "5kB", "--no-prune"], "encode_to", {"size": 5000}),
-    (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {"keep": 0.5, "psnr": None, "max_psnr_drop": None}),
+    (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {}),
     (["compare", "scene.ply", "scene.csplat", "--mode", "fast"], "compare", {"mode": "fast"}),
     (["tradeoff", "scene.ply", "--what", "presets"], "tradeoff", {"say": None}),
 ])  # fmt: skip
@@ -277,6 +310,22 @@ def test_commands_call_the_public_functions(files, monkeypatch, words, name, giv
     (scene, *_), named = arguments_of(monkeypatch, csplat_tools, name, words)
     assert_same(csplat.read_ply(files[1]), getattr(scene, "model", getattr(scene, "source", scene)))
     assert given.items() <= named.items()
+
+
+@pytest.mark.parametrize(("words", "target"), [
+    (["--max-error", "means=0.01"], {"max_error": {"means": 0.01}}),
+    (["--target-psnr", "40"], {"psnr": 40.0}),
+    (["--keep", "0.5", "--effort", "1"], {"keep": 0.5, "effort": 1}),
+    (["--target-size", "5kB", "--no-prune"], {"size_bytes": 5000, "prune": False}),
+])  # fmt: skip
+@pytest.mark.usefixtures("views_once")
+def test_encode_calls_the_encoder_with_its_target(files, monkeypatch, words, target):
+    monkeypatch.chdir(files[1].parent)
+    words = ["encode", "scene.ply", "o", *words]
+    (scene, _), named = arguments_of(monkeypatch, csplat_tools.encode_file, "encode_with_report", words)
+    assert_same(csplat.read_ply(files[1]), scene)
+    assert csplat.Target(**target) == named["target"]
+    assert ("max_error" in target) == (named["views"] is None)
 
 
 def test_the_size_of_a_model_is_that_of_a_plain_ply(files):

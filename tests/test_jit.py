@@ -189,7 +189,7 @@ prepare_renderer(quiet=True, simplify=True)
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.pruning import simplify
 before = compiled()
-simplify(model, keep=0.5, options=SimplifyOptions(views=2, view_size=(32, 24), rounds=1, effort=1))
+simplify(model, csplat.Target(keep=0.5), options=SimplifyOptions(views=2, view_size=(32, 24), rounds=1, effort=1))
 """
 
 _COMPARE = """

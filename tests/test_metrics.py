@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from csplat.errors import InputError
+from csplat.types import PSNR_CAP
 
 pytest.importorskip("numba", reason="SSIM requires the extra [render]")
 
@@ -28,7 +29,7 @@ from csplat_render.metric_kernels import (
     mean_ssim,
     mean_ssim_twin,
 )
-from csplat_render.metrics import PSNR_CAP, Scores, flip, psnr, score_view, ssim
+from csplat_render.metrics import Scores, flip, psnr, score_view, ssim
 
 
 def two_images(seed=0, height=30, width=41, noise=0.1):

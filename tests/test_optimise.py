@@ -21,7 +21,7 @@ from command_line import call, change_views, invoke
 
 from csplat import EncodeOptions, decode, write_ply
 from csplat.decoder import decode_scene
-from csplat.encoder import Importance, encode_with_report
+from csplat.encoder import Importance, SearchReport, Target, encode_with_report, meet_bounds
 from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.camera import intrinsics, look_at, resized
@@ -30,17 +30,16 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.shared_options import parse_max_error
 from csplat_tools.console import parse_size_bytes
 from csplat_tools.optimise.candidates import CodingChoice, WholeScene
 from csplat_tools.optimise.precision_search import REFIT_GAIN, PrecisionSearch, SearchGoal, SearchWindow, find_in_window
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
-from csplat_tools.optimise.search_report import SearchReport, psnr_spread
+from csplat_tools.optimise.search_report import format_search, psnr_spread
 from csplat_tools.optimise.subsets import Pruner
-from csplat_tools.optimise.target_encoding import encode_to, meet_bounds
 from csplat_tools.optimise.target_search import expected_renders
-from csplat_tools.optimise.targets import Target, parse_max_error
 from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import pose_key, render_seconds
 
@@ -151,26 +150,26 @@ def test_the_spread_is_over_views():
 def test_a_psnr_is_reached_with_fewer_splats(many, search_at_psnr):
     found, views = search_at_psnr, with_validation_views(judged_by(cameras(40)))
     decoded = decode_scene(found.data)
-    assert 30.0 <= found.report.psnr <= 31.0  # the PSNR of such small files jumps
-    assert found.report.psnr == pytest.approx(views.test_scorer(many).psnr(decoded.model), abs=1e-4)
+    assert 30.0 <= found.report.search.psnr <= 31.0  # the PSNR of such small files jumps
+    assert found.report.search.psnr == pytest.approx(views.test_scorer(many).psnr(decoded.model), abs=1e-4)
     validation_psnr = views.validation_scorer(many).psnr(decoded.model)
-    assert found.report.chosen["validation_psnr"] == pytest.approx(validation_psnr, abs=1e-3)
-    assert (len(found.data), len(decoded.model)) == (found.report.size_bytes, found.report.splats)
-    assert found.report.splats < 600
-    assert 900 == found.result.report.options["simplified"]["splats"] == decoded.declared_bounds.source_count
-    assert len(np.unique(found.result.source_index)) == len(decoded.model)
+    assert found.report.search.chosen["validation_psnr"] == pytest.approx(validation_psnr, abs=1e-3)
+    assert (len(found.data), len(decoded.model)) == (found.report.search.size_bytes, found.report.search.splats)
+    assert found.report.search.splats < 600
+    assert 900 == found.report.options["simplified"]["splats"] == decoded.declared_bounds.source_count
+    assert len(np.unique(found.source_index)) == len(decoded.model)
 
 
 @pytest.mark.slow
 def test_declared_errors_of_a_found_file_hold(many, search_at_psnr):
-    measured = measure_errors(many, decode(search_at_psnr.data), search_at_psnr.result.source_index)
-    stated = search_at_psnr.result.report.errors
+    measured = measure_errors(many, decode(search_at_psnr.data), search_at_psnr.source_index)
+    stated = search_at_psnr.report.errors
     assert [] == [name for name in stated if measured[name][0] > stated[name][0]]
 
 
 @pytest.mark.slow
 def test_no_candidate_reaches_the_psnr_with_fewer_bytes(search_at_psnr):
-    report = search_at_psnr.report
+    report = search_at_psnr.report.search
     good = [one["size_bytes"] for one in report.tried if one["psnr"] is not None and one["psnr"] >= 30.0]
     assert min(good) == report.size_bytes
 
@@ -178,31 +177,31 @@ def test_no_candidate_reaches_the_psnr_with_fewer_bytes(search_at_psnr):
 @pytest.mark.slow
 def test_a_small_size_is_met_with_fewer_splats(search_at_size):
     assert 0.9 * 1500 <= len(search_at_size.data) <= 1500
-    assert search_at_size.report.splats < 900
-    assert search_at_size.report.psnr > 24.0
+    assert search_at_size.report.search.splats < 900
+    assert search_at_size.report.search.psnr > 24.0
 
 
 @pytest.mark.slow
 def test_a_psnr_drop_against_images_prunes_splats(many, photographs, search_at_loss):
-    decoded, scores = decode(search_at_loss.data), search_at_loss.report.photographs
+    decoded, scores = decode(search_at_loss.data), search_at_loss.report.search.photographs
     scorer = with_validation_views(photographs).image_validation_scorer()
     assert scores["source"] < 28.0
     assert scores["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
     assert scores["file"] >= scores["source"] - 1.0  # the validation images decide
     assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
-    assert search_at_loss.report.splats < 900
+    assert search_at_loss.report.search.splats < 900
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["search_at_size", "search_at_loss"])
 def test_test_views_only_score_the_chosen_file_of_a_size_or_drop(request, name):
-    report = request.getfixturevalue(name).report
+    report = request.getfixturevalue(name).report.search
     assert [report.chosen] == [one for one in report.tried if one["psnr"] is not None]
 
 
 @pytest.mark.slow
 def test_the_report_has_goal_reasons_and_spread(search_at_psnr):
-    report = search_at_psnr.report
+    report = search_at_psnr.report.search
     assert {"psnr": 30.0} == report.goal
     assert len(report.tried) == report.encodes
     assert 10 == report.views
@@ -223,17 +222,17 @@ def test_the_number_of_threads_does_not_change_the_bytes(kept, alike):
 
 @pytest.mark.slow
 def test_bounds_in_addition_to_a_psnr_hold_without_pruning(scene):
-    found = search(scene, psnr=18.0, errors={"means": 1e-3, "sh1": 1e-2})
+    found = search(scene, psnr=18.0, max_error={"means": 1e-3, "sh1": 1e-2})
     for name, most in (("means", 1e-3), ("sh1", 1e-2)):  # although 18 dB need no SH
-        assert most >= found.result.report.errors[name][0] == found.report.reached[name]
-    assert found.report.psnr >= 18.0
-    assert 300 == found.report.splats
+        assert most >= found.report.errors[name][0] == found.report.search.reached[name]
+    assert found.report.search.psnr >= 18.0
+    assert 300 == found.report.search.splats
 
 
 def test_impossible_bounds_are_refused(scene):
     for measure in ("opacities", "covariance"):
         with pytest.raises(InputError, match=f"no lattice keeps the error of {measure}"):
-            search(scene, errors={measure: 1e-310}, size=10**6)
+            search(scene, max_error={measure: 1e-310}, size_bytes=10**6)
 
 
 @pytest.mark.slow
@@ -273,23 +272,23 @@ def kept(alike):
 
 @pytest.mark.slow
 def test_a_share_of_the_splats_is_verified(kept, alike):
-    decoded, index = decode_scene(kept.data), kept.result.source_index
-    assert 180 == kept.report.splats == len(decoded.model) == len(np.unique(index))
+    decoded, index = decode_scene(kept.data), kept.source_index
+    assert 180 == kept.report.search.splats == len(decoded.model) == len(np.unique(index))
     distances = np.linalg.norm(decoded.model.means.astype(np.float64) - alike.means[index], axis=1)
-    assert distances.max() <= kept.result.report.errors["means"][0]
+    assert distances.max() <= kept.report.errors["means"][0]
     assert verify_bounds(Source.of(alike), decoded.model, decoded.header, decoded.declared_bounds, index).holds
     assert decoded.declared_bounds.refitted
 
 
 @pytest.mark.slow
 def test_shapes_are_clustered_by_importance(kept):
-    assert 0 < kept.result.report.options["shape_codebook_size"] <= 60
+    assert 0 < kept.report.options["shape_codebook_size"] <= 60
 
 
 @pytest.mark.slow
 def test_kept_splats_are_refitted_to_the_source(kept, alike):
-    bare = Scorer.of_source(alike, judged_by(cameras(40)).test, BLACK).psnr(alike.select(kept.result.source_index))
-    assert kept.report.psnr > bare + 3.0
+    bare = Scorer.of_source(alike, judged_by(cameras(40)).test, BLACK).psnr(alike.select(kept.source_index))
+    assert kept.report.search.psnr > bare + 3.0
 
 
 @pytest.mark.slow
@@ -355,7 +354,7 @@ def test_options_that_contradict_a_target_are_refused(scene):
         search(scene.select(np.zeros(0, np.int64)), views, psnr=30.0)
     with pytest.raises(InputError, match="chosen by the target"):
         search(scene, views, EncodeOptions(attribute_psnr=40.0), psnr=30.0)
-    with pytest.raises(InputError, match="exclude each other"):
+    with pytest.raises(InputError, match="excludes prune=False"):
         search(scene, views, keep=0.5, no_prune=True)
 
 
@@ -373,10 +372,10 @@ def surroundings():
 def test_virtual_views_in_surroundings_cause_a_warning(surroundings):
     views = replace(judged_by(cameras(40)), virtual=True)
     views = replace(views, training=[resized(camera, 24, 20) for camera in views.training])
-    fewer = search(surroundings, views, keep=0.8, refit=False).report
+    fewer = search(surroundings, views, keep=0.8, refit=False).report.search
     assert "cameras inside of the surroundings" in fewer.why[-1]
     assert "--no-prune" in fewer.why[-1]
-    kept = search(surroundings, views, psnr=22.0, no_prune=True).report
+    kept = search(surroundings, views, psnr=22.0, no_prune=True).report.search
     assert (100, 0, 0) == (kept.splats, kept.removal_views, kept.sensitivity_views)
     assert not any("surroundings" in line for line in kept.why)
 
@@ -417,7 +416,7 @@ def test_quantisation_classes_reduce_the_size_at_equal_psnr(unequal, measured):
 def test_a_search_uses_measured_classes_in_addition_to_a_given_importance(unequal):
     few = unequal.select(np.arange(5000))
     weights = np.linspace(1.0, 2.0, len(few))
-    report = search(few, None, None, psnr=34.0, no_prune=True, importance=weights).report
+    report = search(few, None, None, psnr=34.0, no_prune=True, importance=weights).report.search
     assert {1, 2} == {one["classes"] for one in report.tried}
     assert 26 == report.sensitivity_views
 
@@ -481,7 +480,7 @@ def test_seconds_per_render_exclude_the_first(scene):
 @pytest.mark.parametrize(("psnr", "note"), [(39.5, "39.50 at other"), (37.0, "positions: up to 3.0 dB less")])
 def test_the_psnr_of_extra_test_views_is_reported(psnr, note):
     report = SearchReport({"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, elsewhere={"beside": psnr})
-    assert 1 == sum(note in line for line in report.lines())
+    assert 1 == sum(note in line for line in format_search(report))
 
 
 def test_extra_test_cameras_are_nearer_and_farther(scene):
@@ -531,7 +530,7 @@ def test_a_length_with_a_unit_requires_a_scene_with_a_unit():
 )  # fmt: skip
 def test_invalid_bounds_are_refused(text, message):
     with pytest.raises(InputError, match=message):
-        parse_max_error(text, 1.0)
+        Target(max_error=parse_max_error(text, 1.0))
 
 
 @pytest.mark.parametrize(
@@ -543,7 +542,8 @@ def test_invalid_bounds_are_refused(text, message):
         ({"psnr": 99.5}, "at most 99"), ({"psnr": float("nan")}, "above 0"), ({"max_psnr_drop": 0.0}, "0.001 to 60"),
         ({"max_psnr_drop": 1e-16}, "0.001 to 60"), ({"max_psnr_drop": 4000.0}, "0.001 to 60"),
         ({"keep": 1.5}, "at most 1"), ({"keep": 0.0}, "above 0"), ({"psnr": -1.0}, "above 0"),
-        ({"keep": 0.5, "psnr": 40.0}, "one of them"),
+        ({"keep": 0.5, "psnr": 40.0}, "one of them"), ({"keep": 0.5, "prune": False}, "excludes prune"),
+        ({"psnr": 40.0, "effort": 0}, "1 to 9"), ({"psnr": 40.0, "effort": "3"}, "expected a number"),
     ],
 )  # fmt: skip
 def test_invalid_targets_are_refused(asked, message):
@@ -556,12 +556,12 @@ def test_invalid_targets_are_refused(asked, message):
     "bounds", [{"means": 1e-4}, {"opacities": 0.004, "covariance": 0.02}, {"sh0": 0.01}, {"sh1": 0.02, "sh2": 0.05}]
 )
 def test_bounds_hold_for_every_splat(scene, bounds):
-    found = encode_to(scene, errors=bounds)
-    proof = measure_errors(scene, decode(found.result.data), found.result.source_index)
+    found = encode_with_report(scene, target=Target(max_error=bounds))
+    proof = measure_errors(scene, decode(found.data), found.source_index)
     for name, bound in bounds.items():
         assert 0.3 * bound < proof[name][0] <= bound
-        assert found.report.reached[name] == found.result.report.errors[name][0] <= bound
-    assert (300, 0) == (found.report.splats, found.report.renders)
+        assert found.report.search.reached[name] == found.report.errors[name][0] <= bound
+    assert (300, 0) == (found.report.search.splats, found.report.search.renders)
 
 
 @pytest.mark.slow
@@ -569,14 +569,15 @@ def test_a_bound_of_the_means_holds_for_outliers(scene):
     away = (scene.means[:20] * 3000.0).astype(np.float32)
     far = replace(scene, means=np.concatenate([away, scene.means[20:]]))
     coarse = encode_with_report(far, EncodeOptions(position_step=1e-4)).report.errors["means"][0]
-    bounded = meet_bounds(far, EncodeOptions(), {"means": 1e-4}).result
+    bounded, _ = meet_bounds(far, EncodeOptions(), Target(max_error={"means": 1e-4}))
     assert bounded.report.errors["means"][0] <= 1e-4 < coarse
-    assert any("tiles" in note for note in meet_bounds(far, EncodeOptions(), {"means": 1e-6}).result.report.notes)
+    finer, _ = meet_bounds(far, EncodeOptions(), Target(max_error={"means": 1e-6}))
+    assert any("tiles" in note for note in finer.report.notes)
 
 
 def test_an_impossible_bound_is_refused(scene):
     with pytest.raises(InputError, match="no lattice keeps the error of opacities within 1e-09"):
-        meet_bounds(scene, EncodeOptions(), {"opacities": 1e-9})
+        meet_bounds(scene, EncodeOptions(), Target(max_error={"opacities": 1e-9}))
 
 
 def test_an_option_that_contradicts_a_bound_is_refused(scene):
@@ -587,7 +588,7 @@ def test_an_option_that_contradicts_a_bound_is_refused(scene):
         ({"sh_coding": "codebook"}, "sh1", "codebook excludes a bound"),
     ):
         with pytest.raises(InputError, match=message):
-            meet_bounds(scene, EncodeOptions(**fixed), {measure: 0.1})
+            meet_bounds(scene, EncodeOptions(**fixed), Target(max_error={measure: 0.1}))
 
 
 # The command.
@@ -672,7 +673,7 @@ REFUSED = [
     (["--keep", "0.5", "--max-error", "means=1"], 2, "no bounds"),
     (["--target-size", "5kB", "--attribute-psnr", "40"], 2, "--attribute-psnr and --target-size: give one of them"),
     (["--effort", "2"], 2, "--effort requires --target-psnr or"),
-    (["--effort", "12", "--target-size", "5kB"], 2, "--effort is 12, expected 1 to 9"),
+    (["--effort", "12", "--target-size", "5kB"], 2, "the effort is 12, expected 1 to 9"),
     (["--no-prune"], 2, "--no-prune requires --target-psnr or"),
     (["--keep", "0.5", "--no-prune"], 2, "--keep and --no-prune: give one of them"),
     (["--keep", "0.5", "--importance", "w.npy"], 2, "--keep and --importance: give one of them"),

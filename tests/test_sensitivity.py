@@ -12,7 +12,7 @@ from checked import covariances, quaternion_of
 from command_line import call, change_views, invoke
 from oracle import adversarial, extreme_splats, facing
 
-from csplat.encoder import EncodeOptions
+from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats, sh_degree_of
 from csplat.ply import read_ply, write_ply
@@ -409,7 +409,7 @@ def test_invalid_options_are_refused(tmp_path, sample_path, camera_file):
     [
         ({"prune_unseen": True}, "requires a file of `csplat sensitivity`"),
         ({"prune_unseen": True, "out_of_core": OutOfCoreOptions(always=True)}, "requires a file of"),
-        ({"importance": "w.npy", "encoder": print}, "an encoder and an importance"),
+        ({"importance": "w.npy", "prune_unseen": True, "target": Target(psnr=30.0)}, "prune_unseen and a target"),
         ({"importance": "w.npy", "out_of_core": OutOfCoreOptions(resume=True)}, "larger than memory"),
     ],
 )

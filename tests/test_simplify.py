@@ -14,7 +14,7 @@ from captures import views_of
 from command_line import call, change_options, change_views, invoke
 
 from csplat import EncodeOptions
-from csplat.encoder import EncodePlan, fix_quantisation
+from csplat.encoder import EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
@@ -160,7 +160,7 @@ def test_exact_errors_prune_better_than_opacity(source):
     views = views_of(camera_sequence(source, 32, (48, 36), seed=3))
     for rounds in (1, SMALL.rounds):
         options = replace(SMALL, rounds=rounds, refit=False, bands=False)
-        scores[rounds] = judge.psnr(simplify(source, keep=0.8, views=views, options=options).model)
+        scores[rounds] = judge.psnr(simplify(source, Target(keep=0.8), views=views, options=options).model)
     by_opacity = []
     for weights in (1.0, surface_areas(source)):
         least = np.argsort(source.opacities * weights, kind="stable")[: len(source) - round(0.8 * len(source))]
@@ -171,7 +171,7 @@ def test_exact_errors_prune_better_than_opacity(source):
 # Simplified scenes.
 @pytest.mark.slow
 def test_keep_reports_the_kept_splats(source, given):
-    result = simplify(source, keep=0.5, views=given, options=replace(SMALL, refit=False))
+    result = simplify(source, Target(keep=0.5), views=given, options=replace(SMALL, refit=False))
     assert len(result.model) == 225
     np.testing.assert_array_equal(source.means[result.source_index], result.model.means)
     report = result.report
@@ -186,7 +186,7 @@ def test_a_refit_improves_validation_views(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
     views = views_of(camera_sequence(shell, 40, (48, 36), seed=3))
-    report = simplify(shell, keep=0.5, views=views, options=replace(SMALL, bands=False)).report
+    report = simplify(shell, Target(keep=0.5), views=views, options=replace(SMALL, bands=False)).report
     assert report["check_psnr"] > report["check_psnr_pruned"] + 1.5
 
 
@@ -195,7 +195,7 @@ def test_a_refit_that_overfits_is_discarded(source, given, monkeypatch):
         return RefitResult(replace(model, sh0=model.sh0 - np.float32(1.0)), None)
 
     monkeypatch.setattr(sys.modules[simplify.__module__], "refit_with_bands", dark)
-    result = simplify(source, keep=0.6, views=given, options=SMALL)
+    result = simplify(source, Target(keep=0.6), views=given, options=SMALL)
     assert result.report["refit_refused"]
     assert result.report["check_psnr"] == result.report["check_psnr_pruned"]
     np.testing.assert_array_equal(source.sh0[result.source_index], result.model.sh0)
@@ -265,7 +265,7 @@ def test_a_second_quantised_refit_continues_from_the_first(source):
 @pytest.mark.slow
 @pytest.mark.parametrize(("goal", "refit"), [(35.0, False), (28.0, True)])
 def test_a_target_psnr_is_reached(source, given, goal, refit):
-    result = simplify(source, psnr=goal, views=given, options=replace(SMALL, bands=False, refit=refit))
+    result = simplify(source, Target(psnr=goal), views=given, options=replace(SMALL, bands=False, refit=refit))
     assert result.report["validation_psnr"] >= goal
     assert given.validation_scorer(source).psnr(result.model) == pytest.approx(result.report["validation_psnr"])
     assert len(result.model) < len(source)
@@ -276,7 +276,7 @@ def test_the_source_is_kept_with_a_remark_if_no_pruned_scene_reaches_the_target(
         return RefitResult(replace(pruned, sh0=np.full_like(pruned.sh0, -10.0)), None)
 
     monkeypatch.setattr("csplat_tools.optimise.pruning.refit_with_bands", make_black)
-    result = simplify(source, psnr=35.0, views=given, options=replace(SMALL, bands=False, refit=False))
+    result = simplify(source, Target(psnr=35.0), views=given, options=replace(SMALL, bands=False, refit=False))
     assert source is result.model
     (remark,) = result.notes
     assert "all splats are kept, unchanged" in remark
@@ -292,7 +292,9 @@ def test_a_larger_psnr_drop_prunes_more_splats(source):
     judge = image_scorer(views.images_of(views.validation), views.background)
     sizes = []
     for loss in (0.05, 1.0):
-        result = simplify(source, max_psnr_drop=loss, views=views, options=replace(SMALL, bands=False, refit=False))
+        result = simplify(
+            source, Target(max_psnr_drop=loss), views=views, options=replace(SMALL, bands=False, refit=False)
+        )
         assert judge.psnr(result.model) >= judge.psnr(source) - loss
         sizes.append(len(result.model))
     assert sizes[0] > sizes[1]
@@ -300,11 +302,11 @@ def test_a_larger_psnr_drop_prunes_more_splats(source):
 
 def test_a_psnr_drop_requires_images(source):
     with pytest.raises(InputError, match="name a data set"):
-        simplify(source, max_psnr_drop=0.3, options=SMALL)
+        simplify(source, Target(max_psnr_drop=0.3), options=SMALL)
 
 
 def test_keeping_all_splats_changes_nothing(source, given):
-    result = simplify(source, keep=1.0, views=given, options=replace(SMALL, refit=False))
+    result = simplify(source, Target(keep=1.0), views=given, options=replace(SMALL, refit=False))
     assert len(result.model) == len(source)
     np.testing.assert_array_equal(source.shN, result.model.shN)
 
@@ -320,13 +322,13 @@ def test_keeping_all_splats_changes_nothing(source, given):
 )
 def test_the_requested_number_but_at_least_one_splat_is_kept(source, given, keep, options, left):
     chosen = replace(SMALL, refit=False, bands=False, **options)
-    assert left == len(simplify(source, keep=keep, views=given, options=chosen).model)
+    assert left == len(simplify(source, Target(keep=keep), views=given, options=chosen).model)
 
 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_threads(source, given):
     one, two = (
-        simplify(source, keep=0.5, views=given, options=replace(SMALL, bands=False, threads=threads))
+        simplify(source, Target(keep=0.5), views=given, options=replace(SMALL, bands=False, threads=threads))
         for threads in (1, 2)
     )
     np.testing.assert_array_equal(one.source_index, two.source_index)
@@ -347,7 +349,7 @@ def test_bands_with_less_gain_than_cost_are_dropped():
 
 @pytest.mark.slow
 def test_dropped_bands_are_zero(source, given):
-    result = simplify(source, keep=0.4, views=given, options=SMALL)
+    result = simplify(source, Target(keep=0.4), views=given, options=SMALL)
     kept_bands = result.kept_bands
     assert kept_bands is not None
     assert 0 < np.count_nonzero(~kept_bands) < kept_bands.size
@@ -358,10 +360,10 @@ def test_dropped_bands_are_zero(source, given):
 
 
 # Errors.
-def test_several_targets_and_options_out_of_range_are_refused(source):
-    for given, message in (({}, "no target"), ({"psnr": 40.0, "keep": 0.5}, "one of them")):
-        with pytest.raises(InputError, match=message):
-            simplify(source, options=SMALL, **given)
+def test_other_targets_and_options_out_of_range_are_refused(source):
+    for given in ({"size_bytes": 1000}, {"psnr": 40.0, "max_error": {"means": 1.0}}):
+        with pytest.raises(InputError, match="is no target of simplify, expected keep or psnr or max_psnr_drop"):
+            simplify(source, Target(**given), options=SMALL)
     for wrong in ({"rounds": 0}, {"effort": 0}, {"effort": 10}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="expected"):
             SimplifyOptions(**wrong)
@@ -370,7 +372,7 @@ def test_several_targets_and_options_out_of_range_are_refused(source):
 
 def test_an_empty_scene_is_refused(source):
     with pytest.raises(InputError, match="without splats"):
-        simplify(source.select(slice(0, 0)), keep=0.5)
+        simplify(source.select(slice(0, 0)), Target(keep=0.5))
 
 
 def test_decibels_are_parsed_with_and_without_unit():

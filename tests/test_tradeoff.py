@@ -20,7 +20,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from csplat import EncodeOptions, decode, encode, write_ply
+from csplat import EncodeOptions, Target, decode, encode, write_ply
 from csplat._spec import CHUNK_CODEBOOK
 from csplat.decoder import read_header
 from csplat.errors import InputError
@@ -146,24 +146,24 @@ def test_targets_are_reached(swept):
 def test_rows_name_the_target_of_their_search(setting, monkeypatch):
     asked = []
 
-    def fail(source, **words):
-        asked.append((source, words))
+    def fail(source, options, **words):
+        asked.append((source, options, words))
         raise InputError("none")
 
-    monkeypatch.setattr("csplat_tools.tradeoffs.sweep_run.encode_to", fail)
+    monkeypatch.setattr("csplat_tools.tradeoffs.sweep_run.encode_with_report", fail)
     wanted = SweepOptions(what=("targets", "simplify"), preset="fast", psnr=(30.0,), sizes=(9000,), keep=(0.7,))
     tried = {one.name: one for one in plan_points(setting, wanted)}
-    for name, goal in (("target 30 dB", "psnr"), ("target 9.0 kB", "size"), ("keep 0.7", "keep")):
-        assert ("simplify" if goal == "keep" else "targets") == tried[name].family
+    for name, target in (
+        ("target 30 dB", Target(psnr=30.0)), ("target 9.0 kB", Target(size_bytes=9000)), ("keep 0.7", Target(keep=0.7)),
+    ):  # fmt: skip
+        assert ("targets" if target.keep is None else "simplify") == tried[name].family
         with pytest.raises(InputError, match="none"):
             tried[name].make(lambda *_: None)
-        source, words = asked.pop()
+        source, options, words = asked.pop()
         assert source is setting.source
         assert words["views"] is setting.views
-        assert "fast" == words["options"].preset
-        assert {goal: {"psnr": 30.0, "size": 9000, "keep": 0.7}[goal]} == {
-            one: words[one] for one in ("psnr", "size", "keep") if words.get(one) is not None
-        }
+        assert "fast" == options.preset
+        assert target == words["target"]
 
 
 def roles_of(views):

@@ -18,13 +18,13 @@ from PIL import Image
 from posed_sets import to_opengl
 
 from csplat import decode, read_ply, write_ply
-from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, fix_quantisation
+from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.training_record import TrainingRecord
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to
 from csplat_render.rasteriser import Rasteriser
 from csplat_tools.training import tuning_run
-from csplat_tools.training.training_run import tuning_after
+from csplat_tools.training.training_run import plan_training, tuning_after
 from csplat_tools.training.tuning_run import TuningSubset
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
@@ -384,6 +384,24 @@ def test_one_training_gives_several_files(file_runs):
     good = made("good.csplat", "--target-psnr", wanted, final_share=1.0)
     assert wanted <= good["validation"]["psnr"] <= wanted + 0.1
     assert trained == file_runs.checkpoint.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("target", "max_splats", "planned"),
+    [
+        (None, None, (20_000, 0.8)), (None, 500, (500, 0.8)), (Target(keep=0.5), 500, (500, 0.5)),
+        (Target(psnr=30.0), None, (20_000, 1.0)), (Target(size_bytes=80_000), None, (10_000, 0.8)),
+        (Target(size_bytes=80_000), 16_000, (16_000, 0.5)), (Target(size_bytes=80_000), 4_000, (4_000, 1.0)),
+    ],
+)  # fmt: skip
+def test_a_training_is_planned_by_its_target(target, max_splats, planned):
+    options = plan_training(TrainOptions(seed=7), target, max_splats=max_splats)
+    assert (*planned, 7) == (options.max_splats, options.final_share, options.seed)
+
+
+def test_a_training_for_a_drop_of_psnr_is_refused():
+    with pytest.raises(InputError, match="max_psnr_drop is no target of train"):
+        plan_training(TrainOptions(), Target(max_psnr_drop=1.0))
 
 
 def test_tuning_after_a_long_training_takes_more_and_smaller_steps():

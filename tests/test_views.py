@@ -22,6 +22,7 @@ from csplat_render.camera_files import save_cameras
 from csplat_render.scorer import renderer
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
 from csplat_tools.views.view_sets import pose_key
+from csplat_trainer.data import load
 from csplat_trainer.posed_images import evaluate
 
 KINDS = ("rgb", "rgba", "colmap")
@@ -144,6 +145,13 @@ def test_recorded_training_options_are_the_defaults(sets, scene):
         "test_every is 10, but the scene was trained with 5",
         "background is white, but the scene was trained on 0,1,0",
     ] == [line for line in views.notes if "trained" in line]
+
+
+def test_an_opened_data_set_has_the_same_views(sets, scene):
+    opened = load(sets["rgb"])
+    found, named = (find_view_set(scene, data=data) for data in (opened, DataOptions(str(sets["rgb"]))))
+    assert (poses(named), named.background) == (poses(found), found.background)
+    assert found.images[0].source is opened.train[0].source  # pixels are read once
 
 
 def test_a_folder_of_images_is_read_as_its_set(sets, scene):

@@ -3,6 +3,7 @@
     >>> import csplat
     >>> model = csplat.read_ply("scene.ply")
     >>> data = csplat.encode(model, csplat.EncodeOptions(preset="small"))
+    >>> data = csplat.encode(model, target=csplat.Target(psnr=38))  # doctest: +SKIP
     >>> model = csplat.decode(data)
     >>> with csplat.open("scene.csplat") as file:  # or https://…, s3://…: reads only the parts it needs
     ...     model = file.read(box=(-1, -1, -1, 1, 1, 1))
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from csplat.decoder import decode, decode_integers, decode_scene, read_header
     from csplat.editing.merge import merge
     from csplat.editing.up_axis import with_up
-    from csplat.encoder import EncodeOptions, EncodeResult, encode, encode_with_report
+    from csplat.encoder import EncodeOptions, EncodeResult, Target, encode, encode_with_report
     from csplat.errors import CsplatError, FormatError, InputError, LimitError, StoreError, UnsupportedError
     from csplat.formats import read, write
     from csplat.interop import from_gsplat, to_gsplat
@@ -48,6 +49,7 @@ __all__ = [
     "SplatFile",
     "SplatModel",
     "StoreError",
+    "Target",
     "UnsupportedError",
     "__version__",
     "decode",
@@ -108,6 +110,7 @@ _MODULE_OF = {
     "SplatFile": "csplat.splat_file",
     "SplatModel": "csplat.model",
     "StoreError": "csplat.errors",
+    "Target": "csplat.encoder",
     "UnsupportedError": "csplat.errors",
     "decode": "csplat.decoder",
     "decode_integers": "csplat.decoder",

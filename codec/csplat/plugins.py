@@ -4,6 +4,7 @@
 |---|---|
 | `csplat.formats` | a `csplat.formats.format.Format` under the name of each format |
 | `csplat.display` | `html`: a function that converts a `SplatModel` to HTML for notebooks |
+| `csplat.search` | `target`: a function like `encode_with_report` that meets a `Target` by rendering |
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Define types that all layers share: arrays by dtype, and the progress callback."""
+"""Define what all layers share: arrays by dtype, the progress callback, and the largest PSNR."""
 
 from __future__ import annotations
 
@@ -22,6 +22,9 @@ Mask = NDArray[np.bool_]
 
 Progress = Callable[[str, float], None]
 """Progress callback: (name of the stage, fraction done from 0 to 1)."""
+
+PSNR_CAP = 99.0
+"""Largest PSNR, dB, also that of equal images."""
 
 
 def null_progress(stage: str, done: float) -> None:

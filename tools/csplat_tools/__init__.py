@@ -1,8 +1,8 @@
 """Command line, conversion, comparison and reports around the csplat codec.
 
-    >>> import csplat_tools
-    >>> found = csplat_tools.encode_to("scene.ply", psnr=40.0)  # doctest: +SKIP
-    >>> compared = csplat_tools.compare("scene.ply", found.data)  # doctest: +SKIP
+    >>> import csplat, csplat_tools
+    >>> simple = csplat_tools.simplify("scene.ply", csplat.Target(keep=0.5))  # doctest: +SKIP
+    >>> compared = csplat_tools.compare("scene.ply", simple.model)  # doctest: +SKIP
 
 The commands call these functions. A *scene* is a `SplatModel`, or a file of either kind: a path, an open binary file,
 or bytes. Functions that render require the packages of the extra `render`, and raise an error without them. The names
@@ -11,7 +11,7 @@ load their modules when first used.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from csplat import __version__, lazy_exports
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from csplat_tools.inspect.comparison import Comparison, compare
     from csplat_tools.optimise.pruning import Simplified, simplify
     from csplat_tools.optimise.pruning_order import SimplifyOptions
-    from csplat_tools.optimise.search_report import Optimised
-    from csplat_tools.optimise.target_encoding import encode_to
     from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
     from csplat_tools.tradeoffs.sweep_options import SweepOptions
     from csplat_tools.tradeoffs.sweep_run import Tradeoff, tradeoff
@@ -34,7 +32,6 @@ __all__ = [
     "Comparison",
     "DataOptions",
     "LoadedModel",
-    "Optimised",
     "SceneLike",
     "Simplified",
     "SimplifyOptions",
@@ -43,7 +40,6 @@ __all__ = [
     "ViewSet",
     "batch",
     "compare",
-    "encode_to",
     "find_view_set",
     "load_model",
     "simplify",
@@ -58,7 +54,6 @@ _MODULE_OF = {
     "Comparison": "csplat_tools.inspect.comparison",
     "DataOptions": "csplat_tools.views",
     "LoadedModel": "csplat_tools.scene_files",
-    "Optimised": "csplat_tools.optimise.search_report",
     "SceneLike": "csplat_tools.scene_files",
     "Simplified": "csplat_tools.optimise.pruning",
     "SimplifyOptions": "csplat_tools.optimise.pruning_order",
@@ -67,10 +62,24 @@ _MODULE_OF = {
     "SweepOptions": "csplat_tools.tradeoffs.sweep_options",
     "batch": "csplat_tools.batches.batch_run",
     "compare": "csplat_tools.inspect.comparison",
-    "encode_to": "csplat_tools.optimise.target_encoding",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.scene_files",
     "simplify": "csplat_tools.optimise.pruning",
     "tradeoff": "csplat_tools.tradeoffs.sweep_run",
 }
-__getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)
+_export, __dir__ = lazy_exports(__name__, _MODULE_OF)
+
+
+def __getattr__(name: str) -> object:
+    if name == "Optimised":
+        raise AttributeError(
+            "csplat_tools.Optimised has moved: csplat.encode_with_report returns a csplat.EncodeResult"
+        )
+    return _export(name)
+
+
+def encode_to(*_arguments: object, **_named: object) -> NoReturn:
+    """Refuse, naming the successor."""
+    from csplat.errors import InputError
+
+    raise InputError("encode_to has moved: csplat.encode_with_report(model, options, target=csplat.Target(psnr=38))")

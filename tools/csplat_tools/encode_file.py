@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from csplat._spec import MEASURE_NAMES
-from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, encode_with_report
+from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target, encode_with_report
 from csplat.errors import InputError, counted
 from csplat.formats import detect_format, open_scene, read_all
 from csplat.lint import Finding, refuse
@@ -129,47 +129,24 @@ def estimate_cost(local: Path, options: EncodeOptions, limits: OutOfCoreOptions)
 
 
 @dataclass(frozen=True)
-class EncoderOutcome:
-    """The result of an encoder, with the report of the search that chose it, if any.
-
-    Attributes:
-        result: the encoder's result.
-        search_report: the target, the candidates and the choice, JSON-compatible; empty without a search.
-        lines: remarks for the user, a sentence each.
-    """
-
-    result: EncodeResult
-    search_report: Mapping[str, Any] = field(default_factory=dict)
-    lines: tuple[str, ...] = ()
-
-
-EncodeFunction = Callable[[SplatModel, EncodeOptions, Progress | None], EncoderOutcome]
-
-
-@dataclass(frozen=True)
 class EncodedFile:
     """A written file, with its source and reports.
 
     Attributes:
         source: the encoded scene; only its metadata if it was encoded out of core.
         report: choices and errors.
-        outcome: the encoder's outcome; `None` if the scene was encoded out of core.
+        result: the encoder's result; `None` if the scene was encoded out of core.
         findings: lint findings in the source.
         source_bytes: size of the source.
-        seconds: time of reading, encoding and writing.
+        seconds: time of reading, unless the scene had been read, encoding and writing.
     """
 
     source: SplatModel
     report: EncodeReport
-    outcome: EncoderOutcome | None
+    result: EncodeResult | None
     findings: tuple[Finding, ...]
     source_bytes: int
     seconds: float
-
-    @property
-    def search_report(self) -> Mapping[str, Any]:
-        """The report of the target search; empty without a search."""
-        return {} if self.outcome is None else self.outcome.search_report
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
@@ -187,38 +164,39 @@ class EncodedFile:
             "notes": list(report.notes),
             "stated_errors": {name: {"max": pair[0], "rms": pair[1]} for name, pair in report.errors.items()},
             "options": report.options,
-            **({"target": dict(self.search_report)} if self.search_report else {}),
+            **({} if report.search is None else {"target": report.search.as_json()}),
         }
 
 
 def encode_file(
-    source: str,
-    target: str,
+    source: str | LoadedModel,
+    output: str,
     options: EncodeOptions,
     *,
+    target: Target | None = None,
+    views: Any = None,
     overrides: MetadataOverrides | None = None,
     strict: bool = False,
     importance: str | None = None,
     prune_unseen: bool = False,
     source_index: str | None = None,
-    encoder: EncodeFunction | None = None,
     out_of_core: OutOfCoreOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodedFile:
     """Read a scene file, encode it, and write the .csplat file.
 
-    `encoder`, `importance` and `source_index` require the scene in memory, and exclude `out_of_core`.
+    A `target`, `importance` and `source_index` require the scene in memory, and exclude `out_of_core`.
 
     Args:
-        source: a scene in any format, or `-`.
-        target: the file to write, or `-`; it is replaced without a check.
+        source: a scene in any format, or `-`; or one that `read_source` has read.
+        output: the file to write, or `-`; it is replaced without a check.
         options: options of the encoder; `keep_extra` applies to reading, too.
-        overrides: overrides of the scene's metadata.
-        strict: refuse defects that would be repaired.
+        target, views: as for `csplat.encode`.
+        overrides: overrides of the scene's metadata, for reading.
+        strict: refuse defects that would be repaired in reading.
         importance: a .npy file with one weight per splat of the source, or a file of `csplat sensitivity`.
         prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
-        encoder: called instead of the encoder, such as a target search; excludes `importance`.
         out_of_core: memory, disk and workers.
         progress: progress callback.
 
@@ -227,50 +205,48 @@ def encode_file(
         CsplatError: the scene or the options are not valid.
         OSError: a file cannot be read or written.
     """
-    in_memory = encoder is not None or importance is not None or source_index is not None
+    in_memory = target is not None or importance is not None or source_index is not None
     limits = out_of_core or OutOfCoreOptions()
     if prune_unseen and importance is None:
         raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
-    if encoder is not None and importance is not None:
-        raise InputError("an encoder and an importance are given, expected only one of them")
+    if prune_unseen and target is not None:
+        raise InputError("prune_unseen and a target are given, expected only one of them")
     if in_memory and limits != OutOfCoreOptions():
-        raise InputError("an encoder, an importance and a source index exclude options for scenes larger than memory")
+        raise InputError("a target, an importance and a source index exclude options for scenes larger than memory")
     start = time.perf_counter()
-    read: LoadedModel | None = None
-    with source_path(source) as local:
-        if not in_memory and limits.may_exceed_memory(local):
-            if progress is not None:
-                progress("opening", 0.0)
-            with open_scene(local, sh_degree=read_degree(options)) as reader:
-                if _exceeds_memory(reader, options, limits):
-                    encoded = encode_out_of_core(
-                        reader, local, target, options, limits, overrides=overrides, strict=strict, progress=progress
-                    )
-                    return replace(encoded, seconds=time.perf_counter() - start)
-                if reader.format not in CHEAP_TO_REOPEN:
-                    read = _load_opened(reader, local, options, overrides, strict=strict, progress=progress)
-        if read is None:
-            read = read_source(
-                local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
-                progress=progress,
-            )  # fmt: skip
-    model = read.model
-    if encoder is not None:
-        outcome = encoder(model, options, progress)
-    elif importance is not None:
+    read = source if isinstance(source, LoadedModel) else None
+    if not isinstance(source, LoadedModel):
+        with source_path(source) as local:
+            if not in_memory and limits.may_exceed_memory(local):
+                if progress is not None:
+                    progress("opening", 0.0)
+                with open_scene(local, sh_degree=read_degree(options)) as reader:
+                    if _exceeds_memory(reader, options, limits):
+                        encoded = encode_out_of_core(
+                            reader, local, output, options, limits, overrides=overrides, strict=strict,
+                            progress=progress,
+                        )  # fmt: skip
+                        return replace(encoded, seconds=time.perf_counter() - start)
+                    if reader.format not in CHEAP_TO_REOPEN:
+                        read = _load_opened(reader, local, options, overrides, strict=strict, progress=progress)
+            if read is None:
+                read = read_source(
+                    local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
+                    progress=progress,
+                )  # fmt: skip
+    assert read is not None
+    if importance is None:
+        result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
+    else:
         from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
 
-        outcome = EncoderOutcome(
-            encode_by_importance(model, options, importance, prune_unseen=prune_unseen, progress=progress)
+        result = encode_by_importance(
+            read.model, options, importance, target=target, views=views, prune_unseen=prune_unseen, progress=progress
         )
-    else:
-        outcome = EncoderOutcome(encode_with_report(model, options, progress=progress))
-    write_bytes(target, outcome.result.data)
+    write_bytes(output, result.data)
     if source_index is not None:
-        write_array(source_index, outcome.result.source_index)
-    return EncodedFile(
-        model, outcome.result.report, outcome, read.findings, read.size_bytes, time.perf_counter() - start
-    )
+        write_array(source_index, result.source_index)
+    return EncodedFile(read.model, result.report, result, read.findings, read.size_bytes, time.perf_counter() - start)
 
 
 def _exceeds_memory(reader: SceneSource, options: EncodeOptions, limits: OutOfCoreOptions) -> bool:
@@ -370,7 +346,7 @@ def format_encoding(encoded: EncodedFile, psnr: float | None, source: str, outpu
     """Format counts, time, sizes and quality of an encoding as a line.
 
     Args:
-        encoded: the outcome.
+        encoded: the written file.
         psnr: PSNR of small renders, dB; `None`: not measured.
         source, output: names of the files.
     """
@@ -379,11 +355,11 @@ def format_encoding(encoded: EncodedFile, psnr: float | None, source: str, outpu
     ratio = encoded.source_bytes / report.size_bytes
     splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
     sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
-    quality, found = "", encoded.search_report.get("psnr")
+    quality, found = "", None if encoded.result is None else encoded.result.psnr
     if psnr is not None:
         quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
     elif found is not None:
         quality = f", PSNR {found:.2f} dB"
-    elif encoded.outcome is not None and len(encoded.source) and "-" not in (source, output):
+    elif encoded.result is not None and len(encoded.source) and "-" not in (source, output):
         quality = f"; `csplat compare {source} {output}` shows how it looks"
     return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.disk_files import read_array
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, encode_with_report
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, Target, encode_with_report
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
@@ -52,13 +52,15 @@ def encoder_importance(
     return weights
 
 
-def read_encoder_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance:
-    """Read the importance for the encoder from a file, see `read_importance`."""
-    return encoder_importance(read_importance(path, model), model)
-
-
 def encode_by_importance(
-    model: SplatModel, options: EncodeOptions, path: str, *, prune_unseen: bool, progress: Progress | None = None
+    model: SplatModel,
+    options: EncodeOptions,
+    path: str,
+    *,
+    target: Target | None = None,
+    views: Any = None,
+    prune_unseen: bool = False,
+    progress: Progress | None = None,
 ) -> EncodeResult:
     """Encode a scene with the importance of its splats.
 
@@ -66,6 +68,7 @@ def encode_by_importance(
         model: the scene.
         options: options of the encoder.
         path: a file as for `read_importance`.
+        target, views: as for `csplat.encode`; not with `prune_unseen`.
         prune_unseen: prune the splats that no view of the sensitivities saw.
         progress: progress callback.
 
@@ -79,6 +82,8 @@ def encode_by_importance(
     if prune_unseen and stored is None:
         raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
     weights = encoder_importance(found, model)
+    if target is not None:
+        return encode_with_report(model, options, target=target, views=views, importance=weights, progress=progress)
     notes = _class_notes(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
         return _with_notes(encode_with_report(model, options, importance=weights, progress=progress), *notes)

@@ -25,10 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
-from csplat.types import F32, F64
-
-#: dB, maximum PSNR, also for equal images.
-PSNR_CAP = 99.0
+from csplat.types import F32, F64, PSNR_CAP
 
 #: Minimum alpha of a covered pixel.
 COVERED_ALPHA = 0.5

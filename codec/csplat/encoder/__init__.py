@@ -1,19 +1,23 @@
 """Encode scenes to `.csplat` files.
 
-`encode` and `encode_with_report` encode in one call. `EncodePlan` and `encode_tiles` encode in steps, for callers that
-refit colours to the quantised geometry; `fix_quantisation` is for callers that tune all values.
+`encode` and `encode_with_report` encode in one call, with the given options or to a `Target`. `EncodePlan` and
+`encode_tiles` encode in steps, for callers that refit colours to the quantised geometry; `fix_quantisation` is for
+callers that tune all values.
 """
 
 from __future__ import annotations
 
+from csplat.encoder.encode_api import encode, encode_with_report
 from csplat.encoder.encode_options import PRESETS, Deflate, EncodeOptions, MeansCoding, PresetName, ShCoding
 from csplat.encoder.encode_plan import EncodePlan, Origin
+from csplat.encoder.error_targets import meet_bounds
 from csplat.encoder.fixed_quantisation import DecodedValues, FixedQuantisation, FreeValues, fix_quantisation
 from csplat.encoder.kmeans import cluster
-from csplat.encoder.pipeline import EncodedTiles, EncodeReport, EncodeResult, encode, encode_tiles, encode_with_report
+from csplat.encoder.pipeline import EncodedTiles, EncodeReport, EncodeResult, encode_tiles
 from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.quantisation_classes import max_class_count
 from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor
+from csplat.encoder.target import SearchReport, Target
 
 __all__ = [
     "PRESETS",
@@ -31,7 +35,9 @@ __all__ = [
     "MeansCoding",
     "Origin",
     "PresetName",
+    "SearchReport",
     "ShCoding",
+    "Target",
     "apply_weight_floor",
     "canonicalise_shape",
     "cluster",
@@ -40,4 +46,5 @@ __all__ = [
     "encode_with_report",
     "fix_quantisation",
     "max_class_count",
+    "meet_bounds",
 ]

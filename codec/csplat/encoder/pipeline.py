@@ -1,4 +1,4 @@
-"""Encode a model to a file, in one call or in two steps, `encode_tiles` and `EncodedTiles.write`.
+"""Encode a planned scene to a file in two steps, `encode_tiles` and `EncodedTiles.write`.
 
 The second step takes almost no time, so that a file can be written, measured, and written again with its own PSNR.
 """
@@ -6,8 +6,9 @@ The second step takes almost no time, so that a file can be written, measured, a
 from __future__ import annotations
 
 import math
+import os
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -16,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.disk_files import atomic_writer
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import CodingParameters, StepFactors
 from csplat.encoder.container import FileChunk, FileTile, SceneFields, file_pieces, json_payload, tile_payload
-from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.encode_plan import EncodePlan, Origin
 from csplat.encoder.error_bounds import (
     ErrorSums,
@@ -39,7 +40,7 @@ from csplat.encoder.shape_codebook import (
     shape_blocks,
     shape_codebook_chunk,
 )
-from csplat.encoder.splat_importance import Importance
+from csplat.encoder.target import SearchReport
 from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort
 from csplat.errors import InputError, counted
 from csplat.model import UNSPECIFIED, SplatModel
@@ -50,61 +51,6 @@ Integers = NDArray[Any]
 _FEW_TILES, _SMALL_TILE = 16, 256  # more tiles than this, with fewer splats per tile on average, cause a note
 _COLOUR_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))
 _SHAPE_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
-
-
-def encode(
-    model: SplatModel, options: EncodeOptions | None = None, *, progress: Callable[[str, float], None] | None = None
-) -> bytes:
-    """Encode a scene.
-
-    Args:
-        model: the scene.
-        options: default: the preset "balanced".
-        progress: called with the stage and the fraction done, 0 to 1.
-
-    Returns:
-        The bytes of a `.csplat` file. They depend only on the model, the options and the versions of the libraries.
-
-    Examples:
-        >>> import csplat
-        >>> from pathlib import Path
-        >>> data = csplat.encode(csplat.read_ply("scene.ply"), csplat.EncodeOptions(preset="fast"))
-        >>> Path("small.csplat").write_bytes(data) == len(data)
-        True
-
-    Raises:
-        InputError: `model` is not a model, a value fits no lattice, or an option is not allowed for the model.
-    """
-    return encode_with_report(model, options, progress=progress).data
-
-
-def encode_with_report(
-    model: SplatModel,
-    options: EncodeOptions | None = None,
-    *,
-    importance: NDArray[Any] | Importance | None = None,
-    origin: Origin | None = None,
-    metadata: Mapping[str, Any] | None = None,
-    progress: Callable[[str, float], None] | None = None,
-) -> EncodeResult:
-    """Encode a scene, and report choices and errors.
-
-    Args:
-        model, options, importance, origin, progress: see `EncodePlan.of`.
-        metadata: see `EncodedTiles.write`.
-
-    Examples:
-        >>> import csplat
-        >>> result = csplat.encode_with_report(csplat.read_ply("scene.ply"))
-        >>> largest, rms = result.report.errors["opacities"]  # declared by the file
-        >>> 0.0 < rms < largest < 0.1
-        True
-
-    Raises:
-        InputError: as in `EncodePlan.of`.
-    """
-    plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
-    return encode_tiles(plan, progress=progress).write(metadata)
 
 
 @dataclass(frozen=True)
@@ -118,6 +64,7 @@ class EncodeReport:
         tile_count: number of tiles in the file.
         size_bytes: size of the file.
         notes: warnings for the user, one sentence each.
+        search: the search for a target; `None` without one.
     """
 
     options: dict[str, Any]
@@ -126,9 +73,10 @@ class EncodeReport:
     tile_count: int
     size_bytes: int
     notes: tuple[str, ...] = ()
+    search: SearchReport | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)
 class EncodeResult:
     """An encoded scene.
 
@@ -141,6 +89,37 @@ class EncodeResult:
     data: bytes
     source_index: NDArray[np.int64]
     report: EncodeReport
+
+    def __repr__(self) -> str:
+        quality = "" if self.psnr is None else f", {self.psnr:.2f} dB"
+        return f"EncodeResult({self.size_bytes:,} bytes, {self.report.splat_count:,} splats{quality})"
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the file."""
+        return len(self.data)
+
+    @property
+    def psnr(self) -> float | None:
+        """PSNR on the test views of a search against renders of the source, dB; `None` if nothing was rendered."""
+        return None if self.report.search is None else self.report.search.psnr
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file; it appears under its name only when complete.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        with atomic_writer(path) as stream:
+            stream.write(self.data)
+
+    def largest_error(self, measure: str) -> float:
+        """Return the largest error that the file declares for a measure; 0 if the scene has no such attribute."""
+        return self.report.errors.get(measure, (0.0, 0.0))[0]
+
+    def with_search(self, search: SearchReport) -> EncodeResult:
+        """Return the same file with the report of a search."""
+        return replace(self, report=replace(self.report, search=search))
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from csplat.encoder import EncodeOptions
+from csplat.encoder import EncodeOptions, Target
 from csplat.formats import assume_format
 from csplat.model import SplatModel
 from csplat.types import Progress
@@ -19,68 +18,22 @@ from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
-    EncodeFunction,
-    EncoderOutcome,
     OutOfCoreOptions,
     encode_file,
     estimate_cost,
     format_cost,
     format_declared_errors,
     format_encoding,
+    read_degree,
 )
 from csplat_tools.file_streams import check_name, source_path
 from csplat_tools.inspect.comparison import ESTIMATE_SIZE, ESTIMATE_SPLATS_MAX, estimate_psnr
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
-
-if TYPE_CHECKING:
-    from csplat_tools.optimise.targets import Target
+from csplat_tools.scene_files import LoadedModel, read_source
+from csplat_tools.views import ViewSet
 
 #: Parameters that require the whole scene in memory.
 IN_MEMORY = ("target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index")
-
-
-@dataclass(frozen=True)
-class _TargetSearch:
-    """The target of the file, and how it is searched.
-
-    Attributes:
-        psnr, size, max_psnr_drop, keep, max_error: values of the options.
-        no_prune: keep all splats unchanged.
-        effort: amount of work; `None`: the default.
-        views: training, validation and test views.
-        importance: importance of each splat, a file.
-    """
-
-    psnr: float | None
-    size: str | None
-    max_psnr_drop: float | None
-    keep: float | None
-    max_error: str | None
-    no_prune: bool
-    effort: int | None
-    views: shared.ViewOptions
-    importance: str | None
-
-    @property
-    def is_rendered(self) -> bool:
-        """True if meeting the target requires rendering."""
-        return any(value is not None for value in (self.psnr, self.size, self.max_psnr_drop, self.keep))
-
-    def target(self, unit_metres: float | None) -> Target | None:
-        """Return the target; `None` if no option specifies one.
-
-        Args:
-            unit_metres: length of a scene unit in metres, if known.
-
-        Raises:
-            InputError: the target is invalid.
-        """
-        if not self.is_rendered and self.max_error is None:
-            return None
-        from csplat_tools.optimise.targets import Target, parse_max_error  # imports names of the renderer
-
-        bounds = {} if self.max_error is None else parse_max_error(self.max_error, unit_metres)
-        return Target(self.psnr, shared.parse_bytes(self.size), self.max_psnr_drop, self.keep, bounds)
 
 
 def encode(
@@ -164,16 +117,15 @@ def encode(
     shared.require_one({"--no-prune": no_prune}, {**precision, "--max-error": max_error})
     shared.require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
     shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
-    shared.check_range("--effort", effort, 1, 9)
     shared.parse_sh_degree(sh_degree)
     options = shared.checked(
         EncodeOptions, preset=preset, sh_degree=sh_degree, attribute_psnr=attribute_psnr, keep_extra=keep_extra,
         threads=threads,
     )  # fmt: skip
-    psnr = shared.parse_decibels(target_psnr, "--target-psnr")
-    drop = shared.parse_decibels(max_psnr_drop, "--max-psnr-drop")
-    search = _TargetSearch(psnr, target_size, drop, keep, max_error, no_prune, effort, views, importance)
-    shared.checked(search.target, 1.0)  # errors of the target that do not depend on the scene
+    target = shared.parse_target(
+        psnr=target_psnr, size=target_size, max_psnr_drop=max_psnr_drop, keep=keep, max_error=max_error,
+        prune=not no_prune, effort=effort,
+    )  # fmt: skip
     overrides = shared.parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased or None, licence=licence)
     limits = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, cluster=dask)
     with out.bar() as progress, assume_format(read_as):
@@ -182,13 +134,21 @@ def encode(
             return
         out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
         check_name(output, ".csplat", "encode", source)
-        if search.is_rendered:
-            require_renderer()
-        has_target = search.is_rendered or max_error is not None
-        encoder: EncodeFunction | None = partial(_encode_to_target, search, out) if has_target else None
+        scene: str | LoadedModel = source
+        around = None
+        if target is not None:
+            if target.is_rendered:
+                require_renderer()
+            scene = read_source(
+                source, overrides, keep_extra=keep_extra, sh_degree=read_degree(options), progress=progress
+            )
+            if max_error is not None:
+                target = replace(target, max_error=shared.parse_max_error(max_error, scene.model.unit_metres))
+            if target.is_rendered:
+                around = _find_views(scene.model, options, target, views, out)
         encoded = encode_file(
-            source, output, options, overrides=overrides, importance=None if has_target else importance,
-            source_index=source_index, encoder=encoder, out_of_core=limits, progress=progress,
+            scene, output, options, target=target, views=around, overrides=overrides, importance=importance,
+            source_index=source_index, out_of_core=limits, progress=progress,
         )  # fmt: skip
         _publish(encoded, source, output, threads, out, up=up, progress=progress)
 
@@ -207,13 +167,16 @@ def _publish(
     out.print_findings(encoded.findings)
     for line in encoded.report.notes:
         note(line)
-    out.remark(*(() if encoded.outcome is None else encoded.outcome.lines))
+    if encoded.report.search is not None:
+        from csplat_tools.optimise.search_report import format_search
+
+        out.remark(*format_search(encoded.report.search))
     out.remark(*format_declared_errors(encoded.report.errors))
     if progress is not None:
         progress("eight small renders", 0.0)
     psnr = None if out.quiet else _psnr(encoded, threads)
     about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
-    if not out.quiet and encoded.outcome is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
+    if not out.quiet and encoded.result is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
         shared.take_estimated_up(estimate_up(encoded.source), out, given=up, shown=False)
     out.remark(format_encoding(encoded, psnr, source, output))
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
@@ -226,43 +189,26 @@ def _publish_estimate(source: str, options: EncodeOptions, limits: OutOfCoreOpti
     out.publish(found.as_json(), format_cost(found))
 
 
-def _encode_to_target(
-    search: _TargetSearch, out: Output, model: SplatModel, encoding: EncodeOptions, progress: Progress | None
-) -> EncoderOutcome:
-    """Encode a scene to the target; called by `encode_file` with the last three arguments."""
-    import csplat_tools
-    from csplat_tools.importance_file import read_encoder_importance
+def _find_views(
+    model: SplatModel, options: EncodeOptions, target: Target, views: shared.ViewOptions, out: Output
+) -> ViewSet:
+    """Compile the renderer, find the views of a scene, and announce how long the search will take."""
+    prepare_renderer(quiet=out.quiet, simplify=True)
+    from csplat_tools.optimise.target_encoding import expected_search_seconds
 
-    target, around, simplifying = search.target(model.unit_metres), None, None
-    assert target is not None
-    weights = None if search.importance is None else read_encoder_importance(search.importance, model)
-    if target.is_rendered:
-        prepare_renderer(quiet=out.quiet, simplify=True)
-        from csplat_tools.optimise.pruning_order import SimplifyOptions
-        from csplat_tools.optimise.target_search import expected_seconds
-
-        simplifying = SimplifyOptions() if search.effort is None else SimplifyOptions(effort=search.effort)
-        around = search.views.find(model, out)
-        if len(model) and around.test:
-            may_prune = not search.no_prune and search.keep is None
-            out.announce_time(
-                partial(
-                    expected_seconds, model, encoding, target, around, no_prune=search.no_prune,
-                    simplifying=simplifying,
-                ),
-                "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
-            )  # fmt: skip
-    made = csplat_tools.encode_to(
-        model, psnr=target.psnr, size=target.size_bytes, max_psnr_drop=target.max_psnr_drop, keep=target.keep,
-        errors=target.max_error, views=around, options=encoding, no_prune=search.no_prune, importance=weights,
-        simplifying=simplifying, progress=progress,
-    )  # fmt: skip
-    return EncoderOutcome(made.result, made.report.as_json(), made.report.lines())
+    found = views.find(model, out)
+    if len(model) and found.test:
+        may_prune = target.prune and target.keep is None
+        out.announce_time(
+            lambda: expected_search_seconds(model, options, target, found),
+            "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
+        )
+    return found
 
 
 def _psnr(encoded: EncodedFile, threads: int | None) -> float | None:
     """Return an approximate PSNR in dB; `None` if it is known already, or if measuring it would take long."""
-    outcome = encoded.outcome
-    if outcome is None or outcome.search_report.get("psnr") is not None or find_spec("numba") is None:
+    result = encoded.result
+    if result is None or result.psnr is not None or find_spec("numba") is None:
         return None
-    return estimate_psnr(encoded.source, outcome.result.data, threads=threads)
+    return estimate_psnr(encoded.source, result.data, threads=threads)

@@ -57,17 +57,16 @@ def finetune(
       csplat finetune scene.ply scene.csplat --self
     """
     out = Output(force, report, as_json, quiet)
-    views, psnr = shared.ViewOptions(cameras, data, background), shared.parse_decibels(target_psnr, "--target-psnr")
+    views = shared.ViewOptions(cameras, data, background)
     if data is None and not itself:
         raise typer.BadParameter("expected --data or --self")
     shared.refuse_together({"--data": data, "--self": itself})
     by_psnr = {"--target-psnr": target_psnr}
-    shared.refuse_together(by_psnr, {"--target-size": target_size})
-    shared.refuse_together(by_psnr, {"--keep": keep, "--checkpoint": checkpoint, "--resume": resume})
+    shared.refuse_together({**by_psnr, "--target-size": target_size, "--keep": keep})
+    shared.refuse_together(by_psnr, {"--checkpoint": checkpoint, "--resume": resume})
     shared.refuse_together({"--lambda": byte_cost}, {"--target-size": target_size, **by_psnr})
     shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
-    shared.parse_fraction(keep)
-    size_bytes = shared.checked(shared.parse_bytes, target_size)
+    target = shared.parse_target(psnr=target_psnr, size=target_size, keep=keep)
     require_trainer(plots=page is not None)
     from csplat_tools.training import tuning_run as tuning
     from csplat_tools.training.tuning_report import format_tuning_report
@@ -96,7 +95,7 @@ def finetune(
         around.read_images()
         result = tuning.run_finetuning(
             read.model, around, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
-            keep=keep, source_index=source_index, size_bytes=size_bytes, psnr=psnr, page=page, quiet=out.quiet,
+            target=target, source_index=source_index, page=page, quiet=out.quiet,
         )  # fmt: skip
     out.remark(format_tuning_report(result))
     out.publish(result)

@@ -17,13 +17,13 @@ from typing import Annotated, Any, TypeVar
 import typer
 
 from csplat.editing.up_axis import Direction, unit_up
-from csplat.encoder import PresetName
+from csplat.encoder import PresetName, Target
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel, check_axes
 from csplat_render import Mode
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import Output
-from csplat_tools.console import parse_size_bytes, print_data
+from csplat_tools.console import NUMBER, parse_size_bytes, print_data
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
@@ -31,6 +31,7 @@ T = TypeVar("T")
 N = TypeVar("N", int, float, int | None, float | None)
 
 CHECKPOINT_EVERY = 1_000  # steps from one checkpoint to the next
+_LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}  # metres
 _NAMED_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -367,13 +368,6 @@ def check_range(option: str, value: N, low: float, high: float) -> N:
     return value
 
 
-def parse_fraction(keep: float | None) -> float | None:
-    """Check the fraction of splats to keep: above 0, at most 1."""
-    if keep is not None and not 0.0 < keep <= 1.0:
-        raise typer.BadParameter(f"--keep is {keep:g}, expected a fraction above 0, at most 1")
-    return keep
-
-
 def is_same_file(a: str | None, b: str | None) -> bool:
     """Return True if two paths are given and lead to the same place."""
     return a is not None and b is not None and Path(a).resolve() == Path(b).resolve()
@@ -393,3 +387,66 @@ def parse_decibels(text: str | None, option: str) -> float | None:
     if not math.isfinite(value):
         raise typer.BadParameter(f"{option} is {text!r}, expected a finite number of decibels")
     return value
+
+
+def parse_target(
+    *,
+    psnr: str | None = None,
+    size: str | None = None,
+    max_psnr_drop: str | None = None,
+    keep: float | None = None,
+    max_error: str | None = None,
+    prune: bool = True,
+    effort: int | None = None,
+) -> Target | None:
+    """Return the target of a command; `None` if no option specifies one.
+
+    Lengths with a unit in `max_error` are parsed as if a scene unit were a metre; see `parse_max_error`.
+    """
+    decibels = parse_decibels(psnr, "--target-psnr"), parse_decibels(max_psnr_drop, "--max-psnr-drop")
+    size_bytes = checked(parse_bytes, size)
+    bounds = {} if max_error is None else checked(parse_max_error, max_error, 1.0)
+    if not bounds and all(value is None for value in (*decibels, size_bytes, keep)):
+        return None
+    return checked(
+        Target, decibels[0], size_bytes, decibels[1], keep, bounds, prune,
+        Target.effort if effort is None else effort,
+    )  # fmt: skip
+
+
+def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
+    """Parse bounds by measure from `means=0.001,opacities=0.01`.
+
+    Args:
+        text: the user's text; lengths may have a unit, such as `means=2mm`, if the scene's unit is known.
+        unit_metres: length of a scene unit in metres; `None` if unknown.
+
+    Raises:
+        InputError: the text is invalid; or a length has a unit, and the scene's unit is unknown.
+    """
+    bounds: dict[str, float] = {}
+    for part in text.split(","):
+        name, _, value = part.partition("=")
+        name = name.strip()
+        found = re.fullmatch(NUMBER + r"\s*([a-zµ]*)", value.strip().lower())
+        if found is None:
+            raise InputError(f"{part.strip()!r} is not an error bound, expected a measure and a number: means=0.001")
+        if name in bounds:
+            raise InputError(f"the largest error of {name} is given twice")
+        bounds[name] = float(found[1]) * _factor(part.strip(), name, found[2], unit_metres)
+    return bounds
+
+
+def _factor(part: str, name: str, unit: str, unit_metres: float | None) -> float:
+    """Return the factor that converts a number with a unit to scene units."""
+    if not unit:
+        return 1.0
+    if name != "means" or unit not in _LENGTHS:
+        expected = f"one of {', '.join(_LENGTHS)}" if name == "means" else "no unit, since it is not a length"
+        raise InputError(f"{part!r} has the unit {unit!r}, expected {expected}")
+    if unit_metres is None:
+        raise InputError(
+            f"{part!r} has a unit, and the length of a scene unit is unknown: use scene units (means=0.001), or set"
+            " --unit-metres"
+        )
+    return _LENGTHS[unit] / unit_metres

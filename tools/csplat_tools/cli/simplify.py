@@ -50,22 +50,16 @@ def simplify(
     views, overrides = shared.ViewOptions(cameras, data), shared.parse_overrides(up)
     shared.refuse_together({"--keep": keep, "--target-psnr": target_psnr, "--max-psnr-drop": max_psnr_drop})
     shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
-    shared.check_range("--effort", effort, 1, 9)
-    if keep is None and target_psnr is None and max_psnr_drop is None:
+    target = shared.parse_target(psnr=target_psnr, max_psnr_drop=max_psnr_drop, keep=keep, effort=effort)
+    if target is None:
         raise typer.BadParameter("expected --keep, --target-psnr or --max-psnr-drop")
     require_renderer()
     import csplat_tools
     from csplat_tools.optimise.pruning_order import SimplifyOptions
-    from csplat_tools.optimise.targets import Target
     from csplat_tools.views import shrink_cameras
     from csplat_tools.views.view_sets import total_render_seconds
 
-    psnr, drop = (
-        shared.parse_decibels(target_psnr, "--target-psnr"),
-        shared.parse_decibels(max_psnr_drop, "--max-psnr-drop"),
-    )
-    shared.checked(Target, psnr=psnr, max_psnr_drop=drop, keep=keep)  # before anything is read
-    options = SimplifyOptions() if effort is None else SimplifyOptions(effort=effort)
+    options = SimplifyOptions(effort=target.effort)
     out.check(output, inputs=(source, *views.inputs))
     check_name(output, ".ply", "simplify", source)
     with out.bar() as progress:
@@ -80,9 +74,7 @@ def simplify(
             lambda: passes * total_render_seconds(model, shrink_cameras(around.training, size)),
             "--effort 1 takes less",
         )
-        result = csplat_tools.simplify(
-            model, keep=keep, psnr=psnr, max_psnr_drop=drop, views=around, options=options, progress=progress
-        )
+        result = csplat_tools.simplify(model, target, views=around, options=options, progress=progress)
     write_model(output, result.model, absolute=False)
     out.remark(*result.notes, *format_simplification(result.report))
     out.publish(result.report)

@@ -17,7 +17,6 @@ from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
 _DEFAULT = TrainOptions()
 _BACKGROUNDS = ", ".join(BACKGROUNDS)
-_KEEP = 0.8  # default fraction of the trained splats that OUT.csplat keeps: some of them are hardly seen
 
 
 def train(
@@ -81,34 +80,33 @@ def train(
       csplat train lego small.csplat --resume run.npz --target-size 400KB
     """
     out = Output(force, report, as_json, quiet)
-    to_file, psnr = Path(output).suffix == ".csplat", shared.parse_decibels(target_psnr, "--target-psnr")
+    to_file = Path(output).suffix == ".csplat"
     targets = {"--keep": keep, "--target-size": target_size, "--target-psnr": target_psnr}
     shared.refuse_together(targets)
     for name, value in {"--preset": preset, **targets}.items():
         if value is not None and not to_file:
             raise typer.BadParameter(f"{name} is for files, expected OUT.csplat")
-    shared.parse_fraction(keep)
-    size_bytes, overrides = shared.checked(shared.parse_bytes, target_size), shared.parse_overrides(up)
+    target, overrides = shared.parse_target(psnr=target_psnr, size=target_size, keep=keep), shared.parse_overrides(up)
     data = DataOptions(source, None if size is None else shared.parse_size(size), test_every=test_every)
     require_trainer(plots=page is not None)
-    from csplat_tools.training.training_run import run_training, run_training_to_file, tuning_after, tuning_checkpoint
+    from csplat_tools.training.training_run import (
+        plan_training,
+        run_training,
+        run_training_to_file,
+        tuning_after,
+        tuning_checkpoint,
+    )
     from csplat_tools.training.tuning_report import format_tuning_report
-    from csplat_tools.training.tuning_run import SHAPE_ENTRIES, SPLAT_BYTES
-    from csplat_trainer.training_checkpoint import load_checkpoint
+    from csplat_tools.training.tuning_run import SHAPE_ENTRIES
 
-    share = 1.0 if not to_file or psnr is not None else _KEEP if keep is None else keep
-    if (size_bytes is not None or psnr is not None) and max_splats is None and resume is not None:
-        max_splats = load_checkpoint(resume).options.get("max_splats")
-    if size_bytes is not None:
-        left = max(1, size_bytes // SPLAT_BYTES)
-        max_splats = max_splats or round(left / _KEEP)
-        share = min(1.0, left / max_splats)
     options = shared.checked(
-        TrainOptions, max_splats=max_splats or TrainOptions.max_splats, sh_degree=sh_degree, iterations=iterations,
-        seed=seed, device=device, background=background, antialiased=antialiased, final_share=share,
+        TrainOptions, max_splats=TrainOptions.max_splats if max_splats is None else max_splats, sh_degree=sh_degree,
+        iterations=iterations, seed=seed, device=device, background=background, antialiased=antialiased,
     )  # fmt: skip
+    if to_file:
+        options = plan_training(options, target, max_splats=max_splats, resume=resume)
     replaces = shared.is_same_file(checkpoint, resume)
-    tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and psnr is None else None
+    tuned = str(tuning_checkpoint(checkpoint)) if to_file and checkpoint is not None and target_psnr is None else None
     written = {} if replaces else {"--checkpoint": checkpoint, "the checkpoint of the tuning": tuned}
     out.check(output, inputs=(source, resume), named={"--page": page, **written})
     if not to_file:
@@ -119,7 +117,7 @@ def train(
         return
     encoding = EncodeOptions(preset or "small", seed=seed, shape_codebook_size=SHAPE_ENTRIES)
     result = run_training_to_file(
-        data, output, options, files, encoding, tuning_after(training=options), size_bytes=size_bytes, psnr=psnr,
+        data, output, options, files, encoding, tuning_after(training=options), target=target,
         overrides=overrides, page=page, quiet=out.quiet,
     )  # fmt: skip
     out.remark(format_tuning_report(result["file"]))

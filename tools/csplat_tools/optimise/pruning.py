@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder import Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, I64, Progress
+from csplat.types import F32, I64, PSNR_CAP, Progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
-from csplat_render.metrics import PSNR_CAP
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scorer import Scorer, renderer
 from csplat_tools.optimise.pruning_order import (
@@ -27,7 +27,6 @@ from csplat_tools.optimise.pruning_order import (
     total_error,
 )
 from csplat_tools.optimise.splat_refit import RefitResult, refit_with_bands
-from csplat_tools.optimise.targets import Target
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import ViewSet, camera_sequence, find_view_set
@@ -171,26 +170,22 @@ def _render_all(source: SplatModel, cameras: Sequence[Camera], options: Simplify
 
 def simplify(
     scene: SceneLike,
+    target: Target,
     *,
-    keep: float | None = None,
-    psnr: float | None = None,
-    max_psnr_drop: float | None = None,
     views: ViewSet | None = None,
     options: SimplifyOptions | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> Simplified:
     """Prune splats to a target, refit the others, and drop SH bands, as `csplat simplify` does.
 
-    Give one of `keep`, `psnr` and `max_psnr_drop`. Requires the packages of the render extra.
+    Requires the packages of the render extra.
 
     Args:
         scene: a model, or a file in any format.
-        keep: fraction of the splats to keep, above 0, at most 1.
-        psnr: least PSNR against the source's renders on the validation views, dB; the fewest splats are kept.
-        max_psnr_drop: largest drop of the PSNR on the validation images of `views`, dB.
+        target: a fraction to keep, a PSNR, or a drop of PSNR; the fewest splats that meet it are kept.
         views: the kept splats are fitted to training views; validation views determine how many may be pruned. `None`:
             virtual views.
-        options: options of the simplification.
+        options: number of views and rounds, instead of the target's effort.
         progress: progress callback.
 
     Returns:
@@ -198,21 +193,21 @@ def simplify(
         reaches it, that is the unchanged source, with a remark in `notes`.
 
     Examples:
-        >>> import csplat_tools
-        >>> half = csplat_tools.simplify("scene.ply", keep=0.5)  # doctest: +SKIP
+        >>> import csplat, csplat_tools
+        >>> half = csplat_tools.simplify("scene.ply", csplat.Target(keep=0.5))  # doctest: +SKIP
         >>> len(half.model), half.report["psnr"]  # doctest: +SKIP
         (4464, 39.6)
 
     Raises:
-        InputError: the scene has no splats, training or validation views are missing, or even the source misses the
-            target.
+        InputError: the target is of another kind, the scene has no splats, training or validation views are missing,
+            or even the source misses the target.
         CsplatError: the scene is not valid.
         OSError: the file cannot be read.
     """
     require_renderer()
-    target = Target(psnr=psnr, max_psnr_drop=max_psnr_drop, keep=keep)
+    target.require("simplify", "keep", "psnr", "max_psnr_drop")
     source = load_model(scene).model
-    options = options or SimplifyOptions()
+    options = options or SimplifyOptions(effort=target.effort)
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
     if target.max_psnr_drop is not None and (views is None or not views.images):

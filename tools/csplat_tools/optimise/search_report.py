@@ -1,138 +1,64 @@
-"""The report of a search for a target, and its result."""
+"""Make the report of a search for a target, and format it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from csplat.encoder import EncodeResult
+from csplat.encoder import SearchReport, Target
 from csplat.errors import counted
 from csplat.types import F64
 from csplat_render.metrics import psnr_of_mse
 from csplat_tools.console import format_bytes
 from csplat_tools.optimise.candidates import Candidate, CandidatePool
-from csplat_tools.optimise.targets import Target
 from csplat_tools.views import describe_views
 
 _FAR = 0.3  # dB; a PSNR that exceeds the target by more is explained
 _LESS = 1.0  # dB; a PSNR on other views that is lower by more is pointed out
 
 
-@dataclass(frozen=True)
-class SearchReport:
-    """The report of a search.
-
-    Attributes:
-        goal: the target, by name.
-        size_bytes, splats: size of the file and its number of splats.
-        splats_before: number of splats of the scene.
-        encodes: number of files that were made.
-        seconds: time of the whole search.
-        reached: largest errors of the file by measure, for bounded measures.
-        psnr: PSNR of the file against the source, dB; `None`, like the following fields, if nothing was rendered.
-        photographs: PSNR of `file` and `source` against the test images, if any.
-        worst_psnr: PSNR of the worst view, dB.
-        spread: standard deviation of the PSNR over other choices of such views, dB.
-        elsewhere: PSNR on virtual views that were not used in the search, dB, by kind (`extra_test_cameras`).
-        views: number of test views.
-        views_of: source of the views: `virtual`, or a name.
-        renders: number of scored renders.
-        removal_views, sensitivity_views: number of small renders for measuring pruning errors, and sensitivities.
-        chosen, tried: the chosen file and all candidates, see `Candidate.as_json`.
-        why, sure: explanations of the choice, and of the accuracy of the PSNR.
-    """
-
-    goal: dict[str, Any]
-    size_bytes: int
-    splats: int
-    splats_before: int
-    encodes: int
-    seconds: float
-    reached: dict[str, float] = field(default_factory=dict)
-    psnr: float | None = None
-    photographs: dict[str, float] = field(default_factory=dict)
-    worst_psnr: float | None = None
-    spread: float | None = None
-    elsewhere: dict[str, float] = field(default_factory=dict)
-    views: int = 0
-    views_of: str = ""
-    renders: int = 0
-    removal_views: int = 0
-    sensitivity_views: int = 0
-    chosen: dict[str, Any] = field(default_factory=dict)
-    tried: tuple[dict[str, Any], ...] = ()
-    why: tuple[str, ...] = ()
-    sure: str = ""
-
-    def as_json(self) -> dict[str, Any]:
-        """Return everything as JSON-compatible values."""
-        return asdict(self)
-
-    def lines(self) -> tuple[str, ...]:
-        """Return the report for users, a sentence each."""
-        goal = self.goal
-        asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
-        if "size_bytes" in goal:
-            percentage = 100.0 * self.size_bytes / goal["size_bytes"]
-            asked.append(f"{format_bytes(goal['size_bytes'])}; the file uses {percentage:.1f} %")
-        if "psnr" in goal:
-            asked.append(f"{goal['psnr']:g} dB; the file has {self.psnr:.2f} dB")
-        if "keep" in goal:
-            asked.append(f"{100.0 * goal['keep']:g} % of {counted(self.splats_before, 'splat')}")
-        if "max_psnr_drop" in goal:
-            asked.append(f"a drop of {goal['max_psnr_drop']:g} dB on the validation images")
-        lines = [f"target: {'; '.join(asked)}"]
-        if self.photographs:
-            file, source = self.photographs["file"], self.photographs["source"]
-            lines.append(f"test images: {file:.2f} dB, the source {source:.2f} dB")
-        lines += [f"chosen: {line}" for line in self.why]
-        if self.psnr is not None:
-            lines.append(f"PSNR {self.psnr:.2f} dB, {self.sure}")
-            lines += self._elsewhere(self.psnr)
-        cost = f"{counted(self.encodes, 'file')} tried"
-        if self.renders:
-            cost += f", {counted(self.renders, 'render')} scored"
-        if self.sensitivity_views:
-            cost += f", sensitivity measured in {counted(self.sensitivity_views, 'render')}"
-        if self.removal_views:
-            cost += f", pruning error measured in {counted(self.removal_views, 'small render')}"
-        return (*lines, cost)
-
-    def _elsewhere(self, psnr: float) -> list[str]:
-        if not self.elsewhere:
-            return []
-        kinds = {"beside": "at other positions"}
-        scores = ", ".join(f"{found:.2f} {kinds.get(kind, kind)}" for kind, found in self.elsewhere.items())
-        less = psnr - min(self.elsewhere.values())
-        worse = f": up to {less:.1f} dB less than on the test views" if less > _LESS else ""
-        return [f"PSNR on virtual views that were not used in the search: {scores}{worse}"]
+def format_search(report: SearchReport) -> tuple[str, ...]:
+    """Format the report of a search for users, a sentence each."""
+    goal = report.goal
+    asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
+    if "size_bytes" in goal:
+        percentage = 100.0 * report.size_bytes / goal["size_bytes"]
+        asked.append(f"{format_bytes(goal['size_bytes'])}; the file uses {percentage:.1f} %")
+    if "psnr" in goal:
+        asked.append(f"{goal['psnr']:g} dB; the file has {report.psnr:.2f} dB")
+    if "keep" in goal:
+        asked.append(f"{100.0 * goal['keep']:g} % of {counted(report.splats_before, 'splat')}")
+    if "max_psnr_drop" in goal:
+        asked.append(f"a drop of {goal['max_psnr_drop']:g} dB on the validation images")
+    lines = [f"target: {'; '.join(asked)}"]
+    if report.photographs:
+        file, source = report.photographs["file"], report.photographs["source"]
+        lines.append(f"test images: {file:.2f} dB, the source {source:.2f} dB")
+    lines += [f"chosen: {line}" for line in report.why]
+    if report.psnr is not None:
+        lines.append(f"PSNR {report.psnr:.2f} dB, {report.sure}")
+        lines += _format_elsewhere(report.psnr, report.elsewhere)
+    cost = f"{counted(report.encodes, 'file')} tried"
+    if report.renders:
+        cost += f", {counted(report.renders, 'render')} scored"
+    if report.sensitivity_views:
+        cost += f", sensitivity measured in {counted(report.sensitivity_views, 'render')}"
+    if report.removal_views:
+        cost += f", pruning error measured in {counted(report.removal_views, 'small render')}"
+    return (*lines, cost)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Optimised:
-    """A file that meets a target.
-
-    Attributes:
-        result: the encoder's result; its source index refers to the source.
-        report: the report of the search.
-    """
-
-    result: EncodeResult
-    report: SearchReport
-
-    def __repr__(self) -> str:
-        encoded, psnr = self.result.report, self.report.psnr
-        quality = "" if psnr is None else f", {psnr:.2f} dB"
-        return f"Optimised({encoded.size_bytes:,} bytes, {encoded.splat_count:,} splats{quality})"
-
-    @property
-    def data(self) -> bytes:
-        """The bytes of the file."""
-        return self.result.data
+def _format_elsewhere(psnr: float, elsewhere: Mapping[str, float]) -> list[str]:
+    if not elsewhere:
+        return []
+    kinds = {"beside": "at other positions"}
+    scores = ", ".join(f"{found:.2f} {kinds.get(kind, kind)}" for kind, found in elsewhere.items())
+    less = psnr - min(elsewhere.values())
+    worse = f": up to {less:.1f} dB less than on the test views" if less > _LESS else ""
+    return [f"PSNR on virtual views that were not used in the search: {scores}{worse}"]
 
 
 def make_report(

@@ -15,11 +15,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from csplat.decoder import decode
-from csplat.encoder import PRESETS, EncodeOptions
+from csplat.encoder import PRESETS, EncodeOptions, SearchReport, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import Progress
-from csplat_render.metrics import PSNR_CAP, psnr_of_mse
+from csplat.types import PSNR_CAP, Progress
+from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, CodingChoice, Weights, WholeScene
@@ -27,10 +27,9 @@ from csplat_tools.optimise.precision_search import REFIT_GAIN, PrecisionSearch, 
 from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import BYTES_PER_DB, error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import complete_importance
-from csplat_tools.optimise.search_report import SearchReport, make_report
+from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.sh_codings import CodingSearch
 from csplat_tools.optimise.subsets import Pruner
-from csplat_tools.optimise.targets import Target
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import render_seconds
 

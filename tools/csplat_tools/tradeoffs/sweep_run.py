@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import PurePath
 from typing import Any
 
-from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, encode_with_report
+from csplat.encoder import PRESETS, EncodeOptions, EncodeResult, Target, encode_with_report
 from csplat.errors import CsplatError, InputError, counted
 from csplat.file_source import File
 from csplat.model import SplatModel
@@ -23,7 +23,6 @@ from csplat_render.kernels import thread_count
 from csplat_render.metrics import Scores
 from csplat_tools.console import format_bytes, format_estimate
 from csplat_tools.file_streams import STANDARD_STREAM
-from csplat_tools.optimise.target_encoding import encode_to
 from csplat_tools.optional_packages import describe_machine, require_renderer
 from csplat_tools.study import Reduction, encode_reduced
 from csplat_tools.tradeoffs.sweep_options import SweepOptions, SweepSetting, read_setting
@@ -276,22 +275,20 @@ def _strategies(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedP
 
 def _targets(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
     for psnr in sweep.psnr:
-        yield _target(setting, sweep, f"target {psnr:g} dB", psnr=psnr)
+        yield _target(setting, sweep, f"target {psnr:g} dB", Target(psnr=psnr))
     for size in sweep.sizes:
-        yield _target(setting, sweep, f"target {format_bytes(size)}", size=size)
+        yield _target(setting, sweep, f"target {format_bytes(size)}", Target(size_bytes=size))
 
 
-def _target(
-    setting: SweepSetting, sweep: SweepOptions, name: str, psnr: float | None = None, size: int | None = None
-) -> PlannedPoint:
-    command = target_command(setting, name, sweep.preset, target_psnr=psnr, target_size=size)
-    return PlannedPoint(name, "targets", command, partial(_reach, setting, sweep, psnr=psnr, size=size))
+def _target(setting: SweepSetting, sweep: SweepOptions, name: str, target: Target) -> PlannedPoint:
+    command = target_command(setting, name, sweep.preset, target_psnr=target.psnr, target_size=target.size_bytes)
+    return PlannedPoint(name, "targets", command, partial(_reach, setting, sweep, target))
 
 
 def _plan_simplified(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
     for keep in sweep.keep:
         command = target_command(setting, f"keep {keep:g}", sweep.preset, keep=keep)
-        yield PlannedPoint(f"keep {keep:g}", "simplify", command, partial(_reach, setting, sweep, keep=keep))
+        yield PlannedPoint(f"keep {keep:g}", "simplify", command, partial(_reach, setting, sweep, Target(keep=keep)))
 
 
 def _plan_tuned(setting: SweepSetting, sweep: SweepOptions) -> Iterator[PlannedPoint]:
@@ -315,10 +312,11 @@ def _reduce(setting: SweepSetting, sweep: SweepOptions, reduction: Reduction, pr
     )  # fmt: skip
 
 
-def _reach(setting: SweepSetting, sweep: SweepOptions, progress: Progress, **target: Any) -> SweepFile:
+def _reach(setting: SweepSetting, sweep: SweepOptions, target: Target, progress: Progress) -> SweepFile:
     options = EncodeOptions(preset=sweep.preset, threads=sweep.threads)
-    found = encode_to(setting.source, views=setting.views, options=options, progress=progress, **target)
-    return _made(found.result, target=found.report.as_json())
+    made = encode_with_report(setting.source, options, target=target, views=setting.views, progress=progress)
+    assert made.report.search is not None
+    return _made(made, target=made.report.search.as_json())
 
 
 def _made(result: EncodeResult, **settings: Any) -> SweepFile:
@@ -331,8 +329,8 @@ def _tune(setting: SweepSetting, sweep: SweepOptions, keep: float | None, progre
     encoding = EncodeOptions(preset=sweep.preset, shape_codebook_size=SHAPE_ENTRIES, threads=sweep.threads)
     options = FinetuneOptions(iterations=sweep.iterations, byte_cost=RATE_WEIGHT[itself])
     tuned = choose_and_finetune(
-        setting.source, _tuning_views(setting), encoding, options.scaled(LEARNING_FACTOR[itself]), keep=keep,
-        progress=progress,
+        setting.source, _tuning_views(setting), encoding, options.scaled(LEARNING_FACTOR[itself]),
+        None if keep is None else Target(keep=keep), progress=progress,
     )  # fmt: skip
     made = tuned.made
     settings = {

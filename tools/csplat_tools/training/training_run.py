@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import csplat_trainer
-from csplat.encoder import EncodeOptions
+from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError, counted
 from csplat.training_record import TrainingRecord
 from csplat_render.kernels import thread_count
@@ -17,7 +17,7 @@ from csplat_tools.file_streams import write_model
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.training.tuning_report import show_views, write_training_page
-from csplat_tools.training.tuning_run import RATE_WEIGHT, default_validation_count, run_finetuning
+from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, default_validation_count, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.losses import PerceptualLoss
@@ -27,6 +27,7 @@ from csplat_trainer.training_report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
+_KEEP = 0.8  # default fraction of the trained splats that a file keeps: some of them are hardly seen
 _BRIEF = 4_000  # training steps up to which the tuning uses full learning rates; later they gain nothing
 
 
@@ -62,11 +63,13 @@ def run_training(
         InputError: a package is missing, or the data set is invalid or does not fit the options.
         OSError: a file cannot be read or written.
     """
-    result = _train(data, options, files, plot=plot, threads=threads, quiet=quiet)
+    _check_inputs(options, files)
+    data_set = _load(data)
+    result = _train(data_set, options, files, plot=plot, threads=threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
-        views = find_view_set(model, data=data, validation_count=0)
+        views = find_view_set(model, data=data_set, validation_count=0)
         write_training_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
     if not quiet:
         record = TrainingRecord.of(result.model.metadata)
@@ -82,8 +85,7 @@ def run_training_to_file(
     encoding: EncodeOptions,
     tuning: FinetuneOptions,
     *,
-    size_bytes: int | None = None,
-    psnr: float | None = None,
+    target: Target | None = None,
     overrides: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
@@ -92,14 +94,14 @@ def run_training_to_file(
     """Read a data set, train, and tune a file to the same images; the trained scene itself is not written.
 
     Args:
-        data, options, overrides, plot, page, quiet: as for `run_training`.
+        data, overrides, plot, page, quiet: as for `run_training`.
+        options: options of the training; `plan_training` derives them from the target.
         output: the `.csplat` file to write, or `-`.
         files: as for `run_training`. Checkpoints of the tuning are next to those of the training
             (`tuning_checkpoint`); a run resumes from them if the training had ended.
         encoding: options of the encoder; its number of threads applies to everything.
         tuning: options of the tuning.
-        size_bytes: largest size of the file.
-        psnr: as for `run_finetuning`.
+        target: as for `run_finetuning`; but a fraction to keep is that of the training, which has pruned to it.
 
     Returns:
         `training`, the log of `run_training`, and `file`, the report of `run_finetuning`.
@@ -109,19 +111,57 @@ def run_training_to_file(
         OSError: a file cannot be read or written.
     """
     tuning_files = _tuning_outputs(files, options)
-    for one in _load(data).val:  # training does not read these; finds damaged ones before it
+    _check_inputs(options, files)
+    data_set = _load(data)
+    for one in data_set.val:  # training does not read these; finds damaged ones before it
         _ = one.pixels, one.mask
-    result = _train(data, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
+    result = _train(data_set, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply(result.model)
-    views = find_view_set(model, data=data, validation_count=default_validation_count(0, cameras=None, data=data))
+    count = default_validation_count(0, cameras=None, data=data_set)
+    views = find_view_set(model, data=data_set, validation_count=count)
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
         known = {"source": {**result.metrics, "lpips": None}}
     report = run_finetuning(
-        model, views, output, encoding, tuning, tuning_files, size_bytes=size_bytes, psnr=psnr, known=known, page=page,
+        model, views, output, encoding, tuning, tuning_files,
+        target=None if target is None or target.keep is not None else target, known=known, page=page,
         training=result.log, quiet=quiet,
     )  # fmt: skip
     return {"training": result.log, "file": report}
+
+
+def plan_training(
+    options: TrainOptions,
+    target: Target | None = None,
+    *,
+    max_splats: int | None = None,
+    resume: str | Path | None = None,
+) -> TrainOptions:
+    """Return the options of a training before a tuning: the number of splats, and the fraction to keep.
+
+    Args:
+        options: the other options.
+        target: the target of the file. A kept fraction is that of the trained splats. A size leaves one splat per
+            `SPLAT_BYTES`. A PSNR leaves all, since the tuning prunes. `None`: 0.8 are kept.
+        max_splats: number of splats to train; `None`: for a size a quarter more than are kept, otherwise the default;
+            for a size or a PSNR that of the checkpoint.
+        resume: the checkpoint that the training resumes from, if any.
+
+    Raises:
+        InputError: the target is of another kind, or the checkpoint is damaged.
+    """
+    if target is not None:
+        target.require("train", "psnr", "size_bytes", "keep")
+        if max_splats is None and resume is not None and target.keep is None:
+            max_splats = load_checkpoint(resume).options.get("max_splats")
+    share = _KEEP
+    if target is not None and target.size_bytes is not None:
+        kept_count = max(1, target.size_bytes // SPLAT_BYTES)
+        max_splats = round(kept_count / _KEEP) if max_splats is None else max_splats
+        share = min(1.0, kept_count / max_splats)
+    elif target is not None:
+        share = 1.0 if target.keep is None else target.keep
+    return replace(options, max_splats=TrainOptions.max_splats if max_splats is None else max_splats, final_share=share)
 
 
 def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> FinetuneOptions:
@@ -161,11 +201,9 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
 
 
 def _train(
-    data: DataOptions, options: TrainOptions, files: Outputs, *, plot: str | None, threads: int | None, quiet: bool
+    data_set: DataSet, options: TrainOptions, files: Outputs, *, plot: str | None, threads: int | None, quiet: bool
 ) -> TrainResult:
-    """Read the data set, train, plot the loss, and print a summary."""
-    _check_inputs(options, files)
-    data_set = _load(data)
+    """Read the images, train, plot the loss, and print a summary."""
     for line in () if quiet else data_set.report:
         note(line)
     data_set.read()  # before kernels are compiled, to find damaged images early
@@ -175,7 +213,7 @@ def _train(
         with step_progress("training", _state, quiet=quiet) as show:
             result = csplat_trainer.train(data_set, options, outputs=files, on_step=show)
     if plot is not None:
-        plot_loss(plot, result.log["losses"], Path(data.path).name)
+        plot_loss(plot, result.log["losses"], Path(data_set.name).name)
     if not quiet:
         note(_summary(result.log, result.metrics))
     return result

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Importance, Origin, encode_tiles
+from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Importance, Origin, Target, encode_tiles
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import I64, Progress
@@ -100,9 +100,7 @@ def run_finetuning(
     options: FinetuneOptions,
     files: Outputs,
     *,
-    size_bytes: int | None = None,
-    psnr: float | None = None,
-    keep: float | None = None,
+    target: Target | None = None,
     prune_unseen: bool | None = None,
     importance: str | None = None,
     source_index: str | None = None,
@@ -121,10 +119,9 @@ def run_finetuning(
         encoding: options of the encoder.
         options: options of the tuning.
         files: checkpoints.
-        size_bytes: as for `choose_and_finetune`.
-        psnr: a target instead of a size: PSNR on the validation views, pooled, dB. Several files are made without
-            checkpoints, and the smallest that reaches the target is written.
-        keep, prune_unseen, importance: as for `choose_splats`.
+        target: as for `choose_and_finetune`; or a PSNR, for which several files are made without checkpoints, and the
+            smallest that reaches it is written.
+        prune_unseen, importance: as for `choose_splats`.
         source_index: a .npy file to write: the index in the scene of each splat of the file.
         lpips: computes LPIPS; `None`: it is not computed.
         known: as for `score_models`.
@@ -140,6 +137,8 @@ def run_finetuning(
         OSError: a file cannot be read or written.
     """
     threads = encoding.threads
+    if target is not None:
+        target.require("finetune", "psnr", "size_bytes", "keep")
     with thread_count(threads):
         prepare_renderer(quiet=quiet, gradients=True)
         with progress_bar(quiet=quiet) as progress, step_progress("tuning", _state, quiet=quiet) as show:
@@ -147,10 +146,10 @@ def run_finetuning(
                 choose_and_finetune, source, views, encoding, options, prune_unseen=prune_unseen, importance=importance,
                 progress=progress, on_step=show,
             )  # fmt: skip
-            if psnr is None:
-                tuned = make(size_bytes=size_bytes, files=files, keep=keep)
+            if target is None or target.psnr is None:
+                tuned = make(target, files=files)
             else:
-                tuned = _tune_to_psnr(psnr, make, quiet=quiet)
+                tuned = _tune_to_psnr(target, make, quiet=quiet)
         made, timer = tuned.made, StageTimer(tuned.seconds)
         write_bytes(output, made.data)
         if source_index is not None:
@@ -196,10 +195,9 @@ def choose_and_finetune(
     views: ViewSet,
     encoding: EncodeOptions,
     options: FinetuneOptions,
+    target: Target | None = None,
     *,
-    size_bytes: int | None = None,
     files: Outputs | None = None,
-    keep: float | None = None,
     prune_unseen: bool | None = None,
     importance: str | None = None,
     progress: Progress | None = None,
@@ -212,26 +210,28 @@ def choose_and_finetune(
         views: the views; the file is tuned to training views.
         encoding: options of the encoder.
         options: options of the tuning.
-        size_bytes: largest size of the file; splats are pruned and lambda is raised until it fits.
+        target: largest size of the file: splats are pruned and lambda is raised until it fits. Or the fraction of the
+            splats to keep. `None`: keep all.
         files: checkpoints.
-        keep, prune_unseen, importance: as for `choose_splats`; with `size_bytes`, `keep` is an upper bound.
+        prune_unseen, importance: as for `choose_splats`.
         progress, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
         InputError: no file is small enough.
         CsplatError: as for `choose_splats` and `csplat_trainer.finetune`.
     """
-    timer = StageTimer()
+    timer, size_bytes = StageTimer(), None if target is None else target.size_bytes
+    effort = Target.effort if target is None else target.effort
 
     def choose(share: float | None) -> TuningSubset:
         return choose_splats(
-            source, views, keep=share, prune_unseen=prune_unseen, importance=importance, threads=encoding.threads,
-            progress=progress,
+            source, views, None if share is None else Target(keep=share, effort=effort), prune_unseen=prune_unseen,
+            importance=importance, threads=encoding.threads, progress=progress,
         )  # fmt: skip
 
     with timer.stage("choosing"):
         tuning_views = training_views(source, views, encoding.threads)
-        chosen = choose(keep)
+        chosen = choose(None if target is None else target.keep)
         if size_bytes is not None:
             chosen, encoding = _fit_to_size(
                 chosen, encoding, size_bytes, lambda count: choose(count / len(source)), progress
@@ -254,19 +254,20 @@ def choose_and_finetune(
             chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
 
 
-def _tune_to_psnr(psnr: float, make: Callable[..., TunedSubset], *, quiet: bool) -> TunedSubset:
+def _tune_to_psnr(target: Target, make: Callable[[Target | None], TunedSubset], *, quiet: bool) -> TunedSubset:
     """Make files until one reaches a PSNR, and return it with the seconds of all."""
     timer = StageTimer()
 
     def made(size_bytes: int | None) -> TunedSubset:
-        found = make(size_bytes=size_bytes)
+        found = make(None if size_bytes is None else Target(size_bytes=size_bytes, effort=target.effort))
         for stage, seconds in found.seconds.items():
             timer.seconds[stage] = round(timer.seconds.get(stage, 0.0) + seconds, 3)
         if not quiet:
             note(f"{format_bytes(found.size_bytes)}: {found.psnr:.2f} dB on the validation views")
         return found
 
-    return replace(smallest_reaching(psnr, made), seconds=timer.seconds)
+    assert target.psnr is not None
+    return replace(smallest_reaching(target.psnr, made), seconds=timer.seconds)
 
 
 def _fit_to_size(
@@ -426,8 +427,8 @@ def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> T
 def choose_splats(
     source: SplatModel,
     views: ViewSet,
+    target: Target | None = None,
     *,
-    keep: float | None = None,
     prune_unseen: bool | None = None,
     importance: str | None = None,
     threads: int | None = None,
@@ -438,7 +439,7 @@ def choose_splats(
     Args:
         source: the scene.
         views: the views; importance is measured in training views.
-        keep: fraction of the splats to keep; `None`: keep all.
+        target: fraction of the splats to keep; `None`: keep all.
         prune_unseen: prune splats that no training or validation view shows; `None`: only if the views have images.
         importance: a file with the importance of the source's splats; `None`: measure it in the training views, as
             `csplat sensitivity` does.
@@ -458,7 +459,7 @@ def choose_splats(
 
     given = _read_importance(importance, source)
     prune = bool(views.images) if prune_unseen is None else prune_unseen
-    found = measure(source) if given is None and keep is None else None
+    found = measure(source) if given is None and target is None else None
     if found is not None and not (prune and len(measuring) < len(all_views)):
         seen = found.seen
     else:
@@ -469,10 +470,16 @@ def choose_splats(
         raise InputError("no view shows any splat: check that the cameras belong to the scene")
     rows = np.flatnonzero(seen) if prune else np.arange(len(source))
     model, pruning = source.select(rows), {"unseen": len(source) - len(rows)}
-    if keep is not None:
+    if target is not None:
         simplify_views = with_validation_views(replace(views, training=measuring, test=()))
-        model, kept = _prune(model, simplify_views, keep * len(source) / len(rows), threads, progress)
-        rows, pruning = rows[kept], {**pruning, "simplified_from": len(rows)}
+        assert target.keep is not None
+        pruning, share = {**pruning, "simplified_from": len(rows)}, target.keep * len(source) / len(rows)
+        if share < 1.0:
+            simplified = simplify(
+                model, replace(target, keep=share), views=simplify_views,
+                options=SimplifyOptions(effort=target.effort, threads=threads), progress=progress,
+            )  # fmt: skip
+            model, rows = simplified.model, rows[simplified.source_index]
     if given is not None:
         return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], pruning)
     if found is not None:
@@ -489,14 +496,3 @@ def _read_importance(importance: str | None, source: SplatModel) -> NDArray[Any]
     if isinstance(given, np.ndarray) and given.shape != (len(source),):
         raise InputError(f"{importance} has shape {given.shape}, expected ({len(source)},)")
     return given
-
-
-def _prune(
-    model: SplatModel, views: ViewSet, keep: float, threads: int | None, progress: Progress | None
-) -> tuple[SplatModel, I64]:
-    """Return a fraction of the splats, refitted, and their indices."""
-    if keep >= 1.0:
-        return model, np.arange(len(model))
-    options = SimplifyOptions(threads=threads)
-    result = simplify(model, keep=keep, views=views, options=options, progress=progress)
-    return result.model, result.source_index

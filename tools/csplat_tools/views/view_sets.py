@@ -37,6 +37,7 @@ from csplat_tools.views import virtual_views
 from csplat_tools.views.virtual_views import HELD_OUT_COUNT, camera_sequence, default_views, evenly_spaced
 
 if TYPE_CHECKING:
+    from csplat_trainer.data import DataSet
     from csplat_trainer.posed_images import PosedImage
 
 Colour = tuple[float, float, float]
@@ -220,7 +221,7 @@ def find_view_set(
     source: SplatModel,
     *,
     cameras: str | None = None,
-    data: DataOptions | None = None,
+    data: DataOptions | DataSet | None = None,
     background: Colour | None = None,
     count: int | None = None,
     size: tuple[int, int] | None = None,
@@ -234,7 +235,7 @@ def find_view_set(
     Args:
         source: the scene.
         cameras: a camera file, see `csplat_render.camera_files.load_cameras`.
-        data: a data set, instead of a camera file.
+        data: a data set, to be opened or opened already, instead of a camera file.
         background: background colour; `None`: that of the scene's training if known, else black.
         count: number of virtual training views, in addition to 16 that pruning holds out; 0: no virtual training or
             validation views. `None`: by the number of splats (`default_views`).
@@ -367,18 +368,16 @@ def _views_of_file(
 
 
 def _views_of_data(
-    source: SplatModel, data: DataOptions, background: Colour | None, validation_count: int | None, split: Split
+    source: SplatModel,
+    data: DataOptions | DataSet,
+    background: Colour | None,
+    validation_count: int | None,
+    split: Split,
 ) -> ViewSet:
-    require_data_sets()
-    from csplat_trainer.data.loader import find_image_folder, load
-
-    folder, images = find_image_folder(data.path)
-    if images is not None:
-        data = replace(data, path=str(folder), images=images)
     record = TrainingRecord.of(source.metadata)
-    options, notes = _complete_options(data, record)
-    every = _HOLD_OUT_EVERY if options.test_every is None else options.test_every
-    found = load(options.path, options.size, images=options.images, test_every=every, near=options.near)
+    name, found, notes = (
+        _open_data_set(data, record) if isinstance(data, DataOptions) else (data.name, data, list[str]())
+    )
     shift = np.subtract(source.origin, found.origin)
     parts = (found.train, found.test, evenly_spaced(found.val, _VALIDATION_MAX))
     train, test, val = (_shift(part, shift) for part in parts)
@@ -394,9 +393,23 @@ def _views_of_data(
     if validation_count or not validation:
         validation, training = _split_validation(training, validation_count)
     return ViewSet(
-        _set_name(data.path), colour, training, validation, [one.camera for one in test], [*train, *val, *test],
+        name, colour, training, validation, [one.camera for one in test], [*train, *val, *test],
         origin=source.origin, notes=(*found.report, *notes, *more), split=split,
     )  # fmt: skip
+
+
+def _open_data_set(data: DataOptions, record: TrainingRecord | None) -> tuple[str, DataSet, list[str]]:
+    """Return the name of a data set, the set, and remarks if the options contradict the scene's metadata."""
+    require_data_sets()
+    from csplat_trainer.data.loader import find_image_folder, load
+
+    folder, images = find_image_folder(data.path)
+    if images is not None:
+        data = replace(data, path=str(folder), images=images)
+    options, notes = _complete_options(data, record)
+    every = _HOLD_OUT_EVERY if options.test_every is None else options.test_every
+    found = load(options.path, options.size, images=options.images, test_every=every, near=options.near)
+    return _set_name(data.path), found, notes
 
 
 def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple[DataOptions, list[str]]:

@@ -19,12 +19,12 @@ import shlex
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions
+from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
@@ -33,8 +33,8 @@ from csplat_bench.protocol import AbsentError, Measure, Setup
 from csplat_bench.suites import Case
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_tools.console import parse_size_bytes
-from csplat_tools.training.training_run import run_training, run_training_to_file, tuning_after
-from csplat_tools.training.tuning_run import SHAPE_ENTRIES, SPLAT_BYTES
+from csplat_tools.training.training_run import plan_training, run_training, run_training_to_file, tuning_after
+from csplat_tools.training.tuning_run import SHAPE_ENTRIES
 from csplat_tools.views import DataOptions
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.posed_images import image_scorer
@@ -153,15 +153,15 @@ def finish_training(
     from csplat_trainer.training_checkpoint import load_checkpoint
 
     known = TrainOptions(**load_checkpoint(checkpoint).options)
-    share = 1.0 if "target_psnr" in settings else settings.get("keep", 0.8)
-    if size_bytes is not None:
-        share = min(1.0, max(1, size_bytes // SPLAT_BYTES) / known.max_splats)
-    options = TrainOptions(**{**vars(known), "final_share": settings.get("final_share", share)})
+    target = None
+    if size_bytes is not None or "target_psnr" in settings or "keep" in settings:
+        target = Target(settings.get("target_psnr"), size_bytes, keep=settings.get("keep"))
+    options = plan_training(known, target, max_splats=known.max_splats)
+    options = replace(options, final_share=settings.get("final_share", options.final_share))
     return run_training_to_file(
         data, output, options, Outputs(resume=checkpoint),
         EncodeOptions(settings.get("preset", "small"), shape_codebook_size=SHAPE_ENTRIES),
-        tuning_after(options, settings.get("lambda")), size_bytes=size_bytes, psnr=settings.get("target_psnr"),
-        quiet=True,
+        tuning_after(options, settings.get("lambda")), target=target, quiet=True,
     )  # fmt: skip
 
 
