@@ -21,7 +21,8 @@ _FASTEST_LEVEL = 1  # DEFLATE level at which samples replace trials
 _SHORT_RUN = 1.5  # mean run length, bytes, from which RUN_LENGTH is tried
 _LONG_RUN = 32  # the same at the fastest level
 _SAMPLE = 4096  # bytes of each of four samples
-_TRIAL_LEVEL = 6  # DEFLATE level of trials, which takes a tenth of the highest level's time and rarely errs
+_TRIAL_LEVEL = 6  # DEFLATE level of trials, which takes a twentieth of the highest level's time and rarely errs
+_CLEAR = 0.95  # ratio of the sizes of trials from which the smaller remains the smaller at the highest level
 _GAIN = 0.98  # maximum relative size with RUN_LENGTH; a smaller gain is not worth the decoding time
 _MOSTLY = 0.9  # fraction of non-zero splats above which a mask is not worth the decoding time
 _SPREAD = (  # shifts and masks that insert two zeros between bits
@@ -50,6 +51,11 @@ class DeflateSettings:
             raise InputError(f"deflate library is {self.library!r}, expected libdeflate or zlib")
         if not 1 <= self.level <= 12:
             raise InputError(f"the level of DEFLATE is {self.level}, expected 1 to 12")
+
+
+def trial_settings(deflate: DeflateSettings) -> DeflateSettings:
+    """Return settings that are fast enough to compare codings, most of which are not used."""
+    return replace(deflate, level=min(deflate.level, _TRIAL_LEVEL))
 
 
 def deflate_library(name: str) -> str:
@@ -104,11 +110,14 @@ def smooth_stream(values: Integers, deflate: DeflateSettings) -> bytes:
         values: [n], n >= 1, integers from 0 to 2**32 - 1.
         deflate: level and library of DEFLATE; at the lowest level, entropies replace trials.
     """
-    if deflate.level > _FASTEST_LEVEL:
-        return min(unsigned_stream(values, deflate), unsigned_stream(values, deflate, signed_delta=True), key=len)
-    low = values.astype(np.uint8)
-    differences = np.diff(low)  # modulo 256; zigzag would not change the entropy
-    return unsigned_stream(values, deflate, signed_delta=_byte_entropy(differences) < _byte_entropy(low))
+    if deflate.level <= _FASTEST_LEVEL:
+        low = values.astype(np.uint8)
+        differences = np.diff(low)  # modulo 256; zigzag would not change the entropy
+        return unsigned_stream(values, deflate, signed_delta=_byte_entropy(differences) < _byte_entropy(low))
+    trial = trial_settings(deflate)
+    sizes = [len(unsigned_stream(values, trial, signed_delta=delta)) for delta in (False, True)]
+    tried = [delta for delta in (False, True) if _CLEAR * sizes[delta] <= sizes[not delta]]
+    return min((unsigned_stream(values, deflate, signed_delta=delta) for delta in tried), key=len)
 
 
 def signed_stream(values: Integers, deflate: DeflateSettings) -> bytes:
@@ -305,7 +314,7 @@ def _run_length(data: NDArray[np.uint8], least: float) -> NDArray[np.uint8] | No
 
 def _is_smaller(runs: NDArray[np.uint8], planes: NDArray[np.uint8], deflate: DeflateSettings) -> bool:
     """Return True if a quick trial compresses the runs to at most `_GAIN` of the planes."""
-    trial = replace(deflate, level=min(deflate.level, _TRIAL_LEVEL))
+    trial = trial_settings(deflate)
     return len(_code(runs, trial)[1]) <= _GAIN * len(_code(planes, trial)[1])
 
 

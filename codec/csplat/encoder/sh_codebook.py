@@ -19,7 +19,7 @@ from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import CodingParameters, band_slice
 from csplat.encoder.container import FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
-from csplat.encoder.entropy import signed_stream
+from csplat.encoder.entropy import signed_stream, trial_settings
 from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric
 from csplat.encoder.quantisation import colour_integers, largest_exact, lattice_values, lift_colour, quantise_sh
 from csplat.encoder.splat_importance import ErrorMetric, splat_weights
@@ -38,6 +38,7 @@ _FULL_SHARE_SPLATS = 1 << 15  # splats; smaller scenes get the number of entries
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
 _ESCAPE_CANDIDATES = 4  # candidates for escape, as a multiple of the number of escapes
 _IMPORTANT = 0.95  # quantile of the weights above which splats are quantised on the full lattice
+_CLEAR = 0.2  # relative difference of rates that no DEFLATE level reverses; rates of trials are up to 13 % too high
 _COARSEST = 6  # log2 of the coarsest multiple of the SH step
 _SLACK = 1.0 + 2.0**-18  # factor that covers the rounding of float32 differences in declared errors
 _CODEBOOK_ID = 0
@@ -372,7 +373,7 @@ def _train(
     weights, threads = error_weights.weights, options.thread_count
     points = _lattice_points(model.shN, parameters)
     size = _codebook_size(len(model), parameters, options)
-    effort = {"near_groups": 8, "iterations": 6, "sample_per_entry": 16} if size >= _GROUPED_ENTRIES_MIN else {}
+    effort = {"near_groups": 8, "iterations": 7, "sample_per_entry": 16} if size >= _GROUPED_ENTRIES_MIN else {}
 
     def report_steps(done: int, steps: int) -> None:
         progress("codebook", done / steps)
@@ -482,16 +483,22 @@ def _codebook_pays(
 
     Scalar coding is tried on a few splats at two steps, between which its rate R is linear in the logarithm of the
     distortion D. The codebook has the distortion D_book; scalar coding would save s · log2(D_book / D) with
-    s = -ΔR / Δlog2 D, which is added to the rate of the codebook.
+    s = -ΔR / Δlog2 D, which is added to the rate of the codebook. Quick DEFLATE decides if the rates differ clearly.
     """
-    fine_rate, fine_distortion = _try_scalar(model, error_weights, trial, parameters)
-    coarser = replace(parameters, sh_step=2 * parameters.sh_step)
-    coarse_rate, coarse_distortion = _try_scalar(model, error_weights, trial, coarser)
-    rate += float((book.index == book.size).mean()) * fine_rate  # escapes
-    if not 0.0 < fine_distortion < coarse_distortion:
-        return rate < fine_rate
-    slope = (fine_rate - coarse_rate) / math.log2(coarse_distortion / fine_distortion)
-    return rate + slope * math.log2(max(distortion, 1e-30) / fine_distortion) < fine_rate
+    share = float((book.index == book.size).mean())  # escapes
+    scalar_rate = codebook_rate = 0.0
+    for deflate in (trial_settings(parameters.deflate), parameters.deflate):
+        fine = replace(parameters, deflate=deflate)
+        scalar_rate, fine_distortion = _try_scalar(model, error_weights, trial, fine)
+        coarser = replace(fine, sh_step=2 * parameters.sh_step)
+        coarse_rate, coarse_distortion = _try_scalar(model, error_weights, trial, coarser)
+        codebook_rate = rate + share * scalar_rate
+        if 0.0 < fine_distortion < coarse_distortion:
+            slope = (scalar_rate - coarse_rate) / math.log2(coarse_distortion / fine_distortion)
+            codebook_rate += slope * math.log2(max(distortion, 1e-30) / fine_distortion)
+        if deflate == parameters.deflate or abs(codebook_rate - scalar_rate) > _CLEAR * scalar_rate:
+            break
+    return codebook_rate < scalar_rate
 
 
 def _try_scalar(
