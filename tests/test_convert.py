@@ -15,10 +15,11 @@ from csplat.editing.transform import convert_axes
 from csplat.encoder import EncodeOptions
 from csplat.formats import spz
 from csplat.model import SplatModel, normalise_quats
+from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import source_from_model
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
-from csplat_tools.encode_file import OutOfCoreOptions, encode_file
+from csplat_tools.encode_file import encode_file
 from csplat_tools.scene_files import open_scenes
 
 

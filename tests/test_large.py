@@ -8,7 +8,6 @@ import resource
 import shutil
 import signal
 from dataclasses import replace
-from functools import partial
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -17,15 +16,14 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat import EncodeOptions, InputError, decode, encode, encode_with_report, read_ply, write_ply
-from csplat.encoder import encode_plan, encode_tiles, tiling
-from csplat.encoder.tiling import BucketCurve, bucket_rows
+from csplat.encoder import buckets, encode_plan, encode_tiles
+from csplat.encoder.buckets import BucketCurve, bucket_rows
 from csplat.formats import open_scene
-from csplat.out_of_core import disk_encode, encode_scene
-from csplat.out_of_core.spill_files import EncodingState
+from csplat.out_of_core import OutOfCoreOptions, disk_encode, encode_scene
 from csplat.scene_source import source_from_model
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
-from csplat_tools.encode_file import OutOfCoreOptions, encode_out_of_core, estimate_cost
+from csplat_tools.encode_file import encode_file, estimate_file_cost, may_exceed_memory
 
 WHOLE = 600  # splats per bucket, in place of half a million
 COUNT = 6 * WHOLE
@@ -35,11 +33,12 @@ FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook"
 @pytest.fixture(autouse=True)
 def small_buckets(monkeypatch):
     """Make scenes of thousands of splats large."""
-    for module in (tiling, encode_plan, disk_encode):
+    for module in (buckets, encode_plan, disk_encode):
         monkeypatch.setattr(module, "BUCKET_SPLATS", WHOLE)
 
 
-encode_large = partial(encode_scene, by_disk=True)
+def encode_large(scene, target, options, *, progress=None, **limits):
+    return encode_scene(scene, target, options, OutOfCoreOptions(always=True, **limits), progress=progress)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +54,7 @@ def model(sample_path):
 def whole(model):
     """The file of the scene, encoded in memory."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tiling, "BUCKET_SPLATS", WHOLE)
+        patch.setattr(buckets, "BUCKET_SPLATS", WHOLE)
         patch.setattr(encode_plan, "BUCKET_SPLATS", WHOLE)
         return encode(model, FAST)
 
@@ -84,7 +83,7 @@ def test_a_file_of_many_buckets_is_valid_with_declared_errors(model, whole):
 def test_the_sample_of_a_plan_has_refitted_colours(model):
     other = encode_plan.EncodePlan.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
     assert other.sample is not None
-    assert np.array_equal(-model.shN[tiling.sample_rows(COUNT)], other.sample.model.shN)
+    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT)], other.sample.model.shN)
     decoded = decode(encode_tiles(other).write().data)
     assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
 
@@ -188,12 +187,12 @@ def test_a_full_disk_is_reported_and_the_encoding_resumed(model, whole, tmp_path
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not target.exists()
-    assert [10_000] == [path.stat().st_size for path in (tmp_path / "out.csplat.work").glob("bucket-*")]
+    assert [10_000] == [path.stat().st_size for path in (tmp_path / "out.csplat.work").glob("section-*")]
     encode_large(source_from_model(model), target, FAST, resume=True)
     assert whole == target.read_bytes()
 
 
-@pytest.mark.parametrize("kind", ["sample", "bucket-000003", "chunks-000001", "tiles-000001", "state.json"])
+@pytest.mark.parametrize("kind", ["sample", "section-000003", "tiles-000001", "state.json"])
 def test_a_damaged_work_file_is_named(model, tmp_path, kind):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
@@ -205,21 +204,6 @@ def test_a_damaged_work_file_is_named(model, tmp_path, kind):
     with pytest.raises(InputError, match=f"{kind} is damaged: remove out.csplat.work"):
         encode_large(source_from_model(model), target, FAST, resume=True)
     assert not target.exists()
-
-
-@pytest.mark.parametrize(
-    "done",
-    [
-        "",
-        ', "curve": {"corner": [0.5, 0.0, -1.0], "scale": 2.0, "bounds": [3, 9]}, "largest": 1.5',
-        ', "curve": {"corner": [0.5], "scale": 2.0, "bounds": [7]}, "largest": 0.0, "counts": [5], "contrast": 0.0',
-    ],
-    ids=["new", "surveyed", "measured"],
-)
-def test_the_state_of_an_encoding_is_written_as_the_json_that_was_read(done):
-    text = f'{{"key": {{"splats": 5}}{done}}}'
-
-    assert text == EncodingState.from_json(text.encode()).to_json().decode()
 
 
 def test_a_folder_with_other_files_is_refused_and_kept(model, tmp_path):
@@ -237,9 +221,8 @@ def test_an_out_of_core_encoding_is_resumed_with_more_memory(model, whole, tmp_p
     with pytest.raises(KeyboardInterrupt):
         encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding", after=2))
     stages = []
-    encode_scene(
-        source_from_model(model), target, FAST, resume=True, progress=lambda stage, _done: stages.append(stage)
-    )
+    resume = OutOfCoreOptions(resume=True)
+    encode_scene(source_from_model(model), target, FAST, resume, progress=lambda stage, _done: stages.append(stage))
     assert "coding" in stages
     assert "sorting" not in stages
     assert whole == target.read_bytes()
@@ -278,7 +261,7 @@ def test_buckets_partition_the_splats_by_place(model):
 def test_a_large_bucket_is_split_into_equal_parts():
     rng = np.random.default_rng(1)
     means = rng.normal(0, 1, (COUNT, 3)).astype(np.float32)
-    means[tiling.sample_rows(COUNT)] += 100.0  # the sampled rows are far from the others
+    means[buckets.sample_rows(COUNT)] += 100.0  # the sampled rows are far from the others
     parts = bucket_rows(means)
     assert np.array_equal(np.arange(COUNT), np.sort(np.concatenate(parts)))
     assert max(map(len, parts)) <= WHOLE
@@ -333,14 +316,12 @@ def ply(model, tmp_path):
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
-    foretold = estimate_cost(ply, options, limits)
-    assert (COUNT, 1, False) == (foretold.count, foretold.sh_degree, foretold.needs.in_memory)
-    assert 0 < foretold.needs.memory_bytes <= 300e6
+    cost = estimate_file_cost(ply, options, limits)
+    assert (COUNT, 1, False) == (cost.splats, cost.sh_degree, cost.in_memory)
+    assert 0 < cost.memory_bytes <= 300e6
     stages = []
-    with open_scene(ply, sh_degree=3) as scene:
-        encoded = encode_out_of_core(
-            scene, ply, str(target), options, limits, progress=lambda stage, _done: stages.append(stage)
-        )
+    note = lambda stage, _done: stages.append(stage)  # noqa: E731
+    encoded = encode_file(str(ply), str(target), options, out_of_core=limits, progress=note)
     assert {"sorting", "coding"} <= set(stages)
     assert encoded.report.size_bytes == target.stat().st_size
     with open_scene(ply) as scene:
@@ -348,31 +329,31 @@ def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
 
 
 def test_the_command_passes_out_of_core_options(ply, tmp_path, monkeypatch):
-    target, asked = tmp_path / "out.csplat", []
+    target, limits = tmp_path / "out.csplat", []
 
-    def encode_here(reader, local, target, options, limits, **others):
-        asked.append(limits)
-        return encode_out_of_core(reader, local, target, options, limits, **others)
+    def encode_here(scene, target, options, asked, **others):
+        limits.append(asked)
+        return encode_scene(scene, target, options, asked, **others)
 
-    monkeypatch.setattr("csplat_tools.encode_file.encode_out_of_core", encode_here)
+    monkeypatch.setattr("csplat_tools.encode_file.encode_scene", encode_here)
     run = CliRunner().invoke
-    foretold = run(app, ["encode", str(ply), str(target), "--memory", "300MB", "--dry-run", "--json"])
-    assert 0 == foretold.exit_code
-    said = json.loads(foretold.stdout)
-    assert (COUNT, 3, True) == (said["splats"], said["sh_degree"], said["in_memory"])
+    dry = run(app, ["encode", str(ply), str(target), "--memory", "300MB", "--dry-run", "--json"])
+    assert 0 == dry.exit_code
+    cost = json.loads(dry.stdout)
+    assert (COUNT, 3, True) == (cost["splats"], cost["sh_degree"], cost["in_memory"])
     assert not target.exists()
     words = ["--memory", "300MB", "--resume", "--preset", "fast", "--quiet"]
     done = run(app, ["encode", str(ply), str(target), *words])
     assert 0 == done.exit_code, done.output
-    assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == asked
+    assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == limits
     refused = run(app, ["encode", str(ply), str(target), "--resume", "--target-psnr", "40", "--force"])
     assert 2 == refused.exit_code
 
 
 def test_only_large_files_may_exceed_the_memory(ply, tmp_path):
-    def may_leave(path, size, **scale):
+    def may_leave(path, size, **limits):
         os.truncate(path, size)  # a sparse file
-        return OutOfCoreOptions(**scale).may_exceed_memory(path)
+        return may_exceed_memory(path, OutOfCoreOptions(**limits))
 
     assert not may_leave(ply, 4 << 20, memory_bytes=1)
     assert may_leave(ply, 5 << 20, memory_bytes=19 << 20)

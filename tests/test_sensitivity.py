@@ -15,6 +15,7 @@ from oracle import adversarial, extreme_splats, facing
 from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats, sh_degree_of
+from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import read_ply, write_ply
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
@@ -26,7 +27,7 @@ from csplat_render.reference_rasteriser import Decisions, render_exact
 from csplat_render.refit import ColourOperator, fit_colours
 from csplat_render.scene_frame import scene_frame
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.encode_file import OutOfCoreOptions, encode_file
+from csplat_tools.encode_file import encode_file
 from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target, encode_with_report
 from csplat.errors import InputError, counted
-from csplat.formats import detect_format, open_scene, read_all
+from csplat.formats import detect_format, open_scene
 from csplat.lint import Finding, refuse
 from csplat.model import MAX_SH_DEGREE, SplatModel
-from csplat.out_of_core import ResourceNeeds, encode_scene, estimate_needs
+from csplat.out_of_core import EncodingCost, OutOfCoreOptions, encode_scene, estimate_cost
 from csplat.ply.column_names import dropped_columns
 from csplat.scene_source import SceneSource
 from csplat.system import default_memory_bytes
@@ -31,40 +32,7 @@ from csplat_tools.scene_files import (
 )
 
 _MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
-#: By SH degree: seconds per million splats for one reading pass and for coding; seconds for a codebook. Within 10 % of
-#: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
-#: 30 M of degree 3.
-_SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0))
-#: Bytes per splat of a file, by preset and SH degree 0 to 3.
-_FILE_BYTES = {"fast": (9.0, 9.5, 10.0, 11.0), "balanced": (6.5, 8.0, 8.5, 9.0), "small": (5.0, 6.5, 7.0, 7.5)}
 _SMALL = 4 << 20  # bytes; smaller files of any format always fit in memory
-
-
-@dataclass(frozen=True)
-class OutOfCoreOptions:
-    """Options for encoding scenes that may be larger than memory.
-
-    Attributes:
-        memory_bytes: limit of the memory; `None`: half of the free memory.
-        folder: working folder; `None`: next to the file.
-        resume: continue from the content of the working folder.
-        cluster: address of a Dask scheduler.
-        always: encode scenes of several buckets out of core, even if they fit in memory.
-    """
-
-    memory_bytes: int | None = None
-    folder: str | None = None
-    resume: bool = False
-    cluster: str | None = None
-    always: bool = False
-
-    def may_exceed_memory(self, path: Path) -> bool:
-        """Return True if a scene may not fit in memory, which can only be decided after opening it."""
-        if self.cluster is not None or self.resume or self.always:
-            return True
-        bound = default_memory_bytes() if self.memory_bytes is None else self.memory_bytes
-        size = size_on_disk(path)
-        return size > _SMALL and (detect_format(path).name != "ply" or size * _MEMORY_FACTOR > bound)
 
 
 def read_degree(options: EncodeOptions) -> int | None:
@@ -76,56 +44,15 @@ def read_degree(options: EncodeOptions) -> int | None:
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
 
-@dataclass(frozen=True)
-class CostEstimate:
-    """The expected cost of an encoding.
-
-    Attributes:
-        count, sh_degree: number of splats and SH degree that will be encoded.
-        needs: memory, disk, workers.
-        seconds: approximate time (`_SECONDS`).
-        file_bytes: approximate size of the file at the preset's precision.
-    """
-
-    count: int
-    sh_degree: int
-    needs: ResourceNeeds
-    seconds: float
-    file_bytes: int
-
-    def as_json(self) -> dict[str, Any]:
-        """Return everything as JSON-compatible values."""
-        return {
-            "splats": self.count,
-            "sh_degree": self.sh_degree,
-            "in_memory": self.needs.in_memory,
-            "workers": self.needs.workers,
-            "memory_bytes": self.needs.memory_bytes,
-            "disk_bytes": self.needs.disk_bytes,
-            "seconds": round(self.seconds, 1),
-            "file_bytes": self.file_bytes,
-        }
-
-
-def estimate_cost(local: Path, options: EncodeOptions, limits: OutOfCoreOptions) -> CostEstimate:
-    """Estimate the cost of encoding a scene, without reading its splats.
+def estimate_file_cost(local: Path, options: EncodeOptions, limits: OutOfCoreOptions) -> EncodingCost:
+    """Estimate the cost of encoding a scene file, without reading its splats.
 
     Raises:
         CsplatError: the scene is not valid, or there is too little memory.
         OSError: the scene cannot be read.
     """
     with open_scene(local, sh_degree=read_degree(options)) as reader:
-        needs = estimate_needs(reader, options, limits.memory_bytes, by_disk=limits.always)
-        count = reader.count
-        degree = (
-            reader.metadata_model.sh_degree
-            if options.sh_degree is None
-            else min(options.sh_degree, reader.metadata_model.sh_degree)
-        )
-    read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
-    passes = 1 if needs.in_memory else 4
-    seconds = count / 1e6 * (read * passes + code / needs.workers) + book * min(1.0, count / 5e5) / needs.workers
-    return CostEstimate(count, degree, needs, seconds, round(count * _FILE_BYTES[options.preset][degree]))
+        return estimate_cost(reader, options, limits)
 
 
 @dataclass(frozen=True)
@@ -214,27 +141,26 @@ def encode_file(
     if in_memory and limits != OutOfCoreOptions():
         raise InputError("a target, an importance and a source index exclude options for scenes larger than memory")
     start = time.perf_counter()
-    read = source if isinstance(source, LoadedModel) else None
-    if not isinstance(source, LoadedModel):
-        with source_path(source) as local:
-            if not in_memory and limits.may_exceed_memory(local):
+    if isinstance(source, LoadedModel):
+        read = source
+    else:
+        with source_path(source) as local, ExitStack() as stack:
+            opened: SceneSource | None = None
+            if not in_memory and may_exceed_memory(local, limits):
                 if progress is not None:
                     progress("opening", 0.0)
-                with open_scene(local, sh_degree=read_degree(options)) as reader:
-                    if _exceeds_memory(reader, options, limits):
-                        encoded = encode_out_of_core(
-                            reader, local, output, options, limits, overrides=overrides, strict=strict,
-                            progress=progress,
-                        )  # fmt: skip
-                        return replace(encoded, seconds=time.perf_counter() - start)
-                    if reader.format not in CHEAP_TO_REOPEN:
-                        read = _load_opened(reader, local, options, overrides, strict=strict, progress=progress)
-            if read is None:
-                read = read_source(
-                    local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
-                    progress=progress,
-                )  # fmt: skip
-    assert read is not None
+                opened = stack.enter_context(open_scene(local, sh_degree=read_degree(options)))
+                if limits.resume or not estimate_cost(opened, options, limits).in_memory:
+                    return _encode_out_of_core(
+                        opened, local, output, options, limits, start, overrides=overrides, strict=strict,
+                        progress=progress,
+                    )  # fmt: skip
+                if opened.format in CHEAP_TO_REOPEN:
+                    opened = None
+            read = read_source(
+                local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
+                opened=opened, progress=progress,
+            )  # fmt: skip
     if importance is None:
         result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
     else:
@@ -249,57 +175,28 @@ def encode_file(
     return EncodedFile(read.model, result.report, result, read.findings, read.size_bytes, time.perf_counter() - start)
 
 
-def _exceeds_memory(reader: SceneSource, options: EncodeOptions, limits: OutOfCoreOptions) -> bool:
-    """Return True if a scene is to be encoded out of core."""
-    if limits.cluster is not None or limits.resume:
+def may_exceed_memory(path: Path, limits: OutOfCoreOptions) -> bool:
+    """Return True if a scene may not fit in memory, which can only be decided after opening it."""
+    if limits.cluster is not None or limits.resume or limits.always:
         return True
-    return not estimate_needs(reader, options, limits.memory_bytes, by_disk=limits.always).in_memory
+    bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
+    size = size_on_disk(path)
+    return size > _SMALL and (detect_format(path).name != "ply" or size * _MEMORY_FACTOR > bound)
 
 
-def _load_opened(
-    reader: SceneSource,
-    local: Path,
-    options: EncodeOptions,
-    overrides: MetadataOverrides | None,
-    *,
-    strict: bool,
-    progress: Progress | None,
-) -> LoadedModel:
-    """Read an opened scene into memory."""
-    findings: list[Finding] = []
-    if progress is not None:
-        progress("reading", 0.0)
-    model = read_all(reader, strict=strict, keep_extra=options.keep_extra, report=findings)
-    model = (overrides or MetadataOverrides()).apply(model)
-    return LoadedModel(model, size_on_disk(local), name=local.name, findings=tuple(findings))
-
-
-def encode_out_of_core(
+def _encode_out_of_core(
     reader: SceneSource,
     local: Path,
     target: str,
     options: EncodeOptions,
     limits: OutOfCoreOptions,
+    start: float,
     *,
-    overrides: MetadataOverrides | None = None,
-    strict: bool = False,
-    progress: Progress | None = None,
+    overrides: MetadataOverrides | None,
+    strict: bool,
+    progress: Progress | None,
 ) -> EncodedFile:
-    """Encode an opened scene out of core, and write the .csplat file.
-
-    Args:
-        reader: the scene.
-        local: its file.
-        target: the file to write.
-        options, overrides, strict, progress: as for `encode_file`.
-        limits: memory, disk and workers.
-
-    Raises:
-        InputError: the file is to be written to standard output.
-        CsplatError: as for `encode_scene`.
-        OSError: as for `encode_scene`.
-    """
-    start = time.perf_counter()
+    """Encode an opened scene without reading it into memory, and write the .csplat file."""
     if target == STANDARD_STREAM:
         raise InputError("the scene does not fit in memory, and cannot be written to standard output: name a file")
     findings = [*reader.findings]
@@ -309,27 +206,23 @@ def encode_out_of_core(
     scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
     size = size_on_disk(local)
     try:
-        report = encode_scene(
-            scene, target, options, memory_bytes=limits.memory_bytes, by_disk=limits.always, folder=limits.folder,
-            resume=limits.resume, cluster=limits.cluster, progress=progress,
-            source={"name": local.name, "size": size, "changed": local.stat().st_mtime_ns},
-        )  # fmt: skip
+        source = {"name": local.name, "size": size, "changed": local.stat().st_mtime_ns}
+        report = encode_scene(scene, target, options, limits, source=source, progress=progress)
     except (KeyboardInterrupt, OSError):
-        folder = Path(limits.folder or f"{target}.work")
+        folder = limits.working_folder(target)
         if folder.exists():
             note(f"{folder} holds the finished part: --resume continues from it")
         raise
     return EncodedFile(scene.metadata_model, report, None, tuple(findings), size, time.perf_counter() - start)
 
 
-def format_cost(found: CostEstimate) -> str:
+def format_cost(cost: EncodingCost) -> str:
     """Format the cost of an encoding as a line."""
-    needs = found.needs
-    where = "in memory" if needs.in_memory else f"on the disk, {counted(needs.workers, 'process', 'processes')}"
+    where = "in memory" if cost.in_memory else f"on the disk, {counted(cost.workers, 'process', 'processes')}"
     return (
-        f"{counted(found.count, 'splat')} of SH degree {found.sh_degree}, {where}: about"
-        f" {format_estimate(found.seconds)}, {format_bytes(needs.memory_bytes)} of memory,"
-        f" {format_bytes(needs.disk_bytes)} of disk; the file about {format_bytes(found.file_bytes)}"
+        f"{counted(cost.splats, 'splat')} of SH degree {cost.sh_degree}, {where}: about"
+        f" {format_estimate(cost.seconds)}, {format_bytes(cost.memory_bytes)} of memory,"
+        f" {format_bytes(cost.disk_bytes)} of disk; the file about {format_bytes(cost.file_bytes)}"
     )
 
 

@@ -197,6 +197,7 @@ def read_source(
     strict: bool = False,
     keep_extra: bool = False,
     sh_degree: int | None = None,
+    opened: SceneSource | None = None,
     progress: Progress | None = None,
 ) -> LoadedModel:
     """Read a scene to be encoded, in any format but .csplat, and repair defects if that is safe.
@@ -207,6 +208,7 @@ def read_source(
         strict: refuse defects that would be repaired.
         keep_extra: keep additional columns.
         sh_degree: as for `load_model`.
+        opened: the scene of the file, if it is open; `sh_degree` has no effect then.
         progress: progress callback.
 
     Raises:
@@ -217,7 +219,10 @@ def read_source(
     report = progress or null_progress
     report("reading", 0.0)
     with source_path(file) as local:
-        model = formats.read(local, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
+        if opened is None:
+            model = formats.read(local, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
+        else:
+            model = formats.read_all(opened, strict=strict, keep_extra=keep_extra, report=findings)
         size_bytes, name = size_on_disk(local), local.name
     report("reading", 1.0)
     return LoadedModel((overrides or MetadataOverrides()).apply(model), size_bytes, name=name, findings=tuple(findings))

@@ -39,7 +39,7 @@ from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
 from csplat.file_source import File
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.out_of_core import encode_scene
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene_source import SceneSource
 from csplat.splat_file import SplatFile
 from csplat.splat_file import open as opened
@@ -211,7 +211,7 @@ def _encode_again(
     dropped = {column.name for scene in scenes for column in scene.header.extras} - metadata_model.extra.keys()
     with TemporaryDirectory(prefix="csplat-") as folder:
         path = Path(folder) / "merged.csplat"
-        encode_scene(whole, path, options, folder=Path(folder) / "work")
+        encode_scene(whole, path, options, OutOfCoreOptions(folder=Path(folder) / "work"))
         with path.open("rb") as coded, open_writer(output) as stream:
             shutil.copyfileobj(coded, stream)
         return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))

@@ -21,17 +21,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.encoder.coding_parameters import CodingParameters, choose_parameters, measure_contrast
+from csplat.encoder.buckets import BUCKET_SPLATS, SceneSurvey, bucket_rows, sample_rows
+from csplat.encoder.coding_parameters import CodingParameters, choose_parameters
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.error_bounds import SCALE_MOST
 from csplat.encoder.quantisation_classes import QuantisationClasses, choose_classes
 from csplat.encoder.sh_codebook import (
     FileCodebooks,
     ShCodebook,
+    ShCodingPlan,
     assign_splats,
     choose_sh_coding,
     final_parameters,
-    largest_sh,
 )
 from csplat.encoder.shape_codebook import ShapeCodebook, choose_shapes, dequantise_shapes
 from csplat.encoder.splat_importance import (
@@ -42,16 +43,7 @@ from csplat.encoder.splat_importance import (
     shape_weights,
     splat_weights,
 )
-from csplat.encoder.tiling import (
-    BUCKET_SPLATS,
-    TileSplats,
-    bucket_rows,
-    contrast_buckets,
-    cut_scene,
-    dequantise_means,
-    dequantise_opacities,
-    sample_rows,
-)
+from csplat.encoder.tiling import TileSplats, cut_scene, dequantise_means, dequantise_opacities
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.types import F32, I64, Progress, null_progress
@@ -81,7 +73,7 @@ class EncodePlan:
     """A scene, and the encoder's choices about its geometry.
 
     Attributes:
-        model: the scene, with the colours to encode.
+        model: the scene, with the colours to encode; without splats if they are on disk.
         options: the caller's options.
         origin: the source of the scene.
         importance: importance of the splats, if known.
@@ -92,7 +84,7 @@ class EncodePlan:
         classes: quantisation classes of the splats, if there are several.
         sample: plan of the sample on which choices are made, for a scene of more than `BUCKET_SPLATS` splats without
             importance.
-        buckets: rows of each bucket of such a scene.
+        buckets: see `of_survey`; none for other scenes.
     """
 
     model: SplatModel
@@ -143,7 +135,8 @@ class EncodePlan:
             raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
         if len(model) > BUCKET_SPLATS and importance is None and not options.shape_codebook_size:
-            return cls._of_many(model, options, origin, progress)
+            buckets = bucket_rows(model.means)
+            return cls.of_survey(SceneSurvey.of(model, buckets), model, buckets, options, origin, progress)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
@@ -157,15 +150,30 @@ class EncodePlan:
         return cls(model, options, origin, importance, parameters, tiles, extras, shapes, classes)
 
     @classmethod
-    def _of_many(
-        cls, model: SplatModel, options: EncodeOptions, origin: Origin, progress: Progress | None
+    def of_survey(
+        cls,
+        survey: SceneSurvey,
+        model: SplatModel,
+        buckets: Sequence[NDArray[np.intp]],
+        options: EncodeOptions,
+        origin: Origin,
+        progress: Progress | None = None,
     ) -> EncodePlan:
-        buckets = bucket_rows(model.means)
-        contrast = measure_contrast(model.select(buckets[index]) for index in contrast_buckets(len(buckets)))
-        sample = cls.of(model.select(sample_rows(len(model))), options, contrast=contrast, progress=progress)
-        sample = replace(sample, parameters=final_parameters(sample.parameters, largest_sh(model.shN)))
-        tiles, extras = cut_scene(model, sample.parameters, buckets=buckets), extra_records(model, options)
-        return cls(model, options, origin, None, sample.parameters, tiles, extras, None, None, sample, buckets)
+        """Plan the encoding of a scene of more than `BUCKET_SPLATS` splats.
+
+        Args:
+            survey: the survey of the scene.
+            model: the scene; without splats if they are on disk.
+            buckets: rows of the model in each bucket; none if the splats are on disk.
+            options, origin, progress: as for `of`.
+
+        Raises:
+            InputError: as in `of`.
+        """
+        sample = cls.of(survey.sample, options, contrast=survey.contrast, progress=progress)
+        sample = replace(sample, parameters=final_parameters(sample.parameters, survey.largest_sh))
+        tiles = cut_scene(model, sample.parameters, buckets=buckets)
+        return replace(sample, model=model, origin=origin, tiles=tiles, sample=sample, buckets=buckets)
 
     @cached_property
     def scene(self) -> SplatModel:
@@ -196,14 +204,16 @@ class EncodePlan:
         sample = None if self.sample is None else self.sample.with_colours(sh0[rows], shN[rows])
         return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
 
-    def choose_sh_coding(self, progress: Progress | None = None) -> tuple[CodingParameters, FileCodebooks]:
-        """Choose the SH coding; return the final parameters and the codebooks with the assignment of the splats."""
+    def choose_sh_coding(self, progress: Progress | None = None) -> tuple[EncodePlan, FileCodebooks]:
+        """Choose the SH coding; return the complete plan and the codebooks with the assignment of the splats."""
         model, parameters, importance = self.model, self.parameters, self.importance
         if self.sample is not None:
-            return self._assign_all(*self.sample.choose_sh_coding(progress))
+            sample, codebooks = self.sample.choose_sh_coding(progress)
+            assigned = replace(codebooks, sh_plan=self._assign_all(sample.parameters, codebooks))
+            return replace(self, parameters=sample.parameters, sample=None), assigned
         uses_weights = parameters.adaptive > 0.0 or parameters.sh_coding in ("auto", "codebook")
         weights = splat_weights(model, importance) if importance is not None or uses_weights else None
-        return choose_sh_coding(
+        parameters, codebooks = choose_sh_coding(
             model,
             parameters,
             self.options,
@@ -213,11 +223,10 @@ class EncodePlan:
             trial=trial_rows(model, self.tiles, self.classes),
             progress=progress or null_progress,
         )
+        return replace(self, parameters=parameters), codebooks
 
-    def _assign_all(
-        self, parameters: CodingParameters, codebooks: FileCodebooks
-    ) -> tuple[CodingParameters, FileCodebooks]:
-        """Apply the sample's choices to all splats."""
+    def _assign_all(self, parameters: CodingParameters, codebooks: FileCodebooks) -> ShCodingPlan:
+        """Assign all splats to the codebooks of the sample."""
         sh_plan, count = codebooks.sh_plan, len(self.model)
         index = None if sh_plan.book is None else np.empty(count, np.int32)
         weights = None if sh_plan.weights is None else np.empty(count, np.float32)
@@ -228,7 +237,7 @@ class EncodePlan:
             if index is not None and part.book is not None:
                 index[rows] = part.book.index
         book = None if sh_plan.book is None or index is None else ShCodebook(sh_plan.book.entries, index)
-        return parameters, replace(codebooks, sh_plan=replace(sh_plan, weights=weights, book=book))
+        return replace(sh_plan, weights=weights, book=book)
 
 
 def trial_rows(model: SplatModel, tiles: Sequence[TileSplats], classes: QuantisationClasses | None) -> NDArray[np.intp]:

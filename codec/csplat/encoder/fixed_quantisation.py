@@ -270,8 +270,8 @@ def fix_quantisation(
     source, source_count = plan.model if source is None else source, plan.origin.source_count
     if len(source) != source_count:
         raise InputError(f"the source has {len(source)} splats, expected {source_count} by the origin")
-    parameters, codebooks = plan.choose_sh_coding(progress)
-    parameters = replace(parameters, canonical=True)
+    plan, codebooks = plan.choose_sh_coding(progress)
+    parameters = replace(plan.parameters, canonical=True)
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
     order = np.concatenate(rows).astype(np.int64)
     plan = replace(_reorder(plan, order, [len(part) for part in rows]), parameters=parameters)
@@ -297,7 +297,6 @@ def _reorder(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
             for tile, count, end in zip(plan.tiles, counts, ends, strict=True)
         ],
         shapes=None if plan.shapes is None else plan.shapes.select(order),
-        sample=None,
         buckets=(),
     )
 

@@ -11,7 +11,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from typing import Any
+from io import BytesIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +45,7 @@ from csplat.encoder.target import SearchReport
 from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort
 from csplat.errors import InputError, counted
 from csplat.model import UNSPECIFIED, SplatModel
-from csplat.types import F32, Progress
+from csplat.types import F32, Progress, null_progress
 
 Integers = NDArray[Any]
 
@@ -172,7 +173,7 @@ class EncodedTiles:
         return replace(self, errors=measured_sums(source, decoded, self.source_index))
 
     def write(self, metadata: Mapping[str, Any] | None = None) -> EncodeResult:
-        """Write the file.
+        """Return the file.
 
         Args:
             metadata: JSON-compatible entries to add to the OPTS chunk.
@@ -180,14 +181,25 @@ class EncodedTiles:
         Raises:
             InputError: an error is too large to be declared.
         """
+        stream = BytesIO()
+        report = self.write_to(stream, metadata)
+        return EncodeResult(stream.getvalue(), self.source_index, report)
+
+    def write_to(
+        self, stream: BinaryIO, metadata: Mapping[str, Any] | None = None, progress: Progress = null_progress
+    ) -> EncodeReport:
+        """Write the file to a stream; arguments and errors are those of `write`."""
         settings = {**(metadata or {}), **encoding_settings(self.plan, self.codebooks.sh_plan)}
-        chunks = file_chunks(self.plan, self.errors, settings)
-        scene, tiles = scene_fields(self.plan, self.codebooks, chunks), [part.tile for part in self.tiles]
-        data = b"".join(file_pieces(scene, tiles))
+        scene = scene_fields(self.plan, self.codebooks, file_chunks(self.plan, self.errors, settings))
+        tiles = [part.tile for part in self.tiles]
+        size, payloads = 0, sum(len(payload) for tile in tiles for payload in tile.layers.values())
+        for piece in file_pieces(scene, tiles):
+            stream.write(piece)
+            size += len(piece)
+            progress("writing", min(1.0, size / max(1, payloads)))
         notes = make_notes(self.tiles, strict=self.plan.parameters.lattice.strict)
         errors = declared_errors(self.errors, self.plan.origin)
-        report = EncodeReport(settings, errors, self.errors.count, len(self.tiles), len(data), notes)
-        return EncodeResult(data, self.source_index, report)
+        return EncodeReport(settings, errors, self.errors.count, len(tiles), size, notes)
 
 
 def encode_tiles(
@@ -209,8 +221,7 @@ def encode_tiles(
         InputError: a value fits no lattice.
     """
     if codebooks is None:
-        parameters, codebooks = plan.choose_sh_coding(progress)
-        plan = replace(plan, parameters=parameters)
+        plan, codebooks = plan.choose_sh_coding(progress)
     tiles = _encode_all(plan, codebooks.sh_plan, progress)
     errors = errors or ErrorSums.total(part.errors for part in tiles)
     if plan.shapes is not None:

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from csplat.out_of_core.disk_encode import ResourceNeeds, encode_scene, estimate_needs
+from csplat.out_of_core.disk_encode import EncodingCost, OutOfCoreOptions, encode_scene, estimate_cost
 
-__all__ = ["ResourceNeeds", "encode_scene", "estimate_needs"]
+__all__ = ["EncodingCost", "OutOfCoreOptions", "encode_scene", "estimate_cost"]

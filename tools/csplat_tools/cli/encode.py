@@ -11,6 +11,7 @@ import typer
 from csplat.encoder import EncodeOptions, Target
 from csplat.formats import assume_format
 from csplat.model import SplatModel
+from csplat.out_of_core import OutOfCoreOptions
 from csplat.types import Progress
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli import shared_options as shared
@@ -18,9 +19,8 @@ from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
-    OutOfCoreOptions,
     encode_file,
-    estimate_cost,
+    estimate_file_cost,
     format_cost,
     format_declared_errors,
     format_encoding,
@@ -185,7 +185,7 @@ def _publish(
 def _publish_estimate(source: str, options: EncodeOptions, limits: OutOfCoreOptions, out: Output) -> None:
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local:
-        found = estimate_cost(local, options, limits)
+        found = estimate_file_cost(local, options, limits)
     out.publish(found.as_json(), format_cost(found))
 
 

@@ -1,0 +1,143 @@
+"""Divide a large scene into buckets of neighbours, and survey it.
+
+A scene of up to `BUCKET_SPLATS` splats is one bucket. For a larger scene, a sample of that size is analysed: all
+choices are made on it, and a Morton curve through it divides space into buckets. Each bucket is cut into tiles by
+itself, so that only one has to be in memory, and the file does not depend on the available memory.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.coding_parameters import measure_contrast
+from csplat.encoder.entropy import morton_codes
+from csplat.encoder.sh_codebook import largest_sh
+from csplat.model import SplatModel
+from csplat.types import F32, F64, I64
+
+Rows = NDArray[np.intp]
+Item = TypeVar("Item")
+
+#: Maximum number of splats in a bucket, and size of the sample of a larger scene.
+BUCKET_SPLATS = 1 << 19
+
+_BUCKET_FILL = 0.8  # fraction of a bucket to fill; the sample predicts bucket sizes within a few per cent
+_CURVE_EDGE = 0.005  # fraction of the splats beyond either side of the curve's cube
+_CURVE_TOP = (1 << 16) - 1  # cells along a side of the cube, minus one
+_CURVE_BLOCK = 1 << 16  # splats per block of temporaries
+_CONTRAST_BUCKETS = 16  # buckets in which the contrast is measured
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSurvey:
+    """The values that choices for a scene of more than `BUCKET_SPLATS` splats depend on.
+
+    Attributes:
+        sample: the splats `sample_rows` of the scene.
+        largest_sh: largest magnitude of the SH coefficients of all splats.
+        contrast: contrast of the scene, see `measure_contrast`.
+    """
+
+    sample: SplatModel
+    largest_sh: float
+    contrast: float
+
+    @classmethod
+    def of(cls, model: SplatModel, buckets: Sequence[Rows]) -> SceneSurvey:
+        """Survey a scene in memory.
+
+        Args:
+            model: the scene.
+            buckets: its `bucket_rows`.
+        """
+        contrast = measure_contrast(model.select(rows) for rows in contrast_buckets(buckets))
+        return cls(model.select(sample_rows(len(model))), largest_sh(model.shN), contrast)
+
+
+@dataclass(frozen=True, eq=False)
+class BucketCurve:
+    """A Morton curve through space, divided into buckets.
+
+    Attributes:
+        corner: [3] float64, corner of the cube that the curve fills; splats outside are clamped to it.
+        scale: cells per scene unit.
+        bounds: [B - 1] int64, first code of each bucket except the first, ascending.
+    """
+
+    corner: F64
+    scale: float
+    bounds: I64
+
+    @classmethod
+    def through(cls, means: F32, count: int) -> BucketCurve:
+        """Divide the curve into buckets of about equal numbers of splats.
+
+        Args:
+            means: [n, 3] float32, means of the sample.
+            count: number of splats in the scene.
+        """
+        if count <= BUCKET_SPLATS:
+            return cls(np.zeros(3), 0.0, np.zeros(0, np.int64))
+        points = np.sort(means.astype(np.float64), axis=0)
+        edge = int(len(points) * _CURVE_EDGE)
+        low, high = points[edge], points[len(points) - 1 - edge]
+        side = float((high - low).max())
+        curve = cls(low, _CURVE_TOP / side if side > 0.0 else 0.0, np.zeros(0, np.int64))
+        buckets = math.ceil(count / (_BUCKET_FILL * BUCKET_SPLATS))
+        codes = np.sort(curve._codes(means))
+        starts = np.arange(1, buckets, dtype=np.int64) * len(codes) // buckets
+        return cls(curve.corner, curve.scale, np.unique(codes[starts]))
+
+    @property
+    def count(self) -> int:
+        """Number of buckets."""
+        return len(self.bounds) + 1
+
+    def bucket_of(self, means: F32) -> Rows:
+        """Return the bucket of each splat, [n]."""
+        if not len(self.bounds):
+            return np.zeros(len(means), np.intp)
+        return np.searchsorted(self.bounds, self._codes(means), side="right")
+
+    def _codes(self, means: F32) -> I64:
+        codes = np.empty(len(means), np.int64)
+        for at in range(0, len(means), _CURVE_BLOCK):
+            cells = (means[at : at + _CURVE_BLOCK].T.astype(np.float64) - self.corner[:, None]) * self.scale
+            codes[at : at + _CURVE_BLOCK] = morton_codes(np.clip(cells, 0, _CURVE_TOP).astype(np.int32))
+        return codes
+
+
+def bucket_rows(means: F32) -> Sequence[Rows]:
+    """Return the rows of each bucket of a scene in memory, ascending."""
+    if len(means) <= BUCKET_SPLATS:
+        return [np.arange(len(means), dtype=np.intp)]
+    curve = BucketCurve.through(means[sample_rows(len(means))], len(means))
+    bucket = curve.bucket_of(means)
+    order = np.argsort(bucket, kind="stable")
+    ends = np.searchsorted(bucket[order], np.arange(curve.count + 1))
+    found = [order[start:end] for start, end in pairwise(ends)]
+    return [rows[part] for rows in found for part in bucket_slices(len(rows)) if len(rows)]
+
+
+def bucket_slices(count: int) -> list[slice]:
+    """Split a bucket of more than `BUCKET_SPLATS` splats into equal parts, in the scene's order."""
+    parts = max(1, math.ceil(count / BUCKET_SPLATS))
+    return [slice(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
+
+
+def sample_rows(count: int) -> I64:
+    """Return the evenly spaced rows of the sample of a scene with more than `BUCKET_SPLATS` splats."""
+    return np.arange(BUCKET_SPLATS, dtype=np.int64) * count // BUCKET_SPLATS
+
+
+def contrast_buckets(buckets: Sequence[Item]) -> list[Item]:
+    """Return the buckets in which the contrast is measured; a sample of the scene has no neighbours for it."""
+    chosen = {index * len(buckets) // _CONTRAST_BUCKETS for index in range(_CONTRAST_BUCKETS)}
+    return [buckets[index] for index in sorted(chosen)]

@@ -1,0 +1,318 @@
+"""Sort the splats of a scene into buckets in a working folder, from which an interrupted encoding continues.
+
+Each section of the bucket curve has a spill file; a large section is split into several buckets, which are ranges of
+its splats. A spill file is a sequence of frames: number of splats, CRC, and a record of all values of each splat. Files
+use the byte order of the machine, which is also the one that reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.disk_files import atomic_writer, check_free_space
+from csplat.encoder.buckets import BucketCurve, SceneSurvey, bucket_slices, contrast_buckets, sample_rows
+from csplat.encoder.coding_parameters import measure_contrast
+from csplat.encoder.sh_codebook import largest_sh
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.scene_source import SceneSource, with_progress
+from csplat.types import Progress
+
+Records = NDArray[np.void]
+
+#: Bytes of splats in memory before they are written to their spill files.
+PENDING_BYTES = 96_000_000
+
+_FRAME = struct.Struct("<QI")  # splats, CRC-32 of the records
+_FRAME_SPLATS = 1 << 12  # maximum number of splats in a frame; their records (1 MB) stay in the cache
+_ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+_STATE, _SAMPLE = "state.json", "sample"
+
+
+@dataclass(frozen=True)
+class Bucket:
+    """A bucket: splats that are coded together.
+
+    Attributes:
+        index: index among all buckets.
+        section: index of the spill file with its splats.
+        start, stop: range of its splats in that file.
+    """
+
+    index: int
+    section: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True, eq=False)
+class DiskBuckets:
+    """The splats of a scene, sorted into buckets in a working folder.
+
+    Attributes:
+        folder: path of the folder.
+        model: the scene without splats.
+        counts: number of splats in each section.
+        largest_sh, contrast: see `SceneSurvey`.
+    """
+
+    folder: Path
+    model: SplatModel
+    counts: list[int]
+    largest_sh: float
+    contrast: float
+
+    @classmethod
+    def of(
+        cls,
+        scene: SceneSource,
+        folder: Path,
+        key: dict[str, Any],
+        *,
+        resume: bool,
+        disk_bytes: int,
+        progress: Progress,
+    ) -> DiskBuckets:
+        """Sort a scene, or continue from a folder in which it is sorted.
+
+        Args:
+            scene: the scene; its extra columns are kept.
+            folder: a new or empty folder.
+            key: identity of scene and options, JSON-compatible.
+            resume: continue from the content of the folder if it exists.
+            disk_bytes: free space that the encoding needs.
+            progress: called with the stage and the completed fraction of it.
+
+        Raises:
+            InputError: the folder exists and `resume` is False, it belongs to another scene or other options, or it has
+                other content; the disk is too small; the scene has another number of splats than it declares.
+            CsplatError: the scene cannot be read.
+            OSError: a file cannot be read or written.
+        """
+        done = _read_state(folder, key, resume=resume)
+        if done is not None:
+            return cls(folder, scene.metadata_model, **done)
+        for path in folder.glob("section-*"):  # an interrupted sort starts again
+            path.unlink()
+        check_free_space(
+            folder if folder.exists() else folder.parent,
+            disk_bytes,
+            "this scene is encoded: --work names another folder",
+        )
+        folder.mkdir(exist_ok=True)
+        _write_json(folder / _STATE, {"key": key})
+        store = _sort(scene, folder, progress)
+        done = {"counts": store.counts, "largest_sh": store.largest_sh, "contrast": store.contrast}
+        _write_json(folder / _STATE, {"key": key, **done})
+        return store
+
+    @property
+    def buckets(self) -> list[Bucket]:
+        """All buckets, in the order of the output file."""
+        parts = [(section, part) for section, count in enumerate(self.counts) if count for part in bucket_slices(count)]
+        return [Bucket(index, section, part.start, part.stop) for index, (section, part) in enumerate(parts)]
+
+    def survey(self) -> SceneSurvey:
+        """Return the survey of the scene.
+
+        Raises:
+            InputError: the file with the sample is damaged.
+            OSError: it cannot be read.
+        """
+        count = len(sample_rows(sum(self.counts)))
+        return SceneSurvey(_read(self.folder / _SAMPLE, self.model, 0, count), self.largest_sh, self.contrast)
+
+    def remove_section(self, section: int) -> None:
+        """Remove a spill file whose buckets are coded."""
+        _section_path(self.folder, section).unlink(missing_ok=True)
+
+    def remove(self) -> None:
+        """Remove the folder after the output is complete."""
+        with suppress(OSError):
+            shutil.rmtree(self.folder)
+
+
+def read_bucket(folder: Path, model: SplatModel, bucket: Bucket) -> SplatModel:
+    """Read the splats of a bucket.
+
+    Args:
+        folder: the working folder.
+        model: the scene without splats.
+        bucket: the bucket.
+
+    Raises:
+        InputError: the file is damaged.
+        OSError: the file cannot be read.
+    """
+    return _read(_section_path(folder, bucket.section), model, bucket.start, bucket.stop)
+
+
+def splat_bytes(model: SplatModel) -> int:
+    """Return the size of a splat in a spill file."""
+    return _record_type(model).itemsize
+
+
+def damaged_file(path: Path) -> InputError:
+    """Return the error for a damaged file of the working folder."""
+    return InputError(f"{path} is damaged: remove {path.parent.name} and start again")
+
+
+def _read_state(folder: Path, key: dict[str, Any], *, resume: bool) -> dict[str, Any] | None:
+    """Return the fields of `DiskBuckets` from the folder; `None` if its scene is not sorted yet."""
+    path = folder / _STATE
+    if not path.exists():
+        if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise InputError(f"{folder} is not empty: the working folder is removed afterwards, choose a new one")
+        return None
+    if not resume:
+        raise InputError(f"{folder} is left from an interrupted encoding: continue with `--resume`, or remove it")
+    try:
+        state = json.loads(path.read_bytes())
+        found = state.pop("key")
+    except (ValueError, TypeError, KeyError):
+        raise damaged_file(path) from None
+    for name, value in key.items():
+        if found.get(name) != value:
+            raise InputError(
+                f"{folder} was started with {name} {found.get(name)}, now {value}: continue with the former {name}, "
+                "or remove the folder to start again"
+            )
+    return state or None
+
+
+def _write_json(path: Path, value: Any) -> None:
+    with atomic_writer(path) as stream:
+        stream.write(json.dumps(value).encode())
+
+
+def _sort(scene: SceneSource, folder: Path, progress: Progress) -> DiskBuckets:
+    """Read the scene twice: survey it, then sort its splats into spill files."""
+    curve, largest = _survey(with_progress(scene, "looking", progress), folder)
+    counts = _spill(with_progress(scene, "sorting", progress), folder, curve)
+    store = DiskBuckets(folder, scene.metadata_model, counts, largest, 0.0)
+    chosen = contrast_buckets(store.buckets)
+    return replace(store, contrast=measure_contrast(read_bucket(folder, store.model, bucket) for bucket in chosen))
+
+
+def _survey(scene: SceneSource, folder: Path) -> tuple[BucketCurve, float]:
+    """Write the sample; return the curve through it and the largest magnitude of all SH coefficients."""
+    rows, largest = sample_rows(scene.count), 0.0
+    sample = np.empty(len(rows), _record_type(scene.metadata_model))
+    for where, block in scene.numbered():
+        first, last = np.searchsorted(rows, (where.start, where.stop))
+        sample[first:last] = _records(block, rows[first:last] - where.start, sample.dtype)
+        largest = max(largest, largest_sh(block.shN))
+    _append(folder / _SAMPLE, sample, mode="wb")
+    return BucketCurve.through(np.ascontiguousarray(sample["means"]), scene.count), largest
+
+
+def _spill(scene: SceneSource, folder: Path, curve: BucketCurve) -> list[int]:
+    """Write all splats to spill files, each in the scene's order; return the number of splats in each."""
+    dtype, counts = _record_type(scene.metadata_model), np.zeros(curve.count, np.int64)
+    pending: list[list[Records]] = [[] for _ in range(curve.count)]
+    pending_bytes = 0
+
+    def flush() -> None:
+        for section, parts in enumerate(pending):
+            if parts:
+                _append(_section_path(folder, section), np.concatenate(parts))
+                parts.clear()
+
+    for block in scene.blocks():
+        pending_bytes += len(block) * dtype.itemsize
+        if pending_bytes > PENDING_BYTES:
+            flush()
+            pending_bytes = len(block) * dtype.itemsize
+        sections = curve.bucket_of(block.means)
+        sizes = np.bincount(sections, minlength=curve.count)
+        records = _records(block, np.argsort(sections, kind="stable"), dtype)
+        for section, part in enumerate(np.split(records, np.cumsum(sizes)[:-1])):
+            if len(part):
+                pending[section].append(part)
+        counts += sizes
+    flush()
+    found: list[int] = counts.tolist()
+    return found
+
+
+def _section_path(folder: Path, section: int) -> Path:
+    return folder / f"section-{section:06}"
+
+
+def _arrays(model: SplatModel) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a model by the name of their field in a record."""
+    doubles = {} if model.means_double is None else {"means_double": model.means_double}
+    return {
+        **{name: getattr(model, name) for name in _ARRAYS},
+        **doubles,
+        **{f"extra {name}": array for name, array in model.extra.items()},
+    }
+
+
+def _record_type(model: SplatModel) -> np.dtype[np.void]:
+    return np.dtype([(name, array.dtype, array.shape[1:]) for name, array in _arrays(model).items()])
+
+
+def _records(model: SplatModel, rows: NDArray[Any], dtype: np.dtype[Any]) -> Records:
+    """Return records of some splats, without extra columns that the type does not have."""
+    records, arrays = np.empty(len(rows), dtype), _arrays(model)
+    for start in range(0, len(rows), _FRAME_SPLATS):
+        part, chosen = records[start : start + _FRAME_SPLATS], rows[start : start + _FRAME_SPLATS]
+        for name in dtype.names or ():
+            part[name] = np.take(arrays[name], chosen, axis=0)
+    return records
+
+
+def _append(path: Path, records: Records, mode: str = "ab") -> None:
+    """Append frames of at most `_FRAME_SPLATS` splats to a file."""
+    with path.open(mode) as stream:
+        for start in range(0, len(records), _FRAME_SPLATS):
+            data = records[start : start + _FRAME_SPLATS].view(np.uint8).data
+            stream.write(_FRAME.pack(len(data) // records.itemsize, zlib.crc32(data)))
+            stream.write(data)
+
+
+def _frames(path: Path, dtype: np.dtype[Any]) -> Iterator[Records]:
+    """Yield the records of each frame of a file."""
+    left = path.stat().st_size
+    with path.open("rb") as stream:
+        while left:
+            head = stream.read(_FRAME.size)
+            count, crc = _FRAME.unpack(head) if len(head) == _FRAME.size else (left, 0)
+            left -= _FRAME.size + count * dtype.itemsize
+            if left < 0:
+                raise damaged_file(path)
+            records = np.empty(count, dtype)
+            data = records.view(np.uint8).data
+            if stream.readinto(data) != len(data) or zlib.crc32(data) != crc:
+                raise damaged_file(path)
+            yield records
+
+
+def _read(path: Path, model: SplatModel, start: int, stop: int) -> SplatModel:
+    """Read a range of the splats of a file."""
+    dtype, at, read = _record_type(model), 0, 0
+    arrays: dict[str, Any] = {
+        name: np.empty((stop - start, *array.shape[1:]), array.dtype) for name, array in _arrays(model).items()
+    }
+    for frame in _frames(path, dtype):
+        wanted = frame[max(0, start - at) : max(0, stop - at)]
+        for name, array in arrays.items():
+            array[read : read + len(wanted)] = wanted[name]
+        at, read = at + len(frame), read + len(wanted)
+        if at >= stop:
+            break
+    if read < stop - start:
+        raise damaged_file(path)
+    return replace(model, extra={name: arrays.pop(f"extra {name}") for name in model.extra}, **arrays)
