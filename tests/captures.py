@@ -275,6 +275,9 @@ class FileRuns:
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
             change_options(patch, "csplat_tools.cli.train.TrainOptions", log_every=10, **options)
+            patch.setattr(
+                "csplat_trainer.data.loader.load", None
+            )  # a training opens its data set once, by another name
             brief = lambda **given: replace(tuning_after(**given), iterations=self.TUNED)  # noqa: E731
             patch.setattr(training_run, "tuning_after", brief)
             words = ("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)

@@ -234,7 +234,7 @@ def test_a_search_is_called_by_its_entry_point(files, monkeypatch):
     assert (files[0], csplat.EncodeOptions()) == (model, options)
     assert {"target": target, "views": "views", "importance": weights, "progress": None} == named
     monkeypatch.setattr("csplat.encoder.encode_api.load_plugins", lambda _: {})
-    with pytest.raises(InputError, match=r"needs a renderer: pip install 'csplat\[render\]'"):
+    with pytest.raises(InputError, match=r"no search for targets is installed.*pip install 'csplat\[render\]'"):
         csplat.encode(files[0], target=target)
 
 

@@ -109,6 +109,8 @@ def encode_with_report(
         return meet_bounds(model, options, target, importance=importance, progress=progress)[0]
     search = load_plugins("csplat.search").get("target")
     if search is None:
-        raise InputError("this target needs a renderer: pip install 'csplat[render]'")
+        raise InputError(
+            "no search for targets is installed (entry points of csplat.search): pip install 'csplat[render]'"
+        )
     found: EncodeResult = search(model, options, target=target, views=views, importance=importance, progress=progress)
     return found

@@ -77,7 +77,7 @@ def search_target(
         source: the scene.
         target: the target, other than largest errors alone.
         views: training, validation and test views.
-        encoding, no_prune, importance, simplifying, progress: as for `encode_to`.
+        encoding, no_prune, importance, simplifying, progress: as for `meet_target`.
 
     Returns:
         The file, and the report with 0 seconds.

@@ -17,7 +17,7 @@ from csplat_tools.file_streams import write_model
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.training.tuning_report import show_views, write_training_page
-from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, default_validation_count, run_finetuning
+from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.losses import PerceptualLoss
@@ -63,8 +63,7 @@ def run_training(
         InputError: a package is missing, or the data set is invalid or does not fit the options.
         OSError: a file cannot be read or written.
     """
-    _check_inputs(options, files)
-    data_set = _load(data)
+    data_set = _load(data, options, files)
     result = _train(data_set, options, files, plot=plot, threads=threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply(result.model)
     write_model(output, model, absolute=False)
@@ -111,14 +110,12 @@ def run_training_to_file(
         OSError: a file cannot be read or written.
     """
     tuning_files = _tuning_outputs(files, options)
-    _check_inputs(options, files)
-    data_set = _load(data)
+    data_set = _load(data, options, files)
     for one in data_set.val:  # training does not read these; finds damaged ones before it
         _ = one.pixels, one.mask
     result = _train(data_set, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply(result.model)
-    count = default_validation_count(0, cameras=None, data=data_set)
-    views = find_view_set(model, data=data_set, validation_count=count)
+    views = find_view_set(model, data=data_set, validation_count=0)  # the tuning splits the training views
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":
         known = {"source": {**result.metrics, "lpips": None}}
@@ -219,7 +216,9 @@ def _train(
     return result
 
 
-def _load(data: DataOptions) -> DataSet:
+def _load(data: DataOptions, options: TrainOptions, files: Outputs) -> DataSet:
+    """Check the other inputs, and open the data set."""
+    _check_inputs(options, files)
     every = 8 if data.test_every is None else data.test_every
     return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
 
