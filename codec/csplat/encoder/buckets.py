@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,16 +49,41 @@ class SceneSurvey:
     largest_sh: float
     contrast: float
 
-    @classmethod
-    def of(cls, model: SplatModel, buckets: Sequence[Rows]) -> SceneSurvey:
-        """Survey a scene in memory.
 
-        Args:
-            model: the scene.
-            buckets: its `bucket_rows`.
-        """
-        contrast = measure_contrast(model.select(rows) for rows in contrast_buckets(buckets))
-        return cls(model.select(sample_rows(len(model))), largest_sh(model.shN), contrast)
+class BucketStore(Protocol):
+    """The splats of a scene of more than `BUCKET_SPLATS` splats by bucket, in memory or on disk."""
+
+    @property
+    def model(self) -> SplatModel:
+        """The scene; without splats if they are on disk."""
+        ...
+
+    @property
+    def rows(self) -> Sequence[Rows]:
+        """Rows of the model in each bucket, ascending; none if the splats are on disk."""
+        ...
+
+    def survey(self) -> SceneSurvey:
+        """Survey the scene."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class MemoryBuckets:
+    """A bucket store in memory, which shares the arrays of the scene; see `BucketStore`."""
+
+    model: SplatModel
+    rows: Sequence[Rows]
+
+    @classmethod
+    def of(cls, model: SplatModel) -> MemoryBuckets:
+        """Sort the splats of a scene into buckets."""
+        return cls(model, bucket_rows(model.means))
+
+    def survey(self) -> SceneSurvey:
+        """Survey the scene."""
+        contrast = measure_contrast(self.model.select(rows) for rows in contrast_buckets(self.rows))
+        return SceneSurvey(self.model.select(sample_rows(len(self.model))), largest_sh(self.model.shN), contrast)
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.encoder.buckets import BUCKET_SPLATS, SceneSurvey, bucket_rows, sample_rows
+from csplat.encoder.buckets import BUCKET_SPLATS, BucketStore, MemoryBuckets, sample_rows
 from csplat.encoder.coding_parameters import CodingParameters, choose_parameters
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.error_bounds import SCALE_MOST
@@ -84,7 +84,7 @@ class EncodePlan:
         classes: quantisation classes of the splats, if there are several.
         sample: plan of the sample on which choices are made, for a scene of more than `BUCKET_SPLATS` splats without
             importance.
-        buckets: see `of_survey`; none for other scenes.
+        buckets: `BucketStore.rows` of such a scene.
     """
 
     model: SplatModel
@@ -135,8 +135,7 @@ class EncodePlan:
             raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
         if len(model) > BUCKET_SPLATS and importance is None and not options.shape_codebook_size:
-            buckets = bucket_rows(model.means)
-            return cls.of_survey(SceneSurvey.of(model, buckets), model, buckets, options, origin, progress)
+            return cls.of_buckets(MemoryBuckets.of(model), options, origin, progress)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
@@ -150,30 +149,23 @@ class EncodePlan:
         return cls(model, options, origin, importance, parameters, tiles, extras, shapes, classes)
 
     @classmethod
-    def of_survey(
-        cls,
-        survey: SceneSurvey,
-        model: SplatModel,
-        buckets: Sequence[NDArray[np.intp]],
-        options: EncodeOptions,
-        origin: Origin,
-        progress: Progress | None = None,
+    def of_buckets(
+        cls, store: BucketStore, options: EncodeOptions, origin: Origin, progress: Progress | None = None
     ) -> EncodePlan:
-        """Plan the encoding of a scene of more than `BUCKET_SPLATS` splats.
+        """Plan the encoding of a scene of more than `BUCKET_SPLATS` splats on a sample of it.
 
         Args:
-            survey: the survey of the scene.
-            model: the scene; without splats if they are on disk.
-            buckets: rows of the model in each bucket; none if the splats are on disk.
+            store: the scene, in memory or on disk.
             options, origin, progress: as for `of`.
 
         Raises:
             InputError: as in `of`.
         """
+        survey = store.survey()
         sample = cls.of(survey.sample, options, contrast=survey.contrast, progress=progress)
         sample = replace(sample, parameters=final_parameters(sample.parameters, survey.largest_sh))
-        tiles = cut_scene(model, sample.parameters, buckets=buckets)
-        return replace(sample, model=model, origin=origin, tiles=tiles, sample=sample, buckets=buckets)
+        tiles = cut_scene(store.model, sample.parameters, buckets=store.rows)
+        return replace(sample, model=store.model, origin=origin, tiles=tiles, sample=sample, buckets=store.rows)
 
     @cached_property
     def scene(self) -> SplatModel:

@@ -58,10 +58,10 @@ class Bucket:
 
 @dataclass(frozen=True, eq=False)
 class DiskBuckets:
-    """The splats of a scene, sorted into buckets in a working folder.
+    """A bucket store on disk.
 
     Attributes:
-        folder: path of the folder.
+        folder: path of the working folder.
         model: the scene without splats.
         counts: number of splats in each section.
         largest_sh, contrast: see `SceneSurvey`.
@@ -118,13 +118,18 @@ class DiskBuckets:
         return store
 
     @property
+    def rows(self) -> tuple[()]:
+        """No rows, see `BucketStore`."""
+        return ()
+
+    @property
     def buckets(self) -> list[Bucket]:
         """All buckets, in the order of the output file."""
         parts = [(section, part) for section, count in enumerate(self.counts) if count for part in bucket_slices(count)]
         return [Bucket(index, section, part.start, part.stop) for index, (section, part) in enumerate(parts)]
 
     def survey(self) -> SceneSurvey:
-        """Return the survey of the scene.
+        """Survey the scene.
 
         Raises:
             InputError: the file with the sample is damaged.

@@ -192,9 +192,8 @@ def _encode_buckets(
 ) -> EncodedTiles:
     """Plan the encoding on the sample, and encode the buckets that are not encoded yet."""
     count, buckets = sum(store.counts), store.buckets
-    plan, codebooks = EncodePlan.of_survey(
-        store.survey(), store.model, (), options, Origin(count, np.zeros(0, np.int64)), progress
-    ).choose_sh_coding(progress)
+    origin = Origin(count, np.zeros(0, np.int64))
+    plan, codebooks = EncodePlan.of_buckets(store, options, origin, progress).choose_sh_coding(progress)
     left = [one for one in buckets if not coded_path(store.folder, one).exists()]
     uncoded = Counter(one.section for one in left)
     for section in set(range(len(store.counts))) - set(uncoded):
