@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol, TypeVar
 
@@ -82,7 +82,8 @@ class MemoryBuckets:
 
     def survey(self) -> SceneSurvey:
         """Survey the scene."""
-        contrast = measure_contrast(self.model.select(rows) for rows in contrast_buckets(self.rows))
+        plain = replace(self.model, shN=self.model.shN[:, :0], extra={})  # SH has no influence, and takes most memory
+        contrast = measure_contrast(plain.select(rows) for rows in contrast_buckets(self.rows))
         return SceneSurvey(self.model.select(sample_rows(len(self.model))), largest_sh(self.model.shN), contrast)
 
 

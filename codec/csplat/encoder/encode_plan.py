@@ -85,6 +85,7 @@ class EncodePlan:
         sample: plan of the sample on which choices are made, for a scene of more than `BUCKET_SPLATS` splats without
             importance.
         buckets: `BucketStore.rows` of such a scene.
+        is_sample: the model is such a sample.
     """
 
     model: SplatModel
@@ -98,6 +99,7 @@ class EncodePlan:
     classes: QuantisationClasses | None
     sample: EncodePlan | None = None
     buckets: Sequence[NDArray[np.intp]] = ()
+    is_sample: bool = False
 
     @classmethod
     def of(
@@ -146,7 +148,18 @@ class EncodePlan:
             weights = shape_weights(model, importance)
             metric = shape_metric(weights, importance)
             shapes = choose_shapes(model, weights, metric, tiles, parameters, options, progress or null_progress)
-        return cls(model, options, origin, importance, parameters, tiles, extras, shapes, classes)
+        return cls(
+            model,
+            options,
+            origin,
+            importance,
+            parameters,
+            tiles,
+            extras,
+            shapes,
+            classes,
+            is_sample=contrast is not None,
+        )
 
     @classmethod
     def of_buckets(
@@ -212,6 +225,7 @@ class EncodePlan:
             weights=weights,
             metric=sh_metric(model, weights, importance),
             measured=importance is not None,
+            is_sample=self.is_sample,
             trial=trial_rows(model, self.tiles, self.classes),
             progress=progress or null_progress,
         )

@@ -35,9 +35,12 @@ Floats = NDArray[Any]
 
 _SEED_ROUNDS = 2  # rounds in which the initial entries are drawn; 8 lower the error by 0.3 %
 _EXACT = 2.0**23  # float32 represents every multiple of 1/2 below this
-_PRODUCT_ROWS, _PRODUCT_COLUMNS = 256, 4096  # points and entries per matrix product, a result of 4 MiB
+_PRODUCT = 1 << 18  # scores per matrix product, 1 MiB, which fits the second-level cache
+_PRODUCT_COLUMNS = 1024  # entries per matrix product
 _GROUPED_ROWS = 1 << 13  # points that are sorted by group together
 _GROUP_ITERATIONS = 2
+_REFINED_POINTS = 1 << 16  # minimum number of points of the last iteration, unless there are fewer
+_REFINED_PER_ENTRY = 64  # the same, per entry
 _NEXT_GROUPS = 4  # groups searched if a near entry is known; in training, 8 would lower the error by less than 0.5 %
 _BLAS = threading.RLock()  # a BLAS has one thread count per process: one search at a time
 _CANDIDATES = 96  # candidates for a point: its entry and the nearest neighbours of that
@@ -60,7 +63,7 @@ def cluster(
 ) -> tuple[I32, U32]:
     """Train a codebook of at most `size` entries, and assign the points to it.
 
-    Iterates on a weighted sample, then twice on all points. Takes memory for the sample and about 40 bytes per point.
+    Iterates on a weighted sample, and once on a larger one. Takes memory for the samples and 40 bytes per point.
 
     Args:
         points: [N, D], lattice integers. Clip outliers first: if a norm exceeds about 2,300, all points are assigned
@@ -94,14 +97,16 @@ def cluster(
     for step in range(iterations + 1):
         most = size >> (2 + 4 * step // iterations) if step < iterations else 0
         if step == iterations and len(sample) < len(points):
-            sample, sample_w, index = points, w, None
+            rows, sample_w = _priority_sample(w, max(_REFINED_POINTS, size * _REFINED_PER_ENTRY), rng)
+            sample, index = points[rows], None
         index, error = search_nearest(sample, entries, near_groups, threads, start=index)
         entries = _move_to_means(sample, sample_w, index, entries)
         _relocate(entries, index, sample, sample_w, error, most, min(near_groups, _NEXT_GROUPS), rng, threads)
         if progress:
             progress(step + 1, iterations + 2)
-    index = search_nearest(points, entries, near_groups, threads, start=index)[0]
-    entries = _move_to_means(points, w, index, entries)
+    is_sample = len(sample) < len(points)
+    index = search_nearest(points, entries, near_groups, threads, start=None if is_sample else index)[0]
+    entries = entries if is_sample else _move_to_means(points, w, index, entries)
     if progress:
         progress(iterations + 2, iterations + 2)
     distinct, merged = _distinct(entries)
@@ -176,7 +181,7 @@ def search_nearest(
         length, near = _GROUPED_ROWS, near_groups if start is None else min(near_groups, _NEXT_GROUPS)
         find = _near_entries(coarse, table, near, threads, other)
     else:
-        length, start = _PRODUCT_ROWS, None
+        length, start = _PRODUCT // min(_PRODUCT_COLUMNS, 1 << len(entries).bit_length()), None
         find = _every_entry(table, other)
 
     def work(starts: range) -> None:

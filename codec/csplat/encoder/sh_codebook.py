@@ -30,9 +30,10 @@ from csplat.types import F32, F64, I16, I32, U32, Progress
 Rows = NDArray[np.intp]
 
 _CLIP = 511  # lattice steps; splats with larger coefficients are escaped, so that assignments stay exact in float32
-_BLOCK = 1 << 14  # splats per block of temporaries
+_BLOCK = 1 << 12  # splats per block of temporaries, 0.7 MiB, which fits the second-level cache
 _TRIAL_SPLATS = 1 << 14  # maximum number of splats on which scalar coding is tried
 _CODEBOOK_SPLATS_MIN = 256  # splats; in smaller scenes a codebook costs more bytes than it saves
+_TRAINING_SPLATS, _TRAINING_USERS = 1 << 16, 64  # minimum numbers of splats, and per entry, to train a codebook on
 _GROUPED_ENTRIES_MIN = 4096  # entries from which searching near groups is worth the additional distortion
 _FULL_SHARE_SPLATS = 1 << 15  # splats; smaller scenes get the number of entries of this size, within `_USERS_MIN`
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
@@ -158,6 +159,7 @@ def choose_sh_coding(
     weights: F32 | None,
     metric: ErrorMetric | None,
     measured: bool,
+    is_sample: bool,
     trial: Rows,
     progress: Progress,
 ) -> tuple[CodingParameters, FileCodebooks]:
@@ -170,6 +172,8 @@ def choose_sh_coding(
         weights: [N] float32, importance of the splats; `None` if no choice depends on it.
         metric: Gauss-Newton matrices of the coefficients; `None`: the identity, times the weights.
         measured: the weights are measured, not guessed from opacity and size.
+        is_sample: the model is a sample of the scene, on a part of which the codebook is trained. The assignment that
+            is returned is that of this part.
         trial: rows of about a tile, on which scalar coding is tried.
         progress: called with the stage and the fraction done.
 
@@ -185,7 +189,11 @@ def choose_sh_coding(
     if is_open and (len(model) < _CODEBOOK_SPLATS_MIN or not _escapes_fit(largest_sh(model.shN[:, :kept]), fine)):
         return scalar
     error_weights = _ErrorWeights(weights, None if metric is None else metric.first(kept), measured)
-    rule, index, distortion = _train(model, error_weights, fine, options, progress)
+    size = _codebook_size(len(model), fine, options)
+    step = max(1, len(model) // max(_TRAINING_SPLATS, _TRAINING_USERS * size)) if is_sample else 1
+    rule, index, distortion = _train(
+        model.shN[::step], replace(error_weights, weights=weights[::step]), size, fine, options, progress
+    )
     rgb = rule.entries.reshape(len(rule.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
     book = ShCodebook(colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift), index)
     codebooks = replace(make_codebooks(sh_plan, book, fine), rule=rule)
@@ -363,16 +371,16 @@ def _escapes_fit(largest: float, parameters: CodingParameters) -> bool:
 
 
 def _train(
-    model: SplatModel,
+    shN: F32,
     error_weights: _ErrorWeights,
+    size: int,
     parameters: CodingParameters,
     options: EncodeOptions,
     progress: Progress,
 ) -> tuple[AssignmentRule, I32, float]:
     """Train a codebook; return it with the entry of each splat [N] and the weighted mean squared error."""
     weights, threads = error_weights.weights, options.thread_count
-    points = _lattice_points(model.shN, parameters)
-    size = _codebook_size(len(model), parameters, options)
+    points = _lattice_points(shN, parameters)
     effort = {"near_groups": 8, "iterations": 7, "sample_per_entry": 16} if size >= _GROUPED_ENTRIES_MIN else {}
 
     def report_steps(done: int, steps: int) -> None:
@@ -380,11 +388,11 @@ def _train(
 
     found = cluster(points, weights, size, seed=options.seed, threads=threads, progress=report_steps, **effort)
     if error_weights.metric is not None:
-        found = _refine(model.shN, points, error_weights.metric, found, parameters, threads)
+        found = _refine(shN, points, error_weights.metric, found, parameters, threads)
     ranked, entries = rank_by_frequency(found[1], found[0])
     index = ranked.astype(np.int32)
-    errors = _errors(model.shN, index, entries, parameters, error_weights)
-    escaped = _choose_escapes(model.shN, errors, parameters, options, error_weights)
+    errors = _errors(shN, index, entries, parameters, error_weights)
+    escaped = _choose_escapes(shN, errors, parameters, options, error_weights)
     threshold = float(errors[escaped].min(initial=np.inf))
     errors[escaped] = 0.0
     index[escaped] = len(entries)
@@ -412,7 +420,8 @@ def _lattice_points(shN: F32, parameters: CodingParameters) -> I16:
     for at in range(0, len(shN), _BLOCK):
         rows = shN[at : at + _BLOCK, :kept].reshape(-1, 3 * kept)
         rows = np.clip(rows, -_CLIP * parameters.sh_step, _CLIP * parameters.sh_step)
-        points[at : at + _BLOCK] = np.rint(rows * np.float32(1.0 / parameters.sh_step))
+        rows *= np.float32(1.0 / parameters.sh_step)
+        points[at : at + _BLOCK] = np.rint(rows, out=rows)
     return points
 
 
@@ -433,8 +442,8 @@ def _errors(shN: F32, index: I32, entries: I32, parameters: CodingParameters, er
     for at in range(0, len(shN), _BLOCK):
         part = slice(at, at + _BLOCK)
         difference = shN[part, :kept].reshape(-1, 3 * kept).copy()
-        clipped = np.abs(difference).max(axis=1) > (_CLIP - 1) * parameters.sh_step
-        difference -= table[index[part]]
+        clipped = np.flatnonzero(np.abs(difference) > (_CLIP - 1) * parameters.sh_step) // (3 * kept)
+        difference -= np.take(table, index[part], axis=0)
         errors[part] = error_weights.errors(difference, part)
         errors[part][clipped] = np.inf
     return errors
