@@ -39,8 +39,7 @@ from csplat_trainer.data.colmap import read_points
 from csplat_trainer.parameters import Parameters, from_model
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
-from csplat_trainer.training_checkpoint import fit_to_options
-from csplat_trainer.training_loop import train
+from csplat_trainer.training_loop import fit_to_options, train
 
 pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.usefixtures("small_views")]
 LONG = pytest.mark.area(name="extremes")

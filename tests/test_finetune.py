@@ -34,8 +34,7 @@ from csplat_tools.training.tuning_report import ply_splat_bytes
 from csplat_tools.training.tuning_run import smallest_reaching
 from csplat_trainer.losses import PhotometricLoss
 from csplat_trainer.posed_images import PosedImage
-from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, renders_of, split_views, tune
-from csplat_trainer.tuning.tuned_scene import (
+from csplat_trainer.tuned_scene import (
     RateTerm,
     TunedScene,
     colour_integers_of,
@@ -43,6 +42,7 @@ from csplat_trainer.tuning.tuned_scene import (
     sum_by_entry,
     sum_by_entry_twin,
 )
+from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, renders_of, split_views, tune
 from csplat_trainer.tuning.tuning_loop import RateController
 
 BLACK = np.zeros(3, np.float32)
@@ -337,20 +337,22 @@ def test_the_same_seed_gives_the_same_bytes_at_any_number_of_threads(source, vie
     assert files[0] != files[2]
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one(source, views, tmp_path):
+@pytest.mark.parametrize("share", [None, 0.9], ids=["fixed lambda", "size"])
+def test_a_killed_run_resumes_as_if_uninterrupted(source, views, tmp_path, share):
     fixed = fix_quantisation(EncodePlan.of(source, replace(COARSE, shape_codebook_size=32)))
-    file, middle = tmp_path / "c.npz", []
+    size_bytes = None if share is None else int(share * len(fixed.encode(fixed.start()).write().data))
+    file, options = tmp_path / "c.npz", replace(FEW, lr_exposure=0.01)
 
-    def keep(now):
+    def kill(now):
         if now.iteration == 8:
-            middle.append(file.read_bytes())  # the checkpoint of step 6
+            raise KeyboardInterrupt
 
-    whole = tune(fixed, views, FEW, progress=keep, checkpoint=file, checkpoint_every=3)
-    file.write_bytes(middle[0])
-    rest = tune(fixed, views, FEW, resume=file)
+    with pytest.raises(KeyboardInterrupt):
+        tune(fixed, views, options, size_bytes=size_bytes, progress=kill, checkpoint=file, checkpoint_every=3)
+    whole, rest = (tune(fixed, views, options, size_bytes=size_bytes, resume=one) for one in (None, file))
     assert fixed.encode(whole.best_values).write().data == fixed.encode(rest.best_values).write().data
-    assert whole.log["losses"] == rest.log["losses"]
-    assert whole.log["validations"] == rest.log["validations"]
+    for name in ("losses", "validations", "exposures", "byte_cost"):
+        assert whole.log[name] == rest.log[name]
 
 
 @pytest.mark.slow
@@ -404,25 +406,13 @@ def test_a_checkpoint_of_other_views_or_options_is_refused(coarse, views, tmp_pa
         tune(fixed, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
 
 
-def test_a_checkpoint_without_an_option_has_its_default(coarse, views, tmp_path):
-    file, fixed = tmp_path / "run.npz", coarse
-    tune(fixed, views, replace(QUICK, iterations=5), checkpoint=file)
-    arrays = dict(np.load(file))
-    facts = json.loads(arrays["facts"].tobytes())
-    del facts["options"]["lr_exposure"]
-    np.savez(file, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
-    assert 6 == len(tune(fixed, views, replace(QUICK, iterations=6), resume=file).log["losses"])
-    with pytest.raises(InputError, match=r"another lr_exposure: 0\.0"):
-        tune(fixed, views, replace(QUICK, iterations=6, lr_exposure=0.01), resume=file)
-
-
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, coarse, views, tmp_path):
     file = tmp_path / "c.npz"
     tune(coarse, views, replace(QUICK, iterations=5), checkpoint=file)
     other = fix_quantisation(EncodePlan.of(source, replace(COARSE, attribute_psnr=29.0)))
     with pytest.raises(InputError, match="another scene"):
         tune(other, views, QUICK, resume=file)
-    np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 1}', np.uint8))
+    np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 2}', np.uint8))
     np.save(tmp_path / "n.npy", np.zeros(3))
     data, entry = file.read_bytes(), file.read_bytes().index(b"PK\x01\x02")
     locked = data[: entry + 8] + bytes([data[entry + 8] | 1]) + data[entry + 9 :]

@@ -39,7 +39,7 @@ from csplat.model import normalise_quats
 from csplat_conformance.adapter import answer
 from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
 from csplat_selftest.fuzzing.decoder_targets import compared
-from csplat_trainer.tuning.tuned_scene import TunedScene, cost_slopes
+from csplat_trainer.tuned_scene import TunedScene, cost_slopes
 
 
 @pytest.mark.parametrize("square", [False, True])

@@ -26,15 +26,6 @@ from csplat_render.virtual_cameras import is_clear
 from csplat_tools.cli.shared_options import parse_decibels
 from csplat_tools.optimise.pruning import simplify
 from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_error
-from csplat_tools.optimise.splat_refit import (
-    RefitResult,
-    choose_bands,
-    coefficient_mask,
-    drop_bands,
-    quantisation_aware_refit,
-    refit_splats,
-    unrounded_model,
-)
 from csplat_tools.views import (
     VIEW_COUNT,
     VIEW_SIZE,
@@ -46,6 +37,15 @@ from csplat_tools.views import (
 )
 from csplat_tools.views.sufficient_views import find_sufficient_views, pruning_keys
 from csplat_trainer.posed_images import PosedImage, image_scorer
+from csplat_trainer.splat_refit import (
+    RefitResult,
+    choose_bands,
+    coefficient_mask,
+    drop_bands,
+    quantisation_aware_refit,
+    refit_splats,
+    unrounded_model,
+)
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -204,7 +204,7 @@ def test_a_refit_that_overfits_is_discarded(source, given, monkeypatch):
 def test_unseen_splats_are_not_refitted(source):
     cameras = camera_sequence(source, 4, (48, 36))[:1]
     wanted = [picture + np.float32(0.1) for picture in render_all(source, cameras)]
-    adjusted = refit_splats(source, cameras, wanted, SMALL, steps=8)
+    adjusted = refit_splats(source, cameras, wanted, steps=8)
     seen = measure_pruning_error(source, cameras).seen
     assert 0 < np.count_nonzero(seen) < len(source)
     np.testing.assert_array_equal(source.means, adjusted.means)
@@ -217,7 +217,7 @@ def test_alphas_of_a_refit_stay_within_0_and_1(source):
     cameras = camera_sequence(source, 4, (48, 36))
     wanted = render_all(source, cameras)
     extreme = replace(source, opacities=np.where(np.arange(len(source)) % 2, 0.0, 1.0).astype(np.float32))
-    adjusted = refit_splats(extreme, cameras, wanted, SMALL, steps=8)
+    adjusted = refit_splats(extreme, cameras, wanted, steps=8)
     assert np.isfinite(adjusted.scales).all()
     assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0
 
@@ -250,12 +250,12 @@ def test_a_second_quantised_refit_continues_from_the_first(source):
     cameras, coarse = camera_sequence(source, 6, (48, 36)), EncodeOptions(attribute_psnr=26.0)
     wanted = render_all(source, cameras)
     fixed = fix_quantisation(EncodePlan.of(source, coarse))
-    values = quantisation_aware_refit(fixed, cameras, wanted, SMALL, steps=40)
+    values = quantisation_aware_refit(fixed, cameras, wanted, steps=40)
     finer = replace(coarse, attribute_psnr=27.0)
 
     def error(start):
         plan = fix_quantisation(EncodePlan.of(start, finer), source)
-        seen = plan.dequantise(quantisation_aware_refit(plan, cameras, wanted, SMALL, steps=4))
+        seen = plan.dequantise(quantisation_aware_refit(plan, cameras, wanted, steps=4))
         rendered = render_all(replace(plan.encode_plan.model, **vars(seen), means_double=None), cameras)
         return sum(np.square(one - other).sum() for one, other in zip(rendered, wanted, strict=True))
 

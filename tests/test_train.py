@@ -28,6 +28,7 @@ from csplat_tools.training.training_run import plan_training, tuning_after
 from csplat_tools.training.tuning_run import TuningSubset
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
+from csplat_trainer.fit_checkpoint import FitCheckpoint, load_checkpoint, save_checkpoint
 from csplat_trainer.image_gains import ImageGain, ImageGains
 from csplat_trainer.initial_splats import measure_extent, place_splats
 from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss, photometric_loss_twin
@@ -43,8 +44,7 @@ from csplat_trainer.strategies import (
     reset_opacities,
     share_opacity,
 )
-from csplat_trainer.training_checkpoint import TrainingCheckpoint, fit_to_options, load_checkpoint, save_checkpoint
-from csplat_trainer.training_loop import train
+from csplat_trainer.training_loop import fit_to_options, train
 from csplat_trainer.training_options import Outputs, TrainOptions
 from csplat_trainer.training_report import moving_average
 from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, tune
@@ -195,14 +195,16 @@ def test_large_units_do_not_change_the_scene(data):
 
 
 def assert_resumes_identically(data, options, folder):
-    """Compare a run with one that is resumed in its middle; return the run and the checkpoint of the middle."""
-    outputs, stopped = Outputs(checkpoint=folder / "c.npz", checkpoint_every=25), folder / "stopped.npz"
+    """Compare a run with one that is killed and resumed; return the run and the checkpoint of step 25."""
+    stopped = folder / "stopped.npz"
 
-    def stop(now):
+    def kill(now):
         if now.iteration == 40:
-            stopped.write_bytes((folder / "c.npz").read_bytes())  # the checkpoint of step 25
+            raise KeyboardInterrupt
 
-    whole = train(data, options, on_step=stop, outputs=outputs)
+    whole = train(data, options)
+    with pytest.raises(KeyboardInterrupt):
+        train(data, options, on_step=kill, outputs=Outputs(checkpoint=stopped, checkpoint_every=25))
     again = train(data, options, outputs=Outputs(resume=stopped))
     assert np.array_equal(whole.model.means, again.model.means)
     assert np.array_equal(whole.model.shN, again.model.shN)
@@ -641,10 +643,9 @@ def test_densification_stops_at_the_cap(parameters):
     assert np.float32(-9.0) == parameters.values["logits"][0]
 
 
-def checkpoint_of(parameters: Parameters) -> TrainingCheckpoint:
-    return TrainingCheckpoint(
-        7, parameters, np.random.default_rng(0).bit_generator.state, [3, 1], {"seed": 0}, {"losses": []}
-    )
+def checkpoint_of(parameters: Parameters) -> FitCheckpoint:
+    state = np.random.default_rng(0).bit_generator.state
+    return FitCheckpoint("train", 7, False, state, [3, 1], [], {"seed": 0}, {"losses": []}, parameters)
 
 
 def test_a_checkpoint_is_saved_and_loaded(parameters, tmp_path):
@@ -665,6 +666,17 @@ def test_a_damaged_checkpoint_is_refused(parameters, tmp_path, damage):
     if damage == "other":
         np.savez(path, facts=np.frombuffer(json.dumps({"version": 99}).encode(), np.uint8))
     with pytest.raises(InputError, match=r"checkpoint"):
+        load_checkpoint(path)
+
+
+def test_a_checkpoint_of_the_previous_version_is_refused_in_one_line(parameters, tmp_path):
+    path = tmp_path / "run.npz"
+    save_checkpoint(path, checkpoint_of(parameters))
+    arrays = dict(np.load(path))
+    facts = json.loads(arrays["facts"].tobytes()) | {"version": 1}
+    del facts["kind"]  # as in checkpoints of training of version 1
+    np.savez(path, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
+    with pytest.raises(InputError, match=r"run\.npz is a checkpoint of version 1, expected 2: begin a new run$"):
         load_checkpoint(path)
 
 

@@ -5,34 +5,33 @@ from __future__ import annotations
 import math
 import os
 import platform
-import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.random import PCG64, Generator
+from numpy.random import Generator
 
 import csplat
 from csplat.editing.up_axis import with_up
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training_record import TRAINING, VIEW
-from csplat.types import F32
+from csplat.types import F32, I64
 from csplat_render.camera import Camera, central_camera
 from csplat_render.lpips import Lpips, load_lpips
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.engine import CpuEngine, Engine
-from csplat_trainer.image_gains import ImageGain, ImageGains
+from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
+from csplat_trainer.fitter import Fitter
 from csplat_trainer.initial_splats import SceneExtent, measure_extent, place_splats
-from csplat_trainer.losses import PerceptualLoss
-from csplat_trainer.parameters import Parameters, to_model
+from csplat_trainer.losses import LossValue, PerceptualLoss
+from csplat_trainer.parameters import ParameterArrays, Parameters, to_model
 from csplat_trainer.posed_images import PosedImage, compose, evaluate, halve
 from csplat_trainer.strategies import ScreenGradients, densify, grow, prune_least_needed, relocate, reset_opacities
-from csplat_trainer.training_checkpoint import TrainingCheckpoint, fit_to_options, load_checkpoint, save_checkpoint
 from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
 from csplat_trainer.training_report import TrainingStep, peak_memory, save_image, side_by_side
 
@@ -83,37 +82,29 @@ def train(
             on_step(now)
 
     images = data if isinstance(data, DataSet) else load(data)
-    return _TrainingRun(images, options or TrainOptions(), outputs or Outputs()).run(show)
+    return _Training(images, options or TrainOptions(), outputs or Outputs(), show).run()
 
 
-@dataclass
-class _Window:
-    """Steps since the last entry of the log."""
+class _Training:
+    """A training by a `Fitter`: its images, engine and strategy."""
 
-    losses: list[float] = field(default_factory=list)
-    errors: list[float] = field(default_factory=list)
-
-
-class _TrainingRun:
-    """The state of a run: the engine, the random generator, the log."""
-
-    def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs) -> None:
+    def __init__(
+        self, data: DataSet, options: TrainOptions, outputs: Outputs, show: Callable[[TrainingStep], None]
+    ) -> None:
         if not data.train:
             raise InputError("there are no images to train on")
         data.read()
-        self._data, self._options, self._outputs = data, options, outputs
+        self._data, self._options, self._outputs, self._show = data, options, outputs, show
         self._scene = measure_extent(data.inliers)
-        self._rng = Generator(PCG64(options.seed))
-        self._iteration = 0
-        self._queue: list[int] = []
+        self._fitter = Fitter(len(data.train), options.iterations, options.seed)
+        self._log = self._fitter.log
+        self._log |= {"entries": [], "evaluations": []}
         self._halved: dict[int, PosedImage] = {}
-        self._log: dict[str, Any] = {"entries": [], "evaluations": [], "losses": [], "seconds": 0.0}
         if outputs.resume is None:
             parameters = Parameters.starting_at(self._start(self._scene))
             self._log["growth"] = options.growth_from(len(parameters))
         else:
-            parameters = self._resume(load_checkpoint(outputs.resume))
-        self._gains = ImageGains(len(data.train), self._log.get("exposures", ()))
+            parameters = self._resume(outputs.resume)
         self._lpips = _lpips(options, outputs)
         extent_factor = min(1.0, _LARGE_EXTENT / self._scene.extent)
         self._engine = _engine(
@@ -122,42 +113,47 @@ class _TrainingRun:
         self._colour = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._colour, np.float32)
 
-    def run(self, show: Callable[[TrainingStep], None]) -> TrainResult:
-        options, outputs = self._options, self._outputs
-        window = _Window()
-        spent = float(self._log["seconds"])  # by runs before a resume
-        begin, first = time.perf_counter(), self._iteration
+    def run(self) -> TrainResult:
+        """Make the remaining steps, and evaluate the scene."""
+        options, first = self._options, self._fitter.iteration
         if first and not any(map(options.prunings_left, range(first + 1, options.iterations + 1))):
-            self._prune_late(show)
-        while self._iteration < options.iterations:
-            self._iteration += 1
-            step = self._iteration
-            degree = options.active_degree(step - 1)
-            value = self._step(degree)
-            window.losses.append(value[0])
-            window.errors.append(value[1])
-            if options.refines_after(step):
-                self._refine()
-            if times := options.prunings_left(step):
-                self._prune(times)
-            seconds = time.perf_counter() - begin
-            if step % options.log_every == 0 or step == options.iterations:
-                left = seconds / (step - first) * (options.iterations - step)
-                now = self._log_entry(window, degree, spent + seconds, left)
-                window = _Window()
-                show(now)
-            if options.eval_every and step % options.eval_every == 0 and step < options.iterations and self._data.test:
-                self._evaluate(options.eval_views)
-            if outputs.preview_due(step, options.iterations):
-                self._preview(degree)
-            if outputs.checkpoint is not None and outputs.checkpoint_every and step % outputs.checkpoint_every == 0:
-                self._log["seconds"] = spent + time.perf_counter() - begin
-                self._save()
-        self._log["seconds"] = spent + time.perf_counter() - begin
-        if outputs.checkpoint is not None:
+            self._prune_late()
+        self._fitter.run(self)
+        if self._outputs.checkpoint is not None:
             self._save()
         metrics = self._evaluate(options.eval_views) if self._data.test else None
         return TrainResult(self._model(), self._full_log(metrics), metrics)
+
+    def step(self, view: int) -> LossValue:
+        fitter = self._fitter
+        background = self._background
+        if self._options.background == "random":
+            background = fitter.rng.random(3, dtype=np.float32)
+        rates = self._options.learning_rates(fitter.iteration, self._scene.extent)
+        gain = fitter.gain(view, rates["exposure"])
+        value = self._engine.step(self._image(view), background, self._degree, rates, fitter.rng, gain)
+        fitter.check(value)
+        return value
+
+    def after_step(self) -> None:
+        fitter, options, outputs = self._fitter, self._options, self._outputs
+        if options.refines_after(fitter.iteration):
+            self._refine()
+        if times := options.prunings_left(fitter.iteration):
+            self._prune(times)
+        if fitter.is_due(options.log_every) or fitter.is_last:
+            self._report(fitter.seconds_left)
+        if fitter.is_due(options.eval_every) and not fitter.is_last and self._data.test:
+            self._evaluate(options.eval_views)
+        if outputs.preview_due(fitter.iteration, fitter.iterations):
+            self._preview()
+        if outputs.checkpoint is not None and fitter.is_due(outputs.checkpoint_every):
+            self._save()
+
+    @property
+    def _degree(self) -> int:
+        """SH degree of the current step."""
+        return self._options.active_degree(self._fitter.iteration - 1)
 
     def _start(self, scene: SceneExtent) -> dict[str, F32]:
         options, data = self._options, self._data
@@ -172,43 +168,28 @@ class _TrainingRun:
             scene,
             min(count, options.max_splats),
             options.sh_degree,
-            self._rng,
+            self._fitter.rng,
             init=options.init,
             points=data.points,
             colours=data.points_rgb,
         )
 
-    def _resume(self, checkpoint: TrainingCheckpoint) -> Parameters:
-        options = self._options
-        self._rng.bit_generator.state = checkpoint.rng_state
-        self._iteration = checkpoint.iteration
-        self._queue = [index for index in checkpoint.queue if index < len(self._data.train)]
-        self._log |= checkpoint.log
-        shift = np.subtract(checkpoint.origin, self._data.origin)
+    def _resume(self, path: str | Path) -> Parameters:
+        checkpoint = load_checkpoint(path)
+        check_arrays(path, checkpoint.parameters.values, _shapes(checkpoint.parameters.values))
+        self._fitter.resume(checkpoint)
+        origin = np.array(checkpoint.own.get("origin"), np.float64)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise InputError(f"{path}: origin is {origin.tolist()}, expected three numbers")
+        shift = origin - self._data.origin
         if shift.any():  # the data set has another origin, since its cameras differ
             means = checkpoint.parameters.values["means"]
             checkpoint.parameters.values["means"] = (means + shift).astype(np.float32)
-        return fit_to_options(checkpoint.parameters, options, self._rng)
-
-    def _step(self, degree: int) -> tuple[float, float]:
-        if not self._queue:
-            self._queue = self._rng.permutation(len(self._data.train)).tolist()
-        number = self._queue.pop()
-        image = self._image(number)
-        background = self._background
-        if self._options.background == "random":
-            background = self._rng.random(3, dtype=np.float32)
-        rates = self._options.learning_rates(self._iteration, self._scene.extent)
-        gain = ImageGain(self._gains, number, rates["exposure"]) if self._options.lr_exposure else None
-        value = self._engine.step(image, background, degree, rates, self._rng, gain)
-        if not math.isfinite(value.loss):
-            raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
-        self._log["losses"].append(float(f"{value.loss:.6g}"))
-        return value.loss, value.mse
+        return fit_to_options(checkpoint.parameters, self._options, self._fitter.rng)
 
     def _image(self, number: int) -> PosedImage:
         """Return a training image, at half its size in the first steps if requested."""
-        if not self._options.is_half_size(self._iteration):
+        if not self._options.is_half_size(self._fitter.iteration):
             self._halved.clear()
             return self._data.train[number]
         if number not in self._halved:
@@ -226,15 +207,15 @@ class _TrainingRun:
                 options.grad_threshold,
                 options.max_splats,
                 options.dead_opacity,
-                self._rng,
+                self._fitter.rng,
             )
-            if self._iteration % _RESET_EVERY == 0 and self._iteration + _RESET_EVERY / 2 < options.iterations:
+            if self._fitter.is_due(_RESET_EVERY) and self._fitter.iteration + _RESET_EVERY / 2 < options.iterations:
                 reset_opacities(parameters)
             self._engine.screen = ScreenGradients.none(len(parameters))
         else:
-            relocate(parameters, options.dead_opacity, self._rng)
+            relocate(parameters, options.dead_opacity, self._fitter.rng)
             if options.strategy == "mcmc":
-                grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._rng)
+                grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._fitter.rng)
         self._engine.parameters = parameters
 
     def _prune(self, times: int) -> None:
@@ -250,79 +231,64 @@ class _TrainingRun:
         if self._engine.screen is not None:
             self._engine.screen = ScreenGradients.none(len(parameters))
 
-    def _prune_late(self, show: Callable[[TrainingStep], None]) -> None:
+    def _prune_late(self) -> None:
         """Prune splats after the last step of a resumed run, each time followed by steps at the last learning rates."""
-        count = len(self._engine.parameters)
+        count, fitter = len(self._engine.parameters), self._fitter
         final = max(1, round(self._options.final_share * self._log.get("splats_before_thinning", count)))
         if final >= count:
             return
-        spent, begin = float(self._log["seconds"]), time.perf_counter()
-        degree = self._options.active_degree(self._iteration)
-        times = math.ceil(math.log(final / count) / math.log(_KEPT_AT_ONCE))
+        times, begin = math.ceil(math.log(final / count) / math.log(_KEPT_AT_ONCE)), fitter.seconds
         for left in range(times, 0, -1):
             self._prune(left)
-            window = _Window()
             for _ in range(_STEPS_BETWEEN):
-                loss, error = self._step(degree)
-                window.losses.append(loss)
-                window.errors.append(error)
-            seconds = time.perf_counter() - begin
-            show(self._log_entry(window, degree, spent + seconds, seconds / (times - left + 1) * (left - 1)))
+                fitter.step(self)
+            self._report((fitter.seconds - begin) / (times - left + 1) * (left - 1))
 
-    def _log_entry(self, window: _Window, degree: int, seconds: float, left: float) -> TrainingStep:
-        mse = sum(window.errors) / len(window.errors)
+    def _report(self, seconds_left: float) -> None:
+        """Add an entry to the log, and show it."""
+        loss, mse = self._fitter.take_window()
         now = TrainingStep(
-            iteration=self._iteration,
-            iterations=self._options.iterations,
-            loss=sum(window.losses) / len(window.losses),
+            iteration=self._fitter.iteration,
+            iterations=self._fitter.iterations,
+            loss=loss,
             psnr=psnr_of_mse(mse),
             splat_count=len(self._engine.parameters),
-            sh_degree=degree,
-            seconds=seconds,
-            seconds_left=left,
+            sh_degree=self._degree,
+            seconds=self._fitter.seconds,
+            seconds_left=seconds_left,
         )
         entry = asdict(now)
         del entry["iterations"], entry["seconds_left"]
         self._log["entries"].append(entry)
-        return now
+        self._show(now)
 
     def _evaluate(self, views: int) -> dict[str, Any]:
-        degree = self._options.active_degree(self._iteration)
+        degree = self._options.active_degree(self._fitter.iteration)
         test = list(self._data.test)
         if views and views < len(test):
             test = [test[index * len(test) // views] for index in range(views)]
         metrics = evaluate(
             lambda camera: self._engine.render(camera, self._background, degree), test, self._background, self._lpips
         )
-        self._log["evaluations"].append({"iteration": self._iteration, **metrics})
+        self._log["evaluations"].append({"iteration": self._fitter.iteration, **metrics})
         return metrics
 
-    def _preview(self, degree: int) -> None:
+    def _preview(self) -> None:
         assert self._outputs.previews is not None
         folder = Path(self._outputs.previews)
         folder.mkdir(parents=True, exist_ok=True)
         image = (self._data.test or self._data.train)[0]
         size = (image.camera.H, image.camera.W, 3)
         target = compose(image, self._background, np.empty(size, np.float32))
-        rendered = self._engine.render(image.camera, self._background, degree)
-        save_image(folder / f"{self._iteration:06d}.png", side_by_side(target, rendered))
+        rendered = self._engine.render(image.camera, self._background, self._degree)
+        save_image(folder / f"{self._fitter.iteration:06d}.png", side_by_side(target, rendered))
 
     def _save(self) -> None:
         assert self._outputs.checkpoint is not None
-        if self._options.lr_exposure:
-            self._log["exposures"] = self._gains.as_json()
-        save_checkpoint(
-            self._outputs.checkpoint,
-            TrainingCheckpoint(
-                self._iteration,
-                self._engine.parameters,
-                dict(self._rng.bit_generator.state),
-                self._queue,
-                asdict(self._options),
-                self._log,
-                self._data.origin,
-            ),
-        )
+        self._fitter.save(
+            self._outputs.checkpoint, "train", asdict(self._options), self._engine.parameters,
+            own={"origin": self._data.origin},
+        )  # fmt: skip
 
     def _model(self) -> SplatModel:
         model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
@@ -344,8 +310,56 @@ class _TrainingRun:
             "peak_memory_bytes": peak_memory(),
             "metrics": metrics,
             **self._log,
-            **({"exposures": np.round(self._gains.values, 5).tolist()} if self._options.lr_exposure else {}),
+            **({"exposures": np.round(self._fitter.gains.values, 5).tolist()} if self._options.lr_exposure else {}),
         }
+
+
+def fit_to_options(parameters: Parameters, options: TrainOptions, rng: Generator) -> Parameters:
+    """Adapt the parameters of a checkpoint to another number of splats and another SH degree.
+
+    If there are too many splats, those with the least opacity times area of the two longer axes are pruned. If there
+    are too few for a fixed count, splats are added as by growth. SH bands are truncated, or extended by zeros.
+
+    Args:
+        parameters: parameters of a checkpoint; changed in place.
+        options: options of the continued run.
+        rng: source of random choices.
+
+    Returns:
+        `parameters`.
+    """
+    for part in (parameters.values, parameters.first, parameters.second):
+        _fit_degree(part, options.sh_degree)
+    if len(parameters) > options.max_splats:
+        parameters.keep(_most_visible(parameters, options.max_splats))
+    elif options.strategy == "fixed":
+        while 0 < len(parameters) < options.max_splats:
+            grow(parameters, 2.0, options.max_splats, options.dead_opacity, rng)
+    return parameters
+
+
+def _fit_degree(part: ParameterArrays, degree: int) -> None:
+    coefficients = (degree + 1) ** 2 - 1
+    old = part["shN"]
+    if old.shape[1] == coefficients:
+        return
+    fitted = np.zeros((len(old), coefficients, 3), np.float32)
+    common = min(coefficients, old.shape[1])
+    fitted[:, :common] = old[:, :common]
+    part["shN"] = fitted
+
+
+def _most_visible(parameters: Parameters, count: int) -> I64:
+    longer = np.sort(parameters.values["scales"].astype(np.float64), axis=1)[:, 1:]
+    weight = parameters.alphas * np.exp(np.minimum(longer.sum(axis=1), 700.0))  # the exponential fits float64
+    return np.sort(np.argsort(-weight, kind="stable")[:count])
+
+
+def _shapes(values: ParameterArrays) -> dict[str, tuple[int, ...]]:
+    """Return the expected shapes of parameters by the number of logits and of SH coefficients."""
+    sh = values["shN"].shape[1:] if "shN" in values else ()
+    rows = {"means": (3,), "quats": (4,), "scales": (3,), "logits": (), "sh0": (3,), "shN": (*sh[:1], 3)}
+    return {name: (len(values.get("logits", ())), *row) for name, row in rows.items()}
 
 
 def _first_view(cameras: Sequence[Camera]) -> dict[str, Any]:

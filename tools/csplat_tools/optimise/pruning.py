@@ -26,11 +26,11 @@ from csplat_tools.optimise.pruning_order import (
     find_pruning_order,
     total_error,
 )
-from csplat_tools.optimise.splat_refit import RefitResult, refit_with_bands
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import ViewSet, camera_sequence, find_view_set
 from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient_views
+from csplat_trainer.splat_refit import BAND_STEPS, FIT_STEPS, RefitResult, refit_with_bands
 
 _TRIES = 3  # largest number of refits in the search for a target PSNR
 _AGREE_ON = 0.5  # least fraction of the splats on whose pruning views must agree, since refits need views in any case
@@ -108,8 +108,13 @@ class PruningSession:
             self.source.select(rows),
             self.training_cameras,
             self.references,
-            self.options,
+            steps=self.options.steps(FIT_STEPS) if self.options.refit else 0,
+            band_steps=self.options.steps(BAND_STEPS) if self.options.refit else 0,
+            bands=self.options.bands,
             band_views=len(self.views.used),
+            background=self.options.background,
+            seed=self.options.seed,
+            threads=self.options.threads,
             progress=progress,
         )
 

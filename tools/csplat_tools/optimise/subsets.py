@@ -34,7 +34,10 @@ from csplat_tools.optimise.rate_distortion import (
     log_bytes_at_error,
     rate_exponent,
 )
-from csplat_tools.optimise.splat_refit import (
+from csplat_tools.views import ViewSet, evenly_spaced
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.sensitivity_file import StoredSensitivity
+from csplat_trainer.splat_refit import (
     BAND_STEPS,
     FIT_STEPS,
     choose_bands,
@@ -43,9 +46,6 @@ from csplat_tools.optimise.splat_refit import (
     quantisation_aware_refit,
     refit_splats,
 )
-from csplat_tools.views import ViewSet, evenly_spaced
-from csplat_trainer.sensitivity import measure_sensitivity
-from csplat_trainer.sensitivity_file import StoredSensitivity
 
 Cost = Callable[[F64, F64], F64]
 PsnrOf = Callable[[SplatModel], float]
@@ -363,8 +363,9 @@ class RefittedSubset:
             return encode_tiles(plan, progress=self.progress)
         fixed = fix_quantisation(plan, session.source, self.progress)
         values = quantisation_aware_refit(
-            fixed, session.training_cameras, session.references, session.options,
-            steps=session.options.steps(_FILE_STEPS), progress=self.progress,
+            fixed, session.training_cameras, session.references, steps=session.options.steps(_FILE_STEPS),
+            background=session.options.background, seed=session.options.seed, threads=session.options.threads,
+            progress=self.progress,
         )  # fmt: skip
         models = [replace(start, **vars(fixed.dequantise(one)), means_double=None) for one in (fixed.start(), values)]
         if self.psnr_of(models[1]) < self.psnr_of(models[0]):  # steps may be too long for very few splats
@@ -409,8 +410,9 @@ class RefittedSubset:
         """Refit the splats; with `free`, only these SH coefficients beyond the first."""
         session = self.session
         return refit_splats(
-            model, session.training_cameras, session.references, session.options,
-            steps=session.options.steps(steps), free=free, progress=self.progress,
+            model, session.training_cameras, session.references, steps=session.options.steps(steps), free=free,
+            background=session.options.background, seed=session.options.seed, threads=session.options.threads,
+            progress=self.progress,
         )  # fmt: skip
 
     def _importance(self, options: EncodeOptions, *, use_classes: bool) -> NDArray[Any] | Importance:

@@ -20,8 +20,8 @@ from csplat_tools.training.tuning_report import show_views, write_training_page
 from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
+from csplat_trainer.fit_checkpoint import load_checkpoint
 from csplat_trainer.losses import PerceptualLoss
-from csplat_trainer.training_checkpoint import load_checkpoint
 from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
 from csplat_trainer.training_report import TrainingStep, plot_loss
 from csplat_trainer.tuning import FinetuneOptions

@@ -6,35 +6,28 @@ For a target size, `RateController` adjusts lambda, the loss per bit and splat, 
 from __future__ import annotations
 
 import hashlib
-import json
 import math
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.random import PCG64, Generator
-from numpy.typing import NDArray
 
-from csplat.archives import read_archive
-from csplat.disk_files import atomic_writer
 from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.errors import InputError
 from csplat.types import F32
-from csplat_render.conventions import UncheckedSplats
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
-from csplat_trainer.image_gains import ImageGain, ImageGains
-from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss
-from csplat_trainer.parameters import GROUPS, Parameters
+from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
+from csplat_trainer.fitter import COUNT_EVERY, Fitter
+from csplat_trainer.image_gains import ImageGain
+from csplat_trainer.losses import LOSS_WEIGHTS, LossValue, PhotometricLoss
 from csplat_trainer.training_report import peak_memory
-from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
+from csplat_trainer.tuned_scene import RateTerm, TunedScene
 from csplat_trainer.tuning.tuning_options import FinetuneOptions
 from csplat_trainer.tuning.tuning_views import TuningView, TuningViews
 
-_COUNT_EVERY = 50  # steps between counts of the integers
 _MIN_GAIN = 2e-4  # smallest relative difference of the score that counts as a gain
 
 
@@ -104,10 +97,11 @@ def tune(
     Raises:
         InputError: a checkpoint is damaged, or of another scene, views or options; or a loss or a value is not finite.
     """
-    run = _TuningRun(fixed, views, options or FinetuneOptions(), threads, size_bytes)
+    tuning = _Tuning(fixed, views, options or FinetuneOptions(), threads, size_bytes)
+    tuning.progress, tuning.checkpoint, tuning.checkpoint_every = progress, checkpoint, checkpoint_every
     if resume is not None:
-        run.resume(load_finetune(resume, fixed))
-    return run.run(progress, checkpoint, checkpoint_every)
+        tuning.resume(resume)
+    return tuning.run()
 
 
 @dataclass
@@ -129,8 +123,12 @@ class _ImageBuffers:
     reference: F32
 
 
-class _TuningRun:
-    """The state of a run: the scene, the renderer, the random generator, the log."""
+class _Tuning:
+    """A tuning by a `Fitter`: the scene, its views, the best values so far."""
+
+    progress: Callable[[TuningStep], None] | None = None
+    checkpoint: str | Path | None = None
+    checkpoint_every: int = 0
 
     def __init__(
         self,
@@ -145,105 +143,84 @@ class _TuningRun:
         self._rasteriser = Rasteriser(threads=threads)
         self._antialiased = fixed.encode_plan.model.antialiased
         self._extent = float(np.exp(np.clip(np.median(np.median(fixed.encode_plan.model.scales, axis=1)), -80.0, 80.0)))
-        self._rng = Generator(PCG64(options.seed))
-        self._iteration, self._queue = 0, list[int]()
+        self._fitter = Fitter(len(views.train), options.iterations, options.seed)
+        self._log = self._fitter.log
+        self._log |= {"validations": [], "views": views.digest}
         self._sizes: dict[tuple[int, int], _ImageBuffers] = {}
-        self._log: dict[str, Any] = {"losses": [], "validations": [], "seconds": 0.0, "views": views.digest}
-        self._gains = ImageGains(len(views.train))
         self._numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _BestValues | None = None
-        self._rate_term: RateTerm | None = None
         self._controller = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
 
-    def resume(self, checkpoint: FinetuneCheckpoint) -> None:
+    def resume(self, path: str | Path) -> None:
         """Continue from a checkpoint.
 
         Raises:
-            InputError: the checkpoint is of a run with other views or options.
+            InputError: the file is damaged, or of a run with another scene, views or options.
         """
-        if checkpoint.log["views"] != self._views.digest:
+        fixed, start = self._scene.fixed, self._scene.fixed.start()
+        found = load_checkpoint(path, "finetune")
+        own, arrays = found.own, found.arrays
+        if own.get("fixed") != fingerprint(fixed):
+            raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
+        if found.log.get("views") != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
-        controller = RateController.of(checkpoint.log.get("budget"))
+        controller = RateController.of(own.get("controller"))
         if (controller and controller.size_bytes) != (self._controller and self._controller.size_bytes):
             raise InputError("the checkpoint is of a run with another target")
-        before = {**asdict(FinetuneOptions()), **checkpoint.options}  # older checkpoints lack some options
         for name, value in asdict(self._options).items():
-            if name != "iterations" and before[name] != value:
-                raise InputError(f"the checkpoint is of a run with another {name}: {before[name]}")
-        self._scene = TunedScene(self._scene.fixed, checkpoint.parameters)
-        self._rng.bit_generator.state = checkpoint.rng_state
-        self._iteration = checkpoint.iteration
-        self._queue = [index for index in checkpoint.queue if index < len(self._views.train)]
-        self._log = checkpoint.log
-        for validation in self._log["validations"]:
-            validation.setdefault("size_bytes", 0)  # older checkpoints lack it without a target size
-        self._gains = ImageGains(len(self._views.train), self._log.get("exposures", ()))
-        self._best = _BestValues(checkpoint.best_values, *checkpoint.best)
+            if name != "iterations" and found.options.get(name) != value:
+                raise InputError(f"the checkpoint is of a run with another {name}: {found.options.get(name)}")
+        values = self._scene.parameters.values
+        check_arrays(path, found.parameters.values, {name: array.shape for name, array in values.items()})
+        check_arrays(path, arrays, {f"best_{name}": getattr(start, name).shape for name in _FREE_VALUES})
+        self._fitter.resume(found)
+        self._scene = TunedScene(fixed, found.parameters)
+        tables = {name.removeprefix("rate_"): array for name, array in arrays.items() if name.startswith("rate_")}
+        try:
+            self._best = _BestValues(FreeValues(*(arrays[f"best_{name}"] for name in _FREE_VALUES)), **own["best"])
+            self._fitter.rate = RateTerm(fixed, tables=tables, **own["rate"]) if tables else None
+        except (KeyError, TypeError) as error:
+            raise InputError(f"{path} is not a checkpoint of csplat finetune: {error}") from None
         self._controller = controller
-        if checkpoint.costs:
-            self._rate_term = RateTerm(self._scene.fixed, self._byte_cost, checkpoint.costs)
 
-    def run(
-        self, progress: Callable[[TuningStep], None] | None, checkpoint: str | Path | None, checkpoint_every: int
-    ) -> TuningResult:
-        options = self._options
-        begin, first, spent = time.perf_counter(), self._iteration, float(self._log["seconds"])
+    def run(self) -> TuningResult:
+        """Make the remaining steps, and return the best values."""
         if self._best is None:
             self._validate()
-        window = list[float]()
-        while self._iteration < options.iterations and not self._has_converged:
-            self._iteration += 1
-            window.append(self._step())
-            if self._iteration % options.validate_every == 0 or self._iteration == options.iterations:
-                self._validate()
-            seconds = time.perf_counter() - begin
-            self._log["seconds"] = spent + seconds
-            if progress is not None and (
-                self._iteration % options.log_every == 0 or self._iteration == options.iterations or self._has_converged
-            ):
-                left = seconds / (self._iteration - first) * (options.iterations - self._iteration)
-                progress(self._progress(window, left))
-                window = []
-            if checkpoint is not None and checkpoint_every and self._iteration % checkpoint_every == 0:
-                self._save(checkpoint)
-        if checkpoint is not None:
-            self._save(checkpoint)
+        self._fitter.run(self)
+        if self.checkpoint is not None:
+            self._save(self.checkpoint)
         assert self._best is not None
         return TuningResult(self._best.values, self._full_log())
 
-    @property
-    def _has_converged(self) -> bool:
-        """True after `patience` evaluations without a gain."""
-        assert self._best is not None
-        return 0 < self._options.patience <= self._best.since
-
-    def _step(self) -> float:
-        """Make a step on one image, and return its loss before the step."""
-        if not self._queue:
-            self._queue = self._rng.permutation(len(self._views.train)).tolist()
-        number = self._queue.pop()
-        view = self._views.train[number]
+    def step(self, view: int) -> LossValue:
+        fitter, options, shown_view = self._fitter, self._options, self._views.train[view]
         seen, alphas = self._scene.dequantise()
-        if self._byte_cost > 0.0 and (self._rate_term is None or self._iteration % _COUNT_EVERY == 0):
-            self._rate_term = self._scene.count(seen, self._byte_cost)
+        if self._byte_cost > 0.0 and (fitter.rate is None or fitter.is_due(COUNT_EVERY)):
+            fitter.rate = self._scene.count(seen, self._byte_cost)
             if self._controller is not None:
-                done = (self._iteration - 1) / self._options.iterations
-                self._controller.update(self._rate_term.bits, done, self._options.byte_cost)
-        rendered = self._render(seen, view)
-        buffers = self._buffers(view)
-        rate = self._options.lr_exposure * self._options.learning_rate_factor(self._iteration)
-        gain = ImageGain(self._gains, number, rate) if self._options.lr_exposure else None
+                self._controller.update(fitter.rate.bits, (fitter.iteration - 1) / fitter.iterations, options.byte_cost)
+        rendered = self._render(seen, shown_view)
+        buffers = self._buffers(shown_view)
+        gain = fitter.gain(view, options.lr_exposure * options.learning_rate_factor(fitter.iteration))
         shown = rendered if gain is None else gain.apply(rendered)
-        value, slope = buffers.loss(shown, view.image(self._views.background, buffers.reference), view.mask)
-        if not math.isfinite(value.loss):
-            if self._iteration == 1:  # values are still the initial ones
-                raise InputError("renders of the scene overflow float32: its colours are too large for tuning")
-            raise InputError(f"the loss is not finite at step {self._iteration}: try smaller learning rates")
+        value, slope = buffers.loss(shown, shown_view.image(self._views.background, buffers.reference), shown_view.mask)
+        if fitter.iteration == 1 and not math.isfinite(value.loss):  # values are still the initial ones
+            raise InputError("renders of the scene overflow float32: its colours are too large for tuning")
+        fitter.check(value)
         if gain is not None:
             slope = gain.backward(rendered, slope)
-        self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), self._rate_term)
-        self._log["losses"].append(float(f"{value.loss:.6g}"))
-        return value.loss
+        self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), fitter.rate)
+        return value
+
+    def after_step(self) -> None:
+        fitter, options = self._fitter, self._options
+        if fitter.is_due(options.validate_every) or fitter.is_last:
+            self._validate()
+        if self.progress is not None and (fitter.is_due(options.log_every) or fitter.is_last):
+            self.progress(self._progress())
+        if self.checkpoint is not None and fitter.is_due(self.checkpoint_every):
+            self._save(self.checkpoint)
 
     @property
     def _byte_cost(self) -> float:
@@ -252,7 +229,7 @@ class _TuningRun:
 
     def _rates(self) -> dict[str, float]:
         options = self._options
-        factor = options.learning_rate_factor(self._iteration)
+        factor = options.learning_rate_factor(self._fitter.iteration)
         return {
             "means": options.lr_means * self._extent * factor,
             "quats": options.lr_quats * factor,
@@ -264,21 +241,20 @@ class _TuningRun:
         }
 
     def _render(self, seen: DecodedValues, view: TuningView) -> F32:
-        splats = UncheckedSplats(seen.means, seen.quats, seen.scales, seen.opacities, seen.sh0, seen.shN)
         return self._rasteriser.forward(
-            splats, view.camera, background=self._views.background, antialiased=self._antialiased
+            seen, view.camera, background=self._views.background, antialiased=self._antialiased
         ).rgb
 
     def _validate(self) -> None:
         """Score on the validation views, and keep the values with the least sum of loss and rate term."""
         if not all(np.isfinite(values).all() for values in self._scene.parameters.values.values()):
-            raise InputError(f"a value is not finite at step {self._iteration}: try smaller learning rates")
+            raise InputError(f"a value is not finite at step {self._fitter.iteration}: try smaller learning rates")
         seen, _ = self._scene.dequantise()
         loss, error, count = 0.0, 0.0, 0
         for view in self._views.validation:
             buffers, rendered = self._buffers(view), self._render(seen, view)
             if self._options.lr_exposure and id(view) in self._numbers:  # also a training view
-                rendered = ImageGain(self._gains, self._numbers[id(view)], 0.0).apply(rendered)
+                rendered = ImageGain(self._fitter.gains, self._numbers[id(view)], 0.0).apply(rendered)
             reference = view.image(self._views.background, buffers.reference)
             loss += buffers.loss(rendered, reference, view.mask)[0].loss / len(self._views.validation)
             error += float(np.square(np.clip(rendered, 0, 1) - np.clip(reference, 0, 1)).sum(dtype=np.float64))
@@ -294,12 +270,13 @@ class _TuningRun:
             shrinks = excess > 0.0 and not self._controller.is_exhausted
             score = loss + excess
         self._log["validations"].append(
-            {"iteration": self._iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes}
+            {"iteration": self._fitter.iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes}
         )
         if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
-            self._best = _BestValues(self._scene.free_values.copy(), score, psnr, self._iteration)
-        elif self._options.has_calmed(self._iteration) and not shrinks:
+            self._best = _BestValues(self._scene.free_values.copy(), score, psnr, self._fitter.iteration)
+        elif self._options.has_calmed(self._fitter.iteration) and not shrinks:
             self._best.since += 1
+            self._fitter.has_ended = 0 < self._options.patience <= self._best.since
 
     def _buffers(self, view: TuningView) -> _ImageBuffers:
         size = (view.camera.H, view.camera.W)
@@ -308,42 +285,34 @@ class _TuningRun:
             self._sizes[size] = _ImageBuffers(loss, np.empty((*size, 3), np.float32))
         return self._sizes[size]
 
-    def _progress(self, window: list[float], left: float) -> TuningStep:
+    def _progress(self) -> TuningStep:
         assert self._best is not None
-        validation = self._log["validations"][-1]
+        fitter, validation = self._fitter, self._log["validations"][-1]
         return TuningStep(
-            self._iteration,
-            self._options.iterations,
-            sum(window) / max(1, len(window)),
+            fitter.iteration,
+            fitter.iterations,
+            fitter.take_window()[0],
             validation["psnr"],
             self._best.psnr,
             validation["size_bytes"],
-            self._log["seconds"],
-            left,
+            fitter.seconds,
+            fitter.seconds_left,
         )
 
     def _save(self, path: str | Path) -> None:
         assert self._best is not None
-        if self._options.lr_exposure:
-            self._log["exposures"] = self._gains.as_json()
-        if self._controller is not None:
-            self._log["budget"] = asdict(self._controller)
-        best = (self._best.score, self._best.psnr, self._best.iteration, self._best.since)
-        save_finetune(
-            path,
-            FinetuneCheckpoint(
-                self._iteration,
-                self._scene.parameters,
-                dict(self._rng.bit_generator.state),
-                self._queue,
-                asdict(self._options),
-                self._log,
-                self._best.values,
-                {} if self._rate_term is None else self._rate_term.tables,
-                best,
-            ),
-            self._scene.fixed,
-        )
+        best, rate = vars(self._best).copy(), self._fitter.rate
+        arrays = {f"best_{name}": getattr(best["values"], name) for name in _FREE_VALUES}
+        if rate is not None:
+            arrays |= {f"rate_{name}": table for name, table in rate.tables.items()}
+        del best["values"]
+        own = {
+            "fixed": fingerprint(self._scene.fixed),
+            "best": best,
+            "rate": None if rate is None else {"weight": rate.weight, "bits": rate.bits},
+            "controller": self._controller and asdict(self._controller),
+        }
+        self._fitter.save(path, "finetune", asdict(self._options), self._scene.parameters, own=own, arrays=arrays)
 
     def _full_log(self) -> dict[str, Any]:
         assert self._best is not None
@@ -352,15 +321,15 @@ class _TuningRun:
             "train_views": len(self._views.train),
             "validation_views": len(self._views.validation),
             "held_out": self._views.is_held_out,
-            "steps": self._iteration,
-            "converged": self._has_converged,
+            "steps": self._fitter.iteration,
+            "converged": self._fitter.has_ended,
             "byte_cost": self._byte_cost,
             "start_psnr": self._log["validations"][0]["psnr"],
             "best_psnr": self._best.psnr,
             "best_iteration": self._best.iteration,
             "peak_memory_bytes": peak_memory(),
             **self._log,
-            **({"exposures": np.round(self._gains.values, 5).tolist()} if self._options.lr_exposure else {}),
+            **({"exposures": np.round(self._fitter.gains.values, 5).tolist()} if self._options.lr_exposure else {}),
         }
 
 
@@ -433,104 +402,7 @@ class RateController:
         self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _WEIGHT_RANGE[1])
 
 
-_VERSION = 1
-_FACTS = {
-    "frozen": str, "iteration": int, "step": int, "rng_state": dict, "queue": list, "options": dict, "log": dict,
-    "best": list,
-}  # fmt: skip
-_BEST_COUNT = 4  # length of `best` in a checkpoint
-_KIND = "csplat finetune"
-_FREE_VALUES = ("means", "quats", "scales", "opacities", "sh0", "sh", "sizes")
-_GROUPS = (*GROUPS, "sizes")
-
-
-@dataclass
-class FinetuneCheckpoint:
-    """A run between two steps.
-
-    Attributes:
-        iteration: number of steps so far.
-        parameters: the values, with Adam's moments.
-        rng_state: state of the random generator, JSON-compatible.
-        queue: indices of the images that remain in this epoch.
-        options: options of the run, as a dictionary.
-        log: log so far.
-        best_values: the best values so far.
-        costs: slopes of the rate by attribute, from the last count; empty before the first.
-        best: score and PSNR of the best values on the validation views, their step, number of evaluations since.
-    """
-
-    iteration: int
-    parameters: Parameters
-    rng_state: dict[str, Any]
-    queue: list[int]
-    options: dict[str, Any]
-    log: dict[str, Any]
-    best_values: FreeValues
-    costs: dict[str, NDArray[np.float32]]
-    best: tuple[float, float, int, int]
-
-
-def save_finetune(path: str | Path, checkpoint: FinetuneCheckpoint, fixed: FixedQuantisation) -> None:
-    """Write a checkpoint; the file gets its name only when it is complete."""
-    facts = {
-        "kind": _KIND,
-        "version": _VERSION,
-        "frozen": fingerprint(fixed),
-        "iteration": checkpoint.iteration,
-        "step": checkpoint.parameters.step,
-        "rng_state": checkpoint.rng_state,
-        "queue": checkpoint.queue,
-        "options": checkpoint.options,
-        "log": checkpoint.log,
-        "best": list(checkpoint.best),
-    }
-    arrays: dict[str, NDArray[Any]] = {"facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)}
-    for kind in ("values", "first", "second"):
-        arrays |= {f"{kind}_{name}": getattr(checkpoint.parameters, kind)[name] for name in _GROUPS}
-    arrays |= {f"best_{name}": getattr(checkpoint.best_values, name) for name in _FREE_VALUES}
-    arrays |= {f"costs_{name}": table for name, table in checkpoint.costs.items()}
-    with atomic_writer(str(path)) as stream:
-        np.savez(stream, allow_pickle=False, **arrays)
-
-
-def load_finetune(path: str | Path, fixed: FixedQuantisation) -> FinetuneCheckpoint:
-    """Read a checkpoint of a fixed quantisation.
-
-    Raises:
-        InputError: the file is not a checkpoint, or is of another version, scene or encoder options.
-        OSError: the file cannot be read.
-    """
-    stored = read_archive(path, "a checkpoint of csplat finetune")
-    facts = stored.facts()
-    if facts.get("kind") != _KIND:
-        stored.refuse("it is of another kind")
-    if facts.get("version") != _VERSION:
-        raise InputError(f"{path} is a checkpoint of version {facts.get('version')}, expected {_VERSION}")
-    stored.check(facts, _FACTS)
-    if facts["frozen"] != fingerprint(fixed):
-        raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
-    if len(facts["best"]) != _BEST_COUNT or not all(isinstance(one, (int, float)) for one in facts["best"]):
-        stored.refuse(f"its best evaluation is {facts['best']}")
-    parts = [{name: stored[f"{kind}_{name}"] for name in _GROUPS} for kind in ("values", "first", "second")]
-    best = FreeValues(*(stored[f"best_{name}"] for name in _FREE_VALUES))
-    costs = {name.removeprefix("costs_"): array for name, array in stored.items() if name.startswith("costs_")}
-    if any(table.ndim != 2 or table.dtype != np.float32 or not np.isfinite(table).all() for table in costs.values()):
-        stored.refuse("its costs are not tables of float32")
-    score, psnr, iteration, since = facts["best"]
-    checkpoint = FinetuneCheckpoint(
-        facts["iteration"],
-        Parameters(parts[0], parts[1], parts[2], facts["step"]),
-        facts["rng_state"],
-        facts["queue"],
-        facts["options"],
-        facts["log"],
-        best,
-        costs,
-        (score, psnr, iteration, since),
-    )
-    _check(path, checkpoint, fixed.start())
-    return checkpoint
+_FREE_VALUES = tuple(one.name for one in fields(FreeValues))
 
 
 def fingerprint(fixed: FixedQuantisation) -> str:
@@ -540,18 +412,3 @@ def fingerprint(fixed: FixedQuantisation) -> str:
     for array in (fixed.source_index, *index, *(getattr(start, name) for name in _FREE_VALUES)):
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
-
-
-def _check(path: str | Path, checkpoint: FinetuneCheckpoint, start: FreeValues) -> None:
-    shapes = {name: getattr(start, name).shape for name in _FREE_VALUES}
-    found: dict[str, list[NDArray[Any]]] = {name: [getattr(checkpoint.best_values, name)] for name in _FREE_VALUES}
-    parameters = checkpoint.parameters
-    for part in (parameters.values, parameters.first, parameters.second):
-        for name in _GROUPS:
-            found[{"logits": "opacities", "shN": "sh"}.get(name, name)].append(part[name])
-    for name, arrays in found.items():
-        for array in arrays:
-            if array.shape != shapes[name] or array.dtype != np.float32 or not np.isfinite(array).all():
-                raise InputError(
-                    f"{path}: {name} is {array.dtype} {list(array.shape)}, expected float32 {shapes[name]}"
-                )

@@ -150,7 +150,7 @@ def finish_training(
         settings: of the case.
         size_bytes: largest size of the file.
     """
-    from csplat_trainer.training_checkpoint import load_checkpoint
+    from csplat_trainer.fit_checkpoint import load_checkpoint
 
     known = TrainOptions(**load_checkpoint(checkpoint).options)
     target = None

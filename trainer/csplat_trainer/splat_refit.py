@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.model import SplatModel
@@ -25,12 +25,12 @@ from csplat_render.conventions import Gradients, HasSplats, UncheckedSplats
 from csplat_render.metrics import squared_error
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.rate_distortion import LEAST_QUANTISED, rate_exponent
+from csplat_trainer.fitter import COUNT_EVERY, Fitter
+from csplat_trainer.losses import LossValue
 from csplat_trainer.parameters import Parameters, adam_step, from_model
-from csplat_trainer.tuning.tuned_scene import RateTerm, TunedScene
+from csplat_trainer.tuned_scene import TunedScene
 
-#: Steps of a refit, and of the one after bands were dropped.
+#: Usual steps of a refit, and of the one after bands were dropped.
 FIT_STEPS, BAND_STEPS = 960, 160
 #: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
 #: optimum, every bit reduces the error by the same amount. A splat has some 30 quantised values, whose error is half of
@@ -72,8 +72,8 @@ _SH_FACTOR = 2.0  # factor of the step length for scenes without SH; not used th
 _LARGEST_ERROR = 0.04  # root mean square error, 0 to 1, above which steps do not get longer
 _BETA2 = 0.98  # Adam's decay rate of squared gradients; errors fall too fast for a longer memory
 _LAST_RATE = 0.02  # fraction of the learning rates in the last steps
-_SLOPE = 0.07  # typical fraction of the bytes that a decibel costs after a refit
-_COUNT_EVERY = 50  # steps between counts of a file's integers
+_RATE_EXPONENT = 0.07 * 10.0 / math.log(10.0)  # k of bytes ∝ error^-k, for 7 % of the bytes per dB after a refit
+_LEAST_QUANTISED = 0.1  # least fraction of a file's error that is attributed to quantisation
 _CENTRE_BITS = 24.0  # typical bits of a splat's centre, which is fixed
 _SAMPLE = 8  # every Nth view is rendered to measure the error
 
@@ -82,10 +82,12 @@ def refit_splats(
     model: SplatModel,
     cameras: Sequence[Camera],
     references: Sequence[F32],
-    options: SimplifyOptions,
     *,
     steps: int,
     free: Mask | None = None,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    threads: int | None = None,
     progress: Progress | None = None,
 ) -> SplatModel:
     """Move colours, opacities, scales and rotations along the gradient of the squared error, view by view.
@@ -94,49 +96,54 @@ def refit_splats(
         model: the scene.
         cameras: the views.
         references: [H, W, 3], the reference image of each view.
-        options: background, seed of the order of views, threads.
         steps: number of steps, one view each.
         free: [N, K], mask of the SH coefficients beyond the first that may change; `None` for all.
+        background: red, green, blue behind the splats.
+        seed: seed of the order of the views.
+        threads: number of threads; `None` for all. The result does not depend on it.
         progress: progress callback.
 
     Returns:
         The scene; splats that no view shows are unchanged.
     """
-    values, views = _FloatValues.of(model, free), _TrainingViews(cameras, references, options, model.antialiased)
+    views = _TrainingViews(cameras, references, background, model.antialiased, threads)
+    refit = _FloatRefit(views, steps, seed, progress, model, free)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
-    _descend(values, views, steps, factor * _step_length(views.rms(values.splats())), progress)
-    return values.applied_to(model)
+    refit.run(factor * _step_length(views.rms(refit.splats())))
+    return refit.applied_to(model)
 
 
 def quantisation_aware_refit(
     fixed: FixedQuantisation,
     cameras: Sequence[Camera],
     references: Sequence[F32],
-    options: SimplifyOptions,
     *,
     steps: int,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    threads: int | None = None,
     progress: Progress | None = None,
 ) -> FreeValues:
     """Refit splats through the quantisers of a file, so that renders are those of the decoded file; weigh its bytes.
 
     Args:
         fixed: the encoder's quantisation.
-        cameras, references, options, steps, progress: as for `refit_splats`.
+        cameras, references, steps, background, seed, threads, progress: as for `refit_splats`.
 
     Returns:
         Values for `FixedQuantisation.encode`.
     """
-    model, values = fixed.encode_plan.model, _QuantisedValues(TunedScene(fixed))
-    values.tuned.parameters.beta2 = _BETA2
-    views = _TrainingViews(cameras, references, options, model.antialiased)
-    rms, pruning_rms = views.rms(values.splats()), views.rms(model)
-    quantised = max(rms**2 - pruning_rms**2, LEAST_QUANTISED * rms**2)
+    model = fixed.encode_plan.model
+    views = _TrainingViews(cameras, references, background, model.antialiased, threads)
+    refit = _QuantisedRefit(views, steps, seed, progress, fixed)
+    rms, pruning_rms = views.rms(refit.scene.dequantise()[0]), views.rms(model)
+    quantised = max(rms**2 - pruning_rms**2, _LEAST_QUANTISED * rms**2)
     if math.isfinite(quantised):
         value_count = sum(image.size for image in references) / len(references)
         # Growth of the error per saved fraction of the bytes; halved, since views give half of the gradient.
-        values.lambda_ = 0.5 * quantised * value_count / rate_exponent(_SLOPE)
-    _descend(values, views, steps, _step_length(rms), progress)
-    return values.tuned.free_values.copy()
+        refit.lambda_ = 0.5 * quantised * value_count / _RATE_EXPONENT
+    refit.run(_step_length(rms))
+    return refit.scene.free_values.copy()
 
 
 def unrounded_model(fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
@@ -189,9 +196,14 @@ def refit_with_bands(
     model: SplatModel,
     cameras: Sequence[Camera],
     references: Sequence[F32],
-    options: SimplifyOptions,
     *,
+    steps: int = FIT_STEPS,
+    band_steps: int = BAND_STEPS,
+    bands: bool = True,
     band_views: int | None = None,
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    seed: int = 0,
+    threads: int | None = None,
     progress: Progress | None = None,
 ) -> RefitResult:
     """Refit the splats, set bands to zero that are not worth their bits, and refit the others again.
@@ -200,13 +212,22 @@ def refit_with_bands(
         model: the scene, with the source's values.
         cameras: the views.
         references: [H, W, 3], the source's render of each view.
-        options: `refit` and `bands`, effort, background.
-        band_views: choose bands by the first views, of this number; `None`: all.
-        progress: progress callback.
+        steps: number of steps of the first refit; 0: none.
+        band_steps: the same after bands were dropped.
+        bands: choose bands.
+        band_views: choose them by the first views, of this number; `None`: all.
+        background, seed, threads, progress: as for `refit_splats`.
     """
-    if options.refit:
-        model = refit_splats(model, cameras, references, options, steps=options.steps(FIT_STEPS), progress=progress)
-    if not options.bands or not model.sh_degree:
+
+    def refit(model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
+        return refit_splats(
+            model, cameras, references, steps=steps, free=free, background=background, seed=seed, threads=threads,
+            progress=progress,
+        )  # fmt: skip
+
+    if steps:
+        model = refit(model, steps)
+    if not bands or not model.sh_degree:
         return RefitResult(model, None)
     error = 0.0
 
@@ -215,55 +236,52 @@ def refit_with_bands(
         error += float(np.sum(squared_error(references[number], render)))
 
     pruning_error = measure_pruning_error(
-        model,
-        cameras[:band_views],
-        background=options.background,
-        on_render=add,
-        threads=options.threads,
-        progress=progress,
+        model, cameras[:band_views], background=background, on_render=add, threads=threads, progress=progress
     )
     kept_bands = choose_bands(pruning_error, error / max(1, len(model)))
     if not kept_bands.all():
         model = drop_bands(model, kept_bands)
-        if options.refit:
-            free = coefficient_mask(kept_bands)
-            model = refit_splats(
-                model, cameras, references, options, steps=options.steps(BAND_STEPS), free=free, progress=progress
-            )
+        if band_steps:
+            model = refit(model, band_steps, coefficient_mask(kept_bands))
     return RefitResult(model, kept_bands)
-
-
-class _FittedValues(Protocol):
-    """The fitted values, and the splats to render."""
-
-    def splats(self) -> UncheckedSplats: ...
-
-    def step(self, gradients: Gradients, rates: dict[str, float]) -> None: ...
 
 
 class _TrainingViews:
     """Training views with their reference images."""
 
     def __init__(
-        self, cameras: Sequence[Camera], references: Sequence[F32], options: SimplifyOptions, antialiased: bool
+        self,
+        cameras: Sequence[Camera],
+        references: Sequence[F32],
+        background: ArrayLike,
+        antialiased: bool,
+        threads: int | None,
     ) -> None:
-        self.cameras, self.references, self.seed = cameras, references, options.seed
-        self.rasteriser = Rasteriser(threads=options.threads)
-        self._background, self._antialiased = options.background, antialiased
+        self._cameras, self._references = cameras, references
+        self._background, self._antialiased = background, antialiased
+        self._rasteriser = Rasteriser(threads=threads)
 
-    def error_image(self, splats: HasSplats, view: int) -> F32:
-        """Return the error of a view's render, [H, W, 3]; positive if it is too bright."""
-        render = self.rasteriser.forward(
-            splats, self.cameras[view], background=self._background, antialiased=self._antialiased
-        )
-        # Straight-through gradient of the clipping: a colour above 1 is reduced only if the reference is darker.
-        return np.clip(render.rgb, 0.0, 1.0) - np.clip(self.references[view], 0.0, 1.0)
+    def __len__(self) -> int:
+        return len(self._cameras)
 
     def rms(self, splats: HasSplats) -> float:
         """Return the root mean square error over a sample of the views."""
-        sample = range(0, len(self.cameras), _SAMPLE)
-        errors = [np.mean(np.square(self.error_image(splats, view), dtype=np.float64)) for view in sample]
+        sample = range(0, len(self), _SAMPLE)
+        errors = [np.mean(np.square(self._error_image(splats, view), dtype=np.float64)) for view in sample]
         return math.sqrt(np.mean(errors))
+
+    def gradients(self, splats: HasSplats, view: int) -> tuple[float, Gradients]:
+        """Return the mean squared error of a view's render, and the gradients of half its sum."""
+        error = self._error_image(splats, view)
+        return float(np.vdot(error, error)) / max(1, error.size), self._rasteriser.backward(error)
+
+    def _error_image(self, splats: HasSplats, view: int) -> F32:
+        """Return the error of a view's render, [H, W, 3]; positive if it is too bright."""
+        render = self._rasteriser.forward(
+            splats, self._cameras[view], background=self._background, antialiased=self._antialiased
+        )
+        # Straight-through gradient of the clipping: a colour above 1 is reduced only if the reference is darker.
+        return np.clip(render.rgb, 0.0, 1.0) - np.clip(self._references[view], 0.0, 1.0)
 
 
 def _step_length(rms: float) -> float:
@@ -271,54 +289,74 @@ def _step_length(rms: float) -> float:
     return min(rms, _LARGEST_ERROR) if math.isfinite(rms) else 0.0
 
 
-def _descend(
-    values: _FittedValues, views: _TrainingViews, steps: int, length: float, progress: Progress | None
-) -> None:
-    """Fit the values of a scene by Adam."""
-    count = len(views.cameras)
-    rng = np.random.default_rng(views.seed)
-    order = np.concatenate([rng.permutation(count) for _ in range(-(-steps // count))])
-    for step, view in enumerate(order[:steps]):
-        gradients = views.rasteriser.backward(views.error_image(values.splats(), view))
-        rate_factor = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * (step + 1) / steps))
-        values.step(gradients, {name: length * rate_factor * rate for name, rate in _RATES.items()})
-        if progress is not None:
-            progress("adjusting splats", (step + 1) / steps)
+class _Refit:
+    """A refit to training views by a `Fitter`, with steps that become shorter along half a cosine."""
+
+    def __init__(self, views: _TrainingViews, steps: int, seed: int, progress: Progress | None) -> None:
+        self._views, self._progress, self._length = views, progress, 0.0
+        self._fitter = Fitter(len(views), steps, seed)
+        passes = [self._fitter.rng.permutation(len(views)) for _ in range(-(-steps // len(views)))]
+        self._fitter.queue = np.concatenate(passes)[:steps][::-1].tolist()  # the last is the next
+
+    def run(self, length: float) -> None:
+        """Make all steps, the first of this length."""
+        self._length = length
+        self._fitter.run(self)
+
+    def step(self, view: int) -> LossValue:
+        fitter = self._fitter
+        factor = max(_LAST_RATE, 0.5 + 0.5 * math.cos(math.pi * fitter.iteration / fitter.iterations))
+        error = self._move(view, {name: self._length * factor * rate for name, rate in _RATES.items()})
+        return LossValue(error, math.nan, math.nan, error)
+
+    def after_step(self) -> None:
+        if self._progress is not None:
+            self._progress("adjusting splats", self._fitter.iteration / self._fitter.iterations)
+
+    def _move(self, view: int, rates: dict[str, float]) -> float:
+        """Make a step on a view, and return its mean squared error before."""
+        raise NotImplementedError
 
 
-@dataclass(eq=False)
-class _FloatValues:
-    """Values without quantisation."""
+class _FloatRefit(_Refit):
+    """A refit of values without quantisation."""
 
-    means: F32
-    parameters: Parameters
-    free: Mask | None
-
-    @classmethod
-    def of(cls, model: SplatModel, free: Mask | None) -> _FloatValues:
-        parameters = Parameters.starting_at(_values_to_fit(model))
-        parameters.beta2 = _BETA2
-        return cls(model.means, parameters, free)
+    def __init__(
+        self,
+        views: _TrainingViews,
+        steps: int,
+        seed: int,
+        progress: Progress | None,
+        model: SplatModel,
+        free: Mask | None,
+    ) -> None:
+        super().__init__(views, steps, seed, progress)
+        self._means, self._free = model.means, free
+        self._parameters = Parameters.starting_at(_values_to_fit(model))
+        self._parameters.beta2 = _BETA2
 
     def splats(self) -> UncheckedSplats:
-        v = self.parameters.values
-        return UncheckedSplats(self.means, v["quats"], v["scales"], self.parameters.alphas, v["sh0"], v["shN"])
+        """Return the splats to render."""
+        v = self._parameters.values
+        return UncheckedSplats(self._means, v["quats"], v["scales"], self._parameters.alphas, v["sh0"], v["shN"])
 
-    def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
-        alphas = self.parameters.alphas
+    def _move(self, view: int, rates: dict[str, float]) -> float:
+        splats = self.splats()
+        error, gradients = self._views.gradients(splats, view)
         slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
-        slopes["logits"] = gradients.opacities * alphas * (np.float32(1.0) - alphas)
-        if self.free is not None:
-            gradients.shN[:] *= self.free[:, :, None]  # the rasteriser's buffer, valid until its next pass
-        adam_step(self.parameters, slopes, rates)
+        slopes["logits"] = gradients.opacities * splats.opacities * (np.float32(1.0) - splats.opacities)
+        if self._free is not None:
+            gradients.shN[:] *= self._free[:, :, None]  # the rasteriser's buffer, valid until its next pass
+        adam_step(self._parameters, slopes, rates)
+        return error
 
     def applied_to(self, before: SplatModel) -> SplatModel:
         """Return the scene with the changed values; unchanged and overflowed splats are kept bit for bit.
 
         This releases the optimiser's state, so no step may follow.
         """
-        self.parameters.first, self.parameters.second = {}, {}  # each as large as the scene
-        values, alphas, start = self.parameters.values, self.parameters.alphas, _values_to_fit(before)
+        self._parameters.first, self._parameters.second = {}, {}  # each as large as the scene
+        values, alphas, start = self._parameters.values, self._parameters.alphas, _values_to_fit(before)
         moved = np.zeros(len(before), bool)
         for name in ("logits", "scales", "sh0", "shN"):
             moved |= (values[name] != start[name]).reshape(len(before), -1).any(axis=1)
@@ -341,27 +379,23 @@ def _values_to_fit(model: SplatModel) -> dict[str, F32]:
     return values
 
 
-@dataclass(eq=False)
-class _QuantisedValues:
-    """Values that pass through quantisers; `lambda_` is the squared error of a render that all bits are worth."""
+class _QuantisedRefit(_Refit):
+    """A refit through quantisers; `lambda_` is the squared error of a render that all bits are worth."""
 
-    tuned: TunedScene
-    lambda_: float = 0.0
-    _alphas: F32 | None = None
-    _seen: Any = None
-    _costs: RateTerm | None = None
+    def __init__(
+        self, views: _TrainingViews, steps: int, seed: int, progress: Progress | None, fixed: FixedQuantisation
+    ) -> None:
+        super().__init__(views, steps, seed, progress)
+        self.lambda_ = 0.0
+        self.scene = TunedScene(fixed)
+        self.scene.parameters.beta2 = _BETA2
 
-    def splats(self) -> UncheckedSplats:
-        self._seen = None  # as large as the scene
-        self._seen, self._alphas = self.tuned.dequantise()
-        s = self._seen
-        return UncheckedSplats(s.means, s.quats, s.scales, s.opacities, s.sh0, s.shN)
-
-    def step(self, gradients: Gradients, rates: dict[str, float]) -> None:
-        assert self._alphas is not None
-        if self.tuned.parameters.step % _COUNT_EVERY == 0:
-            costs, splats = self.tuned.count(self._seen, 1.0), len(self._alphas)
-            costs.weight = self.lambda_ * splats / (costs.bits + _CENTRE_BITS * splats)
-            self._costs = costs
+    def _move(self, view: int, rates: dict[str, float]) -> float:
+        fitter, (seen, alphas) = self._fitter, self.scene.dequantise()
+        error, gradients = self._views.gradients(seen, view)
+        if self.lambda_ and (fitter.iteration - 1) % COUNT_EVERY == 0:
+            fitter.rate = self.scene.count(seen, 1.0)
+            fitter.rate.weight = self.lambda_ * len(alphas) / (fitter.rate.bits + _CENTRE_BITS * len(alphas))
         rates = {**rates, "means": 0.0, "sizes": rates["scales"]}
-        self.tuned.step(gradients, self._seen, self._alphas, rates, self._costs if self.lambda_ else None)
+        self.scene.step(gradients, seen, alphas, rates, fitter.rate)
+        return error

@@ -1,0 +1,148 @@
+"""`Fitter`: the loop of training, quantisation-aware tuning and refitting, an image per step."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any, Protocol
+
+from numpy.random import PCG64, Generator
+
+from csplat.errors import InputError
+from csplat.types import F32
+from csplat_trainer.fit_checkpoint import FitCheckpoint, Kind, save_checkpoint
+from csplat_trainer.image_gains import ImageGain, ImageGains
+from csplat_trainer.losses import LossValue
+from csplat_trainer.parameters import Parameters
+from csplat_trainer.tuned_scene import RateTerm
+
+COUNT_EVERY = 50  # steps between counts of the file's integers for the rate term
+
+
+class Fit(Protocol):
+    """The values that a `Fitter` fits, and their loss."""
+
+    def step(self, view: int) -> LossValue:
+        """Move the values against the gradient of a view's loss, and return the loss before."""
+        ...
+
+    def after_step(self) -> None:
+        """Do what is due after the step: refine, validate, report, write a checkpoint."""
+        ...
+
+
+class Fitter:
+    """The state of a descent, apart from the fitted values.
+
+    Args:
+        view_count: number of images.
+        iterations: number of steps.
+        seed: seed of the random generator.
+
+    Attributes:
+        iterations: as given.
+        iteration: number of steps so far, including the current one.
+        has_ended: set to end the run after the current step.
+        rng: the random generator.
+        queue: indices of the images that remain in this epoch; the last is the next.
+        gains: gain and bias of each image.
+        rate: the rate term of the loss, if there is one.
+        log: loss of each step, seconds, and what users of the loop add; JSON-compatible.
+    """
+
+    def __init__(self, view_count: int, iterations: int, seed: int) -> None:
+        self.iterations, self.iteration, self.has_ended = iterations, 0, False
+        self.rng = Generator(PCG64(seed))
+        self.queue: list[int] = []
+        self.gains = ImageGains(view_count)
+        self.rate: RateTerm | None = None
+        self.log: dict[str, Any] = {"losses": [], "seconds": 0.0}
+        self._window: list[LossValue] = []
+        self._begin, self._first, self._spent = time.perf_counter(), 0, 0.0  # the last two: before a resume
+
+    def resume(self, checkpoint: FitCheckpoint) -> None:
+        """Continue from a checkpoint.
+
+        Raises:
+            InputError: it has gains of another number of images.
+        """
+        view_count = len(self.gains.values)
+        self.iteration = self._first = checkpoint.iteration
+        self.has_ended = checkpoint.has_ended
+        self.rng.bit_generator.state = checkpoint.rng_state
+        self.queue = [view for view in checkpoint.queue if view < view_count]
+        self.gains = ImageGains(view_count, checkpoint.gains)
+        self.log |= checkpoint.log
+        self._spent = float(self.log["seconds"])
+
+    def save(
+        self,
+        path: str | Path,
+        kind: Kind,
+        options: dict[str, Any],
+        parameters: Parameters,
+        *,
+        own: dict[str, Any],
+        arrays: dict[str, F32] | None = None,
+    ) -> None:
+        """Write a checkpoint; arguments as in `FitCheckpoint`."""
+        self.log["seconds"] = self.seconds
+        gains = self.gains.as_json() if self.gains.values.any() else []
+        save_checkpoint(
+            path,
+            FitCheckpoint(
+                kind, self.iteration, self.has_ended, dict(self.rng.bit_generator.state), self.queue, gains, options,
+                self.log, parameters, own, arrays or {},
+            ),
+        )  # fmt: skip
+
+    def run(self, fit: Fit) -> None:
+        """Make the remaining steps."""
+        while self.iteration < self.iterations and not self.has_ended:
+            self.iteration += 1
+            self.step(fit)
+            fit.after_step()
+        self.log["seconds"] = self.seconds
+
+    def step(self, fit: Fit) -> None:
+        """Make a step on the next image of the queue, which is filled in random order when it is empty."""
+        if not self.queue:
+            self.queue = self.rng.permutation(len(self.gains.values)).tolist()
+        value = fit.step(self.queue.pop())
+        self._window.append(value)
+        self.log["losses"].append(float(f"{value.loss:.6g}"))
+
+    def check(self, value: LossValue) -> None:
+        """Raise an `InputError` if a loss is not finite."""
+        if not math.isfinite(value.loss):
+            raise InputError(f"the loss is not finite at step {self.iteration}: try smaller learning rates")
+
+    def gain(self, view: int, rate: float) -> ImageGain | None:
+        """Return the correction of an image, to be trained at a learning rate; `None` if that is 0."""
+        return ImageGain(self.gains, view, rate) if rate else None
+
+    def is_due(self, every: int) -> bool:
+        """Return True after every Nth step; never for 0."""
+        return every > 0 and self.iteration % every == 0
+
+    @property
+    def is_last(self) -> bool:
+        """True after the last step."""
+        return self.has_ended or self.iteration == self.iterations
+
+    def take_window(self) -> tuple[float, float]:
+        """Return mean loss and mean squared error of the steps since the last call."""
+        window, self._window = self._window, []
+        return sum(one.loss for one in window) / len(window), sum(one.mse for one in window) / len(window)
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start of the run, without interruptions."""
+        return self._spent + time.perf_counter() - self._begin
+
+    @property
+    def seconds_left(self) -> float:
+        """Estimated time of the remaining steps."""
+        per_step = (self.seconds - self._spent) / (self.iteration - self._first)
+        return per_step * (self.iterations - self.iteration)
