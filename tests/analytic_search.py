@@ -21,7 +21,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import SimpleNamespace
 from typing import Any
@@ -32,12 +32,10 @@ from checked import cloud
 from csplat import EncodeOptions, SplatModel
 from csplat.encoder import PRESETS, SearchReport, Target
 from csplat_tools.optimise.candidates import CandidatePool
-from csplat_tools.optimise.precision_search import PrecisionSearch
-from csplat_tools.optimise.pruning_order import PruningOrder, SimplifyOptions
+from csplat_tools.optimise.pruning import Pruner
 from csplat_tools.optimise.search_report import make_report
-from csplat_tools.optimise.sh_codings import CodingSearch
-from csplat_tools.optimise.subsets import Pruner
-from csplat_tools.optimise.target_search import TargetSearch, find_goal
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.target_search import Goal, TargetSearch
 
 USUAL_QUALITY = 42.0  # dB per attribute at which bytes per splat are those of the scene
 QUALITIES = np.arange(24.0, 110.0, 0.2)  # dB, the qualities that a search may request
@@ -304,28 +302,25 @@ def search(
     encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
     judge, validation_scorer = _Judge(scene, judging or Views()), _Judge(scene, Views())
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
-    trials = CandidatePool(encoding, judge, validation_scorer, photographs, decode=lambda data: data)
-    removal = None if no_prune else analytic_removal(scene, grades=grades, effort=effort)
+    pool = CandidatePool(encoding, validation_scorer, decode=lambda data: data)
+    removal = None if no_prune else analytic_removal(scene, grades=grades)
     whole = _Splats(scene, model, refits=False, classifiable=grades)
-    goal = find_goal(asked, model, photographs)
-    moves = TargetSearch(PrecisionSearch(trials, goal), CodingSearch(model, encoding, grades), whole, removal)
+    goal, work = Goal.of(asked, model, judge, photographs), SimplifyOptions(effort=effort).work
     try:
-        best = moves.best()
+        best = TargetSearch(goal, pool, whole, removal, work).best()
     finally:
         if tried is not None:
-            tried += [one.result.data for one in trials.made]
+            tried += [one.result.data for one in pool.made]
     report = make_report(
-        asked, best, trials, splats_before=scene.splats, views_of="virtual", remarks=(),
-        encodes=len(trials.made), seconds=0.0,
+        asked, best, pool, judge, splats_before=scene.splats, views_of="virtual", remarks=(),
+        encodes=len(pool.made), seconds=0.0,
     )  # fmt: skip
-    made = [one.result.data for one in trials.made]
-    return Found(best.result.data, made, judge.scored, report)
+    return Found(best.result.data, [one.result.data for one in pool.made], judge.scored, report)
 
 
-def analytic_removal(scene: AnalyticScene, *, grades: bool = False, effort: int = 3) -> Pruner:
+def analytic_removal(scene: AnalyticScene, *, grades: bool = False) -> Pruner:
     """Return the pruner of an analytic scene."""
-    how = SimplifyOptions(effort=effort)
-    return _Removal(scene.model(), None, how, use_classes=grades, progress=None, psnr=None, scene=scene)
+    return _Removal(scene.model(), None, (48, 36), use_classes=grades, scene=scene)
 
 
 @dataclass(eq=False)
@@ -341,10 +336,9 @@ class _Judge:
         if isinstance(model, AnalyticFile):
             self.scored.append(model)
             error = self.scene.error_of(model.contents, self.views)
-        elif isinstance(model, _Shown):
-            error = self.scene.source_error(model.splats, self.scene.sh_degree, self.views, refitted=model.refitted)
         else:
-            error = self.scene.source_error(len(model), model.sh_degree, self.views)
+            refitted = bool(model.sh0.any())  # marks the splats of `_Removal.refit`
+            error = self.scene.source_error(len(model), model.sh_degree, self.views, refitted=refitted)
         return np.full(len(self.cameras), error)
 
     def pooled(self, errors):
@@ -354,46 +348,21 @@ class _Judge:
         return float(psnr_of(self.pooled(self.errors(model))))
 
 
-@dataclass(frozen=True)
-class _Shown:
-    """Splats before quantisation."""
-
-    splats: int
-    refitted: bool
-
-
 @dataclass(eq=False)
 class _Splats:
     """Splats of a file: a `Subset`."""
 
     scene: AnalyticScene
-    model: object
+    model: SplatModel
     refits: bool
     classifiable: bool
 
-    @property
-    def unquantised(self):
-        return _Shown(len(self.model), self.refits)
-
-    @property
-    def rows(self):
-        return np.arange(len(self.model))
-
-    @property
-    def psnr(self):
-        if not self.refits:
-            return np.inf
-        error = self.scene.source_error(len(self.model), self.scene.sh_degree, Views(), refitted=True)
-        return float(psnr_of(error))
-
-    fitted_psnr = psnr
-
-    def coded(self, options, *, use_classes, quick):
+    def encode(self, options, *, use_classes, draft):
         use_classes = use_classes and self.classifiable and options.max_classes != 1 and self.scene.grading != 1.0
-        contents = Contents(options, len(self.model), self.refits, graded=use_classes, draft=quick and self.refits)
-        return SimpleNamespace(write=lambda _: _encoded(AnalyticFile(self.scene, contents)))
+        contents = Contents(options, len(self.model), self.refits, graded=use_classes, draft=draft and self.refits)
+        return SimpleNamespace(write=lambda: _encoded(AnalyticFile(self.scene, contents)))
 
-    def options_entry(self, candidate):  # noqa: ARG002  # not recorded in the file
+    def metadata(self, validation_psnr):  # noqa: ARG002  # not recorded in the file
         return None
 
 
@@ -404,18 +373,20 @@ def _encoded(file):
     return SimpleNamespace(data=file, report=report)
 
 
-@dataclass(frozen=True)
-class _Session:
-    """The pruning order, which is shared by every number of splats."""
+@dataclass
+class _Order:
+    """A complete pruning order."""
 
-    order: PruningOrder
-    splats: int
-    options: SimplifyOptions
-    value_count: int = 1
-    view_groups: tuple[()] = ()
+    scene: AnalyticScene
 
-    def kept_rows(self, pruned_count):
-        return np.arange(pruned_count, self.splats)
+    def extend(self, **_):
+        return False
+
+    def mean_errors(self):
+        return self.scene.removed(np.arange(self.scene.splats, 0, -1), refitted=False)
+
+    def kept(self, count):
+        return np.arange(self.scene.splats - count, self.scene.splats)
 
 
 @dataclass(eq=False)
@@ -425,12 +396,10 @@ class _Removal(Pruner):
     scene: AnalyticScene = None
 
     @cached_property
-    def session(self):
-        count = len(self.source)
-        errors = self.scene.removed(np.arange(count, 0, -1), refitted=False)
-        order = PruningOrder(np.arange(count - 1), np.diff(errors), ())
-        return _Session(order, count, self.options)
+    def order(self):
+        return _Order(self.scene)
 
-    def refit(self, kept_count, allowed, psnr_of):  # noqa: ARG002  # the signature of `Pruner`
-        model = self.source.select(np.arange(len(self.source) - kept_count, len(self.source)))
+    def refit(self, kept_count):
+        model = self.source.select(self.order.kept(kept_count))
+        model = replace(model, sh0=np.ones_like(model.sh0))
         return _Splats(self.scene, model, refits=True, classifiable=self.use_classes)

@@ -24,7 +24,7 @@ from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.scorer import renderer
-from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.target_encoding import meet_target
 from csplat_tools.training import training_run
 from csplat_tools.training.training_run import tuning_after
@@ -149,7 +149,7 @@ def found_within(source, views=None, encoding=None, *, no_prune=False, importanc
     views = views or judged_by(cameras(40))
     # Larger views take fewer steps of a fit. The size only matters if virtual views are added.
     size = SMALL if views.virtual else (960, 720)
-    simplifying = SimplifyOptions(effort=1, rounds=2, view_size=size, refit=refit)
+    simplifying = SimplifyOptions(effort=1, view_size=size, refit=refit)
     target = Target(prune=not no_prune, **goal)
     chosen = {"importance": importance, "simplifying": simplifying}
     return meet_target(source, encoding or EncodeOptions(), target=target, views=views, **chosen)

@@ -38,8 +38,7 @@ from csplat_render.conventions import RenderResult
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.optimise.pruning import Simplified, simplify
-from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
 from csplat_trainer.data import DataSet
 from csplat_trainer.posed_images import PosedImage
 from csplat_trainer.training_loop import train
@@ -352,7 +351,7 @@ def verify(source: SplatModel, result: EncodeResult, decoded: SplatModel) -> Bou
 
 def _learn(source: SplatModel) -> Learnt:
     views = cameras(9)
-    half = simplify(source, Target(keep=0.5), views=views_of(views), options=SimplifyOptions(rounds=1, effort=1)).model
+    half = simplify(source, Target(keep=0.5), views=views_of(views), options=SimplifyOptions(effort=1)).model
     options = replace(QUICK, iterations=40, refine_start=10, refine_every=10)
     trained = train(images_of(source, views, source.means[:COUNT]), options)
     try:

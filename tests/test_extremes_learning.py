@@ -32,7 +32,7 @@ from csplat import EncodeOptions, decode, encode
 from csplat.encoder import Target, encode_with_report
 from csplat.errors import InputError
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.simplify import simplify
 from csplat_tools.optimise.target_encoding import meet_target
 from csplat_tools.views import find_view_set
 from csplat_trainer.data.colmap import read_points

@@ -28,7 +28,7 @@ from csplat_render import render
 from csplat_render.camera_files import save_cameras
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.optimise.pruning_order import SimplifyOptions
+from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.training import tuning_run
 from csplat_tools.training.tuning_report import ply_splat_bytes
 from csplat_tools.training.tuning_run import smallest_reaching
@@ -512,14 +512,14 @@ def capture(source, tmp_path_factory):
 @pytest.fixture
 def brief_fits(monkeypatch):
     """Refit kept splats once, in a quarter of the usual steps."""
-    brief = partial(SimplifyOptions, effort=1, bands=False)
+    brief = partial(SimplifyOptions, effort=1)
     monkeypatch.setattr("csplat_tools.training.tuning_run.SimplifyOptions", brief)
 
 
 @pytest.fixture
 def no_fits(monkeypatch):
     """Do not refit kept splats, in tests of their number."""
-    bare = partial(SimplifyOptions, refit=False, bands=False)
+    bare = partial(SimplifyOptions, refit=False)
     monkeypatch.setattr("csplat_tools.training.tuning_run.SimplifyOptions", bare)
 
 

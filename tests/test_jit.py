@@ -160,7 +160,7 @@ def test_compilation_is_reported_once():
 _USE = """
 import json, os, sys
 import numpy as np
-import csplat_tools.optimise.pruning, csplat_render.scorer, csplat_render.lpips, csplat_render.metric_kernels
+import csplat_tools.optimise.simplify, csplat_render.scorer, csplat_render.lpips, csplat_render.metric_kernels
 from csplat.model import SplatModel
 from csplat_render.warmup import warm_up
 
@@ -186,10 +186,10 @@ plain = compiled()
 
 _SIMPLIFY = """
 prepare_renderer(quiet=True, simplify=True)
-from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.pruning import simplify
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.simplify import simplify
 before = compiled()
-simplify(model, csplat.Target(keep=0.5), options=SimplifyOptions(views=2, view_size=(32, 24), rounds=1, effort=1))
+simplify(model, csplat.Target(keep=0.5), options=SimplifyOptions(views=2, view_size=(32, 24), effort=1))
 """
 
 _COMPARE = """

@@ -26,26 +26,23 @@ from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.camera_files import save_cameras
-from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.shared_options import parse_max_error
 from csplat_tools.console import parse_size_bytes
-from csplat_tools.optimise.candidates import CodingChoice, WholeScene
-from csplat_tools.optimise.precision_search import REFIT_GAIN, PrecisionSearch, SearchGoal, SearchWindow, find_in_window
-from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.rate_distortion import error_of_psnr
+from csplat_tools.optimise.candidates import WholeScene
+from csplat_tools.optimise.rate_distortion import RateLine, RatePoint, log_bytes_at_error, log_bytes_at_size
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
 from csplat_tools.optimise.search_report import format_search, psnr_spread
-from csplat_tools.optimise.subsets import Pruner
+from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.target_search import expected_renders
 from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
 from csplat_tools.views.view_sets import pose_key, render_seconds
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
-SMALL = SimplifyOptions(effort=1, rounds=2, view_size=(960, 720))
+SMALL = SimplifyOptions(effort=1, view_size=(960, 720))
 
 
 @pytest.fixture(scope="module")
@@ -70,73 +67,35 @@ def search(*given, **how):
         return found_within(*given, **how)
 
 
-# Searches for a number.
-def test_a_search_ends_within_the_window():
-    window = SearchWindow(31.9, 32.1, 32.0)
-    points = find_in_window(lambda q: q * q / 50, window, start=20.0, slope=1.0, bounds=(0, 100), tries=9)
-    assert 31.9 <= points[-1][1] <= 32.1
-    assert 40.0 == pytest.approx(points[-1][0], abs=0.1)
+# The model of size and error.
+LINE = RateLine(RatePoint(40.0, 1e-4, 1000), -0.23, 0.045)
 
 
-def test_a_search_stops_at_a_bound():
-    points = find_in_window(lambda q: q, SearchWindow(200, 201, 200), start=50.0, slope=1.0, bounds=(0, 100), tries=9)
-    assert [50.0, 100.0] == [place for place, _ in points]
+def test_a_line_predicts_error_and_bytes_of_another_precision():
+    assert 50.0 == pytest.approx(LINE.quality_at_error(1e-4 * math.exp(-2.3)))
+    assert 1000 * math.exp(0.45) == pytest.approx(math.exp(LINE.log_bytes_at(50.0)))
+    assert 44.0 == pytest.approx(LINE.quality_at_size(1000 * math.exp(0.18)))
+    assert LINE.error_at(LINE.quality_at_error(3e-5)) == pytest.approx(3e-5)
 
 
-def test_a_plateau_is_crossed():
-    def value(place):
-        return 34.0 if place < 55.0 else place - 21.0
-
-    points = find_in_window(value, SearchWindow(38.0, 38.25, 38.1), start=42.0, slope=1.0, bounds=(24, 110), tries=9)
-    assert 38.0 <= points[-1][1] <= 38.25
-
-
-def test_a_search_gives_up_when_values_stop_growing():
-    window = SearchWindow(50, 51, 50.5)
-    points = find_in_window(lambda q: min(q, 40.0), window, start=39.0, slope=1.0, bounds=(0, 1000), tries=30)
-    assert len(points) < 6
-    assert points[-1][0] < 1000.0
+def test_slopes_are_measured_on_two_files_within_limits():
+    near, far = RatePoint(40.5, 9e-5, 1010), RatePoint(44.0, 1e-4 * math.exp(-0.8), 1000 * math.exp(0.2))
+    line = RateLine.through([LINE.nearest, near, far], -0.23, 0.045)
+    assert (line.error_slope, line.bytes_slope) == pytest.approx((math.log(0.9) / 0.5, math.log(1.01) / 0.5 * 1.0))
+    line = RateLine.through([LINE.nearest, far], -0.23, 0.045)
+    assert (line.error_slope, line.bytes_slope) == pytest.approx((-0.2, 0.05))
+    flat = RateLine.through([LINE.nearest, RatePoint(50.0, 1e-4, 1000)], -0.23, 0.045)
+    assert (flat.error_slope, flat.bytes_slope) == pytest.approx((-0.23 * 0.3, 0.045 * 0.3))
 
 
-@pytest.mark.parametrize(("fine", "stalls"), [(36.2, True), (37.5, False), (40.5, False)])
-def test_a_coding_that_gains_little_from_precision_is_not_chosen(fine, stalls):
-    part, coding = SimpleNamespace(psnr=45.0, refits=False), CodingChoice("codebook", 1 / 8)
-    alike = {"subset": part, "coding": coding, "is_final": True, "is_scored": False, "psnr": 40.0, "size_bytes": 9}
-    deflate = SimpleNamespace(deflate_level=10)
-    files = [
-        SimpleNamespace(**alike, quality=at, validation_psnr=psnr, options=deflate)
-        for at, psnr in ((50, 36), (54, fine))
-    ]
-    made = [SimpleNamespace(**{**alike, "is_scored": True}, quality=40, validation_psnr=40.0)]
-    solver = PrecisionSearch(SimpleNamespace(made=made, of=lambda *_: files), SearchGoal(psnr=40.0))
-    assert stalls == solver.is_stalled(files[0]) == math.isinf(solver.expected_cost(files[1]))
-
-
-def test_the_pruning_error_in_test_views_raises_the_validation_goal():
-    # Pruning takes 0.45 of the allowed error on the validation views; its excess on the test views is added.
-    allowed, gains = error_of_psnr(34.0), REFIT_GAIN
-    part = SimpleNamespace(refits=True, psnr=psnr_of_mse(0.45 * allowed) - gains)
-
-    def solver(scored):
-        trials = SimpleNamespace(made=[], test_psnr=lambda _: psnr_of_mse(scored * allowed) - gains)
-        return PrecisionSearch(trials, SearchGoal(psnr=34.0))
-
-    assert solver(0.8).validation_goal(part) == pytest.approx(psnr_of_mse((0.45 + 0.2) * allowed))
-    assert solver(0.45).validation_goal(part) == pytest.approx(34.0)
-    assert [False, True] == [solver(share).is_hopeless(part) for share in (0.85, 0.95)]
-    assert not PrecisionSearch(solver(0.95).candidates, SearchGoal(size_bytes=1000)).is_hopeless(part)
-
-
-def test_a_decibel_is_expensive_near_the_pruning_error():
-    # Two files equally far below the goal: the one with the larger pruning error needs more precision.
-    part, better = (SimpleNamespace(refits=True, psnr=psnr) for psnr in (34.5, 40.0))
-    packed = SimpleNamespace(deflate_level=12)
-    plan = {"coding": CodingChoice("scalar"), "quality": 40.0, "options": packed, "is_final": True, "is_scored": True}
-    scores = {"psnr": 33.8, "validation_psnr": 33.8, "size_bytes": 1000}
-    made = [SimpleNamespace(subset=one, **plan, **scores) for one in (part, better)]
-    trials = SimpleNamespace(made=made, of=lambda part, _coding: [one for one in made if one.subset is part])
-    solver = PrecisionSearch(trials, SearchGoal(psnr=34.0))
-    assert solver.expected_cost(made[0]) > solver.expected_cost(made[1]) > math.log(1000)
+def test_the_model_weighs_pruning_against_quantisation():
+    counts, errors = np.array([1000.0, 500.0, 250.0]), np.array([0.0, 2e-5, 2e-4])
+    costs = log_bytes_at_error(counts, errors, 1e-4, 0.2)
+    assert math.log(1000.0) - 0.2 * math.log(1e-4) == pytest.approx(costs[0])
+    assert 1 == np.argmin(costs)  # half of the splats leave most of the error to quantisation
+    assert np.isinf(costs[2])  # more than the allowed error
+    costs = log_bytes_at_size(counts / 1000.0, errors, 1e-4, 0.2)
+    assert 1 == np.argmin(costs)
 
 
 def test_the_spread_is_over_views():
@@ -296,25 +255,25 @@ def test_a_refit_through_the_quantisers_improves_test_views(scene):
     # Coarse geometry, fine colours: a refit through the quantisers improves test views.
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
     bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
-    how = replace(SMALL, effort=3, view_size=(960, 720))
-    removal = Pruner(bare, views, how, use_classes=False, progress=None, psnr=None, kept_count=300)
-    part, judge = removal.refit(300, None, views.validation_scorer(bare).psnr), views.test_scorer(bare)
-    quick, fitted = (part.coded(coarse, use_classes=False, quick=quick).write().data for quick in (True, False))
+    removal = replace(SMALL, effort=3).pruner(bare, views, use_classes=False, progress=None)
+    part, judge = removal.refit(300), views.test_scorer(bare)
+    quick, fitted = (part.encode(coarse, use_classes=False, draft=draft).write().data for draft in (True, False))
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
 
 
 def test_a_refit_keeps_the_requested_number(scene):
     views = with_validation_views(judged_by(cameras(40)))
-    removal = Pruner(scene, views, SMALL, use_classes=False, progress=None, psnr=30.0)
-    assert 3 == len(removal.refit(3, None, lambda _: 20.0).rows)
+    assert 3 == len(SMALL.pruner(scene, views, progress=None).refit(3).rows)
 
 
-def test_two_refits_predict_the_next_number_of_splats():
-    # If the second refit errs little more than the first, fewer splats suffice than the second alone suggests.
-    alone, together = (analytic_removal(AnalyticScene()) for _ in range(2))
-    together.next_at_psnr(6000, 37.0, 35.0, 0.05)
-    (first, _), (second, _) = (removal.next_at_psnr(5800, 36.95, 35.0, 0.05) for removal in (alone, together))
-    assert second < first
+def test_two_refits_predict_the_error_of_others():
+    removal = analytic_removal(AnalyticScene())
+    counts, alone = removal.errors(1.0, {6000: 1e-4})
+    _, together = removal.errors(1.0, {5000: 9e-4, 6000: 1e-4})
+    rows = [int(np.flatnonzero(counts == count)[0]) for count in (5000, 6000)]
+    assert [9e-4, 1e-4] == pytest.approx(together[rows].tolist(), rel=0.05)
+    assert 1e-4 == pytest.approx(alone[rows[1]])
+    assert alone[rows[0]] < together[rows[0]]
 
 
 # Views.
@@ -405,7 +364,7 @@ def test_quantisation_classes_reduce_the_size_at_equal_psnr(unequal, measured):
     for use_classes in (True, False):
         options = EncodeOptions(attribute_psnr=48.0 if use_classes else 47.0)
         whole = WholeScene(unequal, None, measured, None)
-        files[use_classes] = whole.coded(options, use_classes=use_classes, quick=False).write()
+        files[use_classes] = whole.encode(options, use_classes=use_classes, draft=False).write()
     assert len(files[True].report.options["classes"]["splats"]) > 1
     assert "classes" not in files[False].report.options
     assert judge.psnr(decode(files[True].data)) >= judge.psnr(decode(files[False].data))
@@ -455,12 +414,13 @@ def test_sensitivity_is_measured_if_it_has_an_effect(scene, unequal, measured):
 # Reports.
 def test_the_expected_number_of_renders_depends_on_the_target():
     target, options = Target(psnr=30.0), EncodeOptions()
-    assert (520.0, 3000.0) == tuple(expected_renders(options, target, no_prune=keep) for keep in (True, False))
+    most, least = (expected_renders(options, replace(target, prune=prune)) for prune in (True, False))
+    assert 0.0 < least < most
     fast, extra = EncodeOptions(preset="fast"), EncodeOptions(keep_extra=True)
-    assert [520.0, 520.0] == [expected_renders(one, target, no_prune=False) for one in (fast, extra)]
-    assert 520.0 == expected_renders(options, Target(psnr=30.0, max_error={"means": 1.0}), no_prune=False)
-    assert 3000.0 == expected_renders(fast, Target(keep=0.5), no_prune=False)
-    assert 1200.0 == expected_renders(options, target, no_prune=False, simplifying=SimplifyOptions(effort=1))
+    assert [least, least] == [expected_renders(one, target) for one in (fast, extra)]
+    assert least == expected_renders(options, Target(psnr=30.0, max_error={"means": 1.0}))
+    assert most == expected_renders(fast, Target(keep=0.5))
+    assert most > expected_renders(options, replace(target, effort=1))
 
 
 def test_seconds_per_render_exclude_the_first(scene):
@@ -653,7 +613,7 @@ def test_only_long_work_is_announced(capsys):
 
 def test_the_command_announces_the_time_of_a_search(tmp_path, ply, monkeypatch):
     # The search itself fails: the test view shows nothing.
-    monkeypatch.setattr("csplat_tools.optimise.target_search.render_seconds", lambda *_, **__: 170.0 / 520.0)
+    monkeypatch.setattr("csplat_tools.optimise.target_encoding.render_seconds", lambda *_, **__: 170.0 / 520.0)
     K = intrinsics(48, 40, 60.0)
     save_cameras(tmp_path / "away.json", [look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)])
     words = ("encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json")

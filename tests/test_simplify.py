@@ -1,7 +1,6 @@
 """Simplification: views, pruning order, refits, SH bands, and the command."""
 
 import json
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -13,19 +12,18 @@ pytest.importorskip("numba", reason="simplification requires the extra [render]"
 from captures import views_of
 from command_line import call, change_options, change_views, invoke
 
-from csplat import EncodeOptions
-from csplat.encoder import EncodePlan, Target, fix_quantisation
+from csplat.encoder import Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
 from csplat_render.camera_files import save_cameras
-from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scene_frame import sample_cloud, scene_frame, surface_areas
 from csplat_render.scorer import Scorer, renderer
 from csplat_render.virtual_cameras import is_clear
 from csplat_tools.cli.shared_options import parse_decibels
-from csplat_tools.optimise.pruning import simplify
-from csplat_tools.optimise.pruning_order import MeasuredViews, SimplifyOptions, find_pruning_order, total_error
+from csplat_tools.optimise.pruning import Pruner
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_tools.views import (
     VIEW_COUNT,
     VIEW_SIZE,
@@ -35,21 +33,14 @@ from csplat_tools.views import (
     find_view_set,
     shrink_cameras,
 )
-from csplat_tools.views.sufficient_views import find_sufficient_views, pruning_keys
+from csplat_tools.views.sufficient_views import find_sufficient_views
 from csplat_trainer.posed_images import PosedImage, image_scorer
-from csplat_trainer.splat_refit import (
-    RefitResult,
-    choose_bands,
-    coefficient_mask,
-    drop_bands,
-    quantisation_aware_refit,
-    refit_splats,
-    unrounded_model,
-)
+from csplat_trainer.pruning import MeasuredViews, PruningOrder, pruning_keys, total_error
+from csplat_trainer.splat_refit import refit_splats
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
-SMALL = SimplifyOptions(views=12, view_size=(48, 36), effort=1, rounds=2)
+SMALL = SimplifyOptions(views=12, view_size=(48, 36), effort=1)
 
 
 def render_all(model, seen_from):
@@ -128,44 +119,48 @@ def test_views_are_added_until_others_agree(source):
 # Pruning order.
 def test_transparent_splats_are_pruned_first_and_unseen_ones_kept(source):
     found = find_sufficient_views(source, views_of(camera_sequence(source, 9, (48, 36))), 0.5)
-    keys = pruning_keys(source.opacities, found.pruning_error)
+    total = total_error(found.batches)
+    keys = pruning_keys(source.opacities, total)
     assert (keys[:10] == -1.0).all()
-    unseen = ~found.pruning_error.seen & (source.opacities > 0.01)
+    unseen = ~total.seen & (source.opacities > 0.01)
     assert np.isinf(keys[unseen]).all()
-    assert (pruning_keys(source.opacities, found.pruning_error, keep_unseen=False)[unseen] < 0.0).all()
-    order = find_pruning_order(source, [MeasuredViews(found.used, found.pruning_error)], SMALL, len(source) // 2)
+    assert (pruning_keys(source.opacities, total, keep_unseen=False)[unseen] < 0.0).all()
+    order = PruningOrder(source, found.batches)
+    assert len(source) // 2 == len(order.kept(len(source) // 2))
     assert set(order.rows[:10]) == set(range(10))
-    assert len(order.rounds) == 2
+    assert [126, 91, 8] == order.rounds  # each keeps 72 %
 
 
 def test_rounds_alternate_between_groups_of_views(source):
     # Each round measures one group of views again; the other keeps its last errors until its turn.
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
     view_groups = [MeasuredViews(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
-    order = find_pruning_order(source, view_groups, replace(SMALL, rounds=2), len(source) // 2)
-    first = order.rounds[0].removed
-    rows = order.kept(len(source), first)
+    order = PruningOrder(source, list(view_groups))
+    order.extend(kept_count=len(source) - 200)
+    first, second = order.rounds
+    rows = order.kept(len(source) - first)
     keys = pruning_keys(source.opacities, total_error(view_groups))
     np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
-    again = measure_pruning_error(source.select(rows), parts[0]).error + view_groups[1].pruning_error.error[rows]
+    again = (
+        measure_pruning_error(source.select(rows), parts[0], bands=False).error
+        + view_groups[1].pruning_error.error[rows]
+    )
     places = np.searchsorted(rows, order.rows[first:])
     np.testing.assert_allclose(order.errors[first:], again[places], rtol=1e-9)
+    assert 200 == first + second
 
 
 @pytest.mark.slow
 def test_exact_errors_prune_better_than_opacity(source):
     check = camera_sequence(source, 6, (64, 48), seed=9)
     judge = Scorer.of_source(source, check, (0, 0, 0))
-    scores = {}
     views = views_of(camera_sequence(source, 32, (48, 36), seed=3))
-    for rounds in (1, SMALL.rounds):
-        options = replace(SMALL, rounds=rounds, refit=False, bands=False)
-        scores[rounds] = judge.psnr(simplify(source, Target(keep=0.8), views=views, options=options).model)
+    by_error = judge.psnr(simplify(source, Target(keep=0.8), views=views, options=replace(SMALL, refit=False)).model)
     by_opacity = []
     for weights in (1.0, surface_areas(source)):
         least = np.argsort(source.opacities * weights, kind="stable")[: len(source) - round(0.8 * len(source))]
         by_opacity.append(judge.psnr(source.select(np.delete(np.arange(len(source)), least))))
-    assert min(scores.values()) > max(by_opacity) + 3.0
+    assert by_error > max(by_opacity) + 3.0
 
 
 # Simplified scenes.
@@ -186,15 +181,15 @@ def test_a_refit_improves_validation_views(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
     views = views_of(camera_sequence(shell, 40, (48, 36), seed=3))
-    report = simplify(shell, Target(keep=0.5), views=views, options=replace(SMALL, bands=False)).report
+    report = simplify(shell, Target(keep=0.5), views=views, options=SMALL).report
     assert report["check_psnr"] > report["check_psnr_pruned"] + 1.5
 
 
 def test_a_refit_that_overfits_is_discarded(source, given, monkeypatch):
     def dark(model, *_arguments, **_options):
-        return RefitResult(replace(model, sh0=model.sh0 - np.float32(1.0)), None)
+        return replace(model, sh0=model.sh0 - np.float32(1.0))
 
-    monkeypatch.setattr(sys.modules[simplify.__module__], "refit_with_bands", dark)
+    monkeypatch.setattr("csplat_tools.optimise.pruning.refit_splats", dark)
     result = simplify(source, Target(keep=0.6), views=given, options=SMALL)
     assert result.report["refit_refused"]
     assert result.report["check_psnr"] == result.report["check_psnr_pruned"]
@@ -222,62 +217,24 @@ def test_alphas_of_a_refit_stay_within_0_and_1(source):
     assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0
 
 
-ENCODINGS = [
-    EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32),
-    EncodeOptions(attribute_psnr=28.0, sh_coding="scalar"),
-    EncodeOptions(attribute_psnr=28.0, sh_degree=1),
-]
-
-
-@pytest.mark.parametrize("encoding", ENCODINGS, ids=["codebooks", "scalar", "degree 1"])
-def test_an_unrounded_model_holds_the_values_before_quantisation(source, encoding):
-    fixed = fix_quantisation(EncodePlan.of(source, encoding))
-    values = fixed.start()
-    values.opacities *= np.float32(0.999)
-    free = unrounded_model(fixed, values)
-    order = np.argsort(fixed.source_index)
-    np.testing.assert_array_equal(values.opacities[order], free.opacities)
-    np.testing.assert_array_equal(source.means, free.means)
-    exact = np.ones(len(source), bool) if fixed.shapes is None else fixed.shapes.escaped[order]
-    np.testing.assert_allclose(
-        np.sort(source.scales, axis=1)[exact], np.sort(free.scales, axis=1)[exact], rtol=0, atol=1e-6
-    )
-    if fixed.book is None:
-        np.testing.assert_array_equal(values.sh[order], free.shN[:, : values.sh.shape[1]])
-
-
-def test_a_second_quantised_refit_continues_from_the_first(source):
-    cameras, coarse = camera_sequence(source, 6, (48, 36)), EncodeOptions(attribute_psnr=26.0)
-    wanted = render_all(source, cameras)
-    fixed = fix_quantisation(EncodePlan.of(source, coarse))
-    values = quantisation_aware_refit(fixed, cameras, wanted, steps=40)
-    finer = replace(coarse, attribute_psnr=27.0)
-
-    def error(start):
-        plan = fix_quantisation(EncodePlan.of(start, finer), source)
-        seen = plan.dequantise(quantisation_aware_refit(plan, cameras, wanted, steps=4))
-        rendered = render_all(replace(plan.encode_plan.model, **vars(seen), means_double=None), cameras)
-        return sum(np.square(one - other).sum() for one, other in zip(rendered, wanted, strict=True))
-
-    assert error(unrounded_model(fixed, values)) < error(source)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("goal", "refit"), [(35.0, False), (28.0, True)])
 def test_a_target_psnr_is_reached(source, given, goal, refit):
-    result = simplify(source, Target(psnr=goal), views=given, options=replace(SMALL, bands=False, refit=refit))
+    result = simplify(source, Target(psnr=goal), views=given, options=replace(SMALL, refit=refit))
     assert result.report["validation_psnr"] >= goal
     assert given.validation_scorer(source).psnr(result.model) == pytest.approx(result.report["validation_psnr"])
     assert len(result.model) < len(source)
 
 
 def test_the_source_is_kept_with_a_remark_if_no_pruned_scene_reaches_the_target(source, given, monkeypatch):
-    def make_black(pruned, *_, **__):
-        return RefitResult(replace(pruned, sh0=np.full_like(pruned.sh0, -10.0)), None)
+    def select_black(pruner, count):
+        refit = one_refit(pruner, count)
+        return refit if count == len(source) else replace(refit, model=replace(refit.model, sh0=refit.model.sh0 - 10.0))
 
-    monkeypatch.setattr("csplat_tools.optimise.pruning.refit_with_bands", make_black)
-    result = simplify(source, Target(psnr=35.0), views=given, options=replace(SMALL, bands=False, refit=False))
-    assert source is result.model
+    one_refit = Pruner.refit
+    monkeypatch.setattr(Pruner, "refit", select_black)
+    result = simplify(source, Target(psnr=35.0), views=given, options=replace(SMALL, refit=False))
+    np.testing.assert_array_equal(source.sh0, result.model.sh0)
     (remark,) = result.notes
     assert "all splats are kept, unchanged" in remark
 
@@ -292,9 +249,7 @@ def test_a_larger_psnr_drop_prunes_more_splats(source):
     judge = image_scorer(views.images_of(views.validation), views.background)
     sizes = []
     for loss in (0.05, 1.0):
-        result = simplify(
-            source, Target(max_psnr_drop=loss), views=views, options=replace(SMALL, bands=False, refit=False)
-        )
+        result = simplify(source, Target(max_psnr_drop=loss), views=views, options=replace(SMALL, refit=False))
         assert judge.psnr(result.model) >= judge.psnr(source) - loss
         sizes.append(len(result.model))
     assert sizes[0] > sizes[1]
@@ -311,52 +266,19 @@ def test_keeping_all_splats_changes_nothing(source, given):
     np.testing.assert_array_equal(source.shN, result.model.shN)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("keep", "options", "left"),
-    [
-        (0.998, {}, 449),  # less than one splat per round
-        (0.98, {"rounds": 12}, 441),
-        (1e-4, {"keep_unseen": False, "rounds": 1}, 1),
-    ],
-)
-def test_the_requested_number_but_at_least_one_splat_is_kept(source, given, keep, options, left):
-    chosen = replace(SMALL, refit=False, bands=False, **options)
-    assert left == len(simplify(source, Target(keep=keep), views=given, options=chosen).model)
+@pytest.mark.parametrize(("keep", "left"), [(0.998, 449), (0.98, 441), (0.5, 225)])
+def test_the_requested_number_is_kept(source, given, keep, left):
+    assert left == len(simplify(source, Target(keep=keep), views=given, options=replace(SMALL, refit=False)).model)
 
 
 @pytest.mark.slow
 def test_the_result_does_not_depend_on_threads(source, given):
     one, two = (
-        simplify(source, Target(keep=0.5), views=given, options=replace(SMALL, bands=False, threads=threads))
-        for threads in (1, 2)
+        simplify(source, Target(keep=0.5), views=given, options=replace(SMALL, threads=threads)) for threads in (1, 2)
     )
     np.testing.assert_array_equal(one.source_index, two.source_index)
     for name in ("opacities", "scales", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(one.model, name), getattr(two.model, name))
-
-
-# SH bands.
-def test_bands_with_less_gain_than_cost_are_dropped():
-    bands = np.array([[0.3, 0.3, 0.3], [0.0, 0.0, 0.0], [9.0, 9.0, 9.0]])
-    zeros = np.zeros(3)
-    pruning_error = PruningError(zeros, zeros, np.array([True, False, True]), bands, 1)
-    kept_bands = choose_bands(pruning_error, 1.0)
-    np.testing.assert_array_equal([[True, False, False], [True, True, True], [True, True, True]], kept_bands)
-    free = coefficient_mask(kept_bands)
-    assert [3, 15, 15] == free.sum(axis=1).tolist()
-
-
-@pytest.mark.slow
-def test_dropped_bands_are_zero(source, given):
-    result = simplify(source, Target(keep=0.4), views=given, options=SMALL)
-    kept_bands = result.kept_bands
-    assert kept_bands is not None
-    assert 0 < np.count_nonzero(~kept_bands) < kept_bands.size
-    np.testing.assert_array_equal(result.model.shN, drop_bands(result.model, kept_bands).shN)
-    for band, count in result.report["zero_bands"].items():
-        span = slice(int(band) ** 2 - 1, (int(band) + 1) ** 2 - 1)
-        assert count == np.count_nonzero(~result.model.shN[:, span].any(axis=(1, 2)))
 
 
 # Errors.
@@ -364,7 +286,7 @@ def test_other_targets_and_options_out_of_range_are_refused(source):
     for given in ({"size_bytes": 1000}, {"psnr": 40.0, "max_error": {"means": 1.0}}):
         with pytest.raises(InputError, match="is no target of simplify, expected keep or psnr or max_psnr_drop"):
             simplify(source, Target(**given), options=SMALL)
-    for wrong in ({"rounds": 0}, {"effort": 0}, {"effort": 10}, {"views": 0}, {"view_size": (0, 1)}):
+    for wrong in ({"effort": 0}, {"effort": 10}, {"views": 0}, {"view_size": (0, 1)}):
         with pytest.raises(InputError, match="expected"):
             SimplifyOptions(**wrong)
     assert SimplifyOptions(view_size=(1, 1)).view_size == (1, 1)
@@ -385,7 +307,7 @@ def test_decibels_are_parsed_with_and_without_unit():
 @pytest.mark.slow
 def test_the_command_writes_a_smaller_ply_and_a_report(source, tmp_path, monkeypatch):
     change_views(monkeypatch, 8, (48, 36))
-    change_options(monkeypatch, "csplat_tools.optimise.pruning_order.SimplifyOptions", rounds=2, refit=False)
+    change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", refit=False)
     scene, out, report = tmp_path / "scene.ply", tmp_path / "out.ply", tmp_path / "report.json"
     write_ply(scene, source)
     words = ("simplify", scene, out, "--keep", "0.5")
@@ -404,7 +326,7 @@ def test_the_command_uses_cameras_prints_json_and_announces_the_time(source, tmp
     write_ply(scene, source)
     save_cameras(cameras, camera_sequence(source, 10, (48, 36)))
     change_views(monkeypatch, 24, (48, 36))
-    change_options(monkeypatch, "csplat_tools.optimise.pruning_order.SimplifyOptions", refit=False)
+    change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", refit=False)
     words = ("simplify", scene, tmp_path / "out.ply", "--target-psnr", "30", "--cameras", cameras)
     result = invoke(*words, "--json")
     assert result.exit_code == 0, result.output
@@ -443,6 +365,3 @@ def test_views_of_many_splats_are_larger_and_fewer():
     assert default_views(10_000_000) == (VIEW_COUNT // 2, (2 * VIEW_SIZE[0], 2 * VIEW_SIZE[1]))
     assert SimplifyOptions().views_and_size(100) == default_views(100)
     assert SimplifyOptions(views=3, view_size=(20, 10)).views_and_size(10_000_000) == (3, (20, 10))
-    usual = SimplifyOptions().steps(400)
-    assert SimplifyOptions(view_size=(480, 360)).steps(400) == usual // 2
-    assert SimplifyOptions(view_size=(24, 18)).steps(400) == usual

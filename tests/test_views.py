@@ -186,7 +186,7 @@ def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, 
     # test_tradeoff.py tests the validation views of a sweep.
     ply, own = sets["rgba"] / "scene.ply", ("--data", sets["rgba"])
     change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", size=(24, 20), test_every=5)
-    change_options(monkeypatch, "csplat_tools.optimise.pruning_order.SimplifyOptions", rounds=1)
+    change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", effort=1)
     change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
     found = {}
 
@@ -275,7 +275,7 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
     quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10)
     size = "x".join(map(str, SIZE))
     change_options(monkeypatch, "csplat_tools.cli.train.TrainOptions", init="box")
-    change_options(monkeypatch, "csplat_tools.optimise.pruning_order.SimplifyOptions", rounds=1, refit=False)
+    change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", refit=False)
     change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
     call("train", data, ply, *quick, "--size", size, "--test-every", every, "--report", log, "-q")
     record = TrainingRecord.of(read_ply(ply).metadata)

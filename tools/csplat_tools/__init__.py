@@ -19,8 +19,7 @@ from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 if TYPE_CHECKING:
     from csplat_tools.batches.batch_run import Batch, batch
     from csplat_tools.inspect.comparison import Comparison, compare
-    from csplat_tools.optimise.pruning import Simplified, simplify
-    from csplat_tools.optimise.pruning_order import SimplifyOptions
+    from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
     from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
     from csplat_tools.tradeoffs.sweep_options import SweepOptions
     from csplat_tools.tradeoffs.sweep_run import Tradeoff, tradeoff
@@ -55,8 +54,8 @@ _MODULE_OF = {
     "DataOptions": "csplat_tools.views",
     "LoadedModel": "csplat_tools.scene_files",
     "SceneLike": "csplat_tools.scene_files",
-    "Simplified": "csplat_tools.optimise.pruning",
-    "SimplifyOptions": "csplat_tools.optimise.pruning_order",
+    "Simplified": "csplat_tools.optimise.simplify",
+    "SimplifyOptions": "csplat_tools.optimise.simplify",
     "Tradeoff": "csplat_tools.tradeoffs.sweep_run",
     "ViewSet": "csplat_tools.views",
     "SweepOptions": "csplat_tools.tradeoffs.sweep_options",
@@ -64,7 +63,7 @@ _MODULE_OF = {
     "compare": "csplat_tools.inspect.comparison",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.scene_files",
-    "simplify": "csplat_tools.optimise.pruning",
+    "simplify": "csplat_tools.optimise.simplify",
     "tradeoff": "csplat_tools.tradeoffs.sweep_run",
 }
 _export, __dir__ = lazy_exports(__name__, _MODULE_OF)

@@ -1,4 +1,4 @@
-"""Refit kept splats to renders of the source by gradient descent, and choose the SH bands that they need.
+"""Refit kept splats to renders of the source by gradient descent.
 
 Colours, opacities, scales and rotations are fitted together, one small view per step, so that neighbours of pruned
 splats cover for them, and other values compensate for quantisation. The step length is proportional to the error. Least
@@ -11,60 +11,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.model import SplatModel
-from csplat.types import F32, Mask, Progress
+from csplat.types import F32, Progress
 from csplat_render import Camera
 from csplat_render.conventions import Gradients, HasSplats, UncheckedSplats
-from csplat_render.metrics import squared_error
-from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.fitter import COUNT_EVERY, Fitter
 from csplat_trainer.losses import LossValue
 from csplat_trainer.parameters import Parameters, adam_step, from_model
 from csplat_trainer.tuned_scene import TunedScene
-
-#: Usual steps of a refit, and of the one after bands were dropped.
-FIT_STEPS, BAND_STEPS = 960, 160
-#: Largest errors of bands 1, 2, 3 that are not worth their bits, as fractions of the scene's error per splat. At the
-#: optimum, every bit reduces the error by the same amount. A splat has some 30 quantised values, whose error is half of
-#: the total, and a bit reduces its value's error by 2 ln 2; bands of 9, 15 and 21 values take 1.5 bits per value.
-BAND_COST = (0.25, 0.4, 0.55)
-
-
-def choose_bands(pruning_error: PruningError, error: float) -> Mask:
-    """Return a mask of the bands to keep, [N, d].
-
-    Args:
-        pruning_error: errors of removing each band from the scene.
-        error: squared error of the scene per splat, summed over the views of `pruning_error`.
-
-    Splats that no view saw keep all bands.
-    """
-    costs = np.array(BAND_COST[: pruning_error.bands.shape[1]])
-    kept_bands: Mask = (pruning_error.bands > error * costs) | ~pruning_error.seen[:, None]
-    return kept_bands
-
-
-def coefficient_mask(kept_bands: Mask) -> Mask:
-    """Return a mask of the SH coefficients beyond the first that belong to kept bands, [N, (d + 1)² − 1]."""
-    columns = [np.zeros((len(kept_bands), 0), bool)]
-    columns += [
-        np.repeat(kept_bands[:, band - 1 : band], 2 * band + 1, axis=1) for band in range(1, kept_bands.shape[1] + 1)
-    ]
-    return np.concatenate(columns, axis=1)
-
-
-def drop_bands(model: SplatModel, kept_bands: Mask) -> SplatModel:
-    """Return the scene with zeros in the bands that are not kept."""
-    return replace(model, shN=model.shN * coefficient_mask(kept_bands)[:, :, None].astype(np.float32))
-
 
 #: Learning rates of the first steps per unit of the root mean square error, which is limited to `_LARGEST_ERROR`.
 _RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
@@ -84,7 +46,6 @@ def refit_splats(
     references: Sequence[F32],
     *,
     steps: int,
-    free: Mask | None = None,
     background: ArrayLike = (0.0, 0.0, 0.0),
     seed: int = 0,
     threads: int | None = None,
@@ -97,7 +58,6 @@ def refit_splats(
         cameras: the views.
         references: [H, W, 3], the reference image of each view.
         steps: number of steps, one view each.
-        free: [N, K], mask of the SH coefficients beyond the first that may change; `None` for all.
         background: red, green, blue behind the splats.
         seed: seed of the order of the views.
         threads: number of threads; `None` for all. The result does not depend on it.
@@ -107,7 +67,7 @@ def refit_splats(
         The scene; splats that no view shows are unchanged.
     """
     views = _TrainingViews(cameras, references, background, model.antialiased, threads)
-    refit = _FloatRefit(views, steps, seed, progress, model, free)
+    refit = _FloatRefit(views, steps, seed, progress, model)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
     refit.run(factor * _step_length(views.rms(refit.splats())))
     return refit.applied_to(model)
@@ -144,106 +104,6 @@ def quantisation_aware_refit(
         refit.lambda_ = 0.5 * quantised * value_count / _RATE_EXPONENT
     refit.run(_step_length(rms))
     return refit.scene.free_values.copy()
-
-
-def unrounded_model(fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
-    """Return the splats with values as they are before quantisation, from which another `EncodePlan` may start.
-
-    Args:
-        fixed: the encoder's quantisation.
-        values: its values, for example of `quantisation_aware_refit`.
-
-    Returns:
-        The splats in the order of their indices in the source, in canonical axis order. Splats of a codebook's entry
-        share its values; SH bands beyond the degree kept are zero.
-    """
-    model, book, shapes = fixed.encode_plan.model, fixed.book, fixed.shapes
-    sh, quats, scales = values.sh, values.quats, values.scales
-    if book is not None:
-        sh = sh[_rows_of(book.index, book.size)]
-    if shapes is not None:
-        rows = _rows_of(shapes.index, shapes.size)
-        quats, scales = quats[rows], scales[rows] + values.sizes[:, None]
-    shN = np.zeros_like(model.shN)
-    shN[:, : sh.shape[1]] = sh
-    model = replace(
-        model, means=values.means, quats=quats, scales=scales, opacities=values.opacities, sh0=values.sh0, shN=shN,
-        means_double=None,
-    )  # fmt: skip
-    return model.select(np.argsort(fixed.source_index))
-
-
-def _rows_of(index: NDArray[np.int32], size: int) -> NDArray[np.int64]:
-    """Return each splat's row of `FreeValues`: its entry, or its own row behind the entries if it is escaped."""
-    escaped = index == size
-    return np.where(escaped, size - 1 + np.cumsum(escaped), index)
-
-
-@dataclass(frozen=True, eq=False)
-class RefitResult:
-    """A refitted scene.
-
-    Attributes:
-        model: the scene.
-        kept_bands: [N, d], mask of the kept SH bands; `None` if bands were not chosen.
-    """
-
-    model: SplatModel
-    kept_bands: Mask | None
-
-
-def refit_with_bands(
-    model: SplatModel,
-    cameras: Sequence[Camera],
-    references: Sequence[F32],
-    *,
-    steps: int = FIT_STEPS,
-    band_steps: int = BAND_STEPS,
-    bands: bool = True,
-    band_views: int | None = None,
-    background: ArrayLike = (0.0, 0.0, 0.0),
-    seed: int = 0,
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> RefitResult:
-    """Refit the splats, set bands to zero that are not worth their bits, and refit the others again.
-
-    Args:
-        model: the scene, with the source's values.
-        cameras: the views.
-        references: [H, W, 3], the source's render of each view.
-        steps: number of steps of the first refit; 0: none.
-        band_steps: the same after bands were dropped.
-        bands: choose bands.
-        band_views: choose them by the first views, of this number; `None`: all.
-        background, seed, threads, progress: as for `refit_splats`.
-    """
-
-    def refit(model: SplatModel, steps: int, free: Mask | None = None) -> SplatModel:
-        return refit_splats(
-            model, cameras, references, steps=steps, free=free, background=background, seed=seed, threads=threads,
-            progress=progress,
-        )  # fmt: skip
-
-    if steps:
-        model = refit(model, steps)
-    if not bands or not model.sh_degree:
-        return RefitResult(model, None)
-    error = 0.0
-
-    def add(number: int, render: NDArray[np.float32]) -> None:
-        nonlocal error
-        error += float(np.sum(squared_error(references[number], render)))
-
-    pruning_error = measure_pruning_error(
-        model, cameras[:band_views], background=background, on_render=add, threads=threads, progress=progress
-    )
-    kept_bands = choose_bands(pruning_error, error / max(1, len(model)))
-    if not kept_bands.all():
-        model = drop_bands(model, kept_bands)
-        if band_steps:
-            model = refit(model, band_steps, coefficient_mask(kept_bands))
-    return RefitResult(model, kept_bands)
 
 
 class _TrainingViews:
@@ -322,16 +182,10 @@ class _FloatRefit(_Refit):
     """A refit of values without quantisation."""
 
     def __init__(
-        self,
-        views: _TrainingViews,
-        steps: int,
-        seed: int,
-        progress: Progress | None,
-        model: SplatModel,
-        free: Mask | None,
+        self, views: _TrainingViews, steps: int, seed: int, progress: Progress | None, model: SplatModel
     ) -> None:
         super().__init__(views, steps, seed, progress)
-        self._means, self._free = model.means, free
+        self._means = model.means
         self._parameters = Parameters.starting_at(_values_to_fit(model))
         self._parameters.beta2 = _BETA2
 
@@ -345,8 +199,6 @@ class _FloatRefit(_Refit):
         error, gradients = self._views.gradients(splats, view)
         slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
         slopes["logits"] = gradients.opacities * splats.opacities * (np.float32(1.0) - splats.opacities)
-        if self._free is not None:
-            gradients.shN[:] *= self._free[:, :, None]  # the rasteriser's buffer, valid until its next pass
         adam_step(self._parameters, slopes, rates)
         return error
 

@@ -55,7 +55,7 @@ def simplify(
         raise typer.BadParameter("expected --keep, --target-psnr or --max-psnr-drop")
     require_renderer()
     import csplat_tools
-    from csplat_tools.optimise.pruning_order import SimplifyOptions
+    from csplat_tools.optimise.simplify import SimplifyOptions
     from csplat_tools.views import shrink_cameras
     from csplat_tools.views.view_sets import total_render_seconds
 

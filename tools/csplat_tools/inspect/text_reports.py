@@ -256,9 +256,6 @@ def format_simplification(report: Mapping[str, Any]) -> list[str]:
         rows.append(("held-out images, source", f"{scores['source']:.2f}"))
         rows.append(("held-out images", f"{scores['psnr']:.2f}"))
     lines.append(format_table(("PSNR", "dB"), rows))
-    if report["zero_bands"]:
-        percentages = [f"{band}: {100.0 * count / after:.0f} %" for band, count in report["zero_bands"].items()]
-        lines.append(f"splats without SH band {', '.join(percentages)}")
     return lines
 
 

@@ -1,24 +1,33 @@
-"""The rate-distortion model of the search, in the number of splats and the error of quantisation.
+"""The model of the search: size and error of files, by the number of splats and the precision of their values.
 
-A decibel costs the fraction s of a file's bytes, so the bytes for n splats with quantisation error Q are proportional
-to n · Q^-k, k = 10 / ln(10) · s. With P(n) the error of pruning, the smallest file of error D has the n that minimises
-n · (D - P(n))^-k. The best file of a given size has the n that minimises P(n) + Q · (n / N)^(1 / k), where Q is the
-quantisation error with N splats.
+The error of a file is the sum of the error P of pruning and the error Q of quantisation. For one coding, the logarithms
+of Q and of the bytes are nearly linear in the precision (`RateLine`), so that n splats take bytes ∝ n · Q^-k. P(n) is
+known from the pruning order. Hence the smallest file of error D has the n that minimises n · (D - P(n))^-k. The best
+file of a size has the n that minimises P(n) + Q · (n / N)^(1 / k), if N splats of that size have the error Q.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from csplat.types import F64
 
-#: Typical fraction of the bytes that a decibel costs; measured 0.035 without SH, 0.05 with it.
+#: Fraction of the bytes that a decibel of quantisation error costs; measured 0.035 without SH, 0.05 with it.
 BYTES_PER_DB = 0.045
 
-#: Least fraction of a file's error that is attributed to quantisation.
+#: Least fraction of a file's error that is attributed to quantisation, since a smaller rest is noise.
 LEAST_QUANTISED = 0.1
+
+#: Natural logarithm of an error per dB.
+NEPERS = math.log(10.0) / 10.0
+
+_APART = 0.5  # dB; two files of less distance do not determine a slope
+_SLOPES = (0.3, 2.0)  # range of a measured slope, as a multiple of the typical one
+_MOST_PRUNED = 0.7  # largest fraction of the error that pruning may take
 
 
 def error_of_psnr(psnr: float) -> float:
@@ -26,34 +35,96 @@ def error_of_psnr(psnr: float) -> float:
     return math.pow(10.0, -psnr / 10.0)
 
 
-def error_at_size(kept_count: F64, removed: F64, quantised: float, slope: float) -> F64:
-    """Return the mean squared error of files of one size.
-
-    Args:
-        kept_count: number of kept splats, relative to the number at which quantisation costs `quantised`.
-        removed: mean squared error of pruning the others.
-        quantised: mean squared error of quantisation.
-        slope: fraction of the bytes that a decibel costs.
-    """
-    return np.asarray(removed + quantised * kept_count ** (1.0 / rate_exponent(slope)))
-
-
-def log_bytes_at_error(kept_count: F64, removed: F64, allowed: float, most: float, slope: float) -> F64:
-    """Return the log bytes of files with equal error, up to a constant; infinite if pruning takes too much of it.
-
-    Args:
-        kept_count: number of kept splats, in any unit.
-        removed: mean squared error of pruning the others.
-        allowed: mean squared error of the files.
-        most: largest fraction of it that pruning may take; beyond, the rest for quantisation would be a small
-            difference of uncertain numbers.
-        slope: fraction of the bytes that a decibel costs.
-    """
-    fits = removed <= most * allowed
-    spare = np.where(fits, allowed - removed, 1.0)
-    return np.where(fits, np.log(kept_count) - rate_exponent(slope) * np.log(spare), np.inf)
-
-
 def rate_exponent(slope: float) -> float:
-    """Return k of bytes ∝ error^-k for the fraction of the bytes that a decibel costs."""
-    return slope * 10.0 / math.log(10.0)
+    """Return the k of bytes ∝ Q^-k if a decibel of Q costs the fraction `slope` of the bytes."""
+    return slope / NEPERS
+
+
+@dataclass(frozen=True)
+class RatePoint:
+    """A measured file: precision in dB of PSNR of each attribute alone, quantisation error, bytes."""
+
+    quality: float
+    error: float
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class RateLine:
+    """Logarithms of quantisation error and bytes of one kind of file, linear in the precision.
+
+    Attributes:
+        nearest: the file that the line passes through.
+        error_slope: change of log error per dB of precision, below 0.
+        bytes_slope: change of log bytes per dB of precision, above 0.
+    """
+
+    nearest: RatePoint
+    error_slope: float
+    bytes_slope: float
+
+    @classmethod
+    def through(cls, points: Sequence[RatePoint], error_slope: float, bytes_slope: float) -> RateLine:
+        """Return the line through files, the first of which is nearest to the goal.
+
+        Args:
+            points: the files. Another one that is far enough from the first determines the slopes.
+            error_slope, bytes_slope: the slopes to assume without one, and to limit measured ones by.
+        """
+        first = points[0]
+        for other in points[1:]:
+            apart = other.quality - first.quality
+            if abs(apart) >= _APART:
+                by_error = math.log(other.error / first.error) / apart / error_slope
+                by_size = math.log(other.size_bytes / first.size_bytes) / apart / bytes_slope
+                error_slope *= min(max(by_error, _SLOPES[0]), _SLOPES[1])
+                bytes_slope *= min(max(by_size, _SLOPES[0]), _SLOPES[1])
+                break
+        return cls(first, error_slope, bytes_slope)
+
+    @property
+    def exponent(self) -> float:
+        """The k of bytes ∝ Q^-k."""
+        return -self.bytes_slope / self.error_slope
+
+    def quality_at_error(self, error: float) -> float:
+        """Return the precision for a quantisation error."""
+        return self.nearest.quality + math.log(error / self.nearest.error) / self.error_slope
+
+    def quality_at_size(self, size_bytes: float) -> float:
+        """Return the precision for a size."""
+        return self.nearest.quality + math.log(size_bytes / self.nearest.size_bytes) / self.bytes_slope
+
+    def error_at(self, quality: float) -> float:
+        """Return the quantisation error at a precision."""
+        return self.nearest.error * math.exp(self.error_slope * (quality - self.nearest.quality))
+
+    def log_bytes_at(self, quality: float) -> float:
+        """Return the log bytes at a precision."""
+        return math.log(self.nearest.size_bytes) + self.bytes_slope * (quality - self.nearest.quality)
+
+
+def log_bytes_at_error(kept_count: F64, pruned: F64, allowed: float, exponent: float) -> F64:
+    """Return the log bytes of files of equal error, up to a constant; infinite if pruning takes too much of it.
+
+    Args:
+        kept_count: numbers of kept splats.
+        pruned: mean squared error of pruning the others.
+        allowed: mean squared error of the files.
+        exponent: k of bytes ∝ Q^-k.
+    """
+    fits = pruned <= _MOST_PRUNED * allowed
+    rest = np.where(fits, allowed - pruned, 1.0)
+    return np.where(fits, np.log(kept_count) - exponent * np.log(rest), np.inf)
+
+
+def log_bytes_at_size(kept_count: F64, pruned: F64, quantised: float, exponent: float) -> F64:
+    """Return the log bytes that the error of files of equal size is worth, up to a constant.
+
+    Args:
+        kept_count: numbers of kept splats, relative to the number at which quantisation costs `quantised`.
+        pruned: mean squared error of pruning the others.
+        quantised: mean squared error of quantisation.
+        exponent: k of bytes ∝ Q^-k.
+    """
+    return np.asarray(exponent * np.log(pruned + quantised * kept_count ** (1.0 / exponent)))

@@ -12,6 +12,7 @@ from csplat.encoder import SearchReport, Target
 from csplat.errors import counted
 from csplat.types import F64
 from csplat_render.metrics import psnr_of_mse
+from csplat_render.scorer import Scorer
 from csplat_tools.console import format_bytes
 from csplat_tools.optimise.candidates import Candidate, CandidatePool
 from csplat_tools.views import describe_views
@@ -65,6 +66,7 @@ def make_report(
     target: Target,
     found: Candidate,
     candidates: CandidatePool,
+    test_scorer: Scorer,
     *,
     splats_before: int,
     views_of: str,
@@ -77,41 +79,47 @@ def make_report(
         target: the target.
         found: the chosen file.
         candidates: all candidates.
+        test_scorer: scorer on the test views.
         splats_before: number of splats of the scene.
         views_of: source of the test views: `virtual`, or a name.
         remarks: additional sentences for `why`.
         numbers: the other fields of `SearchReport`.
     """
-    errors, spread = found.errors, psnr_spread(found.errors)
+    errors = found.test_errors
+    if errors is None:
+        errors = test_scorer.errors(candidates.decode(found.result.data))
+    found.test_psnr = psnr = psnr_of_mse(test_scorer.pooled(errors))
+    spread = psnr_spread(errors)
     worst = min(psnr_of_mse(float(error)) for error in errors)
     many = describe_views(len(errors), views_of)
     sure = (
         f"measured on the file itself, in {many}, which chose nothing but the precision: the worst has {worst:.2f} dB"
     )
     if not math.isnan(spread):
-        sure += (
-            f"; other such views would change the {found.psnr:.2f} dB by about {spread:.1f} (one standard deviation)"
-        )
+        sure += f"; other such views would change the {psnr:.2f} dB by about {spread:.1f} (one standard deviation)"
     return SearchReport(
         goal=target.as_json(),
         size_bytes=found.size_bytes,
         splats=found.splats,
         splats_before=splats_before,
-        psnr=found.psnr,
+        psnr=psnr,
         worst_psnr=worst,
         spread=None if math.isnan(spread) else round(spread, 3),
         views=len(errors),
         views_of=views_of,
-        renders=candidates.render_count,
+        renders=sum(
+            len(candidates.validation_scorer.cameras) + len(errors) * (one.goal_error is not None)
+            for one in candidates.made
+        ),
         chosen=found.as_json(),
         tried=tuple(candidate.as_json() for candidate in candidates.made),
-        why=(*_why(target, found, candidates, splats_before), *remarks),
+        why=(*_why(target, found, psnr, candidates, splats_before), *remarks),
         sure=sure,
         **numbers,
     )
 
 
-def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_before: int) -> list[str]:
+def _why(target: Target, found: Candidate, psnr: float, candidates: CandidatePool, splats_before: int) -> list[str]:
     """Return sentences on the coding of SH, the alternatives, and the number of pruned splats."""
     codings = list(dict.fromkeys(_coding(one) for one in candidates.made if one.subset is found.subset))
     if found.quality is None:
@@ -126,7 +134,7 @@ def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_bef
     if others:
         expected = "look worse" if target.size_bytes is not None else "take more"
         lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
-    if target.psnr is not None and found.psnr > target.psnr + _FAR:
+    if target.psnr is not None and psnr > target.psnr + _FAR:
         lines.append("no smaller file of those tried reaches the target")
     pruned_count = splats_before - found.splats
     if pruned_count:

@@ -13,9 +13,10 @@ from csplat.types import Progress
 from csplat_tools.optimise.candidates import Weights
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.views import ViewSet, find_view_set
+from csplat_tools.views.view_sets import render_seconds
 
 if TYPE_CHECKING:
-    from csplat_tools.optimise.pruning_order import SimplifyOptions
+    from csplat_tools.optimise.simplify import SimplifyOptions
 
 
 def meet_target(
@@ -46,19 +47,20 @@ def meet_target(
     """
     start = time.perf_counter()
     require_renderer()
+    from csplat_tools.optimise.simplify import SimplifyOptions
     from csplat_tools.optimise.target_search import check_target, search_target
 
     if not (views is None or isinstance(views, ViewSet)):
         raise InputError(f"views is a {type(views).__name__}, expected csplat_tools.find_view_set(...)")
-    check_target(source, target, options, no_prune=not target.prune)
+    check_target(source, target, options)
     encodes = 0
     if target.max_error:
         bounded, options = meet_bounds(source, options, target, importance=importance, progress=progress)
         assert bounded.report.search is not None
         encodes = bounded.report.search.encodes
     found, report = search_target(
-        source, target, views or find_view_set(source), options, no_prune=not target.prune, importance=importance,
-        simplifying=simplifying or _simplifying(target), progress=progress,
+        source, target, views or find_view_set(source), options, importance=importance,
+        options=simplifying or SimplifyOptions(effort=target.effort), progress=progress,
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 3)
     return found.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
@@ -66,12 +68,6 @@ def meet_target(
 
 def expected_search_seconds(source: SplatModel, options: EncodeOptions, target: Target, views: ViewSet) -> float:
     """Estimate the seconds of `meet_target` on this machine, from the time of some renders of test views."""
-    from csplat_tools.optimise.target_search import expected_seconds
+    from csplat_tools.optimise.target_search import expected_renders
 
-    return expected_seconds(source, options, target, views, no_prune=not target.prune, simplifying=_simplifying(target))
-
-
-def _simplifying(target: Target) -> SimplifyOptions:
-    from csplat_tools.optimise.pruning_order import SimplifyOptions
-
-    return SimplifyOptions(effort=target.effort)
+    return expected_renders(options, target) * render_seconds(source, views.test, threads=options.threads)

@@ -1,16 +1,25 @@
-"""Search for the smallest file at a PSNR or a loss, or the best one within a size.
+"""Search for the smallest file of a PSNR, or the best one of a size.
 
-The search chooses the precision, which determines all steps; the SH bands and their coding; quantisation classes; and
-the number of splats, which are refitted to renders of the source after pruning. A few candidates of each kind are made
-near the goal, and kinds are compared by their expected cost there. For the best kinds candidates exactly on the goal
-are made, and compared with the presets' own files. Candidates that are not expected to pay are not made.
+How a target is met:
+
+1. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
+   gives the first number of splats (`_first_count`), which are refitted to renders of the source.
+2. Drafts of these splats are encoded with one coding of SH after another: each neighbour of the best coding is tried
+   until none is expected to be smaller (`_choose_coding`).
+3. Two drafts of a coding give its bytes and error as functions of the precision (`RateLine`). Together with the pruning
+   order they predict the best number of splats (`_next_count`). If it promises to save enough, it is tried as well.
+4. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
+   goal, which corrects the prediction of the precision, until another file would hardly be smaller (`_finish`).
+
+Candidates are compared by their error on validation views. Test views settle the precision of the last files for a
+PSNR, and nothing else. With all splats kept, steps 1 and 3 are left out, and the presets' own files are candidates.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,46 +27,493 @@ from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, SearchReport, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import PSNR_CAP, Progress
+from csplat.scene_source import drop_bands
+from csplat.types import Progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
-from csplat_tools.optimise.candidates import Candidate, CandidatePool, CodingChoice, Weights, WholeScene
-from csplat_tools.optimise.precision_search import REFIT_GAIN, PrecisionSearch, SearchGoal, clip_quality
-from csplat_tools.optimise.pruning_order import SimplifyOptions
-from csplat_tools.optimise.rate_distortion import BYTES_PER_DB, error_of_psnr
+from csplat_tools.optimise.candidates import Candidate, CandidatePool, Coding, Subset, Weights, WholeScene
+from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
+from csplat_tools.optimise.rate_distortion import (
+    BYTES_PER_DB,
+    LEAST_QUANTISED,
+    NEPERS,
+    RateLine,
+    RatePoint,
+    error_of_psnr,
+    log_bytes_at_error,
+    log_bytes_at_size,
+    rate_exponent,
+)
 from csplat_tools.optimise.scene_sensitivity import complete_importance
 from csplat_tools.optimise.search_report import make_report
-from csplat_tools.optimise.sh_codings import CodingSearch
-from csplat_tools.optimise.subsets import Pruner
+from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
-from csplat_tools.views.view_sets import render_seconds
 
-#: Cost of a target in renders of 640x480. Without pruning, measured 380 to 690 with plane3, donut, lego60k, fox120k.
-#: With pruning, a fixed part, and one that grows with the effort (plane3 at 40 dB, effort 1, 3 and 7: 0.6 to 1 to 4).
+#: Cost of a target in renders of 640x480, without pruning; with pruning, a fixed part and one that grows with effort.
 _RENDERS = 520.0
 _RENDERS_WITH_PRUNING = (600.0, 2400.0)
-_ATTRIBUTE_GAIN = (5.0, 8.5)  # dB from the PSNR of all attributes to that of one alone, at 30 dB, without and with SH
-_ATTRIBUTE_GAIN_GROWS = (0.0, 0.22)  # increase of this gain per dB above 30, without and with SH
-_USUAL = (7.0, 42.0)  # usual bytes per splat, and the attribute PSNR of such files, dB
-_COUNTS = 3  # splat counts to refit; twice this number if none has a file yet
-_WORTH = 0.02  # fraction of file size; a splat count predicted to save less is not refitted
-_CLOSE = 0.04  # fraction of the splats; a splat count closer to one that was tried is not refitted
-_SPARE = 0.7  # dB above the goal; a refit of lower PSNR leaves too little of the error to quantisation
-_FEWER = 0.7  # factor from one splat count to the next if none of its files fits the size
+
+_QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
+_ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, without and with SH, at about 38 dB
+_USUAL = (7.0, 42.0)  # usual bytes per splat, and the precision of such files, dB
+_USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat at useful quality, without and with SH
+_BYTES_PER_DB = (0.045, 0.07)  # fraction of the bytes that a decibel costs if splats are added, without and with SH
+_GAINS = {"codebook": 0.6}  # typical dB of PSNR per dB of precision; 1 for other codings
+_TUNING_GAINS = {
+    "codebook": 1.2
+}  # dB by which the refit through the quantisers reduces the error of a file; 0.7 for others
+_AIM = 0.06  # dB above a PSNR, and the bytes they are worth below a size, that files aim at
+_COUNTS, _CODINGS = 3, 10  # most splat counts, and drafts for the choice of a coding
+_FILES = (8, 4)  # most files on the goal, of all splats and of refitted ones
+_FARTHEST = 2.0  # largest factor between the errors of pruning of two splat counts, since they are extrapolated
+_NEGLIGIBLE = 0.1  # fraction of the allowed error; errors of pruning below that need no limit
+_OTHER = 4.0  # dB of precision from which another coding may be better
+_WORTH = 0.03  # fraction of the bytes that another splat count must promise, since it takes a refit
+_WORTH_FILE = 0.01  # fraction of the bytes that another file of the same splats and coding must promise
+_STALLED = 6.0  # dB of precision above the usual at which a coding is tried first
+_DRAFTS = 3  # most drafts of one coding
+_JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
+_NEAR = 1.0  # dB of precision; a draft farther from its goal does not predict the bytes on it
 _ALL_BUT = 0.02  # fraction of the splats; pruning fewer does not pay
-_LEAST_REST = 0.15  # least fraction of the allowed error that is left to quantisation
-_WITHIN_REACH = 0.1  # fraction of file size that another coding may save
-_PAYS = 0.01  # fraction of file size; a candidate expected to be larger by less may turn out smaller
-_PAYS_FOR_REFIT = 0.03  # fraction of file size that pruned candidates must promise, since each takes a refit
-_COMMON = 0.1  # fraction of file size; largest excess of one refitted file that is assumed for others
-_FAR = 0.03  # fraction of file size; presets are not tried if candidates of all splats exceed the best by more
-_BANDS_GROW = (34.0, 0.055)  # dB above which splats with SH become cheaper to keep, and the fraction per dB
-_PRESETS = (-1.0, 2.5)  # dB above the goal; presets whose own files are expected in this range are tried
+_PRESETS = 2.5  # dB; presets whose precision is this close to the chosen one are tried
+_USUAL_ENTRIES = 1 / 16  # codebook entries per splat to begin with
+_ENTRIES = (1 / 4096, 1 / 4)  # least and most codebook entries per splat
+_MOST_DROPPED = 0.35  # largest fraction of the error that dropping SH bands may take
+_BEYOND = 1.4  # factor of the number of splats if no file of a number meets the goal
+_NOTHING = 1e-12  # least mean squared error
+_LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
 _INSIDE_REMARK = (
     "splats were pruned by virtual views, which may show less than cameras inside of the surroundings do:"
     " use --data, or --cameras with at least 40 cameras, or keep all splats with --no-prune"
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Goal:
+    """The goal of a search.
+
+    Attributes:
+        scorer: scorer on the goal's views: the test views for a PSNR, validation images for a drop.
+        size_bytes: largest size of the file; `None` without a target size.
+        error: largest mean squared error on the goal's views.
+        source_error: that of the source.
+        max_error: largest errors of splats by measure; files that exceed one are rejected.
+    """
+
+    scorer: Scorer
+    size_bytes: int | None = None
+    error: float = math.inf
+    source_error: float = 0.0
+    max_error: Mapping[str, float] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, target: Target, source: SplatModel, test_scorer: Scorer, image_scorer: Scorer | None) -> Goal:
+        """Return the goal for a target.
+
+        Args:
+            target: a PSNR, a size or a drop of PSNR.
+            source: the scene.
+            test_scorer: scorer on the test views, against the source's renders.
+            image_scorer: scorer on the validation images; required for a drop.
+        """
+        if target.psnr is not None:
+            return cls(test_scorer, error=error_of_psnr(target.psnr), max_error=target.max_error)
+        if target.max_psnr_drop is None or image_scorer is None:
+            return cls(test_scorer, target.size_bytes, max_error=target.max_error)
+        error = image_scorer.pooled(image_scorer.errors(source))
+        return cls(image_scorer, error=error / error_of_psnr(target.max_psnr_drop), source_error=error)
+
+
+@dataclass(eq=False)
+class TargetSearch:
+    """The search for the splats, the coding and the precision of a file.
+
+    Attributes:
+        goal: the goal.
+        pool: makes the candidates.
+        whole: all splats.
+        pruner: prunes splats; `None`: all are kept.
+        work: amount of work relative to the default effort.
+    """
+
+    goal: Goal
+    pool: CandidatePool
+    whole: WholeScene
+    pruner: Pruner | None
+    work: float = 1.0
+    _errors: dict[tuple[int, int, bool], float] = field(default_factory=dict, init=False)
+    _pruned: dict[int, float] = field(default_factory=dict, init=False)
+
+    def best(self) -> Candidate:
+        """Return the smallest file that meets the goal, or the best one of a size.
+
+        Raises:
+            InputError: no file meets the goal.
+        """
+        if self.pruner is None:
+            coding = self._choose_coding(self.whole)
+            self._finish(self.whole, coding)
+            self._try_presets(coding)
+        else:
+            subset, coding = self._choose_splats(self.pruner)
+            while not self._finish(subset, coding):
+                another = self.pruner.refit(self._count_beyond(len(subset.model)))
+                if len(another.model) == len(subset.model):
+                    break
+                subset = another
+                self._try(subset, coding, {})
+        met = [one for one in self.pool.made if self._is_met(one)]
+        if not met:
+            raise InputError(self._out_of_reach())
+        return min(met, key=lambda one: one.size_bytes if self.goal.size_bytes is None else one.error)
+
+    # The number of splats
+
+    def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding]:
+        """Return the refitted splats and the coding with the least expected cost."""
+        kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
+        coding: Coding | None = None
+        quality = 0.0
+        for _ in range(_COUNTS):
+            subset = pruner.refit(kept_count)
+            if coding is None or abs(self._start(subset, coding) - quality) > _OTHER:
+                coding = self._choose_coding(subset)
+                quality = self._predict(subset, coding)[0]
+            else:
+                self._try(subset, coding, {})
+            kept_count, saved = self._next_count(pruner, subset, coding)
+            cost = self._predict(subset, coding)[1]
+            tried.append((math.inf if math.isinf(saved) else cost, subset, coding))
+            if self.work < 1.0:
+                break
+            if saved < _WORTH or any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
+                break
+        return min(tried, key=lambda one: one[0])[1:]
+
+    def _first_count(self, pruner: Pruner) -> int:
+        """Return the number of splats to begin with."""
+        splats = len(self.whole.model)
+        if self.goal.size_bytes is not None:
+            usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
+            return self._rounded(min(self.goal.size_bytes / usual, splats))
+        allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
+        for _ in range(_COUNTS):  # pruning errors in validation views differ from those in training views
+            counts, errors = pruner.errors(allowed, known)
+            costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
+            before, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
+            if abs(kept_count - before) <= _WORTH * splats:
+                break
+            pruned = self.whole.model.select(pruner.order.kept(kept_count))
+            known = {kept_count: error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)}
+        return kept_count
+
+    def _next_count(self, pruner: Pruner, subset: Subset, coding: Coding) -> tuple[int, float]:
+        """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save."""
+        line, size_bytes, allowed = self._line(subset, coding), self.goal.size_bytes, self._allowed_in_renders
+        count = len(subset.model)
+        self._pruned[count] = self._unquantised(subset, coding, on_goal=size_bytes is None)
+        quantised = 0.0 if size_bytes is None else line.error_at(line.quality_at_size(size_bytes))
+        counts, errors = pruner.errors(allowed if size_bytes is None else quantised, self._pruned)
+        if size_bytes is None:
+            costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
+        else:
+            costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
+        least = _NEGLIGIBLE * (quantised if size_bytes is not None else allowed)
+        costs[errors > max(_FARTHEST * self._pruned[count], least)] = np.inf
+        best = int(np.argmin(costs))
+        return self._rounded(counts[best]), float(costs[np.searchsorted(-counts, -count)] - costs[best])
+
+    @property
+    def _exponent(self) -> float:
+        """The k of bytes ∝ n · Q^-k, for the choice of the number n of splats."""
+        return rate_exponent(_BYTES_PER_DB[self.whole.model.sh_degree > 0])
+
+    def _count_beyond(self, count: int) -> int:
+        """Return the next number of splats to try if no file of this number meets the goal."""
+        return self._rounded(count * _BEYOND if self.goal.size_bytes is None else count / _BEYOND**2)
+
+    def _rounded(self, count: float) -> int:
+        """Return a number of splats; all of them if pruning the others would not pay."""
+        splats = len(self.whole.model)
+        return splats if count > (1.0 - _ALL_BUT) * splats else max(1, round(count))
+
+    # The coding
+
+    def _choose_coding(self, subset: Subset) -> Coding:
+        """Return the coding with the least expected cost.
+
+        A coding of each kind is tried; then the neighbours of the best one, and larger codebooks while they gain.
+        """
+        costs, most = dict[Coding, float](), max(2, round(_CODINGS * self.work))
+        waiting = self._first_codings(subset)
+        while waiting and len(costs) < most:
+            coding = waiting.pop(0)
+            costs[coding] = self._try(subset, coding, costs)
+            if not waiting:
+                best, *others = sorted(costs, key=costs.__getitem__)
+                book = next((one for one in others if one.sh == "codebook"), None)
+                larger = [] if book is None or best.sh == "codebook" else self._other_sizes(book)[:1]
+                found = [
+                    *self._fewer_bands(subset, best),
+                    *self._other_sizes(best),
+                    *larger,
+                    *self._alike(subset, best),
+                ]
+                waiting = [one for one in found if one not in costs][:1]
+        return min(costs, key=costs.__getitem__)
+
+    def _try(self, subset: Subset, coding: Coding, costs: Mapping[Coding, float]) -> float:
+        """Make a draft of a coding, more if it is far from its goal and promising, and return the expected cost."""
+        best, quality = min(costs, key=costs.__getitem__, default=None), self._start(subset, coding)
+        if best is not None:  # unless its codebook is too small for any precision
+            quality = min(self._predict(subset, best)[0], quality + _STALLED)
+        cost = math.inf
+        for _ in range(_DRAFTS):
+            made = self.pool.make(subset, coding, quality, draft=True)
+            if not costs:
+                self._score(made)
+            quality, cost = self._predict(subset, coding)
+            if abs(quality - (made.quality or 0.0)) < _NEAR or (best is not None and cost > costs[best] + _WORTH):
+                break
+        return cost
+
+    def _start(self, subset: Subset, coding: Coding) -> float:
+        """Return the precision of the first draft of a subset, dB."""
+        size_bytes = self.goal.size_bytes
+        for other in reversed(self.pool.made):
+            if other.coding == coding and other.quality is not None:
+                line = self._line(other.subset, coding)
+                if size_bytes is None:
+                    return _clipped(line.quality_at_error(self._rest(subset, coding)))
+                return _clipped(line.quality_at_size(size_bytes / len(subset.model) * len(other.subset.model)))
+        if size_bytes is None:
+            return _clipped(psnr_of_mse(self._rest(subset, coding)) + _ATTRIBUTE_GAIN[coding.sh != "none"])
+        return _clipped(_USUAL[1] + math.log(size_bytes / len(subset.model) / _USUAL[0]) / BYTES_PER_DB)
+
+    def _first_codings(self, subset: Subset) -> list[Coding]:
+        """Return a coding of each kind that the caller left open."""
+        encoding, degree = self.pool.encoding, self.whole.model.sh_degree
+        if encoding.sh_coding == "none" or not degree or encoding.sh_degree == 0:
+            return [Coding("none")]
+        coarse = subset.classifiable and not subset.refits and encoding.adaptive is None
+        scalar, book = Coding("scalar", adaptive=1.0 if coarse else None), Coding("codebook", _USUAL_ENTRIES)
+        if encoding.sh_coding != "auto":
+            return [book if encoding.sh_coding == "codebook" else scalar]
+        is_extreme = float(np.abs(self.whole.model.shN).max(initial=0.0)) > _LARGEST_SH
+        return [scalar] if is_extreme or encoding.preset == "fast" else [scalar, book]
+
+    def _other_sizes(self, book: Coding) -> list[Coding]:
+        """Return a coding with twice and with half the codebook entries, within limits."""
+        if book.entries_per_splat is None or self.pool.encoding.codebook_size is not None:
+            return []
+        sizes = [factor * book.entries_per_splat for factor in (2.0, 0.5)]
+        return [replace(book, entries_per_splat=size) for size in sizes if _ENTRIES[0] <= size <= _ENTRIES[1]]
+
+    def _fewer_bands(self, subset: Subset, coding: Coding) -> list[Coding]:
+        """Return codings with fewer SH bands, the fewest first, if dropping these takes little of the error."""
+        found, lower = list[Coding](), self._degree(coding) - 1
+        if coding.sh == "none" or self.pool.encoding.sh_degree is not None or self.goal.size_bytes is not None:
+            return found
+        while lower >= 0:
+            fewer = replace(coding, degree=lower) if lower else Coding("none", degree=0, use_classes=coding.use_classes)
+            if self._unquantised(subset, fewer) > _MOST_DROPPED * self._allowed(subset, coding):
+                break
+            found, lower = [fewer, *found], lower - 1
+        return found
+
+    def _alike(self, subset: Subset, coding: Coding) -> list[Coding]:
+        """Return codings with equal steps for all splats in one respect."""
+        found = [replace(coding, adaptive=None)] if coding.adaptive is not None else []
+        if subset.classifiable and coding.use_classes:
+            found.append(replace(coding, use_classes=False))
+        return found
+
+    # The precision
+
+    def _finish(self, subset: Subset, coding: Coding) -> bool:
+        """Make files until one meets the goal and another one would hardly be smaller; return True if one meets it."""
+        best: Candidate | None = None
+        if subset.refits:
+            self._score(self._by_distance(subset, coding, draft=True)[0])
+        made: dict[float, Candidate] = {}
+        for _ in range(_FILES[subset.refits]):
+            quality = self._predict(subset, coding)[0]
+            if best is None:  # files of neighbouring precisions may differ by chance
+                while any(abs(quality - other) < 0.5 * _JUMP for other in made):
+                    quality += _JUMP if self.goal.size_bytes is None else -_JUMP
+            elif self._cost(best) - self._predict(subset, coding)[1] < _WORTH_FILE:
+                break
+            if quality in made or not _QUALITIES[0] <= quality <= _QUALITIES[1]:
+                break
+            made[quality] = file = self.pool.make(subset, coding, quality, draft=False)
+            self._score(file)
+            if self._is_met(file) and (best is None or self._cost(file) < self._cost(best)):
+                best = file
+        return best is not None
+
+    def _predict(self, subset: Subset, coding: Coding) -> tuple[float, float]:
+        """Return the precision at which a file of a subset and coding meets the goal, dB, and its cost in log bytes.
+
+        For a size, the cost is the log bytes that the file's error is worth.
+        """
+        line = self._line(subset, coding)
+        if self.goal.size_bytes is not None:
+            quality = _clipped(line.quality_at_size(self.goal.size_bytes * (1.0 - BYTES_PER_DB * _AIM)))
+            error = self._unquantised(subset, coding) + line.error_at(quality)
+            return quality, rate_exponent(BYTES_PER_DB) * math.log(error)
+        quality = line.quality_at_error(self._rest(subset, coding))
+        return _clipped(quality), line.log_bytes_at(quality)
+
+    def _cost(self, file: Candidate) -> float:
+        """Return the cost of a file on the goal, as in `_predict`."""
+        if self.goal.size_bytes is None:
+            return math.log(file.size_bytes)
+        return rate_exponent(BYTES_PER_DB) * math.log(max(file.error, _NOTHING))
+
+    def _line(self, subset: Subset, coding: Coding) -> RateLine:
+        """Return quantisation error and bytes of a subset and coding by precision.
+
+        The line passes through the candidate nearest to the goal, a draft only if there is no other. Slopes are
+        measured on files of one kind if there are two, first on drafts.
+        """
+        gain, line = _GAINS.get(coding.sh or "", 1.0), None
+        slopes = (-gain * NEPERS, gain * BYTES_PER_DB)
+        for draft in (True, False):
+            made = self._by_distance(subset, coding, draft=draft)
+            if made:
+                line = RateLine.through([self._point(one) for one in made], *slopes)
+                slopes = line.error_slope, line.bytes_slope
+        assert line is not None
+        return line
+
+    def _excess(self, one: Candidate) -> float:
+        """Return the log of a candidate's size, or of its quantisation error, divided by that of the goal."""
+        if self.goal.size_bytes is not None:
+            return math.log(one.size_bytes / self.goal.size_bytes)
+        return math.log(self._point(one).error / self._rest(one.subset, one.coding))
+
+    def _by_distance(self, subset: Subset, coding: Coding, *, draft: bool) -> list[Candidate]:
+        """Return candidates: the nearest to the goal first, then those on the other side of the goal."""
+        made = [(self._excess(one), one) for one in self.pool.of(subset, coding, draft=draft)]
+        made.sort(key=lambda found: (abs(found[0]), -(found[1].quality or 0.0)))  # the finest of equal ones first
+        made[1:] = sorted(made[1:], key=lambda found: (found[0] > 0.0) == (made[0][0] > 0.0))
+        return [one for _, one in made]
+
+    def _point(self, one: Candidate) -> RatePoint:
+        """Return precision, bytes and the expected quantisation error of a candidate, after the refit if a draft."""
+        error = self._expected(one, one.error)
+        rest = max(error - self._unquantised(one.subset, one.coding), LEAST_QUANTISED * error, _NOTHING)
+        return RatePoint(one.quality or 0.0, rest, one.size_bytes)
+
+    def _rest(self, subset: Subset, coding: Coding) -> float:
+        """Return the mean squared error that quantisation may cause on the validation views."""
+        allowed = self._allowed(subset, coding) * error_of_psnr(_AIM)
+        return max(allowed - self._unquantised(subset, coding), LEAST_QUANTISED * allowed)
+
+    def _allowed(self, subset: Subset, coding: Coding) -> float:
+        """Return the mean squared error on the validation views at which a file meets the goal.
+
+        Errors differ between the validation views and the views of the goal, most of all those of pruning. Candidates
+        that were measured in both correct that.
+        """
+        before, on_goal = (self._unquantised(subset, coding, on_goal=on_goal) for on_goal in (False, True))
+        rest, ratio = max(self._allowed_in_renders - on_goal, LEAST_QUANTISED * self._allowed_in_renders), 1.0
+        measured = [one for one in self.pool.made if one.subset is subset and one.goal_error is not None]
+        if measured:
+            nearest = min(
+                measured,
+                key=lambda one: (
+                    one.is_draft,
+                    one.coding != coding,
+                    abs(math.log((one.goal_error or 0.0) / self.goal.error)),
+                ),
+            )
+            goal_error = self._expected(nearest, (nearest.goal_error or 0.0) - self.goal.source_error)
+            quantised = max(goal_error - on_goal, LEAST_QUANTISED * goal_error, _NOTHING)
+            ratio = max(self._expected(nearest, nearest.error) - before, LEAST_QUANTISED * quantised) / quantised
+        return before + ratio * rest
+
+    @staticmethod
+    def _expected(one: Candidate, error: float) -> float:
+        """Return the expected error of a file after the refit through the quantisers, which drafts have not had."""
+        return error * (_tuned(one.coding) if one.is_draft else 1.0)
+
+    @property
+    def _allowed_in_renders(self) -> float:
+        """The mean squared error that a file may have against renders of the source, if these had no other error."""
+        return self.goal.error - self.goal.source_error
+
+    def _unquantised(self, subset: Subset, coding: Coding, *, on_goal: bool = False) -> float:
+        """Return the mean squared error before quantisation, reduced as by the refit through the quantisers."""
+        degree = self._degree(coding)
+        if not subset.refits and degree == self.whole.model.sh_degree:
+            return 0.0
+        key = id(subset), degree, on_goal
+        if key not in self._errors:
+            scorer = self.goal.scorer if on_goal else self.pool.validation_scorer
+            found = self._error_in(scorer, drop_bands(subset.model, degree))
+            self._errors[key] = max(found - (self.goal.source_error if on_goal else 0.0), 0.0)
+        return self._errors[key] * (_tuned(coding) if subset.refits else 1.0)
+
+    def _degree(self, coding: Coding) -> int:
+        """Return the SH degree of a coding's files."""
+        chosen = [self.pool.encoding.sh_degree, coding.degree, 0 if coding.sh == "none" else None]
+        return min([self.whole.model.sh_degree, *(one for one in chosen if one is not None)])
+
+    @staticmethod
+    def _error_in(scorer: Scorer, model: SplatModel) -> float:
+        return scorer.pooled(scorer.errors(model))
+
+    # Files on the goal
+
+    def _score(self, file: Candidate) -> None:
+        """Measure a file on the views of the goal, unless the goal is a size."""
+        if self.goal.size_bytes is None and file.goal_error is None:
+            errors = self.goal.scorer.errors(self.pool.decode(file.result.data))
+            file.goal_error = self.goal.scorer.pooled(errors)
+            if not self.goal.source_error:
+                file.test_errors, file.test_psnr = errors, psnr_of_mse(file.goal_error)
+
+    def _is_met(self, file: Candidate) -> bool:
+        """Return True if a file meets the goal and may be written."""
+        errors = file.result.report.errors
+        if file.is_draft or any(errors[name][0] > most for name, most in self.goal.max_error.items() if name in errors):
+            return False
+        if self.goal.size_bytes is not None:
+            return file.size_bytes <= self.goal.size_bytes
+        return file.goal_error is not None and file.goal_error <= self.goal.error
+
+    def _try_presets(self, coding: Coding) -> None:
+        """Make the presets' own files if their precision is near the goal, so that a search is not worse than these."""
+        wanted, own = self._predict(self.whole, coding)[0], self.pool.encoding.preset
+        for name, preset in PRESETS.items():
+            allowed = name == own if "fast" in (name, own) else True
+            if allowed and abs(preset.quality[coding.sh == "none"] - wanted) < _PRESETS:
+                self._score(self.pool.make(self.whole, Coding(use_classes=False, preset=name), None, draft=False))
+
+    def _out_of_reach(self) -> str:
+        goal, made = self.goal, self.pool.made
+        if goal.size_bytes is not None:
+            kept = " with all splats" if self.pruner is None else ""
+            smallest = min(one.size_bytes for one in made)
+            return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
+        best = psnr_of_mse(min(one.goal_error for one in made if one.goal_error is not None and not one.is_draft))
+        if goal.source_error:
+            return (
+                f"no file reaches {psnr_of_mse(goal.error):.2f} dB on the validation images; the best has {best:.2f} dB"
+            )
+        return f"no file reaches {psnr_of_mse(goal.error):.2f} dB; the best found has {best:.2f} dB"
+
+
+def _tuned(coding: Coding) -> float:
+    """Return the factor of a file's error by the refit through the quantisers."""
+    return error_of_psnr(_TUNING_GAINS.get(coding.sh or "", 0.7))
+
+
+def _clipped(quality: float) -> float:
+    """Clip a precision to the range of the search, dB."""
+    return min(max(quality, _QUALITIES[0]), _QUALITIES[1])
 
 
 def search_target(
@@ -66,9 +522,8 @@ def search_target(
     views: ViewSet,
     encoding: EncodeOptions,
     *,
-    no_prune: bool,
     importance: Weights | None,
-    simplifying: SimplifyOptions | None,
+    options: SimplifyOptions,
     progress: Progress | None,
 ) -> tuple[Candidate, SearchReport]:
     """Search for the file that meets a target, by rendering candidates.
@@ -77,7 +532,8 @@ def search_target(
         source: the scene.
         target: the target, other than largest errors alone.
         views: training, validation and test views.
-        encoding, no_prune, importance, simplifying, progress: as for `meet_target`.
+        encoding, importance, progress: as for `csplat.encode_with_report`.
+        options: options of pruning and refitting.
 
     Returns:
         The file, and the report with 0 seconds.
@@ -89,76 +545,50 @@ def search_target(
     test_scorer = views.test_scorer(source, threads=encoding.threads)
     if views.name != VIRTUAL and _is_empty(test_scorer):
         raise InputError("no splat is visible in the given views: check that the cameras belong to the scene")
+    if target.max_psnr_drop is not None and not views.images:
+        raise InputError("a largest drop of PSNR requires images (--data), against which it is measured")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
-    pruner = None
-    if not _keeps_all(target, encoding, no_prune=no_prune):
-        how = replace(simplifying or SimplifyOptions(), background=views.background, threads=encoding.threads)
-        kept_count = None if target.keep is None else target.count(len(source))
-        pruner = Pruner(
-            source, views, how, use_classes=not inside, progress=progress, psnr=target.psnr, kept_count=kept_count
-        )  # fmt: skip
-    image_scorer = None
-    if target.max_psnr_drop is not None:
-        if not views.images:
-            raise InputError("a largest drop of PSNR requires images (--data), against which it is measured")
-        image_scorer = views.image_validation_scorer(threads=encoding.threads)
-    validation_scorer = views.validation_scorer(source, threads=encoding.threads)
-    candidates = CandidatePool(encoding, test_scorer, validation_scorer, image_scorer, progress=progress)
+    options, pruner = replace(options, threads=encoding.threads), None
+    if not _keeps_all(target, encoding):
+        pruner = options.pruner(source, views, use_classes=not inside, progress=progress)
+    pool = CandidatePool(encoding, views.validation_scorer(source, threads=encoding.threads), progress)
     sensitivity_views = 0
-    if pruner is not None and pruner.kept_count is not None:
-        subset = pruner.refit(pruner.kept_count, None, validation_scorer.psnr)
-        found = candidates.make(subset, CodingChoice(None), None, quick=False)
+    if pruner is not None and target.keep is not None:
+        found = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
     else:
-        goal = find_goal(target, source, image_scorer)
-        measured, sensitivity_views = complete_importance(
-            source, views, encoding, importance, inside=inside, progress=progress
-        )
+        images = None if target.max_psnr_drop is None else views.image_validation_scorer(threads=encoding.threads)
+        goal, measured = Goal.of(target, source, test_scorer, images), None
+        if pruner is None:
+            measured, sensitivity_views = complete_importance(
+                source, views, encoding, importance, inside=inside, progress=progress
+            )
         whole = WholeScene(source, importance, measured, progress)
-        found = TargetSearch(
-            PrecisionSearch(candidates, goal), CodingSearch(source, encoding, measured is not None), whole, pruner
-        ).best()
-    photo = _image_psnr(source, found, views, encoding.threads) if views.images else {}
+        found = TargetSearch(goal, pool, whole, pruner, options.work).best()
     report = make_report(
-        target, found, candidates, splats_before=len(source), views_of=views.name,
-        remarks=[_INSIDE_REMARK] * (inside and found.splats < len(source)), encodes=len(candidates.made), seconds=0.0,
-        photographs=photo, sensitivity_views=sensitivity_views,
-        removal_views=0 if pruner is None else pruner.view_count,
+        target, found, pool, test_scorer, splats_before=len(source), views_of=views.name,
+        remarks=[_INSIDE_REMARK] * (inside and found.splats < len(source)), encodes=len(pool.made), seconds=0.0,
+        photographs=_image_psnr(source, found, views, encoding.threads) if views.images else {},
+        sensitivity_views=sensitivity_views, removal_views=0 if pruner is None else pruner.view_count,
         elsewhere=_psnr_elsewhere(source, found, views, encoding.threads),
         reached={name: found.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
     return found, report
 
 
-def expected_seconds(
-    source: SplatModel,
-    encoding: EncodeOptions,
-    target: Target,
-    views: ViewSet,
-    *,
-    no_prune: bool,
-    simplifying: SimplifyOptions | None = None,
-) -> float:
-    """Estimate the seconds for a target on this machine, from the time of some renders of test views."""
-    renders = expected_renders(encoding, target, no_prune=no_prune, simplifying=simplifying)
-    return renders * render_seconds(source, views.test, threads=encoding.threads)
-
-
-def expected_renders(
-    encoding: EncodeOptions, target: Target, *, no_prune: bool, simplifying: SimplifyOptions | None = None
-) -> float:
+def expected_renders(encoding: EncodeOptions, target: Target) -> float:
     """Return the approximate cost of a target in renders of the test views."""
-    if _keeps_all(target, encoding, no_prune=no_prune):
+    if _keeps_all(target, encoding):
         return _RENDERS
-    return _RENDERS_WITH_PRUNING[0] + _RENDERS_WITH_PRUNING[1] * (simplifying or SimplifyOptions()).work
+    return _RENDERS_WITH_PRUNING[0] + _RENDERS_WITH_PRUNING[1] * SimplifyOptions(effort=target.effort).work
 
 
-def _keeps_all(target: Target, encoding: EncodeOptions, *, no_prune: bool) -> bool:
-    """Return True if no splat may be pruned, due to `no_prune`, error bounds, extra columns or the preset `fast`."""
-    blocked = no_prune or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
+def _keeps_all(target: Target, encoding: EncodeOptions) -> bool:
+    """Return True if no splat may be pruned, due to the target, error bounds, extra columns or the preset `fast`."""
+    blocked = not target.prune or bool(target.max_error) or encoding.preset == "fast" or encoding.keep_extra
     return target.keep is None and blocked
 
 
-def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *, no_prune: bool) -> None:
+def check_target(source: SplatModel, target: Target, encoding: EncodeOptions) -> None:
     """Refuse targets that no search can meet.
 
     Raises:
@@ -168,8 +598,6 @@ def check_target(source: SplatModel, target: Target, encoding: EncodeOptions, *,
         raise InputError("a scene without splats cannot be encoded to a target")
     if encoding.attribute_psnr is not None and target.is_rendered and target.keep is None:
         raise InputError("attribute_psnr is chosen by the target: give only one of them")
-    if target.keep is not None and no_prune:
-        raise InputError("a kept fraction and no_prune exclude each other")
 
 
 def _is_empty(scorer: Scorer) -> bool:
@@ -191,252 +619,3 @@ def _image_psnr(source: SplatModel, found: Candidate, views: ViewSet, threads: i
     """Return the PSNR of file and source against the test images, dB."""
     scorer = views.image_test_scorer(threads=threads)
     return {"file": scorer.psnr(decode(found.result.data)), "source": scorer.psnr(source)}
-
-
-def find_goal(target: Target, source: SplatModel, image_scorer: Scorer | None) -> SearchGoal:
-    """Return the goal of the search for a target.
-
-    Args:
-        target: a PSNR, a size or a drop of PSNR.
-        source: the scene.
-        image_scorer: the scorer on validation images, against which a drop is measured.
-    """
-    if target.max_psnr_drop is None or image_scorer is None:
-        return SearchGoal(target.psnr, target.size_bytes, max_error=target.max_error)
-    reached = image_scorer.psnr(source)
-    # The source's error against images is far larger than the drop, so a file's own error is a small part of the sum.
-    slope = 1.0 - 10.0 ** (-target.max_psnr_drop / 10.0)
-    return SearchGoal(
-        min(loss_as_psnr(target.max_psnr_drop, reached), PSNR_CAP), None, reached - target.max_psnr_drop, slope
-    )
-
-
-def loss_as_psnr(loss: float, photo_psnr: float) -> float:
-    """Return the PSNR against the source's renders at which the PSNR against images drops by `loss` dB.
-
-    The errors of the source and of the file are assumed to be independent, so that squared errors add up.
-
-    Args:
-        loss: dB, above 0.
-        photo_psnr: PSNR of the source against images, dB.
-    """
-    return photo_psnr - 10.0 * math.log10(10.0 ** (loss / 10.0) - 1.0)
-
-
-@dataclass(eq=False)
-class TargetSearch:
-    """The search for the coding, the splats and the precision.
-
-    Attributes:
-        search: finds the precision of candidates near the goal, and on it.
-        codings: the possible codings of SH.
-        whole: all splats.
-        pruner: prunes splats; `None`: all are kept.
-    """
-
-    search: PrecisionSearch
-    codings: CodingSearch
-    whole: WholeScene
-    pruner: Pruner | None
-
-    def best(self) -> Candidate:
-        """Return the smallest file that meets a PSNR or a drop of PSNR, or the best one of a size.
-
-        Raises:
-            InputError: no file meets the goal.
-        """
-        tried = self.codings.best(self.search, self.whole, self._start(), brief=self.pruner is not None)
-        if self.pruner is not None:
-            if self.search.goal.uses_test_views:
-                tried[0].score_on_test_views()
-            cost, fitted = self.search.cost, self._pruned_candidates(self.pruner, tried[0])
-            if cost(tried[0]) < min(map(cost, fitted), default=math.inf) + _WITHIN_REACH:
-                tried = self.codings.best(self.search, self.whole, tried[0].quality or 0.0)
-            tried += fitted
-        found = self._on_goal(tried)
-        if found:
-            self.search.try_neighbours(min(found, key=lambda candidate: candidate.size_bytes))
-        self._try_presets(tried)
-        best = self.search.goal.best([one for one in self.search.candidates.made if self._may_be_written(one)])
-        if best is None:
-            raise InputError(self._out_of_reach())
-        return best
-
-    def _on_goal(self, tried: Sequence[Candidate]) -> list[Candidate]:
-        """Return candidates on the goal, of the most promising kinds; with more splats if all tried were too few."""
-        found, failed, excess = list[Candidate](), list[Candidate](), 0.0
-        for candidate in sorted(tried, key=self.search.cost):
-            others = [one for one in tried if one.subset.refits and one.splats > candidate.splats]
-            if any(one.subset is candidate.subset for one in failed) and others:
-                continue  # candidates of more splats come first
-            if self._pays(candidate, found, excess):
-                expected, on = self.search.cost(candidate), self.search.find_on(candidate.subset, candidate.coding)
-                if on is not None and candidate.subset.refits:
-                    excess = max(excess, min(math.log(on.size_bytes) - expected, _COMMON))
-                (failed if on is None else found).append(on or candidate)
-        if failed and not any(one.subset.refits for one in found):
-            on = self._of_more(max(failed, key=lambda candidate: candidate.splats))
-            found += [] if on is None else [on]
-        return found
-
-    def _may_be_written(self, candidate: Candidate) -> bool:
-        """Return True for a final file; if the goal refers to test views, it must have been scored on them."""
-        return candidate.is_packed and (candidate.is_scored or not self.search.goal.uses_test_views)
-
-    def _start(self) -> float:
-        """Return the attribute PSNR of the first file, dB."""
-        goal, has_sh = self.search.goal, self.codings.usual_codings(self.whole) != [CodingChoice("none")]
-        if goal.size_bytes is None:
-            psnr = goal.psnr or 0.0
-            return clip_quality(psnr + _ATTRIBUTE_GAIN[has_sh] + _ATTRIBUTE_GAIN_GROWS[has_sh] * (psnr - 30.0))
-        per_splat = goal.size_bytes / len(self.whole.model)
-        return clip_quality(_USUAL[1] + math.log(per_splat / _USUAL[0]) / BYTES_PER_DB)
-
-    def _pruned_candidates(self, pruner: Pruner, whole: Candidate) -> list[Candidate]:
-        """Return candidates near the goal for several splat counts, each predicted from earlier ones."""
-        search, goal, splats = self.search, self.search.goal, len(self.whole.model)
-        slope, found = self._slope_of_counts(whole), list[Candidate]()
-        psnr_of = search.candidates.validation_scorer.psnr
-        allowed = None if goal.psnr is None else search.validation_goal(self.whole)
-        kept_count = self._first_kept_count(pruner, whole, slope)
-        start = (whole.quality or 0.0) - search.margin(whole) - REFIT_GAIN
-        for number in range(2 * _COUNTS):
-            if number >= _COUNTS and found:
-                break
-            if kept_count > (1.0 - _ALL_BUT) * splats:
-                if found or pruner.options.is_brief:
-                    break
-                kept_count = splats  # all splats, which are still refitted through the quantisers
-            subset = pruner.refit(kept_count, allowed, psnr_of)
-            if allowed is not None and subset.fitted_psnr < allowed + _SPARE:
-                if found:
-                    break
-                kept_count, _ = pruner.next_at_psnr(len(subset.rows), subset.fitted_psnr, allowed, slope)
-                continue
-            if search.is_hopeless(subset):
-                kept_count = _next_larger(kept_count)
-                continue
-            quality = start if goal.psnr is None else _raised_quality(start, goal.psnr, subset.psnr)
-            tries = self.codings.best(search, subset, quality, brief=pruner.options.is_brief)
-            candidate = tries[0]
-            found += tries
-            if kept_count == splats or pruner.options.is_brief:
-                break
-            if math.isinf(search.cost(candidate)):
-                # No candidate is small enough for a size, or good enough for a PSNR.
-                if goal.size_bytes is None:
-                    kept_count = _next_larger(kept_count)
-                elif len(subset.rows) > kept_count or kept_count == 1:
-                    break  # no more splats can be pruned, since no view saw the others
-                else:
-                    kept_count = int(kept_count * _FEWER)
-                continue
-            if goal.psnr is not None:
-                # The error of dropped bands does not depend on the number of splats.
-                allowed = search.validation_goal(subset)
-                goal_psnr = _subtract(allowed, error_of_psnr(subset.psnr) - error_of_psnr(subset.fitted_psnr))
-                kept_count, saved = pruner.next_at_psnr(len(subset.rows), subset.fitted_psnr, goal_psnr, slope)
-            else:
-                kept_count, saved = pruner.next_at_size(
-                    len(subset.rows), subset.fitted_psnr, candidate.validation_psnr, slope
-                )
-            saved -= search.cost(candidate) - min(map(search.cost, found))
-            if saved < _WORTH or any(abs(one.splats - kept_count) < _CLOSE * kept_count for one in found):
-                break
-        return found
-
-    def _slope_of_counts(self, whole: Candidate) -> float:
-        """Return the fraction of the bytes that a decibel costs, for the choice of the number of splats.
-
-        The more SH a file needs, the cheaper are less important splats, since they have fewer bands.
-        """
-        above = (self.search.goal.psnr or whole.validation_psnr) - _BANDS_GROW[0]
-        has_sh = whole.coding.sh != "none"
-        return self.search.slope(whole) * (1.0 + _BANDS_GROW[1] * max(above, 0.0) * has_sh)
-
-    def _of_more(self, candidate: Candidate) -> Candidate | None:
-        """Return a file on the goal with more splats than a candidate that cannot meet it; `None` if there is none."""
-        kept_count = _next_larger(candidate.splats)
-        keeps_all = candidate.subset is self.whole or kept_count > (1.0 - _ALL_BUT) * len(self.whole.model)
-        if self.pruner is None or self.search.goal.psnr is None or keeps_all:
-            return None
-        psnr_of = self.search.candidates.validation_scorer.psnr
-        subset = self.pruner.refit(kept_count, self.search.validation_goal(self.whole), psnr_of)
-        best = self.codings.best(self.search, subset, candidate.quality or 0.0)[0]
-        return self.search.find_on(best.subset, best.coding)
-
-    def _first_kept_count(self, pruner: Pruner, whole: Candidate, slope: float) -> int:
-        """Return the number of splats to begin with."""
-        goal, psnr_of = self.search.goal, self.search.candidates.validation_scorer.psnr
-        if goal.psnr is not None:
-            return pruner.first_at_psnr(goal.psnr, slope, psnr_of)
-        near = None if math.isinf(self.search.cost(whole)) else (whole.splats, whole.validation_psnr)
-        return pruner.first_at_size(goal.size_bytes or 0, near, slope, psnr_of)
-
-    def _pays(self, candidate: Candidate, found: list[Candidate], excess: float) -> bool:
-        """Return True if a candidate near the goal is worth the search for its precision on the goal.
-
-        Args:
-            candidate: the candidate.
-            found: files that meet the goal already.
-            excess: log bytes by which a refitted file among them exceeded its expected cost.
-        """
-        best = self.search.goal.best(found)
-        if best is None:
-            return True
-        again = any(one.subset is candidate.subset for one in found)
-        # The cost of a file that meets a PSNR is its actual size, even if less was predicted.
-        known = math.log(best.size_bytes) if self.search.goal.size_bytes is None else self.search.cost(best)
-        saved = known - self.search.cost(candidate) - excess * candidate.subset.refits
-        return saved > (_PAYS_FOR_REFIT if candidate.subset.refits else _PAYS if again else -_PAYS)
-
-    def _try_presets(self, tried: Sequence[Candidate]) -> None:
-        """Make the presets' own files if they are expected near the goal, so that a search is not worse than these."""
-        goal, plain = self.search.goal, [candidate for candidate in tried if candidate.subset is self.whole]
-        if not goal.uses_test_views:
-            return
-        near = min(plain, key=lambda candidate: (candidate.coding.use_classes, self.search.cost(candidate)))
-        if self.search.cost(near) > min(map(self.search.cost, tried)) + _FAR:
-            return  # presets keep all splats, in one class
-        lost = (near.quality or 0.0) - self.search.margin(near)
-        for name, preset in PRESETS.items():
-            expected = preset.quality[near.coding.sh == "none"] - lost
-            if _may_try_preset(name, self.codings.encoding.preset) and _PRESETS[0] <= expected <= _PRESETS[1]:
-                encoding = replace(self.codings.encoding, preset=name)
-                coding = CodingChoice(None, use_classes=False)
-                made = self.search.candidates.make(self.whole, coding, None, quick=False, encoding=encoding)
-                made.score_on_test_views()
-
-    def _out_of_reach(self) -> str:
-        goal, made = self.search.goal, self.search.candidates.made
-        if goal.size_bytes is not None:
-            kept = " with all splats" if self.pruner is None else ""
-            smallest = min(candidate.size_bytes for candidate in made)
-            return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
-        if goal.photo_psnr is not None:
-            nearest = max(candidate.photo_psnr for candidate in made)
-            return f"no file reaches {goal.photo_psnr:.2f} dB on the validation images; the best has {nearest:.2f} dB"
-        highest = max(candidate.psnr for candidate in made if candidate.is_scored)
-        return f"no file reaches {goal.psnr or 0.0:.2f} dB; the best found has {highest:.2f} dB"
-
-
-def _may_try_preset(name: str, preset: str) -> bool:
-    """Return True if a search with a preset may use another preset's file; `fast` only for itself."""
-    return name == preset if "fast" in (name, preset) else True
-
-
-def _next_larger(splats: int) -> int:
-    """Return the next larger number of splats to try."""
-    return math.ceil(splats / _FEWER)
-
-
-def _subtract(psnr: float, error: float) -> float:
-    """Return the PSNR of the error that remains after another error is subtracted from that of a PSNR."""
-    allowed = error_of_psnr(psnr)
-    return psnr_of_mse(max(allowed - max(error, 0.0), _LEAST_REST * allowed))
-
-
-def _raised_quality(quality: float, psnr: float, fitted_psnr: float) -> float:
-    """Return the attribute PSNR, raised to compensate for the error of pruning."""
-    rest = max(_LEAST_REST, 1.0 - error_of_psnr(fitted_psnr) / error_of_psnr(psnr))
-    return clip_quality(quality + psnr_of_mse(rest))

@@ -24,10 +24,9 @@ from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.console import format_bytes, note, progress_bar, step_progress
 from csplat_tools.file_streams import write_array, write_bytes
 from csplat_tools.importance_file import read_importance
-from csplat_tools.optimise.pruning import simplify
-from csplat_tools.optimise.pruning_order import SimplifyOptions
 from csplat_tools.optimise.rate_distortion import BYTES_PER_DB
 from csplat_tools.optimise.scene_sensitivity import measure_views
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.training.tuning_report import make_tuning_report, score_models, show_views, write_training_page
 from csplat_tools.views import VIEW_COUNT, ViewSet, with_validation_views

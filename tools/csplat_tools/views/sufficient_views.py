@@ -11,15 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F64, Progress
+from csplat.types import Progress
 from csplat_render import Camera
-from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_tools.views import HELD_OUT_COUNT, VIEW_SIZE, ViewSet, shrink_cameras
+from csplat_trainer.pruning import MeasuredViews, pruning_keys, total_error
 
 _BATCH = 40  # virtual views added at a time
 # Views suffice if the errors predicted for used and held-out views differ by less, dB. Refits overfit more than choices
@@ -33,16 +32,19 @@ class SufficientViews:
     """Training views, held-out views, and the pruning errors of a source.
 
     Attributes:
-        used: the training views.
+        batches: the training views, with pruning errors of the source.
         check: the held-out views.
-        pruning_error: pruning errors of the source, measured in `used`.
-        gap: dB by which the predicted error of the splats to prune is larger in `check` than in `used`.
+        gap: dB by which the predicted error of the splats to prune is larger in `check` than in the training views.
     """
 
-    used: list[Camera]
+    batches: list[MeasuredViews]
     check: list[Camera]
-    pruning_error: PruningError
     gap: float
+
+    @property
+    def used(self) -> list[Camera]:
+        """The training views."""
+        return [camera for batch in self.batches for camera in batch.cameras]
 
 
 def find_sufficient_views(
@@ -70,10 +72,11 @@ def find_sufficient_views(
         InputError: there are no training or no validation views.
     """
 
-    def measure(cameras: Sequence[Camera]) -> PruningError:
-        return measure_pruning_error(
+    def measure(cameras: Sequence[Camera]) -> MeasuredViews:
+        found = measure_pruning_error(
             model, cameras, background=views.background, bands=False, threads=threads, progress=progress
         )
+        return MeasuredViews(cameras, found)
 
     if not views.training or not views.validation:
         found = len(views.training) + len(views.validation)
@@ -81,33 +84,17 @@ def find_sufficient_views(
     every, check = shrink_cameras(views.training, size), shrink_cameras(views.validation, size)
     if views.virtual:
         every, check = _hold_out(every)  # views of the same kind
-    check_errors = measure(check)
+    check_errors = measure(check).pruning_error
     count = min(_BATCH, len(every)) if views.virtual else len(every)
-    pruning_error = measure(every[:count])
+    batches = [measure(every[:count])]
     while count < len(every):
-        missed = int(np.count_nonzero(check_errors.seen & ~pruning_error.seen))
-        if missed <= _MISSED_MAX * len(model) and _gap(model, pruning_error, check_errors, pruned) < _GAP_MAX:
+        total = total_error(batches)
+        missed = int(np.count_nonzero(check_errors.seen & ~total.seen))
+        if missed <= _MISSED_MAX * len(model) and _gap(model, total, check_errors, pruned) < _GAP_MAX:
             break
-        pruning_error += measure(every[count : count + _BATCH])
+        batches.append(measure(every[count : count + _BATCH]))
         count = min(count + _BATCH, len(every))
-    return SufficientViews(every[:count], check, pruning_error, _gap(model, pruning_error, check_errors, pruned))
-
-
-def pruning_keys(opacities: NDArray[np.float32], pruning_error: PruningError, *, keep_unseen: bool = True) -> F64:
-    """Return the keys by which splats are pruned, the smallest first.
-
-    Args:
-        opacities: [N], opacities of a scene.
-        pruning_error: its pruning errors.
-        keep_unseen: prune splats that no view saw last, not first.
-
-    Returns:
-        [N] float64: −1 for a splat whose alpha is too small to be drawn; infinity, or −0.5 without `keep_unseen`, for
-        a splat that no view saw; else the pruning error.
-    """
-    keys = np.where(pruning_error.seen, pruning_error.error, np.inf if keep_unseen else -0.5)
-    keys[opacities < ALPHA_MIN] = -1.0
-    return keys
+    return SufficientViews(batches, check, _gap(model, total_error(batches), check_errors, pruned))
 
 
 def _hold_out(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:

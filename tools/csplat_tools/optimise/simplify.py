@@ -1,0 +1,250 @@
+"""`simplify`: prune splats to a target, and refit the others."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from csplat.encoder import Target
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.types import I64
+from csplat_render.conventions import ALPHA_MIN
+from csplat_render.metrics import psnr_of_mse
+from csplat_tools.optimise.pruning import PrunedSubset, Pruner
+from csplat_tools.optimise.rate_distortion import error_of_psnr
+from csplat_tools.optional_packages import require_renderer
+from csplat_tools.scene_files import SceneLike, load_model
+from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
+
+_DEFAULT_EFFORT = 3
+_TRIES = 4  # largest number of refits in the search for the fewest splats of a PSNR
+_NEAR = 0.05  # dB; a result this close above the PSNR is not improved
+_NOT_PRUNED = f"none of up to {_TRIES} pruned scenes reached the target: all splats are kept, unchanged"
+
+
+@dataclass(frozen=True)
+class SimplifyOptions:
+    """Options of pruning and refitting.
+
+    Attributes:
+        refit: fit colours, opacities, scales and rotations of the kept splats to the source's renders.
+        effort: amount of work, 1 to 9. Steps of refits halve with each level below 3, and double with every two above.
+        view_size: width and height of training renders, pixels; `None`: chosen by the number of splats.
+        views: largest number of virtual views if no views are given; `None`: chosen by the number of splats.
+        background: red, green, blue behind virtual views; given views have their own.
+        seed: seed of the virtual views, and of the order in which views are used.
+        threads: number of threads; `None` for all. The result does not depend on it.
+
+    Raises:
+        InputError: a value is out of range.
+    """
+
+    refit: bool = True
+    effort: int = _DEFAULT_EFFORT
+    view_size: tuple[int, int] | None = None
+    views: int | None = None
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seed: int = 0
+    threads: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.effort <= 9:
+            raise InputError(f"effort is {self.effort}, expected 1 to 9")
+        if self.views is not None and self.views < 1:
+            raise InputError(f"views is {self.views}, expected at least 1")
+        if self.view_size is not None and min(self.view_size) < 1:
+            raise InputError(f"view_size is {self.view_size}, expected at least 1 pixel")
+
+    def views_and_size(self, splats: int) -> tuple[int, tuple[int, int]]:
+        """Return the largest number of training views, and the width and height of their renders, for N splats."""
+        views, size = default_views(splats)
+        return self.views or views, self.view_size or size
+
+    @property
+    def work(self) -> float:
+        """The amount of work relative to the default effort."""
+        octaves = self.effort - _DEFAULT_EFFORT
+        return 2.0 ** (octaves / 2 if octaves > 0 else octaves)
+
+    def pruner(
+        self,
+        source: SplatModel,
+        views: ViewSet,
+        *,
+        use_classes: bool = True,
+        progress: Callable[[str, float], None] | None,
+    ) -> Pruner:
+        """Return the pruner of a scene, with fewer steps if renders are larger than usual."""
+        size = self.views_and_size(len(source))[1]
+        larger = max(1.0, math.sqrt(math.prod(size) / math.prod(VIEW_SIZE)))
+        return Pruner(
+            source, views, size, self.work / larger, self.refit, use_classes, self.seed, self.threads, progress
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Simplified:
+    """A simplified scene.
+
+    Attributes:
+        model: the scene.
+        source_index: [N] int64, the index of each splat in the source.
+        report: pruned splats by reason, predicted and measured errors, views, seconds; JSON-compatible.
+        notes: remarks for the user, a sentence each.
+    """
+
+    model: SplatModel
+    source_index: I64
+    report: dict[str, Any]
+    notes: tuple[str, ...] = ()
+
+
+def simplify(
+    scene: SceneLike,
+    target: Target,
+    *,
+    views: ViewSet | None = None,
+    options: SimplifyOptions | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> Simplified:
+    """Prune splats to a target, and refit the others, as `csplat simplify` does.
+
+    Requires the packages of the render extra.
+
+    Args:
+        scene: a model, or a file in any format.
+        target: a fraction to keep, a PSNR, or a drop of PSNR; the fewest splats that meet it are kept.
+        views: the kept splats are fitted to training views; validation views determine how many may be pruned. `None`:
+            virtual views.
+        options: number and size of views, instead of the target's effort.
+        progress: progress callback.
+
+    Returns:
+        The simplified scene; its splats are in the source's order. If the search for a PSNR finds no pruned scene that
+        reaches it, that is the unchanged source, with a remark in `notes`.
+
+    Examples:
+        >>> import csplat, csplat_tools
+        >>> half = csplat_tools.simplify("scene.ply", csplat.Target(keep=0.5))  # doctest: +SKIP
+        >>> len(half.model), half.report["psnr"]  # doctest: +SKIP
+        (4464, 39.6)
+
+    Raises:
+        InputError: the target is of another kind, the scene has no splats, training or validation views are missing,
+            or even the source misses the target.
+        CsplatError: the scene is not valid.
+        OSError: the file cannot be read.
+    """
+    require_renderer()
+    target.require("simplify", "keep", "psnr", "max_psnr_drop")
+    source, options, start = (
+        load_model(scene).model,
+        options or SimplifyOptions(effort=target.effort),
+        time.perf_counter(),
+    )
+    if not len(source):
+        raise InputError("a scene without splats cannot be simplified")
+    if target.max_psnr_drop is not None and (views is None or not views.images):
+        raise InputError("a largest drop of PSNR requires images: name a data set")
+    if views is None:
+        count, size = options.views_and_size(len(source))
+        views = find_view_set(source, background=options.background, count=count, size=size, seed=options.seed)
+    pruner, scores = options.pruner(source, views, progress=progress), dict[str, Any]()
+    if target.keep is not None:
+        subset = pruner.refit(target.count(len(source)))
+    else:
+        subset, scores = _fewest(pruner, target)
+    report = {**_report(pruner, subset, target), **scores, **_test_scores(pruner, subset.model)}
+    report["seconds"] = round(time.perf_counter() - start, 2)
+    notes = (_NOT_PRUNED,) if target.keep is None and len(subset.rows) == len(source) else ()
+    return Simplified(subset.model, subset.rows, report, notes)
+
+
+def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, float]]:
+    """Return the fewest splats that reach a PSNR on validation views, and their PSNR for the report.
+
+    Each number is predicted from the pruning order and the last refits. If none reaches the PSNR, all are kept.
+
+    Raises:
+        InputError: even the source misses the PSNR.
+    """
+    source, views = pruner.source, pruner.views
+    scorer = views.validation_scorer(source, threads=pruner.threads)
+    if target.max_psnr_drop is not None:
+        scorer = views.image_validation_scorer(threads=pruner.threads)
+    source_error = scorer.pooled(scorer.errors(source))
+    goal = target.psnr if target.max_psnr_drop is None else psnr_of_mse(source_error) - target.max_psnr_drop
+    assert goal is not None
+    if psnr_of_mse(source_error) < goal:
+        raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
+    allowed, known, found = error_of_psnr(goal), dict[int, float](), dict[int, tuple[float, PrunedSubset]]()
+    for _ in range(_TRIES):
+        counts, errors = pruner.errors(allowed - source_error, known)
+        fits = counts[errors <= (allowed - source_error) * error_of_psnr(0.5 * _NEAR)]
+        kept_count = int(fits.min(initial=len(source)))
+        if kept_count in found or kept_count == len(source):
+            break
+        subset = pruner.refit(kept_count)
+        error = scorer.pooled(scorer.errors(subset.model))
+        found[kept_count], known[kept_count] = (psnr_of_mse(error), subset), max(error - source_error, 0.0)
+        if goal <= psnr_of_mse(error) <= goal + _NEAR:
+            break
+    reached = [one for one in found.values() if one[0] >= goal]
+    psnr, subset = min(
+        reached, key=lambda one: len(one[1].rows), default=(psnr_of_mse(source_error), pruner.refit(len(source)))
+    )
+    return subset, {"validation_psnr": psnr}
+
+
+def _test_scores(pruner: Pruner, model: SplatModel) -> dict[str, Any]:
+    """Return the scores on the test views, for the report; empty without test views."""
+    views, threads = pruner.views, pruner.threads
+    if not views.test:
+        return {}
+    scores: dict[str, Any] = {
+        "psnr": views.test_scorer(pruner.source, threads=threads).psnr(model),
+        "test_views": {"cameras": views.name, "views": len(views.test)},
+    }
+    if views.images:
+        scorer = views.image_test_scorer(threads=threads)
+        scores["photographs"] = {"source": scorer.psnr(pruner.source), "psnr": scorer.psnr(model)}
+    return scores
+
+
+def _report(pruner: Pruner, subset: PrunedSubset, target: Target) -> dict[str, Any]:
+    source, views, order = pruner.source, pruner.sufficient, pruner.order
+    pruned = np.ones(len(source), bool)
+    pruned[subset.rows] = False
+    pruned_count = int(np.count_nonzero(pruned))
+    invisible = source.opacities < ALPHA_MIN
+    unseen = ~order.seen & ~invisible
+    predicted = float(order.mean_errors()[pruned_count])
+    return {
+        "target": target.as_json(),
+        "splats_before": len(source),
+        "splats": len(subset.model),
+        "removed": {
+            "invisible": int(np.count_nonzero(pruned & invisible)),
+            "unseen": int(np.count_nonzero(pruned & unseen)),
+            "least_error": int(np.count_nonzero(pruned & ~invisible & ~unseen)),
+        },
+        "unseen_share": float(np.mean(unseen)),
+        "views": {
+            "used": len(views.used),
+            "check": len(views.check),
+            "gap_db": round(views.gap, 3),
+            "size": [views.used[0].W, views.used[0].H],
+        },
+        "rounds": len(order.rounds),
+        "largest_error_removed": float(order.errors[:pruned_count].max(initial=0.0)),
+        "predicted_psnr": psnr_of_mse(predicted) if predicted > 0.0 else None,
+        "check_psnr_pruned": subset.check_psnr_pruned,
+        "check_psnr": subset.check_psnr,
+        **({"refit_refused": True} if subset.refit_refused else {}),
+    }

@@ -1,0 +1,151 @@
+"""The pruning order of splats: by the exact error of removing each from renders, measured again in rounds.
+
+Pruned splats may have hidden others, so that errors change. Targets, `simplify`, fine-tuning and training use this
+order.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import operator
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from csplat.model import SplatModel
+from csplat.types import F64, I64, Mask, Progress
+from csplat_render import Camera
+from csplat_render.conventions import ALPHA_MIN
+from csplat_render.pruning_error import PruningError, measure_pruning_error
+
+_ROUND_FRACTION = 0.72  # fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB
+_LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredViews:
+    """Views in which pruning errors are measured together.
+
+    Attributes:
+        cameras: the views.
+        pruning_error: errors of removing each splat that is left, as last measured in these views.
+    """
+
+    cameras: Sequence[Camera]
+    pruning_error: PruningError
+
+    def __add__(self, other: MeasuredViews) -> MeasuredViews:
+        return MeasuredViews([*self.cameras, *other.cameras], self.pruning_error + other.pruning_error)
+
+
+@dataclass(eq=False)
+class PruningOrder:
+    """The splats of a scene in the order of pruning; longer on demand.
+
+    Attributes:
+        model: the scene.
+        groups: views with the pruning errors of the scene. Each round measures the next group, and adds the last
+            measurements of the others: two groups give twice the views at the cost of one.
+        background: background colour of the views.
+        keep_unseen: splats that no view shows are never pruned; else they are pruned first.
+        threads: number of threads; `None` for all. The order does not depend on it.
+        progress: progress callback.
+        rows: [G] int64, indices of splats in the order of pruning.
+        errors: [G], error of removing each, measured in its round: summed over pixels, channels and views.
+        rounds: number of pruned splats by round.
+        seen: [N] bool, True for splats that are visible in a view.
+    """
+
+    model: SplatModel
+    groups: list[MeasuredViews]
+    background: ArrayLike = (0.0, 0.0, 0.0)
+    keep_unseen: bool = True
+    threads: int | None = None
+    progress: Progress | None = None
+    rows: I64 = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
+    errors: F64 = field(default_factory=lambda: np.zeros(0), init=False)
+    rounds: list[int] = field(default_factory=list, init=False)
+    seen: Mask = field(init=False)
+    _left: I64 = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._left = np.arange(len(self.model))
+        self.seen = total_error(self.groups).seen
+
+    @property
+    def value_count(self) -> int:
+        """Number of pixels times channels of all views."""
+        return sum(group.pruning_error.value_count for group in self.groups)
+
+    def mean_errors(self) -> F64:
+        """Return [G + 1], the sum of the errors of the first 0, 1, … G splats, as a mean squared error."""
+        sums: F64 = np.concatenate([[0.0], np.cumsum(self.errors)]) / self.value_count
+        return sums
+
+    def kept(self, count: int) -> I64:
+        """Return the ascending indices of `count` kept splats; of more if not enough can be pruned."""
+        self.extend(kept_count=count)
+        is_kept = np.ones(len(self.model), bool)
+        is_kept[self.rows[: len(self.model) - count]] = False
+        return np.flatnonzero(is_kept)
+
+    def extend(self, *, kept_count: int | None = None, error: float = math.inf) -> bool:
+        """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`.
+
+        Returns:
+            True if the order became longer.
+        """
+        least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
+        before = len(self.rows)
+        while len(self._left) > least and float(self.errors.sum()) <= error * self.value_count:
+            fewer = int(len(self._left) * _ROUND_FRACTION)
+            if not self._prune(max(least, fewer) if kept_count is None or fewer > least else least):
+                break
+        return len(self.rows) > before
+
+    def _prune(self, count: int) -> bool:
+        """Make a round: prune until `count` splats are left; return False if none can be pruned."""
+        if self.rounds:
+            turn = (len(self.rounds) - 1) % len(self.groups)
+            measured = measure_pruning_error(
+                self.model.select(self._left), self.groups[turn].cameras, background=self.background, bands=False,
+                threads=self.threads, progress=self.progress,
+            )  # fmt: skip
+            self.groups[turn] = replace(self.groups[turn], pruning_error=measured)
+        keys = pruning_keys(self.model.opacities[self._left], total_error(self.groups), keep_unseen=self.keep_unseen)
+        order = np.argsort(keys, kind="stable")[: len(self._left) - count]
+        order = order[np.isfinite(keys[order])]
+        if not len(order):
+            return False
+        self.rows = np.concatenate([self.rows, self._left[order]])
+        self.errors = np.concatenate([self.errors, np.maximum(keys[order], 0.0)])
+        self.rounds.append(len(order))
+        kept = np.delete(np.arange(len(keys)), order)
+        self._left = self._left[kept]
+        self.groups = [replace(group, pruning_error=group.pruning_error.of_rows(kept)) for group in self.groups]
+        return True
+
+
+def total_error(groups: Sequence[MeasuredViews]) -> PruningError:
+    """Return the sum of the pruning errors over all groups of views."""
+    return functools.reduce(operator.add, [group.pruning_error for group in groups])
+
+
+def pruning_keys(opacities: NDArray[np.float32], pruning_error: PruningError, *, keep_unseen: bool = True) -> F64:
+    """Return the keys by which splats are pruned, the smallest first.
+
+    Args:
+        opacities: [N], opacities of a scene.
+        pruning_error: its pruning errors.
+        keep_unseen: prune splats that no view saw never instead of first.
+
+    Returns:
+        [N] float64: −1 for a splat whose alpha is too small to be drawn; infinity, or −0.5 without `keep_unseen`, for
+        a splat that no view saw; else the pruning error.
+    """
+    keys = np.where(pruning_error.seen, pruning_error.error, np.inf if keep_unseen else -0.5)
+    keys[opacities < ALPHA_MIN] = -1.0
+    return keys
