@@ -4,6 +4,7 @@ command = "encode --preset fast"    # csplat's command line, in a process of its
 bytes_per_splat = 4                 # with command: --target-size, by the number of splats
 suffix = ".spz"                     # the file that the command writes ends in this. Default: .csplat
 peer = "spz"                        # splat-transform; see `peers.PEERS`
+library = "spz"                     # SPZ's C++ library
 format = "spz4"                     # `csplat.formats.write`, in a process of its own
 """
 
@@ -23,7 +24,7 @@ from csplat.formats import format_by_name, read, write
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_bench.measuring import alone, run_program, timed
-from csplat_bench.peers import read_peer, splat_transform_version, write_peer
+from csplat_bench.peers import DRIVERS, build_with_spz, read_peer, splat_transform_version, write_peer
 from csplat_bench.protocol import Setup
 from csplat_bench.scenes import Scene
 from csplat_bench.suites import Case
@@ -89,6 +90,19 @@ def _by_peer(setup: Setup, scene: Scene, case: Case, folder: Path) -> MadeFile:
     return MadeFile(path, values, lambda: read_peer(path, setup.peers))
 
 
+def _by_library(setup: Setup, scene: Scene, _: Case, folder: Path) -> MadeFile:
+    path, program = folder / "file.spz", setup.peers / "spz_encode"
+    if not program.exists():
+        build_with_spz(DRIVERS / "spz_encode.cc", program, setup.peers)
+    used = run_program([program, scene.path, path])
+    wall, cpu = map(float, used.stdout.split())
+    values = {
+        "seconds": used.wall, "cpu_seconds": used.cpu, "peak_bytes": used.peak_bytes,
+        "encode_seconds": wall, "encode_cpu_seconds": cpu,
+    }  # fmt: skip
+    return MadeFile(path, values, lambda: read(path))
+
+
 def _by_format(_: Setup, scene: Scene, case: Case, folder: Path) -> MadeFile:
     name = case["format"]
     path = folder / f"file{format_by_name(name).suffixes[0]}"
@@ -106,4 +120,6 @@ def read_file(path: Path) -> SplatModel:
     return decode(path.read_bytes()) if path.suffix == ".csplat" else read(path)
 
 
-ENCODERS: dict[str, Encoder] = {"command": _by_command, "peer": _by_peer, "format": _by_format}
+ENCODERS: dict[str, Encoder] = {
+    "command": _by_command, "peer": _by_peer, "library": _by_library, "format": _by_format,
+}  # fmt: skip

