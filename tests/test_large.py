@@ -206,6 +206,16 @@ def test_a_damaged_work_file_is_named(model, tmp_path, kind):
     assert not target.exists()
 
 
+def test_a_folder_with_other_fields_of_state_is_refused(model, tmp_path):
+    target = tmp_path / "out.csplat"
+    with pytest.raises(KeyboardInterrupt):
+        encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding"))
+    path = tmp_path / "out.csplat.work" / "state.json"
+    path.write_text(path.read_text().replace("largest_sh", "largest"))
+    with pytest.raises(InputError, match=r"state\.json is damaged: remove out.csplat.work"):
+        encode_large(source_from_model(model), target, FAST, resume=True)
+
+
 def test_a_folder_with_other_files_is_refused_and_kept(model, tmp_path):
     folder = tmp_path / "photographs"
     folder.mkdir()

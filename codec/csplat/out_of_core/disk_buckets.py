@@ -38,6 +38,7 @@ _FRAME = struct.Struct("<QI")  # splats, CRC-32 of the records
 _FRAME_SPLATS = 1 << 12  # maximum number of splats in a frame; their records (1 MB) stay in the cache
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 _STATE, _SAMPLE = "state.json", "sample"
+_STATE_FIELDS = ("counts", "largest_sh", "contrast")  # attributes of `DiskBuckets`, written once the scene is sorted
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,7 @@ class DiskBuckets:
         folder.mkdir(exist_ok=True)
         _write_json(folder / _STATE, {"key": key})
         store = _sort(scene, folder, progress)
-        done = {"counts": store.counts, "largest_sh": store.largest_sh, "contrast": store.contrast}
-        _write_json(folder / _STATE, {"key": key, **done})
+        _write_json(folder / _STATE, {"key": key, **{name: getattr(store, name) for name in _STATE_FIELDS}})
         return store
 
     @property
@@ -174,7 +174,7 @@ def damaged_file(path: Path) -> InputError:
 
 
 def _read_state(folder: Path, key: dict[str, Any], *, resume: bool) -> dict[str, Any] | None:
-    """Return the fields of `DiskBuckets` from the folder; `None` if its scene is not sorted yet."""
+    """Return `_STATE_FIELDS` from the folder; `None` if its scene is not sorted yet."""
     path = folder / _STATE
     if not path.exists():
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -193,6 +193,8 @@ def _read_state(folder: Path, key: dict[str, Any], *, resume: bool) -> dict[str,
                 f"{folder} was started with {name} {found.get(name)}, now {value}: continue with the former {name}, "
                 "or remove the folder to start again"
             )
+    if state and tuple(state) != _STATE_FIELDS:  # another version's
+        raise damaged_file(path)
     return state or None
 
 
