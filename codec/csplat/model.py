@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import MISSING, dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -134,17 +134,17 @@ class SplatModel:
         Args:
             index: index of the first axis of a NumPy array: integers, a mask, or a slice, which returns views.
         """
-        return replace(
-            self,
-            means=self.means[index],
-            quats=self.quats[index],
-            scales=self.scales[index],
-            opacities=self.opacities[index],
-            sh0=self.sh0[index],
-            shN=self.shN[index],
-            extra={name: column[index] for name, column in self.extra.items()},
-            means_double=None if self.means_double is None else self.means_double[index],
-        )
+
+        def rows(array: NDArray[Any]) -> NDArray[Any]:
+            if isinstance(index, slice) or np.asarray(index).dtype == bool:
+                return array[index]
+            return np.take(array, index, axis=0)  # takes half the time of indexing
+
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        values |= {name: rows(values[name]) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+        values["extra"] = {name: rows(column) for name, column in self.extra.items()}
+        values["means_double"] = None if self.means_double is None else rows(self.means_double)
+        return trusted_model(**values)
 
 
 def trusted_model(**values: Any) -> SplatModel:
