@@ -31,7 +31,7 @@ from csplat.types import F32, F64, I64, Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scorer import Scorer, renderer
-from csplat_tools.optimise.rate_distortion import error_of_psnr
+from csplat_tools.optimise.rate_distortion import NOTHING, error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
 from csplat_tools.views import ViewSet, camera_sequence
 from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient_views
@@ -46,7 +46,6 @@ REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
 _ERROR_POWER = 0.85  # typical power of the error of pruning with which the error after a refit grows
 _ERROR_POWERS = (0.5, 2.0)  # range of that power if it is measured on two refits
 _DISTINCT = 0.1  # log ratio of errors from which two refits determine the power
-_NOTHING = 1e-12  # least mean squared error
 _LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes; fewer are too similar
 
 
@@ -142,14 +141,14 @@ class Pruner:
                     power = math.log(other_after / after) / math.log(other_before / before)
                     power = min(max(power, _ERROR_POWERS[0]), _ERROR_POWERS[1])
             gain = after / before**power
-        self.order.extend(error=max((allowed / max(gain, _NOTHING)) ** (1.0 / power), _NOTHING))
+        self.order.extend(error=max((allowed / max(gain, NOTHING)) ** (1.0 / power), NOTHING))
         errors = self.order.mean_errors()[: len(self.source)]  # at least one splat is kept
         return len(self.source) - np.arange(len(errors), dtype=np.float64), gain * errors**power
 
     def _error(self, kept_count: int) -> float:
         """Return the mean squared error of pruning all but this number of splats, before a refit."""
         errors = self.order.mean_errors()
-        return max(float(errors[min(len(self.source) - kept_count, len(errors) - 1)]), _NOTHING)
+        return max(float(errors[min(len(self.source) - kept_count, len(errors) - 1)]), NOTHING)
 
     def refit(self, kept_count: int) -> PrunedSubset:
         """Return the kept splats, refitted to renders of the source, unless that makes held-out views worse."""

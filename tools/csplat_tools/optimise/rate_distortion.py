@@ -22,6 +22,9 @@ BYTES_PER_DB = 0.045
 #: Least fraction of a file's error that is attributed to quantisation, since a smaller rest is noise.
 LEAST_QUANTISED = 0.1
 
+#: Least mean squared error, to divide by.
+NOTHING = 1e-12
+
 #: Natural logarithm of an error per dB.
 NEPERS = math.log(10.0) / 10.0
 

@@ -38,6 +38,7 @@ from csplat_tools.optimise.rate_distortion import (
     BYTES_PER_DB,
     LEAST_QUANTISED,
     NEPERS,
+    NOTHING,
     RateLine,
     RatePoint,
     error_of_psnr,
@@ -54,35 +55,31 @@ from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_valida
 _RENDERS = 520.0
 _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 
+# What is typical, without and with SH. It is assumed only until candidates show otherwise.
+_USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
+_ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
+_BYTES_PER_DB = (0.045, 0.07)  # fraction of the bytes that a decibel costs if splats are added
+_GAINS = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
+_TUNING_GAINS = {"codebook": 1.2}  # dB that the refit through the quantisers gains; 0.7 for other codings
+_USUAL_ENTRIES = 1 / 16  # codebook entries per splat
+
+# What is tried.
 _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
-_ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, without and with SH, at about 38 dB
-_USUAL = (7.0, 42.0)  # usual bytes per splat, and the precision of such files, dB
-_USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat at useful quality, without and with SH
-_BYTES_PER_DB = (0.045, 0.07)  # fraction of the bytes that a decibel costs if splats are added, without and with SH
-_GAINS = {"codebook": 0.6}  # typical dB of PSNR per dB of precision; 1 for other codings
-_TUNING_GAINS = {
-    "codebook": 1.2
-}  # dB by which the refit through the quantisers reduces the error of a file; 0.7 for others
-_AIM = 0.06  # dB above a PSNR, and the bytes they are worth below a size, that files aim at
-_COUNTS, _CODINGS = 3, 10  # most splat counts, and drafts for the choice of a coding
-_FILES = (8, 4)  # most files on the goal, of all splats and of refitted ones
+_ENTRIES = (1 / 4096, 1 / 4)  # range of the codebook entries per splat
+_TRIES, _CODINGS = 3, 10  # most splat counts, most drafts of one coding, and most codings at the default effort
+_FILES = (8, 4)  # most files on the goal, of all splats and of refitted ones, which take a refit each
+_MOST_DROPPED = 0.35  # largest fraction of the error that dropping SH bands may take
 _FARTHEST = 2.0  # largest factor between the errors of pruning of two splat counts, since they are extrapolated
-_NEGLIGIBLE = 0.1  # fraction of the allowed error; errors of pruning below that need no limit
-_OTHER = 4.0  # dB of precision from which another coding may be better
+_BEYOND = 1.4  # factor of the number of splats if no file of a number meets the goal
+_LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
+
+# What is near, and what is worth another candidate.
+_AIM = 0.06  # dB above a PSNR that files aim at; PSNR varies by 0.1 dB from one precision to the next
+_NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; another coding may be better there
+_JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, since it takes a refit
 _WORTH_FILE = 0.01  # fraction of the bytes that another file of the same splats and coding must promise
-_STALLED = 6.0  # dB of precision above the usual at which a coding is tried first
-_DRAFTS = 3  # most drafts of one coding
-_JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
-_NEAR = 1.0  # dB of precision; a draft farther from its goal does not predict the bytes on it
-_ALL_BUT = 0.02  # fraction of the splats; pruning fewer does not pay
-_PRESETS = 2.5  # dB; presets whose precision is this close to the chosen one are tried
-_USUAL_ENTRIES = 1 / 16  # codebook entries per splat to begin with
-_ENTRIES = (1 / 4096, 1 / 4)  # least and most codebook entries per splat
-_MOST_DROPPED = 0.35  # largest fraction of the error that dropping SH bands may take
-_BEYOND = 1.4  # factor of the number of splats if no file of a number meets the goal
-_NOTHING = 1e-12  # least mean squared error
-_LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
+
 _INSIDE_REMARK = (
     "splats were pruned by virtual views, which may show less than cameras inside of the surroundings do:"
     " use --data, or --cameras with at least 40 cameras, or keep all splats with --no-prune"
@@ -175,9 +172,9 @@ class TargetSearch:
         kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
         coding: Coding | None = None
         quality = 0.0
-        for _ in range(_COUNTS):
+        for _ in range(_TRIES):
             subset = pruner.refit(kept_count)
-            if coding is None or abs(self._start(subset, coding) - quality) > _OTHER:
+            if coding is None or abs(self._start(subset, coding) - quality) > _FAR:
                 coding = self._choose_coding(subset)
                 quality = self._predict(subset, coding)[0]
             else:
@@ -198,7 +195,7 @@ class TargetSearch:
             usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
             return self._rounded(min(self.goal.size_bytes / usual, splats))
         allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
-        for _ in range(_COUNTS):  # pruning errors in validation views differ from those in training views
+        for _ in range(_TRIES):  # pruning errors in validation views differ from those in training views
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
             before, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
@@ -219,7 +216,7 @@ class TargetSearch:
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
         else:
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
-        least = _NEGLIGIBLE * (quantised if size_bytes is not None else allowed)
+        least = LEAST_QUANTISED * (quantised if size_bytes is not None else allowed)
         costs[errors > max(_FARTHEST * self._pruned[count], least)] = np.inf
         best = int(np.argmin(costs))
         return self._rounded(counts[best]), float(costs[np.searchsorted(-counts, -count)] - costs[best])
@@ -236,7 +233,7 @@ class TargetSearch:
     def _rounded(self, count: float) -> int:
         """Return a number of splats; all of them if pruning the others would not pay."""
         splats = len(self.whole.model)
-        return splats if count > (1.0 - _ALL_BUT) * splats else max(1, round(count))
+        return splats if count > (1.0 - _WORTH) * splats else max(1, round(count))
 
     # The coding
 
@@ -267,9 +264,9 @@ class TargetSearch:
         """Make a draft of a coding, more if it is far from its goal and promising, and return the expected cost."""
         best, quality = min(costs, key=costs.__getitem__, default=None), self._start(subset, coding)
         if best is not None:  # unless its codebook is too small for any precision
-            quality = min(self._predict(subset, best)[0], quality + _STALLED)
+            quality = min(self._predict(subset, best)[0], quality + _FAR)
         cost = math.inf
-        for _ in range(_DRAFTS):
+        for _ in range(_TRIES):
             made = self.pool.make(subset, coding, quality, draft=True)
             if not costs:
                 self._score(made)
@@ -289,7 +286,8 @@ class TargetSearch:
                 return _clipped(line.quality_at_size(size_bytes / len(subset.model) * len(other.subset.model)))
         if size_bytes is None:
             return _clipped(psnr_of_mse(self._rest(subset, coding)) + _ATTRIBUTE_GAIN[coding.sh != "none"])
-        return _clipped(_USUAL[1] + math.log(size_bytes / len(subset.model) / _USUAL[0]) / BYTES_PER_DB)
+        usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
+        return _clipped(_USUAL_QUALITY + math.log(size_bytes / len(subset.model) / usual) / BYTES_PER_DB)
 
     def _first_codings(self, subset: Subset) -> list[Coding]:
         """Return a coding of each kind that the caller left open."""
@@ -369,7 +367,7 @@ class TargetSearch:
         """Return the cost of a file on the goal, as in `_predict`."""
         if self.goal.size_bytes is None:
             return math.log(file.size_bytes)
-        return rate_exponent(BYTES_PER_DB) * math.log(max(file.error, _NOTHING))
+        return rate_exponent(BYTES_PER_DB) * math.log(max(file.error, NOTHING))
 
     def _line(self, subset: Subset, coding: Coding) -> RateLine:
         """Return quantisation error and bytes of a subset and coding by precision.
@@ -403,7 +401,7 @@ class TargetSearch:
     def _point(self, one: Candidate) -> RatePoint:
         """Return precision, bytes and the expected quantisation error of a candidate, after the refit if a draft."""
         error = self._expected(one, one.error)
-        rest = max(error - self._unquantised(one.subset, one.coding), LEAST_QUANTISED * error, _NOTHING)
+        rest = max(error - self._unquantised(one.subset, one.coding), LEAST_QUANTISED * error, NOTHING)
         return RatePoint(one.quality or 0.0, rest, one.size_bytes)
 
     def _rest(self, subset: Subset, coding: Coding) -> float:
@@ -430,7 +428,7 @@ class TargetSearch:
                 ),
             )
             goal_error = self._expected(nearest, (nearest.goal_error or 0.0) - self.goal.source_error)
-            quantised = max(goal_error - on_goal, LEAST_QUANTISED * goal_error, _NOTHING)
+            quantised = max(goal_error - on_goal, LEAST_QUANTISED * goal_error, NOTHING)
             ratio = max(self._expected(nearest, nearest.error) - before, LEAST_QUANTISED * quantised) / quantised
         return before + ratio * rest
 
@@ -489,7 +487,7 @@ class TargetSearch:
         wanted, own = self._predict(self.whole, coding)[0], self.pool.encoding.preset
         for name, preset in PRESETS.items():
             allowed = name == own if "fast" in (name, own) else True
-            if allowed and abs(preset.quality[coding.sh == "none"] - wanted) < _PRESETS:
+            if allowed and abs(preset.quality[coding.sh == "none"] - wanted) < _FAR:
                 self._score(self.pool.make(self.whole, Coding(use_classes=False, preset=name), None, draft=False))
 
     def _out_of_reach(self) -> str:
