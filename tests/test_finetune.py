@@ -34,6 +34,7 @@ from csplat_tools.training.tuning_report import ply_splat_bytes
 from csplat_tools.training.tuning_run import smallest_reaching
 from csplat_trainer.losses import PhotometricLoss
 from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuned_scene import (
     RateTerm,
     TunedScene,
@@ -348,8 +349,10 @@ def test_a_killed_run_resumes_as_if_uninterrupted(source, views, tmp_path, share
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        tune(fixed, views, options, size_bytes=size_bytes, progress=kill, checkpoint=file, checkpoint_every=3)
-    whole, rest = (tune(fixed, views, options, size_bytes=size_bytes, resume=one) for one in (None, file))
+        tune(fixed, views, options, size_bytes=size_bytes, progress=kill, outputs=Outputs(file, 3))
+    whole, rest = (
+        tune(fixed, views, options, size_bytes=size_bytes, outputs=Outputs(resume=one)) for one in (None, file)
+    )
     assert fixed.encode(whole.best_values).write().data == fixed.encode(rest.best_values).write().data
     for name in ("losses", "validations", "exposures", "byte_cost"):
         assert whole.log[name] == rest.log[name]
@@ -369,12 +372,12 @@ def test_lambda_is_controlled_to_meet_a_size(source, views, tmp_path):
     assert costs[0] > options.byte_cost > costs[1]
     file = tmp_path / "run.npz"
     half = replace(FEW, iterations=8)
-    tune(fixed, views, half, size_bytes=before, checkpoint=file)
-    whole, rest = (tune(fixed, views, half, size_bytes=before, resume=one) for one in (None, file))
+    tune(fixed, views, half, size_bytes=before, outputs=Outputs(file))
+    whole, rest = (tune(fixed, views, half, size_bytes=before, outputs=Outputs(resume=one)) for one in (None, file))
     assert fixed.encode(whole.best_values).write().data == fixed.encode(rest.best_values).write().data
     assert whole.log["byte_cost"] == rest.log["byte_cost"]
     with pytest.raises(InputError, match="another target"):
-        tune(fixed, views, half, resume=file)
+        tune(fixed, views, half, outputs=Outputs(resume=file))
 
 
 def test_the_excess_of_a_file_is_added_to_the_loss():
@@ -397,21 +400,21 @@ def test_the_rate_controller_raises_lambda_in_time():
 
 def test_a_checkpoint_of_other_views_or_options_is_refused(coarse, views, tmp_path):
     fixed, file = coarse, tmp_path / "c.npz"
-    tune(fixed, views, replace(QUICK, iterations=5), checkpoint=file)
+    tune(fixed, views, replace(QUICK, iterations=5), outputs=Outputs(file))
     with pytest.raises(InputError, match="another byte_cost"):
-        tune(fixed, views, replace(QUICK, byte_cost=0.5), resume=file)
+        tune(fixed, views, replace(QUICK, byte_cost=0.5), outputs=Outputs(resume=file))
     with pytest.raises(InputError, match="other views"):
-        tune(fixed, replace(views, train=views.train[1:]), QUICK, resume=file)
+        tune(fixed, replace(views, train=views.train[1:]), QUICK, outputs=Outputs(resume=file))
     with pytest.raises(InputError, match="other views"):
-        tune(fixed, replace(views, background=views.background + np.float32(0.5)), QUICK, resume=file)
+        tune(fixed, replace(views, background=views.background + np.float32(0.5)), QUICK, outputs=Outputs(resume=file))
 
 
 def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, coarse, views, tmp_path):
     file = tmp_path / "c.npz"
-    tune(coarse, views, replace(QUICK, iterations=5), checkpoint=file)
+    tune(coarse, views, replace(QUICK, iterations=5), outputs=Outputs(file))
     other = fix_quantisation(EncodePlan.of(source, replace(COARSE, attribute_psnr=29.0)))
     with pytest.raises(InputError, match="another scene"):
-        tune(other, views, QUICK, resume=file)
+        tune(other, views, QUICK, outputs=Outputs(resume=file))
     np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 2}', np.uint8))
     np.save(tmp_path / "n.npy", np.zeros(3))
     data, entry = file.read_bytes(), file.read_bytes().index(b"PK\x01\x02")
@@ -421,7 +424,7 @@ def test_a_checkpoint_of_another_scene_or_kind_is_refused(source, coarse, views,
     for content in (*wrong, (tmp_path / "n.npz").read_bytes(), (tmp_path / "n.npy").read_bytes()):
         (tmp_path / "bad.npz").write_bytes(content)
         with pytest.raises(InputError, match="not a checkpoint") as caught:
-            tune(coarse, views, QUICK, resume=tmp_path / "bad.npz")
+            tune(coarse, views, QUICK, outputs=Outputs(resume=tmp_path / "bad.npz"))
         assert "pickle" not in str(caught.value)
 
 
@@ -460,7 +463,7 @@ def test_every_learning_rate_warms_up(coarse, views, tmp_path):
     start = {name: values.copy() for name, values in TunedScene(fixed).parameters.values.items() if values.size}
     for warm_up in (0, 100):
         options = FinetuneOptions(iterations=1, warm_up=warm_up, byte_cost=0.0)
-        tune(fixed, views, options, checkpoint=file)
+        tune(fixed, views, options, outputs=Outputs(file))
         with np.load(file) as stored:
             steps = {name: np.abs(stored[f"values_{name}"] - start[name]).max() for name in start}
             moved.append({name: step / options.learning_rate_factor(1) for name, step in steps.items()})

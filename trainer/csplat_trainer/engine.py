@@ -13,7 +13,7 @@ from csplat_render.conventions import UncheckedSplats
 from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.image_gains import ImageGain
-from csplat_trainer.losses import LOSS_WEIGHTS, LossValue, PerceptualLoss, PhotometricLoss
+from csplat_trainer.losses import LossValue, PerceptualLoss, SizedLosses
 from csplat_trainer.parameters import Parameters, adam_step
 from csplat_trainer.posed_images import PosedImage, compose
 from csplat_trainer.strategies import ScreenGradients, add_noise
@@ -74,7 +74,7 @@ class CpuEngine:
         self._perceptual = perceptual
         self._samples = options.strategy in ("mcmc", "fixed")
         self._rasteriser = Rasteriser("standard", np.float32)
-        self._losses: dict[tuple[int, int], tuple[PhotometricLoss, F32]] = {}
+        self._losses = SizedLosses(options.loss)
         self._alphas = self._logit_gradient = np.empty(0, np.float32)
         self._normals = np.empty((0, 3), np.float32)
 
@@ -101,7 +101,7 @@ class CpuEngine:
             The photometric loss before the step.
         """
         options, camera = self._options, image.camera
-        loss, target = self._loss_for(camera)
+        loss, target = self._losses.of(camera)
         compose(image, background, target)
         rgb = self._forward(camera, background, degree)
         shown = rgb if gain is None else gain.apply(rgb)
@@ -153,14 +153,6 @@ class CpuEngine:
             splats, camera, background=background, antialiased=self._options.antialiased, sh_degree=degree
         )
         return result.rgb
-
-    def _loss_for(self, camera: Camera) -> tuple[PhotometricLoss, F32]:
-        """Return the loss and the image buffer for images of a camera's size."""
-        size = (camera.H, camera.W)
-        if size not in self._losses:
-            weights = LOSS_WEIGHTS[self._options.loss]
-            self._losses[size] = PhotometricLoss(*size, *weights), np.empty((*size, 3), np.float32)
-        return self._losses[size]
 
 
 def _per_half_image(norms: F32, camera: Camera) -> F32:

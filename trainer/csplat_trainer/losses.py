@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.types import F32, F64
+from csplat_render.camera import Camera
 from csplat_render.kernels import parallel_kernel
 from csplat_render.lpips import MIN_SIZE, SCALE, SHIFT, Lpips
 from csplat_render.metric_kernels import (
@@ -116,6 +117,25 @@ class PhotometricLoss:
             mse /= float(np.mean(mask))
         loss = self.l1_weight * l1 + (self.ssim_weight * (1.0 - ssim) if self.ssim_weight != 0.0 else 0.0)
         return LossValue(loss, l1, ssim, mse), self._gradient
+
+
+class SizedLosses:
+    """A loss for each size of images, with a buffer for the image to compare with.
+
+    Args:
+        name: name of the weights in `LOSS_WEIGHTS`.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._weights = LOSS_WEIGHTS[name]
+        self._by_size: dict[tuple[int, int], tuple[PhotometricLoss, F32]] = {}
+
+    def of(self, camera: Camera) -> tuple[PhotometricLoss, F32]:
+        """Return the loss and the buffer, [H, W, 3], for images of a camera's size."""
+        size = (camera.H, camera.W)
+        if size not in self._by_size:
+            self._by_size[size] = PhotometricLoss(*size, *self._weights), np.empty((*size, 3), np.float32)
+        return self._by_size[size]
 
 
 @parallel_kernel(relaxed=True)

@@ -80,7 +80,6 @@ class Parameters:
 
 def from_model(model: SplatModel, sh_degree: int) -> ParameterArrays:
     """Return the parameters of a model's splats, with SH truncated or extended by zeros to a degree."""
-    alpha = np.clip(model.opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
     coefficients = (sh_degree + 1) ** 2 - 1
     shN = np.zeros((len(model), coefficients, 3), np.float32)
     common = min(coefficients, model.shN.shape[1])
@@ -89,7 +88,7 @@ def from_model(model: SplatModel, sh_degree: int) -> ParameterArrays:
         "means": model.means.copy(),
         "quats": normalise_quats(model.quats),
         "scales": model.scales.copy(),
-        "logits": np.log(alpha / (1.0 - alpha)).astype(np.float32),
+        "logits": logits_of(model.opacities),
         "sh0": model.sh0.copy(),
         "shN": shN,
     }
@@ -112,6 +111,13 @@ def sigmoid(logits: F32) -> F32:
     """Return the opacities of logits, computed in float64 and rounded once."""
     alpha: F32 = (1.0 / (1.0 + np.exp(-logits.astype(np.float64)))).astype(np.float32)
     return alpha
+
+
+def logits_of(opacities: F32) -> F32:
+    """Return the logits of opacities, which are limited to 1e-6 from 0 and 1."""
+    alpha = np.clip(opacities.astype(np.float64), 1e-6, 1.0 - 1e-6)
+    logits: F32 = np.log(alpha / (1.0 - alpha)).astype(np.float32)
+    return logits
 
 
 def adam_step(parameters: Parameters, gradients: ParameterArrays, rates: dict[str, float]) -> None:

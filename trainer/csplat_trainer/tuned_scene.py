@@ -23,9 +23,7 @@ from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.types import F32, I32, I64
 from csplat_render.conventions import Gradients
 from csplat_render.kernels import lane_range, parallel_kernel
-from csplat_trainer.parameters import ParameterArrays, Parameters, adam_step, sigmoid
-
-_ALPHAS = (1e-6, 1.0 - 1e-6)  # range of the opacities that logits are computed from
+from csplat_trainer.parameters import ParameterArrays, Parameters, adam_step, logits_of, sigmoid
 
 
 class TunedScene:
@@ -126,12 +124,11 @@ class TunedScene:
 
 
 def _values(start: FreeValues) -> ParameterArrays:
-    alpha = np.clip(start.opacities.astype(np.float64), *_ALPHAS)
     return {
         "means": start.means,
         "quats": start.quats,
         "scales": start.scales,
-        "logits": np.log(alpha / (1.0 - alpha)).astype(np.float32),
+        "logits": logits_of(start.opacities),
         "sh0": start.sh0,
         "shN": start.sh,
         "sizes": start.sizes,

@@ -139,12 +139,10 @@ def finetune(
         if on_step is not None:
             on_step(now)
 
-    files = outputs or Outputs()
     with timer.stage("tuning"):
         tuned = tune(
-            fixed, views, options, size_bytes=size_bytes, progress=show, checkpoint=files.checkpoint,
-            checkpoint_every=files.checkpoint_every, resume=files.resume, threads=encoding.threads,
-        )  # fmt: skip
+            fixed, views, options, size_bytes=size_bytes, progress=show, outputs=outputs, threads=encoding.threads
+        )
     with timer.stage("encoding"):
         result = fixed.encode(tuned.best_values).write(tuning_metadata(tuned.log["best_iteration"]))
         decoded = decode(result.data)

@@ -22,7 +22,8 @@ from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
 from csplat_trainer.fitter import COUNT_EVERY, Fitter
 from csplat_trainer.image_gains import ImageGain
-from csplat_trainer.losses import LOSS_WEIGHTS, LossValue, PhotometricLoss
+from csplat_trainer.losses import LossValue, SizedLosses
+from csplat_trainer.training_options import Outputs
 from csplat_trainer.training_report import peak_memory
 from csplat_trainer.tuned_scene import RateTerm, TunedScene
 from csplat_trainer.tuning.tuning_options import FinetuneOptions
@@ -74,9 +75,7 @@ def tune(
     *,
     size_bytes: int | None = None,
     progress: Callable[[TuningStep], None] | None = None,
-    checkpoint: str | Path | None = None,
-    checkpoint_every: int = 0,
-    resume: str | Path | None = None,
+    outputs: Outputs | None = None,
     threads: int | None = None,
 ) -> TuningResult:
     """Fine-tune a fixed quantisation.
@@ -89,18 +88,16 @@ def tune(
         options: options of the tuning.
         size_bytes: largest size of the file; lambda is adjusted to meet it, starting at `byte_cost`.
         progress: called every `log_every` steps.
-        checkpoint: file for checkpoints, each of which replaces the last; `None`: none are written.
-        checkpoint_every: steps between checkpoints; 0: only at the end.
-        resume: a checkpoint of the same fixed quantisation to continue from.
+        outputs: checkpoints; a run resumes from one of the same fixed quantisation.
         threads: number of threads; `None` for all.
 
     Raises:
         InputError: a checkpoint is damaged, or of another scene, views or options; or a loss or a value is not finite.
     """
-    tuning = _Tuning(fixed, views, options or FinetuneOptions(), threads, size_bytes)
-    tuning.progress, tuning.checkpoint, tuning.checkpoint_every = progress, checkpoint, checkpoint_every
-    if resume is not None:
-        tuning.resume(resume)
+    outputs = outputs or Outputs()
+    tuning = _Tuning(fixed, views, options or FinetuneOptions(), outputs, progress, threads, size_bytes)
+    if outputs.resume is not None:
+        tuning.resume(outputs.resume)
     return tuning.run()
 
 
@@ -115,30 +112,20 @@ class _BestValues:
     since: int = 0
 
 
-@dataclass
-class _ImageBuffers:
-    """Reusable loss and reference image for images of one size."""
-
-    loss: PhotometricLoss
-    reference: F32
-
-
 class _Tuning:
     """A tuning by a `Fitter`: the scene, its views, the best values so far."""
-
-    progress: Callable[[TuningStep], None] | None = None
-    checkpoint: str | Path | None = None
-    checkpoint_every: int = 0
 
     def __init__(
         self,
         fixed: FixedQuantisation,
         views: TuningViews,
         options: FinetuneOptions,
+        outputs: Outputs,
+        show: Callable[[TuningStep], None] | None,
         threads: int | None,
         size_bytes: int | None,
     ) -> None:
-        self._views, self._options = views, options
+        self._views, self._options, self._outputs, self._show = views, options, outputs, show
         self._scene = TunedScene(fixed)
         self._rasteriser = Rasteriser(threads=threads)
         self._antialiased = fixed.encode_plan.model.antialiased
@@ -146,7 +133,7 @@ class _Tuning:
         self._fitter = Fitter(len(views.train), options.iterations, options.seed)
         self._log = self._fitter.log
         self._log |= {"validations": [], "views": views.digest}
-        self._sizes: dict[tuple[int, int], _ImageBuffers] = {}
+        self._losses = SizedLosses(options.loss)
         self._numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _BestValues | None = None
         self._controller = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
@@ -188,8 +175,8 @@ class _Tuning:
         if self._best is None:
             self._validate()
         self._fitter.run(self)
-        if self.checkpoint is not None:
-            self._save(self.checkpoint)
+        if self._outputs.checkpoint is not None:
+            self._save(self._outputs.checkpoint)
         assert self._best is not None
         return TuningResult(self._best.values, self._full_log())
 
@@ -201,10 +188,10 @@ class _Tuning:
             if self._controller is not None:
                 self._controller.update(fitter.rate.bits, (fitter.iteration - 1) / fitter.iterations, options.byte_cost)
         rendered = self._render(seen, shown_view)
-        buffers = self._buffers(shown_view)
+        loss, buffer = self._losses.of(shown_view.camera)
         gain = fitter.gain(view, options.lr_exposure * options.learning_rate_factor(fitter.iteration))
         shown = rendered if gain is None else gain.apply(rendered)
-        value, slope = buffers.loss(shown, shown_view.image(self._views.background, buffers.reference), shown_view.mask)
+        value, slope = loss(shown, shown_view.image(self._views.background, buffer), shown_view.mask)
         if fitter.iteration == 1 and not math.isfinite(value.loss):  # values are still the initial ones
             raise InputError("renders of the scene overflow float32: its colours are too large for tuning")
         fitter.check(value)
@@ -214,13 +201,13 @@ class _Tuning:
         return value
 
     def after_step(self) -> None:
-        fitter, options = self._fitter, self._options
+        fitter, options, outputs = self._fitter, self._options, self._outputs
         if fitter.is_due(options.validate_every) or fitter.is_last:
             self._validate()
-        if self.progress is not None and (fitter.is_due(options.log_every) or fitter.is_last):
-            self.progress(self._progress())
-        if self.checkpoint is not None and fitter.is_due(self.checkpoint_every):
-            self._save(self.checkpoint)
+        if self._show is not None and (fitter.is_due(options.log_every) or fitter.is_last):
+            self._show(self._progress())
+        if outputs.checkpoint is not None and fitter.is_due(outputs.checkpoint_every):
+            self._save(outputs.checkpoint)
 
     @property
     def _byte_cost(self) -> float:
@@ -250,13 +237,13 @@ class _Tuning:
         if not all(np.isfinite(values).all() for values in self._scene.parameters.values.values()):
             raise InputError(f"a value is not finite at step {self._fitter.iteration}: try smaller learning rates")
         seen, _ = self._scene.dequantise()
-        loss, error, count = 0.0, 0.0, 0
+        total, error, count = 0.0, 0.0, 0
         for view in self._views.validation:
-            buffers, rendered = self._buffers(view), self._render(seen, view)
+            (loss, buffer), rendered = self._losses.of(view.camera), self._render(seen, view)
             if self._options.lr_exposure and id(view) in self._numbers:  # also a training view
                 rendered = ImageGain(self._fitter.gains, self._numbers[id(view)], 0.0).apply(rendered)
-            reference = view.image(self._views.background, buffers.reference)
-            loss += buffers.loss(rendered, reference, view.mask)[0].loss / len(self._views.validation)
+            reference = view.image(self._views.background, buffer)
+            total += loss(rendered, reference, view.mask)[0].loss / len(self._views.validation)
             error += float(np.square(np.clip(rendered, 0, 1) - np.clip(reference, 0, 1)).sum(dtype=np.float64))
             count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
         costs = self._scene.count(seen, self._options.byte_cost)
@@ -264,26 +251,19 @@ class _Tuning:
         size_bytes = len(self._scene.fixed.encode(self._scene.free_values).write().data)
         shrinks = False
         if self._controller is None:
-            score = loss + costs.loss
+            score = total + costs.loss
         else:
             excess = self._controller.excess(size_bytes, costs.bits)
             shrinks = excess > 0.0 and not self._controller.is_exhausted
-            score = loss + excess
+            score = total + excess
         self._log["validations"].append(
-            {"iteration": self._fitter.iteration, "loss": loss, "psnr": psnr, "size_bytes": size_bytes}
+            {"iteration": self._fitter.iteration, "loss": total, "psnr": psnr, "size_bytes": size_bytes}
         )
         if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
             self._best = _BestValues(self._scene.free_values.copy(), score, psnr, self._fitter.iteration)
         elif self._options.has_calmed(self._fitter.iteration) and not shrinks:
             self._best.since += 1
             self._fitter.has_ended = 0 < self._options.patience <= self._best.since
-
-    def _buffers(self, view: TuningView) -> _ImageBuffers:
-        size = (view.camera.H, view.camera.W)
-        if size not in self._sizes:
-            loss = PhotometricLoss(*size, *LOSS_WEIGHTS[self._options.loss])
-            self._sizes[size] = _ImageBuffers(loss, np.empty((*size, 3), np.float32))
-        return self._sizes[size]
 
     def _progress(self) -> TuningStep:
         assert self._best is not None

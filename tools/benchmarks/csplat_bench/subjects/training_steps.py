@@ -96,10 +96,11 @@ def _walk(
         return run
 
     engine, rng, extent = CpuEngine(parameters, options), np.random.default_rng(1), measure_extent(images).extent
-    rasteriser, loss_for = engine._rasteriser, engine._loss_for  # noqa: SLF001  # its stages are timed
+    rasteriser, losses = engine._rasteriser, engine._losses  # noqa: SLF001  # its stages are timed
+    loss_of = losses.of
 
     def clock_loss(camera: Any) -> Any:
-        loss, *others = loss_for(camera)
+        loss, *others = loss_of(camera)
         return clock("loss", loss), *others
 
     times: dict[str, list[float]] = {name: [] for name in ("step", "step_cpu", *_STAGES)}
@@ -108,7 +109,7 @@ def _walk(
         patch.object(rasteriser, "forward", clock("forward", rasteriser.forward)),
         patch.object(rasteriser, "backward", clock("backward", rasteriser.backward)),
         patch("csplat_trainer.engine.adam_step", clock("adam", adam_step)),
-        patch.object(engine, "_loss_for", clock_loss),
+        patch.object(losses, "of", clock_loss),
     ):
         for step in range(steps):
             spent.clear()
