@@ -37,6 +37,22 @@ class MeasuredViews:
     cameras: Sequence[Camera]
     pruning_error: PruningError
 
+    @classmethod
+    def of(
+        cls,
+        model: SplatModel,
+        cameras: Sequence[Camera],
+        background: ArrayLike,
+        *,
+        threads: int | None = None,
+        progress: Progress | None = None,
+    ) -> MeasuredViews:
+        """Measure the pruning errors of a scene; arguments as for `measure_pruning_error`."""
+        found = measure_pruning_error(
+            model, cameras, background=background, bands=False, threads=threads, progress=progress
+        )
+        return cls(cameras, found)
+
     def __add__(self, other: MeasuredViews) -> MeasuredViews:
         return MeasuredViews([*self.cameras, *other.cameras], self.pruning_error + other.pruning_error)
 
@@ -110,11 +126,10 @@ class PruningOrder:
         """Make a round: prune until `count` splats are left; return False if none can be pruned."""
         if self.rounds:
             turn = (len(self.rounds) - 1) % len(self.groups)
-            measured = measure_pruning_error(
-                self.model.select(self._left), self.groups[turn].cameras, background=self.background, bands=False,
-                threads=self.threads, progress=self.progress,
-            )  # fmt: skip
-            self.groups[turn] = replace(self.groups[turn], pruning_error=measured)
+            left, cameras = self.model.select(self._left), self.groups[turn].cameras
+            self.groups[turn] = MeasuredViews.of(
+                left, cameras, self.background, threads=self.threads, progress=self.progress
+            )
         keys = pruning_keys(self.model.opacities[self._left], total_error(self.groups), keep_unseen=self.keep_unseen)
         order = np.argsort(keys, kind="stable")[: len(self._left) - count]
         order = order[np.isfinite(keys[order])]

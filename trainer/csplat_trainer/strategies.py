@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from csplat.types import F32, F64, I64
 from csplat_render.kernels import lane_range, parallel_kernel
-from csplat_render.pruning_error import measure_pruning_error
 from csplat_trainer.parameters import GROUPS, Parameters, to_model
 from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.pruning import MeasuredViews, PruningOrder
 
 _MAX_SHARE = 51  # largest number of splats in one place, as in the paper's code
 _BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])
@@ -287,5 +287,5 @@ def prune_least_needed(
     """
     views = images[:: -(-len(images) // _PRUNING_VIEWS)]
     model = to_model(parameters.values, antialiased=antialiased)
-    found = measure_pruning_error(model, [one.camera for one in views], background=background, bands=False)
-    parameters.keep(np.sort(np.argsort(-found.error, kind="stable")[:count]))
+    measured = MeasuredViews.of(model, [one.camera for one in views], background)
+    parameters.keep(PruningOrder(model, [measured], background, keep_unseen=False).kept(count))

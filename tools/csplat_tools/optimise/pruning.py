@@ -29,7 +29,6 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, F64, I64, Progress
 from csplat_render import Camera
-from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scorer import Scorer, renderer
 from csplat_tools.optimise.rate_distortion import NOTHING, error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
@@ -91,11 +90,10 @@ class Pruner:
         if self.views.virtual:
             cameras = camera_sequence(self.source, len(self.sufficient.used), self.size, seed=self.seed + 1)
             for part in (cameras[::2], cameras[1::2]):
-                found = measure_pruning_error(
-                    self.source, part, background=self.views.background, bands=False, threads=self.threads,
-                    progress=self.progress,
-                )  # fmt: skip
-                groups.append(MeasuredViews(part, found))
+                found = MeasuredViews.of(
+                    self.source, part, self.views.background, threads=self.threads, progress=self.progress
+                )
+                groups.append(found)
         return PruningOrder(self.source, groups, self.views.background, threads=self.threads, progress=self.progress)
 
     @cached_property

@@ -248,9 +248,9 @@ class TargetSearch:
             coding = waiting.pop(0)
             costs[coding] = self._try(subset, coding, costs)
             if not waiting:
-                best, *others = sorted(costs, key=costs.__getitem__)
-                book = next((one for one in others if one.sh == "codebook"), None)
-                larger = [] if book is None or best.sh == "codebook" else self._other_sizes(book)[:1]
+                ordered = sorted(costs, key=costs.__getitem__)
+                best, books = ordered[0], [one for one in ordered if one.sh == "codebook"]
+                larger = self._other_sizes(books[0])[:1] if books else []  # even if another kind is better so far
                 found = [
                     *self._fewer_bands(subset, best),
                     *self._other_sizes(best),
@@ -412,25 +412,27 @@ class TargetSearch:
     def _allowed(self, subset: Subset, coding: Coding) -> float:
         """Return the mean squared error on the validation views at which a file meets the goal.
 
-        Errors differ between the validation views and the views of the goal, most of all those of pruning. Candidates
-        that were measured in both correct that.
+        Errors differ between the validation views and the views of the goal. Those before quantisation are measured in
+        both. Those of quantisation are in a ratio that candidates measured in both show, 1 until there are any.
         """
         before, on_goal = (self._unquantised(subset, coding, on_goal=on_goal) for on_goal in (False, True))
-        rest, ratio = max(self._allowed_in_renders - on_goal, LEAST_QUANTISED * self._allowed_in_renders), 1.0
+        rest = max(self._allowed_in_renders - on_goal, LEAST_QUANTISED * self._allowed_in_renders)
         measured = [one for one in self.pool.made if one.subset is subset and one.goal_error is not None]
-        if measured:
-            nearest = min(
-                measured,
-                key=lambda one: (
-                    one.is_draft,
-                    one.coding != coding,
-                    abs(math.log((one.goal_error or 0.0) / self.goal.error)),
-                ),
-            )
-            goal_error = self._expected(nearest, (nearest.goal_error or 0.0) - self.goal.source_error)
-            quantised = max(goal_error - on_goal, LEAST_QUANTISED * goal_error, NOTHING)
-            ratio = max(self._expected(nearest, nearest.error) - before, LEAST_QUANTISED * quantised) / quantised
-        return before + ratio * rest
+        if not measured:
+            return before + rest
+        nearest = min(measured, key=lambda one: (one.is_draft, one.coding != coding, self._off_goal(one)))
+        error, goal_error = (self._expected(nearest, found) for found in (nearest.error, self._goal_error(nearest)))
+        floor = LEAST_QUANTISED * (rest if self.goal.source_error else goal_error)
+        quantised = max(goal_error - on_goal, floor, NOTHING)
+        return before + rest * max(error - before, LEAST_QUANTISED * quantised) / quantised
+
+    def _goal_error(self, one: Candidate) -> float:
+        """Return the mean squared error of a measured candidate on the views of the goal, without the source's."""
+        return (one.goal_error or 0.0) - self.goal.source_error
+
+    def _off_goal(self, one: Candidate) -> float:
+        """Return how far a measured candidate is from the goal, on the views of the goal."""
+        return abs(math.log(max(one.goal_error or 0.0, NOTHING) / self.goal.error))
 
     @staticmethod
     def _expected(one: Candidate, error: float) -> float:

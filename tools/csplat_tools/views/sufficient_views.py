@@ -16,7 +16,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render import Camera
-from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_render.pruning_error import PruningError
 from csplat_tools.views import HELD_OUT_COUNT, VIEW_SIZE, ViewSet, shrink_cameras
 from csplat_trainer.pruning import MeasuredViews, pruning_keys, total_error
 
@@ -73,10 +73,7 @@ def find_sufficient_views(
     """
 
     def measure(cameras: Sequence[Camera]) -> MeasuredViews:
-        found = measure_pruning_error(
-            model, cameras, background=views.background, bands=False, threads=threads, progress=progress
-        )
-        return MeasuredViews(cameras, found)
+        return MeasuredViews.of(model, cameras, views.background, threads=threads, progress=progress)
 
     if not views.training or not views.validation:
         found = len(views.training) + len(views.validation)
