@@ -85,11 +85,6 @@ class RateLine:
                 break
         return cls(first, error_slope, bytes_slope)
 
-    @property
-    def exponent(self) -> float:
-        """The k of bytes ∝ Q^-k."""
-        return -self.bytes_slope / self.error_slope
-
     def quality_at_error(self, error: float) -> float:
         """Return the precision for a quantisation error."""
         return self.nearest.quality + math.log(error / self.nearest.error) / self.error_slope
@@ -121,13 +116,13 @@ def log_bytes_at_error(kept_count: F64, pruned: F64, allowed: float, exponent: f
     return np.where(fits, np.log(kept_count) - exponent * np.log(rest), np.inf)
 
 
-def log_bytes_at_size(kept_count: F64, pruned: F64, quantised: float, exponent: float) -> F64:
+def log_bytes_at_size(relative_count: F64, pruned: F64, quantised: float, exponent: float) -> F64:
     """Return the log bytes that the error of files of equal size is worth, up to a constant.
 
     Args:
-        kept_count: numbers of kept splats, relative to the number at which quantisation costs `quantised`.
+        relative_count: numbers of kept splats, relative to the number at which quantisation costs `quantised`.
         pruned: mean squared error of pruning the others.
         quantised: mean squared error of quantisation.
         exponent: k of bytes ∝ Q^-k.
     """
-    return np.asarray(exponent * np.log(pruned + quantised * kept_count ** (1.0 / exponent)))
+    return np.asarray(exponent * np.log(pruned + quantised * relative_count ** (1.0 / exponent)))

@@ -3,16 +3,19 @@
 How a target is met:
 
 1. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
-   gives the first number of splats (`_first_count`), which are refitted to renders of the source.
+   gives the first number of splats; for a size, typical bytes per splat do (`_first_count`). These splats are refitted
+   to renders of the source.
 2. Drafts of these splats are encoded with one coding of SH after another: each neighbour of the best coding is tried
-   until none is expected to be smaller (`_choose_coding`).
-3. Two drafts of a coding give its bytes and error as functions of the precision (`RateLine`). Together with the pruning
-   order they predict the best number of splats (`_next_count`). If it promises to save enough, it is tried as well.
+   until none is expected to be smaller (`_choose_coding`). Drafts of a coding give its bytes and error as functions of
+   the precision (`RateLine`), and so its bytes on the goal (`_predict`).
+3. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
+   save enough, it is tried as well (`_next_count`).
 4. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
    goal, which corrects the prediction of the precision, until another file would hardly be smaller (`_finish`).
 
-Candidates are compared by their error on validation views. Test views settle the precision of the last files for a
-PSNR, and nothing else. With all splats kept, steps 1 and 3 are left out, and the presets' own files are candidates.
+Candidates are compared by their error on validation views. The views of the goal, which are the test views for a PSNR,
+only tell how much error is left there (`_allowed`): they settle precision and number of splats. With all splats kept,
+steps 1 and 3 are left out, and the presets' own files are candidates.
 """
 
 from __future__ import annotations
@@ -68,7 +71,7 @@ _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alo
 _ENTRIES = (1 / 4096, 1 / 4)  # range of the codebook entries per splat
 _TRIES, _CODINGS = 3, 10  # most splat counts, most drafts of one coding, and most codings at the default effort
 _FILES = (8, 4)  # most files on the goal, of all splats and of refitted ones, which take a refit each
-_MOST_DROPPED = 0.35  # largest fraction of the error that dropping SH bands may take
+_MOST_DROPPED = 0.35  # largest fraction of the error left to quantisation that dropping SH bands may take
 _FARTHEST = 2.0  # largest factor between the errors of pruning of two splat counts, since they are extrapolated
 _BEYOND = 1.4  # factor of the number of splats if no file of a number meets the goal
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
@@ -171,22 +174,22 @@ class TargetSearch:
         """Return the refitted splats and the coding with the least expected cost."""
         kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
         coding: Coding | None = None
-        quality = 0.0
+        chosen_at = 0.0
         for _ in range(_TRIES):
             subset = pruner.refit(kept_count)
-            if coding is None or abs(self._start(subset, coding) - quality) > _FAR:
+            if coding is None or abs(self._start(subset, coding) - chosen_at) > _FAR:
                 coding = self._choose_coding(subset)
-                quality = self._predict(subset, coding)[0]
+                chosen_at = self._predict(subset, coding)[0]
             else:
                 self._try(subset, coding, {})
             kept_count, saved = self._next_count(pruner, subset, coding)
             cost = self._predict(subset, coding)[1]
-            tried.append((math.inf if math.isinf(saved) else cost, subset, coding))
+            tried.append((math.inf if math.isinf(saved) else cost, subset, coding))  # infinite if pruning took too much
             if self.work < 1.0:
                 break
             if saved < _WORTH or any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
                 break
-        return min(tried, key=lambda one: one[0])[1:]
+        return min(tried, key=lambda one: (one[0], -len(one[1].model)))[1:]
 
     def _first_count(self, pruner: Pruner) -> int:
         """Return the number of splats to begin with."""
@@ -209,7 +212,8 @@ class TargetSearch:
         """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save."""
         line, size_bytes, allowed = self._line(subset, coding), self.goal.size_bytes, self._allowed_in_renders
         count = len(subset.model)
-        self._pruned[count] = self._unquantised(subset, coding, on_goal=size_bytes is None)
+        with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
+        self._pruned[count] = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
         quantised = 0.0 if size_bytes is None else line.error_at(line.quality_at_size(size_bytes))
         counts, errors = pruner.errors(allowed if size_bytes is None else quantised, self._pruned)
         if size_bytes is None:
@@ -263,7 +267,7 @@ class TargetSearch:
     def _try(self, subset: Subset, coding: Coding, costs: Mapping[Coding, float]) -> float:
         """Make a draft of a coding, more if it is far from its goal and promising, and return the expected cost."""
         best, quality = min(costs, key=costs.__getitem__, default=None), self._start(subset, coding)
-        if best is not None:  # unless its codebook is too small for any precision
+        if best is not None:  # its codebook may be too small for any precision
             quality = min(self._predict(subset, best)[0], quality + _FAR)
         cost = math.inf
         for _ in range(_TRIES):
@@ -276,7 +280,7 @@ class TargetSearch:
         return cost
 
     def _start(self, subset: Subset, coding: Coding) -> float:
-        """Return the precision of the first draft of a subset, dB."""
+        """Return the precision of the first draft of a subset with a coding, dB."""
         size_bytes = self.goal.size_bytes
         for other in reversed(self.pool.made):
             if other.coding == coding and other.quality is not None:
@@ -310,12 +314,14 @@ class TargetSearch:
 
     def _fewer_bands(self, subset: Subset, coding: Coding) -> list[Coding]:
         """Return codings with fewer SH bands, the fewest first, if dropping these takes little of the error."""
-        found, lower = list[Coding](), self._degree(coding) - 1
-        if coding.sh == "none" or self.pool.encoding.sh_degree is not None or self.goal.size_bytes is not None:
+        encoding, found, lower = self.pool.encoding, list[Coding](), self._degree(coding) - 1
+        fixed = encoding.sh_degree is not None or encoding.sh_coding != "auto"
+        if coding.sh == "none" or fixed or self.goal.size_bytes is not None:
             return found
+        before, most = self._unquantised(subset, coding), _MOST_DROPPED * self._rest(subset, coding)
         while lower >= 0:
             fewer = replace(coding, degree=lower) if lower else Coding("none", degree=0, use_classes=coding.use_classes)
-            if self._unquantised(subset, fewer) > _MOST_DROPPED * self._allowed(subset, coding):
+            if self._unquantised(subset, fewer) - before > most:
                 break
             found, lower = [fewer, *found], lower - 1
         return found
@@ -422,9 +428,11 @@ class TargetSearch:
             return before + rest
         nearest = min(measured, key=lambda one: (one.is_draft, one.coding != coding, self._off_goal(one)))
         error, goal_error = (self._expected(nearest, found) for found in (nearest.error, self._goal_error(nearest)))
+        # Against images, the error of a file may be that of the source by chance.
         floor = LEAST_QUANTISED * (rest if self.goal.source_error else goal_error)
-        quantised = max(goal_error - on_goal, floor, NOTHING)
-        return before + rest * max(error - before, LEAST_QUANTISED * quantised) / quantised
+        quantised = max(goal_error - self._unquantised(subset, nearest.coding, on_goal=True), floor, NOTHING)
+        on_validation = max(error - self._unquantised(subset, nearest.coding), LEAST_QUANTISED * quantised)
+        return before + rest * on_validation / quantised
 
     def _goal_error(self, one: Candidate) -> float:
         """Return the mean squared error of a measured candidate on the views of the goal, without the source's."""
@@ -488,7 +496,7 @@ class TargetSearch:
         """Make the presets' own files if their precision is near the goal, so that a search is not worse than these."""
         wanted, own = self._predict(self.whole, coding)[0], self.pool.encoding.preset
         for name, preset in PRESETS.items():
-            allowed = name == own if "fast" in (name, own) else True
+            allowed = name == own or "fast" not in (name, own)
             if allowed and abs(preset.quality[coding.sh == "none"] - wanted) < _FAR:
                 self._score(self.pool.make(self.whole, Coding(use_classes=False, preset=name), None, draft=False))
 
@@ -496,7 +504,7 @@ class TargetSearch:
         goal, made = self.goal, self.pool.made
         if goal.size_bytes is not None:
             kept = " with all splats" if self.pruner is None else ""
-            smallest = min(one.size_bytes for one in made)
+            smallest = min(one.size_bytes for one in made if not one.is_draft)
             return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
         best = psnr_of_mse(min(one.goal_error for one in made if one.goal_error is not None and not one.is_draft))
         if goal.source_error:
