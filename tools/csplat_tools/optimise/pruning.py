@@ -37,9 +37,8 @@ from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient
 from csplat_trainer.pruning import MeasuredViews, PruningOrder
 from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
-_FIT_STEPS = 960  # steps of a refit
-_CARRIED_STEPS = 480  # steps of a refit that starts from the values of another
-_FILE_STEPS = 480  # steps of a refit through the quantisers of a file
+_FIT_STEPS = (560, 960)  # steps of a refit, without and with SH; half if it starts from the values of another
+_FILE_STEPS = (320, 480)  # the same through the quantisers of a file; fewer make files with SH 8 % larger, others not
 _AGREE_ON = 0.5  # fraction of the splats on whose pruning virtual views must agree before they are enough
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
 _ERROR_POWER = 0.85  # typical power of the error of pruning with which the error after a refit grows
@@ -154,9 +153,9 @@ class Pruner:
         pruned = model = self.source.select(rows)
         before = after = self.check_scorer.psnr(pruned)
         if self.refits and len(rows) < len(self.source):
-            steps = _FIT_STEPS
+            steps = _FIT_STEPS[self.source.sh_degree > 0]
             if self._last is not None:
-                model, steps = _with_values_of(self._last.model, self._last.rows, pruned, rows), _CARRIED_STEPS
+                model, steps = _with_values_of(self._last.model, self._last.rows, pruned, rows), steps // 2
             model = refit_splats(
                 model, self.cameras, self.references, steps=self.steps(steps), background=self.views.background,
                 seed=self.seed, threads=self.threads, progress=self.progress,
@@ -211,7 +210,7 @@ class PrunedSubset:
             return encode_tiles(plan, progress=pruner.progress)
         fixed = fix_quantisation(plan, pruner.source, pruner.progress)
         values = quantisation_aware_refit(
-            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_FILE_STEPS),
+            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_FILE_STEPS[self.model.sh_degree > 0]),
             background=pruner.views.background, seed=pruner.seed, threads=pruner.threads, progress=pruner.progress,
         )  # fmt: skip
         start = fixed.start()
