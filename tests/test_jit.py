@@ -160,7 +160,7 @@ def test_compilation_is_reported_once():
 _USE = """
 import json, os, sys
 import numpy as np
-import csplat_tools.optimise.simplify, csplat_render.scorer, csplat_render.lpips, csplat_render.metric_kernels
+import csplat, csplat_tools.optimise.simplify, csplat_render.scorer, csplat_render.lpips, csplat_render.metric_kernels
 from csplat.model import SplatModel
 from csplat_render.warmup import warm_up
 
