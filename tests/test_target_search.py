@@ -26,7 +26,7 @@ SCENES = {
     "many bytes per dB": AnalyticScene(rate=0.07), "quality far from renders": AnalyticScene(lost=16.0),
 }  # fmt: skip
 
-MOST_TRIES = 20  # candidates; a codebook that has to grow takes some more
+MOST_TRIES = 25  # candidates; a codebook that has to grow takes some more
 LARGER = 1.12  # times the size of the smallest possible file; the limit of a search for a PSNR
 WORSE = (2.2, 5.0)  # dB below the best possible file with all splats and with fewer; the limits of a search for a size
 
@@ -229,7 +229,7 @@ def test_a_psnr_is_reached_if_test_and_validation_views_differ(judging):
 def test_test_views_with_larger_errors_cost_no_more_candidates(offset):
     found = search(PLAIN, psnr=38.0, judging=Views(offset), no_prune=True)
     assert 0.0 <= found.file.psnr(Views(offset)) - 38.0 <= 0.2
-    assert len(found.tried) <= 10
+    assert len(found.tried) <= 14
 
 
 @pytest.mark.parametrize("goal", [{"size_bytes": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}])

@@ -64,7 +64,7 @@ _ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at
 _BYTES_PER_DB = (0.045, 0.07)  # fraction of the bytes that a decibel costs if splats are added
 _GAINS = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 _TUNING_GAINS = {"codebook": 1.2}  # dB that the refit through the quantisers gains; 0.7 for other codings
-_USUAL_ENTRIES = 1 / 16  # codebook entries per splat
+_USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
 
 # What is tried.
 _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
@@ -80,6 +80,7 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 _AIM = 0.06  # dB above a PSNR that files aim at; PSNR varies by 0.1 dB from one precision to the next
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; another coding may be better there
 _JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
+_CLOSE = 0.1  # fraction of the bytes; a codebook worse by less may win with another size
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, since it takes a refit
 _WORTH_FILE = 0.01  # fraction of the bytes that another file of the same splats and coding must promise
 
@@ -244,7 +245,7 @@ class TargetSearch:
     def _choose_coding(self, subset: Subset) -> Coding:
         """Return the coding with the least expected cost.
 
-        A coding of each kind is tried; then the neighbours of the best one, and larger codebooks while they gain.
+        A coding of each kind is tried; then codebooks of other sizes, and neighbours of the best coding.
         """
         costs, most = dict[Coding, float](), max(2, round(_CODINGS * self.work))
         waiting = self._first_codings(subset)
@@ -254,11 +255,12 @@ class TargetSearch:
             if not waiting:
                 ordered = sorted(costs, key=costs.__getitem__)
                 best, books = ordered[0], [one for one in ordered if one.sh == "codebook"]
-                larger = self._other_sizes(books[0])[:1] if books else []  # even if another kind is better so far
+                sizes = self._other_sizes(books[0]) if books else []
+                if books and costs[books[0]] > costs[best] + _CLOSE:
+                    sizes = sizes[:1]  # only a larger one can gain that much
                 found = [
                     *self._fewer_bands(subset, best),
-                    *self._other_sizes(best),
-                    *larger,
+                    *sizes,
                     *self._alike(subset, best),
                 ]
                 waiting = [one for one in found if one not in costs][:1]
@@ -299,7 +301,10 @@ class TargetSearch:
         if encoding.sh_coding == "none" or not degree or encoding.sh_degree == 0:
             return [Coding("none")]
         coarse = subset.classifiable and not subset.refits and encoding.adaptive is None
-        scalar, book = Coding("scalar", adaptive=1.0 if coarse else None), Coding("codebook", _USUAL_ENTRIES)
+        scalar, book = (
+            Coding("scalar", adaptive=1.0 if coarse else None),
+            Coding("codebook", _USUAL_ENTRIES[subset.refits]),
+        )
         if encoding.sh_coding != "auto":
             return [book if encoding.sh_coding == "codebook" else scalar]
         is_extreme = float(np.abs(self.whole.model.shN).max(initial=0.0)) > _LARGEST_SH
@@ -497,7 +502,7 @@ class TargetSearch:
         wanted, own = self._predict(self.whole, coding)[0], self.pool.encoding.preset
         for name, preset in PRESETS.items():
             allowed = name == own or "fast" not in (name, own)
-            if allowed and abs(preset.quality[coding.sh == "none"] - wanted) < _FAR:
+            if allowed and abs(preset.quality[coding.sh == "none"] - wanted) < 0.5 * _FAR:
                 self._score(self.pool.make(self.whole, Coding(use_classes=False, preset=name), None, draft=False))
 
     def _out_of_reach(self) -> str:
