@@ -167,7 +167,7 @@ def test_the_report_has_goal_reasons_and_spread(search_at_psnr):
     assert report.worst_psnr <= report.psnr
     assert {"beside", "nearer", "farther"} == set(report.elsewhere)
     assert "10 views of cameras" in report.sure
-    assert any("left out" in line for line in report.why)
+    assert any("pruned, the others" in line for line in report.why)
     assert report.removal_views > 0
     json.dumps(report.as_json(), allow_nan=False)
 

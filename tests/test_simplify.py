@@ -134,17 +134,14 @@ def test_transparent_splats_are_pruned_first_and_unseen_ones_kept(source):
 def test_rounds_alternate_between_groups_of_views(source):
     # Each round measures one group of views again; the other keeps its last errors until its turn.
     parts = [camera_sequence(source, 4, (48, 36), seed=seed) for seed in (1, 2)]
-    view_groups = [MeasuredViews(cameras, measure_pruning_error(source, cameras, bands=False)) for cameras in parts]
+    view_groups = [MeasuredViews(cameras, measure_pruning_error(source, cameras)) for cameras in parts]
     order = PruningOrder(source, list(view_groups))
     order.extend(kept_count=len(source) - 200)
     first, second = order.rounds
     rows = order.kept(len(source) - first)
     keys = pruning_keys(source.opacities, total_error(view_groups))
     np.testing.assert_array_equal(order.errors[:first], np.sort(np.maximum(keys, 0.0))[:first])
-    again = (
-        measure_pruning_error(source.select(rows), parts[0], bands=False).error
-        + view_groups[1].pruning_error.error[rows]
-    )
+    again = measure_pruning_error(source.select(rows), parts[0]).error + view_groups[1].pruning_error.error[rows]
     places = np.searchsorted(rows, order.rows[first:])
     np.testing.assert_allclose(order.errors[first:], again[places], rtol=1e-9)
     assert 200 == first + second

@@ -194,27 +194,18 @@ class Contributions(Rasteriser):
     def measure_pruning(
         self,
         drawn: ProjectedView,
-        shN: Array,
-        totals: Array,
-        bands: Array,
+        error: Array,
+        seen: Array,
         *,
         background: Array,
-        reference: Array | None = None,
-    ) -> Array:
-        """Add the sums of one view for every splat to the totals of a scene.
+    ) -> None:
+        """Measure one view, and add to the sums of a scene.
 
         Args:
             drawn: the view, with the splats' own colours.
-            shN: [N, K, 3] float32, SH coefficients of all splats.
-            totals: [N, 5] float64, sums over pixels are added: |d|², d · (render − reference), w and w², with w the
-                weight of the splat and d the change of the render without it; and 1 if the splat is visible.
-            bands: [N, d] float64, squared change of the render with zeros in SH band 1, … d is added; [N, 0] for views
-                without a basis.
+            error: [N] float64, |d|² summed over pixels is added, with d the change of the render without the splat.
+            seen: [N] bool, set for splats that are visible.
             background: [3].
-            reference: [H, W, 3], the image to compare with; `None`: this render.
-
-        Returns:
-            [H, W, 3], the render.
         """
         size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
         records = self._buffer("sums", (len(drawn.ids), PRUNING_SUMS), self.dtype)
@@ -227,13 +218,11 @@ class Contributions(Rasteriser):
                 rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
                 np.empty((0, 0, 5), self.dtype),
             )  # fmt: skip
-            error = np.empty((0, 0, 3), self.dtype) if reference is None else rgb - reference
             sum_pruning(
                 drawn.starts, drawn.ids, drawn.slots, drawn.shape, drawn.box, tiles_x, self._limits, behind,
-                error.astype(self.dtype, copy=False), transmittance, last, records,
+                transmittance, last, records,
             )  # fmt: skip
-            add_pruning_sums(drawn.rows, drawn.first, records, drawn.basis, shN, totals, bands)
-        return rgb
+            add_pruning_sums(drawn.rows, drawn.first, records, error, seen)
 
     def backproject(
         self,
@@ -331,33 +320,17 @@ def _colour_at(basis: Any, coefficients: Any) -> tuple[float, float, float]:
 
 
 @parallel_kernel()
-def add_pruning_sums(
-    lane: int, lanes: int, rows: Any, first: Any, records: Any, basis: Any, shN: Any, totals: Any, bands: Any
-) -> None:
-    """Add the records of a view to the totals of `Contributions.measure_pruning`; parallel over blocks of splats.
-
-    Without SH band b, a splat's colour changes by Σ_{k in b} Y_k sh_k, and a pixel by w times that.
-    """
+def add_pruning_sums(lane: int, lanes: int, rows: Any, first: Any, records: Any, errors: Any, seen: Any) -> None:
+    """Add the records of a view to the sums of `Contributions.measure_pruning`; parallel over blocks of splats."""
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
-            i = rows[j]
-            error, product, weight, squares = 0.0, 0.0, 0.0, 0.0
+            error, weight = 0.0, 0.0
             for n in range(first[j], first[j + 1]):
                 error += records[n, 0]
-                product += records[n, 1]
-                weight += records[n, 2]
-                squares += records[n, 3]
-            if weight <= 0.0:
-                continue
-            totals[i, 0] += error
-            totals[i, 1] += product
-            totals[i, 2] += weight
-            totals[i, 3] += squares
-            totals[i, 4] += 1.0
-            for band in range(1, bands.shape[1] + 1):
-                begin, end = band * band, (band + 1) * (band + 1)
-                r, g, b = _colour_at(basis[j, begin:end], shN[i, begin - 1 : end - 1])
-                bands[i, band - 1] += squares * (r * r + g * g + b * b)
+                weight += records[n, 1]
+            if weight > 0.0:
+                errors[rows[j]] += error
+                seen[rows[j]] = True
 
 
 @parallel_kernel()
@@ -392,14 +365,14 @@ def add_gradient(
 
 
 #: Numbers per record.
-PRUNING_SUMS = 4
+PRUNING_SUMS = 2
 
 _AREA = TILE * TILE
 
 # Offsets of the planes of a tile: after transmittance, the colour B behind the current splat, the position of each
-# pixel's last splat, the error, the current splat's terms of two sums, its weight, and positions in a row.
-_RED, _GREEN, _BLUE, _LAST, _ERR_R, _ERR_G, _ERR_B, _CHANGE, _PRODUCT, _WEIGHT, _X = (_AREA * k for k in range(1, 12))
-_PLANES = 12
+# pixel's last splat, the current splat's term of the sum, its weight, and positions in a row.
+_RED, _GREEN, _BLUE, _LAST, _CHANGE, _WEIGHT, _X = (_AREA * k for k in range(1, 8))
+_PLANES = 8
 
 
 @parallel_kernel(relaxed=True)
@@ -414,7 +387,6 @@ def sum_pruning(
     tiles_x: int,
     limits: Any,
     background: Any,
-    error: Any,
     transmittance: Any,
     last: Any,
     records: Any,
@@ -424,9 +396,8 @@ def sum_pruning(
     Args:
         lane, lanes, starts, ids, shape, box, tiles_x, limits, background: as in `blend_counted`.
         slots: [intersections] int32, the record of each entry of `ids`.
-        error: [H, W, 3], the render minus the reference; [0, 0, 3] if the render is the reference.
         transmittance, last: [H, W], results of `blend_counted`.
-        records: [intersections, PRUNING_SUMS], written: sums over pixels of |d|², d · error, w and w².
+        records: [intersections, PRUNING_SUMS], written: sums over pixels of |d|² and w.
     """
     height, width = transmittance.shape
     # Planes of 16 × 16 one after the other in one array, so that the compiler knows which parts overlap.
@@ -437,14 +408,11 @@ def sum_pruning(
     batch, rows = np.empty((BATCH, BATCH_COLUMNS), limits.dtype), np.empty((BATCH, 2), np.int64)
     alpha_min, alpha_cap = limits[0], limits[1]
     zero, one = alpha_min - alpha_min, alpha_min / alpha_min
-    is_wrong = error.shape[0] > 0
     for tile in range(lane, len(starts) - 1, lanes):
         X0, Y0, columns, high = tile_extent(tile, tiles_x, width, height)
         planes[:_LAST] = zero
-        planes[_LAST:_ERR_R] = -one  # pixels beyond the image have no splat
-        planes[_ERR_R:_X] = zero
-        if is_wrong:
-            read_planes(error, X0, Y0, columns, high, planes, _ERR_R)
+        planes[_LAST:_CHANGE] = -one  # pixels beyond the image have no splat
+        planes[_CHANGE:_X] = zero
         start, end = starts[tile], starts[tile]
         for y in range(high):
             row = planes[y * TILE :]
@@ -488,19 +456,11 @@ def sum_pruning(
                         row[_BLUE + x] -= alpha * db
                         row[_WEIGHT + x] = weight
                         row[_CHANGE + x] = weight * weight * (dr * dr + dg * dg + db * db)
-                        if is_wrong:
-                            row[_PRODUCT + x] = weight * (
-                                dr * row[_ERR_R + x] + dg * row[_ERR_G + x] + db * row[_ERR_B + x]
-                            )
-                m0, m1, m2, m3 = zero, zero, zero, zero
+                change, weight_sum = zero, zero
                 for e in range((after_last - first) * TILE):
-                    weight = body[_WEIGHT + e]
-                    m0 += body[_CHANGE + e]
-                    if is_wrong:
-                        m1 += body[_PRODUCT + e]
-                    m2 += weight
-                    m3 += weight * weight
-                record[0], record[1], record[2], record[3] = m0, m1, m2, m3
+                    change += body[_CHANGE + e]
+                    weight_sum += body[_WEIGHT + e]
+                record[0], record[1] = change, weight_sum
             end = begin
 
 

@@ -48,9 +48,7 @@ class MeasuredViews:
         progress: Progress | None = None,
     ) -> MeasuredViews:
         """Measure the pruning errors of a scene; arguments as for `measure_pruning_error`."""
-        found = measure_pruning_error(
-            model, cameras, background=background, bands=False, threads=threads, progress=progress
-        )
+        found = measure_pruning_error(model, cameras, background=background, threads=threads, progress=progress)
         return cls(cameras, found)
 
     def __add__(self, other: MeasuredViews) -> MeasuredViews:
@@ -108,19 +106,12 @@ class PruningOrder:
         is_kept[self.rows[: len(self.model) - count]] = False
         return np.flatnonzero(is_kept)
 
-    def extend(self, *, kept_count: int | None = None, error: float = math.inf) -> bool:
-        """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`.
-
-        Returns:
-            True if the order became longer.
-        """
+    def extend(self, *, kept_count: int | None = None, error: float = math.inf) -> None:
+        """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`."""
         least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
-        before = len(self.rows)
         while len(self._left) > least and float(self.errors.sum()) <= error * self.value_count:
-            fewer = int(len(self._left) * _ROUND_FRACTION)
-            if not self._prune(max(least, fewer) if kept_count is None or fewer > least else least):
+            if not self._prune(max(least, int(len(self._left) * _ROUND_FRACTION))):
                 break
-        return len(self.rows) > before
 
     def _prune(self, count: int) -> bool:
         """Make a round: prune until `count` splats are left; return False if none can be pruned."""

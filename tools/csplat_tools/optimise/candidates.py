@@ -28,7 +28,7 @@ from csplat_render.scorer import Scorer
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance
 
-_ENTRIES = (16, 8192)  # least and largest number of codebook entries
+_BOOK_SIZES = (16, 8192)  # least and largest number of codebook entries
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Coding:
         """Return the caller's options with this coding and precision, for a file of this number of splats."""
         size = encoding.codebook_size
         if self.entries_per_splat is not None and size is None:
-            size = 1 << round(math.log2(min(max(self.entries_per_splat * splats, _ENTRIES[0]), _ENTRIES[1])))
+            size = 1 << round(math.log2(min(max(self.entries_per_splat * splats, _BOOK_SIZES[0]), _BOOK_SIZES[1])))
         return replace(
             encoding,
             preset=self.preset or encoding.preset,

@@ -215,7 +215,7 @@ class PrunedSubset:
         )  # fmt: skip
         start = fixed.start()
         before, after = (pruner.check_scorer.psnr(self._decoded(fixed, one)) for one in (start, values))
-        return fixed.encode(values if after >= before else start, pruner.progress)  # steps are too long for few splats
+        return fixed.encode(values if after >= before else start, pruner.progress)  # a refit of few splats may overfit
 
     def _decoded(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
         return replace(self.model, **vars(fixed.dequantise(values)), means_double=None)

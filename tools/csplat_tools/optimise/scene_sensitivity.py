@@ -99,7 +99,7 @@ def measure_scene(
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
     if check:
-        elsewhere = measure_pruning_error(model, check, background=views.background, bands=False, threads=threads).seen
+        elsewhere = measure_pruning_error(model, check, background=views.background, threads=threads).seen
         missed = float(np.mean(elsewhere & ~measured.seen))
     return SceneSensitivity(model, measured, source, missed)
 

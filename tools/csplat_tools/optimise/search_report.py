@@ -140,7 +140,7 @@ def _why(target: Target, found: Candidate, psnr: float, candidates: CandidatePoo
     if pruned_count:
         percentage = 100.0 * pruned_count / splats_before
         splats = f"{counted(pruned_count, 'splat')} ({percentage:.0f} %)"
-        lines.append(f"{splats} left out, the others fitted to what the source looks like")
+        lines.append(f"{splats} pruned, the others refitted to renders of the source")
     return lines
 
 

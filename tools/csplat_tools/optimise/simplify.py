@@ -22,7 +22,6 @@ from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
 
-_DEFAULT_EFFORT = 3
 _TRIES = 4  # largest number of refits in the search for the fewest splats of a PSNR
 _NEAR = 0.05  # dB; a result this close above the PSNR is not improved
 _NOT_PRUNED = f"none of up to {_TRIES} pruned scenes reached the target: all splats are kept, unchanged"
@@ -46,7 +45,7 @@ class SimplifyOptions:
     """
 
     refit: bool = True
-    effort: int = _DEFAULT_EFFORT
+    effort: int = Target.effort
     view_size: tuple[int, int] | None = None
     views: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -69,7 +68,7 @@ class SimplifyOptions:
     @property
     def work(self) -> float:
         """The amount of work relative to the default effort."""
-        octaves = self.effort - _DEFAULT_EFFORT
+        octaves = self.effort - Target.effort
         return 2.0 ** (octaves / 2 if octaves > 0 else octaves)
 
     def pruner(
@@ -143,11 +142,8 @@ def simplify(
     """
     require_renderer()
     target.require("simplify", "keep", "psnr", "max_psnr_drop")
-    source, options, start = (
-        load_model(scene).model,
-        options or SimplifyOptions(effort=target.effort),
-        time.perf_counter(),
-    )
+    source, start = load_model(scene).model, time.perf_counter()
+    options = options or SimplifyOptions(effort=target.effort)
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")
     if target.max_psnr_drop is not None and (views is None or not views.images):

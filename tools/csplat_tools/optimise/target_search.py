@@ -61,7 +61,7 @@ _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 # What is typical, without and with SH. It is assumed only until candidates show otherwise.
 _USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
 _ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
-_BYTES_PER_DB = (0.045, 0.07)  # fraction of the bytes that a decibel costs if splats are added
+_COUNT_BYTES_PER_DB = (0.045, 0.07)  # fraction of the bytes that a decibel costs if splats are added
 _GAINS = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 _TUNING_GAINS = {"codebook": 1.2}  # dB that the refit through the quantisers gains; 0.7 for other codings
 _USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
@@ -81,7 +81,7 @@ _AIM = 0.06  # dB above a PSNR that files aim at; PSNR varies by 0.1 dB from one
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; another coding may be better there
 _JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
 _CLOSE = 0.1  # fraction of the bytes; a codebook worse by less may win with another size
-_WORTH = 0.03  # fraction of the bytes that another splat count must promise, since it takes a refit
+_WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 _WORTH_FILE = 0.01  # fraction of the bytes that another file of the same splats and coding must promise
 
 _INSIDE_REMARK = (
@@ -124,6 +124,11 @@ class Goal:
             return cls(test_scorer, target.size_bytes, max_error=target.max_error)
         error = image_scorer.pooled(image_scorer.errors(source))
         return cls(image_scorer, error=error / error_of_psnr(target.max_psnr_drop), source_error=error)
+
+    @property
+    def is_drop(self) -> bool:
+        """True if the goal is a drop of PSNR against images."""
+        return self.source_error > 0.0
 
 
 @dataclass(eq=False)
@@ -229,7 +234,7 @@ class TargetSearch:
     @property
     def _exponent(self) -> float:
         """The k of bytes ∝ n · Q^-k, for the choice of the number n of splats."""
-        return rate_exponent(_BYTES_PER_DB[self.whole.model.sh_degree > 0])
+        return rate_exponent(_COUNT_BYTES_PER_DB[self.whole.model.sh_degree > 0])
 
     def _count_beyond(self, count: int) -> int:
         """Return the next number of splats to try if no file of this number meets the goal."""
@@ -434,7 +439,7 @@ class TargetSearch:
         nearest = min(measured, key=lambda one: (one.is_draft, one.coding != coding, self._off_goal(one)))
         error, goal_error = (self._expected(nearest, found) for found in (nearest.error, self._goal_error(nearest)))
         # Against images, the error of a file may be that of the source by chance.
-        floor = LEAST_QUANTISED * (rest if self.goal.source_error else goal_error)
+        floor = LEAST_QUANTISED * (rest if self.goal.is_drop else goal_error)
         quantised = max(goal_error - self._unquantised(subset, nearest.coding, on_goal=True), floor, NOTHING)
         on_validation = max(error - self._unquantised(subset, nearest.coding), LEAST_QUANTISED * quantised)
         return before + rest * on_validation / quantised
@@ -485,7 +490,7 @@ class TargetSearch:
         if self.goal.size_bytes is None and file.goal_error is None:
             errors = self.goal.scorer.errors(self.pool.decode(file.result.data))
             file.goal_error = self.goal.scorer.pooled(errors)
-            if not self.goal.source_error:
+            if not self.goal.is_drop:
                 file.test_errors, file.test_psnr = errors, psnr_of_mse(file.goal_error)
 
     def _is_met(self, file: Candidate) -> bool:
@@ -512,7 +517,7 @@ class TargetSearch:
             smallest = min(one.size_bytes for one in made if not one.is_draft)
             return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
         best = psnr_of_mse(min(one.goal_error for one in made if one.goal_error is not None and not one.is_draft))
-        if goal.source_error:
+        if goal.is_drop:
             return (
                 f"no file reaches {psnr_of_mse(goal.error):.2f} dB on the validation images; the best has {best:.2f} dB"
             )

@@ -463,7 +463,7 @@ def choose_splats(
         seen = found.seen
     else:
         seen = measure_pruning_error(
-            source, all_views, background=views.background, bands=False, threads=threads, progress=progress
+            source, all_views, background=views.background, threads=threads, progress=progress
         ).seen
     if not seen.any():
         raise InputError("no view shows any splat: check that the cameras belong to the scene")
