@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.polynomial import Legendre
+from numpy.typing import NDArray
 
 import csplat
 from csplat.disk_files import local_file
@@ -112,3 +115,18 @@ def disturbed(model, rng, sigma=1e-3):
     arrays = {name: near(getattr(model, name)) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
     arrays |= {"quats": normalise_quats(arrays["quats"]), "opacities": np.clip(arrays["opacities"], 0, 1)}
     return replace(model, **arrays)
+
+
+def sh_by_definition(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the real SH basis [D, (degree + 1)**2] in unit directions [D, 3], by associated Legendre functions."""
+    x, y, z = directions.T
+    columns = []
+    for band in range(degree + 1):
+        for order in range(-band, band + 1):
+            m = abs(order)
+            legendre = Legendre.basis(band)
+            value = (-1.0) ** m * (1.0 - z * z) ** (m / 2) * (legendre.deriv(m) if m else legendre)(z)
+            value *= math.sqrt((2 * band + 1) / (4 * math.pi) * math.factorial(band - m) / math.factorial(band + m))
+            angle = m * np.arctan2(y, x)
+            columns.append(value * (math.sqrt(2.0) * (np.sin(angle) if order < 0 else np.cos(angle)) if m else 1.0))
+    return np.stack(columns, axis=1)

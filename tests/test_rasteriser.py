@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from csplat.errors import InputError, LimitError
-from csplat.model import SH_C0, SplatModel
+from csplat.model import SplatModel
 from csplat.ply import read_ply
+from csplat.spherical_harmonics import SH_C0
 
 pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 

@@ -12,7 +12,7 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from checked import cloud, covariances
+from checked import cloud, covariances, sh_by_definition
 from command_line import call
 from posed_sets import write_blender, write_colmap_set, write_transforms
 
@@ -231,19 +231,9 @@ def shapes(model):
 
 
 def colours(model, directions):
-    """Return the SH colour of every splat in every direction, by the formulas of INRIA's renderer."""
-    x, y, z = directions.T
-    basis = [
-        -0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x,
-        1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * z * z - x * x - y * y),
-        -1.0925484305920792 * x * z, 0.5462742152960396 * (x * x - y * y),
-        -0.5900435899266435 * y * (3 * x * x - y * y), 2.890611442640554 * x * y * z,
-        -0.4570457994644658 * y * (4 * z * z - x * x - y * y),
-        0.3731763325901154 * z * (2 * z * z - 3 * x * x - 3 * y * y),
-        -0.4570457994644658 * x * (4 * z * z - x * x - y * y), 1.445305721320277 * z * (x * x - y * y),
-        -0.5900435899266435 * x * (x * x - 3 * y * y),
-    ]  # fmt: skip
-    return np.einsum("kd,nkc->ndc", basis[: model.shN.shape[1]], model.shN.astype(np.float64))
+    """Return the SH colour of every splat in every direction, without degree 0."""
+    basis = sh_by_definition(4, directions)[:, 1:]
+    return np.einsum("dk,nkc->ndc", basis[:, : model.shN.shape[1]], model.shN.astype(np.float64))
 
 
 @pytest.mark.parametrize("matrix", [*WHOLE[::5], ANY, -ANY])

@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from csplat.spherical_harmonics import sh_basis
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_CAP, ALPHA_MIN, COMPENSATION_MIN, DILATION, FOV_MARGIN, TRANSMITTANCE_MIN
-from csplat_render.kernels import python_function
-from csplat_render.projection import sh_basis
 
 Array = NDArray[Any]
 Tensor = torch.Tensor
@@ -90,7 +89,7 @@ def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tupl
     coefficients = torch.cat([sh0[:, None], shN], 1)
     basis: list[Any] = [torch.zeros(())] * coefficients.shape[1]
     degree = int(np.sqrt(len(basis))) - 1
-    python_function(sh_basis)(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
+    sh_basis(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
     values = torch.stack([one * torch.ones_like(z) for one in basis], 1)
     colour = torch.clamp(torch.einsum("nk,nkc->nc", values, coefficients) + 0.5, min=0.0)
     return torch.stack([fx * x / z + cx, fy * y / z + cy], 1), covariance, opacity, colour, z

@@ -42,9 +42,9 @@ def unpack(wheel: Path, folder: Path) -> None:
 def kernel_cache(folder: Path) -> Path:
     """Return the folder for compiled kernels of these sources; kernels of other sources are removed."""
     total = hashlib.sha256()
-    for package in ("csplat_render", "csplat_trainer"):
-        for path in sorted((folder / package).rglob("*.py")):
-            total.update(path.read_bytes())
+    kernels = [path for package in ("csplat_render", "csplat_trainer") for path in (folder / package).rglob("*.py")]
+    for path in sorted([*kernels, folder / "csplat" / "spherical_harmonics.py"]):
+        total.update(path.read_bytes())
     caches, name = folder.parent / "kernels", total.hexdigest()[:16]
     for other in caches.glob("*"):
         if other.name != name:

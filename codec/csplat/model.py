@@ -20,9 +20,6 @@ from csplat.types import F32, F64
 #: Highest spherical-harmonics degree of a model.
 MAX_SH_DEGREE = 3
 
-#: Basis function of SH degree 0: colour per coefficient.
-SH_C0 = 0.28209479177387814
-
 #: Maximum deviation of the length of a unit quaternion from 1.
 QUAT_LENGTH_TOLERANCE = 1e-3
 

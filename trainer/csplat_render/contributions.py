@@ -29,6 +29,7 @@ from typing import Any
 import numpy as np
 
 from csplat.model import sh_degree_of
+from csplat.spherical_harmonics import BASIS_SIZE
 from csplat_render.binning import TILE
 from csplat_render.blending import (
     BATCH,
@@ -284,7 +285,7 @@ class Contributions(Rasteriser):
 @parallel_kernel()
 def evaluate_basis(lane: int, lanes: int, means: Any, rows: Any, view: Any, degree: int, basis: Any) -> None:
     """Evaluate the SH basis in the direction of each drawn splat; parallel over blocks of splats."""
-    values = np.empty(16, np.float64)
+    values = np.empty(BASIS_SIZE, np.float64)
     for block in range(lane, (len(rows) + BLOCK - 1) // BLOCK, lanes):
         for j in range(block * BLOCK, min(len(rows), (block + 1) * BLOCK)):
             x, y, z, _ = view_direction(view, means[rows[j]])

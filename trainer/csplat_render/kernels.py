@@ -188,12 +188,6 @@ def lane_range(lane: int, lanes: int, count: int) -> tuple[int, int]:
     return count * lane // lanes, count * (lane + 1) // lanes
 
 
-def python_function(compiled: Callable[P, R]) -> Callable[P, R]:
-    """Return the uncompiled function of a kernel, which also accepts arrays in place of numbers."""
-    function: Callable[P, R] = getattr(compiled, "py_func", compiled)
-    return function
-
-
 def available_threads() -> int:
     """Return the maximum number of threads for kernels: the processors of this process, or NUMBA_NUM_THREADS."""
     return int(numba.config.NUMBA_NUM_THREADS)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.model import sh_degree_of
+from csplat.spherical_harmonics import evaluate_sh
 from csplat_render.camera import Camera
 from csplat_render.conventions import (
     ALPHA_CAP,
@@ -26,8 +27,6 @@ from csplat_render.conventions import (
     HasSplats,
     RenderResult,
 )
-from csplat_render.kernels import python_function
-from csplat_render.projection import sh_basis
 
 Array = NDArray[Any]
 
@@ -140,9 +139,7 @@ def _project(
 
     direction = means - camera.position
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    basis = np.empty(((degree + 1) ** 2, len(z)))
-    python_function(sh_basis)(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
-    colour = np.einsum("kn,nkc->nc", basis, coefficients) + 0.5
+    colour = np.einsum("nk,nkc->nc", evaluate_sh(degree, direction), coefficients) + 0.5
     colour = np.where(decisions.ask(colour > 0.0), colour, 0.0)
     drawn = {
         "centre": np.stack([fx * x / z + cx, fy * y / z + cy], 1),

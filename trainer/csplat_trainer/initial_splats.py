@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from csplat.errors import InputError
-from csplat.model import SH_C0
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 from csplat_render.camera import Camera
 from csplat_trainer.parameters import ParameterArrays

@@ -37,6 +37,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.spherical_harmonics import BASIS_SIZE
 from csplat.types import F32, F64, Progress
 from csplat_render.binning import TILE
 from csplat_render.blending import (
@@ -79,7 +80,7 @@ class Sensitivity:
     """Sensitivities and squared derivatives of a scene's renders, by splat and group of attributes.
 
     Attributes:
-        colour: [N] float64, S of the SH coefficients including sh0: the largest of up to 48.
+        colour: [N] float64, S of the SH coefficients including sh0: the largest of up to 75.
         opacity: [N] float64, S of alpha, with magnitudes summed over pixels and channels.
         shape: [N] float64, S of the covariance over its trace, the largest of 6 entries, summed likewise.
         opacity_net: [N] float64, S of alpha as published: pixels of a view cancel.
@@ -480,7 +481,7 @@ def add_view(lane: int, lanes: int, means: Any, opacities: Any, scales: Any, vie
     """
     n = means.shape[0]
     count = (degree + 1) * (degree + 1)
-    basis, sums = np.empty(16, np.float64), np.empty(DERIVATIVE_SUMS, np.float64)
+    basis, sums = np.empty(BASIS_SIZE, np.float64), np.empty(DERIVATIVE_SUMS, np.float64)
     with_magnitudes = colour.shape[0] > 0
     for block in range(lane, (n + BLOCK - 1) // BLOCK, lanes):
         for i in range(block * BLOCK, min(n, (block + 1) * BLOCK)):

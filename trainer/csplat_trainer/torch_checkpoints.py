@@ -26,10 +26,11 @@ from csplat.errors import InputError, counted, missing_package
 from csplat.formats import Format
 from csplat.interop import from_gsplat
 from csplat.lint import Finding, too_many_bands
-from csplat.model import MAX_SH_DEGREE, SH_C0, SplatModel
+from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply.columns import AttributeArrays, RowStatistics, choose_thickness, list_findings, survey_arrays
 from csplat.ply.comments import CommentMetadata, split_origin
 from csplat.scene_source import SceneSource, join_blocks, source_from_model
+from csplat.spherical_harmonics import SH_C0
 
 _MAGICS = (b"PK\x03\x04", b"\x80")  # a zip, or a pickle as written by torch before 1.6
 _NAMED = 5  # names in a message

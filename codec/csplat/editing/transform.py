@@ -18,6 +18,7 @@ from csplat.editing.up_axis import UP, Direction, unit_up, up_of, up_of_axes
 from csplat.errors import InputError
 from csplat.model import UNSPECIFIED, SplatModel, check_axes, normalise_quats, sh_degree_of
 from csplat.scene_source import SceneSource
+from csplat.spherical_harmonics import evaluate_sh
 from csplat.training_record import VIEW
 from csplat.types import F32, F64
 
@@ -261,16 +262,26 @@ def _left_product(quat: F64) -> F64:
 
 def _rotate_sh(shN: F32, matrix: F64) -> F32:
     """Rotate SH band by band: the colour in direction v becomes the one in direction M v."""
-    directions = sphere_lattice(_DIRECTIONS)
-    after, before = sh_bands(directions), sh_bands(directions @ matrix)  # row v of `after` is Mᵀ v before
     out = np.empty_like(shN)
-    for band in range(1, sh_degree_of(shN.shape[1]) + 1):
+    for band, turn in enumerate(sh_rotations(sh_degree_of(shN.shape[1]), matrix), start=1):
         part = slice(band**2 - 1, (band + 1) ** 2 - 1)
-        turn = _round_near_integers(np.linalg.lstsq(after[band - 1], before[band - 1], rcond=None)[0])
         shape = len(shN), 2 * band + 1, 3
         channels = np.kron(turn, np.eye(3)).astype(np.float64)  # rotates all three channels
         out[:, part] = _multiply_rows(channels, shN[:, part].reshape(len(shN), channels.shape[0])).reshape(shape)
     return out
+
+
+def sh_rotations(degree: int, matrix: F64) -> list[F64]:
+    """Return the matrices [2 l + 1, 2 l + 1] that rotate or mirror the coefficients of the bands l = 1 to `degree`.
+
+    Args:
+        degree: 0 to 4.
+        matrix: [3, 3] orthogonal; the colour in direction v becomes the one in direction `matrix` v.
+    """
+    directions = sphere_lattice(_DIRECTIONS)
+    after, before = evaluate_sh(degree, directions), evaluate_sh(degree, directions @ matrix)  # row v is Mᵀ v before
+    bands = [slice(band**2, (band + 1) ** 2) for band in range(1, degree + 1)]
+    return [_round_near_integers(np.linalg.lstsq(after[:, one], before[:, one], rcond=None)[0]) for one in bands]
 
 
 def _round_near_integers(matrix: NDArray[Any]) -> F64:
@@ -285,27 +296,6 @@ def sphere_lattice(count: int) -> F64:
     height, angle = 1.0 - 2.0 * index / count, index * np.pi * (3.0 - np.sqrt(5.0))
     ring = np.sqrt(1.0 - height * height)
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
-
-
-def sh_bands(directions: F64) -> list[F64]:
-    """Evaluate the SH basis of bands 1, 2 and 3 in unit directions, with the order and signs of INRIA and gsplat.
-
-    A factor common to all functions of a band is omitted.
-    """
-    x, y, z = directions.T
-    xx, yy, zz = x * x, y * y, z * z
-    first = [-y, z, -x]
-    second = [2.0 * x * y, -2.0 * y * z, (2.0 * zz - xx - yy) / 3.0**0.5, -2.0 * x * z, xx - yy]
-    third = [
-        -y * (3.0 * xx - yy),
-        24.0**0.5 * x * y * z,
-        -(0.6**0.5) * y * (4.0 * zz - xx - yy),
-        0.4**0.5 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy),
-        -(0.6**0.5) * x * (4.0 * zz - xx - yy),
-        6.0**0.5 * z * (xx - yy),
-        -x * (xx - 3.0 * yy),
-    ]
-    return [np.stack(band, axis=1) for band in (first, second, third)]
 
 
 def _rotate_metadata(model: SplatModel, matrix: F64) -> dict[str, Any]:

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder.encode_options import PRESETS, EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
-from csplat.model import SH_C0, SplatModel
+from csplat.model import SplatModel
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
 _EXTENT_SAMPLE = 1 << 16  # splats on which the extent is estimated

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from csplat.encoder.coding_parameters import CodingParameters
 from csplat.encoder.error_bounds import rotation_rows
 from csplat.errors import InputError
-from csplat.model import SH_C0, SplatModel
+from csplat.model import SplatModel
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
 Floats = NDArray[Any]

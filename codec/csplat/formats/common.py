@@ -16,9 +16,10 @@ from csplat.encoder.entropy import morton_codes
 from csplat.errors import InputError, counted
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
-from csplat.model import SH_C0, SplatModel, normalise_quats
+from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import RowStatistics, count_huge_rows, list_findings
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64, I64, U8
 
 Rows = NDArray[Any]

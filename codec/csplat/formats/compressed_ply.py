@@ -20,10 +20,11 @@ from csplat.errors import InputError, counted
 from csplat.formats.common import crossed_bounds, decode_smallest_three, encode_smallest_three, sorted_along_curve
 from csplat.formats.format import Format
 from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import MAX_SH_DEGREE, SH_C0, SplatModel
+from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply.comments import format_comments, parse_comments
 from csplat.ply.ply_header import read_ply_header
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, U8, U32
 
 _CHUNK = 256  # splats that share bounds

@@ -19,8 +19,9 @@ from csplat.errors import InputError, counted
 from csplat.file_source import map_file
 from csplat.formats.common import finite_scene, round_to_bytes, sh0_from_bytes
 from csplat.formats.format import Format
-from csplat.model import SH_C0, SplatModel, normalise_quats
+from csplat.model import SplatModel, normalise_quats
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32
 
 _ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("colours", "u1", 4), ("quats", "u1", 4)])

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import counted
 from csplat.lint import Finding
-from csplat.model import QUAT_LENGTH_TOLERANCE, SH_C0, normalise_quats
+from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats
 from csplat.ply.column_names import ColumnMap, colour_finding, float_columns, plain_name
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
 Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous

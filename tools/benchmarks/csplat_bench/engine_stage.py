@@ -21,14 +21,13 @@ from csplat.formats.format import Format
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat.scene_source import source_from_model
+from csplat.spherical_harmonics import SH_C0, evaluate_sh
 from csplat_bench.browser import open_page, serve
 from csplat_bench.peers import npm_pinned
 from csplat_bench.scenes import ROOT, Scene
 from csplat_render import Camera, render
 from csplat_render.camera_paths import orbit_cameras
-from csplat_render.kernels import python_function
 from csplat_render.metrics import psnr
-from csplat_render.projection import sh_basis
 
 Image = NDArray[np.float32]
 
@@ -197,10 +196,8 @@ def _colour(model: SplatModel, camera: Camera, degree: int) -> SplatModel:
     """Return the splats with the clipped colours that a camera sees, without SH."""
     directions = model.means - camera.position
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    basis = np.empty(((degree + 1) ** 2, len(model)))
-    x, y, z = directions.T
-    python_function(sh_basis)(degree, x, y, z, basis)
-    colours = np.clip(0.5 + basis[0, 0] * model.sh0, 0.0, 1.0)
-    colours += np.einsum("kn,nkc->nc", basis[1:], model.shN[:, : len(basis) - 1])
-    sh0 = (np.clip(colours, 0.0, 1.0) - 0.5) / basis[0, 0]
+    basis = evaluate_sh(degree, directions)[:, 1:]
+    colours = np.clip(0.5 + SH_C0 * model.sh0, 0.0, 1.0)
+    colours += np.einsum("nk,nkc->nc", basis, model.shN[:, : basis.shape[1]])
+    sh0 = (np.clip(colours, 0.0, 1.0) - 0.5) / SH_C0
     return replace(model, sh0=sh0.astype(np.float32), shN=model.shN[:, :0])

@@ -25,16 +25,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.editing.transform import axes_rotation, rotate_scene, sh_bands, sphere_lattice, stretch_scene
+from csplat.editing.transform import axes_rotation, rotate_scene, sphere_lattice, stretch_scene
 from csplat.errors import InputError, counted
 from csplat.formats.common import RangeStatistics, classify_opacities, classify_scales
 from csplat.formats.gltf.gltf_document import Accessor, GltfDocument, JsonPath, PlacedPrimitive, open_document
 from csplat.formats.spz import ANTIALIASED, SpzArrays, decode_block, decode_means, read_spz_file
 from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import SH_C0, SplatModel, normalise_quats
+from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.spherical_harmonics import SH_C0, evaluate_sh
 from csplat.types import F32, F64
 
 #: Directions of +x, +y and +z: left, up, front.
@@ -450,8 +451,6 @@ def _read_metadata(file: GltfDocument) -> CommentMetadata:
 
 _DIRECTIONS = 96  # six per coefficient of degree 3; 1,000 would change the colours of a scene by 0.01 of 255 steps
 _ROWS = 4096  # splats whose colours are fitted at a time
-#: Factors that `sh_bands` omits, degrees 1 to 3.
-_FACTORS = (0.4886025119029199, 0.5462742152960396, 0.5900435899266435)
 
 
 def fit_srgb(model: SplatModel) -> SplatModel:
@@ -473,10 +472,8 @@ def measure_srgb_error(model: SplatModel) -> float:
 def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
     """Yield coefficients [n, K, 3] of some splats, with their fitted and exact colours [n, D, 3]."""
     directions = sphere_lattice(_DIRECTIONS)
-    bands = [factor * band for factor, band in zip(_FACTORS, sh_bands(directions), strict=True)]
-    wide = np.concatenate(
-        [np.full((len(directions), 1), np.float64(np.float32(SH_C0))), *bands[: model.sh_degree]], axis=1
-    )
+    wide = evaluate_sh(model.sh_degree, directions)
+    wide[:, 0] = np.float32(SH_C0)  # the same constant as in `sh0` of the other formats
     inverse, basis = np.linalg.pinv(wide).astype(np.float32), wide.astype(np.float32)
     for start in range(0, len(model), _ROWS):
         rows = slice(start, start + _ROWS)

@@ -17,9 +17,10 @@ from csplat.editing.transform import convert_axes, scale_scene
 from csplat.errors import InputError
 from csplat.formats.gltf.gltf_document import BIN, GLB_HEAD, JSON, MAGIC
 from csplat.formats.gltf.gltf_reader import AXES, COLOURS, EXTENSION, sh_names
-from csplat.model import SH_C0, SplatModel
+from csplat.model import SplatModel
 from csplat.ply.comments import format_comments
 from csplat.scene_source import SceneSource
+from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
 _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
