@@ -38,7 +38,7 @@ _FEW_POINTS = 1 << 14  # for more, 8 rounds lower the error by 0.3 %; for a few 
 _EXACT = 2.0**23  # float32 represents every multiple of 1/2 below this
 _PRODUCT = 1 << 18  # scores per matrix product, 1 MiB, which fits the second-level cache
 _PRODUCT_COLUMNS = 1024  # entries per matrix product
-_GROUPED_ROWS = 1 << 13  # points that are sorted by group together
+_BLOCK = 1 << 13  # points that a thread assigns, and sorts by group, at a time
 _GROUP_ITERATIONS = 2
 _REFINED_POINTS = 1 << 16  # minimum number of points of the last iteration, unless there are fewer
 _REFINED_PER_ENTRY = 64  # the same, per entry
@@ -179,37 +179,47 @@ def search_nearest(
     error = np.zeros(len(points))
     table = _table(coarse)
     if 0 < near_groups < math.isqrt(len(entries)):
-        length, near = _GROUPED_ROWS, near_groups if start is None else min(near_groups, _NEXT_GROUPS)
+        near = near_groups if start is None else min(near_groups, _NEXT_GROUPS)
         find = _near_entries(coarse, table, near, threads, other)
     else:
-        length, start = _PRODUCT // min(_PRODUCT_COLUMNS, 1 << len(entries).bit_length()), None
+        start = None
         find = _every_entry(table, other)
 
-    def work(starts: range) -> None:
-        x = np.ones((length, table.shape[1]), np.float32)
-        for a in starts:
-            part = slice(a, min(a + length, len(points)))
-            rows = x[: part.stop - a]
-            rows[:, :-1] = points[part] if shift == 0 else _divide(points[part], shift)
-            found = np.zeros(len(rows), np.int64)
-            best = np.full(len(rows), -np.inf, np.float32)
-            if start is not None:
-                found[:] = start[part]
-                best[:] = np.einsum("nd,nd->n", rows, table[found])
-            find(rows, a, found, best)
-            index[part] = found
-            norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
-            error[part] = (norm - 2.0 * best) * 4.0**shift
+    def work(part: slice) -> None:
+        rows = np.ones((part.stop - part.start, table.shape[1]), np.float32)
+        rows[:, :-1] = points[part] if shift == 0 else _divide(points[part], shift)
+        found = np.zeros(len(rows), np.int64)
+        best = np.full(len(rows), -np.inf, np.float32)
+        if start is not None:
+            found[:] = start[part]
+            best[:] = np.einsum("nd,nd->n", rows, np.take(table, found, axis=0))
+        find(rows, part.start, found, best)
+        index[part] = found
+        norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
+        error[part] = (norm - 2.0 * best) * 4.0**shift
 
-    workers = max(1, min(threads or os.cpu_count() or 1, -(-len(points) // length)))
-    jobs = [range(w * length, len(points), workers * length) for w in range(workers)]
     with one_blas_thread():
-        if workers == 1:  # a small search takes less time than starting a thread
-            work(jobs[0])
-        else:
-            with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(work, jobs))
+        run_blocks(work, len(points), _BLOCK, threads)
     return index, error
+
+
+def run_blocks(work: Callable[[slice], object], count: int, length: int, threads: int | None) -> None:
+    """Call `work` with the slices of `length` of `count` rows, in threads unless there is one slice.
+
+    Args:
+        work: writes results to these rows; releases the GIL for most of its time.
+        count: number of rows.
+        length: rows per slice.
+        threads: number of threads; `None`: all processors.
+    """
+    slices = [slice(start, min(start + length, count)) for start in range(0, count, length)]
+    workers = min(threads or os.cpu_count() or 1, len(slices))
+    if workers <= 1:  # a small scene takes less time than starting a thread
+        for part in slices:
+            work(part)
+        return
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(work, slices))
 
 
 @contextmanager
@@ -431,8 +441,8 @@ def _shift(points: I16 | I32, entries: I32) -> int:
 
 def _largest_norm(rows: I16 | I32) -> float:
     largest = 0.0
-    for a in range(0, len(rows), _GROUPED_ROWS):
-        part = rows[a : a + _GROUPED_ROWS].astype(np.float64)
+    for a in range(0, len(rows), _BLOCK):
+        part = rows[a : a + _BLOCK].astype(np.float64)
         largest = max(largest, float(np.einsum("nd,nd->n", part, part).max()))
     return math.sqrt(largest)
 
@@ -450,16 +460,20 @@ def _table(entries: I64) -> F32:
 def _every_entry(table: F32, other: bool) -> _Find:
     """Return a search of every entry."""
     matrix = np.ascontiguousarray(table.T)
+    width = min(matrix.shape[1], _PRODUCT_COLUMNS)
+    step = _PRODUCT // width
 
     def find(x: F32, start: int, index: I64, best: F32) -> None:
-        rows = np.arange(len(x))
-        for k in range(0, matrix.shape[1], _PRODUCT_COLUMNS):
-            scores = x @ matrix[:, k : k + _PRODUCT_COLUMNS]
-            if other:
-                own = rows + (start - k)
-                here = (own >= 0) & (own < scores.shape[1])
-                scores[rows[here], own[here]] = -np.inf
-            _keep_better(rows, scores, k, index, best)
+        for at in range(0, len(x), step):
+            part = slice(at, at + step)
+            rows = np.arange(len(x[part]))
+            for k in range(0, matrix.shape[1], width):
+                scores = x[part] @ matrix[:, k : k + width]
+                if other:
+                    own = rows + (start + at - k)
+                    here = (own >= 0) & (own < scores.shape[1])
+                    scores[rows[here], own[here]] = -np.inf
+                _keep_better(rows, scores, k, index[part], best[part])
 
     return find
 
@@ -477,15 +491,15 @@ def _near_entries(entries: I64, table: F32, near: int, threads: int | None, othe
     def find(x: F32, start: int, index: I64, best: F32) -> None:
         found = np.empty_like(index)
         before = best.copy()
-        for rows, group in _by_group(x @ coarse, near):
-            if not matrices[group].size:
-                continue
-            scores = x[rows] @ matrices[group]
-            if other:
-                own = place[rows + start] - ends[group]
-                here = np.flatnonzero((own >= 0) & (own < scores.shape[1]))
-                scores[here, own[here]] = -np.inf
-            _keep_better(rows, scores, int(ends[group]), found, best)
+        for chosen, group in _by_group(x @ coarse, near):
+            width = matrices[group].shape[1]
+            for rows in np.array_split(chosen, -(-len(chosen) * width // _PRODUCT)) if width else ():
+                scores = np.take(x, rows, axis=0) @ matrices[group]  # unlike x[rows], `take` releases the GIL
+                if other:
+                    own = place[rows + start] - ends[group]
+                    here = np.flatnonzero((own >= 0) & (own < width))
+                    scores[here, own[here]] = -np.inf
+                _keep_better(rows, scores, int(ends[group]), found, best)
         better = best > before
         index[better] = order[found[better]]
 

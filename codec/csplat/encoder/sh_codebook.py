@@ -20,7 +20,7 @@ from csplat.encoder.coding_parameters import CodingParameters, band_slice
 from csplat.encoder.container import FileChunk, IndexedCodebook
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.entropy import signed_stream, trial_settings
-from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric
+from csplat.encoder.kmeans import assign, cluster, rank_by_frequency, refine_by_metric, run_blocks
 from csplat.encoder.quantisation import colour_integers, largest_exact, lattice_values, lift_colour, quantise_sh
 from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
@@ -231,9 +231,10 @@ def assign_splats(
     weights = None if sh_plan.weights is None else splat_weights(model, None)
     if rule is None or sh_plan.book is None or weights is None:
         return replace(sh_plan, weights=weights)
-    points = _lattice_points(model.shN, parameters)
+    points = _lattice_points(model.shN, parameters, threads)
     index = assign(points, rule.entries, near_groups=rule.near_groups, threads=threads).astype(np.int32)
-    errors = _errors(model.shN, index, rule.entries, parameters, _ErrorWeights(weights, None, measured=False))
+    error_weights = _ErrorWeights(weights, None, measured=False)
+    errors = _errors(model.shN, index, rule.entries, parameters, error_weights, threads)
     index[errors >= rule.threshold] = sh_plan.book.size
     return replace(sh_plan, weights=weights, book=ShCodebook(sh_plan.book.entries, index))
 
@@ -380,7 +381,7 @@ def _train(
 ) -> tuple[AssignmentRule, I32, float]:
     """Train a codebook; return it with the entry of each splat [N] and the weighted mean squared error."""
     weights, threads = error_weights.weights, options.thread_count
-    points = _lattice_points(shN, parameters)
+    points = _lattice_points(shN, parameters, threads)
     effort = {"near_groups": 8, "iterations": 7, "sample_per_entry": 16} if size >= _GROUPED_ENTRIES_MIN else {}
 
     def report_steps(done: int, steps: int) -> None:
@@ -391,7 +392,7 @@ def _train(
         found = _refine(shN, points, error_weights.metric, found, parameters, threads)
     ranked, entries = rank_by_frequency(found[1], found[0])
     index = ranked.astype(np.int32)
-    errors = _errors(shN, index, entries, parameters, error_weights)
+    errors = _errors(shN, index, entries, parameters, error_weights, threads)
     escaped = _choose_escapes(shN, errors, parameters, options, error_weights)
     threshold = float(errors[escaped].min(initial=np.inf))
     errors[escaped] = 0.0
@@ -413,15 +414,18 @@ def _refine(
     return np.clip(entries, -_CLIP, _CLIP).reshape(len(entries), -1), refined.astype(np.uint32)
 
 
-def _lattice_points(shN: F32, parameters: CodingParameters) -> I16:
+def _lattice_points(shN: F32, parameters: CodingParameters, threads: int) -> I16:
     """Return R, G, B integers [N, 3K] of the kept bands, clipped to `_CLIP`."""
     kept = parameters.sh_coefficients
     points = np.empty((len(shN), 3 * kept), np.int16)
-    for at in range(0, len(shN), _BLOCK):
-        rows = shN[at : at + _BLOCK, :kept].reshape(-1, 3 * kept)
+
+    def work(part: slice) -> None:
+        rows = shN[part, :kept].reshape(-1, 3 * kept)
         rows = np.clip(rows, -_CLIP * parameters.sh_step, _CLIP * parameters.sh_step)
         rows *= np.float32(1.0 / parameters.sh_step)
-        points[at : at + _BLOCK] = np.rint(rows, out=rows)
+        points[part] = np.rint(rows, out=rows)
+
+    run_blocks(work, len(shN), _BLOCK, threads)
     return points
 
 
@@ -434,18 +438,22 @@ def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOpti
     return min(1 << max(round(math.log2(max(1.0, size))), 4), parameters.codebook_most)
 
 
-def _errors(shN: F32, index: I32, entries: I32, parameters: CodingParameters, error_weights: _ErrorWeights) -> F64:
+def _errors(
+    shN: F32, index: I32, entries: I32, parameters: CodingParameters, error_weights: _ErrorWeights, threads: int
+) -> F64:
     """Return the weighted squared error of each splat, [N], infinite if a coefficient was clipped."""
     kept = parameters.sh_coefficients
     table = entries.astype(np.float32) * np.float32(parameters.sh_step)
     errors = np.empty(len(shN))
-    for at in range(0, len(shN), _BLOCK):
-        part = slice(at, at + _BLOCK)
+
+    def work(part: slice) -> None:
         difference = shN[part, :kept].reshape(-1, 3 * kept).copy()
         clipped = np.flatnonzero(np.abs(difference) > (_CLIP - 1) * parameters.sh_step) // (3 * kept)
         difference -= np.take(table, index[part], axis=0)
         errors[part] = error_weights.errors(difference, part)
         errors[part][clipped] = np.inf
+
+    run_blocks(work, len(shN), _BLOCK, threads)
     return errors
 
 
