@@ -310,15 +310,17 @@ def test_an_input_equals_its_scene(tmp_path):
     assert [] == failures([one for name, one in ENCODABLE.items() if name != DEGREE_4], check)
 
 
-def test_our_reader_refuses_degree_4(tmp_path):
+def test_our_encoder_refuses_degree_4(tmp_path):
     one = ENCODABLE[DEGREE_4]
     (tmp_path / "in.ply").write_bytes(one.make())
     rows = plyfile.PlyData.read(tmp_path / "in.ply")["vertex"].data
     source = one.source()
     assert (4, (64, 24, 3)) == (source.sh_degree, source.shN.shape)
     np.testing.assert_array_equal(rows["f_rest_49"], source.shN[:, 1, 2])  # blue comes after 48 of red and green
-    with pytest.raises(InputError, match="SH degree 4"):
-        csplat.read_ply(tmp_path / "in.ply")
+    model = csplat.read_ply(tmp_path / "in.ply")
+    np.testing.assert_array_equal(source.shN, model.shN)
+    with pytest.raises(InputError, match=r"holds SH of degree 3 at most, the scene has degree 4: use --sh-degree 3"):
+        csplat.encode(model)
 
 
 def test_no_origin_brings_far_doubles_into_single_precision(tmp_path):

@@ -58,18 +58,24 @@ def test_dropped_columns_are_reported_by_every_command(tmp_path, make_model):
     assert "columns motion_0 are not splat attributes" in call("lint", source, status=1).stdout
 
 
-def test_degree_4_is_converted_encoded_and_fixed_with_fewer_bands(tmp_path, ply):
+def test_degree_4_is_converted_and_encoded_with_fewer_bands(tmp_path, ply):
     header, _, body = ply.read_bytes().partition(b"end_header\n")
     width = len(body) // 200
     more = b"".join(b"property float f_rest_%d\n" % index for index in range(24, 72))
     rows = b"".join(body[start : start + width] + bytes(4 * 48) for start in range(0, len(body), width))
     (tmp_path / "4.ply").write_bytes(header + more + b"end_header\n" + rows)
+    refusal = "holds SH of degree 3 at most, the scene has degree 4: use --sh-degree 3 / sh_degree=3"
+    assert refusal in call("encode", tmp_path / "4.ply", tmp_path / "a.csplat", status=1).output
+    assert refusal in call("encode", tmp_path / "4.ply", tmp_path / "a.csplat", "--target-psnr", 30, status=1).output
     for command in ("convert 4.ply a.ply", "encode 4.ply a.csplat", "lint 4.ply --fix b.ply"):
         words = [tmp_path / word if "." in word else word for word in command.split()]
-        assert "--sh-degree 3 of csplat encode, convert" in call(*words, status=1).output
         call(*words, "--sh-degree", 3)
     assert 3 == read_ply(tmp_path / "a.ply").sh_degree == read_ply(tmp_path / "b.ply").sh_degree
     assert 3 == csplat.decode(tmp_path / "a.csplat").sh_degree
+    call("verify", tmp_path / "a.csplat", "--source", tmp_path / "4.ply")
+    call("convert", tmp_path / "4.ply", tmp_path / "c.ply")
+    assert np.array_equal(read_ply(tmp_path / "4.ply").shN, read_ply(tmp_path / "c.ply").shN)
+    assert "SH band 4" in call("convert", tmp_path / "4.ply", tmp_path / "c.sog").stderr
 
 
 @pytest.mark.parametrize(
@@ -241,9 +247,9 @@ def test_a_packed_scene_is_unpacked_once(tmp_path, make_model, monkeypatch):
     csplat.write(tmp_path / "a.spz", make_model(50, 1))
     unpacked, read = [], spz.read_spz_file
 
-    def counting(*words, any_degree):
+    def counting(*words):
         unpacked.append(words)
-        return read(*words, any_degree=any_degree)
+        return read(*words)
 
     monkeypatch.setattr(spz, "read_spz_file", counting)
     limits = OutOfCoreOptions(always=True)

@@ -392,12 +392,12 @@ def test_linear_colours_are_fitted_and_the_error_is_reported(tmp_path, bands):
 
 
 def test_bands_above_the_requested_degree_are_left_out():
-    names = [f"SH_DEGREE_{one}_COEF_{m}" for one in (1, 2, 3, 4) for m in range(2 * one + 1)]
+    names = [f"SH_DEGREE_{one}_COEF_{m}" for one in (1, 2, 3, 4, 5) for m in range(2 * one + 1)]
     bands = {f"{PREFIX}:{name}": np.ones((2, 3), "<f4") for name in names}
     data = glb(*document(TWO | bands))
-    with pytest.raises(InputError, match="SH degree 4, expected at most 3: --sh-degree 3"):
+    with pytest.raises(InputError, match="SH degree 5, expected at most 4: --sh-degree 4"):
         csplat.read(data)
-    assert [3, 1] == [csplat.read(data, sh_degree=degree).sh_degree for degree in (3, 1)]
+    assert [4, 1] == [csplat.read(data, sh_degree=degree).sh_degree for degree in (4, 1)]
 
 
 def test_required_extensions_that_splats_do_not_use_are_ignored():

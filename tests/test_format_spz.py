@@ -6,6 +6,7 @@ import re
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from math import sqrt
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from conftest import of_peers
 import csplat
 from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
-from csplat.formats import open_scene
+from csplat.formats import format_by_name, open_scene
 from csplat.scene_source import source_from_model
 
 WIDTHS = {1: (6, 1, 3, 3, 3), 2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}
@@ -107,13 +108,26 @@ def test_a_file_without_splats_is_read():
 def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path):
     parts = splats(4, degree=4)
     (tmp_path / "a.spz").write_bytes(spz(4, parts, degree=4))
-    for degree in (3, 1):
+    for degree in (4, 3, 1):
         coefficients = (degree + 1) ** 2 - 1
         expected = np.frombuffer(parts[5], np.uint8).reshape(2, 24, 3)[:, :coefficients] / 128.0 - 1.0
         with open_scene(tmp_path / "a.spz", sh_degree=degree) as scene:
             assert (2, degree) == (scene.count, scene.metadata_model.sh_degree)
         read = convert_axes(source_from_model(csplat.read(tmp_path / "a.spz", sh_degree=degree)), "RUB").model()
         assert np.array_equal(expected, read.shN)
+
+
+def test_version_4_stores_degree_4_and_version_3_leaves_its_band_out(tmp_path, make_model):
+    model = make_model(40, 4)
+    model = replace(model, shN=model.shN.clip(-0.9, 0.9))
+    for name, degree in (("spz4", 4), ("spz", 3)):
+        csplat.write(tmp_path / "a.spz", model, name)
+        found = csplat.read(tmp_path / "a.spz")
+        kept = model.shN[:, : (degree + 1) ** 2 - 1]
+        assert kept.shape == found.shN.shape
+        assert np.abs(kept - found.shN).max() <= 2.01 / 128
+    assert "SH band 4" in format_by_name("spz").losses(model)
+    assert "SH band 4" not in format_by_name("spz4").losses(model)
 
 
 def test_bytes_after_the_splats_are_reported(tmp_path):
@@ -133,7 +147,7 @@ MANY = spz(4, [bytes(n * (1 << 22)) for n in (9, 1, 3, 3, 4)])
 
 
 @pytest.mark.parametrize(("data", "message"), [
-    (spz(4, splats(4, degree=3), degree=4), "SH degree 4, expected at most 3: --sh-degree 3"),
+    (spz(4, splats(4, degree=4), degree=5), "SH degree 5, expected at most 4"),
     (struct.pack("<4sI40x", b"NGSP", 5), "version 5"),
     (gzip.compress(spz(4, splats(4)), mtime=0), "version 4, expected 1 to 4"),
     (gzip.compress(b"NGSX" + bytes(40), mtime=0), "begins with b'NGSX'"),

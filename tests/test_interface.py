@@ -453,7 +453,7 @@ def test_sh_degree_and_length_follow_from_the_shapes(make_model):
     ("sh0", np.zeros((10, 3)), "sh0 is float64, expected float32"),
     ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, expected float32"),
     ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, expected 0, 3, 8"),
-    ("shN", np.zeros((10, 24, 3), np.float32), "24 coefficients"),
+    ("shN", np.zeros((10, 35, 3), np.float32), "35 coefficients"),
     ("shN", np.zeros((10, 45), np.float32), "shN has shape"),
     ("opacities", np.full(10, 1.5, np.float32), "alpha in .0, 1."),
     ("opacities", np.full(10, -0.1, np.float32), "not logits"),

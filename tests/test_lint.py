@@ -200,25 +200,25 @@ def test_other_numbers_of_sh_columns_are_refused(path, count):
     names += [f"f_rest_{i}" for i in range(count)]
     put(path, good_rows(names=names))
     assert count == found(path)["sh-columns"].count
-    with pytest.raises(InputError, match=f"{count} f_rest columns match no SH degree, expected 0, 9, 24 or 45"):
+    with pytest.raises(InputError, match=f"{count} f_rest columns match no SH degree, expected 0, 9, 24, 45 or 72"):
         read_ply(path)
 
 
-def test_degree_4_is_read_with_fewer_bands(path):
+def test_degree_5_is_read_with_fewer_bands(path):
     names = without(*(name for name in NAMES if name.startswith("f_rest")))
-    rows = good_rows(names=[*names, *(f"f_rest_{i}" for i in range(72))])
+    rows = good_rows(names=[*names, *(f"f_rest_{i}" for i in range(105))])
     put(path, rows)
     for read in (read_ply, csplat.read):
-        with pytest.raises(InputError, match=r"SH degree 4, expected at most 3: --sh-degree 3 .* leaves band 4 out"):
+        with pytest.raises(InputError, match=r"SH degree 5, expected at most 4: --sh-degree 4 .* leaves band 5 out"):
             read(path)
-        with pytest.raises(InputError, match="sh_degree is 4, expected 0 to 3"):
-            read(path, sh_degree=4)
-    for degree, kept in ((3, 15), (1, 3), (0, 0)):
+        with pytest.raises(InputError, match="sh_degree is 5, expected 0 to 4"):
+            read(path, sh_degree=5)
+    for degree, kept in ((4, 24), (3, 15), (1, 3), (0, 0)):
         report = []
         model = read_ply(path, sh_degree=degree, strict=True, keep_extra=True, report=report)
-        assert ({}, ("sh-bands", 72 - 3 * kept)) == (model.extra, (report[0].id, report[0].count))
+        assert ({}, ("sh-bands", 105 - 3 * kept)) == (model.extra, (report[0].id, report[0].count))
         for channel in range(3):
-            expected = [rows[f"f_rest_{24 * channel + band}"] for band in range(kept)]
+            expected = [rows[f"f_rest_{35 * channel + band}"] for band in range(kept)]
             assert np.array_equal(model.shN[:, :, channel], np.reshape(expected, (kept, 5)).T)
         with open_scene(path, sh_degree=degree) as scene:
             assert np.array_equal(model.shN, scene.model().shN)

@@ -9,7 +9,7 @@
 | `scales` | [N, 3] natural logarithms | [N, 3] standard deviations, scene units |
 | `opacities` | [N] logits | [N] alpha, 0 to 1 |
 | `sh0` | [N, 1, 3] coefficient of degree 0 | the same |
-| `shN` | [N, K, 3] higher coefficients, K = 0, 3, 8 or 15 | the same |
+| `shN` | [N, K, 3] higher coefficients, K = 0, 3, 8, 15 or 24 | the same |
 
 A `SplatModel` mixes the two forms: it holds log scales and alpha. torch is imported only if tensors are requested.
 """

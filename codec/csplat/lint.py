@@ -6,7 +6,7 @@ refuses it. An *error* cannot be repaired without guessing.
 | id | meaning | kind |
 |---|---|---|
 | `missing-columns` | a required column is absent | error |
-| `sh-columns` | f_rest columns that match no SH degree up to 3, or are not numbered from 0 | error |
+| `sh-columns` | f_rest columns that match no SH degree up to 4, or are not numbered from 0 | error |
 | `ambiguous-columns` | two columns with the same meaning under other programs' names | error |
 | `colour-columns` | red, green and blue that are neither bytes nor in 0 to 1 | error |
 | `integer-columns` | integers instead of floats | error |

@@ -18,7 +18,7 @@ from csplat.plugins import load_plugins
 from csplat.types import F32, F64
 
 #: Highest spherical-harmonics degree of a model.
-MAX_SH_DEGREE = 3
+MAX_SH_DEGREE = 4
 
 #: Maximum deviation of the length of a unit quaternion from 1.
 QUAT_LENGTH_TOLERANCE = 1e-3
@@ -43,7 +43,7 @@ class SplatModel:
         scales: [N, 3] float32, natural logarithms of the standard deviations in scene units.
         opacities: [N] float32, alpha in [0, 1] (not logits).
         sh0: [N, 3] float32, spherical-harmonics coefficient of degree 0, red green blue.
-        shN: [N, K, 3] float32, higher coefficients, K = (d + 1)**2 - 1 for degree d = 0, 1, 2, 3. Default: K = 0.
+        shN: [N, K, 3] float32, higher coefficients, K = (d + 1)**2 - 1 for degree d = 0 to 4. Default: K = 0.
         origin: offset of `means` in the source's coordinates, three float64, scene units. Scenes at geographic
             coordinates keep the precision of float32 this way.
         means_double: [N, 3] float64, centres in the source's coordinates; `means` are these minus `origin`, rounded.
@@ -184,7 +184,7 @@ def sh_degree_of(coefficient_count: int) -> int:
     for degree in range(MAX_SH_DEGREE + 1):
         if (degree + 1) ** 2 - 1 == coefficient_count:
             return degree
-    raise InputError(f"shN has {coefficient_count} coefficients per channel, expected 0, 3, 8 or 15")
+    raise InputError(f"shN has {coefficient_count} coefficients per channel, expected 0, 3, 8, 15 or 24")
 
 
 def normalise_quats(quats: NDArray[Any]) -> F32:

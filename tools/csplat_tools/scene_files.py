@@ -156,7 +156,7 @@ def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel
     Args:
         scene: a path, an open binary file, or bytes; the path `-` is standard input. A model or a `LoadedModel` is
             not read again.
-        sh_degree: drop the SH bands above; required to read files of a higher degree than 3. `None`: keep all.
+        sh_degree: drop the SH bands above; required to read files of a higher degree than 4. `None`: keep all.
 
     Examples:
         >>> import csplat_tools

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from csplat import _spec
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Origin, canonicalise_shape, cluster, encode_tiles
 from csplat.errors import InputError
-from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
+from csplat.model import SplatModel, normalise_quats
 from csplat.scene_source import drop_bands
 from csplat.types import F32, F64, I64, Progress
 from csplat_render import Camera
@@ -61,8 +62,8 @@ class Reduction:
     def __post_init__(self) -> None:
         if self.prune_opacity is not None:
             _check_threshold(self.prune_opacity)
-        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
-            raise InputError(f"sh_degree is {self.sh_degree}, expected 0 to {MAX_SH_DEGREE}")
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= _spec.SH_DEGREE_MAX:
+            raise InputError(f"sh_degree is {self.sh_degree}, expected 0 to {_spec.SH_DEGREE_MAX}")
         if self.kmeans is not None and not 1 <= self.kmeans <= _MAX_ENTRIES:
             raise InputError(f"kmeans is {self.kmeans}, expected 1 to {_MAX_ENTRIES} entries")
 
@@ -92,8 +93,9 @@ def encode_reduced(
         InputError: all splats would be pruned; there are no bands to distil, or too few views; or as for the encoder.
     """
     encoding = encoding or EncodeOptions()
-    degree = encoding.sh_degree if reduction.sh_degree is None else reduction.sh_degree
-    degree = source.sh_degree if degree is None else min(degree, source.sh_degree)
+    if reduction.sh_degree is not None:
+        encoding = replace(encoding, sh_degree=reduction.sh_degree)
+    degree = encoding.kept_degree(source.sh_degree)
     encoding = replace(encoding, sh_degree=degree)
     renders = None
     if reduction.distil:

@@ -112,7 +112,7 @@ class UncheckedSplats:
         scales: [N, 3], natural logarithms of the standard deviations.
         opacities: [N], alpha.
         sh0: [N, 3].
-        shN: [N, K, 3], K = 0, 3, 8 or 15.
+        shN: [N, K, 3], K = 0, 3, 8, 15 or 24.
     """
 
     means: Array

@@ -35,7 +35,7 @@ class TrainOptions:
 
     Attributes:
         max_splats: largest number of splats.
-        sh_degree: SH degree of the finished scene, 0 to 3.
+        sh_degree: SH degree of the finished scene, 0 to 4.
         iterations: training steps, one image each.
         seed: seed of every random choice.
         device: `cpu` (numba) or `cuda` (the gsplat package).

@@ -157,7 +157,7 @@ def choose_parameters(
         contrast: contrast of the scene that the model is a sample of; see `measure_contrast`.
     """
     preset = PRESETS[options.preset]
-    degree = model.sh_degree if options.sh_degree is None else min(options.sh_degree, model.sh_degree)
+    degree = options.kept_degree(model.sh_degree)
     if options.sh_coding == "none":
         degree = 0
     sh_coding = preset.sh_coding if options.sh_coding == "auto" else options.sh_coding

@@ -126,7 +126,7 @@ def _first_options(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[
         bounded = max(int(name[2:]) for name in bounds if _family(name) == "sh")
         if encoding.sh_degree is not None and encoding.sh_degree < min(bounded, source.sh_degree):
             raise InputError(f"SH degree {encoding.sh_degree} drops sh{bounded}, whose error is bounded")
-        chosen.update(sh_coding="scalar", adaptive=0.0, sh_degree=encoding.sh_degree or source.sh_degree)
+        chosen.update(sh_coding="scalar", adaptive=0.0, sh_degree=encoding.kept_degree(source.sh_degree))
     return replace(encoding, **chosen)
 
 

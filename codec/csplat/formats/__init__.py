@@ -23,7 +23,7 @@ from csplat.errors import InputError
 from csplat.file_source import File
 from csplat.formats.format import ARRAYS, Format
 from csplat.lint import Finding, refuse
-from csplat.model import SplatModel, check_model, check_sh_degree
+from csplat.model import MAX_SH_DEGREE, SplatModel, check_model, check_sh_degree
 from csplat.plugins import load_plugins
 from csplat.ply import lint_ply, open_ply, read_ply, write_scene_ply
 from csplat.scene_source import SceneSource, drop_bands, source_from_model
@@ -69,7 +69,7 @@ def read(
         format: name of the format as `csplat formats` lists it, if neither content nor name identify it.
         strict: refuse files that need repairs.
         keep_extra: keep columns that are not splat attributes.
-        sh_degree: drop the SH bands above this degree, 0 to 3; the file's own degree may exceed 3. `None`: keep all.
+        sh_degree: drop the SH bands above this degree, 0 to 4; the file's own degree may exceed 4. `None`: keep all.
         report: findings, including repairs, are appended to this list.
 
     Examples:
@@ -87,7 +87,8 @@ def read(
         if found.name == _PLY:
             return read_ply(path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=report)
         if found.name == _CSPLAT:
-            model = decode(path, sh_degree=sh_degree)
+            check_sh_degree(sh_degree)
+            model = decode(path, sh_degree=None if sh_degree is None else min(sh_degree, found.degree))
             return model if keep_extra or not model.extra else replace(model, extra={})
         with _open(found, path, sh_degree=sh_degree) as scene:
             return read_all(scene, strict=strict, keep_extra=keep_extra, report=report)
@@ -199,7 +200,7 @@ def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | 
     found = format_by_suffix(target) if format is None else format_by_name(format)
     if found.write is None:
         raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
-    found.write(target, scene)
+    found.write(target, _with_fewer_bands(scene, found.degree))
 
 
 def detect_format(path: Path) -> Format:
@@ -274,7 +275,8 @@ _PLY_FORMAT = Format(
     open=open_ply,
     open_bands=open_ply,
     write=write_scene_ply,
-    splat_bytes=(68.0, 104.0, 164.0, 248.0),
+    degree=MAX_SH_DEGREE,
+    splat_bytes=(68.0, 104.0, 164.0, 248.0, 356.0),
     exact=frozenset(ARRAYS),
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "extra", "metadata"}),
 )

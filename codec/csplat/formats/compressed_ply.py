@@ -19,8 +19,8 @@ from csplat.disk_files import atomic_writer
 from csplat.errors import InputError, counted
 from csplat.formats.common import crossed_bounds, decode_smallest_three, encode_smallest_three, sorted_along_curve
 from csplat.formats.format import Format
-from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.lint import Finding, trailing_bytes
+from csplat.model import SplatModel
 from csplat.ply.comments import format_comments, parse_comments
 from csplat.ply.ply_header import read_ply_header
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
@@ -59,7 +59,7 @@ class _Element:
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
+def _open(path: Path) -> Iterator[SceneSource]:
     elements, comments, findings = _parse_header(path)
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
@@ -79,16 +79,10 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
         if sh.count != vertex.count or rest not in _BANDS:
             raise InputError(
                 f"{path.name}: {counted(sh.count, 'row')} of {rest} SH coefficients for"
-                f" {counted(vertex.count, 'splat')}, expected one row of 9, 24 or 45 per splat"
+                f" {counted(vertex.count, 'splat')}, expected one row of 9, 24, 45 or 72 per splat"
             )
         _check_columns(path, "sh", sh, [f"f_rest_{index}" for index in range(rest)], "u1")
-        degree = _BANDS.index(rest) + 1
-        if degree > MAX_SH_DEGREE and sh_degree is None:
-            raise InputError(f"{path.name} has {too_many_bands(degree)}")
-        kept = rest // 3 if sh_degree is None else min(rest // 3, (sh_degree + 1) ** 2 - 1)
-        if degree > MAX_SH_DEGREE:
-            text = f"SH degree {degree}: bands above {sh_degree} are dropped, as requested"
-            findings.append(Finding("sh-bands", rest - 3 * kept, text, "note"))
+        kept = rest // 3
     table = chunk.read(path, 0, chunk.count)
     with np.errstate(invalid="ignore"):  # signalling NaNs are refused below
         columns = np.stack([table[name] for name in names], 1).astype(np.float64)
@@ -286,7 +280,6 @@ def _build_header(metadata_model: SplatModel, count: int, rest: int) -> bytes:
 FORMAT = Format(
     name="compressed-ply",
     open=_open,
-    open_bands=_open,
     splat_bytes=(16.3, 25.3, 40.3, 61.3),
     write=_write,
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),

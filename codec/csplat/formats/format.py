@@ -37,11 +37,11 @@ class Format:
         write: writes a file; `None`: csplat does not write the format.
         doubt: for formats identified by the file name alone: returns the reason why the content is unlikely to be of
             this format, "" if it may be.
-        degree: highest SH degree that the format stores.
+        degree: highest SH degree that the format stores; the writer gets no higher bands.
         axes: directions of +x, +y and +z in every file of this format, and in the scenes that `open` returns; "" if
             files specify their axes or leave them open.
         exact: names of the arrays that are stored losslessly; opacities stored as logits come back within an ulp.
-        splat_bytes: approximate bytes per splat at SH degrees 0 to 3; empty if that depends on the scene.
+        splat_bytes: approximate bytes per splat by SH degree, from 0 to `degree`; empty if that depends on the scene.
         carries: the fields among `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`,
             `flat` and `cameras` that the format stores.
     """

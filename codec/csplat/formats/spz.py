@@ -34,7 +34,7 @@ from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
 from csplat.formats.common import decode_smallest_three, encode_smallest_three, round_to_bytes
 from csplat.formats.format import Format
-from csplat.lint import Finding, too_many_bands, trailing_bytes
+from csplat.lint import Finding, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, U8
@@ -59,7 +59,6 @@ _COORDINATE_SYSTEM = 0xADBE0003  # the extension SPZ_ADOBE_coordinate_system
 _SYSTEMS = "RUBLDBRDBLUBRUBLDFRDFLUFRUFLFDRFDLFURFULBDRBDLBURBU"  # three letters per number; 0 is unspecified
 _EXTENSION_BYTES = 1 << 20  # maximum size of all extensions together
 _RATIO = 1032  # maximum expansion by deflate; SPZ programs refuse more from Zstandard, too
-_MAX_DEGREE = 4  # highest SH degree since version 4 of the format
 _GZIP_LEVEL, _ZSTD_LEVEL = 9, 12
 _PIECE = 1 << 18  # bytes unpacked at a time
 
@@ -114,14 +113,13 @@ class SpzArrays:
         return self.parts[0].view("<f2")
 
 
-def read_spz_file(file: BinaryIO, name: str, size: int, *, any_degree: bool = False) -> SpzArrays:
+def read_spz_file(file: BinaryIO, name: str, size: int) -> SpzArrays:
     """Check and unpack a file.
 
     Args:
         file: the file, positioned at its beginning.
         name: name of the file, for messages.
         size: bytes of the file.
-        any_degree: also accept SH of degree 4, which models do not have.
 
     Raises:
         InputError: the file is incomplete, or csplat does not read its version.
@@ -131,7 +129,7 @@ def read_spz_file(file: BinaryIO, name: str, size: int, *, any_degree: bool = Fa
     file.seek(0)
     try:
         with cast(BinaryIO, gzip.open(file)) if zipped else nullcontext(file) as stream:
-            packed = _parse_header(name, size, stream, any_degree=any_degree)
+            packed = _parse_header(name, size, stream)
             (_read_streams if packed.version == 4 else _read_arrays)(packed, size, stream)
     except (EOFError, zlib.error, zstandard.ZstdError, gzip.BadGzipFile) as error:
         raise InputError(f"{name} is damaged: {str(error) or 'it is truncated'}") from None
@@ -140,16 +138,14 @@ def read_spz_file(file: BinaryIO, name: str, size: int, *, any_degree: bool = Fa
     return packed
 
 
-def _parse_header(name: str, size: int, stream: BinaryIO, *, any_degree: bool) -> SpzArrays:
+def _parse_header(name: str, size: int, stream: BinaryIO) -> SpzArrays:
     magic, version, count, degree, bits, flags, streams = _HEADER.unpack(_read_exactly(name, stream, _HEADER.size))
     if magic != _MAGIC:
         raise InputError(f"{name} is not SPZ: it begins with {magic!r}, expected {_MAGIC!r}")
     if not 1 <= version <= 4 or (version == 4 and isinstance(stream, gzip.GzipFile)):
         raise InputError(f"{name} is SPZ of version {version}, expected 1 to 4 (4 not within gzip)")
-    if degree > _MAX_DEGREE:
-        raise InputError(f"{name} has SH degree {degree}, expected at most {_MAX_DEGREE}")
-    if degree > MAX_SH_DEGREE and not any_degree:
-        raise InputError(f"{name} has {too_many_bands(degree)}")
+    if degree > MAX_SH_DEGREE:
+        raise InputError(f"{name} has SH degree {degree}, expected at most {MAX_SH_DEGREE}")
     if version > 1 and bits > MAX_FRACTION_BITS:
         raise InputError(f"{name} has {bits} fractional bits, expected at most {MAX_FRACTION_BITS}")
     if flags & _LEVELS:
@@ -241,7 +237,7 @@ _SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     with path.open("rb") as file:
-        packed = read_spz_file(file, path.name, path.stat().st_size, any_degree=sh_degree is not None)
+        packed = read_spz_file(file, path.name, path.stat().st_size)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
 
     def blocks() -> Iterator[SplatModel]:
@@ -371,4 +367,7 @@ FORMAT = Format(
 )
 
 
-FORMAT_4 = replace(FORMAT, name="spz4", write=partial(write_spz, version=4))
+# Readers of version 3 that are older than version 4 refuse degree 4.
+FORMAT_4 = replace(
+    FORMAT, name="spz4", write=partial(write_spz, version=4), degree=4, splat_bytes=(*FORMAT.splat_bytes, 36.2)
+)

@@ -98,11 +98,10 @@ def estimate_cost(scene: SceneSource, options: EncodeOptions, limits: OutOfCoreO
         limits: memory and disk.
 
     Raises:
-        InputError: there is too little memory.
+        InputError: there is too little memory, or the SH degree is too high for a file.
     """
     limits = limits or OutOfCoreOptions()
-    count, degree = scene.count, scene.metadata_model.sh_degree
-    degree = degree if options.sh_degree is None else min(options.sh_degree, degree)
+    count, degree = scene.count, options.kept_degree(scene.metadata_model.sh_degree)
     bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
     row = splat_bytes(_with_written_columns(scene, options).metadata_model)
     workers, passes, disk = options.thread_count, 1, int(count * row * _CODED)

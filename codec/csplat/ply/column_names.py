@@ -79,7 +79,7 @@ def find_columns(
     Args:
         dtype: structured, one field per scalar property, in the order of the file.
         keep_extra: extra columns are kept, so they are not reported.
-        sh_degree: highest SH degree to read; `None`: all, up to 3.
+        sh_degree: highest SH degree to read; `None`: all, up to 4.
         elements: names of the other elements of the file, for messages.
 
     Returns:

@@ -57,7 +57,7 @@ def read_ply(
     sh_degree: int | None = None,
     report: list[Finding] | None = None,
 ) -> SplatModel:
-    """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 3.
+    """Read a PLY of splats: binary of either byte order or ASCII, SH degree 0 to 4.
 
     Columns that other programs name differently are recognised and reported (`csplat.lint`): CloudCompare's names,
     red, green and blue in place of f_dc, and the filter of Mip-Splatting, which is fused into scales and opacities.
@@ -71,7 +71,7 @@ def read_ply(
         file: path of the file; or an open binary file or bytes, which are copied to a temporary file.
         strict: refuse files that need repairs (`csplat.lint` lists them).
         keep_extra: keep columns that are not splat attributes in `SplatModel.extra`.
-        sh_degree: drop the SH bands above this degree; the file's own degree may exceed 3. `None`: keep all.
+        sh_degree: drop the SH bands above this degree; the file's own degree may exceed 4. `None`: keep all.
         report: findings, including repairs, are appended to this list.
 
     Examples:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import _spec
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.types import F32, F64
@@ -90,7 +91,7 @@ class Source:
         return replace(first, **arrays, extra=extra)
 
     def to_model(self, origin: tuple[float, float, float]) -> SplatModel:
-        """Return a model to render: centres in float32 relative to a file's origin, SH degree 3 at most."""
+        """Return a model to render: centres in float32 relative to a file's origin, SH degree 4 at most."""
         near = self.about(origin)
         with np.errstate(over="ignore"):  # SplatModel refuses values beyond float32
             means = near.means.astype(np.float32)
@@ -141,7 +142,7 @@ def measure_names(source: Source | SplatModel, decoded: SplatModel) -> list[str]
 
 def _bands(source: Source | SplatModel, decoded: SplatModel) -> range:
     """Return the SH bands that have a measure and that at least one of the two scenes has."""
-    return range(1, min(MAX_SH_DEGREE, max(source.sh_degree, decoded.sh_degree)) + 1)
+    return range(1, min(_spec.SH_DEGREE_MAX, max(source.sh_degree, decoded.sh_degree)) + 1)
 
 
 def measure_pairs(

@@ -32,8 +32,7 @@ def lint(
 
     Notes are ordinary variation. Repairs are made by `csplat encode`, too.
     Errors cannot be repaired without guessing. The status is 1 if there are
-    repairs or errors; with --fix, if there are errors. A file of SH degree 4
-    requires --sh-degree.
+    repairs or errors; with --fix, if there are errors.
 
     Examples:
       csplat lint scene.ply

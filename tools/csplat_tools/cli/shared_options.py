@@ -70,7 +70,7 @@ ReadAs = Annotated[
 _up = typer.Option("--up", metavar="-y|X,Y,Z", help="Up direction. Default: the scene's own.")
 Up = Annotated[str | None, _up]
 HiddenUp = Annotated[str | None, hidden(_up)]
-_sh_degree = typer.Option("--sh-degree", metavar="0..3", help="Drop higher SH bands. Default: keep all.")
+_sh_degree = typer.Option("--sh-degree", metavar="0..4", help="Drop higher SH bands. Default: keep all.")
 ShDegree = Annotated[int | None, _sh_degree]
 HiddenShDegree = Annotated[int | None, hidden(_sh_degree)]
 MaxSplats = Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse larger scenes. Default: no limit.")]
@@ -357,7 +357,7 @@ def parse_axes(text: str) -> str:
 
 
 def parse_sh_degree(degree: int | None) -> int | None:
-    """Check an SH degree: 0 to 3."""
+    """Check an SH degree: 0 to 4."""
     return check_range("--sh-degree", degree, 0, MAX_SH_DEGREE)
 
 

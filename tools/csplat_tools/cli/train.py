@@ -26,7 +26,7 @@ def train(
         int | None, typer.Option(metavar="N", help="Largest number of splats. Default: 20,000.")
     ] = None,
     sh_degree: Annotated[
-        int, typer.Option(metavar="0..3", show_default=False, help="SH degree of colours. Default: 3.")
+        int, typer.Option(metavar="0..4", show_default=False, help="SH degree of colours. Default: 3.")
     ] = _DEFAULT.sh_degree,
     iterations: Annotated[
         int, typer.Option(metavar="N", show_default=False, help="Training steps. Default: 7,000.")

@@ -99,7 +99,7 @@ def _verify_bounds(
 ) -> BoundsVerification:
     opened = open_tiles(data)
     header, bounds = opened.header, opened.declared_bounds
-    degree = MAX_SH_DEGREE  # bands above cannot be encoded, and declared bounds do not include them
+    degree = MAX_SH_DEGREE  # bands above have not been read by the encoder
     with source_path(source) as local:
         if fits_memory(opened, bounds.source_count if bounds else 0, size_on_disk(local), memory_bytes):
             model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)

@@ -10,6 +10,7 @@ import html
 
 import numpy as np
 
+from csplat._spec import SH_DEGREE_MAX
 from csplat.encoder import EncodeOptions, encode
 from csplat.model import SplatModel
 from csplat_render.scene_frame import surface_areas, visible_opacity
@@ -38,7 +39,8 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
     """
     shown = most_visible(model, most_splats)
     wishes = estimated_up_parameters(estimate_up(shown))
-    page = export_page(encode(shown, EncodeOptions(preset="fast")), "scene", wishes).page.decode()
+    data = encode(shown, EncodeOptions(preset="fast", sh_degree=SH_DEGREE_MAX))
+    page = export_page(data, "scene", wishes).page.decode()
     frame = (
         f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{html.escape(repr(model))}"'
         f' style="width: 100%; height: {_HEIGHT}px; border: 0"></iframe>'

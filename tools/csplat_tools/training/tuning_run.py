@@ -135,6 +135,7 @@ def run_finetuning(
         CsplatError: an option or a file is not usable.
         OSError: a file cannot be read or written.
     """
+    encoding.kept_degree(source.sh_degree)
     threads = encoding.threads
     if target is not None:
         target.require("finetune", "psnr", "size_bytes", "keep")

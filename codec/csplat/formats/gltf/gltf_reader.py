@@ -31,7 +31,7 @@ from csplat.formats.common import RangeStatistics, classify_opacities, classify_
 from csplat.formats.gltf.gltf_document import Accessor, GltfDocument, JsonPath, PlacedPrimitive, open_document
 from csplat.formats.spz import ANTIALIASED, SpzArrays, decode_block, decode_means, read_spz_file
 from csplat.lint import Finding, too_many_bands, trailing_bytes
-from csplat.model import SplatModel, normalise_quats
+from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
@@ -85,7 +85,7 @@ class _GltfReading:
 
     Attributes:
         required: extensions that the file requires.
-        sh_degree: the highest degree to read; `None`: all, up to 3.
+        sh_degree: the highest degree to read; `None`: all, up to 4.
         scales, opacities: statistics of the finite rows of all primitives.
         statistics: counts of rows for findings.
         infinite: number of rows with infinite opacity, which is valid for logits only.
@@ -185,7 +185,7 @@ class _GltfReading:
 
         widths = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1, **dict.fromkeys(sh_names(0), 3)}
         degree = 0
-        while degree < 3 and any(f"{EXTENSION}:{name}" in attributes for name in sh_names(degree + 1)):
+        while degree < MAX_SH_DEGREE and any(f"{EXTENSION}:{name}" in attributes for name in sh_names(degree + 1)):
             degree += 1
             widths |= dict.fromkeys(sh_names(degree), 3)
         arrays = {name: array(name, width) for name, width in widths.items()}
@@ -193,8 +193,8 @@ class _GltfReading:
         for name, accessor in arrays.items():
             if len(accessor.rows) != count:
                 raise file.error(json_path, f"{name} has {len(accessor.rows)} rows, POSITION {count}")
-        if any(f"{EXTENSION}:{name}" in attributes for name in sh_names(4)) and self.sh_degree is None:
-            raise file.error(json_path, too_many_bands(4))
+        if any(f"{EXTENSION}:{name}" in attributes for name in sh_names(degree + 1)) and self.sh_degree is None:
+            raise file.error(json_path, too_many_bands(degree + 1))
         return partial(_decode_block, self, arrays, degree), count, self._survey(arrays, count)
 
     def _survey(self, arrays: dict[str, Accessor], count: int) -> tuple[int, int]:
@@ -238,7 +238,7 @@ class _GltfReading:
         if view not in self.packed:
             data, _ = file.view(view)
             name = f"{file.path.name}, bufferViews/{view}"
-            packed = read_spz_file(io.BytesIO(data), name, len(data), any_degree=self.sh_degree is not None)
+            packed = read_spz_file(io.BytesIO(data), name, len(data))
             self.unpacked_bytes += sum(one.nbytes for one in packed.parts)
             if self.unpacked_bytes > _UNPACKED_RATIO * file.size():
                 raise InputError(f"{file.path.name}: its SPZ share their bytes and unpack to too many splats")
