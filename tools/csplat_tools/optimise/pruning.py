@@ -41,7 +41,9 @@ _FIT_STEPS = (560, 960)  # steps of a refit, without and with SH; half if it sta
 _FILE_STEPS = (320, 480)  # the same through the quantisers of a file; fewer make files with SH 8 % larger, others not
 _AGREE_ON = 0.5  # fraction of the splats on whose pruning virtual views must agree before they are enough
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
-_ERROR_POWER = 0.85  # typical power of the error of pruning with which the error after a refit grows
+# Typical power of the error of pruning with which the error after a refit grows, without and with SH; 0.64 to 0.9 and
+# 0.84 to 1.2 in seven scenes.
+_ERROR_POWER = (0.8, 1.05)
 _ERROR_POWERS = (0.5, 2.0)  # range of that power if it is measured on two refits
 _DISTINCT = 0.1  # log ratio of errors from which two refits determine the power
 _LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes; fewer are too similar
@@ -132,7 +134,7 @@ class Pruner:
         gain, power = error_of_psnr(REFIT_GAIN), 1.0
         measured = [(self._error(count), error) for count, error in (known or {}).items() if error > 0.0]
         if measured:
-            (before, after), power = measured[-1], _ERROR_POWER
+            (before, after), power = measured[-1], _ERROR_POWER[self.source.sh_degree > 0]
             for other_before, other_after in measured[:-1]:
                 if abs(math.log(other_before / before)) > _DISTINCT:
                     power = math.log(other_after / after) / math.log(other_before / before)

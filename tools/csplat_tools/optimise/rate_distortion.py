@@ -30,7 +30,8 @@ NEPERS = math.log(10.0) / 10.0
 
 _APART = 0.5  # dB; two files of less distance do not determine a slope
 _SLOPES = (0.3, 2.0)  # range of a measured slope, as a multiple of the typical one
-_MOST_PRUNED = 0.7  # largest fraction of the error that pruning may take
+#: Largest fraction of the error that pruning may take; with more, quantisation would have to be too fine.
+MOST_PRUNED = 0.75
 
 
 def error_of_psnr(psnr: float) -> float:
@@ -111,7 +112,7 @@ def log_bytes_at_error(kept_count: F64, pruned: F64, allowed: float, exponent: f
         allowed: mean squared error of the files.
         exponent: k of bytes ∝ Q^-k.
     """
-    fits = pruned <= _MOST_PRUNED * allowed
+    fits = pruned <= MOST_PRUNED * allowed
     rest = np.where(fits, allowed - pruned, 1.0)
     return np.where(fits, np.log(kept_count) - exponent * np.log(rest), np.inf)
 

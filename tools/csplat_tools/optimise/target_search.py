@@ -40,6 +40,7 @@ from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
 from csplat_tools.optimise.rate_distortion import (
     BYTES_PER_DB,
     LEAST_QUANTISED,
+    MOST_PRUNED,
     NEPERS,
     NOTHING,
     RateLine,
@@ -61,7 +62,7 @@ _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 # What is typical, without and with SH. It is assumed only until candidates show otherwise.
 _USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
 _ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
-_COUNT_BYTES_PER_DB = (0.045, 0.07)  # fraction of the bytes that a decibel costs if splats are added
+_COUNT_BYTES_PER_DB = (0.05, 0.08)  # fraction of the bytes that a decibel costs if splats are added
 _GAINS = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 _TUNING_GAINS = {"codebook": 1.2}  # dB that the refit through the quantisers gains; 0.7 for other codings
 _USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
@@ -72,12 +73,12 @@ _ENTRIES = (1 / 4096, 1 / 4)  # range of the codebook entries per splat
 _TRIES, _CODINGS = 3, 10  # most splat counts, most drafts of one coding, and most codings at the default effort
 _FILES = (8, 4)  # most files on the goal, of all splats and of refitted ones, which take a refit each
 _MOST_DROPPED = 0.35  # largest fraction of the error left to quantisation that dropping SH bands may take
-_FARTHEST = 2.0  # largest factor between the errors of pruning of two splat counts, since they are extrapolated
+_FARTHEST = 3.0  # largest factor between the errors of pruning of two splat counts, since they are extrapolated
 _BEYOND = 1.4  # factor of the number of splats if no file of a number meets the goal
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
 
 # What is near, and what is worth another candidate.
-_AIM = 0.06  # dB above a PSNR that files aim at; PSNR varies by 0.1 dB from one precision to the next
+_AIM = (0.06, 0.12)  # dB above a PSNR that files of all and of refitted splats aim at; PSNR varies by this by chance
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; another coding may be better there
 _JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
 _CLOSE = 0.1  # fraction of the bytes; a codebook worse by less may win with another size
@@ -181,21 +182,30 @@ class TargetSearch:
         kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
         coding: Coding | None = None
         chosen_at = 0.0
-        for _ in range(_TRIES):
+        for left in reversed(range(_TRIES)):
             subset = pruner.refit(kept_count)
+            usual = self._first_codings(subset)[-1]
+            if left and self.work >= 1.0 and self._took_too_much(subset, usual):
+                kept_count = self._next_count(pruner, subset, usual)[0]
+                continue
             if coding is None or abs(self._start(subset, coding) - chosen_at) > _FAR:
                 coding = self._choose_coding(subset)
                 chosen_at = self._predict(subset, coding)[0]
             else:
                 self._try(subset, coding, {})
+            tried.append((self._predict(subset, coding)[1], subset, coding))
             kept_count, saved = self._next_count(pruner, subset, coding)
-            cost = self._predict(subset, coding)[1]
-            tried.append((math.inf if math.isinf(saved) else cost, subset, coding))  # infinite if pruning took too much
-            if self.work < 1.0:
+            if self.work < 1.0 or saved < _WORTH:
                 break
-            if saved < _WORTH or any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
+            if any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
                 break
         return min(tried, key=lambda one: (one[0], -len(one[1].model)))[1:]
+
+    def _took_too_much(self, subset: Subset, coding: Coding) -> bool:
+        """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
+        if self.goal.size_bytes is not None:
+            return False
+        return self._unquantised(subset, coding, on_goal=True) > MOST_PRUNED * self._allowed_in_renders
 
     def _first_count(self, pruner: Pruner) -> int:
         """Return the number of splats to begin with."""
@@ -216,17 +226,19 @@ class TargetSearch:
 
     def _next_count(self, pruner: Pruner, subset: Subset, coding: Coding) -> tuple[int, float]:
         """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save."""
-        line, size_bytes, allowed = self._line(subset, coding), self.goal.size_bytes, self._allowed_in_renders
-        count = len(subset.model)
+        size_bytes, allowed, count = self.goal.size_bytes, self._allowed_in_renders, len(subset.model)
         with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
         self._pruned[count] = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
-        quantised = 0.0 if size_bytes is None else line.error_at(line.quality_at_size(size_bytes))
-        counts, errors = pruner.errors(allowed if size_bytes is None else quantised, self._pruned)
         if size_bytes is None:
+            counts, errors = pruner.errors(allowed, self._pruned)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
+            least = LEAST_QUANTISED * allowed
         else:
+            line = self._line(subset, coding)
+            quantised = line.error_at(line.quality_at_size(size_bytes))
+            counts, errors = pruner.errors(quantised, self._pruned)
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
-        least = LEAST_QUANTISED * (quantised if size_bytes is not None else allowed)
+            least = LEAST_QUANTISED * quantised
         costs[errors > max(_FARTHEST * self._pruned[count], least)] = np.inf
         best = int(np.argmin(costs))
         return self._rounded(counts[best]), float(costs[np.searchsorted(-counts, -count)] - costs[best])
@@ -350,7 +362,7 @@ class TargetSearch:
         best: Candidate | None = None
         if subset.refits:
             self._score(self._by_distance(subset, coding, draft=True)[0])
-        made: dict[float, Candidate] = {}
+        made, is_pruned = dict[float, Candidate](), len(subset.model) < len(self.whole.model)
         for _ in range(_FILES[subset.refits]):
             quality = self._predict(subset, coding)[0]
             if best is None:  # files of neighbouring precisions may differ by chance
@@ -359,6 +371,8 @@ class TargetSearch:
             elif self._cost(best) - self._predict(subset, coding)[1] < _WORTH_FILE:
                 break
             if quality in made or not _QUALITIES[0] <= quality <= _QUALITIES[1]:
+                break
+            if is_pruned and best is None and len(made) > 1 and quality > max(made) + _FAR:  # more splats cost less
                 break
             made[quality] = file = self.pool.make(subset, coding, quality, draft=False)
             self._score(file)
@@ -373,7 +387,7 @@ class TargetSearch:
         """
         line = self._line(subset, coding)
         if self.goal.size_bytes is not None:
-            quality = _clipped(line.quality_at_size(self.goal.size_bytes * (1.0 - BYTES_PER_DB * _AIM)))
+            quality = _clipped(line.quality_at_size(self.goal.size_bytes * (1.0 - BYTES_PER_DB * _AIM[0])))
             error = self._unquantised(subset, coding) + line.error_at(quality)
             return quality, rate_exponent(BYTES_PER_DB) * math.log(error)
         quality = line.quality_at_error(self._rest(subset, coding))
@@ -422,7 +436,7 @@ class TargetSearch:
 
     def _rest(self, subset: Subset, coding: Coding) -> float:
         """Return the mean squared error that quantisation may cause on the validation views."""
-        allowed = self._allowed(subset, coding) * error_of_psnr(_AIM)
+        allowed = self._allowed(subset, coding) * error_of_psnr(_AIM[subset.refits])
         return max(allowed - self._unquantised(subset, coding), LEAST_QUANTISED * allowed)
 
     def _allowed(self, subset: Subset, coding: Coding) -> float:
