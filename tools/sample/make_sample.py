@@ -33,9 +33,9 @@ from csplat.types import F32, F64
 from csplat_render.camera import Camera, intrinsics, look_at
 from csplat_render.warmup import warm_up
 from csplat_trainer.data import load
+from csplat_trainer.fitter import FitStep
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import TrainOptions, TrainResult
-from csplat_trainer.training_report import TrainingStep
 
 SAMPLE = Path(__file__).resolve().parent.parent / "csplat_tools" / "data" / "sample.ply"
 COMMENTS = ("made by tools/sample/make_sample.py",)
@@ -205,7 +205,7 @@ def main(words: Sequence[str] | None = None) -> None:
     print(f"{arguments.output}: {len(result.model)} splats, {arguments.output.stat().st_size} bytes")
 
 
-def _show(now: TrainingStep) -> None:
+def _show(now: FitStep) -> None:
     if now.iteration % 500 == 0:
         _say(f"step {now.iteration} of {now.iterations}: PSNR {now.psnr:.2f} dB, {now.seconds_left:.0f} s left")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,6 +12,7 @@ from numpy.random import PCG64, Generator
 
 from csplat.errors import InputError
 from csplat.types import F32
+from csplat_render.metrics import psnr_of_mse
 from csplat_trainer.fit_checkpoint import FitCheckpoint, Kind, save_checkpoint
 from csplat_trainer.image_gains import ImageGain, ImageGains
 from csplat_trainer.losses import LossValue
@@ -18,6 +20,31 @@ from csplat_trainer.parameters import Parameters
 from csplat_trainer.tuned_scene import RateTerm
 
 COUNT_EVERY = 50  # steps between counts of the file's integers for the rate term
+
+
+@dataclass(frozen=True)
+class FitStep:
+    """Progress of a training or a tuning.
+
+    Attributes:
+        iteration, iterations: number of steps so far, and of all steps.
+        loss: mean over the steps since the last report.
+        psnr: PSNR on the training images since the last report, pooled, dB.
+        splat_count: current number of splats.
+        sh_degree: active SH degree.
+        seconds, seconds_left: time since the start, and estimated remaining time.
+        size_bytes: size of the tuned file at its last evaluation; `None` in a training.
+    """
+
+    iteration: int
+    iterations: int
+    loss: float
+    psnr: float
+    splat_count: int
+    sh_degree: int
+    seconds: float
+    seconds_left: float
+    size_bytes: int | None = None
 
 
 class Fit(Protocol):
@@ -131,10 +158,16 @@ class Fitter:
         """True after the last step."""
         return self.has_ended or self.iteration == self.iterations
 
-    def take_window(self) -> tuple[float, float]:
-        """Return mean loss and mean squared error of the steps since the last call."""
+    def report(
+        self, splat_count: int, sh_degree: int, *, seconds_left: float | None = None, size_bytes: int | None = None
+    ) -> FitStep:
+        """Return the progress since the last report; arguments as in `FitStep`, `None`: estimate the time left."""
         window, self._window = self._window, []
-        return sum(one.loss for one in window) / len(window), sum(one.mse for one in window) / len(window)
+        loss, mse = (sum(values) / len(window) for values in zip(*((one.loss, one.mse) for one in window), strict=True))
+        return FitStep(
+            self.iteration, self.iterations, loss, psnr_of_mse(mse), splat_count, sh_degree, self.seconds,
+            self.seconds_left if seconds_left is None else seconds_left, size_bytes,
+        )  # fmt: skip
 
     @property
     def seconds(self) -> float:

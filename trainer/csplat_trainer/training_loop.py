@@ -21,19 +21,18 @@ from csplat.training_record import TRAINING, VIEW
 from csplat.types import F32, I64
 from csplat_render.camera import Camera, central_camera
 from csplat_render.lpips import Lpips, load_lpips
-from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.engine import CpuEngine, Engine
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
-from csplat_trainer.fitter import Fitter
+from csplat_trainer.fitter import FitStep, Fitter
 from csplat_trainer.initial_splats import SceneExtent, measure_extent, place_splats
 from csplat_trainer.losses import LossValue, PerceptualLoss
 from csplat_trainer.parameters import ParameterArrays, Parameters, to_model
 from csplat_trainer.posed_images import PosedImage, compose, evaluate, halve
 from csplat_trainer.strategies import ScreenGradients, densify, grow, prune_least_needed, relocate, reset_opacities
 from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
-from csplat_trainer.training_report import TrainingStep, peak_memory, save_image, side_by_side
+from csplat_trainer.training_report import peak_memory, save_image, side_by_side
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # background colours of evaluations
@@ -50,7 +49,7 @@ def train(
     *,
     outputs: Outputs | None = None,
     progress: Callable[[str, float], None] | None = None,
-    on_step: Callable[[TrainingStep], None] | None = None,
+    on_step: Callable[[FitStep], None] | None = None,
 ) -> TrainResult:
     """Train splats on images, as `csplat train` does; requires the packages of the render extra.
 
@@ -75,7 +74,7 @@ def train(
         InputError: there are no images, an option does not fit the data, or a file is damaged or of another kind.
     """
 
-    def show(now: TrainingStep) -> None:
+    def show(now: FitStep) -> None:
         if progress is not None:
             progress("training", now.iteration / now.iterations)
         if on_step is not None:
@@ -88,9 +87,7 @@ def train(
 class _Training:
     """A training by a `Fitter`: its images, engine and strategy."""
 
-    def __init__(
-        self, data: DataSet, options: TrainOptions, outputs: Outputs, show: Callable[[TrainingStep], None]
-    ) -> None:
+    def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs, show: Callable[[FitStep], None]) -> None:
         if not data.train:
             raise InputError("there are no images to train on")
         data.read()
@@ -142,7 +139,7 @@ class _Training:
         if times := options.prunings_left(fitter.iteration):
             self._prune(times)
         if fitter.is_due(options.log_every) or fitter.is_last:
-            self._report(fitter.seconds_left)
+            self._report()
         if fitter.is_due(options.eval_every) and not fitter.is_last and self._data.test:
             self._evaluate(options.eval_views)
         if outputs.preview_due(fitter.iteration, fitter.iterations):
@@ -244,21 +241,11 @@ class _Training:
                 fitter.step(self)
             self._report((fitter.seconds - begin) / (times - left + 1) * (left - 1))
 
-    def _report(self, seconds_left: float) -> None:
-        """Add an entry to the log, and show it."""
-        loss, mse = self._fitter.take_window()
-        now = TrainingStep(
-            iteration=self._fitter.iteration,
-            iterations=self._fitter.iterations,
-            loss=loss,
-            psnr=psnr_of_mse(mse),
-            splat_count=len(self._engine.parameters),
-            sh_degree=self._degree,
-            seconds=self._fitter.seconds,
-            seconds_left=seconds_left,
-        )
+    def _report(self, seconds_left: float | None = None) -> None:
+        """Add an entry to the log, and show it; arguments as for `Fitter.report`."""
+        now = self._fitter.report(len(self._engine.parameters), self._degree, seconds_left=seconds_left)
         entry = asdict(now)
-        del entry["iterations"], entry["seconds_left"]
+        del entry["iterations"], entry["seconds_left"], entry["size_bytes"]
         self._log["entries"].append(entry)
         self._show(now)
 

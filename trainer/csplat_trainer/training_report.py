@@ -1,11 +1,10 @@
-"""Reports of a training run: progress, loss plot, previews."""
+"""Reports of a training run: loss plot, previews, memory."""
 
 from __future__ import annotations
 
 import io
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,29 +13,6 @@ from csplat.disk_files import atomic_writer
 from csplat.types import F32, F64
 
 _WINDOW_SHARE = 50  # the moving average spans the run divided by this
-
-
-@dataclass(frozen=True)
-class TrainingStep:
-    """Progress of a run.
-
-    Attributes:
-        iteration, iterations: number of steps so far, and of all steps.
-        loss: mean over the steps since the last report.
-        psnr: PSNR on the training images since the last report, pooled, dB.
-        splat_count: current number of splats.
-        sh_degree: active SH degree.
-        seconds, seconds_left: time since the start, and estimated remaining time.
-    """
-
-    iteration: int
-    iterations: int
-    loss: float
-    psnr: float
-    splat_count: int
-    sh_degree: int
-    seconds: float
-    seconds_left: float
 
 
 def peak_memory() -> int | None:

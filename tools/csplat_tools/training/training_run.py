@@ -16,14 +16,14 @@ from csplat_tools.console import note, step_progress
 from csplat_tools.file_streams import write_model
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
-from csplat_tools.training.tuning_report import show_views, write_training_page
+from csplat_tools.training.tuning_report import describe_step, show_views, write_training_page
 from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.fit_checkpoint import load_checkpoint
 from csplat_trainer.losses import PerceptualLoss
 from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
-from csplat_trainer.training_report import TrainingStep, plot_loss
+from csplat_trainer.training_report import plot_loss
 from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
@@ -208,7 +208,7 @@ def _train(
     with thread_count(threads):
         if options.device == "cpu":
             prepare_renderer(quiet=quiet, gradients=True)
-        with step_progress("training", _state, quiet=quiet) as show:
+        with step_progress("training", describe_step, quiet=quiet) as show:
             result = csplat_trainer.train(data_set, options, outputs=files, on_step=show)
     if plot is not None:
         plot_loss(plot, result.log["losses"], Path(data_set.name).name)
@@ -238,13 +238,6 @@ def _check_inputs(options: TrainOptions, files: Outputs) -> None:
         load_checkpoint(files.resume)
     if files.previews is not None and Path(files.previews).exists() and not Path(files.previews).is_dir():
         raise InputError(f"{files.previews} is not a folder")
-
-
-def _state(now: TrainingStep) -> str:
-    return (
-        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB,"
-        f" {counted(now.splat_count, 'splat')}, SH {now.sh_degree}, {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
-    )
 
 
 def _summary(log: dict[str, Any], metrics: dict[str, Any] | None) -> str:

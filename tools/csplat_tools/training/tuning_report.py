@@ -29,6 +29,8 @@ from csplat_tools.views import ViewSet, evenly_spaced
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from csplat_trainer.fitter import FitStep
+
 
 #: Scores that are reported, with their number of digits after the decimal point.
 SCORES = {"psnr": 2, "psnr_mean": 2, "ssim": 4, "lpips": 4}
@@ -165,6 +167,16 @@ def format_tuning_report(report: Mapping[str, Any]) -> str:
     stop = " until convergence" if report["converged"] else ""
     lines += ["", f"{counted(report['steps'], 'step')}{stop}; best step {report['best_step']}; seconds: {times}"]
     return "\n".join(lines)
+
+
+def describe_step(now: FitStep) -> str:
+    """Return the progress of a training or a tuning as a line."""
+    size = "" if now.size_bytes is None else f", {format_bytes(now.size_bytes)}"
+    return (
+        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, PSNR {now.psnr:.2f} dB,"
+        f" {counted(now.splat_count, 'splat')}, SH {now.sh_degree}{size}, {now.seconds:.0f} s,"
+        f" {now.seconds_left:.0f} s left"
+    )
 
 
 def score_rows(scores: Mapping[str, Mapping[str, float | None]]) -> list[tuple[str, ...]]:

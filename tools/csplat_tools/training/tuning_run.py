@@ -28,8 +28,15 @@ from csplat_tools.optimise.rate_distortion import BYTES_PER_DB
 from csplat_tools.optimise.scene_sensitivity import measure_views
 from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_tools.optional_packages import prepare_renderer
-from csplat_tools.training.tuning_report import make_tuning_report, score_models, show_views, write_training_page
+from csplat_tools.training.tuning_report import (
+    describe_step,
+    make_tuning_report,
+    score_models,
+    show_views,
+    write_training_page,
+)
 from csplat_tools.views import VIEW_COUNT, ViewSet, with_validation_views
+from csplat_trainer.fitter import FitStep
 from csplat_trainer.sensitivity import Sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
@@ -37,7 +44,6 @@ from csplat_trainer.tuning import (
     FinetuneOptions,
     StageTimer,
     TunedFile,
-    TuningStep,
     TuningView,
     TuningViews,
     renders_of,
@@ -141,7 +147,7 @@ def run_finetuning(
         target.require("finetune", "psnr", "size_bytes", "keep")
     with thread_count(threads):
         prepare_renderer(quiet=quiet, gradients=True)
-        with progress_bar(quiet=quiet) as progress, step_progress("tuning", _state, quiet=quiet) as show:
+        with progress_bar(quiet=quiet) as progress, step_progress("tuning", describe_step, quiet=quiet) as show:
             make = partial(
                 choose_and_finetune, source, views, encoding, options, prune_unseen=prune_unseen, importance=importance,
                 progress=progress, on_step=show,
@@ -201,7 +207,7 @@ def choose_and_finetune(
     prune_unseen: bool | None = None,
     importance: str | None = None,
     progress: Progress | None = None,
-    on_step: Callable[[TuningStep], None] | None = None,
+    on_step: Callable[[FitStep], None] | None = None,
 ) -> TunedSubset:
     """Choose the splats of the file, and tune them.
 
@@ -315,14 +321,6 @@ def _fit_to_size(
         if 1.0 / _WITHIN <= share < best_factor:
             encoding, best_factor = finer_options, share
     return chosen, encoding
-
-
-def _state(now: TuningStep) -> str:
-    return (
-        f"{now.iteration}/{now.iterations}: loss {now.loss:.4f}, validation {now.validation_psnr:.2f} dB"
-        f" (best {now.best_psnr:.2f}), {now.size_bytes / 1e6:.3f} MB,"
-        f" {now.seconds:.0f} s, {now.seconds_left:.0f} s left"
-    )
 
 
 class SizedFile(Protocol):

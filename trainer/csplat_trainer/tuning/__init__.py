@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from csplat_trainer.tuning.tuned_encoding import StageTimer, TunedFile, finetune
-from csplat_trainer.tuning.tuning_loop import TuningResult, TuningStep, tune
+from csplat_trainer.tuning.tuning_loop import TuningResult, tune
 from csplat_trainer.tuning.tuning_options import FinetuneOptions
 from csplat_trainer.tuning.tuning_views import TuningView, TuningViews, renders_of, split_views
 
@@ -12,7 +12,6 @@ __all__ = [
     "StageTimer",
     "TunedFile",
     "TuningResult",
-    "TuningStep",
     "TuningView",
     "TuningViews",
     "finetune",

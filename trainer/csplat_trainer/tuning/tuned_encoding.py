@@ -19,10 +19,11 @@ from csplat.training_record import TrainingRecord
 from csplat.types import I64
 from csplat_render.camera import relative_to
 from csplat_trainer.data import DataSet
+from csplat_trainer.fitter import FitStep
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
-from csplat_trainer.tuning.tuning_loop import TuningStep, tune
+from csplat_trainer.tuning.tuning_loop import tune
 from csplat_trainer.tuning.tuning_options import FinetuneOptions
 from csplat_trainer.tuning.tuning_views import TuningView, TuningViews, split_views
 
@@ -78,7 +79,7 @@ def finetune(
     metadata: Mapping[str, Any] | None = None,
     outputs: Outputs | None = None,
     progress: Callable[[str, float], None] | None = None,
-    on_step: Callable[[TuningStep], None] | None = None,
+    on_step: Callable[[FitStep], None] | None = None,
 ) -> TunedFile:
     """Encode a scene, and optimise the values of the file through its quantisers; `csplat finetune` calls it.
 
@@ -133,7 +134,7 @@ def finetune(
         if size_bytes < 1:
             raise InputError("the target size is smaller than the metadata of the file")
 
-    def show(now: TuningStep) -> None:
+    def show(now: FitStep) -> None:
         if progress is not None:
             progress("tuning", now.iteration / now.iterations)
         if on_step is not None:

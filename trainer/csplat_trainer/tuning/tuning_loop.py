@@ -20,7 +20,7 @@ from csplat.types import F32
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
-from csplat_trainer.fitter import COUNT_EVERY, Fitter
+from csplat_trainer.fitter import COUNT_EVERY, FitStep, Fitter
 from csplat_trainer.image_gains import ImageGain
 from csplat_trainer.losses import LossValue, SizedLosses
 from csplat_trainer.training_options import Outputs
@@ -30,29 +30,6 @@ from csplat_trainer.tuning.tuning_options import FinetuneOptions
 from csplat_trainer.tuning.tuning_views import TuningView, TuningViews
 
 _MIN_GAIN = 2e-4  # smallest relative difference of the score that counts as a gain
-
-
-@dataclass(frozen=True)
-class TuningStep:
-    """Progress of a run.
-
-    Attributes:
-        iteration, iterations: number of steps so far, and of all steps.
-        loss: mean over the steps since the last report.
-        validation_psnr: PSNR of the last evaluation on the validation views, pooled, dB.
-        best_psnr: the best so far.
-        size_bytes: size of the file at that evaluation.
-        seconds, seconds_left: time since the start, and estimated remaining time.
-    """
-
-    iteration: int
-    iterations: int
-    loss: float
-    validation_psnr: float
-    best_psnr: float
-    size_bytes: int
-    seconds: float
-    seconds_left: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +51,7 @@ def tune(
     options: FinetuneOptions | None = None,
     *,
     size_bytes: int | None = None,
-    progress: Callable[[TuningStep], None] | None = None,
+    progress: Callable[[FitStep], None] | None = None,
     outputs: Outputs | None = None,
     threads: int | None = None,
 ) -> TuningResult:
@@ -121,7 +98,7 @@ class _Tuning:
         views: TuningViews,
         options: FinetuneOptions,
         outputs: Outputs,
-        show: Callable[[TuningStep], None] | None,
+        show: Callable[[FitStep], None] | None,
         threads: int | None,
         size_bytes: int | None,
     ) -> None:
@@ -205,7 +182,9 @@ class _Tuning:
         if fitter.is_due(options.validate_every) or fitter.is_last:
             self._validate()
         if self._show is not None and (fitter.is_due(options.log_every) or fitter.is_last):
-            self._show(self._progress())
+            model = self._scene.fixed.encode_plan.model
+            size_bytes = self._log["validations"][-1]["size_bytes"]
+            self._show(fitter.report(len(model), model.sh_degree, size_bytes=size_bytes))
         if outputs.checkpoint is not None and fitter.is_due(outputs.checkpoint_every):
             self._save(outputs.checkpoint)
 
@@ -264,20 +243,6 @@ class _Tuning:
         elif self._options.has_calmed(self._fitter.iteration) and not shrinks:
             self._best.since += 1
             self._fitter.has_ended = 0 < self._options.patience <= self._best.since
-
-    def _progress(self) -> TuningStep:
-        assert self._best is not None
-        fitter, validation = self._fitter, self._log["validations"][-1]
-        return TuningStep(
-            fitter.iteration,
-            fitter.iterations,
-            fitter.take_window()[0],
-            validation["psnr"],
-            self._best.psnr,
-            validation["size_bytes"],
-            fitter.seconds,
-            fitter.seconds_left,
-        )
 
     def _save(self, path: str | Path) -> None:
         assert self._best is not None

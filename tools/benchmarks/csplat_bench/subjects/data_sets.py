@@ -36,10 +36,10 @@ from csplat_bench.suites import Case
 from csplat_render.lpips import load_lpips
 from csplat_tools.console import note
 from csplat_trainer.data import DataSet, load
+from csplat_trainer.fitter import FitStep
 from csplat_trainer.posed_images import image_scorer
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import TrainOptions
-from csplat_trainer.training_report import TrainingStep
 
 _NOTES = 5  # lines of progress of a training
 
@@ -93,7 +93,7 @@ def _train(ply: Path, data: DataSet, options: TrainOptions) -> dict[str, Any]:
         return {**known.get("options", {}), **known}
     every = max(1, options.iterations // _NOTES // options.log_every) * options.log_every
 
-    def show(now: TrainingStep) -> None:
+    def show(now: FitStep) -> None:
         if now.iteration % every == 0:
             note(f"{ply.stem}: {now.iteration}/{now.iterations}, {now.splat_count} splats, {now.seconds:.0f} s")
 
