@@ -36,6 +36,7 @@ from oracle import (
 )
 
 from csplat_render import Camera, rasteriser, render
+from csplat_render.contributions import Contributions
 from csplat_render.conventions import ALPHA_CAP, DILATION, UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.reference_rasteriser import render_exact
@@ -556,3 +557,19 @@ def test_ignored_sh_bands_have_no_gradient():
     g = rasteriser.backward(np.ones((VIEW.H, VIEW.W, 3)))
     assert np.abs(g.shN[:, :3]).max() > 0.0
     assert (g.shN[:, 3:] == 0.0).all()
+
+
+@pytest.mark.area(name="rasteriser")
+def test_colour_fits_of_degree_4_have_the_gradients_of_the_rasteriser():
+    arrays = random_splats(20, 4, seed=5)
+    splats, count = UncheckedSplats(**arrays), 20
+    fit = Contributions(np.float64)
+    view = fit.project_view(splats, VIEW)
+    coefficients = np.concatenate([arrays["sh0"][:, None], arrays["shN"]], axis=1).astype(np.float32)
+    gradient, diagonal = np.zeros((count, 25, 3), np.float32), np.zeros((count, 25), np.float32)
+    lit = view.shape[:, 6:9] > 0.0
+    rgb = fit.backproject(view, coefficients, lit, gradient, diagonal, offset=0.5, background=np.zeros(3))
+    plain = Rasteriser(dtype=np.float64)
+    np.testing.assert_allclose(plain.forward(splats, VIEW).rgb, rgb, atol=1e-6)
+    wanted = plain.backward(rgb)
+    np.testing.assert_allclose(gradient[:, 1:], wanted.shN, atol=1e-5 * np.abs(wanted.shN).max())
