@@ -163,8 +163,11 @@ class TargetSearch:
             self._finish(self.whole, coding)
             self._try_presets(coding)
         else:
-            subset, coding = self._choose_splats(self.pruner)
+            subset, coding, larger = self._choose_splats(self.pruner)
             while not self._finish(subset, coding):
+                if larger:
+                    subset, coding = larger.pop()
+                    continue
                 another = self.pruner.refit(self._count_beyond(len(subset.model)))
                 if len(another.model) == len(subset.model):
                     break
@@ -177,8 +180,11 @@ class TargetSearch:
 
     # The number of splats
 
-    def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding]:
-        """Return the refitted splats and the coding with the least expected cost."""
+    def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding, list[tuple[Subset, Coding]]]:
+        """Return the refitted splats and the coding with the least expected cost, and larger ones in decreasing order.
+
+        Fewer splats have to promise something, since the error that is left to quantisation is less certain.
+        """
         kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
         coding: Coding | None = None
         chosen_at = 0.0
@@ -199,7 +205,12 @@ class TargetSearch:
                 break
             if any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
                 break
-        return min(tried, key=lambda one: (one[0], -len(one[1].model)))[1:]
+        tried.sort(key=lambda one: -len(one[1].model))
+        best = 0
+        for number, (cost, _, _) in enumerate(tried):
+            best = number if cost < tried[best][0] - _WORTH else best
+        larger = [(subset, coding) for _, subset, coding in tried[:best] if self.goal.size_bytes is None]
+        return *tried[best][1:], larger
 
     def _took_too_much(self, subset: Subset, coding: Coding) -> bool:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
