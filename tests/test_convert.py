@@ -75,7 +75,9 @@ def test_degree_4_is_converted_and_encoded_with_fewer_bands(tmp_path, ply):
     call("verify", tmp_path / "a.csplat", "--source", tmp_path / "4.ply")
     call("convert", tmp_path / "4.ply", tmp_path / "c.ply")
     assert np.array_equal(read_ply(tmp_path / "4.ply").shN, read_ply(tmp_path / "c.ply").shN)
-    assert "SH band 4" in call("convert", tmp_path / "4.ply", tmp_path / "c.sog").stderr
+    for suffix in ("sog", "spz", "glb"):
+        assert "SH band 4" in call("convert", tmp_path / "4.ply", tmp_path / f"c.{suffix}").stderr
+        assert 3 == csplat.read(tmp_path / f"c.{suffix}").sh_degree
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from csplat.decoder import Limits, open_tiles
 from csplat.editing.transform import convert_axes, rotate_scene, scale_scene, translate_scene
 from csplat.errors import InputError
-from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene
+from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, write_scene
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel
@@ -277,7 +277,7 @@ def convert_file(
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {result.losses()}")
         if not dry_run:
-            writes.write(Path(target), with_progress(scene, "reading", progress))
+            write_scene(target, with_progress(scene, "reading", progress), writes.name)
             result = replace(result, size_bytes=size_on_disk(Path(target)))
         return replace(result, findings=tuple(reader.findings))
 
