@@ -9,7 +9,7 @@ How a target is met:
    until none is expected to be smaller (`_choose_coding`). Drafts of a coding give its bytes and error as functions of
    the precision (`RateLine`), and so its bytes on the goal (`_predict`).
 3. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
-   save enough, it is tried as well (`_next_count`). No draft is made of splats whose pruning takes too much of the error.
+   save enough, it is tried as well (`_next_count`). Splats whose pruning takes too much of the error get no drafts.
 4. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
    goal, which corrects the prediction of the precision, until another file would hardly be smaller (`_finish`). If none
    meets the goal, more splats are taken: those of step 3, or others.
