@@ -7,7 +7,7 @@ import json
 import math
 import re
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,6 +28,7 @@ from csplat_render import render
 from csplat_render.camera_files import save_cameras
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
+from csplat_tools.optimise.pruning import Pruner
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.training import tuning_run
 from csplat_tools.training.tuning_report import ply_splat_bytes
@@ -671,6 +672,30 @@ def test_a_target_size_is_met(capture, whole, tmp_path, share, splats, monkeypat
     facts = tuned_facts(capture, out, *SMALL, "--target-size", f"{size}B")
     assert 0.85 * size < out.stat().st_size == facts["size_bytes"] <= size
     assert splats[0] <= facts["splats"] <= splats[1]
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_fits")
+def test_one_pruning_order_serves_all_numbers_of_splats(capture, tmp_path, monkeypatch):
+    change_options(monkeypatch, ENCODE_OPTIONS, **SCALAR)
+    orders, counts = [], []
+
+    class Counted(Pruner):
+        @cached_property
+        def order(self):
+            orders.append(len(self.source))
+            return super().order
+
+        def refit(self, kept_count):
+            counts.append(kept_count)
+            return super().refit(kept_count)
+
+    monkeypatch.setattr("csplat_tools.optimise.simplify.Pruner", Counted)
+    facts = tuned_facts(capture, tmp_path / "s.csplat", *SMALL, "--target-size", "2300B")
+    assert counts == sorted(counts, reverse=True)
+    assert len(counts) > 1
+    assert [300] == orders
+    assert counts[-1] == facts["splats"]
 
 
 def test_an_impossible_target_size_is_refused(capture, source, tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -24,9 +24,10 @@ from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.console import format_bytes, note, progress_bar, step_progress
 from csplat_tools.file_streams import write_array, write_bytes
 from csplat_tools.importance_file import read_importance
+from csplat_tools.optimise.pruning import Pruner
 from csplat_tools.optimise.rate_distortion import BYTES_PER_DB
 from csplat_tools.optimise.scene_sensitivity import measure_views
-from csplat_tools.optimise.simplify import SimplifyOptions, simplify
+from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.training.tuning_report import (
     describe_step,
@@ -126,7 +127,7 @@ def run_finetuning(
         files: checkpoints.
         target: as for `choose_and_finetune`; or a PSNR, for which several files are made without checkpoints, and the
             smallest that reaches it is written.
-        prune_unseen, importance: as for `choose_splats`.
+        prune_unseen, importance: as for `choose_and_finetune`.
         source_index: a .npy file to write: the index in the scene of each splat of the file.
         lpips: computes LPIPS; `None`: it is not computed.
         known: as for `score_models`.
@@ -219,29 +220,28 @@ def choose_and_finetune(
         target: largest size of the file: splats are pruned and lambda is raised until it fits. Or the fraction of the
             splats to keep. `None`: keep all.
         files: checkpoints.
-        prune_unseen, importance: as for `choose_splats`.
+        prune_unseen: prune splats that no training or validation view shows; `None`: only if the views have images.
+        importance: a file with the importance of the source's splats; `None`: as for `SplatChooser`.
         progress, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
-        InputError: no file is small enough.
-        CsplatError: as for `choose_splats` and `csplat_trainer.finetune`.
+        InputError: no file is small enough, no view shows any splat, or the file with the importance is invalid or
+            belongs to another scene.
+        CsplatError: as for `csplat_trainer.finetune`.
     """
     timer, size_bytes = StageTimer(), None if target is None else target.size_bytes
-    effort = Target.effort if target is None else target.effort
-
-    def choose(share: float | None) -> TuningSubset:
-        return choose_splats(
-            source, views, None if share is None else Target(keep=share, effort=effort), prune_unseen=prune_unseen,
-            importance=importance, threads=encoding.threads, progress=progress,
-        )  # fmt: skip
-
+    simplify_options = SimplifyOptions(
+        effort=Target.effort if target is None else target.effort, threads=encoding.threads
+    )
     with timer.stage("choosing"):
         tuning_views = training_views(source, views, encoding.threads)
-        chosen = choose(None if target is None else target.keep)
+        chooser = SplatChooser(
+            source, views, simplify_options, bool(views.images) if prune_unseen is None else prune_unseen,
+            _read_importance(importance, source), progress,
+        )  # fmt: skip
+        chosen = chooser.choose(target.count(len(source)) if target is not None and target.keep is not None else None)
         if size_bytes is not None:
-            chosen, encoding = _fit_to_size(
-                chosen, encoding, size_bytes, lambda count: choose(count / len(source)), progress
-            )
+            chosen, encoding = _fit_to_size(chosen, encoding, size_bytes, chooser.choose, progress)
     outputs, tries = files or Outputs(), _TRIES
     while True:
         made = csplat_trainer.finetune(
@@ -257,7 +257,7 @@ def choose_and_finetune(
         outputs = replace(outputs, resume=None)  # the checkpoint is of a tuning of more splats
         share = (size_bytes / len(made.data)) ** 2 / _FEWER
         with timer.stage("choosing"):
-            chosen = choose(max(1, int(share * len(chosen.model))) / len(source))
+            chosen = chooser.choose(max(1, int(share * len(chosen.model))))
 
 
 def _tune_to_psnr(target: Target, make: Callable[[Target | None], TunedSubset], *, quiet: bool) -> TunedSubset:
@@ -422,67 +422,87 @@ def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> T
     )
 
 
-def choose_splats(
-    source: SplatModel,
-    views: ViewSet,
-    target: Target | None = None,
-    *,
-    prune_unseen: bool | None = None,
-    importance: str | None = None,
-    threads: int | None = None,
-    progress: Progress | None = None,
-) -> TuningSubset:
-    """Prune splats that no view shows and those of low importance, and measure the importance of the others.
+@dataclass(eq=False)
+class SplatChooser:
+    """Chooses the splats to encode and tune, and measures their importance.
 
-    Args:
+    Attributes:
         source: the scene.
         views: the views; importance is measured in training views.
-        target: fraction of the splats to keep; `None`: keep all.
-        prune_unseen: prune splats that no training or validation view shows; `None`: only if the views have images.
-        importance: a file with the importance of the source's splats; `None`: measure it in the training views, as
+        options: options of pruning and refitting.
+        prune_unseen: prune splats that no training or validation view shows.
+        importance: importance of the source's splats; `None`: measure it in the training views, as
             `csplat sensitivity` does.
-        threads: number of threads; `None` for all.
         progress: progress callback.
-
-    Raises:
-        InputError: no view shows any splat; or the file is invalid, or belongs to another scene.
     """
-    measuring = views.training[:VIEW_COUNT] if views.virtual else views.training
-    all_views = [*views.training, *views.validation]
 
-    def measure(model: SplatModel) -> Sensitivity:
+    source: SplatModel
+    views: ViewSet
+    options: SimplifyOptions
+    prune_unseen: bool
+    importance: NDArray[Any] | Importance | None = None
+    progress: Progress | None = None
+    _candidates: I64 = field(init=False)
+
+    def choose(self, kept_count: int | None = None) -> TuningSubset:
+        """Prune splats that no view shows, and those of low importance.
+
+        Args:
+            kept_count: largest number of splats to keep; `None`: all that are seen.
+
+        Raises:
+            InputError: no view shows any splat.
+        """
+        source, given = self.source, self.importance
+        measured = self._measure(source) if given is None and kept_count is None else None
+        if not hasattr(self, "_candidates"):
+            self._candidates = self._seen(measured)
+        rows = self._candidates
+        model = source.select(rows)
+        pruning = {"unseen": len(source) - len(rows)}
+        if kept_count is not None:
+            pruning["simplified_from"] = len(rows)
+            if kept_count < len(rows):
+                kept = self._pruner.refit(kept_count)
+                model, rows = kept.model, rows[kept.rows]
+        if given is not None:
+            weights = given.select(rows) if isinstance(given, Importance) else given[rows]
+        elif measured is not None:
+            weights = StoredSensitivity.of(source, measured).importance().select(rows)
+        else:
+            weights = StoredSensitivity.of(model, self._measure(model)).importance()
+        return TuningSubset(model, rows, weights, pruning)
+
+    @property
+    def _measuring(self) -> Sequence[Camera]:
+        """The views in which importance is measured, and to whose renders kept splats are fitted."""
+        return self.views.training[:VIEW_COUNT] if self.views.virtual else self.views.training
+
+    @cached_property
+    def _pruner(self) -> Pruner:
+        """The pruner of the splats to choose from; it keeps views, renders and pruning order for the next number."""
+        views = with_validation_views(replace(self.views, training=self._measuring, test=()))
+        return self.options.pruner(self.source.select(self._candidates), views, progress=self.progress)
+
+    def _measure(self, model: SplatModel) -> Sensitivity:
         return measure_views(
-            model, measuring, views.background, matrices=True, magnitudes=False, threads=threads, progress=progress
-        )
+            model, self._measuring, self.views.background, matrices=True, magnitudes=False,
+            threads=self.options.threads, progress=self.progress,
+        )  # fmt: skip
 
-    given = _read_importance(importance, source)
-    prune = bool(views.images) if prune_unseen is None else prune_unseen
-    found = measure(source) if given is None and target is None else None
-    if found is not None and not (prune and len(measuring) < len(all_views)):
-        seen = found.seen
-    else:
-        seen = measure_pruning_error(
-            source, all_views, background=views.background, threads=threads, progress=progress
-        ).seen
-    if not seen.any():
-        raise InputError("no view shows any splat: check that the cameras belong to the scene")
-    rows = np.flatnonzero(seen) if prune else np.arange(len(source))
-    model, pruning = source.select(rows), {"unseen": len(source) - len(rows)}
-    if target is not None:
-        simplify_views = with_validation_views(replace(views, training=measuring, test=()))
-        assert target.keep is not None
-        pruning, share = {**pruning, "simplified_from": len(rows)}, target.keep * len(source) / len(rows)
-        if share < 1.0:
-            simplified = simplify(
-                model, replace(target, keep=share), views=simplify_views,
-                options=SimplifyOptions(effort=target.effort, threads=threads), progress=progress,
-            )  # fmt: skip
-            model, rows = simplified.model, rows[simplified.source_index]
-    if given is not None:
-        return TuningSubset(model, rows, given.select(rows) if isinstance(given, Importance) else given[rows], pruning)
-    if found is not None:
-        return TuningSubset(model, rows, StoredSensitivity.of(source, found).importance().select(rows), pruning)
-    return TuningSubset(model, rows, StoredSensitivity.of(model, measure(model)).importance(), pruning)
+    def _seen(self, measured: Sensitivity | None) -> I64:
+        """Return the indices of the splats to choose from, ascending; `measured` is for the whole scene."""
+        cameras = [*self.views.training, *self.views.validation]
+        if measured is not None and not (self.prune_unseen and len(self._measuring) < len(cameras)):
+            seen = measured.seen
+        else:
+            seen = measure_pruning_error(
+                self.source, cameras, background=self.views.background, threads=self.options.threads,
+                progress=self.progress,
+            ).seen  # fmt: skip
+        if not seen.any():
+            raise InputError("no view shows any splat: check that the cameras belong to the scene")
+        return np.flatnonzero(seen) if self.prune_unseen else np.arange(len(self.source))
 
 
 def _read_importance(importance: str | None, source: SplatModel) -> NDArray[Any] | Importance | None:
