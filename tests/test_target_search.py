@@ -22,7 +22,7 @@ JUMPING = AnalyticScene(jump=0.5)
 SCENES = {
     "plain": PLAIN, "many unneeded splats": UNNEEDED, "no splat to spare": NONE_TO_SPARE,
     "useless codebooks": NO_CODEBOOK, "without SH": WITHOUT_SH, "jumps": JUMPING,
-    "cheap codebooks": AnalyticScene(index_bytes=0.5, entry_bytes=2.0), "few bytes per dB": AnalyticScene(rate=0.03),
+    "cheap codebooks": AnalyticScene(index_bytes=0.5, entry_bytes=2.0), "few bytes per dB": AnalyticScene(rate=0.04),
     "many bytes per dB": AnalyticScene(rate=0.07), "quality far from renders": AnalyticScene(lost=16.0),
 }  # fmt: skip
 

@@ -695,7 +695,7 @@ def test_the_moving_average_covers_the_last_values():
 
 
 def test_options_out_of_range_are_refused():
-    wrong = {"max_splats": 0, "device": "mps", "sh_degree": 4, "loss": "l2", "lr_means": np.nan, "lr_means_final": 1.0}
+    wrong = {"max_splats": 0, "device": "mps", "sh_degree": 5, "loss": "l2", "lr_means": np.nan, "lr_means_final": 1.0}
     for name, value in wrong.items():
         with pytest.raises(InputError, match=r"expected|mps is not supported"):
             TrainOptions(**{name: value})

@@ -63,7 +63,7 @@ _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 # What is typical, without and with SH. It is assumed only until candidates show otherwise.
 _USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
 _ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
-_COUNT_BYTES_PER_DB = (0.05, 0.08)  # fraction of the bytes that a decibel costs if splats are added
+_COUNT_BYTES_PER_DB = (0.05, 0.07)  # fraction of the bytes that a decibel costs if splats are added
 _GAINS = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 _TUNING_GAINS = {"codebook": 1.2}  # dB that the refit through the quantisers gains; 0.7 for other codings
 _USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
