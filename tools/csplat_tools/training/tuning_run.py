@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -442,7 +442,8 @@ class SplatChooser:
     prune_unseen: bool
     importance: NDArray[Any] | Importance | None = None
     progress: Progress | None = None
-    _candidates: I64 = field(init=False)
+    _candidates: I64 | None = field(default=None, init=False)
+    _pruner: Pruner | None = field(default=None, init=False)
 
     def choose(self, kept_count: int | None = None) -> TuningSubset:
         """Prune splats that no view shows, and those of low importance.
@@ -455,14 +456,16 @@ class SplatChooser:
         """
         source, given = self.source, self.importance
         measured = self._measure(source) if given is None and kept_count is None else None
-        if not hasattr(self, "_candidates"):
-            self._candidates = self._seen(measured)
-        rows = self._candidates
+        rows = self._candidates if self._candidates is not None else self._seen(measured)
+        self._candidates = rows
         model = source.select(rows)
         pruning = {"unseen": len(source) - len(rows)}
         if kept_count is not None:
             pruning["simplified_from"] = len(rows)
             if kept_count < len(rows):
+                if self._pruner is None:  # it keeps views, renders and pruning order for the next number
+                    views = with_validation_views(replace(self.views, training=self._measuring, test=()))
+                    self._pruner = self.options.pruner(model, views, progress=self.progress)
                 kept = self._pruner.refit(kept_count)
                 model, rows = kept.model, rows[kept.rows]
         if given is not None:
@@ -477,12 +480,6 @@ class SplatChooser:
     def _measuring(self) -> Sequence[Camera]:
         """The views in which importance is measured, and to whose renders kept splats are fitted."""
         return self.views.training[:VIEW_COUNT] if self.views.virtual else self.views.training
-
-    @cached_property
-    def _pruner(self) -> Pruner:
-        """The pruner of the splats to choose from; it keeps views, renders and pruning order for the next number."""
-        views = with_validation_views(replace(self.views, training=self._measuring, test=()))
-        return self.options.pruner(self.source.select(self._candidates), views, progress=self.progress)
 
     def _measure(self, model: SplatModel) -> Sensitivity:
         return measure_views(
