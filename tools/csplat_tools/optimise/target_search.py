@@ -182,9 +182,10 @@ class TargetSearch:
     # The number of splats
 
     def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding, list[tuple[Subset, Coding]]]:
-        """Return the refitted splats and the coding with the least expected cost, and larger ones in decreasing order.
+        """Return the best refitted splats and coding, and those of more splats, most first.
 
-        Fewer splats have to promise something, since the error that is left to quantisation is less certain.
+        The best have the least expected cost, but fewer splats must promise `_WORTH` over more, since their cost is
+        less certain.
         """
         kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
         coding: Coding | None = None
@@ -209,7 +210,8 @@ class TargetSearch:
         tried.sort(key=lambda one: -len(one[1].model))
         best = 0
         for number, (cost, _, _) in enumerate(tried):
-            best = number if cost < tried[best][0] - _WORTH else best
+            if cost < tried[best][0] - _WORTH:
+                best = number
         larger = [(subset, coding) for _, subset, coding in tried[:best] if self.goal.size_bytes is None]
         return *tried[best][1:], larger
 
@@ -330,10 +332,8 @@ class TargetSearch:
         if encoding.sh_coding == "none" or not degree or encoding.sh_degree == 0:
             return [Coding("none")]
         coarse = subset.classifiable and not subset.refits and encoding.adaptive is None
-        scalar, book = (
-            Coding("scalar", adaptive=1.0 if coarse else None),
-            Coding("codebook", _USUAL_ENTRIES[subset.refits]),
-        )
+        scalar = Coding("scalar", adaptive=1.0 if coarse else None)
+        book = Coding("codebook", _USUAL_ENTRIES[subset.refits])
         if encoding.sh_coding != "auto":
             return [book if encoding.sh_coding == "codebook" else scalar]
         is_extreme = float(np.abs(self.whole.model.shN).max(initial=0.0)) > _LARGEST_SH
