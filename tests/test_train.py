@@ -6,7 +6,6 @@ import json
 import shutil
 import sys
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,14 +17,12 @@ from PIL import Image
 from posed_sets import to_opengl
 
 from csplat import decode, read_ply, write_ply
-from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Target, fix_quantisation
+from csplat.encoder import EncodeOptions, EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.training_record import TrainingRecord
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.training import tuning_run
 from csplat_tools.training.training_run import plan_training, tuning_after
-from csplat_tools.training.tuning_run import TuningSubset
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.fit_checkpoint import FitCheckpoint, load_checkpoint, save_checkpoint
@@ -438,78 +435,6 @@ def test_the_command_names_the_missing_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
     result = call("train", ".", tmp_path / "o.ply", status=1)
     assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)" == result.stderr.strip()
-
-
-USUAL = PRESETS["small"].quality[0]
-ENTRIES = 1024
-
-
-def bytes_of(count, options, per_db):
-    """Return a size: 1,000 bytes, 10 per splat at the preset's precision, and the bytes of additional entries."""
-    finer = 0.0 if options.attribute_psnr is None else options.attribute_psnr - USUAL
-    return round(1000 + 10 * count * np.exp(per_db * finer)) + 2 * max(0, (options.codebook_size or ENTRIES) - ENTRIES)
-
-
-@pytest.fixture
-def fit(make_model, monkeypatch):
-    """Return a function that fits 9,000 splats to a size: count, options, bytes of the draft, number of drafts."""
-
-    def run(size_bytes, *, per_db=0.045, options=None):
-        drafts = []
-
-        def draft(model, encoding, **_):
-            data = bytes(bytes_of(len(model), encoding, per_db))
-            drafts.append(len(data))
-            settings = {"codebook_size": ENTRIES, "sh_degree": model.sh_degree}
-            made = SimpleNamespace(data=data, report=SimpleNamespace(options=settings))
-            return SimpleNamespace(write=lambda: made)
-
-        monkeypatch.setattr(tuning_run, "EncodePlan", SimpleNamespace(of=draft))
-        monkeypatch.setattr(tuning_run, "encode_tiles", lambda plan, **_: plan)
-        whole = make_model(9000, 1)
-
-        def choose(count):
-            return TuningSubset(whole.select(np.arange(count)), np.arange(count), None, {})
-
-        options = options or EncodeOptions("small")
-        chosen, encoding = tuning_run._fit_to_size(choose(9000), options, size_bytes, choose, None)
-        return len(chosen.model), encoding, bytes_of(len(chosen.model), encoding, per_db), len(drafts)
-
-    return run
-
-
-@pytest.mark.parametrize("size", [30_000, 60_000, 85_000])
-def test_a_small_size_prunes_splats(fit, size):
-    count, encoding, draft, _ = fit(size)
-    assert 0.9 * size <= draft <= 1.021 * size
-    assert count < 9000
-    assert encoding.attribute_psnr is None or encoding.attribute_psnr > USUAL
-
-
-@pytest.mark.parametrize("per_db", [0.03, 0.045, 0.09])
-def test_a_large_size_gives_finer_steps_and_more_entries(fit, per_db):
-    count, encoding, draft, _ = fit(130_000, per_db=per_db)
-    assert 9000 == count
-    assert 130_000 / 1.031 <= draft <= 1.021 * 130_000
-    assert ENTRIES < encoding.codebook_size <= 9000 / 3
-
-
-def test_a_file_that_fits_is_unchanged(fit):
-    assert (9000, EncodeOptions("small"), 91_000, 1) == fit(92_000)
-
-
-def test_options_of_the_user_are_kept(fit):
-    book = fit(130_000, options=EncodeOptions("small", codebook_size=512))[1]
-    assert 512 == book.codebook_size
-    assert book.attribute_psnr > USUAL
-    exact = EncodeOptions("small", attribute_psnr=40.0)
-    assert exact == fit(130_000, options=exact)[1]
-
-
-def test_the_precision_is_limited(fit):
-    _, encoding, _, drafts = fit(10**7)
-    assert tuning_run._FINEST == encoding.attribute_psnr
-    assert 2 == drafts
 
 
 @pytest.fixture

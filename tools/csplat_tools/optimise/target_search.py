@@ -5,14 +5,16 @@ How a target is met:
 1. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
    gives the first number of splats; for a size, typical bytes per splat do (`_first_count`). These splats are refitted
    to renders of the source.
-2. Drafts of these splats are encoded with one coding of SH after another: each neighbour of the best coding is tried
-   until none is expected to be smaller (`_choose_coding`). Drafts of a coding give its bytes and error as functions of
-   the precision (`RateLine`), and so its bytes on the goal (`_predict`).
+2. Drafts of these splats, which are files without a refit through their quantisers, are encoded with one coding of SH
+   after another: each neighbour of the best coding is tried until none is expected to be smaller, or `_CODINGS` were
+   tried (`_choose_coding`). Drafts of a coding give its bytes and error as functions of the precision (`RateLine`), and
+   so its bytes on the goal (`_predict`).
 3. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
-   save enough, it is tried as well (`_next_count`). Splats whose pruning takes too much of the error get no drafts.
+   save enough, it is tried as well (`_next_count`). For a PSNR or a drop, splats whose pruning takes too much of the
+   error get no drafts.
 4. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
    goal, which corrects the prediction of the precision, until another file would hardly be smaller (`_finish`). If none
-   meets the goal, more splats are taken: those of step 3, or others.
+   meets the goal, more splats are taken: those of step 3, or others; for a size, fewer.
 
 Candidates are compared by their error on validation views. The views of the goal, which are the test views for a PSNR,
 only tell how much error is left there (`_allowed`): they settle precision and number of splats. With all splats kept,
@@ -41,8 +43,8 @@ from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
 from csplat_tools.optimise.rate_distortion import (
     BYTES_PER_DB,
     LEAST_QUANTISED,
+    LOG_ERROR_PER_DB,
     MOST_PRUNED,
-    NEPERS,
     NOTHING,
     RateLine,
     RatePoint,
@@ -56,33 +58,34 @@ from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 
-#: Cost of a target in renders of 640x480, without pruning; with pruning, a fixed part and one that grows with effort.
+#: Cost of a target in renders of a test view: without pruning; with it, a fixed part and one that grows with effort.
 _RENDERS = 520.0
 _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 
 # What is typical, without and with SH. It is assumed only until candidates show otherwise.
 _USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
-_ATTRIBUTE_GAIN = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
-_COUNT_BYTES_PER_DB = (0.05, 0.07)  # fraction of the bytes that a decibel costs if splats are added
-_GAINS = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
-_TUNING_GAINS = {"codebook": 1.2}  # dB that the refit through the quantisers gains; 0.7 for other codings
+_PRECISION_OFFSET = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
+_COUNT_BYTES_PER_DB = (0.05, 0.07)  # change of log bytes per dB, for the choice of the number of splats
+_PSNR_PER_PRECISION = {"codebook": 0.6}  # dB per dB of precision, hence also of bytes; 1 for other codings
+_TUNING_GAINS = {"codebook": 1.2}  # dB of the whole error by the refit through the quantisers; 0.7 for other codings
 _USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
 
 # What is tried.
 _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
 _ENTRIES = (1 / 4096, 1 / 4)  # range of the codebook entries per splat
-_TRIES, _CODINGS = 3, 10  # most splat counts, most drafts of one coding, and most codings at the default effort
+_ROUNDS = 3  # most rounds of the first prediction of the count, most splat counts, most drafts of one coding
+_CODINGS = 10  # most codings at the default effort
 _FILES = (8, 4)  # most files on the goal, of all splats and of refitted ones, which take a refit each
 _MOST_DROPPED = 0.35  # largest fraction of the error left to quantisation that dropping SH bands may take
-_FARTHEST = 3.0  # largest factor between the errors of pruning of two splat counts, since they are extrapolated
-_BEYOND = 1.4  # factor of the number of splats if no file of a number meets the goal
+_FARTHEST = 3.0  # largest factor by which the error of pruning may rise to the next count, since it is extrapolated
+_BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squared and inverse for a size
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
 
 # What is near, and what is worth another candidate.
-_AIM = (0.06, 0.12)  # dB above a PSNR that files of all and of refitted splats aim at; PSNR varies by this by chance
+_AIM = (0.06, 0.12)  # dB above a PSNR that files of all and of refitted splats aim at, since PSNR varies by chance
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; another coding may be better there
 _JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
-_CLOSE = 0.1  # fraction of the bytes; a codebook worse by less may win with another size
+_CLOSE = 0.1  # fraction of the bytes; of a codebook that is worse by more, only a larger size is tried
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 _WORTH_FILE = 0.01  # fraction of the bytes that another file of the same splats and coding must promise
 
@@ -143,6 +146,8 @@ class TargetSearch:
         whole: all splats.
         pruner: prunes splats; `None`: all are kept.
         work: amount of work relative to the default effort.
+        _errors: mean squared error before quantisation, by subset, SH degree, and True on the views of the goal.
+        _pruned: measured mean squared error of pruning after the refit, by number of splats.
     """
 
     goal: Goal
@@ -179,6 +184,13 @@ class TargetSearch:
             raise InputError(self._out_of_reach())
         return min(met, key=lambda one: one.size_bytes if self.goal.size_bytes is None else one.error)
 
+    def best_draft(self) -> tuple[Candidate, float]:
+        """Return the draft of the best splats, coding and precision, and its expected error after another refit."""
+        assert self.pruner is not None
+        subset, coding, _ = self._choose_splats(self.pruner)
+        draft = self.pool.make(subset, coding, self._predict(subset, coding)[0], draft=True)
+        return draft, self._expected(draft, draft.error)
+
     # The number of splats
 
     def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding, list[tuple[Subset, Coding]]]:
@@ -190,7 +202,7 @@ class TargetSearch:
         kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
         coding: Coding | None = None
         chosen_at = 0.0
-        for left in reversed(range(_TRIES)):
+        for left in reversed(range(_ROUNDS)):
             subset = pruner.refit(kept_count)
             usual = self._first_codings(subset)[-1]
             if left and self.work >= 1.0 and self._took_too_much(subset, usual):
@@ -228,11 +240,11 @@ class TargetSearch:
             usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
             return self._rounded(min(self.goal.size_bytes / usual, splats))
         allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
-        for _ in range(_TRIES):  # pruning errors in validation views differ from those in training views
+        for left in reversed(range(_ROUNDS)):  # pruning errors in validation views differ from those in training views
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
             before, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
-            if abs(kept_count - before) <= _WORTH * splats:
+            if not left or abs(kept_count - before) <= _WORTH * splats:
                 break
             pruned = self.whole.model.select(pruner.order.kept(kept_count))
             known = {kept_count: error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)}
@@ -303,7 +315,7 @@ class TargetSearch:
         if best is not None:  # its codebook may be too small for any precision
             quality = min(self._predict(subset, best)[0], quality + _FAR)
         cost = math.inf
-        for _ in range(_TRIES):
+        for _ in range(_ROUNDS):
             made = self.pool.make(subset, coding, quality, draft=True)
             if not costs:
                 self._score(made)
@@ -322,7 +334,7 @@ class TargetSearch:
                     return _clipped(line.quality_at_error(self._rest(subset, coding)))
                 return _clipped(line.quality_at_size(size_bytes / len(subset.model) * len(other.subset.model)))
         if size_bytes is None:
-            return _clipped(psnr_of_mse(self._rest(subset, coding)) + _ATTRIBUTE_GAIN[coding.sh != "none"])
+            return _clipped(psnr_of_mse(self._rest(subset, coding)) + _PRECISION_OFFSET[coding.sh != "none"])
         usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
         return _clipped(_USUAL_QUALITY + math.log(size_bytes / len(subset.model) / usual) / BYTES_PER_DB)
 
@@ -417,8 +429,8 @@ class TargetSearch:
         The line passes through the candidate nearest to the goal, a draft only if there is no other. Slopes are
         measured on files of one kind if there are two, first on drafts.
         """
-        gain, line = _GAINS.get(coding.sh or "", 1.0), None
-        slopes = (-gain * NEPERS, gain * BYTES_PER_DB)
+        gain, line = _PSNR_PER_PRECISION.get(coding.sh or "", 1.0), None
+        slopes = (-gain * LOG_ERROR_PER_DB, gain * BYTES_PER_DB)
         for draft in (True, False):
             made = self._by_distance(subset, coding, draft=draft)
             if made:

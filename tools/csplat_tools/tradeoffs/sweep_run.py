@@ -337,9 +337,9 @@ def _tune(setting: SweepSetting, sweep: SweepOptions, keep: float | None, progre
         "steps": made.log["steps"],
         "best_step": made.log["best_iteration"],
         "keep": keep,
-        **tuned.subset.pruning,
+        **tuned.pruning,
     }
-    return SweepFile(made.data, {"encoding": made.result.report.options, "finetune": settings}, tuned.seconds)
+    return SweepFile(made.data, {"encoding": made.result.report.options, "finetune": settings}, dict(tuned.seconds))
 
 
 def _tuning_views(setting: SweepSetting) -> ViewSet:

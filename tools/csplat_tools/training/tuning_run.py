@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from typing import Any, Protocol, TypeVar
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import PRESETS, EncodeOptions, EncodePlan, Importance, Origin, Target, encode_tiles
+from csplat.encoder import EncodeOptions, Importance, Origin, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import I64, Progress
@@ -21,13 +21,16 @@ from csplat_render import Camera
 from csplat_render.kernels import thread_count
 from csplat_render.metrics import Distance
 from csplat_render.pruning_error import measure_pruning_error
-from csplat_tools.console import format_bytes, note, progress_bar, step_progress
+from csplat_render.scorer import Scorer
+from csplat_tools.console import progress_bar, step_progress
 from csplat_tools.file_streams import write_array, write_bytes
 from csplat_tools.importance_file import read_importance
-from csplat_tools.optimise.pruning import Pruner
-from csplat_tools.optimise.rate_distortion import BYTES_PER_DB
+from csplat_tools.optimise.candidates import CandidatePool, WholeScene
+from csplat_tools.optimise.pruning import PrunedSubset, Pruner
+from csplat_tools.optimise.rate_distortion import error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import measure_views
 from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.target_search import Goal, TargetSearch, check_target
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.training.tuning_report import (
     describe_step,
@@ -36,9 +39,9 @@ from csplat_tools.training.tuning_report import (
     show_views,
     write_training_page,
 )
-from csplat_tools.views import VIEW_COUNT, ViewSet, with_validation_views
+from csplat_tools.views import VIEW_COUNT, ViewSet, shrink_cameras, with_validation_views
 from csplat_trainer.fitter import FitStep
-from csplat_trainer.sensitivity import Sensitivity
+from csplat_trainer.posed_images import PosedImage, image_scorer
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning import (
@@ -65,20 +68,10 @@ SPLAT_BYTES = 10
 #: Number and size of virtual training views, used without images: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
-_WITHIN = 1.02  # factor by which a draft may be too large: the tuning saves this much without loss of quality
-_FINE_ENOUGH = 1.03  # factor by which a draft may be too small: finer steps would gain little
-_TRIES = 3  # splat counts to try, each predicted from the last file; also quantisation steps, and tunings
-_FIXED = 1.2  # exponent from a factor of bytes to a factor of splats: some bytes do not depend on splats
-_FEWER = 1.08  # divisor of the number of splats if a tuned file is too large
-_ENTRIES_DOUBLE = 6.0  # dB of attribute PSNR at which twice the entries of an SH codebook pay
-_BYTE_ENTRIES = 255  # SH codebooks of more entries grow with precision
-_MOST_ENTRIES, _SPLATS_PER_ENTRY = 1 << 15, 3  # limits of their growth: entries; least splats per entry
-_FINEST = 70.0  # dB of attribute PSNR at which renders equal the scene's
-
-_PER_DOUBLING = 1.25  # assumed gain in dB per doubling of the size, with only one file
-_SLOPE_RANGE = (0.3, 12.0)  # range of the same if measured on two files
-_NEAR_ENOUGH = 0.1  # dB above the target at which the search ends
-_SIZE_TRIES, _FARTHEST = 5, 2.0  # files after the first; largest change of size from the nearest file, in doublings
+_AIM = 0.05  # dB above a PSNR that tuned files aim at
+_WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
+_FINER = 0.25  # least factor of the error of the goal from one tuning to the next
+_TUNINGS = 4  # largest number of tunings for a target
 
 _VALIDATION_EVERY = 8  # every Nth virtual view is a validation view
 _MOST_VALIDATION = 16  # validation views, at most
@@ -87,7 +80,7 @@ _MOST_VALIDATION = 16  # validation views, at most
 def default_validation_count(count: int, *, cameras: str | None, data: object | None) -> int | None:
     """Return the default `validation_count` of `find_view_set` for a tuning.
 
-    With images it is 0, since `training_views` splits the training views.
+    With images it is 0, since `Tuner.tuning_views` splits the training views.
 
     Args:
         count: number of virtual training views.
@@ -125,9 +118,7 @@ def run_finetuning(
         encoding: options of the encoder.
         options: options of the tuning.
         files: checkpoints.
-        target: as for `choose_and_finetune`; or a PSNR, for which several files are made without checkpoints, and the
-            smallest that reaches it is written.
-        prune_unseen, importance: as for `choose_and_finetune`.
+        target, prune_unseen, importance: as for `choose_and_finetune`.
         source_index: a .npy file to write: the index in the scene of each splat of the file.
         lpips: computes LPIPS; `None`: it is not computed.
         known: as for `score_models`.
@@ -144,20 +135,14 @@ def run_finetuning(
     """
     encoding.kept_degree(source.sh_degree)
     threads = encoding.threads
-    if target is not None:
-        target.require("finetune", "psnr", "size_bytes", "keep")
     with thread_count(threads):
         prepare_renderer(quiet=quiet, gradients=True)
         with progress_bar(quiet=quiet) as progress, step_progress("tuning", describe_step, quiet=quiet) as show:
-            make = partial(
-                choose_and_finetune, source, views, encoding, options, prune_unseen=prune_unseen, importance=importance,
+            tuned = choose_and_finetune(
+                source, views, encoding, options, target, files=files, prune_unseen=prune_unseen, importance=importance,
                 progress=progress, on_step=show,
             )  # fmt: skip
-            if target is None or target.psnr is None:
-                tuned = make(target, files=files)
-            else:
-                tuned = _tune_to_psnr(target, make, quiet=quiet)
-        made, timer = tuned.made, StageTimer(tuned.seconds)
+        made, timer = tuned.made, StageTimer(dict(tuned.seconds))
         write_bytes(output, made.data)
         if source_index is not None:
             write_array(source_index, made.result.source_index)
@@ -165,7 +150,7 @@ def run_finetuning(
             models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
             scores = score_models(source, models, views, lpips, threads, known=known)
         shown = [] if page is None else show_views(source, models, views, threads)
-    report = make_tuning_report(source, made.plain, made.result, scores, made.log, timer.seconds, tuned.subset.pruning)
+    report = make_tuning_report(source, made.plain, made.result, scores, made.log, timer.seconds, tuned.pruning)
     report["log"] = made.log
     if page is not None:
         write_training_page(page, output, training, report, shown)
@@ -177,14 +162,14 @@ class TunedSubset:
     """A tuned file of some of a scene's splats.
 
     Attributes:
-        subset: the splats.
         made: the file.
-        seconds: time by stage.
+        pruning: report on the pruned splats, JSON-compatible.
+        seconds: time by stage, of all files that were tuned.
     """
 
-    subset: TuningSubset
     made: TunedFile
-    seconds: dict[str, float]
+    pruning: Mapping[str, Any]
+    seconds: Mapping[str, float]
 
     @property
     def size_bytes(self) -> int:
@@ -195,6 +180,185 @@ class TunedSubset:
     def psnr(self) -> float:
         """PSNR on the validation views, pooled, dB."""
         return float(self.made.log["best_psnr"])
+
+
+@dataclass(eq=False)
+class Tuner:
+    """Tunes files of a scene to the same views.
+
+    Attributes:
+        source: the scene.
+        views: the views; files are tuned to training views.
+        encoding, options: options of the encoder and of the tuning.
+        outputs: checkpoints; the first file resumes from them.
+        prune_unseen: splats that no training or validation view shows are pruned.
+        effort: amount of work of pruning and refitting, 1 to 9.
+        importance: importance of the source's splats; `None`: that of each file's splats is measured in the training
+            views, as `csplat sensitivity` does.
+        progress, on_step: as for `csplat_trainer.finetune`.
+    """
+
+    source: SplatModel
+    views: ViewSet
+    encoding: EncodeOptions
+    options: FinetuneOptions
+    outputs: Outputs
+    prune_unseen: bool
+    effort: int
+    importance: NDArray[Any] | Importance | None = None
+    progress: Progress | None = None
+    on_step: Callable[[FitStep], None] | None = None
+    _timer: StageTimer = field(default_factory=StageTimer, init=False)
+
+    @cached_property
+    def tuning_views(self) -> TuningViews:
+        """Training and validation views with their images, or renders of the scene if there are none.
+
+        Without validation views, some training views become validation views.
+        """
+        views, background = self.views, np.array(self.views.background, np.float32)
+
+        def as_views(cameras: Sequence[Camera]) -> list[TuningView]:
+            if views.images:
+                return [TuningView(one.camera, one) for one in views.images_of(cameras)]
+            return renders_of(self.source, cameras, background, self.encoding.threads)
+
+        training = as_views(views.training)
+        if views.validation:
+            return TuningViews(training, as_views(views.validation), background)
+        return split_views(training, background)
+
+    @cached_property
+    def rows(self) -> I64:
+        """[M] int64, the indices of the splats to choose from, ascending.
+
+        Raises:
+            InputError: no view shows any splat.
+        """
+        if not self.prune_unseen:
+            return np.arange(len(self.source))
+        found = measure_pruning_error(
+            self.source, [*self.views.training, *self.views.validation], background=self.views.background,
+            threads=self.encoding.threads, progress=self.progress,
+        )  # fmt: skip
+        if not found.seen.any():
+            raise InputError("no view shows any splat: check that the cameras belong to the scene")
+        return np.flatnonzero(found.seen)
+
+    @cached_property
+    def pruner(self) -> Pruner:
+        """The pruner of the splats to choose from; without validation views, some training views become such views."""
+        views = with_validation_views(replace(self.views, training=self._measuring, test=()))
+        options = SimplifyOptions(effort=self.effort, threads=self.encoding.threads)
+        return options.pruner(self.source.select(self.rows), views, use_classes=False, progress=self.progress)
+
+    @property
+    def _measuring(self) -> Sequence[Camera]:
+        """The views in which importance is measured, and to whose renders kept splats are fitted."""
+        return self.views.training[:VIEW_COUNT] if self.views.virtual else self.views.training
+
+    def tune_kept(self, kept_count: int | None) -> TunedSubset:
+        """Tune a file of this number of splats at most; `None`: of all that are not pruned as unseen."""
+        with self._timer.stage("choosing"):
+            rows = self.rows
+            if kept_count is not None and kept_count < len(rows):
+                kept = self.pruner.refit(kept_count)
+                model, rows = kept.model, rows[kept.rows]
+            else:
+                model = self.source.select(rows)
+        return self._tune(model, rows, self.encoding, None, is_pruned=kept_count is not None)
+
+    def _tune(
+        self, model: SplatModel, rows: I64, encoding: EncodeOptions, size_bytes: int | None, *, is_pruned: bool = True
+    ) -> TunedSubset:
+        """Tune a file.
+
+        Args:
+            model: its splats.
+            rows: [N] int64, their indices in the source, ascending.
+            encoding: options of the encoder.
+            size_bytes: largest size, to which the tuning adjusts lambda; `None`: none.
+            is_pruned: splats may have been pruned that a view shows.
+        """
+        with self._timer.stage("choosing"):
+            views, given = self.tuning_views, self.importance
+            if given is None:
+                measured = measure_views(
+                    model, self._measuring, self.views.background, matrices=True, magnitudes=False,
+                    threads=encoding.threads, progress=self.progress,
+                )  # fmt: skip
+                weights: NDArray[Any] | Importance = StoredSensitivity.of(model, measured).importance()
+            else:
+                weights = given.select(rows) if isinstance(given, Importance) else given[rows]
+        pruning = {"unseen": len(self.source) - len(self.rows)}
+        if is_pruned:
+            pruning["simplified_from"] = len(self.rows)
+        made = csplat_trainer.finetune(
+            model, views, encoding, self.options, size_bytes=size_bytes, importance=weights, source=self.source,
+            origin=Origin(len(self.source), rows), metadata=pruning, outputs=self.outputs, progress=self.progress,
+            on_step=self.on_step,
+        )  # fmt: skip
+        self.outputs = replace(self.outputs, resume=None)  # the checkpoint was of this file
+        for stage, seconds in made.seconds.items():
+            self._timer.seconds[stage] = round(self._timer.seconds.get(stage, 0.0) + seconds, 3)
+        return TunedSubset(made, pruning, self._timer.seconds)
+
+    def tune_to(self, target: Target) -> TunedSubset:
+        """Tune the best file of a size, or the smallest one of a PSNR on the validation views.
+
+        The search of `csplat encode` chooses splats, coding and precision by drafts, which are compared with renders of
+        the source. The best draft is tuned without becoming larger. The difference between the errors of the tuned file
+        and of the draft corrects the goal of another search.
+
+        Raises:
+            InputError: no file meets the target.
+        """
+        with self._timer.stage("choosing"):
+            pruner = self.pruner
+            cameras = shrink_cameras(pruner.views.validation, pruner.size)  # none that splats are refitted to
+            scorer = Scorer.of_source(pruner.source, cameras, self.views.background, threads=pruner.threads)
+            pool = CandidatePool(self.encoding, scorer, self.progress)
+            whole = WholeScene(pruner.source, None, None, None)
+            aim = math.inf if target.psnr is None else error_of_psnr(target.psnr + _AIM)
+            missed = 0.0 if target.psnr is None else self._image_error(pruner.source)
+            size_bytes = target.size_bytes
+        made, tuned, error = list[TunedSubset](), set[int](), aim
+        for _ in range(_TUNINGS):
+            error = max(aim - missed, _FINER * error)
+            goal = Goal(scorer, size_bytes, error)
+            with self._timer.stage("choosing"):
+                work = SimplifyOptions(effort=self.effort).work
+                draft, expected = TargetSearch(goal, pool, whole, pruner, work).best_draft()
+            met = [one.size_bytes for one in made if one.psnr >= (target.psnr or 0.0)]
+            if id(draft) in tuned or (met and draft.size_bytes > (1.0 - _WORTH) * min(met)):
+                break
+            tuned.add(id(draft))
+            subset = draft.subset
+            assert isinstance(subset, PrunedSubset)
+            most = target.size_bytes or draft.size_bytes
+            made.append(self._tune(subset.model, self.rows[subset.rows], draft.options, most))
+            if size_bytes is None:
+                missed = error_of_psnr(made[-1].psnr) - expected
+            elif made[-1].size_bytes <= most:
+                return made[-1]
+            else:
+                size_bytes = max(1, int(size_bytes * (most / made[-1].size_bytes) ** 2 * (1.0 - _WORTH)))
+        found = [one for one in made if target.psnr is not None and one.psnr >= target.psnr]
+        if found:
+            return min(found, key=lambda one: one.size_bytes)
+        if target.psnr is None:
+            smallest = min(one.size_bytes for one in made)
+            raise InputError(f"the smallest file has {smallest:,} bytes, more than {target.size_bytes:,}")
+        best = max(made, key=lambda one: one.psnr)
+        raise InputError(f"{target.psnr:g} dB cannot be reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
+
+    def _image_error(self, model: SplatModel) -> float:
+        """Return the mean squared error of a scene against the validation images; 0 without images."""
+        images = [one.reference for one in self.tuning_views.validation if isinstance(one.reference, PosedImage)]
+        if not images:
+            return 0.0
+        scorer = image_scorer(images, self.tuning_views.background, threads=self.encoding.threads)
+        return scorer.pooled(scorer.errors(model))
 
 
 def choose_and_finetune(
@@ -217,289 +381,29 @@ def choose_and_finetune(
         views: the views; the file is tuned to training views.
         encoding: options of the encoder.
         options: options of the tuning.
-        target: largest size of the file: splats are pruned and lambda is raised until it fits. Or the fraction of the
-            splats to keep. `None`: keep all.
-        files: checkpoints.
+        target: a size, a PSNR on the validation views, or the fraction of the splats to keep. `None`: keep all.
+        files: checkpoints; not used for a PSNR, for which several files may be tuned.
         prune_unseen: prune splats that no training or validation view shows; `None`: only if the views have images.
-        importance: a file with the importance of the source's splats; `None`: as for `SplatChooser`.
+        importance: a file with the importance of the source's splats; `None`: as for `Tuner`.
         progress, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
-        InputError: no file is small enough, no view shows any splat, or the file with the importance is invalid or
-            belongs to another scene.
+        InputError: no file meets the target, no view shows any splat, an option is set that the target determines, or
+            the file with the importance is invalid or belongs to another scene.
         CsplatError: as for `csplat_trainer.finetune`.
     """
-    timer, size_bytes = StageTimer(), None if target is None else target.size_bytes
-    simplify_options = SimplifyOptions(
-        effort=Target.effort if target is None else target.effort, threads=encoding.threads
-    )
-    with timer.stage("choosing"):
-        tuning_views = training_views(source, views, encoding.threads)
-        chooser = SplatChooser(
-            source, views, simplify_options, bool(views.images) if prune_unseen is None else prune_unseen,
-            _read_importance(importance, source), progress,
-        )  # fmt: skip
-        chosen = chooser.choose(target.count(len(source)) if target is not None and target.keep is not None else None)
-        if size_bytes is not None:
-            chosen, encoding = _fit_to_size(chosen, encoding, size_bytes, chooser.choose, progress)
-    outputs, tries = files or Outputs(), _TRIES
-    while True:
-        made = csplat_trainer.finetune(
-            chosen.model, tuning_views, encoding, options, size_bytes=size_bytes, importance=chosen.importance,
-            source=source, origin=Origin(len(source), chosen.rows), metadata=chosen.pruning, outputs=outputs,
-            progress=progress, on_step=on_step,
-        )  # fmt: skip
-        if size_bytes is None or len(made.data) <= size_bytes:
-            return TunedSubset(chosen, made, {**timer.seconds, **made.seconds})
-        tries -= 1
-        if not tries:
-            raise InputError(f"the smallest file has {len(made.data):,} bytes, more than {size_bytes:,}")
-        outputs = replace(outputs, resume=None)  # the checkpoint is of a tuning of more splats
-        share = (size_bytes / len(made.data)) ** 2 / _FEWER
-        with timer.stage("choosing"):
-            chosen = chooser.choose(max(1, int(share * len(chosen.model))))
-
-
-def _tune_to_psnr(target: Target, make: Callable[[Target | None], TunedSubset], *, quiet: bool) -> TunedSubset:
-    """Make files until one reaches a PSNR, and return it with the seconds of all."""
-    timer = StageTimer()
-
-    def made(size_bytes: int | None) -> TunedSubset:
-        found = make(None if size_bytes is None else Target(size_bytes=size_bytes, effort=target.effort))
-        for stage, seconds in found.seconds.items():
-            timer.seconds[stage] = round(timer.seconds.get(stage, 0.0) + seconds, 3)
-        if not quiet:
-            note(f"{format_bytes(found.size_bytes)}: {found.psnr:.2f} dB on the validation views")
-        return found
-
-    assert target.psnr is not None
-    return replace(smallest_reaching(target.psnr, made), seconds=timer.seconds)
-
-
-def _fit_to_size(
-    chosen: TuningSubset,
-    encoding: EncodeOptions,
-    size_bytes: int,
-    choose: Callable[[int], TuningSubset],
-    progress: Progress | None,
-) -> tuple[TuningSubset, EncodeOptions]:
-    """Return the splats and options of a draft close to a size: fewer splats, or finer steps."""
-
-    def size_factor(encoding: EncodeOptions) -> tuple[float, dict[str, Any]]:
-        """Return the allowed size divided by that of a draft, and the options that the encoder chose."""
-        plan = EncodePlan.of(
-            chosen.model, encoding, importance=chosen.importance, allow_classes=False, progress=progress
-        )
-        made = encode_tiles(plan, progress=progress).write()
-        return size_bytes / len(made.data), made.report.options
-
-    for _ in range(_TRIES):
-        share, settings = size_factor(encoding)
-        if share >= 1.0 / _WITHIN or len(chosen.model) == 1:
-            break
-        chosen = choose(max(1, round(share**_FIXED * len(chosen.model))))
-    else:
-        share, settings = size_factor(encoding)
-    if encoding.attribute_psnr is not None:
-        return chosen, encoding
-    usual, best_factor, finer, slope = encoding, share, 0.0, BYTES_PER_DB
-    quality, entries = PRESETS[usual.preset].quality[0 if settings["sh_degree"] else 1], settings["codebook_size"]
-    for _ in range(_TRIES):
-        step = min(finer + math.log(share) / slope, _FINEST - quality) - finer
-        if best_factor <= _FINE_ENOUGH or step == 0.0 or finer + step <= 0.0:
-            break
-        finer += step
-        finer_options = replace(usual, attribute_psnr=quality + finer)
-        if usual.codebook_size is None and entries > _BYTE_ENTRIES:
-            more = min(
-                round(entries * 2.0 ** (finer / _ENTRIES_DOUBLE)), _MOST_ENTRIES, len(chosen.model) // _SPLATS_PER_ENTRY
-            )
-            finer_options = replace(finer_options, codebook_size=max(entries, more))
-        after, _ = size_factor(finer_options)
-        slope = min(max(math.log(share / after) / step, 0.5 * BYTES_PER_DB), 4.0 * BYTES_PER_DB)
-        share = after
-        if 1.0 / _WITHIN <= share < best_factor:
-            encoding, best_factor = finer_options, share
-    return chosen, encoding
-
-
-class SizedFile(Protocol):
-    """A file with its size and quality."""
-
-    @property
-    def size_bytes(self) -> int:
-        """Size of the file."""
-        ...
-
-    @property
-    def psnr(self) -> float:
-        """PSNR on the validation views, pooled, dB."""
-        ...
-
-
-T = TypeVar("T", bound=SizedFile)
-
-
-def smallest_reaching(psnr: float, make: Callable[[int | None], T]) -> T:
-    """Make files until one is just above a PSNR, and return the smallest that reaches it.
-
-    Between two files, PSNR is assumed to be linear in the logarithm of the size.
-
-    Args:
-        psnr: target PSNR, dB.
-        make: makes a file of at most this number of bytes; called first with `None`, for no limit.
-
-    Raises:
-        InputError: none of the files reaches the PSNR.
-    """
-    tried, least = [make(None)], 1.0
-    for _ in range(_SIZE_TRIES):
-        if psnr <= tried[-1].psnr <= psnr + _NEAR_ENOUGH:
-            break
-        size = _next_size(psnr + 0.5 * _NEAR_ENOUGH, tried)
-        if size <= least:  # known to fail: halfway to the smallest file instead
-            size = math.sqrt(least * min(one.size_bytes for one in tried))
-        try:
-            tried.append(make(max(1, round(size))))
-        except InputError:
-            least = size
-            continue
-        if tried[-1].size_bytes < 0.9 * size:  # a larger file is not possible
-            break
-    enough = [one for one in tried if one.psnr >= psnr]
-    if not enough:
-        best = max(tried, key=lambda one: one.psnr)
-        raise InputError(f"{psnr:g} dB cannot be reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
-    return min(enough, key=lambda one: one.size_bytes)
-
-
-def _next_size(psnr: float, tried: list[T]) -> float:
-    """Predict the size for a PSNR from the two files nearest to it, one on either side if possible."""
-    near = sorted(tried, key=lambda one: abs(one.psnr - psnr))
-    near[1:] = sorted(near[1:], key=lambda one: (one.psnr < psnr) == (near[0].psnr < psnr))
-    octave = math.log2(near[0].size_bytes)
-    slope = _PER_DOUBLING
-    if len(near) > 1 and near[1].size_bytes != near[0].size_bytes:
-        slope = (near[1].psnr - near[0].psnr) / (math.log2(near[1].size_bytes) - octave)
-    by = (psnr - near[0].psnr) / min(max(slope, _SLOPE_RANGE[0]), _SLOPE_RANGE[1])
-    return float(2.0 ** (octave + min(max(by, -_FARTHEST), _FARTHEST)))
-
-
-@dataclass(frozen=True, eq=False)
-class TuningSubset:
-    """The splats to encode and tune.
-
-    Attributes:
-        model: the splats; refitted if others were pruned.
-        rows: [N] int64, their indices in the source, ascending.
-        importance: their importance.
-        pruning: report on the pruned splats, JSON-compatible.
-    """
-
-    model: SplatModel
-    rows: I64
-    importance: NDArray[Any] | Importance
-    pruning: Mapping[str, Any] = field(default_factory=dict)
-
-
-def training_views(source: SplatModel, views: ViewSet, threads: int | None) -> TuningViews:
-    """Return training and validation views with their images, or renders of the scene if there are none.
-
-    Without validation views, some training views become validation views.
-    """
-    background = np.array(views.background, np.float32)
-
-    def as_views(cameras: Sequence[Camera]) -> list[TuningView]:
-        if views.images:
-            return [TuningView(one.camera, one) for one in views.images_of(cameras)]
-        return renders_of(source, cameras, background, threads)
-
-    training = as_views(views.training)
-    return (
-        TuningViews(training, as_views(views.validation), background)
-        if views.validation
-        else split_views(training, background)
-    )
-
-
-@dataclass(eq=False)
-class SplatChooser:
-    """Chooses the splats to encode and tune, and measures their importance.
-
-    Attributes:
-        source: the scene.
-        views: the views; importance is measured in training views.
-        options: options of pruning and refitting.
-        prune_unseen: prune splats that no training or validation view shows.
-        importance: importance of the source's splats; `None`: measure it in the training views, as
-            `csplat sensitivity` does.
-        progress: progress callback.
-    """
-
-    source: SplatModel
-    views: ViewSet
-    options: SimplifyOptions
-    prune_unseen: bool
-    importance: NDArray[Any] | Importance | None = None
-    progress: Progress | None = None
-    _candidates: I64 | None = field(default=None, init=False)
-    _pruner: Pruner | None = field(default=None, init=False)
-
-    def choose(self, kept_count: int | None = None) -> TuningSubset:
-        """Prune splats that no view shows, and those of low importance.
-
-        Args:
-            kept_count: largest number of splats to keep; `None`: all that are seen.
-
-        Raises:
-            InputError: no view shows any splat.
-        """
-        source, given = self.source, self.importance
-        measured = self._measure(source) if given is None and kept_count is None else None
-        rows = self._candidates if self._candidates is not None else self._seen(measured)
-        self._candidates = rows
-        model = source.select(rows)
-        pruning = {"unseen": len(source) - len(rows)}
-        if kept_count is not None:
-            pruning["simplified_from"] = len(rows)
-            if kept_count < len(rows):
-                if self._pruner is None:  # it keeps views, renders and pruning order for the next number
-                    views = with_validation_views(replace(self.views, training=self._measuring, test=()))
-                    self._pruner = self.options.pruner(model, views, progress=self.progress)
-                kept = self._pruner.refit(kept_count)
-                model, rows = kept.model, rows[kept.rows]
-        if given is not None:
-            weights = given.select(rows) if isinstance(given, Importance) else given[rows]
-        elif measured is not None:
-            weights = StoredSensitivity.of(source, measured).importance().select(rows)
-        else:
-            weights = StoredSensitivity.of(model, self._measure(model)).importance()
-        return TuningSubset(model, rows, weights, pruning)
-
-    @property
-    def _measuring(self) -> Sequence[Camera]:
-        """The views in which importance is measured, and to whose renders kept splats are fitted."""
-        return self.views.training[:VIEW_COUNT] if self.views.virtual else self.views.training
-
-    def _measure(self, model: SplatModel) -> Sensitivity:
-        return measure_views(
-            model, self._measuring, self.views.background, matrices=True, magnitudes=False,
-            threads=self.options.threads, progress=self.progress,
-        )  # fmt: skip
-
-    def _seen(self, measured: Sensitivity | None) -> I64:
-        """Return the indices of the splats to choose from, ascending; `measured` is for the whole scene."""
-        cameras = [*self.views.training, *self.views.validation]
-        if measured is not None and not (self.prune_unseen and len(self._measuring) < len(cameras)):
-            seen = measured.seen
-        else:
-            seen = measure_pruning_error(
-                self.source, cameras, background=self.views.background, threads=self.options.threads,
-                progress=self.progress,
-            ).seen  # fmt: skip
-        if not seen.any():
-            raise InputError("no view shows any splat: check that the cameras belong to the scene")
-        return np.flatnonzero(seen) if self.prune_unseen else np.arange(len(self.source))
+    if target is not None:
+        target.require("finetune", "psnr", "size_bytes", "keep")
+        check_target(source, target, encoding)
+    tuner = Tuner(
+        source, views, encoding, options,
+        Outputs() if files is None or (target is not None and target.psnr is not None) else files,
+        bool(views.images) if prune_unseen is None else prune_unseen,
+        Target.effort if target is None else target.effort, _read_importance(importance, source), progress, on_step,
+    )  # fmt: skip
+    if target is None:
+        return tuner.tune_kept(None)
+    return tuner.tune_kept(target.count(len(source))) if target.keep is not None else tuner.tune_to(target)
 
 
 def _read_importance(importance: str | None, source: SplatModel) -> NDArray[Any] | Importance | None:

@@ -234,7 +234,7 @@ class _Tuning:
         else:
             excess = self._controller.excess(size_bytes, costs.bits)
             shrinks = excess > 0.0 and not self._controller.is_exhausted
-            score = total + excess
+            score = total + _EXCESS_WEIGHT * excess
         self._log["validations"].append(
             {"iteration": self._fitter.iteration, "loss": total, "psnr": psnr, "size_bytes": size_bytes}
         )
@@ -280,6 +280,7 @@ class _Tuning:
 
 _TARGET_FRACTION = 0.6  # fraction of the steps after which the size should be reached; later steps hardly move values
 _SIZE_MARGIN = 0.002  # fraction of the size left free, since files grow between counts
+_EXCESS_WEIGHT = 1e3  # loss per relative excess of the size: values that fit win over others
 _GAIN, _MAX_CHANGE = 40.0, 0.5  # change of log(lambda) per relative excess of bits, and its limit at each count
 _WEIGHT_RANGE = (1e-7, 1e-2)  # range of lambda
 # Smallest lambda, as a fraction of the first. Files grow while values move far, and a lambda near 0 would then rise too
