@@ -68,6 +68,7 @@ SPLAT_BYTES = 10
 #: Number and size of virtual training views, used without images: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
+_DRAFT_STEPS = 0.5  # factor of the steps of refits for drafts, since the tuning continues them
 _AIM = 0.05  # dB above a PSNR that tuned files aim at
 _WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
 _FINER = 0.25  # least factor of the error of the goal from one tuning to the next
@@ -315,6 +316,7 @@ class Tuner:
         """
         with self._timer.stage("choosing"):
             pruner = self.pruner
+            pruner.steps_factor *= _DRAFT_STEPS
             cameras = shrink_cameras(pruner.views.validation, pruner.size)  # none that splats are refitted to
             scorer = Scorer.of_source(pruner.source, cameras, self.views.background, threads=pruner.threads)
             pool = CandidatePool(self.encoding, scorer, self.progress)
