@@ -150,6 +150,7 @@ def python_module(registry: Registry) -> str:
         "",
         f"VERSION_MAJOR: Final = {form['version_major']}",
         f"VERSION_MINOR: Final = {form['version_minor']}",
+        f"VERSION_MINOR_OLDEST: Final = {form['version_minor_oldest']}",
         f'MEDIA_TYPE: Final = "{form["media_type"]}"',
         f'EXTENSION: Final = "{form["extension"]}"',
         'MAGIC: Final = b"' + "".join(f"\\x{byte:02x}" for byte in form["magic"]) + '"',
@@ -380,6 +381,7 @@ def javascript_module(registry: Registry) -> str:
         "",
         f"export const VERSION_MAJOR = {form['version_major']};",
         f"export const VERSION_MINOR = {form['version_minor']};",
+        f"export const VERSION_MINOR_OLDEST = {form['version_minor_oldest']};",
         f"export const MEDIA_TYPE = '{form['media_type']}';",
         f"export const MAGIC = Object.freeze({json.dumps(form['magic'])});",
         "",
@@ -468,6 +470,7 @@ def with_c_numbers(text: str, registry: Registry) -> str:
         f"/* {NOTICE} */",
         f"#define SPEC_VERSION_MAJOR {form['version_major']}",
         f"#define SPEC_VERSION_MINOR {form['version_minor']}",
+        f"#define SPEC_VERSION_MINOR_OLDEST {form['version_minor_oldest']}",
         f'#define SPEC_MAGIC "{magic}"',
         *(f"#define SPEC_{c['name'].upper()} {c_value(c['value'])}" for c in registry["constant"]),
     ]
@@ -489,7 +492,13 @@ def with_c_numbers(text: str, registry: Registry) -> str:
 
 
 def with_c_codes(text: str, registry: Registry) -> str:
-    """Return the text of codec/c/csplat.h with updated error codes."""
+    """Return the text of codec/c/csplat.h with updated limits and error codes."""
+    values = {c["name"]: c["value"] for c in registry["constant"]}
+    limits = (
+        f"#define CSPLAT_TILE_SPLATS {values['tile_splats_max']} /* maximum splats per tile */\n"
+        f"#define CSPLAT_SH_DEGREE_MAX {values['sh_degree_max']}   /* maximum SH degree */\n"
+    )
+    text = between(text, "/* begin generated: limits */\n", limits, "/* end generated */")
     codes = [f"    CSPLAT_{e['id']}, /* {e['text']} */\n" for e in enum_named(registry, "error")["entries"]]
     return between(text, "/* begin generated: error codes */\n", "".join(codes), "    /* end generated */")
 

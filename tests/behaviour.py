@@ -2,7 +2,7 @@
 
 `tests/behaviour.json` holds what `tests/test_behaviour.py` compares:
 
-- files: hashes of what `encode` writes for four scenes at every preset, for two targets, and of one training and one
+- files: hashes of what `encode` writes for five scenes at every preset, for two targets, and of one training and one
   tuning. A file is hashed in parts (attributes, tiles, each type of chunk), so that a difference has a name. The OPTS
   chunk names library versions; it is compared as JSON without them.
 - reports: the JSON that commands print for the sample scene, without times, paths and versions.
@@ -90,7 +90,7 @@ def _model(rng: np.random.RandomState, count: int, degree: int, means: np.ndarra
 
 
 def scenes() -> dict[str, csplat.SplatModel]:
-    """Return the sample and three made scenes; RandomState's numbers are the same in every version of NumPy."""
+    """Return the sample and four made scenes; RandomState's numbers are the same in every version of NumPy."""
     rng = np.random.RandomState(7)
     shell = rng.standard_normal((900, 3))
     shell /= np.linalg.norm(shell, axis=1, keepdims=True)
@@ -102,6 +102,7 @@ def scenes() -> dict[str, csplat.SplatModel]:
         "sh0": _model(rng, 1200, 0, rng.standard_normal((1200, 3))),
         "sh3": _model(rng, 900, 3, shell),
         "surroundings": _model(rng, 700, 1, around),
+        "sh4": _model(rng, 900, 4, shell),
     }
 
 

@@ -230,7 +230,7 @@ class EnginePage(_ServedPage):
         """Show a file; return the error, or None."""
         return self.page.evaluate("open_", self.site.add(path, data))
 
-    def look(self, camera: Any, background: tuple[float, ...] = (0, 0, 0), degree: int = 3) -> None:
+    def look(self, camera: Any, background: tuple[float, ...] = (0, 0, 0), degree: int = 4) -> None:
         """Set camera, size, background and degree."""
         K = camera.K
         pinhole = {
@@ -239,7 +239,7 @@ class EnginePage(_ServedPage):
         }  # fmt: skip
         self.page.evaluate("(given) => look(...given)", [pinhole, camera.W, camera.H, list(background), degree])
 
-    def picture(self, camera: Any, background: tuple[float, ...] = (0, 0, 0), degree: int = 3) -> np.ndarray:
+    def picture(self, camera: Any, background: tuple[float, ...] = (0, 0, 0), degree: int = 4) -> np.ndarray:
         """Return the settled picture, [H, W, 3] float, 0 to 1."""
         self.look(camera, background, degree)
         return self._read("engine.readPixels()", camera)

@@ -157,7 +157,7 @@ def test_the_sample_of_the_guide_decodes(decoder, tmp_path):
     source = tmp_path / "sample.c"
     source.write_text(
         '#include "csplat.h"\n#include <stdio.h>\n'
-        "static float means[196608], quats[262144], scales[196608], opacities[65536], sh0[196608], shN[2949120];\n"
+        "static float means[196608], quats[262144], scales[196608], opacities[65536], sh0[196608], shN[4718592];\n"
         "static int fail(const char *message)\n{\n    return puts(message);\n}\n"
         "int main(void)\n{\nstatic char data[4096];\nsize_t size = fread(data, 1, sizeof data, stdin);\n"
         f'{sample}return printf("%g %g", (double)quats[0], (double)shN[0]) != 3;\n}}\n',

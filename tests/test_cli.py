@@ -251,7 +251,7 @@ def test_options_that_went_are_refused_with_what_replaces_them(tmp_path, ply):
     "words",
     [
         ("--preset", "slow"),
-        ("--sh-degree", "4"),
+        ("--sh-degree", "5"),
         ("--up", "0,0,0"),
         ("--max-psnr-drop", "much"),
         ("--memory", "1GB", "--keep", "0.5"),
@@ -789,7 +789,7 @@ def test_completes_commands_and_options(monkeypatch, capfd):
 def test_csplat_as_a_module_is_the_program_and_prints_its_version():
     done = subprocess.run([sys.executable, "-m", "csplat", "--version"], capture_output=True, text=True, check=True)
     assert call("--version") == done.stdout
-    assert done.stdout.startswith(f"csplat {csplat.__version__}, format 0.2")
+    assert done.stdout.startswith(f"csplat {csplat.__version__}, format 0.3")
 
 
 # As a process -------------------------------------------------------------------------------------

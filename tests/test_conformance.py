@@ -454,7 +454,7 @@ def test_every_mapping_kind_type_flag_direction_measure_and_degree_occurs():
     dtypes = {extra.dtype for scene in SCENES for extra in scene.extras}
     assert set(_spec.EXTRA_DTYPE_NAMES) == {dtype for dtype in dtypes if dtype < _spec.ANCILLARY_ID_MIN}
     assert set(_spec.DIRECTION_NAMES) == {axis for scene in SCENES for axis in scene.axes}
-    assert {0, 1, 2, 3} == {scene.sh_degree for scene in SCENES}
+    assert {0, 1, 2, 3, 4} == {scene.sh_degree for scene in SCENES}
     assert set(_spec.CHUNK_NAMES) - {b"TILE", b"CODB"} <= {chunk.type for scene in SCENES for chunk in scene.chunks}
     measures = {m for s in SCENES for chunk in s.chunks if chunk.errors for m, _, _ in chunk.errors.records}
     assert set(_spec.MEASURE_NAMES) == measures

@@ -44,7 +44,7 @@ ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None
 PLACES = "{ply} {out} {index}"
 INTEGRITY = ("L1", "L2", "L3")
 HAS_RENDERER = find_spec("numba") is not None
-DEGREE_4 = "nasty/degree_4"  # ours refuses it, and nothing else that can be encoded
+DEGREE_5 = "nasty/degree_5"  # ours refuses it, and nothing else that can be encoded
 
 
 def invoke(*words):
@@ -147,7 +147,7 @@ def test_our_encoder_passes_on_every_input():
     report = run_encoder(PLACES, EncoderSuiteOptions(",".join(names), INTEGRITY, jobs=1), run=encoder_here())
     assert [] == report.failures
     assert len(report.outcomes) >= 150
-    taken = [one for one in report.outcomes if one.name != DEGREE_4]
+    taken = [one for one in report.outcomes if one.name != DEGREE_5]
     assert all(one.status is Status.PASSED for one in taken)  # ours refuses nothing else that it can encode
 
 
@@ -307,20 +307,18 @@ def test_an_input_equals_its_scene(tmp_path):
             key: column.tobytes() for key, column in found.extra.items()
         }
 
-    assert [] == failures([one for name, one in ENCODABLE.items() if name != DEGREE_4], check)
+    assert [] == failures([one for name, one in ENCODABLE.items() if name != DEGREE_5], check)
 
 
-def test_our_encoder_refuses_degree_4(tmp_path):
-    one = ENCODABLE[DEGREE_4]
+def test_our_encoder_refuses_degree_5(tmp_path):
+    one = ENCODABLE[DEGREE_5]
     (tmp_path / "in.ply").write_bytes(one.make())
     rows = plyfile.PlyData.read(tmp_path / "in.ply")["vertex"].data
     source = one.source()
-    assert (4, (64, 24, 3)) == (source.sh_degree, source.shN.shape)
-    np.testing.assert_array_equal(rows["f_rest_49"], source.shN[:, 1, 2])  # blue comes after 48 of red and green
-    model = csplat.read_ply(tmp_path / "in.ply")
-    np.testing.assert_array_equal(source.shN, model.shN)
-    with pytest.raises(InputError, match=r"holds SH of degree 3 at most, the scene has degree 4: use --sh-degree 3"):
-        csplat.encode(model)
+    assert (5, (64, 35, 3)) == (source.sh_degree, source.shN.shape)
+    np.testing.assert_array_equal(rows["f_rest_71"], source.shN[:, 1, 2])  # blue comes after 70 of red and green
+    with pytest.raises(InputError, match="SH degree 5, expected at most 4: --sh-degree 4"):
+        csplat.read_ply(tmp_path / "in.ply")
 
 
 def test_no_origin_brings_far_doubles_into_single_precision(tmp_path):
@@ -406,13 +404,13 @@ def test_another_quality_moves_the_required_psnr_of_all_pictures():
 def test_figures_for_comparison_are_those_of_the_inputs():
     # Written by `python -m csplat_bench figures`
     figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
-    assert set(ENCODABLE) - {DEGREE_4} == set(figures)
+    assert set(ENCODABLE) - {DEGREE_5} == set(figures)
     for name, by in figures.items():
         assert {"csplat"} <= set(by) <= {"csplat", "spz"}, name
         assert all((numbers["psnr"] is not None) == ENCODABLE[name].renders for numbers in by.values()), name
 
 
-@pytest.mark.parametrize("name", ["ordinary/degree_3", "ordinary/glossy", "nasty/far_doubles"])
+@pytest.mark.parametrize("name", ["ordinary/degree_3", "ordinary/degree_4", "ordinary/glossy", "nasty/far_doubles"])
 def test_figures_of_ours_are_of_this_encoder(tmp_path, name):
     figures = json.loads((files(encoders) / "figures.json").read_text("utf-8"))
     size = len(csplat.encode(csplat.read_ply(written(tmp_path, name))))

@@ -65,7 +65,7 @@ def test_an_empty_scene_is_decoded():
 
 
 @pytest.mark.parametrize("ycocg", [False, True])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_every_degree_and_colour_mapping_is_decoded(degree, ycocg):
     described = scene(degree, (tile(1, 3, degree), tile(2, 5, degree)))
     assert_decodes(replace(described, attributes=attributes(degree, ycocg=ycocg, chroma_shift=3 * ycocg)))
@@ -73,26 +73,27 @@ def test_every_degree_and_colour_mapping_is_decoded(degree, ycocg):
 
 @pytest.mark.parametrize("escaped", [False, True])
 def test_one_codebook_may_serve_all_bands(escaped):
-    entries = {band: rows_of(band, 5, 3 * (2 * band + 1), -60, 60) for band in (1, 2, 3)}
+    entries = {band: rows_of(band, 5, 3 * (2 * band + 1), -60, 60) for band in (1, 2, 3, 4)}
     indices = (0, 5 if escaped else 4, 3, 1)
     escapes = {
         1: signed(rows_of(1, 1, 9, -900, 900), Stream(2)),
         2: offset(rows_of(2, 1, 15, -9, 9)),
         3: signed(rows_of(3, 1, 21, -9, 9)),
+        4: offset(rows_of(4, 1, 27, -99, 9)),
     }
     blocks = {
         SH0 + band: codebook_block(4, indices if band == 1 else (), escapes[band] if escaped else None)
-        for band in (1, 2, 3)
+        for band in (1, 2, 3, 4)
     }
-    described = scene(3, (tile(1, 4, 0, blocks), tile(2, 3, 3)))
+    described = scene(4, (tile(1, 4, 0, blocks), tile(2, 3, 4)))
     described = replace(
         described,
-        attributes=attributes(3, ycocg=True, chroma_shift=1),
-        codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 3)),),
+        attributes=attributes(4, ycocg=True, chroma_shift=1),
+        codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 4)),),
     )
     assert_decodes(described)
     full = decode(build(described).data)
-    for degree in (0, 1, 2):
+    for degree in (0, 1, 2, 3):
         assert_same(full, decode(build(described).data, sh_degree=degree), coefficients=(degree + 1) ** 2 - 1)
 
 
@@ -211,6 +212,15 @@ def test_a_damaged_layer_fails_only_when_read():
     decode(data, sh_degree=1)
 
 
+def test_a_damaged_band_4_fails_only_when_read():
+    data = bytearray(build(scene(4)).data)
+    layer = read_header(data).tiles[0].layers[4]
+    data[layer.offset + layer.size - 1] ^= 1
+    with pytest.raises(FormatError, match=f"E_CRC at byte {layer.offset} \\(CHK-1\\)"):
+        decode(data)
+    assert 3 == decode(data, sh_degree=3).sh_degree
+
+
 def test_the_header_is_read_from_the_first_bytes():
     header = read_header(RICH)
     assert header == read_header(RICH[: _spec.HEADER_SIZE + header.index_size])
@@ -243,13 +253,13 @@ def test_limits_are_enforced(limits, name):
 
 @pytest.mark.parametrize(("kind", "bands", "columns"), [
     (_spec.CODEBOOK_KIND_SHAPE, (0, 0), {0: 6}),
-    (_spec.CODEBOOK_KIND_SH, (1, 3), {1: 9, 2: 15, 3: 21}),
+    (_spec.CODEBOOK_KIND_SH, (1, 4), {1: 9, 2: 15, 3: 21, 4: 27}),
     (_spec.CODEBOOK_KIND_SH, (2, 2), {2: 15}),
 ])  # fmt: skip
 def test_the_budget_includes_codebooks(kind, bands, columns):
     entries = {layer: [[0] * c] * 7 for layer, c in columns.items()}
-    built = build(replace(scene(3), codebooks=(Codebook(4, kind, entries, bands),)))
-    arrays = 2 * 4 * (3 + 4 + 3 + 1 + 3 * 16)
+    built = build(replace(scene(4), codebooks=(Codebook(4, kind, entries, bands),)))
+    arrays = 2 * 4 * (3 + 4 + 3 + 1 + 3 * 25)
     limit = arrays + 4 * 7 * sum(columns.values())
     decode(built.data, limits=Limits(bytes=limit))
     with pytest.raises(LimitError, match=f"{limit}"):
@@ -264,7 +274,7 @@ def test_limits_apply_to_the_chosen_tiles():
 
 
 @pytest.mark.parametrize(
-    "arguments", [{"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 4}, {"sh_degree": -1}, {"threads": 0}]
+    "arguments", [{"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 5}, {"sh_degree": -1}, {"threads": 0}]
 )
 def test_invalid_arguments_are_refused(arguments):
     with pytest.raises(InputError):

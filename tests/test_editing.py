@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 import csplat
 import csplat_conformance
-from csplat import CsplatError, EncodeOptions, FormatError, InputError, decode, encode, read_header, read_ply
+from csplat import CsplatError, EncodeOptions, FormatError, InputError, _spec, decode, encode, read_header, read_ply
 from csplat.decoder import read_declared_bounds, read_metadata, read_options
 from csplat.decoder.tiles import codebook_references
 from csplat_conformance.validator import validate
@@ -83,7 +83,10 @@ def test_extra_columns_come_along(sample_path):
     np.testing.assert_array_equal(decode(data).extra["id"], decode(extract(data, ALL)[1]).extra["id"])
 
 
-COPIED = ["rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed"]
+COPIED = [
+    "rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed", "codebook_sh_1_4_escape",
+    "version_0_2",
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", COPIED)
@@ -227,7 +230,7 @@ def check_references(path):
     for tile in header.tiles:
         here = set()
         for layer in tile.layers.values():
-            if layer.layer <= 3:
+            if layer.layer <= _spec.SH_DEGREE_MAX:
                 for at, id in codebook_references(memoryview(data), header, layer):
                     assert id == int.from_bytes(data[at : at + 2], "little")
                     here.add(id)

@@ -88,8 +88,10 @@ def samples(language):
 
 @pytest.fixture(scope="module")
 def model(request):
-    """The first 2,000 splats of the sample, after a round trip."""
-    return decode(encode(read_ply(request.getfixturevalue("sample_path")).select(slice(0, 2000)), FAST))
+    """The first 2,000 splats of the sample with SH band 4, after a round trip."""
+    part = read_ply(request.getfixturevalue("sample_path")).select(slice(0, 2000))
+    band = np.random.default_rng(4).normal(0.0, 0.05, (len(part), 9, 3)).astype(np.float32)
+    return decode(encode(replace(part, shN=np.concatenate([part.shN, band], axis=1)), FAST))
 
 
 @pytest.fixture(
@@ -175,7 +177,7 @@ def check_covariances(found, scene):
 
 def check_colours(found, scene):
     ways = directions(len(found))
-    basis = evaluate_sh(3, ways)
+    basis = evaluate_sh(4, ways)
     count = len(ways)
     coefficients = np.concatenate([scene.sh0[:count, None], scene.shN[:count]], axis=1).astype(np.float64)
     wanted = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, coefficients))
@@ -187,7 +189,7 @@ def check_stream(given, scene):
     for first, count, means in given["tiles"]:
         np.testing.assert_array_equal(scene.means[first : first + count].ravel(), np.array(means, np.float32))
     assert len(scene) == sum(count for _, count, _ in given["tiles"])
-    assert {1, 2, 3} == {layer for _, layer, _ in given["bands"]}
+    assert {1, 2, 3, 4} == {layer for _, layer, _ in given["bands"]}
     counts = {first: count for first, count, _ in given["tiles"]}
     assert all(size == 3 * (2 * layer + 1) * counts[first] for first, layer, size in given["bands"])
 
@@ -201,7 +203,7 @@ def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
     for program in (whole, part):
         exec(program, {"__name__": "__main__"})  # noqa: S102  # the guide's own lines
         said.append(capsys.readouterr().out)
-    assert f"{len(model)} float32 3 {model.coordinate_system}\n" == said[0]
+    assert f"{len(model)} float32 4 {model.coordinate_system}\n" == said[0]
     first, *tiles, last = said[1].splitlines()
     assert first.startswith(f"{len(model)} {model.coordinate_system} {{")
     assert [str(place) for place in range(10)] == [line.split()[0] for line in tiles if not line.startswith(" ")]
@@ -227,7 +229,7 @@ def test_the_engine_without_a_page(tab, site, model):
 
 def test_the_table_of_sizes_adds_up():
     rows = re.findall(r"^\| (\d) \|((?: \d+ \|){7}) (\d+) MB \|$", TEXT, re.MULTILINE)
-    assert ["0", "1", "2", "3"] == [degree for degree, _, _ in rows]
+    assert ["0", "1", "2", "3", "4"] == [degree for degree, _, _ in rows]
     for degree, cells, megabytes in rows:
         *parts, together = (int(cell) for cell in cells.replace("|", " ").split())
         assert [12, 16, 12, 4, 12, 12 * ((int(degree) + 1) ** 2 - 1)] == parts

@@ -36,7 +36,7 @@ def round_trip(model: SplatModel, importance: np.ndarray | None = None, **option
 
 
 @pytest.mark.parametrize("preset", PRESET_NAMES)
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_scenes_decode_within_declared_errors(make_model, preset, degree):
     # CNF-5, SRC-4
     decoded, _ = round_trip(make_model(500, degree), preset=preset)
@@ -68,7 +68,7 @@ def test_scenes_of_any_count_decode(make_model, count):
 
 
 @pytest.mark.parametrize("coding", ["codebook", "scalar", "none"])
-@pytest.mark.parametrize("degree", [1, 2, 3])
+@pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_every_sh_coding_decodes(make_model, coding, degree):
     decoded, result = round_trip(make_model(400, degree), sh_coding=coding, tile_splats=150)
     assert (0 if coding == "none" else degree) == decoded.sh_degree
@@ -146,6 +146,36 @@ def test_sh_degree_drops_bands_and_declares_their_error(make_model):
     decoded, result = round_trip(model, sh_degree=1)
     assert 1 == decoded.sh_degree
     assert float(np.abs(model.shN[:, 8:]).max()) == pytest.approx(result.report.errors["sh3"][0], rel=1e-4)
+    assert "sh4" not in result.report.errors
+
+
+def test_band_4_is_declared_if_the_file_drops_it(make_model):
+    # SER-6
+    model = make_model(200, 4)
+    decoded, result = round_trip(model, sh_degree=3)
+    assert 3 == decoded.sh_degree
+    assert float(np.abs(model.shN[:, 15:]).max()) == pytest.approx(result.report.errors["sh4"][0], rel=1e-4)
+
+
+def test_band_4_of_few_splats_is_sparse(make_model):
+    model = make_model(2000, 4)
+    few = np.zeros_like(model.shN)
+    few[::100, 15:] = model.shN[::100, 15:]
+    decoded, result = round_trip(replace(model, shN=few), sh_coding="scalar")
+    assert 4 == decoded.sh_degree
+    layers = csplat.read_header(result.data).tiles[0].layers
+    assert {0, 4} == {*layers}  # the other bands are zeros
+    assert layers[4].size < 2000
+
+
+@pytest.mark.parametrize("degree", [3, 4])
+def test_the_id_of_shape_codebooks_does_not_depend_on_the_degree(make_model, degree):
+    # Files of degree 3 keep their bytes.
+    model = make_model(3000, degree)
+    nine = np.arange(3000) % 9
+    shapes = replace(model, quats=model.quats[nine], scales=model.scales[nine])
+    data = encode(shapes, EncodeOptions(sh_coding="codebook", shape_codebook_size=64))
+    assert [0, 4] == [record.codebook_id for record in csplat.read_header(data).codebooks]
 
 
 @pytest.mark.parametrize("bits", [4, 10, 16])
@@ -296,7 +326,7 @@ def test_bytes_do_not_depend_on_threads(make_model, coding):
 
 
 OUT_OF_RANGE = (
-    ("preset", "tiny"), ("position_bits", 17), ("position_bits", 8.5), ("sh_degree", 4), ("quat_levels", 2),
+    ("preset", "tiny"), ("position_bits", 17), ("position_bits", 8.5), ("sh_degree", 5), ("quat_levels", 2),
     ("deflate_level", 0), ("scale_step", 0), ("scale_step", math.nan), ("sh_step", "0.1"), ("tile_splats", None),
     ("seed", -1), ("threads", 0),
 )  # fmt: skip

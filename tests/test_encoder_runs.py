@@ -357,9 +357,9 @@ def test_inputs_are_written_as_files_with_a_list(tmp_path):
 
 def test_the_command_writes_inputs_and_runs_nothing(tmp_path):
     result = invoke("--write-inputs", tmp_path / "new", "--filter", "ordinary/degree_*,broken/cut")
-    assert (0, f"5 inputs in {tmp_path / 'new'}\n") == (result.exit_code, result.stdout)
+    assert (0, f"6 inputs in {tmp_path / 'new'}\n") == (result.exit_code, result.stdout)
     files = {path.relative_to(tmp_path / "new").as_posix() for path in (tmp_path / "new").rglob("*.*")}
-    assert {*(f"ordinary/degree_{d}.ply" for d in range(4)), "broken/cut.ply", "inputs.json"} == files
+    assert {*(f"ordinary/degree_{d}.ply" for d in range(5)), "broken/cut.ply", "inputs.json"} == files
     assert "is not empty" in invoke("--write-inputs", tmp_path / "new").stderr
     assert 0 == invoke("--write-inputs", tmp_path / "new", "--force", "--filter", "broken/*").exit_code
 

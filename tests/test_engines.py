@@ -5,6 +5,7 @@ import subprocess
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 pytest.importorskip("numba", reason="requires the extra [render]")
@@ -102,6 +103,25 @@ def test_a_left_handed_scene_in_two_steps_ends_in_the_same_picture(trial, pictur
     trial.remove()
     assert "failed" not in said, said
     assert psnr(picture[0], again) > 35.0
+
+
+def test_band_4_is_drawn_or_reported_once(trial, files):
+    folder, _, model, camera = files
+    band = np.random.default_rng(4).normal(0.0, 0.2, (len(model), 9, 3)).astype(np.float32)
+    model = replace(model, shN=np.concatenate([model.shN, band], axis=1))
+    (folder / "degree_4.csplat").write_bytes(encode(model, replace(FAST, sh_coding="scalar")))
+    told = []
+    trial.page.on("console", lambda message: told.append(message.text))
+    for options in ({}, {"progressive": True}):
+        said = trial.show("degree_4.csplat", **options)
+        assert "failed" not in said, said
+        shown = settled(trial)
+        trial.remove()
+        to_3, to_4 = (psnr(shown, ENGINES[trial.engine].render(model, camera, degree)) for degree in (3, 4))
+        assert (to_4 > to_3 + 2.0) == (trial.engine == "babylon"), (to_3, to_4)
+        assert abs(to_4 - to_3) > 2.0
+    warnings = [text for text in told if "the engine ends at degree 3" in text]
+    assert len(warnings) == (trial.engine != "babylon")
 
 
 def test_the_picture_is_that_of_the_ply(trial, picture):

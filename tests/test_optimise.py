@@ -524,6 +524,13 @@ def test_bounds_hold_for_every_splat(scene, bounds):
     assert (300, 0) == (found.report.search.splats, found.report.search.renders)
 
 
+def test_a_bound_of_band_4_holds_for_every_splat(make_model):
+    scene = make_model(300, 4)
+    found = encode_with_report(scene, target=Target(max_error={"sh4": 0.02}))
+    largest, _ = measure_errors(scene, decode(found.data), found.source_index)["sh4"]
+    assert 0.006 < largest <= found.report.errors["sh4"][0] <= 0.02
+
+
 @pytest.mark.slow
 def test_a_bound_of_the_means_holds_for_outliers(scene):
     away = (scene.means[:20] * 3000.0).astype(np.float32)

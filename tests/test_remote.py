@@ -167,7 +167,7 @@ def test_invalid_arguments_are_refused_before_reading(data):
             (lambda: file.read((0, 0, 0, 1, 1, math.nan)), InputError, "six finite numbers"),
             (lambda: file.read((1e6,) * 6), InputError, "no tile touches the box 1e.06"),
             (lambda: file.read(tiles=[99]), InputError, "tile 99"),
-            (lambda: file.read(sh_degree=4), InputError, "sh_degree is 4"),
+            (lambda: file.read(sh_degree=5), InputError, "sh_degree is 5"),
             (lambda: file.tiles(sh_degree=-1), InputError, "sh_degree is -1"),
             (lambda: file.read((0, 0, 0, 1, 1, 1), tiles=[1]), InputError, "box and tiles exclude"),
             (file.read, LimitError, "splats"),

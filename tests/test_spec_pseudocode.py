@@ -13,6 +13,7 @@ from csplat import _spec
 from csplat.decoder.blocks import ColumnBlock, morton_axes
 from csplat.decoder.entropy import _undo_run_length, undo_transforms
 from csplat.decoder.reconstruct import lattice_rows, opacity_table, write_colour, write_lattice, write_quats
+from csplat.spherical_harmonics import evaluate_sh
 from csplat_authoring.coders import Deflate
 from csplat_conformance.tolerance import describe_deviation, is_valid_bound
 
@@ -205,6 +206,12 @@ def test_permitted_stated_errors(spec, measure, reach):
                 allowed = spec.may_be_stated(stated, error, measure, reach)
                 assert allowed == is_valid_bound(measure, stated, error, reach)
                 assert not (allowed and error > 1e-3 and abs(stated - error) > 0.002 * error)
+
+
+def test_the_sh_basis(spec):
+    directions = np.random.default_rng(4).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    np.testing.assert_allclose([spec.sh_basis(*one) for one in directions], evaluate_sh(4, directions), atol=1e-13)
 
 
 def test_colours_there_and_back(spec):

@@ -237,7 +237,7 @@ def test_impossible_reductions_are_refused(make_model):
         (lambda: encode_reduced(model, Reduction(distil=True)), "SH of degree 1: distilling requires a lower"),
         (lambda: encode_reduced(model, Reduction(prune_opacity=0.9999)), "no splat has an opacity above"),
         (lambda: Reduction(prune_opacity=1.5), "the opacity to prune by is 1.5"),
-        (lambda: Reduction(sh_degree=4), "sh_degree is 4"),
+        (lambda: Reduction(sh_degree=5), "sh_degree is 5"),
         (lambda: Reduction(kmeans=0), "kmeans is 0, expected 1 to 65536"),
     ):
         with pytest.raises(InputError, match=message):

@@ -23,7 +23,10 @@
 extern "C" {
 #endif
 
+/* begin generated: limits */
 #define CSPLAT_TILE_SPLATS 65536 /* maximum splats per tile */
+#define CSPLAT_SH_DEGREE_MAX 4   /* maximum SH degree */
+/* end generated */
 #define CSPLAT_NO_OFFSET UINT64_MAX
 
 typedef struct csplat csplat;
@@ -118,10 +121,10 @@ typedef struct csplat_tile {
     uint8_t bands;        /* bit l - 1 is set if it has SH band l; otherwise its coefficients are 0 */
     float min[3], max[3]; /* bounding box of the centres */
     float max_scale;      /* natural logarithm of the largest standard deviation */
-    uint32_t bytes[4];    /* sizes of layer 0 and SH bands 1 to 3 in the file */
+    uint32_t bytes[CSPLAT_SH_DEGREE_MAX + 1]; /* sizes of layer 0 and of the SH bands in the file */
 } csplat_tile;
 
-/* Arrays for a tile's values; NULL to skip one. K = (degree + 1)^2 - 1. */
+/* Arrays for a tile's values; NULL to skip one. K = (degree + 1)^2 - 1, at most 24. */
 typedef struct csplat_floats {
     float *means;     /* [n][3], scene units, relative to the origin */
     float *quats;     /* [n][4], w x y z, unit length */
@@ -142,7 +145,7 @@ typedef struct csplat_scene {
 /* The integer arrays of the specification, 9.2, for tests; NULL to skip one. */
 typedef struct csplat_integers {
     uint32_t *opacities;
-    int64_t *scales, *means, *sh0, *sh[3]; /* sh[l - 1]: [n][2 l + 1][3] */
+    int64_t *scales, *means, *sh0, *sh[CSPLAT_SH_DEGREE_MAX]; /* sh[l - 1]: [n][2 l + 1][3] */
     int32_t *quats;
     int32_t *exponents; /* [5 + sh_degree]: opacities, scales, quats, means, sh0, bands */
 } csplat_integers;
@@ -155,7 +158,7 @@ typedef struct csplat_columns {
     unsigned width;         /* bytes per element: 1, 2 or 4 */
     unsigned columns;
     uint32_t count;         /* rows */
-    int64_t offset[21];
+    int64_t offset[3 * (2 * CSPLAT_SH_DEGREE_MAX + 1)];
     double step;
 } csplat_columns;
 
@@ -175,13 +178,16 @@ typedef struct csplat_packed_geometry {
     csplat_packed opacities, scales, quats, means, sh0; /* quats: x, y, z; w follows (specification, 7.5) */
 } csplat_packed_geometry;
 
-/* Error bounds declared in the file; negative if not declared. */
+/* Bounds of an error; negative if not declared. */
+typedef struct csplat_stated_error {
+    double max, rms;
+} csplat_stated_error;
+
+/* Error bounds declared in the file. */
 typedef struct csplat_stated_errors {
     uint64_t source_count, pruned_count;
     uint8_t source_sh_degree, refitted;
-    struct {
-        double max, rms;
-    } means, covariance, opacities, sh[4];
+    csplat_stated_error means, covariance, opacities, sh[CSPLAT_SH_DEGREE_MAX + 1];
 } csplat_stated_errors;
 
 typedef enum csplat_text { CSPLAT_METADATA, CSPLAT_CAMERAS, CSPLAT_ENCODER_OPTIONS } csplat_text;

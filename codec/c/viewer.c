@@ -47,11 +47,15 @@ static const char vertex_text[] =
     "}\n"
     "vec3 shine(int i, vec3 v) {\n"
     "    float x = v.x, y = v.y, z = v.z, xx = x * x, yy = y * y, zz = z * z;\n"
-    "    float basis[15] = float[15](-0.48860251 * y, 0.48860251 * z, -0.48860251 * x, 1.09254843 * x * y,\n"
+    "    float basis[24] = float[24](-0.48860251 * y, 0.48860251 * z, -0.48860251 * x, 1.09254843 * x * y,\n"
     "        -1.09254843 * y * z, 0.31539157 * (2 * zz - xx - yy), -1.09254843 * x * z, 0.54627422 * (xx - yy),\n"
     "        -0.59004359 * y * (3 * xx - yy), 2.89061144 * x * y * z, -0.45704580 * y * (4 * zz - xx - yy),\n"
     "        0.37317633 * z * (2 * zz - 3 * xx - 3 * yy), -0.45704580 * x * (4 * zz - xx - yy),\n"
-    "        1.44530572 * z * (xx - yy), -0.59004359 * x * (xx - 3 * yy));\n"
+    "        1.44530572 * z * (xx - yy), -0.59004359 * x * (xx - 3 * yy), 2.50334294 * x * y * (xx - yy),\n"
+    "        -1.77013077 * y * z * (3 * xx - yy), 0.94617470 * x * y * (7 * zz - 1), -0.66904654 * y * z * (7 * zz - 3),\n"
+    "        0.10578555 * ((35 * zz - 30) * zz + 3), -0.66904654 * x * z * (7 * zz - 3),\n"
+    "        0.47308735 * (xx - yy) * (7 * zz - 1), -1.77013077 * x * z * (xx - 3 * yy),\n"
+    "        0.62583574 * (xx * xx - 6 * xx * yy + yy * yy));\n"
     "    vec3 sum = 0.5 + 0.28209479 * three(sh0, i);\n"
     "    for (int k = 0; k < terms; k++) sum += basis[k] * three(shN, i * terms + k);\n"
     "    return max(sum, 0);\n"
@@ -126,7 +130,7 @@ static void read_scene(const char *path)
     fclose(input);
     if (csplat_open_memory(&file, data, size, NULL, &error))
         die(error.message);
-    if (csplat_decode(file, 3, &scene))
+    if (csplat_decode(file, CSPLAT_SH_DEGREE_MAX, &scene))
         die(csplat_last_error(file)->message);
     info = csplat_get_info(file);
     count = (size_t)scene->splat_count;

@@ -8,7 +8,8 @@ import struct
 from typing import Final, NamedTuple
 
 VERSION_MAJOR: Final = 0
-VERSION_MINOR: Final = 2
+VERSION_MINOR: Final = 3
+VERSION_MINOR_OLDEST: Final = 2
 MEDIA_TYPE: Final = "model/vnd.csplat"
 EXTENSION: Final = ".csplat"
 MAGIC: Final = b"\x93\x43\x53\x50\x0d\x0a\x1a\x0a"
@@ -22,7 +23,7 @@ OPACITY_LEVELS_MAX: Final = 65535  # largest M of the opacities
 QUAT_LEVELS_MIN: Final = 3  # smallest M of the rotations
 QUAT_LEVELS_MAX: Final = 32767  # largest M of the rotations
 CHROMA_SHIFT_MAX: Final = 16  # largest chroma shift
-SH_DEGREE_MAX: Final = 3  # largest SH degree; degree 4 is reserved
+SH_DEGREE_MAX: Final = 4  # largest SH degree
 CODEBOOK_ENTRIES_MAX: Final = 65536  # entries of a codebook
 TRANSFORMS_MAX: Final = 4  # transforms of a stream
 RUN_MAX: Final = 65536  # elements in one run of RUN_LENGTH
@@ -70,23 +71,23 @@ ATTRIBUTE_SH0: Final = 5
 ATTRIBUTE_SH1: Final = 6
 ATTRIBUTE_SH2: Final = 7
 ATTRIBUTE_SH3: Final = 8
-ATTRIBUTE_SH4: Final = 9  # reserved
+ATTRIBUTE_SH4: Final = 9
 ATTRIBUTE_EXTRA: Final = 32
-ATTRIBUTE_NAMES: Final[dict[int, str]] = {1: "opacities", 2: "scales", 3: "quats", 4: "means", 5: "sh0", 6: "sh1", 7: "sh2", 8: "sh3", 32: "extra"}
-ATTRIBUTE_COLUMNS: Final[dict[int, int]] = {1: 1, 2: 3, 3: 3, 4: 3, 5: 3, 6: 9, 7: 15, 8: 21, 32: 1}
-ATTRIBUTE_LAYER: Final[dict[int, int]] = {1: 0, 2: 0, 3: 0, 4: 0, 5: 0, 6: 1, 7: 2, 8: 3, 32: 8}
-ATTRIBUTE_MAPPINGS: Final[dict[int, tuple[str, ...]]] = {1: ("linear", "square",), 2: ("lattice",), 3: ("unit_w",), 4: ("lattice",), 5: ("lattice", "ycocg",), 6: ("lattice", "ycocg",), 7: ("lattice", "ycocg",), 8: ("lattice", "ycocg",), 32: ()}
-ATTRIBUTE_CODINGS: Final[dict[int, tuple[str, ...]]] = {1: ("levels",), 2: ("offset", "signed", "codebook",), 3: ("signed", "codebook",), 4: ("morton", "axis",), 5: ("offset", "signed",), 6: ("offset", "signed", "codebook", "sparse",), 7: ("offset", "signed", "codebook", "sparse",), 8: ("offset", "signed", "codebook", "sparse",), 32: ("raw",)}
-ATTRIBUTE_KIND: Final[dict[int, str]] = {1: "levels", 2: "lattice", 3: "levels", 4: "lattice", 5: "lattice", 6: "lattice", 7: "lattice", 8: "lattice", 32: "raw"}
+ATTRIBUTE_NAMES: Final[dict[int, str]] = {1: "opacities", 2: "scales", 3: "quats", 4: "means", 5: "sh0", 6: "sh1", 7: "sh2", 8: "sh3", 9: "sh4", 32: "extra"}
+ATTRIBUTE_COLUMNS: Final[dict[int, int]] = {1: 1, 2: 3, 3: 3, 4: 3, 5: 3, 6: 9, 7: 15, 8: 21, 9: 27, 32: 1}
+ATTRIBUTE_LAYER: Final[dict[int, int]] = {1: 0, 2: 0, 3: 0, 4: 0, 5: 0, 6: 1, 7: 2, 8: 3, 9: 4, 32: 8}
+ATTRIBUTE_MAPPINGS: Final[dict[int, tuple[str, ...]]] = {1: ("linear", "square",), 2: ("lattice",), 3: ("unit_w",), 4: ("lattice",), 5: ("lattice", "ycocg",), 6: ("lattice", "ycocg",), 7: ("lattice", "ycocg",), 8: ("lattice", "ycocg",), 9: ("lattice", "ycocg",), 32: ()}
+ATTRIBUTE_CODINGS: Final[dict[int, tuple[str, ...]]] = {1: ("levels",), 2: ("offset", "signed", "codebook",), 3: ("signed", "codebook",), 4: ("morton", "axis",), 5: ("offset", "signed",), 6: ("offset", "signed", "codebook", "sparse",), 7: ("offset", "signed", "codebook", "sparse",), 8: ("offset", "signed", "codebook", "sparse",), 9: ("offset", "signed", "codebook", "sparse",), 32: ("raw",)}
+ATTRIBUTE_KIND: Final[dict[int, str]] = {1: "levels", 2: "lattice", 3: "levels", 4: "lattice", 5: "lattice", 6: "lattice", 7: "lattice", 8: "lattice", 9: "lattice", 32: "raw"}
 
 # Layers
 LAYER_GEOMETRY: Final = 0
 LAYER_SH1: Final = 1
 LAYER_SH2: Final = 2
 LAYER_SH3: Final = 3
-LAYER_SH4: Final = 4  # reserved
+LAYER_SH4: Final = 4
 LAYER_EXTRA: Final = 8
-LAYER_NAMES: Final[dict[int, str]] = {0: "geometry", 1: "sh1", 2: "sh2", 3: "sh3", 8: "extra"}
+LAYER_NAMES: Final[dict[int, str]] = {0: "geometry", 1: "sh1", 2: "sh2", 3: "sh3", 4: "sh4", 8: "extra"}
 
 # Mappings (integers to values)
 MAPPING_LATTICE: Final = 0
@@ -112,7 +113,7 @@ CODING_WIDTH_MAX: Final[dict[int, int]] = {1: 2, 2: 7, 3: 3, 4: 4, 5: 4, 6: 4, 7
 CODEBOOK_KIND_SHAPE: Final = 4
 CODEBOOK_KIND_SH: Final = 6
 CODEBOOK_KIND_NAMES: Final[dict[int, str]] = {4: "shape", 6: "sh"}
-CODEBOOK_KIND_ATTRIBUTES: Final[dict[int, tuple[str, ...]]] = {4: ("scales", "quats",), 6: ("sh1", "sh2", "sh3",)}
+CODEBOOK_KIND_ATTRIBUTES: Final[dict[int, tuple[str, ...]]] = {4: ("scales", "quats",), 6: ("sh1", "sh2", "sh3", "sh4",)}
 
 # Transforms
 TRANSFORM_NONE: Final = 0
@@ -147,7 +148,8 @@ MEASURE_SH0: Final = 4
 MEASURE_SH1: Final = 5
 MEASURE_SH2: Final = 6
 MEASURE_SH3: Final = 7
-MEASURE_NAMES: Final[dict[int, str]] = {1: "means", 2: "covariance", 3: "opacities", 4: "sh0", 5: "sh1", 6: "sh2", 7: "sh3"}
+MEASURE_SH4: Final = 8
+MEASURE_NAMES: Final[dict[int, str]] = {1: "means", 2: "covariance", 3: "opacities", 4: "sh0", 5: "sh1", 6: "sh2", 7: "sh3", 8: "sh4"}
 
 # Flags of the stated errors (bit masks)
 ERROR_FLAG_REFITTED: Final = 1

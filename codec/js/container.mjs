@@ -6,7 +6,7 @@ import { checkReserved } from './payload.mjs';
 import * as spec from './spec.mjs';
 
 /**
- * @typedef {{profile: string, indexSize: number, fileSize: number, end: number}} FileHeader
+ * @typedef {{version: string, profile: string, indexSize: number, fileSize: number, end: number}} FileHeader
  * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
  */
 
@@ -54,8 +54,9 @@ export function readFileHeader(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const header = spec.unpackHeader(view, 0);
   const { version_major: major, version_minor: minor, profile, index_size: indexSize } = header;
-  if (major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR) {
-    const ours = `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`;
+  const { VERSION_MAJOR, VERSION_MINOR_OLDEST, VERSION_MINOR } = spec;
+  if (major !== VERSION_MAJOR || minor < VERSION_MINOR_OLDEST || minor > VERSION_MINOR) {
+    const ours = `${VERSION_MAJOR}.${VERSION_MINOR_OLDEST} to ${VERSION_MAJOR}.${VERSION_MINOR}`;
     throw fault(
       spec.ERROR_VERSION,
       AT.version_major,
@@ -73,7 +74,7 @@ export function readFileHeader(bytes) {
   if (indexSize < spec.INDEX_HEAD_SIZE + CRC_SIZE || end > fileSize) {
     throw fault(spec.ERROR_VALUE, AT.index_size, 'HDR-7', `an index of ${indexSize} bytes in a file of ${fileSize}`);
   }
-  return { profile: spec.PROFILE_NAMES[spec.PROFILE_BASE], indexSize, fileSize, end };
+  return { version: `${major}.${minor}`, profile: spec.PROFILE_NAMES[spec.PROFILE_BASE], indexSize, fileSize, end };
 }
 
 /**

@@ -195,6 +195,7 @@ export interface IntegerSplats {
   sh1?: BigInt64Array;
   sh2?: BigInt64Array;
   sh3?: BigInt64Array;
+  sh4?: BigInt64Array;
   tile_splats: Uint32Array;
   exponents: Int32Array;
   extra: Record<string, ExtraArray>;

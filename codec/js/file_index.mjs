@@ -5,7 +5,7 @@ import { fault } from './errors.mjs';
 import { checkIndexCrc, typeName } from './container.mjs';
 import { SINGLE_MIN, STEP_MIN } from './lattice.mjs';
 import { Payload } from './payload.mjs';
-import { nameOf, registeredFlags } from './registry.mjs';
+import { nameOf, registeredFlags, shDegreeMax } from './registry.mjs';
 import * as spec from './spec.mjs';
 import { checkCoverage, checkTables, readTile } from './tile_records.mjs';
 
@@ -56,7 +56,7 @@ export function readIndex(bytes, file, limits) {
     'the head of the index',
   );
   checkSizes(head);
-  const scene = readScene(head);
+  const scene = readScene(head, file);
   checkCounts(head, index, limits);
   index.claim(head.head_size - spec.INDEX_HEAD_SIZE, 'the tail of the head');
 
@@ -98,7 +98,7 @@ export function readIndex(bytes, file, limits) {
 }
 
 /** @param {FileHeader} file */
-const omit = ({ profile, fileSize, indexSize }) => ({ profile, fileSize, indexSize });
+const omit = ({ version, profile, fileSize, indexSize }) => ({ version, profile, fileSize, indexSize });
 
 /**
  * Check IDX-8: the fields that this version reads lie within the record.
@@ -112,11 +112,17 @@ function checkSizes(head) {
   }
 }
 
-/** @param {IndexHead} head */
-function readScene(head) {
+/**
+ * @param {IndexHead} head
+ * @param {FileHeader} file
+ */
+function readScene(head, { version }) {
   const at = spec.HEADER_SIZE;
-  if (head.sh_degree > spec.SH_DEGREE_MAX)
-    throw fault(ERROR_UNSUPPORTED, at + AT_HEAD.sh_degree, 'IDX-3', `SH degree ${head.sh_degree}`);
+  const most = shDegreeMax(version);
+  if (head.sh_degree > most) {
+    const detail = `SH degree ${head.sh_degree}, version ${version} ends at ${most}`;
+    throw fault(ERROR_UNSUPPORTED, at + AT_HEAD.sh_degree, 'IDX-3', detail);
+  }
   const flags = spec.SCENE_FLAG_ANTIALIASED | spec.SCENE_FLAG_FLAT | spec.ANCILLARY_SCENE_FLAGS;
   if (head.scene_flags & ~flags)
     throw fault(ERROR_RESERVED, at + AT_HEAD.scene_flags, 'RES-1', `scene flags ${head.scene_flags}`);
@@ -136,7 +142,6 @@ function readScene(head) {
     throw fault(ERROR_VALUE, place, 'IDX-6', `an origin of ${head.origin[bad]}`);
   }
   return {
-    version: `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`,
     shDegree: head.sh_degree,
     antialiased: (head.scene_flags & spec.SCENE_FLAG_ANTIALIASED) !== 0,
     flat: (head.scene_flags & spec.SCENE_FLAG_FLAT) !== 0,

@@ -207,7 +207,7 @@ export class Reader {
   }
 
   /**
-   * Read one layer of a tile: 0 is geometry and base colour, 1 to 3 are the SH bands. Layers can be read in any order and
+   * Read one layer of a tile: 0 is geometry and base colour, 1 to 4 are the SH bands. Layers can be read in any order and
    * repeatedly.
    *
    * @param {number} index
@@ -290,7 +290,8 @@ export class Reader {
    */
   async describe({ signal } = {}) {
     const description = emptyDescription();
-    const scene = { splatCount: this.header.splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
+    const { version, splatCount } = this.header;
+    const scene = { version, splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
     for (const record of this.header.directory) {
       if (record.type === spec.CHUNK_CODEBOOK || !Object.hasOwn(spec.CHUNK_NAMES, record.type)) continue;
       await describe(description, record, this.opened(await this.fetch(record, signal), record), scene);

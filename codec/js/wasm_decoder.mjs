@@ -30,8 +30,8 @@ import { WASM } from './wasm_binary.mjs';
  */
 
 /** The layout in memory of csplat_columns and csplat_packed of csplat.h. */
-const COLUMNS = { data: 0, width: 4, columns: 8, count: 12, offset: 16, step: 184 };
-const PACKED = { rows: 192, index: 196, indexWidth: 200, codebook: 204, size: 208 };
+const COLUMNS = { data: 0, width: 4, columns: 8, count: 12, offset: 16, step: 232 };
+const PACKED = { rows: 240, index: 244, indexWidth: 248, codebook: 252, size: 256 };
 const GEOMETRY = ['opacities', 'scales', 'quats', 'means', 'sh0'];
 const SH_ROWS = 512; // as in wasm/interface.c
 const ARRAYS = { 1: Uint8Array, 2: Uint16Array, 4: Uint32Array };

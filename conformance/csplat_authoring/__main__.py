@@ -22,7 +22,7 @@ from csplat_authoring.annexes import annex, clause_map, replace_generated
 from csplat_authoring.recipe import Recipe
 from csplat_authoring.recipes import all_recipes
 from csplat_authoring.reference import expected
-from csplat_conformance.manifest import VECTORS, Vector, picture_name, summarise, to_json
+from csplat_conformance.manifest import VECTORS, Vector, load, picture_name, summarise, to_json
 from csplat_conformance.reference_renders import can_render, psnr, read_png, reference_render, write_png
 
 #: The text of the specification.
@@ -85,6 +85,7 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
         data: the file.
         pictures: a PNG for each of the recipe's views.
     """
+    known = {vector.name: vector.since for vector in load()}
     expect: dict[str, Any] = {}
     error: dict[str, Any] = {}
     if recipe.scene is not None:
@@ -110,7 +111,7 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
         sha256=hashlib.sha256(data).hexdigest(),
         why=recipe.why,
         clauses=list(recipe.clauses),
-        since=f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}",
+        since=known.get(recipe.name, f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}"),
         expect=expect,
         error=error,
         views=views,

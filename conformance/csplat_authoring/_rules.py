@@ -48,7 +48,7 @@ class Mask(NamedTuple):
 
 RANGES: Final[tuple[Range, ...]] = (
     Range("header", "version_major", "", 0, 0, "HDR-2", "E_VERSION"),
-    Range("header", "version_minor", "", 2, 2, "HDR-2", "E_VERSION"),
+    Range("header", "version_minor", "", 2, 3, "HDR-2", "E_VERSION"),
     Range("index_head", "head_size", "", 64, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "attribute_size", "", 16, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "codebook_size", "", 12, 255, "IDX-8", "E_VALUE"),
@@ -56,7 +56,7 @@ RANGES: Final[tuple[Range, ...]] = (
     Range("index_head", "directory_size", "", 28, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "tile_size", "", 52, 255, "IDX-8", "E_VALUE"),
     Range("index_head", "layer_size", "", 20, 255, "IDX-8", "E_VALUE"),
-    Range("index_head", "sh_degree", "", 0, 3, "IDX-3", "E_UNSUPPORTED"),
+    Range("index_head", "sh_degree", "", 0, 4, "IDX-3", "E_UNSUPPORTED"),
     Range("index_head", "unit_metres", "", 0.0, 1.7976931348623157e+308, "IDX-5", "E_VALUE"),
     Range("index_head", "origin", "", -1.7976931348623157e+308, 1.7976931348623157e+308, "IDX-6", "E_VALUE"),
     Range("attribute_record", "chroma_shift", "YCOCG", 0, 16, "ATT-8", "E_VALUE"),
@@ -67,9 +67,9 @@ RANGES: Final[tuple[Range, ...]] = (
     Range("attribute_record", "step", "means", 2.2250738585072014e-308, 1.7976931348623157e+308, "ATT-6", "E_VALUE"),
     Range("attribute_record", "step", "scales and colours", 1.1754943508222875e-38, 3.4028234663852886e+38, "ATT-10", "E_VALUE"),
     Range("attribute_record", "step", "level attributes", 0.0, 0.0, "ATT-7", "E_RESERVED"),
-    Range("codebook_record", "band_first", "SH", 1, 3, "CBR-2", "E_VALUE"),
+    Range("codebook_record", "band_first", "SH", 1, 4, "CBR-2", "E_VALUE"),
     Range("codebook_record", "band_first", "SHAPE", 0, 0, "CBR-2", "E_VALUE"),
-    Range("codebook_record", "band_last", "SH", 1, 3, "CBR-2", "E_VALUE"),
+    Range("codebook_record", "band_last", "SH", 1, 4, "CBR-2", "E_VALUE"),
     Range("codebook_record", "band_last", "SHAPE", 0, 0, "CBR-2", "E_VALUE"),
     Range("codebook_record", "size", "", 1, 65536, "CBR-4", "E_VALUE"),
     Range("extra_record", "name_size", "", 1, 62, "EXR-1", "E_VALUE"),
@@ -101,11 +101,11 @@ CHOICES: Final[tuple[Choice, ...]] = (
     Choice("attribute_record", "mapping", "", (0, 1, 2, 3, 4), (5,), "ATT-2", "E_VALUE"),
     Choice("codebook_record", "kind", "", (4, 6), (3, 5), "RES-2", "E_UNSUPPORTED"),
     Choice("extra_record", "dtype", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "RES-2", "E_UNSUPPORTED"),
-    Choice("layer_record", "layer", "", (0, 1, 2, 3, 8), (4, 5), "RES-2", "E_UNSUPPORTED"),
+    Choice("layer_record", "layer", "", (0, 1, 2, 3, 4, 8), (5,), "RES-2", "E_UNSUPPORTED"),
     Choice("block_head", "coding", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "BLK-1", "E_UNSUPPORTED"),
     Choice("stream_head", "coder", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
     Choice("stream_head", "transforms", "", (0, 1, 2, 3, 4), (5,), "RES-2", "E_UNSUPPORTED"),
-    Choice("stated_error_record", "measure", "", (1, 2, 3, 4, 5, 6, 7), (0, 8), "SER-1", "E_VALUE"),
+    Choice("stated_error_record", "measure", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "SER-1", "E_VALUE"),
 )
 
 MASKS: Final[tuple[Mask, ...]] = (

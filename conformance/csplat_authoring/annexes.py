@@ -72,7 +72,7 @@ _SECTIONS: Final = {
 }
 
 _NOTES: Final = {
-    "header.version_minor": "version 0.2",
+    "header.version_minor": "version 0.3",
     "header.profile": "BASE",
     "header.index_size": "so the chunks begin at 32 + 276 = 308",
     "header.header_crc": "of the bytes 0 to 27",

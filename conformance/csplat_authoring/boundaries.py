@@ -198,7 +198,7 @@ def _bases() -> tuple[Built, ...]:
     rich = rich_scene()
     second = replace(rich.tiles[1], blocks=rich.tiles[1].blocks | {MEANS: morton([[0, 1, 0], [1, 0, 0]], 2)})
     every = replace(
-        rich, tiles=(rich.tiles[0], second), sh_degree=3, attributes=attributes(3, ycocg=True, chroma_shift=1)
+        rich, tiles=(rich.tiles[0], second), sh_degree=4, attributes=attributes(4, ycocg=True, chroma_shift=1)
     )
     mixed = attributes(1) | {SH0 + 1: attributes(1, ycocg=True)[SH0 + 1]}
     some = tile(9, 3, 0, {SH0 + 1: sparse((1, 0, 1), rows_of(1, 2, 9, -9, 9))})

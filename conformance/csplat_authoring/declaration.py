@@ -201,8 +201,7 @@ def declared_scene(table: dict[str, Any]) -> Scene:
     if "attributes" in rest:
         changes = rest.pop("attributes")
         records = records | {
-            _ATTRIBUTES.get(name, _spec.ATTRIBUTE_SH4): _attribute(records.get(_ATTRIBUTES.get(name, 0)), change)
-            for name, change in changes.items()
+            _ATTRIBUTES[name]: _attribute(records.get(_ATTRIBUTES[name]), change) for name, change in changes.items()
         }
     if "records" in rest:
         records = {_ATTRIBUTES[name]: records[_ATTRIBUTES[name]] for name in rest.pop("records")}

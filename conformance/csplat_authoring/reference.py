@@ -21,7 +21,7 @@ Array = NDArray[Any]
 EXTRA_DTYPES = {value: f"<{name[0]}{_spec.EXTRA_DTYPE_BYTES[value]}" for value, name in _spec.EXTRA_DTYPE_NAMES.items()}
 
 _ROOT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")
-_COLOURS = (_spec.ATTRIBUTE_SH0, _spec.ATTRIBUTE_SH1, _spec.ATTRIBUTE_SH2, _spec.ATTRIBUTE_SH3)
+_COLOURS = range(_spec.ATTRIBUTE_SH0, _spec.ATTRIBUTE_SH4 + 1)
 
 
 @dataclass

@@ -31,7 +31,7 @@ class Vector:
         sha256: SHA-256 of the file.
         why: its purpose, one line.
         clauses: clauses that the vector covers.
-        since: version of the format.
+        since: version of the format in which the vector was added.
         expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
         error: `code`, `clause`, `offset`, `also` (other acceptable codes), `optional` (chunk type whose payload has the
             defect, if CHK-6 lets a decoder leave it unread and accept the file; otherwise empty).

@@ -287,6 +287,7 @@ _COLOURS = {
     "sh1": "#cc6677",
     "sh2": "#aa4499",
     "sh3": "#9a3a72",
+    "sh4": "#c79fd6",
     "overhead": "#8a8a8a",
 }
 _OTHER = "#bbbbbb"

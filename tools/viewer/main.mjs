@@ -134,6 +134,7 @@ const ACTIONS = {
   Digit1: () => shDegree(1),
   Digit2: () => shDegree(2),
   Digit3: () => shDegree(3),
+  Digit4: () => shDegree(4),
 };
 const BUTTONS = {
   reset: 'KeyR',

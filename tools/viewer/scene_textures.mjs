@@ -3,7 +3,7 @@
 import { toCamera } from './camera_maths.mjs';
 import { BLOCK_SPLATS, layoutSlots } from './texels.mjs';
 import { UNITS } from './shader_programs.mjs';
-import { BAND_CODEBOOK, BAND_ROWS, TILE_TEXELS } from './shader_attributes.mjs';
+import { BAND_CODEBOOK, BAND_ROWS, tileTexels } from './shader_attributes.mjs';
 import { Records } from './framebuffers.mjs';
 import { LinearTexture, Store, formats } from './textures.mjs';
 
@@ -14,8 +14,6 @@ import { LinearTexture, Store, formats } from './textures.mjs';
  * @typedef {import('./renderer.mjs').SceneLayout} SceneLayout
  * @typedef {import('./types.d.ts').View} View
  */
-
-const TILE_WORDS = 4 * TILE_TEXELS;
 
 export class SceneTextures {
   /**
@@ -33,13 +31,14 @@ export class SceneTextures {
     this.starts = starts;
     this.first = new LinearTexture(gl, words, slotCount);
     this.store = new Store(gl, words);
-    this.tiles = new LinearTexture(gl, words, TILE_TEXELS * tiles.length);
+    this.tileTexels = tileTexels(layout.shDegree);
+    this.tiles = new LinearTexture(gl, words, this.tileTexels * tiles.length);
     this.places = new LinearTexture(gl, floats, tiles.length);
     this.blocks = new LinearTexture(gl, word, slotCount / BLOCK_SPLATS);
     this.order = new LinearTexture(gl, word, slotCount);
     this.records = new Records(gl, slotCount);
     this.count = 0; // number of splats in the order
-    this.constants = new Uint32Array(TILE_WORDS * tiles.length);
+    this.constants = new Uint32Array(4 * this.tileTexels * tiles.length);
     this.constantFloats = new Float32Array(this.constants.buffer);
     this.corners = new Float32Array(4 * tiles.length);
     /** @type {Map<string, {at: number, rows: Rows}>} by codebook and layer */
@@ -71,7 +70,7 @@ export class SceneTextures {
     const start = this.starts[tile];
     this.first.write(start, first);
     const [x, y, z] = bits.means;
-    const at = TILE_WORDS * tile;
+    const at = 4 * this.tileTexels * tile;
     this.constants.set(
       [
         x | (y << 5) | (z << 10) | (bits.quats << 15) | (bits.opacities << 20),
@@ -100,7 +99,7 @@ export class SceneTextures {
    * @param {BandTexels} band
    */
   putBand(tile, layer, { rows, codebook }) {
-    const at = TILE_WORDS * tile + 4 * (1 + 2 * layer);
+    const at = 4 * (this.tileTexels * tile + 1 + 2 * layer);
     const rowsAt = rows ? this.store.append(rows.texels) : 0;
     const rowBits = rows ? rows.bits : 1;
     const table = codebook && this.tables.get(`${codebook.id}.${layer}`);
@@ -121,8 +120,8 @@ export class SceneTextures {
 
   /** @param {number} tile */
   putConstants(tile) {
-    const at = TILE_WORDS * tile;
-    this.tiles.write(TILE_TEXELS * tile, this.constants.subarray(at, at + TILE_WORDS));
+    const first = this.tileTexels * tile;
+    this.tiles.write(first, this.constants.subarray(4 * first, 4 * (first + this.tileTexels)));
   }
 
   /**

@@ -3,8 +3,8 @@
 /** Texels per row of the textures that are addressed by one number. */
 export const ROW_TEXELS = 2048;
 
-/** Texels of a tile's row in the table of tiles: 3 for geometry, then 2 for each SH band. */
-export const TILE_TEXELS = 9;
+/** Texels of a tile's row in the table of tiles: 3 for geometry, then 2 for each SH band. @param {number} shDegree */
+export const tileTexels = (shDegree) => 3 + 2 * shDegree;
 
 /** Records per row, one quad of an instance each. */
 export const RECORD_COLUMNS = 512;
@@ -19,6 +19,7 @@ export const READ_GEOMETRY = `
 uniform usampler2D uFirst; // first texel of each splat
 uniform usampler2D uStore; // everything else, as words
 uniform usampler2D uTiles; // constants of tiles
+uniform uint uTileTexels; // texels of a tile
 uniform sampler2D uPlaces; // per tile: corner in camera coordinates, step
 uniform usampler2D uBlocks; // tile of each block of slots
 
@@ -118,7 +119,7 @@ uint rowWords(uint columns, uint bits) {
 
 // Go to a splat's coefficients of a band; return false if its tile has none.
 bool openBand(uint tile, uint local, uint band) {
-  uint row = tile * ${TILE_TEXELS}u + 1u + 2u * band;
+  uint row = tile * uTileTexels + 1u + 2u * band;
   uvec4 head = texelFetch(uTiles, place(row), 0); // kind and bits, index, table, rows
   uint kind = head.x & 3u;
   if (kind == ${BAND_NONE}u) return false;
@@ -177,11 +178,26 @@ vec3 band3(vec3 d) {
   return sum;
 }
 
+vec3 band4(vec3 d) {
+  vec3 s = d * d;
+  vec3 sum = 2.5033429417967046 * d.x * d.y * (s.x - s.y) * coefficient3();
+  sum += -1.7701307697799304 * d.y * d.z * (3.0 * s.x - s.y) * coefficient3();
+  sum += 0.9461746957575601 * d.x * d.y * (7.0 * s.z - 1.0) * coefficient3();
+  sum += -0.6690465435572892 * d.y * d.z * (7.0 * s.z - 3.0) * coefficient3();
+  sum += 0.10578554691520431 * (s.z * (35.0 * s.z - 30.0) + 3.0) * coefficient3();
+  sum += -0.6690465435572892 * d.x * d.z * (7.0 * s.z - 3.0) * coefficient3();
+  sum += 0.47308734787878004 * (s.x - s.y) * (7.0 * s.z - 1.0) * coefficient3();
+  sum += -1.7701307697799304 * d.x * d.z * (s.x - 3.0 * s.y) * coefficient3();
+  sum += 0.6258357354491761 * (s.x * (s.x - 3.0 * s.y) - s.y * (3.0 * s.x - s.y)) * coefficient3();
+  return sum;
+}
+
 vec3 colourOf(uint tile, uint local, vec3 sh0, vec3 d) {
   vec3 sum = 0.5 + 0.28209479177387814 * sh0;
   if (uDegree >= 1 && openBand(tile, local, 1u)) sum += band1(d);
   if (uDegree >= 2 && openBand(tile, local, 2u)) sum += band2(d);
   if (uDegree >= 3 && openBand(tile, local, 3u)) sum += band3(d);
+  if (uDegree >= 4 && openBand(tile, local, 4u)) sum += band4(d);
   return clamp(sum, 0.0, 60000.0); // records store it in half precision
 }
 `;

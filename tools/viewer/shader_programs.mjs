@@ -1,5 +1,6 @@
 // Shader programs of the WebGL 2 back end and their uniforms.
 
+import { tileTexels } from './shader_attributes.mjs';
 import { COVER_VERTEX, PROJECT_FRAGMENT, RESOLVE_FRAGMENT, SPLAT_FRAGMENT, SPLAT_VERTEX } from './shaders.mjs';
 
 /**
@@ -98,6 +99,7 @@ export class ShaderPrograms {
     gl.uniform1i(project.at('uQuatLevels'), scene.quatLevels);
     gl.uniform1i(project.at('uAntialiased'), Number(scene.antialiased));
     gl.uniform1i(project.at('uDegree'), shDegree);
+    gl.uniform1ui(project.at('uTileTexels'), tileTexels(scene.shDegree));
     gl.useProgram(splat.program);
     gl.uniform2f(splat.at('uSize'), view.width, view.height);
   }

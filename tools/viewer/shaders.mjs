@@ -1,7 +1,7 @@
 // The shaders. A fragment pass projects the splats in order, one per pixel, into records; quads are drawn from the records.
 
 import { BLOCK_SPLATS } from './texels.mjs';
-import { COLOUR, READ_BANDS, READ_GEOMETRY, RECORD_COLUMNS, TILE_TEXELS } from './shader_attributes.mjs';
+import { COLOUR, READ_BANDS, READ_GEOMETRY, RECORD_COLUMNS } from './shader_attributes.mjs';
 
 const HEAD = `#version 300 es
 precision highp float;
@@ -74,7 +74,7 @@ void main() {
   if (i >= uEnd) return;
   uint slot = texelFetch(uOrder, place(i), 0).x;
   uint tile = texelFetch(uBlocks, place(slot / ${BLOCK_SPLATS}u), 0).x;
-  uint row = tile * ${TILE_TEXELS}u;
+  uint row = tile * uTileTexels;
   uvec4 layout0 = texelFetch(uTiles, place(row), 0); // bits, bits, texel of the store, number of words | first slot
   uvec4 scaleLattice = texelFetch(uTiles, place(row + 1u), 0);
   uvec4 colourLattice = texelFetch(uTiles, place(row + 2u), 0);

@@ -80,7 +80,7 @@ export interface Progress {
   /** Splats whose layer 0 is decoded. */
   splatsDone: number;
   splatCount: number;
-  /** The layer being read: 0, then 1 to 3. */
+  /** The layer being read: 0, then the SH bands from 1 on. */
   layer: number;
 }
 

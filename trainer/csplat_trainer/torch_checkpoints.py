@@ -243,5 +243,6 @@ FORMAT = Format(
     name="checkpoint",
     open=_open,
     open_bands=_open,
+    degree=MAX_SH_DEGREE,
     exact=frozenset({"means", "quats", "scales", "sh0", "shN"}),
 )

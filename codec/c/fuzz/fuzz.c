@@ -183,14 +183,14 @@ static int read_otherwise(csplat *file)
         csplat_packed_geometry geometry;
         csplat_packed packed;
         csplat_tile tile;
-        int32_t exponents[8];
+        int32_t exponents[ATTRIBUTES_END - OPACITIES];
         float *band;
         csplat_get_tile(file, i, &tile);
         integers.means = malloc(tile.splat_count * 3 * sizeof(int64_t));
         integers.quats = malloc(tile.splat_count * 3 * sizeof(int32_t));
         integers.sh[0] = malloc(tile.splat_count * 9 * sizeof(int64_t));
         integers.exponents = exponents;
-        band = malloc(tile.splat_count * 21 * sizeof(float));
+        band = malloc(tile.splat_count * COLUMNS_MAX * sizeof(float));
         if (!integers.means || !integers.quats || !integers.sh[0] || !band)
             abort();
         for (unsigned k = 1; k <= info->sh_degree; k++) { /* in either order, since a band may need the indices of a lower one */
@@ -223,7 +223,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     source.size = size;
     if (csplat_open_memory(&file, data, size, &small, &error))
         return 0;
-    accepted = csplat_decode(file, 3, &scene) == CSPLAT_OK;
+    accepted = csplat_decode(file, CSPLAT_SH_DEGREE_MAX, &scene) == CSPLAT_OK;
     csplat_free_scene(file, scene);
     if (csplat_open(&other, &source, &small, NULL))
         abort();

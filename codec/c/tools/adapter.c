@@ -169,7 +169,7 @@ static void compare_packed(csplat *file, uint32_t tile, size_t n, unsigned degre
 static void compare_floats(csplat *file, uint32_t tile, const csplat_tile *t, const csplat_scene *scene)
 {
     const size_t n = t->splat_count, k = ((size_t)scene->sh_degree + 1) * (scene->sh_degree + 1) - 1, first = (size_t)t->first;
-    float *means = room(n, 12), *shN = room(n, 12 * (k ? k : 1)), *band = room(n, 84);
+    float *means = room(n, 12), *shN = room(n, 12 * (k ? k : 1)), *band = room(n, 12 * (2 * CSPLAT_SH_DEGREE_MAX + 1));
     csplat_floats out = {0};
     out.means = means;
     out.shN = shN;
@@ -214,7 +214,7 @@ static void put_all(csplat *file, csplat *other, const csplat_scene *scene)
     all.means = room(n, 24);
     all.sh0 = room(n, 24);
     all.exponents = room(info->tile_count * records, 4);
-    for (unsigned band = 1; band <= 3; band++)
+    for (unsigned band = 1; band <= CSPLAT_SH_DEGREE_MAX; band++)
         all.sh[band - 1] = room(band <= info->sh_degree ? n : 0, 24 * (2 * (size_t)band + 1));
     for (uint32_t i = 0; i < info->tile_count; i++) {
         csplat_integers part = all;
@@ -263,7 +263,7 @@ static void put_all(csplat *file, csplat *other, const csplat_scene *scene)
     free(all.means);
     free(all.sh0);
     free(all.exponents);
-    for (int band = 0; band < 3; band++)
+    for (int band = 0; band < CSPLAT_SH_DEGREE_MAX; band++)
         free(all.sh[band]);
     free(tile_splats);
 }
@@ -288,7 +288,7 @@ static int answer(const char *path)
     fclose(input);
     if (csplat_open_memory(&file, data, size, &options, &error))
         refuse(&error);
-    else if (csplat_decode(file, 3, &scene))
+    else if (csplat_decode(file, CSPLAT_SH_DEGREE_MAX, &scene))
         refuse(csplat_last_error(file));
     else {
         if (csplat_open(&other, &source, &options, &error))

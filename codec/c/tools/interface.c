@@ -68,7 +68,7 @@ static csplat_code read_all(caller *c, size_t size, const csplat_options *option
     csplat_code code = csplat_open(&d, &source, options, NULL);
     if (code)
         return code;
-    code = csplat_decode(d, 3, &scene);
+    code = csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene);
     HOLDS((code == CSPLAT_OK) == (scene != NULL));
     csplat_free_scene(d, scene);
     for (int which = 0; which < 3 && !code; which++)
@@ -127,18 +127,18 @@ static void budgets_hold(const unsigned char *data, size_t size)
     size_t length;
     csplat *d;
     int found;
-    HOLDS(!csplat_open_memory(&d, data, size, NULL, NULL) && !csplat_decode(d, 3, &scene));
+    HOLDS(!csplat_open_memory(&d, data, size, NULL, NULL) && !csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene));
     options.splats_max = scene->splat_count - 1;
     csplat_free_scene(d, scene);
     HOLDS(!csplat_check(d) && !csplat_read_text(d, CSPLAT_METADATA, &text, &length) && text && text[length] == '\0');
     HOLDS(!csplat_read_stated_errors(d, &errors, &found));
     csplat_close(d);
-    HOLDS(!csplat_open_memory(&d, data, size, &options, NULL) && csplat_decode(d, 3, &scene) == CSPLAT_E_LIMIT && !scene);
+    HOLDS(!csplat_open_memory(&d, data, size, &options, NULL) && csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene) == CSPLAT_E_LIMIT && !scene);
     csplat_close(d);
     options.splats_max = 0;
     options.bytes_max = 50;
     options.json_bytes_max = length - 1;
-    HOLDS(!csplat_open_memory(&d, data, size, &options, NULL) && csplat_decode(d, 3, &scene) == CSPLAT_E_LIMIT);
+    HOLDS(!csplat_open_memory(&d, data, size, &options, NULL) && csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene) == CSPLAT_E_LIMIT);
     HOLDS(csplat_read_text(d, CSPLAT_METADATA, &text, &length) == CSPLAT_E_LIMIT && !text);
     HOLDS(csplat_get_info(d)->codebook_count == 0 || csplat_check(d) == CSPLAT_E_LIMIT);
     csplat_close(d);
@@ -157,9 +157,12 @@ static void arguments_are_checked(const unsigned char *data, size_t size)
     csplat *d;
     HOLDS(!csplat_open_memory(&d, data, size, NULL, NULL));
     HOLDS(csplat_get_tile(d, csplat_get_info(d)->tile_count, &tile) == CSPLAT_E_INPUT);
-    HOLDS(csplat_read_tile(d, 0, 4, &none) == CSPLAT_E_INPUT && csplat_read_tile(d, 0, 3, &none) == CSPLAT_OK);
+    HOLDS(csplat_read_tile(d, 0, CSPLAT_SH_DEGREE_MAX + 1, &none) == CSPLAT_E_INPUT);
+    HOLDS(csplat_read_tile(d, 0, CSPLAT_SH_DEGREE_MAX, &none) == CSPLAT_OK);
     HOLDS(csplat_read_integers(d, 0, &nothing) == CSPLAT_OK && csplat_read_extras(d, 0, NULL) == CSPLAT_OK);
-    HOLDS(csplat_read_band(d, 0, 0, NULL) == CSPLAT_E_INPUT && csplat_read_packed_band(d, 0, 4, &packed) == CSPLAT_E_INPUT);
+    HOLDS(csplat_read_band(d, 0, 0, NULL) == CSPLAT_E_INPUT);
+    HOLDS(csplat_read_band(d, 0, CSPLAT_SH_DEGREE_MAX + 1, NULL) == CSPLAT_E_INPUT);
+    HOLDS(csplat_read_packed_band(d, 0, CSPLAT_SH_DEGREE_MAX + 1, &packed) == CSPLAT_E_INPUT);
     HOLDS(csplat_read_packed_codebook(d, 65535, 1, &columns) == CSPLAT_E_INPUT);
     HOLDS(csplat_read_text(d, (csplat_text)3, &text, &length) == CSPLAT_E_INPUT);
     for (unsigned degree = 0; degree < 2; degree++) {

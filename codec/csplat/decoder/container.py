@@ -82,7 +82,7 @@ class SceneHeader:
         file_size: size of the file, bytes.
         index_size: size of the index, bytes.
         splat_count: N.
-        sh_degree: 0 to 3.
+        sh_degree: 0 to 4.
         antialiased, flat, coordinate_system, unit_metres, origin: as in `SplatModel`.
         attributes: attribute records, ids ascending.
         codebooks: codebook records, ids ascending.
@@ -209,10 +209,11 @@ def read_file_header(view: memoryview) -> _spec.Header:
         instead = describe_substitute(bytes(view[:_SUBSTITUTE_SIZE]))
         detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
-    version = (header.version_major, header.version_minor)
-    if version != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR):
+    major, oldest, newest = _spec.VERSION_MAJOR, _spec.VERSION_MINOR_OLDEST, _spec.VERSION_MINOR
+    if header.version_major != major or not oldest <= header.version_minor <= newest:
         raise UnsupportedError(
-            f"version {version[0]}.{version[1]} (this decoder reads {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR})",
+            f"version {header.version_major}.{header.version_minor}"
+            f" (this decoder reads {major}.{oldest} to {major}.{newest})",
             _spec.ERROR_VERSION,
             offsets["version_major"],
             "HDR-2",
@@ -226,6 +227,11 @@ def read_file_header(view: memoryview) -> _spec.Header:
     if not least <= header.index_size <= most:
         refuse_field(_spec.ERROR_VALUE, "HDR-7", header, 0, offsets, "index_size", f"{least} to {most}")
     return header
+
+
+def sh_degree_max(version_minor: int) -> int:
+    """Return the largest SH degree of files of a version (IDX-3, SER-1)."""
+    return 3 if version_minor == 2 else _spec.SH_DEGREE_MAX
 
 
 def check_length(view: memoryview, file_size: int) -> None:

@@ -18,6 +18,7 @@ from csplat.decoder.container import (
     read_file_header,
     refuse_field,
     refuse_length,
+    sh_degree_max,
     view_of,
 )
 from csplat.errors import FormatError, UnsupportedError
@@ -74,7 +75,7 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
         refuse_length(_spec.ERROR_TRUNCATED, "HDR-5", "the data ends within the index", view, end)
     check_index_crc(view, start, file.index_size)
     head = _spec.unpack_index_head(view, start)
-    _check_head(head, start)
+    _check_head(head, start, file.version_minor)
     _check_room(head, file.index_size)
     at = start + head.head_size
     attributes = _read_attributes(view, at, head)
@@ -109,13 +110,13 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
     )
 
 
-def _check_head(head: _spec.IndexHead, at: int) -> None:
+def _check_head(head: _spec.IndexHead, at: int, version_minor: int) -> None:
     offsets = _spec.INDEX_HEAD_OFFSETS
     check_reserved(head, at, offsets)
     for name, least in _RECORD_SIZES.items():
         if getattr(head, name) < least:
             refuse_field(_spec.ERROR_VALUE, "IDX-8", head, at, offsets, name, f"at least {least}")
-    if head.sh_degree > _spec.SH_DEGREE_MAX:
+    if head.sh_degree > sh_degree_max(version_minor):
         raise UnsupportedError(f"SH degree {head.sh_degree}", offset=at + offsets["sh_degree"], clause="IDX-3")
     if head.scene_flags & ~(sum(_spec.SCENE_FLAG_NAMES) | _spec.ANCILLARY_SCENE_FLAGS):
         raise FormatError(

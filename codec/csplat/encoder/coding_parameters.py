@@ -85,7 +85,7 @@ class CodingParameters:
         opacity_levels, quat_levels: M of spec 7.3 and 7.5.
         chroma_shift: chroma is coarser than luma by 2**chroma_shift.
         sh_degree: SH degree to keep.
-        codebook_step: lattice step of the bands 1 to 3 with a codebook, whose entries deserve more precision.
+        codebook_step: lattice step of the bands from 1 on with a codebook, whose entries deserve more precision.
         codebook_share: number of codebook entries per splat.
         codebook_most: maximum number of codebook entries.
         escape_fraction: fraction of the splats to escape.
@@ -192,7 +192,7 @@ def choose_parameters(
 
 
 def band_slice(band: int) -> slice:
-    """Return the slice of an SH band among the coefficients of the bands 1 to 3."""
+    """Return the slice of an SH band among the coefficients of the bands from 1 on."""
     return slice(band * band - 1, (band + 1) ** 2 - 1)
 
 

@@ -103,7 +103,6 @@ def encode_with_report(
     options = EncodeOptions() if options is None else options
     if not isinstance(options, EncodeOptions):
         raise InputError(f"options is {options!r}, expected csplat.EncodeOptions(preset=...)")
-    options.kept_degree(model.sh_degree)
     if origin is not None or metadata is not None:
         raise InputError("a target excludes origin and metadata")
     if not target.is_rendered:

@@ -36,7 +36,7 @@ class EncodeOptions:
         sh0_step: step of the degree-0 colour, > 0.
         sh_step: step of the higher SH bands, > 0.
         chroma_shift: chroma is coarser than luma by 2**chroma_shift, 0 to 16.
-        sh_degree: SH degree to keep, 0 to 3; `None` keeps all bands, of which a file holds three.
+        sh_degree: SH degree to keep, 0 to 4; `None` keeps all bands.
         sh_coding: "auto", "codebook", "scalar" or "none".
         codebook_size: number of entries of the SH codebook.
         escape_fraction: fraction of the splats, those with the largest weighted errors, to escape from the SH codebook,
@@ -117,18 +117,8 @@ class EncodeOptions:
         return self.threads or os.cpu_count() or 1
 
     def kept_degree(self, source_degree: int) -> int:
-        """Return the SH degree of the file of a scene.
-
-        Raises:
-            InputError: the scene has a higher degree than a file holds, and the options do not drop its bands.
-        """
-        degree = source_degree if self.sh_degree is None else min(self.sh_degree, source_degree)
-        if degree > (most := _spec.SH_DEGREE_MAX):
-            raise InputError(
-                f"a file of format {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR} holds SH of degree {most} at most, the"
-                f" scene has degree {degree}: use --sh-degree {most} / sh_degree={most}"
-            )
-        return degree
+        """Return the SH degree of the file of a scene."""
+        return source_degree if self.sh_degree is None else min(self.sh_degree, source_degree)
 
     def chosen(self) -> dict[str, Any]:
         """Return the options that the caller set, except `threads`, which has no effect on the bytes."""
@@ -145,7 +135,7 @@ class Preset:
 
     Attributes:
         quality: `attribute_psnr` for scenes with and without SH, dB.
-        sh_quality: the same for the bands 1 to 3, which take more bits.
+        sh_quality: the same for the bands from 1 on, which take more bits.
         sh_coding, adaptive, deflate_level, escape_fraction: as in `EncodeOptions`.
         codebook_share: number of entries of the SH codebook per splat.
         codebook_most: maximum number of its entries.

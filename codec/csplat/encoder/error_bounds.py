@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat import _spec
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F64
@@ -136,7 +135,7 @@ def measured_sums(source: SplatModel, decoded: SplatModel, source_index: NDArray
         source_index: [len(decoded)] integers, index in the source of each decoded splat.
 
     Returns:
-        Sums of the measures means, covariance, opacities, sh0, sh1, sh2, sh3. A band that only one of the two models
+        Sums of the measures means, covariance, opacities, sh0 to sh4. A band that only one of the two models
         has is compared with 0.
 
     Raises:
@@ -163,7 +162,7 @@ def _errors_of_rows(source: SplatModel, decoded: SplatModel, rows: NDArray[Any],
         "opacities": value_errors(source.opacities[rows], decoded.opacities[part]),
         "sh0": value_errors(source.sh0[rows], decoded.sh0[part]),
     }
-    for band in range(1, min(_spec.SH_DEGREE_MAX, max(source.sh_degree, decoded.sh_degree)) + 1):
+    for band in range(1, max(source.sh_degree, decoded.sh_degree) + 1):
         span = slice(band * band - 1, (band + 1) * (band + 1) - 1)
         zeros = np.zeros((len(rows), 2 * band + 1, 3), np.float32)
         before = source.shN[rows, span] if band <= source.sh_degree else zeros

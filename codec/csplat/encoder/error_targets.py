@@ -164,7 +164,7 @@ def _scaled_levels(levels: int | None, factor: float) -> int:
 
 
 def _family(name: str) -> str:
-    return "sh" if name in ("sh1", "sh2", "sh3") else name
+    return "sh" if name.startswith("sh") and name != "sh0" else name
 
 
 def _clip_levels(value: float, low: int, high: int) -> int:

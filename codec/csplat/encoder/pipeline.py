@@ -50,7 +50,7 @@ from csplat.types import F32, Progress, null_progress
 Integers = NDArray[Any]
 
 _FEW_TILES, _SMALL_TILE = 16, 256  # more tiles than this, with fewer splats per tile on average, cause a note
-_COLOUR_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH0 + 4))
+_COLOUR_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in range(_spec.MEASURE_SH0, _spec.MEASURE_SH4 + 1))
 _SHAPE_MEASURES = tuple(_spec.MEASURE_NAMES[id] for id in (_spec.MEASURE_COVARIANCE, _spec.MEASURE_OPACITIES))
 
 

@@ -1,4 +1,4 @@
-"""Encode SH bands 1 to 3 with scalar coding or a codebook with escapes, whichever is smaller at equal distortion.
+"""Encode SH bands 1 to 4 with scalar coding or a codebook with escapes, whichever is smaller at equal distortion.
 
 (Spec 6.4.4, 6.4.5, 7.1.) A codebook is trained on the whole scene. For a scene with more splats than a bucket it is
 trained on a sample, and an `AssignmentRule` assigns the other splats.
@@ -349,7 +349,7 @@ class _BandSums:
     def by_band(self) -> dict[str, tuple[float, float]]:
         """Return (largest, sum of squares) by measure, enlarged by `_SLACK`."""
         result = {}
-        for band in range(1, min(_spec.SH_DEGREE_MAX + 1, round((len(self._largest) + 1) ** 0.5))):
+        for band in range(1, round((len(self._largest) + 1) ** 0.5)):
             largest = float(self._largest[band_slice(band)].max()) * _SLACK
             squares = float(self._squares[band_slice(band)].sum()) * _SLACK
             result[_spec.MEASURE_NAMES[_spec.MEASURE_SH0 + band]] = (largest, squares)

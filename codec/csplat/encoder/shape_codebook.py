@@ -32,8 +32,8 @@ from csplat.types import F32, F64, I16, I32, I64, Mask, Progress
 Integers = NDArray[Any]
 Floats = NDArray[Any]
 
-#: Codebook id, above that of SH.
-SHAPE_CODEBOOK_ID = _spec.SH_DEGREE_MAX + 1
+#: Codebook id, above that of SH. It does not depend on the SH degree, so that files keep their bytes.
+SHAPE_CODEBOOK_ID = 4
 
 _TRACE_STEPS = 2048  # lattice steps per trace; assignments are exact up to norms of about 2,300
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves

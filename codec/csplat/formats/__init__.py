@@ -284,7 +284,8 @@ _CSPLAT_FORMAT = Format(
     name=_CSPLAT,
     open=_open_csplat,
     write=_write_csplat,
-    splat_bytes=(7.0, 8.0, 9.0, 10.0),
+    degree=MAX_SH_DEGREE,
+    splat_bytes=(7.0, 8.0, 9.0, 10.0, 10.3),
     carries=_PLY_FORMAT.carries | {"cameras"},
 )
 

@@ -63,7 +63,7 @@ export class CSPLATFileLoader {
       typeof from === 'string' || from instanceof Blob
         ? from
         : new Blob([/** @type {ArrayBufferView<ArrayBuffer>} */ (from)]);
-    const target = { name: 'csplat for Babylon.js', engine, mirrors: true };
+    const target = { name: 'csplat for Babylon.js', engine, mirrors: true, shDegree: 4 };
     openScene(source, { ...options, onProgress: progress }, target, [controller.signal])
       .then(onSuccess, (error) => onError?.(undefined, error))
       .finally(() => {

@@ -264,7 +264,8 @@ export class CsplatParser {
       this.options.onProgress?.(received, size);
       asset?.fire('progress', received, size);
     };
-    const scene = await openScene(from, { ...this.options, onProgress }, { name: NAME, engine: 'RUB', mirrors: false });
+    const target = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: false, shDegree: BANDS.length };
+    const scene = await openScene(from, { ...this.options, onProgress }, target);
     const { header } = scene;
     /** @type {import('../decoder.d.ts').PackedTile[]} */
     const tiles = [];

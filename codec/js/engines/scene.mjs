@@ -22,8 +22,8 @@ const MOST = 0.9; // fraction of the sample within the bounds
  *
  * @param {Parameters<typeof CsplatReader.open>[0]} from
  * @param {LoadOptions} options
- * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean}} target name of the adapter; letters of the engine's
- *   directions +x, +y, +z; whether the engine can draw with a mirroring matrix
+ * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean, shDegree: number}} target name of the adapter; letters of
+ *   the engine's directions +x, +y, +z; whether the engine can draw with a mirroring matrix; its highest SH degree
  * @param {(AbortSignal | undefined)[]} [signals] further signals that abort the load
  */
 export async function openScene(from, options, target, signals = []) {
@@ -38,8 +38,11 @@ export async function openScene(from, options, target, signals = []) {
     };
     const reader = await CsplatReader.open(from, { ...others, signal, onProgress });
     const { metadata } = await reader.describe({ signal });
-    const degree = Math.min(shDegree ?? reader.header.shDegree, reader.header.shDegree);
-    const { extras } = reader.header;
+    const { extras, shDegree: most } = reader.header;
+    const wanted = Math.min(shDegree ?? most, most);
+    const degree = Math.min(wanted, target.shDegree);
+    if (degree < wanted)
+      onceSaid(target.name, `SH bands above ${degree} are left out: the engine ends at degree ${degree}`);
     if (extras.length)
       onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
     return new SplatScene(
@@ -161,7 +164,7 @@ export class SplatScene {
   /**
    * Yield one band of all tiles that have it, for a progressive load.
    *
-   * @param {number} layer 1 to 3
+   * @param {number} layer from 1 on
    * @returns {AsyncGenerator<Band & {index: number}, void>}
    */
   async *bands(layer) {

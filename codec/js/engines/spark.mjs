@@ -21,7 +21,7 @@ const LAYERS = /** @type {const} */ ([1, 2, 3]);
  * @param {SparkOptions} [options]
  */
 export async function loadCsplat(from, { layout, ...options } = {}) {
-  const scene = await openScene(from, options, { name: NAME, engine: 'RUB', mirrors: false });
+  const scene = await openScene(from, options, { name: NAME, engine: 'RUB', mirrors: false, shDegree: 3 });
   const { header } = scene;
   const make = (layout ?? (halvesSuffice(header) ? 'packed' : 'ext')) === 'packed' ? packed : ext;
   const { splats, words, mesh } = await make(scene);

@@ -11,7 +11,7 @@ import { join } from 'node:path';
 import { pathToFileURL } from 'node:url';
 
 const FLOATS = ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN'];
-const INTEGERS = ['opacities', 'scales', 'quats', 'means', 'sh0', 'sh1', 'sh2', 'sh3', 'tile_splats', 'exponents'];
+const INTEGERS = ['opacities', 'scales', 'quats', 'means', 'sh0', 'sh1', 'sh2', 'sh3', 'sh4', 'tile_splats', 'exponents']; // prettier-ignore
 
 /** Folder of the decoder; a copy may be tested instead. */
 const folder = process.env.CSPLAT_JS ? pathToFileURL(`${process.env.CSPLAT_JS}/`) : new URL('../', import.meta.url);

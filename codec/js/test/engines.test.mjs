@@ -190,7 +190,7 @@ for (const options of [{}, { progressive: true }, { workers: 0 }]) {
       };
       return new Response(body, { status: 206, headers: known });
     };
-    const target = { name: 'test', engine: 'RUB', mirrors: true };
+    const target = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3 };
     const scene = await openScene('http://example.org/a.csplat', { ...options, fetch, firstBytes: 64 }, target);
     let count = 0;
     for await (const tile of scene.tiles()) count += tile.count;

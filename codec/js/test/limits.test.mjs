@@ -52,18 +52,29 @@ test('an index beyond the budget is refused before its records are read', async 
   assert.deepEqual([error.code, error.clause], ['E_LIMIT', 'LIM-1']);
 });
 
-test('a lower SH degree gives the rows of the lower bands', async () => {
-  const file = vector('extreme/seeded');
-  const whole = await decode(file);
-  for (const shDegree of [0, 1, 2, 3, 7]) {
-    const part = await decode(file, { shDegree });
-    const rows = (Math.min(shDegree, 3) + 1) ** 2 - 1;
-    assert.equal(part.shN.length, 3 * rows * part.count);
-    for (let i = 0; i < part.count; i++) {
-      assert.deepEqual(part.shN.slice(3 * rows * i, 3 * rows * (i + 1)), whole.shN.slice(45 * i, 45 * i + 3 * rows));
+for (const name of ['extreme/seeded', 'valid/sh_degree_4_mixed']) {
+  test(`${name}: a lower SH degree gives the rows of the lower bands`, async () => {
+    const file = vector(name);
+    const whole = await decode(file);
+    const width = whole.shN.length / whole.count;
+    for (const shDegree of [0, 1, 2, 3, 4, 7]) {
+      const part = await decode(file, { shDegree });
+      const values = 3 * ((Math.min(shDegree, whole.shDegree) + 1) ** 2 - 1);
+      assert.equal(part.shN.length, values * part.count);
+      for (let i = 0; i < part.count; i++) {
+        const [start, other] = [values * i, width * i];
+        assert.deepEqual(part.shN.slice(start, start + values), whole.shN.slice(other, other + values));
+      }
+      assert.equal(hash(part.sh0), hash(whole.sh0));
     }
-    assert.equal(hash(part.sh0), hash(whole.sh0));
-  }
+  });
+}
+
+test('files of version 0.2 are read, others refused by name', async () => {
+  assert.equal(readHeader(vector('valid/version_0_2')).version, '0.2');
+  assert.equal(readHeader(rich).version, '0.3');
+  const error = await refusal(() => readHeader(vector('invalid/header_version_minor_above')));
+  assert.match(error.message, /has version 0\.4, this decoder reads 0\.2 to 0\.3$/);
 });
 
 test('tiles are returned in the requested order', async () => {
@@ -112,7 +123,7 @@ test('invalid arguments are E_INPUT', async () => {
     () => decode(vector('valid/coder_deflate_fixed'), { inflate: () => new Uint8Array(1) }),
     () => CsplatReader.open(42),
     () => reader.readTile(2),
-    () => reader.readLayer(0, 4),
+    () => reader.readLayer(0, 5),
     () => reader.readLayer(0, 8),
   ];
   for (const mistake of mistakes) {

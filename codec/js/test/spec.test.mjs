@@ -27,6 +27,6 @@ test('the tables of the registry are frozen and complete', () => {
   assert.throws(() => {
     spec.CODER_NAMES[0] = 'x';
   }, TypeError);
-  assert.equal(spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SH3], 21);
+  assert.equal(spec.ATTRIBUTE_COLUMNS[spec.ATTRIBUTE_SH4], 27);
   assert.equal(spec.CODER_NAMES[spec.CODER_DEFLATE], 'deflate');
 });

@@ -10,8 +10,8 @@ __attribute__((import_module("env"), import_name("read"))) int read_part(double 
 enum { SH_ROWS = 512 }; /* as in ../wasm_decoder.mjs */
 
 /* ../wasm_decoder.mjs reads these structures directly from memory. */
-typedef char columns_as_expected[sizeof(csplat_columns) == 192 && offsetof(csplat_columns, offset) == 16 ? 1 : -1];
-typedef char packed_as_expected[sizeof(csplat_packed) == 208 && offsetof(csplat_packed, rows) == 192 ? 1 : -1];
+typedef char columns_as_expected[sizeof(csplat_columns) == 240 && offsetof(csplat_columns, offset) == 16 ? 1 : -1];
+typedef char packed_as_expected[sizeof(csplat_packed) == 256 && offsetof(csplat_packed, rows) == 240 ? 1 : -1];
 
 static csplat *file;
 static csplat_packed_geometry geometry;
@@ -81,7 +81,7 @@ const float *EXPORT(read_tile)(uint32_t index, unsigned degree)
 /* SH of the tile's splats `from` to `to`. Called in order, with few splats at a time so that they stay in the L1 cache. */
 const float *EXPORT(read_rows)(unsigned degree, uint32_t from, uint32_t to)
 {
-    static float rows[SH_ROWS * 3 * 15];
+    static float rows[SH_ROWS * 3 * ((SPEC_SH_DEGREE_MAX + 1) * (SPEC_SH_DEGREE_MAX + 1) - 1)];
     put_bands(bands, 1, degree, from, to, rows_put, rows, 3 * (size_t)coefficients_of(degree));
     return rows;
 }

@@ -49,6 +49,9 @@ def _codebooks() -> list[Recipe]:
         SCALES: codebook_block(65535, (n - 1, n, 0), own, Stream(3), summands=(5, 0, 6)),
         QUATS: codebook_block(65535, (), own),
     }
+    rows = [[*range(-13, 14)]] * (n - 1) + [[*range(27)]]
+    bands = Codebook(1, _spec.CODEBOOK_KIND_SH, {4: rows}, (4, 4), Stream(1, _RUNS))
+    last_band = codebook_block(1, (n - 1, n, 0), signed([[*range(99, 126)]]), Stream(3))
     unused = (
         Codebook(1, _spec.CODEBOOK_KIND_SHAPE, {0: [[1, 2, 3, 4, 5, 6]]}),
         Codebook(2, _spec.CODEBOOK_KIND_SH, {1: rows_of(1, 2, 9, -1, 1)}, (1, 1)),
@@ -85,6 +88,12 @@ def _codebooks() -> list[Recipe]:
             "the escape index is 65,536 and needs three bytes",
             "CBR-4 CBK-2",
             replace(_with(wide), codebooks=(flat,)),
+        ),
+        _extreme(
+            "codebook_of_65536_band_4",
+            "65,536 entries of 27 columns, and an escaped splat",
+            "CBR-4 CBK-2 CBK-3",
+            scene(4, [tile(2, 3, 3, {sh_attribute(4): last_band})], codebooks=(bands,)),
         ),
         _extreme(
             "codebooks_unused",
@@ -241,15 +250,18 @@ def edge_recipes() -> list[Recipe]:
             "ATT-2 LAT-4",
             _lifting(),
         ),
-        _extreme(
-            "column_limits_of_bands",
-            "columns of ±2^22 in every band: Y as it is, Co and Cg after their shift",
-            "LAT-3 LAT-4",
-            scene(
-                3,
-                [tile(degree=3, changes={sh_attribute(band): _limits(band) for band in range(4)})],
-                attributes=attributes(3) | {sh_attribute(band): lifted for band in range(4)},
-            ),
+        *(
+            _extreme(
+                name,
+                f"columns of ±2^22 in every band to {degree}: Y as it is, Co and Cg after their shift",
+                "LAT-3 LAT-4",
+                scene(
+                    degree,
+                    [tile(degree=degree, changes={sh_attribute(band): _limits(band) for band in range(degree + 1)})],
+                    attributes=attributes(degree) | {sh_attribute(band): lifted for band in range(degree + 1)},
+                ),
+            )
+            for name, degree in (("column_limits_of_bands", 3), ("column_limits_of_band_4", 4))
         ),
         _extreme(
             "codebook_bounds",

@@ -9,7 +9,8 @@ from csplat import _spec
 from csplat_authoring.builder import Built, build, seal
 from csplat_authoring.coders import deflate_fixed
 from csplat_authoring.recipe import Recipe, invalid_recipe
-from csplat_authoring.samples import OPACITIES, SCALES, SH0, levels, rows_of, scene, signed, tile
+from csplat_authoring.recipes.valid import full_band_4
+from csplat_authoring.samples import OPACITIES, SCALES, SH0, levels, rows_of, scene, sh_attribute, signed, tile
 from csplat_authoring.scene import Block, Chunk, Codebook, Stream
 
 _SPLAT_BYTES = 4 * (3 + 4 + 3 + 1 + 48)  # bytes per splat of SH degree 3, as float32 (spec section 3)
@@ -85,6 +86,10 @@ def _bombs() -> list[Recipe]:
     values = b"{}" + b" " * runs
     packed = values + b"\0\0" + b"\xff" * runs + b"\0\0" + b"\xff" * runs
     text = scene(chunks=(Chunk(_spec.CHUNK_METADATA, b"{}", Stream(1, _RUNS, "deflate_fixed", packed=packed)),))
+    full, band = full_band_4(), sh_attribute(4)
+    (one,) = full.tiles
+    longer = Stream(1, _RUNS, packed=bytes(range(28)) + (b"\xff" * 27 + b"\0") * 2)
+    blocks = one.blocks | {band: replace(one.blocks[band], stream_coding=longer)}
     return [
         invalid_recipe(
             "deflate_bomb",
@@ -93,6 +98,14 @@ def _bombs() -> list[Recipe]:
             "E_CODER",
             bomb,
             at="TILE.0.0/opacities.stream.coded",
+        ),
+        invalid_recipe(
+            "tile_of_65536_band_4_long",
+            "one element more than 65,536 times 27, the longest stream",
+            "TRF-1",
+            "E_CODER",
+            replace(full, tiles=(replace(one, blocks=blocks),)),
+            at="TILE.0.4/sh4.stream.coded",
         ),
         invalid_recipe(
             "json_beyond_budget",

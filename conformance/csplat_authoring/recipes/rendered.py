@@ -40,7 +40,7 @@ _Vec = tuple[float, float, float]
 
 def rendered_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
-    return [_ellipsoids(), _harmonics(), _antialiased()]
+    return [_ellipsoids(), _harmonics("harmonics", 3), _antialiased(), _harmonics("harmonics_4", 4)]
 
 
 def _ellipsoids() -> Recipe:
@@ -53,11 +53,12 @@ def _ellipsoids() -> Recipe:
     )
 
 
-def _harmonics() -> Recipe:
-    made = _scene(3, 40, (-2.6, -1.4))
+def _harmonics(name: str, degree: int) -> Recipe:
+    made = _scene(degree, 40, (-2.6, -1.4))
     return _recipe(
-        "harmonics",
-        "colours of degree 3 that depend on the direction, some below 0, from two sides; the origin is not added",
+        name,
+        f"colours of degree {degree} that depend on the direction, some below 0, from two sides; the origin is not"
+        " added",
         replace(made, origin=(1000.0, -2000.0, 0.25)),
         [_camera((2.6, -1.0, -1.4), (0.0, 0.0, 0.0)), _camera((-2.2, 1.5, 1.8), (0.1, 0.0, 0.0))],
     )

@@ -64,6 +64,13 @@ def valid_recipes() -> list[Recipe]:
         ),
         valid_recipe(
             "extreme",
+            "tile_of_65536_band_4",
+            "65,536 times 27 elements of four bytes in one stream, the longest",
+            "TIL-1 STR-5 TIL-4",
+            full_band_4(),
+        ),
+        valid_recipe(
+            "extreme",
             "tiles_of_one",
             "many tiles, each with layers and exponents of its own",
             "TIL-1 TIL-4",
@@ -86,6 +93,17 @@ def _full_tile() -> Scene:
     full |= {SH0 + 1: sparse((1,) * n, [[5] * 9] * n, mask_coding=Stream(1, (_RUNS,)))}
     return with_stream_codings(
         scene(1, tiles=[replace(same, blocks=full)]), lambda coding: replace(coding, transforms=(_RUNS,))
+    )
+
+
+def full_band_4() -> Scene:
+    """Return a full tile without bands 1 to 3, whose last splat alone differs in band 4."""
+    n = _spec.TILE_SPLATS_MAX
+    same = tile(2, 1)
+    full = {a: replace(b, rows=[list(b.rows[0])] * n) for a, b in same.blocks.items()}
+    full |= {SH0 + 4: signed([[*range(-13, 14)]] * (n - 1) + [[*range(27)]], Stream(4))}
+    return with_stream_codings(
+        scene(4, tiles=[replace(same, blocks=full)]), lambda coding: replace(coding, transforms=(_PLANES, _RUNS))
     )
 
 
@@ -116,7 +134,8 @@ def _streams() -> list[Recipe]:
 
 def _codebooks() -> list[Recipe]:
     result = _shapes()
-    for first, last in ((1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (1, 3)):
+    for first, last in ((1, 1), (2, 2), (3, 3), (1, 2), (2, 3), (1, 3), (4, 4), (2, 4), (1, 4)):
+        degree = max(3, last)
         entries = {band: rows_of(band, 3, 3 * (2 * band + 1), -99, 99) for band in range(first, last + 1)}
         made = Codebook(900, _spec.CODEBOOK_KIND_SH, entries, (first, last), Stream(1, (_DELTA, _ZIGZAG)))
         changes = {SH0 + first: codebook_block(900, (0, 2, 1, 1))} | {
@@ -124,10 +143,10 @@ def _codebooks() -> list[Recipe]:
         }
         others = {
             SH0 + b: signed(rows_of(b, 4, 3 * (2 * b + 1), -9, 9))
-            for b in range(1, 4)
+            for b in range(1, degree + 1)
             if b not in range(first, last + 1)
         }
-        whole = scene(3, [tile(3, 4, 0, dict(sorted((changes | others).items())))], codebooks=(made,))
+        whole = scene(degree, [tile(3, 4, 0, dict(sorted((changes | others).items())))], codebooks=(made,))
         result.append(
             _valid(f"codebook_sh_{first}_{last}", "bands in chunks of their own, one index", "DIR-5 CBR-2 CBK-4", whole)
         )
@@ -194,11 +213,14 @@ def combined_recipes() -> list[Recipe]:
             "CBK-1 CBK-3 CBK-4 CBK-5 DIR-5 TIL-6",
             _all_codebooks(),
         ),
-        _valid(
-            "codebook_sh_1_3_escape",
-            "one index for all bands; the second and the last splat are escaped in each",
-            "CBK-3 CBK-4 CBK-5",
-            _escaped_bands(),
+        *(
+            _valid(
+                f"codebook_sh_1_{degree}_escape",
+                "one index for all bands; the second and the last splat are escaped in each",
+                "CBK-3 CBK-4 CBK-5",
+                _escaped_bands(degree),
+            )
+            for degree in (3, 4)
         ),
         _valid(
             "combined_tiles",
@@ -312,14 +334,14 @@ def _together() -> Tile:
     return tile(70, _N, 0, dict(sorted(changes.items())), exponent=-1, extras=(_raw(2),))
 
 
-def _escaped_bands() -> Scene:
-    entries = {band: rows_of(band, 2, 3 * (2 * band + 1), -99, 99) for band in (1, 2, 3)}
-    table = Codebook(1, _spec.CODEBOOK_KIND_SH, entries, (1, 3), Stream(1))
+def _escaped_bands(degree: int) -> Scene:
+    entries = {band: rows_of(band, 2, 3 * (2 * band + 1), -99, 99) for band in range(1, degree + 1)}
+    table = Codebook(1, _spec.CODEBOOK_KIND_SH, entries, (1, degree), Stream(1))
     rows = {band: rows_of(band + 5, 2, 3 * (2 * band + 1), -120, 120) for band in entries}
     changes = {
         sh_attribute(band): codebook_block(1, (1, 2, 0, 2) if band == 1 else (), signed(rows[band])) for band in rows
     }
-    return replace(scene(3, [tile(80, _N, 0, changes)]), codebooks=(table,))
+    return replace(scene(degree, [tile(80, _N, 0, changes)]), codebooks=(table,))
 
 
 def _raw(seed: int) -> Block:

@@ -118,7 +118,7 @@ class Source:
 SplatRows = NDArray[Any]  # integers, indices of splats
 
 _NORMALS = frozenset(("nx", "ny", "nz"))
-_BLOCK = 4096  # splats per block; their 45 float64 SH coefficients take 1.5 MB
+_BLOCK = 4096  # splats per block; their 72 float64 SH coefficients of degree 4 take 2.4 MB
 
 
 class MeasuredError(NamedTuple):

@@ -117,7 +117,7 @@ def ordinary_inputs() -> list[EncoderInput]:
 
     few = lambda: cloud(64, 1, 9)  # noqa: E731 - shared by several inputs
     return [
-        *(rows_input(f"ordinary/degree_{d}", f"SH degree {d}", degree(d)) for d in range(4)),
+        *(rows_input(f"ordinary/degree_{d}", f"SH degree {d}", degree(d)) for d in range(5)),
         rows_input("ordinary/one_splat", "one splat", lambda: cloud(1, 3, 5), renders=False),
         rows_input("ordinary/ascii", "numbers as text", few, PlyLayout(format="ascii")),
         rows_input("ordinary/big_endian", "big-endian numbers", few, PlyLayout(format="binary_big_endian")),
@@ -448,9 +448,9 @@ def unusual_inputs() -> list[EncoderInput]:
             PlyLayout(comments=("Größe: 3 µm, 雪", "\udcff\udcfe caf\udce9", "element vertex 5", "end_header?")),
         ),
         rows_input(
-            "nasty/degree_4",
-            "72 columns f_rest: csplat's highest degree is 3, and the file has to state the source's",
-            lambda: cloud(64, 4, 42),
+            "nasty/degree_5",
+            "105 columns f_rest: csplat's highest degree is 4, and the file has to state the source's",
+            lambda: cloud(64, 5, 42),
             renders=False,
         ),
         rows_input(

@@ -38,7 +38,8 @@ class Index:
 
     Attributes:
         head: the index head.
-        degree: `sh_degree`; `None` if this version does not support it.
+        degree_max: largest SH degree of the file's version.
+        degree: `sh_degree`; `None` if that version does not support it.
         attributes: attribute records by registry value.
         steps: steps that obey ATT-6, by registry value.
         levels: levels that obey ATT-3 or ATT-4, by registry value.
@@ -50,6 +51,7 @@ class Index:
     """
 
     head: Head
+    degree_max: int
     degree: int | None
     attributes: dict[int, AttributeAt] = field(default_factory=dict)
     steps: dict[int, float] = field(default_factory=dict)
@@ -74,23 +76,25 @@ def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | 
     return float(product) if low <= product <= high else None
 
 
-def read_records(view: memoryview, end: int, log: ViolationLog) -> Index:
+def read_records(view: memoryview, end: int, version_minor: int, log: ViolationLog) -> Index:
     """Read the records of the index before the directory.
 
     Args:
         view: the file.
         end: offset of the index's CRC according to the header, not beyond the data.
+        version_minor: minor version of the file.
         log: receives the violations.
     """
     start = _spec.HEADER_SIZE
     head = read_record(view, _spec.IndexHead, start, "index")
     record = head.record
-    index = Index(head, record.sh_degree if record.sh_degree <= _spec.SH_DEGREE_MAX else None)
+    degree_max = 3 if version_minor == 2 else _spec.SH_DEGREE_MAX  # IDX-3
+    index = Index(head, degree_max, record.sh_degree if record.sh_degree <= degree_max else None)
     kinds = ("attribute", "codebook", "extra", "directory", "tile")
     needed = index.size_of("head") + sum(getattr(record, f"{kind}_count") * index.size_of(kind) for kind in kinds)
     if start + needed > end:
         log.add("IDX-2", start, "index", f"its counts require at least {needed} bytes, it has {end - start}")
-    _check_head(log, head)
+    _check_head(log, head, degree_max)
     at = start + index.size_of("head")
     at = _read_attributes(view, at, end, index, log)
     at = _read_codebooks(view, at, end, index, log)
@@ -105,15 +109,15 @@ def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> in
     return fitting
 
 
-def _check_head(log: ViolationLog, head: Head) -> None:
+def _check_head(log: ViolationLog, head: Head, degree_max: int) -> None:
     record = head.record
     log.check_reserved(head)
     for kind, least in _SIZES_MIN.items():
         size = getattr(record, f"{kind}_size")
         if size < least:
             log.add_field("IDX-8", head, f"{kind}_size", f"{size}, expected at least {least}")
-    if record.sh_degree > _spec.SH_DEGREE_MAX:
-        log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {_spec.SH_DEGREE_MAX}")
+    if record.sh_degree > degree_max:
+        log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {degree_max}")
     unlisted = record.scene_flags & 0x0F & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
@@ -231,7 +235,7 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
     if record.kind not in _spec.CODEBOOK_KIND_NAMES:
         log.add_field("RES-2", placed, "kind", f"{record.kind} is not a kind of this version")
     elif record.kind == _spec.CODEBOOK_KIND_SH:
-        highest = _spec.SH_DEGREE_MAX if index.degree is None else index.degree
+        highest = index.degree_max if index.degree is None else index.degree
         if not 1 <= first <= last <= highest:
             log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last}, expected 1 to {highest}, ascending")
     elif first or last:

@@ -106,7 +106,7 @@ def _check(
     if end is None:
         log.skip("index and chunks", "the index is incomplete")
         return
-    index = read_records(view, end - _CRC_SIZE, log)
+    index = read_records(view, end - _CRC_SIZE, header.record.version_minor, log)
     counts.splats = index.head.record.splat_count
     directory = read_directory(view, index.end, end - _CRC_SIZE, index, log) if index.complete else []
     tiles: list[Tile] = []
@@ -147,10 +147,10 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
     if magic != _spec.MAGIC:
         log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, expected {_spec.MAGIC.hex(' ')}")
         return None
-    version = (record.version_major, record.version_minor)
-    expected = (_spec.VERSION_MAJOR, _spec.VERSION_MINOR)
-    if version != expected:
-        message = f"{version[0]}.{version[1]}, expected {expected[0]}.{expected[1]}"
+    readable = range(_spec.VERSION_MINOR_OLDEST, _spec.VERSION_MINOR + 1)
+    if record.version_major != _spec.VERSION_MAJOR or record.version_minor not in readable:
+        expected = " or ".join(f"{_spec.VERSION_MAJOR}.{minor}" for minor in readable)
+        message = f"{record.version_major}.{record.version_minor}, expected {expected}"
         log.add_field("HDR-2", header, "version_major", message)
         return None
     end = _spec.HEADER_OFFSETS["header_crc"]

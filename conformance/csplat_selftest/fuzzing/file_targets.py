@@ -370,7 +370,7 @@ class Ply:
 def ply_seeds() -> list[Ply]:
     """Return small PLYs of all degrees, encodings and special cases."""
     made = [_seed(degree, kind, rows) for degree in (0, 1) for kind in _KINDS for rows in (0, 1, 3)]
-    made += [_seed(degree, _KINDS[0], 1) for degree in (2, 3)]
+    made += [_seed(degree, _KINDS[0], 1) for degree in (2, 3, 4)]
     made += [_seed(1, kind, 2, types={"x": "double", "y": "double", "z": "double"}) for kind in _KINDS]
     made += [Ply((), data) for data in (_zip("meta.json"), _zip("a"), gzip.compress(b"NGSP" + bytes(40), mtime=0))]
     made += [_seed(0, kind, 2, extra=("label", "scale_3"), types={"label": "uchar"}) for kind in _KINDS]

@@ -91,7 +91,7 @@ def encode(
     for archives, small if size matters more than precision. One of
     --target-psnr, --target-size, --max-psnr-drop (with --data) and --keep
     chooses the precision and prunes splats, and requires the render extra;
-    --max-error limits errors of means, covariance, opacities, sh0 to sh3. Views
+    --max-error limits errors of means, covariance, opacities, sh0 to sh4. Views
     are virtual without --data or --cameras. --help-all shows --keep, --cameras
     and all other options.
 

@@ -30,7 +30,8 @@ _ATTRIBUTES = {
     "sh0": "colour, independent of the view direction",
     "sh1": "change of colour with the view direction, coarse",
     "sh2": "the same, finer",
-    "sh3": "the same, finest",
+    "sh3": "the same, finer still",
+    "sh4": "the same, finest",
     "overhead": "header, index, frames and metadata",
 }
 _LAYERS = {
@@ -38,6 +39,7 @@ _LAYERS = {
     "sh1": "first band of view-dependent colour, fetched afterwards",
     "sh2": "second band",
     "sh3": "third band",
+    "sh4": "fourth band",
 }
 _MEASURES = {
     "means": "distance between the centres, in scene units",
@@ -47,6 +49,7 @@ _MEASURES = {
     "sh1": "first band of the change of colour with the view direction",
     "sh2": "second band",
     "sh3": "third band",
+    "sh4": "fourth band",
 }
 _CHECK = "<code>csplat verify FILE --source SCENE</code> checks them."
 _SCENE = {

@@ -10,7 +10,6 @@ import html
 
 import numpy as np
 
-from csplat._spec import SH_DEGREE_MAX
 from csplat.encoder import EncodeOptions, encode
 from csplat.model import SplatModel
 from csplat_render.scene_frame import surface_areas, visible_opacity
@@ -39,7 +38,7 @@ def scene_html(model: SplatModel, *, most_splats: int = MOST_SPLATS) -> str:
     """
     shown = most_visible(model, most_splats)
     wishes = estimated_up_parameters(estimate_up(shown))
-    data = encode(shown, EncodeOptions(preset="fast", sh_degree=SH_DEGREE_MAX))
+    data = encode(shown, EncodeOptions(preset="fast"))
     page = export_page(data, "scene", wishes).page.decode()
     frame = (
         f'<iframe srcdoc="{html.escape(page)}" sandbox="allow-scripts" title="{html.escape(repr(model))}"'

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import quote, unquote, urlencode, urlsplit
 
-from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED, SH_DEGREE_MAX
+from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.decoder import SceneHeader, decode, read_header
 from csplat.editing.up_axis import Direction
 from csplat.encoder import EncodeOptions, PresetName, encode_with_report
@@ -267,13 +267,9 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
 
 def _encode_scene(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewerScene:
     source = read_source(str(path), progress=progress)
-    options, findings = EncodeOptions(preset=preset, sh_degree=SH_DEGREE_MAX), source.findings
-    if (degree := source.model.sh_degree) > SH_DEGREE_MAX:
-        text = f"SH degree {degree}: bands above {SH_DEGREE_MAX} are not shown"
-        findings = (*findings, Finding("sh-bands", degree - SH_DEGREE_MAX, text, "note"))
-    data = encode_with_report(source.model, options, progress=progress).data
+    data = encode_with_report(source.model, EncodeOptions(preset=preset), progress=progress).data
     header, up = read_header(data), estimate_up(source.model)
-    return ViewerScene(f"{stem}.csplat", data, len(data), header, up, findings, source.size_bytes)
+    return ViewerScene(f"{stem}.csplat", data, len(data), header, up, source.findings, source.size_bytes)
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -109,7 +109,6 @@ def run_training_to_file(
         InputError: as for both.
         OSError: a file cannot be read or written.
     """
-    encoding.kept_degree(options.sh_degree)
     tuning_files = _tuning_outputs(files, options)
     data_set = _load(data, options, files)
     for one in data_set.val:  # training does not read these; finds damaged ones before it

@@ -134,7 +134,6 @@ def run_finetuning(
         CsplatError: an option or a file is not usable.
         OSError: a file cannot be read or written.
     """
-    encoding.kept_degree(source.sh_degree)
     threads = encoding.threads
     with thread_count(threads):
         prepare_renderer(quiet=quiet, gradients=True)
