@@ -283,6 +283,18 @@ def test_a_codebook_grows_to_one_entry_per_four_splats():
     assert 2048 == found.report.chosen["codebook_size"]  # 1500, rounded up to a power of two
 
 
+@pytest.mark.parametrize("book_psnr", [28.0, 30.0])
+def test_codebooks_of_too_few_entries_lead_to_larger_ones(book_psnr):
+    # Precision hardly lowers the errors of the first codebooks, while scalar coding reaches the goal at once.
+    scene = AnalyticScene(splats=30_000, book_psnr=book_psnr, book_octave=3.5, index_bytes=0.8, entry_bytes=2.0)
+    found, scalar = (
+        search(scene, psnr=38.0, no_prune=True, options=EncodeOptions(sh_coding=coding))
+        for coding in ("auto", "scalar")
+    )
+    assert len(found.file) < 0.85 * len(scalar.file)
+    assert len(found.tried) <= MOST_TRIES
+
+
 def test_quantisation_classes_are_used_if_files_become_smaller():
     cheaper = replace(PLAIN, grading=0.9)
     graded, dearer, unknown = (

@@ -29,7 +29,8 @@ NOTHING = 1e-12
 LOG_ERROR_PER_DB = math.log(10.0) / 10.0
 
 _APART = 0.5  # dB; two files of less distance do not determine a slope
-_SLOPES = (0.3, 2.0)  # range of a measured slope, as a multiple of the typical one
+#: Range of a measured slope, as a multiple of the assumed one.
+LEAST_SLOPE, _LARGEST_SLOPE = 0.3, 2.0
 #: Largest fraction of the error that pruning may take; with more, quantisation would have to be too fine. Files of
 #: donut at 38 dB are expected to be equally large with fractions of 0.66 and 0.74.
 MOST_PRUNED = 0.75
@@ -69,12 +70,15 @@ class RateLine:
     bytes_slope: float
 
     @classmethod
-    def through(cls, points: Sequence[RatePoint], error_slope: float, bytes_slope: float) -> RateLine:
+    def through(
+        cls, points: Sequence[RatePoint], error_slope: float, bytes_slope: float, flattest: float = LEAST_SLOPE
+    ) -> RateLine:
         """Return the line through files, the first of which is nearest to the goal.
 
         Args:
             points: the files. Another one that is far enough from the first determines the slopes.
             error_slope, bytes_slope: the slopes to assume without one, and to limit measured ones by.
+            flattest: least slope of the error, as a multiple of the assumed one.
         """
         first = points[0]
         for other in points[1:]:
@@ -82,8 +86,8 @@ class RateLine:
             if abs(apart) >= _APART:
                 by_error = math.log(other.error / first.error) / apart / error_slope
                 by_size = math.log(other.size_bytes / first.size_bytes) / apart / bytes_slope
-                error_slope *= min(max(by_error, _SLOPES[0]), _SLOPES[1])
-                bytes_slope *= min(max(by_size, _SLOPES[0]), _SLOPES[1])
+                error_slope *= min(max(by_error, flattest), _LARGEST_SLOPE)
+                bytes_slope *= min(max(by_size, LEAST_SLOPE), _LARGEST_SLOPE)
                 break
         return cls(first, error_slope, bytes_slope)
 

@@ -43,6 +43,7 @@ from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
 from csplat_tools.optimise.rate_distortion import (
     BYTES_PER_DB,
     LEAST_QUANTISED,
+    LEAST_SLOPE,
     LOG_ERROR_PER_DB,
     MOST_PRUNED,
     NOTHING,
@@ -85,6 +86,9 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 _AIM = (0.06, 0.12)  # dB above a PSNR that files of all and of refitted splats aim at, since PSNR varies by chance
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; another coding may be better there
 _JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
+# Slopes of the error of codebooks, relative to the typical one. Below the first, a codebook has too few entries, and
+# precision hardly helps. The second is the least that is believed; errors of other codings never are that flat.
+_FLAT, _FLATTEST_BOOK = 0.7, 0.03
 _CLOSE = 0.1  # fraction of the bytes; of a codebook that is worse by more, only a larger size is tried
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 _WORTH_FILE = 0.01  # fraction of the bytes that another file of the same splats and coding must promise
@@ -301,6 +305,9 @@ class TargetSearch:
                 sizes = self._other_sizes(books[0]) if books else []
                 if books and costs[books[0]] > costs[best] + _CLOSE:
                     sizes = sizes[:1]  # only a larger one can gain that much
+                largest = max(books, key=lambda one: one.entries_per_splat or 0.0, default=None)
+                if largest is not None and self._needs_entries(subset, largest, costs[best]):
+                    sizes += self._other_sizes(largest)[:1]
                 found = [
                     *self._fewer_bands(subset, best),
                     *sizes,
@@ -357,6 +364,15 @@ class TargetSearch:
             return []
         sizes = [factor * book.entries_per_splat for factor in (2.0, 0.5)]
         return [replace(book, entries_per_splat=size) for size in sizes if _ENTRIES[0] <= size <= _ENTRIES[1]]
+
+    def _needs_entries(self, subset: Subset, book: Coding, cost: float) -> bool:
+        """Return True if precision hardly improves a codebook, and its drafts are smaller than the best coding's file.
+
+        Then its errors are those of too few entries. What it would cost to meet the goal is extrapolated far.
+        """
+        drafts = self.pool.of(subset, book, draft=subset.refits)
+        is_flat = self._line(subset, book).error_slope > -_FLAT * _PSNR_PER_PRECISION["codebook"] * LOG_ERROR_PER_DB
+        return is_flat and math.log(min(one.size_bytes for one in drafts)) < cost - _CLOSE
 
     def _fewer_bands(self, subset: Subset, coding: Coding) -> list[Coding]:
         """Return codings with fewer SH bands, the fewest first, if dropping these takes little of the error."""
@@ -434,7 +450,9 @@ class TargetSearch:
         for draft in (True, False):
             made = self._by_distance(subset, coding, draft=draft)
             if made:
-                line = RateLine.through([self._point(one) for one in made], *slopes)
+                points = [self._point(one) for one in made]
+                flattest = _FLATTEST_BOOK if coding.sh == "codebook" else LEAST_SLOPE
+                line = RateLine.through(points, *slopes, flattest)
                 slopes = line.error_slope, line.bytes_slope
         assert line is not None
         return line
