@@ -116,8 +116,10 @@ def _check_head(head: _spec.IndexHead, at: int, version_minor: int) -> None:
     for name, least in _RECORD_SIZES.items():
         if getattr(head, name) < least:
             refuse_field(_spec.ERROR_VALUE, "IDX-8", head, at, offsets, name, f"at least {least}")
-    if head.sh_degree > sh_degree_max(version_minor):
-        raise UnsupportedError(f"SH degree {head.sh_degree}", offset=at + offsets["sh_degree"], clause="IDX-3")
+    most = sh_degree_max(version_minor)
+    if head.sh_degree > most:
+        subject = f"SH degree {head.sh_degree} in version 0.{version_minor}, which ends at {most},"
+        raise UnsupportedError(subject, offset=at + offsets["sh_degree"], clause="IDX-3")
     if head.scene_flags & ~(sum(_spec.SCENE_FLAG_NAMES) | _spec.ANCILLARY_SCENE_FLAGS):
         raise FormatError(
             _spec.ERROR_RESERVED, at + offsets["scene_flags"], "RES-1", "scene_flags", found=f"{head.scene_flags:#04x}"

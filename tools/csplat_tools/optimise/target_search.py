@@ -366,10 +366,13 @@ class TargetSearch:
         return [replace(book, entries_per_splat=size) for size in sizes if _ENTRIES[0] <= size <= _ENTRIES[1]]
 
     def _needs_entries(self, subset: Subset, book: Coding, cost: float) -> bool:
-        """Return True if precision hardly improves a codebook, and its drafts are smaller than the best coding's file.
+        """Return True if a codebook has too few entries for a PSNR, and a larger one may beat the best coding.
 
-        Then its errors are those of too few entries. What it would cost to meet the goal is extrapolated far.
+        Then precision hardly lowers its error, so that its expected cost is far from any draft, and its drafts are
+        smaller than the file expected of the best coding, log bytes.
         """
+        if self.goal.size_bytes is not None:
+            return False
         drafts = self.pool.of(subset, book, draft=subset.refits)
         is_flat = self._line(subset, book).error_slope > -_FLAT * _PSNR_PER_PRECISION["codebook"] * LOG_ERROR_PER_DB
         return is_flat and math.log(min(one.size_bytes for one in drafts)) < cost - _CLOSE
