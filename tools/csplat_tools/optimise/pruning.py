@@ -37,15 +37,10 @@ from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient
 from csplat_trainer.pruning import MeasuredViews, PruningOrder
 from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
-_FIT_STEPS = (560, 960)  # steps of a refit, without and with SH; half if it starts from the values of another
-_FILE_STEPS = (320, 480)  # the same through the quantisers of a file; fewer make files with SH 8 % larger, others not
+_FIT_STEPS = 960  # steps of a refit; half if it starts from the values of another
+_FILE_STEPS = 480  # the same through the quantisers of a file; with 320, files are up to 8 % larger
 _AGREE_ON = 0.5  # fraction of the splats on whose pruning virtual views must agree before they are enough
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
-# Typical power of the error of pruning with which the error after a refit grows, without and with SH; 0.64 to 0.9 and
-# 0.84 to 1.2 in seven scenes.
-_ERROR_POWER = (0.8, 1.05)
-_ERROR_POWERS = (0.5, 2.0)  # range of that power if it is measured on two refits
-_DISTINCT = 0.1  # log ratio of errors from which two refits determine the power
 _LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes; fewer are too similar
 
 
@@ -120,29 +115,22 @@ class Pruner:
         later = sum(len(groups[turn % len(groups)].cameras) for turn in range(len(self.order.rounds) - 1))
         return len(self.cameras) + len(self.sufficient.check) + later
 
-    def errors(self, allowed: float, known: Mapping[int, float] | None = None) -> tuple[F64, F64]:
-        """Predict the error of pruning after a refit.
+    def errors(self, allowed: float, known: tuple[int, float] | None = None) -> tuple[F64, F64]:
+        """Predict the error of pruning after a refit, which is proportional to the error that the order predicts.
 
         Args:
             allowed: mean squared error up to which errors are of interest.
-            known: mean squared error after a refit by number of splats, in the order of measurement; `None`: the usual
-                gain of a refit is assumed.
+            known: a number of splats and their mean squared error after a refit; `None`: the usual gain is assumed.
 
         Returns:
             Numbers of kept splats, in decreasing order, and the mean squared error of each.
         """
-        gain, power = error_of_psnr(REFIT_GAIN), 1.0
-        measured = [(self._error(count), error) for count, error in (known or {}).items() if error > 0.0]
-        if measured:
-            (before, after), power = measured[-1], _ERROR_POWER[self.source.sh_degree > 0]
-            for other_before, other_after in measured[:-1]:
-                if abs(math.log(other_before / before)) > _DISTINCT:
-                    power = math.log(other_after / after) / math.log(other_before / before)
-                    power = min(max(power, _ERROR_POWERS[0]), _ERROR_POWERS[1])
-            gain = after / before**power
-        self.order.extend(error=max((allowed / max(gain, NOTHING)) ** (1.0 / power), NOTHING))
+        gain = error_of_psnr(REFIT_GAIN)
+        if known is not None and known[1] > 0.0:
+            gain = known[1] / self._error(known[0])
+        self.order.extend(error=max(allowed / max(gain, NOTHING), NOTHING))
         errors = self.order.mean_errors()[: len(self.source)]  # at least one splat is kept
-        return len(self.source) - np.arange(len(errors), dtype=np.float64), gain * errors**power
+        return len(self.source) - np.arange(len(errors), dtype=np.float64), gain * errors
 
     def _error(self, kept_count: int) -> float:
         """Return the mean squared error of pruning all but this number of splats, before a refit."""
@@ -155,7 +143,7 @@ class Pruner:
         pruned = model = self.source.select(rows)
         before = after = self.check_scorer.psnr(pruned)
         if self.refits and len(rows) < len(self.source):
-            steps = _FIT_STEPS[self.source.sh_degree > 0]
+            steps = _FIT_STEPS
             if self._last is not None:
                 model, steps = _with_values_of(self._last.model, self._last.rows, pruned, rows), steps // 2
             model = refit_splats(
@@ -212,7 +200,7 @@ class PrunedSubset:
             return encode_tiles(plan, progress=pruner.progress)
         fixed = fix_quantisation(plan, pruner.source, pruner.progress)
         values = quantisation_aware_refit(
-            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_FILE_STEPS[self.model.sh_degree > 0]),
+            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_FILE_STEPS),
             background=pruner.views.background, seed=pruner.seed, threads=pruner.threads, progress=pruner.progress,
         )  # fmt: skip
         start = fixed.start()

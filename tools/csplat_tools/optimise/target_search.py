@@ -66,7 +66,7 @@ _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 # What is typical, without and with SH. It is assumed only until candidates show otherwise.
 _USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
 _PRECISION_OFFSET = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
-_COUNT_BYTES_PER_DB = (0.05, 0.07)  # change of log bytes per dB, for the choice of the number of splats
+_COUNT_BYTES_PER_DB = (0.04, 0.1)  # change of log bytes per dB, for the choice of the number of splats
 _PSNR_PER_PRECISION = {"codebook": 0.6}  # dB per dB of precision, hence also of bytes; 1 for other codings
 _TUNING_GAINS = {"codebook": 1.2}  # dB of the whole error by the refit through the quantisers; 0.7 for other codings
 _USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
@@ -151,7 +151,6 @@ class TargetSearch:
         pruner: prunes splats; `None`: all are kept.
         work: amount of work relative to the default effort.
         _errors: mean squared error before quantisation, by subset, SH degree, and True on the views of the goal.
-        _pruned: measured mean squared error of pruning after the refit, by number of splats.
     """
 
     goal: Goal
@@ -160,7 +159,6 @@ class TargetSearch:
     pruner: Pruner | None
     work: float = 1.0
     _errors: dict[tuple[int, int, bool], float] = field(default_factory=dict, init=False)
-    _pruned: dict[int, float] = field(default_factory=dict, init=False)
 
     def best(self) -> Candidate:
         """Return the smallest file that meets the goal, or the best one of a size.
@@ -204,19 +202,13 @@ class TargetSearch:
         less certain.
         """
         kept_count, tried = self._first_count(pruner), list[tuple[float, Subset, Coding]]()
-        coding: Coding | None = None
-        chosen_at = 0.0
         for left in reversed(range(_ROUNDS)):
             subset = pruner.refit(kept_count)
             usual = self._first_codings(subset)[-1]
             if left and self.work >= 1.0 and self._took_too_much(subset, usual):
                 kept_count = self._next_count(pruner, subset, usual)[0]
                 continue
-            if coding is None or abs(self._start(subset, coding) - chosen_at) > _FAR:
-                coding = self._choose_coding(subset)
-                chosen_at = self._predict(subset, coding)[0]
-            else:
-                self._try(subset, coding, {})
+            coding = self._choose_coding(subset)
             tried.append((self._predict(subset, coding)[1], subset, coding))
             kept_count, saved = self._next_count(pruner, subset, coding)
             if self.work < 1.0 or saved < _WORTH:
@@ -243,7 +235,7 @@ class TargetSearch:
         if self.goal.size_bytes is not None:
             usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
             return self._rounded(min(self.goal.size_bytes / usual, splats))
-        allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
+        allowed, kept_count, known = self._allowed_in_renders, splats, None
         for left in reversed(range(_ROUNDS)):  # pruning errors in validation views differ from those in training views
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
@@ -251,25 +243,25 @@ class TargetSearch:
             if not left or abs(kept_count - before) <= _WORTH * splats:
                 break
             pruned = self.whole.model.select(pruner.order.kept(kept_count))
-            known = {kept_count: error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)}
+            known = kept_count, error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)
         return kept_count
 
     def _next_count(self, pruner: Pruner, subset: Subset, coding: Coding) -> tuple[int, float]:
         """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save."""
         size_bytes, allowed, count = self.goal.size_bytes, self._allowed_in_renders, len(subset.model)
         with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
-        self._pruned[count] = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
+        pruned = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
         if size_bytes is None:
-            counts, errors = pruner.errors(allowed, self._pruned)
+            counts, errors = pruner.errors(allowed, (count, pruned))
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
             least = LEAST_QUANTISED * allowed
         else:
             line = self._line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
-            counts, errors = pruner.errors(quantised, self._pruned)
+            counts, errors = pruner.errors(quantised, (count, pruned))
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
             least = LEAST_QUANTISED * quantised
-        costs[errors > max(_FARTHEST * self._pruned[count], least)] = np.inf
+        costs[errors > max(_FARTHEST * pruned, least)] = np.inf
         best = int(np.argmin(costs))
         return self._rounded(counts[best]), float(costs[np.searchsorted(-counts, -count)] - costs[best])
 
