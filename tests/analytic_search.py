@@ -99,7 +99,8 @@ class AnalyticScene:
         unneeded: splats without effect in any view.
         removal_psnr: PSNR after half of the others are pruned, dB, before a refit.
         removal_power: exponent with which the error grows with the number of pruned splats.
-        mended: dB by which a refit reduces that error. tuned: dB that a refit through a file's quantisers gains.
+        mended: dB by which a refit reduces that error.
+        tuned: dB by which a refit through a file's quantisers reduces the error of these.
         shown: PSNR of the scene with bands up to degree 0, 1 and 2, dB.
         frame_bytes: bytes of a file without splats. splat_bytes, sh_bytes: bytes per splat at the usual quality.
         rate: share by which bytes grow with each dB.
@@ -120,7 +121,7 @@ class AnalyticScene:
     removal_psnr: float = 22.0
     removal_power: float = 3.0
     mended: float = 8.0
-    tuned: float = 1.1
+    tuned: float = 2.0
     shown: tuple[float, ...] = (26.0, 32.0, 38.0)
     frame_bytes: int = 900
     splat_bytes: float = 7.0
@@ -186,7 +187,7 @@ class AnalyticScene:
         if chosen["sh_coding"] == "codebook":
             octaves = math.log2(64.0 * chosen["codebook_size"] / contents.splats)
             error = error + error_of(self.book_psnr + self.book_octave * octaves)
-        removed = self.removed(contents.splats, refitted=contents.refitted) / error_of(gained) ** -1.0
+        removed = self.removed(contents.splats, refitted=contents.refitted)
         return self._seen(error + self.missing(chosen["sh_degree"]), removed, views)
 
     def source_error(self, splats: int, sh_degree: int, views: Views, *, refitted: bool = False) -> float:

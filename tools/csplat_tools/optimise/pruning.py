@@ -41,6 +41,8 @@ _FIT_STEPS = 960  # steps of a refit; half if it starts from the values of anoth
 _FILE_STEPS = 480  # the same through the quantisers of a file; with 320, files are up to 8 % larger
 _AGREE_ON = 0.5  # fraction of the splats on whose pruning virtual views must agree before they are enough
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
+_ERROR_POWERS = (0.5, 2.0)  # range of the power of the error of pruning with which that after a refit grows
+_DISTINCT = 0.1  # log ratio of errors from which two refits determine the power
 _LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes; fewer are too similar
 
 
@@ -115,22 +117,29 @@ class Pruner:
         later = sum(len(groups[turn % len(groups)].cameras) for turn in range(len(self.order.rounds) - 1))
         return len(self.cameras) + len(self.sufficient.check) + later
 
-    def errors(self, allowed: float, known: tuple[int, float] | None = None) -> tuple[F64, F64]:
-        """Predict the error of pruning after a refit, which is proportional to the error that the order predicts.
+    def errors(self, allowed: float, known: Mapping[int, float] | None = None) -> tuple[F64, F64]:
+        """Predict the error of pruning after a refit, proportional to that before it until two refits show a power.
 
         Args:
             allowed: mean squared error up to which errors are of interest.
-            known: a number of splats and their mean squared error after a refit; `None`: the usual gain is assumed.
+            known: mean squared error after a refit by number of splats, in the order of measurement; `None`: the usual
+                gain of a refit is assumed.
 
         Returns:
             Numbers of kept splats, in decreasing order, and the mean squared error of each.
         """
-        gain = error_of_psnr(REFIT_GAIN)
-        if known is not None and known[1] > 0.0:
-            gain = known[1] / self._error(known[0])
-        self.order.extend(error=max(allowed / max(gain, NOTHING), NOTHING))
+        gain, power = error_of_psnr(REFIT_GAIN), 1.0
+        measured = [(self._error(count), error) for count, error in (known or {}).items() if error > 0.0]
+        if measured:
+            before, after = measured[-1]
+            for other_before, other_after in measured[:-1]:
+                if abs(math.log(other_before / before)) > _DISTINCT:
+                    power = math.log(other_after / after) / math.log(other_before / before)
+                    power = min(max(power, _ERROR_POWERS[0]), _ERROR_POWERS[1])
+            gain = after / before**power
+        self.order.extend(error=max((allowed / max(gain, NOTHING)) ** (1.0 / power), NOTHING))
         errors = self.order.mean_errors()[: len(self.source)]  # at least one splat is kept
-        return len(self.source) - np.arange(len(errors), dtype=np.float64), gain * errors
+        return len(self.source) - np.arange(len(errors), dtype=np.float64), gain * errors**power
 
     def _error(self, kept_count: int) -> float:
         """Return the mean squared error of pruning all but this number of splats, before a refit."""

@@ -33,7 +33,7 @@ _APART = 0.5  # dB; two files of less distance do not determine a slope
 LEAST_SLOPE, _LARGEST_SLOPE = 0.3, 2.0
 #: Largest fraction of the error that pruning may take; with more, quantisation would have to be too fine. Files of
 #: donut at 38 dB are expected to be equally large with fractions of 0.66 and 0.74.
-MOST_PRUNED = 0.75
+MOST_PRUNED = 0.8
 
 
 def error_of_psnr(psnr: float) -> float:

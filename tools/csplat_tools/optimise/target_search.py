@@ -66,9 +66,9 @@ _RENDERS_WITH_PRUNING = (600.0, 2400.0)
 # What is typical, without and with SH. It is assumed only until candidates show otherwise.
 _USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
 _PRECISION_OFFSET = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
-_COUNT_BYTES_PER_DB = (0.04, 0.1)  # change of log bytes per dB, for the choice of the number of splats
+_COUNT_BYTES_PER_DB = (0.03, 0.07)  # change of log bytes per dB, for the choice of the number of splats
 _PSNR_PER_PRECISION = {"codebook": 0.6}  # dB per dB of precision, hence also of bytes; 1 for other codings
-_TUNING_GAINS = {"codebook": 1.2}  # dB of the whole error by the refit through the quantisers; 0.7 for other codings
+_TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the quantisers; 1.5 to 2.6 in five scenes
 _USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
 
 # What is tried.
@@ -191,7 +191,7 @@ class TargetSearch:
         assert self.pruner is not None
         subset, coding, _ = self._choose_splats(self.pruner)
         draft = self.pool.make(subset, coding, self._predict(subset, coding)[0], draft=True)
-        return draft, self._expected(draft, draft.error)
+        return draft, self._unquantised(subset, coding) + self._quantised(draft)
 
     # The number of splats
 
@@ -235,7 +235,7 @@ class TargetSearch:
         if self.goal.size_bytes is not None:
             usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
             return self._rounded(min(self.goal.size_bytes / usual, splats))
-        allowed, kept_count, known = self._allowed_in_renders, splats, None
+        allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
         for left in reversed(range(_ROUNDS)):  # pruning errors in validation views differ from those in training views
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
@@ -243,7 +243,7 @@ class TargetSearch:
             if not left or abs(kept_count - before) <= _WORTH * splats:
                 break
             pruned = self.whole.model.select(pruner.order.kept(kept_count))
-            known = kept_count, error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)
+            known = {kept_count: error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)}
         return kept_count
 
     def _next_count(self, pruner: Pruner, subset: Subset, coding: Coding) -> tuple[int, float]:
@@ -252,13 +252,13 @@ class TargetSearch:
         with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
         pruned = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
         if size_bytes is None:
-            counts, errors = pruner.errors(allowed, (count, pruned))
+            counts, errors = pruner.errors(allowed, {count: pruned})
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
             least = LEAST_QUANTISED * allowed
         else:
             line = self._line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
-            counts, errors = pruner.errors(quantised, (count, pruned))
+            counts, errors = pruner.errors(quantised, {count: pruned})
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
             least = LEAST_QUANTISED * quantised
         costs[errors > max(_FARTHEST * pruned, least)] = np.inf
@@ -397,19 +397,22 @@ class TargetSearch:
         best: Candidate | None = None
         if subset.refits:
             self._score(self._by_distance(subset, coding, draft=True)[0])
-        made, is_pruned = dict[float, Candidate](), len(subset.model) < len(self.whole.model)
+        made, is_pruned = list[float](), len(subset.model) < len(self.whole.model)
+        finer = 1.0 if self.goal.size_bytes is None else -1.0
         for _ in range(_FILES[subset.refits]):
-            quality = self._predict(subset, coding)[0]
-            if best is None:  # files of neighbouring precisions may differ by chance
-                while any(abs(quality - other) < 0.5 * _JUMP for other in made):
-                    quality += _JUMP if self.goal.size_bytes is None else -_JUMP
-            elif self._cost(best) - self._predict(subset, coding)[1] < _WORTH_FILE:
-                break
-            if quality in made or not _QUALITIES[0] <= quality <= _QUALITIES[1]:
+            quality, cost = self._predict(subset, coding)
+            while any(abs(quality - other) < 0.5 * _JUMP for other in made):
+                quality += finer * _JUMP  # files of neighbouring precisions may differ by chance
+            if best is not None:
+                is_no_cheaper = finer * (quality - (best.quality or 0.0)) >= 0.0
+                if is_no_cheaper or self._cost(best) - cost < _WORTH_FILE:
+                    break
+            if not _QUALITIES[0] <= quality <= _QUALITIES[1]:
                 break
             if is_pruned and best is None and len(made) > 1 and quality > max(made) + _FAR:  # more splats cost less
                 break
-            made[quality] = file = self.pool.make(subset, coding, quality, draft=False)
+            made.append(quality)
+            file = self.pool.make(subset, coding, quality, draft=False)
             self._score(file)
             if self._is_met(file) and (best is None or self._cost(file) < self._cost(best)):
                 best = file
@@ -467,9 +470,7 @@ class TargetSearch:
 
     def _point(self, one: Candidate) -> RatePoint:
         """Return precision, bytes and the expected quantisation error of a candidate, after the refit if a draft."""
-        error = self._expected(one, one.error)
-        rest = max(error - self._unquantised(one.subset, one.coding), LEAST_QUANTISED * error, NOTHING)
-        return RatePoint(one.quality or 0.0, rest, one.size_bytes)
+        return RatePoint(one.quality or 0.0, self._quantised(one), one.size_bytes)
 
     def _rest(self, subset: Subset, coding: Coding) -> float:
         """Return the mean squared error that quantisation may cause on the validation views."""
@@ -488,12 +489,16 @@ class TargetSearch:
         if not measured:
             return before + rest
         nearest = min(measured, key=lambda one: (one.is_draft, one.coding != coding, self._off_goal(one)))
-        error, goal_error = (self._expected(nearest, found) for found in (nearest.error, self._goal_error(nearest)))
-        # Against images, the error of a file may be that of the source by chance.
-        floor = LEAST_QUANTISED * (rest if self.goal.is_drop else goal_error)
-        quantised = max(goal_error - self._unquantised(subset, nearest.coding, on_goal=True), floor, NOTHING)
-        on_validation = max(error - self._unquantised(subset, nearest.coding), LEAST_QUANTISED * quantised)
-        return before + rest * on_validation / quantised
+        return before + rest * self._quantised(nearest) / self._quantised(nearest, on_goal=True)
+
+    def _quantised(self, one: Candidate, *, on_goal: bool = False) -> float:
+        """Return the error of quantisation of a candidate, of a draft that of its file after another refit."""
+        error = self._goal_error(one) if on_goal else one.error
+        least = LEAST_QUANTISED * error
+        if on_goal and self.goal.is_drop:  # against images, the error of a file may be that of the source by chance
+            least = LEAST_QUANTISED * self._allowed_in_renders
+        rest = max(error - self._unquantised(one.subset, one.coding, on_goal=on_goal), least, NOTHING)
+        return rest * (error_of_psnr(_TUNING_GAIN) if one.is_draft else 1.0)
 
     def _goal_error(self, one: Candidate) -> float:
         """Return the mean squared error of a measured candidate on the views of the goal, without the source's."""
@@ -503,18 +508,13 @@ class TargetSearch:
         """Return how far a measured candidate is from the goal, on the views of the goal."""
         return abs(math.log(max(one.goal_error or 0.0, NOTHING) / self.goal.error))
 
-    @staticmethod
-    def _expected(one: Candidate, error: float) -> float:
-        """Return the expected error of a file after the refit through the quantisers, which drafts have not had."""
-        return error * (_tuned(one.coding) if one.is_draft else 1.0)
-
     @property
     def _allowed_in_renders(self) -> float:
         """The mean squared error that a file may have against renders of the source, if these had no other error."""
         return self.goal.error - self.goal.source_error
 
     def _unquantised(self, subset: Subset, coding: Coding, *, on_goal: bool = False) -> float:
-        """Return the mean squared error before quantisation, reduced as by the refit through the quantisers."""
+        """Return the mean squared error before quantisation."""
         degree = self._degree(coding)
         if not subset.refits and degree == self.whole.model.sh_degree:
             return 0.0
@@ -523,7 +523,7 @@ class TargetSearch:
             scorer = self.goal.scorer if on_goal else self.pool.validation_scorer
             found = self._error_in(scorer, drop_bands(subset.model, degree))
             self._errors[key] = max(found - (self.goal.source_error if on_goal else 0.0), 0.0)
-        return self._errors[key] * (_tuned(coding) if subset.refits else 1.0)
+        return self._errors[key]
 
     def _degree(self, coding: Coding) -> int:
         """Return the SH degree of a coding's files."""
@@ -573,11 +573,6 @@ class TargetSearch:
                 f"no file reaches {psnr_of_mse(goal.error):.2f} dB on the validation images; the best has {best:.2f} dB"
             )
         return f"no file reaches {psnr_of_mse(goal.error):.2f} dB; the best found has {best:.2f} dB"
-
-
-def _tuned(coding: Coding) -> float:
-    """Return the factor of a file's error by the refit through the quantisers."""
-    return error_of_psnr(_TUNING_GAINS.get(coding.sh or "", 0.7))
 
 
 def _clipped(quality: float) -> float:
