@@ -404,8 +404,11 @@ class TargetSearch:
             while any(abs(quality - other) < 0.5 * _JUMP for other in made):
                 quality += finer * _JUMP  # files of neighbouring precisions may differ by chance
             if best is not None:
-                is_no_cheaper = finer * (quality - (best.quality or 0.0)) >= 0.0
-                if is_no_cheaper or self._cost(best) - cost < _WORTH_FILE:
+                met = best.quality or 0.0
+                missed = [other for other in made if finer * other < finer * met]
+                if len(missed) > 1:  # the model is off here
+                    quality = 0.5 * (met + max(missed, key=lambda other: finer * other))
+                if finer * (met - quality) < 0.5 * _JUMP or self._cost(best) - cost < _WORTH_FILE:
                     break
             if not _QUALITIES[0] <= quality <= _QUALITIES[1]:
                 break
