@@ -73,7 +73,7 @@ VIEWS, VIEW_SIZE = 480, (320, 240)
 _DRAFT_STEPS = 0.5
 _AIM = 0.05  # dB above a PSNR that tuned files aim at
 _WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
-_FINER = 0.25  # least factor of the error of the goal from one tuning to the next
+_FINER = 0.1  # least factor of the error of the goal from one tuning to the next
 _TUNINGS = 4  # largest number of tunings for a target
 
 _VALIDATION_EVERY = 8  # every Nth virtual view is a validation view
