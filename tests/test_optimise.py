@@ -129,7 +129,7 @@ def test_declared_errors_of_a_found_file_hold(many, search_at_psnr):
 @pytest.mark.slow
 def test_no_candidate_reaches_the_psnr_with_fewer_bytes(search_at_psnr):
     report = search_at_psnr.report.search
-    files = [one for one in report.tried if one["psnr"] is not None and not one["draft"]]
+    files = [one for one in report.tried if one["psnr"] is not None and not one["draft"]]  # no draft is written
     good = [one["size_bytes"] for one in files if one["psnr"] >= 30.0]
     assert min(good) == report.size_bytes
 

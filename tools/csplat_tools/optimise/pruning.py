@@ -38,10 +38,10 @@ from csplat_trainer.pruning import MeasuredViews, PruningOrder
 from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
 _FIT_STEPS = 960  # steps of a refit; half if it starts from the values of another
-_FILE_STEPS = 480  # the same through the quantisers of a file; with 320, files are up to 8 % larger
+_FILE_STEPS = 480  # the same through the quantisers of a file; fewer make files with SH 8 % larger
 _AGREE_ON = 0.5  # fraction of the splats on whose pruning virtual views must agree before they are enough
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
-_ERROR_POWERS = (0.5, 2.0)  # range of the power of the error of pruning with which that after a refit grows
+_ERROR_POWERS = (0.5, 2.0)  # range of the exponent p if two refits show errors after ∝ (error before)^p
 _DISTINCT = 0.1  # log ratio of errors from which two refits determine the power
 _LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes; fewer are too similar
 

@@ -31,8 +31,8 @@ LOG_ERROR_PER_DB = math.log(10.0) / 10.0
 _APART = 0.5  # dB; two files of less distance do not determine a slope
 #: Range of a measured slope, as a multiple of the assumed one.
 LEAST_SLOPE, _LARGEST_SLOPE = 0.3, 2.0
-#: Largest fraction of the error that pruning may take; with more, quantisation would have to be too fine. Pruning too
-#: much costs far more than too little: mic at 38 dB is 30 % larger with 0.73 of the error than with 0.4.
+#: Largest fraction of the error that pruning may take; with more, quantisation would have to be too fine. A file of mic
+#: at 38 dB took 111 kB with 0.8, and 78 kB with 0.65.
 MOST_PRUNED = 0.65
 
 
