@@ -85,12 +85,12 @@ def test_slopes_are_measured_on_two_files_within_limits():
     line = RateLine.through([LINE.nearest, far], -0.23, 0.045)
     assert (line.error_slope, line.bytes_slope) == pytest.approx((-0.2, 0.05))
     flat = RateLine.through([LINE.nearest, RatePoint(50.0, 1e-4, 1000)], -0.23, 0.045)
-    assert (flat.error_slope, flat.bytes_slope) == pytest.approx((-0.23 * 0.3, 0.045 * 0.3))
+    assert (flat.error_slope, flat.bytes_slope) == pytest.approx((-0.046, 0.009))
 
 
 def test_the_model_weighs_pruning_against_quantisation():
     counts, errors = np.array([1000.0, 500.0, 250.0]), np.array([0.0, 2e-5, 2e-4])
-    costs = log_bytes_at_error(counts, errors, 1e-4, 0.2)
+    costs = log_bytes_at_error(counts, errors, 1e-4, 0.2, 0.65)
     assert math.log(1000.0) - 0.2 * math.log(1e-4) == pytest.approx(costs[0])
     assert 1 == np.argmin(costs)  # half of the splats leave most of the error to quantisation
     assert np.isinf(costs[2])  # more than the allowed error
@@ -129,8 +129,7 @@ def test_declared_errors_of_a_found_file_hold(many, search_at_psnr):
 @pytest.mark.slow
 def test_no_candidate_reaches_the_psnr_with_fewer_bytes(search_at_psnr):
     report = search_at_psnr.report.search
-    files = [one for one in report.tried if one["psnr"] is not None and not one["draft"]]  # no draft is written
-    good = [one["size_bytes"] for one in files if one["psnr"] >= 30.0]
+    good = [one["size_bytes"] for one in report.tried if one["psnr"] is not None and one["psnr"] >= 30.0]
     assert min(good) == report.size_bytes
 
 
@@ -256,7 +255,7 @@ def test_a_refit_through_the_quantisers_improves_test_views(scene):
     # Coarse geometry, fine colours: a refit through the quantisers improves test views.
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
     bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
-    removal = replace(SMALL, effort=3).pruner(bare, views, use_classes=False, progress=None)
+    removal = replace(SMALL, effort=2).pruner(bare, views, use_classes=False, progress=None)
     part, judge = removal.refit(300), views.test_scorer(bare)
     quick, fitted = (part.encode(coarse, use_classes=False, draft=draft).write().data for draft in (True, False))
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2

@@ -103,13 +103,13 @@ def test_cameras_of_the_user_are_shrunk_and_every_eighth_is_a_validation_view(so
     views = views_of(own)
     assert (len(views.training), len(views.validation)) == (15, 2)
     with pytest.raises(InputError, match="at least 2"):
-        find_sufficient_views(source, views_of(own[:1]), 0.3)
+        find_sufficient_views(source, views_of(own[:1]))
 
 
 @pytest.mark.slow
 def test_views_are_added_until_others_agree(source):
     views = find_view_set(source, count=100, size=(24, 18))
-    many = find_sufficient_views(source, views, 0.3, size=(24, 18))
+    many = find_sufficient_views(source, views, size=(24, 18))
     assert len(many.used) in (40, 80, 100)
     positions = {tuple(camera.position) for camera in many.used}
     assert not positions & {tuple(camera.position) for camera in many.check}
@@ -118,7 +118,7 @@ def test_views_are_added_until_others_agree(source):
 
 # Pruning order.
 def test_transparent_splats_are_pruned_first_and_unseen_ones_kept(source):
-    found = find_sufficient_views(source, views_of(camera_sequence(source, 9, (48, 36))), 0.5)
+    found = find_sufficient_views(source, views_of(camera_sequence(source, 9, (48, 36))))
     total = total_error(found.batches)
     keys = pruning_keys(source.opacities, total)
     assert (keys[:10] == -1.0).all()

@@ -355,8 +355,7 @@ def test_the_gain_of_a_refit_predicts_the_next_number_of_splats(mended, goal):
     scene = replace(PLAIN, mended=mended)
     found = search(scene, psnr=goal)
     assert goal <= found.file.psnr() <= goal + 0.3
-    # The search counts on more bytes per dB than this law has, which keeps 4 % more in the last case.
-    assert len(found.file) <= 1.05 * scene.smallest(goal)
+    assert len(found.file) <= 1.03 * scene.smallest(goal)
 
 
 def test_a_failed_number_of_splats_is_raised_before_pruning_is_given_up():

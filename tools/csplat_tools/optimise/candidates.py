@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from csplat.decoder import decode
 from csplat.encoder import (
+    PRESETS,
     EncodedTiles,
     EncodeOptions,
     EncodePlan,
@@ -27,8 +28,6 @@ from csplat_render.scorer import Scorer
 
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance
-
-_BOOK_SIZES = (16, 8192)  # least and largest number of codebook entries
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,8 @@ class Coding:
         """Return the caller's options with this coding and precision, for a file of this number of splats."""
         size = encoding.codebook_size
         if self.entries_per_splat is not None and size is None:
-            size = 1 << round(math.log2(min(max(self.entries_per_splat * splats, _BOOK_SIZES[0]), _BOOK_SIZES[1])))
+            most = PRESETS[encoding.preset].codebook_most
+            size = 1 << round(math.log2(min(max(self.entries_per_splat * splats, 1.0), most)))
         return replace(
             encoding,
             preset=self.preset or encoding.preset,

@@ -37,13 +37,9 @@ from csplat_tools.views.sufficient_views import SufficientViews, find_sufficient
 from csplat_trainer.pruning import MeasuredViews, PruningOrder
 from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
-_FIT_STEPS = 960  # steps of a refit; half if it starts from the values of another
-_FILE_STEPS = 480  # the same through the quantisers of a file; fewer make files with SH 8 % larger
-_AGREE_ON = 0.5  # fraction of the splats on whose pruning virtual views must agree before they are enough
+_STEPS = 1280  # steps of a refit; half from other values and through quantisers, where fewer cost 8 % of the bytes
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
-_ERROR_POWERS = (0.5, 2.0)  # range of the exponent p if two refits show errors after ∝ (error before)^p
-_DISTINCT = 0.1  # log ratio of errors from which two refits determine the power
-_LEAST_FOR_CLASSES = 4_000  # least number of splats for quantisation classes; fewer are too similar
+_POWERS = (0.5, 2.0)  # range of the power p if two refits show errors after ∝ (error before)^p
 
 
 @dataclass(eq=False)
@@ -77,7 +73,7 @@ class Pruner:
     def sufficient(self) -> SufficientViews:
         """Training views whose pruning errors agree with those of held-out views, and the held-out views."""
         return find_sufficient_views(
-            self.source, self.views, _AGREE_ON, size=self.size, threads=self.threads, progress=self.progress
+            self.source, self.views, size=self.size, threads=self.threads, progress=self.progress
         )
 
     @cached_property
@@ -118,7 +114,7 @@ class Pruner:
         return len(self.cameras) + len(self.sufficient.check) + later
 
     def errors(self, allowed: float, known: Mapping[int, float] | None = None) -> tuple[F64, F64]:
-        """Predict the error of pruning after a refit, proportional to that before it until two refits show a power.
+        """Predict the error of pruning after a refit, in proportion to that before it until two refits show a power.
 
         Args:
             allowed: mean squared error up to which errors are of interest.
@@ -133,9 +129,9 @@ class Pruner:
         if measured:
             before, after = measured[-1]
             for other_before, other_after in measured[:-1]:
-                if abs(math.log(other_before / before)) > _DISTINCT:
+                if other_before != before:
                     power = math.log(other_after / after) / math.log(other_before / before)
-                    power = min(max(power, _ERROR_POWERS[0]), _ERROR_POWERS[1])
+                    power = min(max(power, _POWERS[0]), _POWERS[1])
             gain = after / before**power
         self.order.extend(error=max((allowed / max(gain, NOTHING)) ** (1.0 / power), NOTHING))
         errors = self.order.mean_errors()[: len(self.source)]  # at least one splat is kept
@@ -152,7 +148,7 @@ class Pruner:
         pruned = model = self.source.select(rows)
         before = after = self.check_scorer.psnr(pruned)
         if self.refits and len(rows) < len(self.source):
-            steps = _FIT_STEPS
+            steps = _STEPS
             if self._last is not None:
                 model, steps = _with_values_of(self._last.model, self._last.rows, pruned, rows), steps // 2
             model = refit_splats(
@@ -195,8 +191,8 @@ class PrunedSubset:
 
     @property
     def classifiable(self) -> bool:
-        """True if the splats may be sorted into quantisation classes: there are enough, and `use_classes` is set."""
-        return self.pruner.use_classes and len(self.rows) >= _LEAST_FOR_CLASSES
+        """True if the splats may be sorted into quantisation classes."""
+        return self.pruner.use_classes
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:
         """Quantise and code the splats, after a refit through the quantisers unless `draft`."""
@@ -209,7 +205,7 @@ class PrunedSubset:
             return encode_tiles(plan, progress=pruner.progress)
         fixed = fix_quantisation(plan, pruner.source, pruner.progress)
         values = quantisation_aware_refit(
-            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_FILE_STEPS),
+            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_STEPS // 2),
             background=pruner.views.background, seed=pruner.seed, threads=pruner.threads, progress=pruner.progress,
         )  # fmt: skip
         start = fixed.start()
@@ -236,7 +232,7 @@ class PrunedSubset:
     def _importance(self) -> Importance | None:
         """The importance of the splats; `None` if no view shows any."""
         pruner = self.pruner
-        cameras = importance_views(self.model, replace(pruner.views, training=pruner.sufficient.used))
+        cameras = importance_views(replace(pruner.views, training=pruner.sufficient.used))
         try:
             return measure_importance(
                 self.model, cameras, pruner.views.background, threads=pruner.threads, progress=pruner.progress

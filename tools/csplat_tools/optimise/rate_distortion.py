@@ -16,8 +16,9 @@ import numpy as np
 
 from csplat.types import F64
 
-#: Change of log bytes per dB of quantisation error, by finer steps; measured 0.035 without SH, 0.05 with it.
-BYTES_PER_DB = 0.045
+#: Usual change of log bytes per dB of quantisation error, without and with SH. Files of neighbouring numbers of splats
+#: show 0.02 (donut, no SH) and 0.07 (garden), those of neighbouring precisions 0.035 and 0.05.
+BYTES_PER_DB = (0.03, 0.07)
 
 #: Least fraction of a file's error that is attributed to quantisation, since a smaller rest is noise.
 LEAST_QUANTISED = 0.1
@@ -28,12 +29,19 @@ NOTHING = 1e-12
 #: Change of the natural logarithm of an error per dB.
 LOG_ERROR_PER_DB = math.log(10.0) / 10.0
 
-_APART = 0.5  # dB; two files of less distance do not determine a slope
-#: Range of a measured slope, as a multiple of the assumed one.
-LEAST_SLOPE, _LARGEST_SLOPE = 0.3, 2.0
-#: Largest fraction of the error that pruning may take; with more, quantisation would have to be too fine. A file of mic
-#: at 38 dB took 111 kB with 0.8, and 78 kB with 0.65.
-MOST_PRUNED = 0.65
+#: dB above a PSNR that is aimed at, since PSNR varies by chance; `simplify` does not improve a result this close.
+AIM = 0.1
+
+#: Distance of two precisions in dB. Nearer ones do not determine a slope; files of half this distance differ by 1 %, as
+#: much as by chance.
+APART = 0.3
+
+_SLOPES = (0.2, 2.0)  # range of a measured slope, as a multiple of the assumed one
+
+#: Largest fraction of a file's error that pruning and left-out SH bands may take, without and with SH; with more,
+#: quantisation would have to be too fine. With SH, codebooks need more of the error: at 38 dB, mic (SH of degree 3)
+#: takes 72 kB with 0.5 and 96 with 0.65; jacket (no SH) takes 99 with 0.5 and 94 with 0.65.
+MOST_LEFT_OUT = (0.65, 0.5)
 
 
 def error_of_psnr(psnr: float) -> float:
@@ -70,24 +78,21 @@ class RateLine:
     bytes_slope: float
 
     @classmethod
-    def through(
-        cls, points: Sequence[RatePoint], error_slope: float, bytes_slope: float, flattest: float = LEAST_SLOPE
-    ) -> RateLine:
+    def through(cls, points: Sequence[RatePoint], error_slope: float, bytes_slope: float) -> RateLine:
         """Return the line through files, the first of which is nearest to the goal.
 
         Args:
             points: the files. Another one that is far enough from the first determines the slopes.
             error_slope, bytes_slope: the slopes to assume without one, and to limit measured ones by.
-            flattest: least slope of the error, as a multiple of the assumed one.
         """
         first = points[0]
         for other in points[1:]:
             apart = other.quality - first.quality
-            if abs(apart) >= _APART:
+            if abs(apart) >= APART:
                 by_error = math.log(other.error / first.error) / apart / error_slope
                 by_size = math.log(other.size_bytes / first.size_bytes) / apart / bytes_slope
-                error_slope *= min(max(by_error, flattest), _LARGEST_SLOPE)
-                bytes_slope *= min(max(by_size, LEAST_SLOPE), _LARGEST_SLOPE)
+                error_slope *= min(max(by_error, _SLOPES[0]), _SLOPES[1])
+                bytes_slope *= min(max(by_size, _SLOPES[0]), _SLOPES[1])
                 break
         return cls(first, error_slope, bytes_slope)
 
@@ -108,7 +113,7 @@ class RateLine:
         return math.log(self.nearest.size_bytes) + self.bytes_slope * (quality - self.nearest.quality)
 
 
-def log_bytes_at_error(kept_count: F64, pruned: F64, allowed: float, exponent: float) -> F64:
+def log_bytes_at_error(kept_count: F64, pruned: F64, allowed: float, exponent: float, most: float) -> F64:
     """Return the log bytes of files of equal error, up to a constant; infinite if pruning takes too much of it.
 
     Args:
@@ -116,8 +121,9 @@ def log_bytes_at_error(kept_count: F64, pruned: F64, allowed: float, exponent: f
         pruned: mean squared error of pruning the others.
         allowed: mean squared error of the files.
         exponent: k of bytes ∝ Q^-k.
+        most: largest fraction of the error that pruning may take.
     """
-    fits = pruned <= MOST_PRUNED * allowed
+    fits = pruned <= most * allowed
     rest = np.where(fits, allowed - pruned, 1.0)
     return np.where(fits, np.log(kept_count) - exponent * np.log(rest), np.inf)
 

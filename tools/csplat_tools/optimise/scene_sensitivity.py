@@ -22,10 +22,7 @@ from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
 
 _NOTHING = "a scene without splats has no sensitivities"
-_PRUNED_FRACTION = 0.4  # fraction of the splats on whose pruning virtual views must agree before they are enough
-_GIVEN = 40  # number of training views that suffice if cameras are given
-_VIRTUAL = {False: (120, 120), True: (80, 60)}  # by `has SH`: number of small virtual views, for small and large scenes
-_LARGE = 40_000  # splats of a large scene; for smaller ones, half of the views would change file sizes by 1 %
+_VIEWS = (40, 80)  # number of views that suffice, if cameras are given and of small virtual ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +91,7 @@ def measure_scene(
     )
     if views.virtual and views.training:
         size = (views.training[0].W, views.training[0].H)
-        found = find_sufficient_views(model, views, _PRUNED_FRACTION, size=size, threads=threads, progress=progress)
+        found = find_sufficient_views(model, views, size=size, threads=threads, progress=progress)
         cameras, check, source = found.used, found.check, "virtual"
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
@@ -166,15 +163,13 @@ def measure_importance(
     return replace(weights, sh=apply_weight_floor(weights.sh, model))
 
 
-def importance_views(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
+def importance_views(views: ViewSet) -> Sequence[Camera]:
     """Return the training views in which the importance of splats is measured.
 
     Virtual training views have various distances and directions. Cameras like the test views generalise less: plane3
     with quantisation classes from 40 of them has 42 dB on them and 39 on others; from these views, 41 and 40.
     """
-    return evenly_spaced(
-        views.training, _VIRTUAL[source.sh_degree > 0][len(source) >= _LARGE] if views.virtual else _GIVEN
-    )
+    return evenly_spaced(views.training, _VIEWS[views.virtual])
 
 
 def complete_importance(
@@ -206,7 +201,7 @@ def complete_importance(
     quick = encoding.preset == "fast" and encoding.max_classes is None
     if inside or quick or not (several or has_sh):
         return None, 0
-    seen_from = importance_views(source, views)
+    seen_from = importance_views(views)
     try:
         found = measure_importance(source, seen_from, views.background, threads=encoding.threads, progress=progress)
     except InputError:

@@ -17,8 +17,7 @@ from csplat_tools.console import format_bytes
 from csplat_tools.optimise.candidates import Candidate, CandidatePool
 from csplat_tools.views import describe_views
 
-_FAR = 0.3  # dB; a PSNR that exceeds the target by more is explained
-_LESS = 1.0  # dB; a PSNR on other views that is lower by more is pointed out
+_NOTABLE = 0.5  # dB; more above the target is explained, and less on other views is pointed out
 
 
 def format_search(report: SearchReport) -> tuple[str, ...]:
@@ -58,7 +57,7 @@ def _format_elsewhere(psnr: float, elsewhere: Mapping[str, float]) -> list[str]:
     kinds = {"beside": "at other positions"}
     scores = ", ".join(f"{found:.2f} {kinds.get(kind, kind)}" for kind, found in elsewhere.items())
     less = psnr - min(elsewhere.values())
-    worse = f": up to {less:.1f} dB less than on the test views" if less > _LESS else ""
+    worse = f": up to {less:.1f} dB less than on the test views" if less > _NOTABLE else ""
     return [f"PSNR on virtual views that were not used in the search: {scores}{worse}"]
 
 
@@ -134,7 +133,7 @@ def _why(target: Target, found: Candidate, psnr: float, candidates: CandidatePoo
     if others:
         expected = "look worse" if target.size_bytes is not None else "take more"
         lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
-    if target.psnr is not None and psnr > target.psnr + _FAR:
+    if target.psnr is not None and psnr > target.psnr + _NOTABLE:
         lines.append("no smaller file of those tried reaches the target")
     pruned_count = splats_before - found.splats
     if pruned_count:

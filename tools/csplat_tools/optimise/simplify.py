@@ -17,13 +17,12 @@ from csplat.types import I64
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.pruning import PrunedSubset, Pruner
-from csplat_tools.optimise.rate_distortion import error_of_psnr
+from csplat_tools.optimise.rate_distortion import AIM, error_of_psnr
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import SceneLike, load_model
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
 
 _TRIES = 4  # largest number of refits in the search for the fewest splats of a PSNR
-_NEAR = 0.05  # dB; a result this close above the PSNR is not improved
 _NOT_PRUNED = f"none of up to {_TRIES} pruned scenes reached the target: all splats are kept, unchanged"
 
 
@@ -182,14 +181,14 @@ def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, flo
     allowed, known, found = error_of_psnr(goal), dict[int, float](), dict[int, tuple[float, PrunedSubset]]()
     for _ in range(_TRIES):
         counts, errors = pruner.errors(allowed - source_error, known)
-        fits = counts[errors <= (allowed - source_error) * error_of_psnr(0.5 * _NEAR)]
+        fits = counts[errors <= (allowed - source_error) * error_of_psnr(0.5 * AIM)]
         kept_count = int(fits.min(initial=len(source)))
         if kept_count in found or kept_count == len(source):
             break
         subset = pruner.refit(kept_count)
         error = scorer.pooled(scorer.errors(subset.model))
         found[kept_count], known[kept_count] = (psnr_of_mse(error), subset), max(error - source_error, 0.0)
-        if goal <= psnr_of_mse(error) <= goal + _NEAR:
+        if goal <= psnr_of_mse(error) <= goal + AIM:
             break
     reached = [one for one in found.values() if one[0] >= goal]
     psnr, subset = min(

@@ -1,4 +1,4 @@
-"""Search for the smallest file of a PSNR, or the best one of a size.
+"""Search for the smallest file of a PSNR or a drop of PSNR, or for the best one of a size.
 
 How a target is met:
 
@@ -6,17 +6,17 @@ How a target is met:
    gives the first number of splats; for a size, typical bytes per splat do (`_first_count`). These splats are refitted
    to renders of the source.
 2. Drafts of these splats, which are files without a refit through their quantisers, are encoded with one coding of SH
-   after another: each neighbour of the best coding is tried until none is expected to be smaller, or `_CODINGS` were
-   tried (`_choose_coding`). Drafts of a coding give its bytes and error as functions of the precision (`RateLine`), and
-   so its bytes on the goal (`_predict`).
+   after another: each neighbour of the best coding, up to `_TRIES` codings (`_choose_coding`). Drafts of a coding give
+   its bytes and error as functions of the precision (`RateLine`), and so its bytes on the goal (`_predict`).
 3. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
    save enough, it is tried as well (`_next_count`). For a PSNR or a drop, splats whose pruning takes too much of the
-   error get no drafts.
+   error get no drafts, unless they are the last.
 4. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
    goal, which corrects the prediction of the precision, until another file would hardly be smaller (`_finish`). If none
-   meets the goal, more splats are taken: those of step 3, or others; for a size, fewer.
+   meets the goal, more splats are taken: those of step 3, or others; for a size, fewer. Of all that meet it, drafts
+   included, the smallest is written, or the best one of a size.
 
-Candidates are compared by their error on validation views. The views of the goal, which are the test views for a PSNR,
+Drafts are compared by their error on validation views. The views of the goal, which are the test views for a PSNR,
 only tell how much error is left there (`_allowed`): they settle precision and number of splats. With all splats kept,
 steps 1 and 3 are left out, and the presets' own files are candidates.
 """
@@ -41,11 +41,12 @@ from csplat_render.scorer import Scorer
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, Coding, Subset, Weights, WholeScene
 from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
 from csplat_tools.optimise.rate_distortion import (
+    AIM,
+    APART,
     BYTES_PER_DB,
     LEAST_QUANTISED,
-    LEAST_SLOPE,
     LOG_ERROR_PER_DB,
-    MOST_PRUNED,
+    MOST_LEFT_OUT,
     NOTHING,
     RateLine,
     RatePoint,
@@ -59,41 +60,25 @@ from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
 
-#: Cost of a target in renders of a test view: without pruning; with it, a fixed part and one that grows with effort.
-_RENDERS = 520.0
-_RENDERS_WITH_PRUNING = (600.0, 2400.0)
+_RENDERS = (520.0, 2480.0)  # cost of a target in renders of a test view: a fixed part, and one of pruning by effort
 
-# What is typical, without and with SH. It is assumed only until candidates show otherwise.
-_USUAL_BYTES, _USUAL_QUALITY = (8.0, 11.0), 42.0  # bytes per kept splat of useful files, and their precision, dB
-_PRECISION_OFFSET = (5.0, 10.0)  # dB from the PSNR of a file to its precision, at about 38 dB
-# Change of log bytes per dB, for the choice of the number of splats. Files of neighbouring numbers show 0.02 for donut
-# and 0.07 for garden.
-_COUNT_BYTES_PER_DB = (0.03, 0.07)
-_PSNR_PER_PRECISION = {"codebook": 0.6}  # dB per dB of precision, hence also of bytes; 1 for other codings
+# What is typical; pairs are without and with SH.
+_USUAL = PRESETS["small"]  # whose precision and codebook the first drafts have
+_USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat of a file of a size
+_PSNR_PER_PRECISION = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the quantisers; 1.5 to 2.6 in five scenes
-_USUAL_ENTRIES = (1 / 64, 1 / 16)  # codebook entries per splat, of all splats and of refitted ones, which differ more
 
 # What is tried.
 _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
-_ENTRIES = (1 / 4096, 1 / 4)  # range of the codebook entries per splat
+_MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
 _ROUNDS = 3  # most rounds of the first prediction of the count, most splat counts, most drafts of one coding
-_CODINGS = 10  # most codings at the default effort
-_FILES = (8, 4)  # most files on the goal, of all splats and of refitted ones, which take a refit each
-_MOST_DROPPED = 0.35  # largest fraction of the error left to quantisation that dropping SH bands may take
-_FARTHEST = 3.0  # largest factor by which the error of pruning may rise to the next count, since it is extrapolated
+_TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
 _BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squared and inverse for a size
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
 
 # What is near, and what is worth another candidate.
-_AIM = (0.06, 0.12)  # dB above a PSNR that files of all and of refitted splats aim at, since PSNR varies by chance
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
-_JUMP = 0.3  # dB of precision between files if the first missed the goal by chance
-# Slopes of the error of codebooks, relative to the typical one. Below the first, a codebook has too few entries, and
-# precision hardly helps. The second is the least that is believed; errors of other codings never are that flat.
-_FLAT, _FLATTEST_BOOK = 0.7, 0.03
-_CLOSE = 0.1  # fraction of the bytes; of a codebook that is worse by more, only a larger size is tried
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
-_WORTH_FILE = 0.01  # fraction of the bytes that another file of the same splats and coding must promise
 
 _INSIDE_REMARK = (
     "splats were pruned by virtual views, which may show less than cameras inside of the surroundings do:"
@@ -152,7 +137,7 @@ class TargetSearch:
         whole: all splats.
         pruner: prunes splats; `None`: all are kept.
         work: amount of work relative to the default effort.
-        _errors: mean squared error before quantisation, by subset, SH degree, and True on the views of the goal.
+        _errors: mean squared error before quantisation, by subset, SH degree, and whether on the views of the goal.
     """
 
     goal: Goal
@@ -160,7 +145,7 @@ class TargetSearch:
     whole: WholeScene
     pruner: Pruner | None
     work: float = 1.0
-    _errors: dict[tuple[int, int, bool], float] = field(default_factory=dict, init=False)
+    _errors: dict[tuple[Subset, int, bool], float] = field(default_factory=dict, init=False)
 
     def best(self) -> Candidate:
         """Return the smallest file that meets the goal, or the best one of a size.
@@ -229,7 +214,7 @@ class TargetSearch:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
         if self.goal.size_bytes is not None:
             return False
-        return self._unquantised(subset, coding, on_goal=True) > MOST_PRUNED * self._allowed_in_renders
+        return self._unquantised(subset, coding, on_goal=True) > self._most_left_out * self._allowed_in_renders
 
     def _first_count(self, pruner: Pruner) -> int:
         """Return the number of splats to begin with."""
@@ -240,7 +225,7 @@ class TargetSearch:
         allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
         for left in reversed(range(_ROUNDS)):  # pruning errors in validation views differ from those in training views
             counts, errors = pruner.errors(allowed, known)
-            costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
+            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
             before, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
             if not left or abs(kept_count - before) <= _WORTH * splats:
                 break
@@ -255,22 +240,29 @@ class TargetSearch:
         pruned = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
         if size_bytes is None:
             counts, errors = pruner.errors(allowed, {count: pruned})
-            costs = log_bytes_at_error(counts, errors, allowed, self._exponent)
-            least = LEAST_QUANTISED * allowed
+            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
         else:
             line = self._line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
             counts, errors = pruner.errors(quantised, {count: pruned})
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
-            least = LEAST_QUANTISED * quantised
-        costs[errors > max(_FARTHEST * pruned, least)] = np.inf
         best = int(np.argmin(costs))
         return self._rounded(counts[best]), float(costs[np.searchsorted(-counts, -count)] - costs[best])
 
     @property
+    def _bytes_per_db(self) -> float:
+        """The usual change of log bytes per dB of quantisation error."""
+        return BYTES_PER_DB[self.whole.model.sh_degree > 0]
+
+    @property
+    def _most_left_out(self) -> float:
+        """The largest fraction of a file's error that pruning and left-out SH bands may take."""
+        return MOST_LEFT_OUT[self.whole.model.sh_degree > 0]
+
+    @property
     def _exponent(self) -> float:
-        """The k of bytes ∝ n · Q^-k, for the choice of the number n of splats."""
-        return rate_exponent(_COUNT_BYTES_PER_DB[self.whole.model.sh_degree > 0])
+        """The k of bytes ∝ n · Q^-k."""
+        return rate_exponent(self._bytes_per_db)
 
     def _count_beyond(self, count: int) -> int:
         """Return the next number of splats to try if no file of this number meets the goal."""
@@ -288,7 +280,7 @@ class TargetSearch:
 
         A coding of each kind is tried; then codebooks of other sizes, and neighbours of the best coding.
         """
-        costs, most = dict[Coding, float](), max(2, round(_CODINGS * self.work))
+        costs, most = dict[Coding, float](), max(2, round(_TRIES * self.work))
         waiting = self._first_codings(subset)
         while waiting and len(costs) < most:
             coding = waiting.pop(0)
@@ -296,18 +288,15 @@ class TargetSearch:
             if not waiting:
                 ordered = sorted(costs, key=costs.__getitem__)
                 best, books = ordered[0], [one for one in ordered if one.sh == "codebook"]
-                sizes = self._other_sizes(books[0]) if books else []
-                if books and costs[books[0]] > costs[best] + _CLOSE:
-                    sizes = sizes[:1]  # only a larger one can gain that much
-                largest = max(books, key=lambda one: one.entries_per_splat or 0.0, default=None)
-                if largest is not None and self._needs_entries(subset, largest, costs[best]):
-                    sizes += self._other_sizes(largest)[:1]
-                found = [
-                    *self._fewer_bands(subset, best),
-                    *sizes,
-                    *self._alike(subset, best),
-                ]
-                waiting = [one for one in found if one not in costs][:1]
+                found = self._fewer_bands(subset, best)
+                if books:
+                    found += self._resized(books[0], 2.0)
+                    if costs[books[0]] <= costs[best] + _WORTH:  # a smaller one hardly gains more
+                        found += self._resized(books[0], 0.5)
+                    largest = max(books, key=lambda one: one.entries_per_splat or 0.0)
+                    if self._needs_entries(subset, largest, costs[best]):
+                        found += self._resized(largest, 2.0)
+                waiting = [one for one in [*found, *self._alike(subset, best)] if one not in costs][:1]
         return min(costs, key=costs.__getitem__)
 
     def _try(self, subset: Subset, coding: Coding, costs: Mapping[Coding, float]) -> float:
@@ -334,10 +323,7 @@ class TargetSearch:
                 if size_bytes is None:
                     return _clipped(line.quality_at_error(self._rest(subset, coding)))
                 return _clipped(line.quality_at_size(size_bytes / len(subset.model) * len(other.subset.model)))
-        if size_bytes is None:
-            return _clipped(psnr_of_mse(self._rest(subset, coding)) + _PRECISION_OFFSET[coding.sh != "none"])
-        usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
-        return _clipped(_USUAL_QUALITY + math.log(size_bytes / len(subset.model) / usual) / BYTES_PER_DB)
+        return _USUAL.quality[coding.sh == "none"]
 
     def _first_codings(self, subset: Subset) -> list[Coding]:
         """Return a coding of each kind that the caller left open."""
@@ -346,30 +332,27 @@ class TargetSearch:
             return [Coding("none")]
         coarse = subset.classifiable and not subset.refits and encoding.adaptive is None
         scalar = Coding("scalar", adaptive=1.0 if coarse else None)
-        book = Coding("codebook", _USUAL_ENTRIES[subset.refits])
+        book = Coding("codebook", _USUAL.codebook_share)
         if encoding.sh_coding != "auto":
             return [book if encoding.sh_coding == "codebook" else scalar]
         is_extreme = float(np.abs(self.whole.model.shN).max(initial=0.0)) > _LARGEST_SH
         return [scalar] if is_extreme or encoding.preset == "fast" else [scalar, book]
 
-    def _other_sizes(self, book: Coding) -> list[Coding]:
-        """Return a coding with twice and with half the codebook entries, within limits."""
+    def _resized(self, book: Coding, factor: float) -> list[Coding]:
+        """Return a coding with more or fewer codebook entries, or none if their number is given or too large."""
         if book.entries_per_splat is None or self.pool.encoding.codebook_size is not None:
             return []
-        sizes = [factor * book.entries_per_splat for factor in (2.0, 0.5)]
-        return [replace(book, entries_per_splat=size) for size in sizes if _ENTRIES[0] <= size <= _ENTRIES[1]]
+        entries = factor * book.entries_per_splat
+        return [replace(book, entries_per_splat=entries)] if entries <= _MOST_ENTRIES else []
 
     def _needs_entries(self, subset: Subset, book: Coding, cost: float) -> bool:
-        """Return True if a codebook has too few entries for a PSNR, and a larger one may beat the best coding.
+        """Return True if a codebook may have too few entries for a PSNR.
 
-        Then precision hardly lowers its error, so that its expected cost is far from any draft, and its drafts are
-        smaller than the file expected of the best coding, log bytes.
+        Precision hardly lowers its error then, so that its expected cost is high, although its drafts are smaller than
+        the file expected of the best coding, whose cost in log bytes is given.
         """
-        if self.goal.size_bytes is not None:
-            return False
         drafts = self.pool.of(subset, book, draft=subset.refits)
-        is_flat = self._line(subset, book).error_slope > -_FLAT * _PSNR_PER_PRECISION["codebook"] * LOG_ERROR_PER_DB
-        return is_flat and math.log(min(one.size_bytes for one in drafts)) < cost - _CLOSE
+        return self.goal.size_bytes is None and math.log(min(one.size_bytes for one in drafts)) < cost - _WORTH
 
     def _fewer_bands(self, subset: Subset, coding: Coding) -> list[Coding]:
         """Return codings with fewer SH bands, the fewest first, if dropping these takes little of the error."""
@@ -377,10 +360,9 @@ class TargetSearch:
         fixed = encoding.sh_degree is not None or encoding.sh_coding != "auto"
         if coding.sh == "none" or fixed or self.goal.size_bytes is not None:
             return found
-        before, most = self._unquantised(subset, coding), _MOST_DROPPED * self._rest(subset, coding)
         while lower >= 0:
             fewer = replace(coding, degree=lower) if lower else Coding("none", degree=0, use_classes=coding.use_classes)
-            if self._unquantised(subset, fewer) - before > most:
+            if self._unquantised(subset, fewer) > self._most_left_out * self._allowed(subset, coding):
                 break
             found, lower = [fewer, *found], lower - 1
         return found
@@ -400,21 +382,21 @@ class TargetSearch:
         if subset.refits:
             self._score(self._by_distance(subset, coding, draft=True)[0])
         made, is_pruned = list[float](), len(subset.model) < len(self.whole.model)
-        finer = 1.0 if self.goal.size_bytes is None else -1.0
-        for _ in range(_FILES[subset.refits]):
-            quality, cost = self._predict(subset, coding)
-            while any(abs(quality - other) < 0.5 * _JUMP for other in made):
-                quality += finer * _JUMP  # files of neighbouring precisions may differ by chance
+        safer = 1.0 if self.goal.size_bytes is None else -1.0  # finer files have less error, coarser ones fewer bytes
+        for _ in range(_TRIES):
+            quality = self._predict(subset, coding)[0]
+            while any(abs(quality - other) < 0.5 * APART for other in made):
+                quality += 0.5 * safer * APART  # files of neighbouring precisions may differ by chance
             if best is not None:
                 met = best.quality or 0.0
-                missed = [other for other in made if finer * other < finer * met]
-                if len(missed) > 1:  # although the model expected the last to meet the goal
-                    quality = 0.5 * (met + max(missed, key=lambda other: finer * other))
-                if finer * (met - quality) < 0.5 * _JUMP or self._cost(best) - cost < _WORTH_FILE:
+                beyond = [other for other in made if safer * other < safer * met]
+                if len(beyond) > 1:  # the last missed the goal, although the model expected it to meet it
+                    quality = 0.5 * (met + max(beyond, key=lambda other: safer * other))
+                if safer * (met - quality) < 0.5 * APART:
                     break
             if not _QUALITIES[0] <= quality <= _QUALITIES[1]:
                 break
-            if is_pruned and best is None and len(made) > 1 and quality > max(made) + _FAR:  # more splats cost less
+            if is_pruned and best is None and len(made) > 1 and quality > max(made) + _FAR:  # other splats cost less
                 break
             made.append(quality)
             file = self.pool.make(subset, coding, quality, draft=False)
@@ -430,9 +412,9 @@ class TargetSearch:
         """
         line = self._line(subset, coding)
         if self.goal.size_bytes is not None:
-            quality = _clipped(line.quality_at_size(self.goal.size_bytes * (1.0 - BYTES_PER_DB * _AIM[0])))
+            quality = _clipped(line.quality_at_size(self.goal.size_bytes * (1.0 - self._bytes_per_db * AIM)))
             error = self._unquantised(subset, coding) + line.error_at(quality)
-            return quality, rate_exponent(BYTES_PER_DB) * math.log(error)
+            return quality, self._exponent * math.log(error)
         quality = line.quality_at_error(self._rest(subset, coding))
         return _clipped(quality), line.log_bytes_at(quality)
 
@@ -440,7 +422,7 @@ class TargetSearch:
         """Return the cost of a file on the goal, as in `_predict`."""
         if self.goal.size_bytes is None:
             return math.log(file.size_bytes)
-        return rate_exponent(BYTES_PER_DB) * math.log(max(file.error, NOTHING))
+        return self._exponent * math.log(max(file.error, NOTHING))
 
     def _line(self, subset: Subset, coding: Coding) -> RateLine:
         """Return quantisation error and bytes of a subset and coding by precision.
@@ -449,13 +431,11 @@ class TargetSearch:
         measured on files of one kind if there are two, first on drafts.
         """
         gain, line = _PSNR_PER_PRECISION.get(coding.sh or "", 1.0), None
-        slopes = (-gain * LOG_ERROR_PER_DB, gain * BYTES_PER_DB)
+        slopes = (-gain * LOG_ERROR_PER_DB, gain * self._bytes_per_db)
         for draft in (True, False):
             made = self._by_distance(subset, coding, draft=draft)
             if made:
-                points = [self._point(one) for one in made]
-                flattest = _FLATTEST_BOOK if coding.sh == "codebook" else LEAST_SLOPE
-                line = RateLine.through(points, *slopes, flattest)
+                line = RateLine.through([self._point(one) for one in made], *slopes)
                 slopes = line.error_slope, line.bytes_slope
         assert line is not None
         return line
@@ -479,7 +459,7 @@ class TargetSearch:
 
     def _rest(self, subset: Subset, coding: Coding) -> float:
         """Return the mean squared error that quantisation may cause on the validation views."""
-        allowed = self._allowed(subset, coding) * error_of_psnr(_AIM[subset.refits])
+        allowed = self._allowed(subset, coding) * error_of_psnr(AIM)
         return max(allowed - self._unquantised(subset, coding), LEAST_QUANTISED * allowed)
 
     def _allowed(self, subset: Subset, coding: Coding) -> float:
@@ -523,7 +503,7 @@ class TargetSearch:
         degree = self._degree(coding)
         if not subset.refits and degree == self.whole.model.sh_degree:
             return 0.0
-        key = id(subset), degree, on_goal
+        key = subset, degree, on_goal
         if key not in self._errors:
             scorer = self.goal.scorer if on_goal else self.pool.validation_scorer
             found = self._error_in(scorer, drop_bands(subset.model, degree))
@@ -552,7 +532,7 @@ class TargetSearch:
     def _is_met(self, file: Candidate) -> bool:
         """Return True if a file meets the goal and may be written."""
         errors = file.result.report.errors
-        if file.is_draft or any(errors[name][0] > most for name, most in self.goal.max_error.items() if name in errors):
+        if any(errors[name][0] > most for name, most in self.goal.max_error.items() if name in errors):
             return False
         if self.goal.size_bytes is not None:
             return file.size_bytes <= self.goal.size_bytes
@@ -570,9 +550,9 @@ class TargetSearch:
         goal, made = self.goal, self.pool.made
         if goal.size_bytes is not None:
             kept = " with all splats" if self.pruner is None else ""
-            smallest = min(one.size_bytes for one in made if not one.is_draft)
+            smallest = min(one.size_bytes for one in made)
             return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
-        best = psnr_of_mse(min(one.goal_error for one in made if one.goal_error is not None and not one.is_draft))
+        best = psnr_of_mse(min(one.goal_error for one in made if one.goal_error is not None))
         if goal.is_drop:
             return (
                 f"no file reaches {psnr_of_mse(goal.error):.2f} dB on the validation images; the best has {best:.2f} dB"
@@ -647,8 +627,8 @@ def search_target(
 def expected_renders(encoding: EncodeOptions, target: Target) -> float:
     """Return the approximate cost of a target in renders of the test views."""
     if _keeps_all(target, encoding):
-        return _RENDERS
-    return _RENDERS_WITH_PRUNING[0] + _RENDERS_WITH_PRUNING[1] * SimplifyOptions(effort=target.effort).work
+        return _RENDERS[0]
+    return _RENDERS[0] + _RENDERS[1] * SimplifyOptions(effort=target.effort).work
 
 
 def _keeps_all(target: Target, encoding: EncodeOptions) -> bool:

@@ -24,6 +24,7 @@ _BATCH = 40  # virtual views added at a time
 # Views suffice if the errors predicted for used and held-out views differ by less, dB. Refits overfit more than choices
 # do: with 1 dB lego60k stops at 40 views, and is 3 dB better on other views with 160.
 _GAP_MAX = 0.1
+_PRUNED = 0.5  # fraction of the splats to prune, for these errors
 _MISSED_MAX = 0.005  # fraction of the splats; views suffice if only held-out views show fewer
 
 
@@ -50,7 +51,6 @@ class SufficientViews:
 def find_sufficient_views(
     model: SplatModel,
     views: ViewSet,
-    pruned: float,
     *,
     size: tuple[int, int] = VIEW_SIZE,
     threads: int | None = None,
@@ -62,7 +62,6 @@ def find_sufficient_views(
         model: the source.
         views: the views. Virtual training views are added batch by batch until they show all splats and agree with some
             that are held out. Other training views are all used, with validation views as the held-out ones.
-        pruned: fraction of the splats to prune, whose predicted errors must agree.
         size: width and height of the renders, pixels; the user's cameras keep their aspect ratio and are never
             enlarged.
         threads: number of threads; `None` for all.
@@ -87,11 +86,11 @@ def find_sufficient_views(
     while count < len(every):
         total = total_error(batches)
         missed = int(np.count_nonzero(check_errors.seen & ~total.seen))
-        if missed <= _MISSED_MAX * len(model) and _gap(model, total, check_errors, pruned) < _GAP_MAX:
+        if missed <= _MISSED_MAX * len(model) and _gap(model, total, check_errors) < _GAP_MAX:
             break
         batches.append(measure(every[count : count + _BATCH]))
         count = min(count + _BATCH, len(every))
-    return SufficientViews(batches, check, _gap(model, total_error(batches), check_errors, pruned))
+    return SufficientViews(batches, check, _gap(model, total_error(batches), check_errors))
 
 
 def _hold_out(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
@@ -101,10 +100,10 @@ def _hold_out(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
     return [one for i, one in enumerate(cameras) if i not in held_out], [cameras[i] for i in sorted(held_out)]
 
 
-def _gap(model: SplatModel, used: PruningError, check: PruningError, pruned: float) -> float:
+def _gap(model: SplatModel, used: PruningError, check: PruningError) -> float:
     """Return by how many dB the predicted error of the splats to prune is larger in held-out views."""
     keys = pruning_keys(model.opacities, used)
-    order = np.argsort(keys, kind="stable")[: int(pruned * len(model))]
+    order = np.argsort(keys, kind="stable")[: int(_PRUNED * len(model))]
     order = order[np.isfinite(keys[order])]
     in_used = float(np.sum(used.error[order])) / used.value_count
     in_check = float(np.sum(check.error[order])) / check.value_count
