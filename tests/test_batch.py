@@ -355,7 +355,7 @@ def test_an_interrupted_batch_is_continued(scenes, tmp_path, make_model):
     )
     with stuck.open("wb"):  # waits for the process to read it
         batch.send_signal(signal.SIGINT)
-        batch.wait()
+        batch.wait(timeout=60)
     assert 130 == batch.returncode
     assert "Traceback" not in batch.communicate()[1]
     noted = [name for name, one in read_journal(out)[0].items() if one.state == "done"]
