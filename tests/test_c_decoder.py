@@ -99,6 +99,14 @@ def test_passes_the_conformance_suite(tmp_path):
     assert_passes(compiled(tmp_path, "adapter", "-DCSPLAT_NO_ZLIB", *sources))
 
 
+def test_selects_the_tiles_of_cuts(decoder, tmp_path):
+    adapter = compiled(tmp_path, "adapter", decoder, C / "tools" / "adapter.c")
+    options = DecoderSuiteOptions("valid/levels*,extreme/levels*", levels=(5,))
+    report = run_command(None, options, cuts=f"{adapter} --cuts {{input}} {{cuts}}")
+    assert report.failures == []
+    assert len(report.outcomes) > 10
+
+
 @in_depth
 @pytest.mark.slow
 def test_compiles_without_a_warning_when_it_is_optimised(tmp_path):
@@ -124,8 +132,9 @@ def test_reads_and_refuses_the_same_streams_by_zlib(decoder, tmp_path):
 @pytest.mark.slow
 def test_survives_callers_whose_functions_fail(sanitized, tmp_path):
     interface = compiled(tmp_path, "interface", *SANITIZED, *sanitized, C / "tools" / "interface.c")
-    ended = run([interface, VECTORS / "valid" / "rich.csplat"])
-    assert (ended.returncode, ended.stderr) == (0, "")
+    for name in ("rich", "levels_of_the_rich_scene"):
+        ended = run([interface, VECTORS / "valid" / f"{name}.csplat"])
+        assert (ended.returncode, ended.stderr) == (0, "")
 
 
 @in_depth

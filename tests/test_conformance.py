@@ -29,6 +29,7 @@ from csplat_authoring.recipes import sound_recipes
 from csplat_authoring.reference import expected
 from csplat_authoring.samples import rich_scene
 from csplat_conformance import decoder_suite, manifest
+from csplat_conformance.answers import LEVELS as LEVELS_OF_THE_SUITE
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.decoder_suite import DecoderSuiteOptions
@@ -72,12 +73,24 @@ def test_floats_are_those_of_the_manifest_bit_for_bit():
     assert [] == failures(VALID, check)
 
 
+def decode_all(data):
+    """Decode floats and integers; only the latter are decoded at all levels of detail (CHK-8)."""
+    csplat.decode(data)
+    csplat.decode_integers(data)
+
+
 def test_refusals_name_code_clause_and_offset_of_the_defect():
     def check(vector):
         wanted = vector.error["code"], vector.error["clause"], vector.error["offset"]
-        assert wanted == refusal(csplat.decode, vector)
+        assert wanted == refusal(decode_all, vector)
 
     assert [] == failures(INVALID, check)
+
+
+def test_payloads_of_coarser_tiles_are_left_unread_by_a_decode_to_floats():
+    # CHK-8
+    for name in ("invalid/coarse_tile_box", "invalid/coarse_tile_stream"):
+        assert 5 == len(csplat.decode(named(name).data))
 
 
 def test_integers_are_refused_with_the_same_code():
@@ -112,7 +125,7 @@ def test_every_error_code_of_files_has_a_vector():
 
 
 def test_vectors_stay_well_below_five_megabytes():
-    assert sum(path.stat().st_size for path in VECTORS.rglob("*") if path.is_file()) < 1_600_000
+    assert sum(path.stat().st_size for path in VECTORS.rglob("*") if path.is_file()) < 2_000_000
 
 
 def test_repair_leaves_a_valid_file_unchanged():
@@ -149,6 +162,20 @@ def test_every_decoding_function_checks_the_whole_file():
         assert [vector.error["code"]] * len(ways) == [refusal(decode, vector)[0] for decode in ways]
 
     assert [] == failures([named(f"invalid/{name}") for name in names], check)
+
+
+def test_cuts_are_those_of_the_manifest():
+    report = decoder_suite.run_builtin(DecoderSuiteOptions(levels=(5,)))
+
+    assert [] == report.failures
+    assert {"L5"} == {one.level for one in report.outcomes}
+    assert {vector.name for vector in VALID if "TRE-9" in vector.clauses} <= {one.name for one in report.outcomes}
+
+
+def test_every_file_with_levels_has_cuts_and_no_other_file():
+    with_levels = {recipe.name for recipe in sound_recipes() if recipe.scene is not None and recipe.scene.nodes}
+
+    assert with_levels == {vector.name for vector in VALID if "cuts" in vector.expect}
 
 
 def test_a_wrong_hash_fails_the_run(monkeypatch):
@@ -336,6 +363,9 @@ def test_the_manifest_is_valid_by_its_schema():
     ("invalid/index_crc", {"error": {}}),
     ("invalid/index_crc", {"expect": {"header": {}}}),
     ("render/ellipsoids", {"views": [{"psnr": 40}]}),
+    ("valid/levels", {"expect": entry_named("valid/levels")["expect"] | {"cuts": [["level one", [0]]]}}),
+    ("valid/levels", {"expect": entry_named("valid/levels")["expect"] | {"cuts": [["level 1", [-1]]]}}),
+    ("valid/levels", {"expect": entry_named("valid/levels")["expect"] | {"cuts": [["level 1", [0, 0]]]}}),
 ])  # fmt: skip
 def test_the_schema_refuses_invalid_manifests(name, change):
     wrong = MANIFEST | {"vectors": [entry_named(name) | change]}
@@ -402,7 +432,7 @@ def test_the_guide_walks_through_every_chapter_of_clauses():
 def test_every_level_and_status_is_explained():
     words = {str(status) for status in Status} - {"skipped"}
     assert [] == [word for word in words if word not in GUIDE_AS_WRITTEN]
-    assert all(f"L{level}" in GUIDE_AS_WRITTEN for level in (1, 2, 3, 4))
+    assert all(f"L{level}" in GUIDE_AS_WRITTEN for level in LEVELS_OF_THE_SUITE)
 
 
 # Features ------------------------------------------------------------------------------------------
@@ -455,7 +485,8 @@ def test_every_mapping_kind_type_flag_direction_measure_and_degree_occurs():
     assert set(_spec.EXTRA_DTYPE_NAMES) == {dtype for dtype in dtypes if dtype < _spec.ANCILLARY_ID_MIN}
     assert set(_spec.DIRECTION_NAMES) == {axis for scene in SCENES for axis in scene.axes}
     assert {0, 1, 2, 3, 4} == {scene.sh_degree for scene in SCENES}
-    assert set(_spec.CHUNK_NAMES) - {b"TILE", b"CODB"} <= {chunk.type for scene in SCENES for chunk in scene.chunks}
+    assert set(_spec.CHUNK_NAMES) - {b"TILE", b"CODB", b"TREE"} <= {chunk.type for s in SCENES for chunk in s.chunks}
+    assert {True, False} == {bool(scene.nodes) for scene in SCENES}
     measures = {m for s in SCENES for chunk in s.chunks if chunk.errors for m, _, _ in chunk.errors.records}
     assert set(_spec.MEASURE_NAMES) == measures
     for bit in _spec.SCENE_FLAG_NAMES:

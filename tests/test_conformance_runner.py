@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from csplat import _spec
 from csplat.decoder import decode_api
 from csplat.decoder.container import open_chunk
-from csplat.errors import InputError
+from csplat.errors import FormatError, InputError
 from csplat_conformance import adapter
 from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
 from csplat_conformance.conformance_report import Status
@@ -43,6 +43,7 @@ from csplat_tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parent.parent
 ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
+CUT_ADAPTER = f"{sys.executable} -m csplat_conformance.adapter --cuts {{input}} {{cuts}}"
 JS_ADAPTER = f"node '{ROOT / 'codec' / 'js' / 'test' / 'adapter.mjs'}' {{input}} {{outdir}}"
 
 needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
@@ -107,6 +108,45 @@ if fault in ("2 ulp", "3 ulp"):
 sys.exit(status)
 """
 
+# The cuts of the manifest, with a selectable fault.
+FAULTY_CUTS = """
+import json, pathlib, sys
+
+fault, source, cuts = sys.argv[1:]
+known = json.loads((pathlib.Path(__file__).parent / "cuts.json").read_text())[pathlib.Path(source).stem]
+lines = []
+for cut in pathlib.Path(cuts).read_text().splitlines():
+    tiles = known[cut]
+    lines.append(tiles if isinstance(tiles, str) else " ".join(map(str, tiles)))
+if fault == "status":
+    sys.exit(77)
+if fault == "refusal":
+    print(json.dumps({"code": "E_INDEX", "clause": "TRE-5"}))
+    sys.exit(1)
+if fault == "silent":
+    lines = []
+if fault == "short":
+    del lines[-1]
+if fault == "long":
+    lines.append("0")
+if fault == "words":
+    lines[1] = "tile 2"
+if fault == "one wrong":
+    lines[1] = "1 0"
+if fault == "empty cuts":
+    lines = [""] * len(lines)
+if fault == "no error code":
+    lines = ["E_INPUT" if line == "E_LIMIT" else line for line in lines]
+if fault == "no sizes":
+    lines = ["E_UNSUPPORTED" if "pixel_size" in cut else line for cut, line in zip(known, lines)]
+if fault == "no list of sizes":
+    lines = ["E_UNSUPPORTED" if len(cut.split()) > 2 else line for cut, line in zip(known, lines)]
+if fault == "no cuts":
+    lines = ["E_UNSUPPORTED"] * len(lines)
+for line in lines:
+    print(line)
+"""
+
 #: Vectors whose answers are recorded.
 RECORDED = (
     "valid/quats",
@@ -130,6 +170,9 @@ def recorded(tmp_path_factory):
                 status = adapter.main([str(VECTORS / vector.file), str(outdir)])
             outdir.with_suffix(".json").write_text(json.dumps([status, words.getvalue()]))
     (folder / "decoder.py").write_text(FAULTY)
+    cuts = {one.name.split("/")[1]: dict(one.expect["cuts"]) for one in VECTOR_LIST if "cuts" in one.expect}
+    (folder / "cuts.json").write_text(json.dumps(cuts))
+    (folder / "cuts.py").write_text(FAULTY_CUTS)
     return folder
 
 
@@ -139,6 +182,12 @@ def faulty(recorded):
     return lambda fault: f"{sys.executable} -I -S {recorded / 'decoder.py'} '{fault}' {{input}} {{outdir}}"
 
 
+@pytest.fixture(scope="module")
+def faulty_cuts(recorded):
+    """Return a function for the command line of a program for cuts with a fault."""
+    return lambda fault: f"{sys.executable} -I -S {recorded / 'cuts.py'} '{fault}' {{input}} {{cuts}}"
+
+
 @pytest.mark.slow
 def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets_and_names_percent_encoded():
     report = run_command(ADAPTER, DecoderSuiteOptions(pattern="extreme/extra_names,invalid/transforms_gap", exact=True))
@@ -146,6 +195,15 @@ def test_our_decoder_passes_by_the_protocol_with_codes_clauses_and_offsets_and_n
     assert [] == report.failures
     assert {"L1", "L2", "L3"} == set(report.levels())
     assert {"extreme", "invalid"} == {outcome.name.split("/")[0] for outcome in report.outcomes}
+
+
+@pytest.mark.slow
+def test_our_cuts_pass_by_the_protocol():
+    report = run_command(None, DecoderSuiteOptions(pattern="valid/levels", levels=(5,)), cuts=CUT_ADAPTER)
+
+    assert [("valid/levels", "L5", Status.PASSED, "")] == [
+        (one.name, one.level, one.status, one.message) for one in report.outcomes
+    ]
 
 
 @needs_node
@@ -245,6 +303,66 @@ def test_a_broken_payload_may_be_accepted_by_decoders_that_leave_it_unread(fault
     assert len(names) == len(run_command(faulty("silent"), DecoderSuiteOptions(pattern=pattern, exact=True)).failures)
 
 
+CUT_FAULTS = {
+    "none": (Status.PASSED, ""),
+    "status": (Status.WRONG_STATUS, "exit status 77"),
+    "refusal": (Status.REFUSED, "refused"),
+    "silent": (Status.NO_OUTPUT, "0 cuts, expected 16, a line for each"),
+    "short": (Status.PARTIAL_OUTPUT, "15 cuts, expected 16"),
+    "long": (Status.FAILED, "17 cuts, expected 16"),
+    "words": (Status.WRONG_ANSWER, "line 2 is 'tile 2', expected numbers of tiles, or an error code"),
+    "one wrong": (Status.FAILED, "the cut 'level 1' is 1 0, expected 2"),
+    "empty cuts": (Status.FAILED, "the cut 'level 0' is empty, expected 0 1; 15 of the other 15 cuts are wrong, too"),
+    "no error code": (Status.FAILED, "the cut 'splats 2' is E_INPUT, expected E_LIMIT"),
+    "no sizes": (Status.PASSED, "the decoder offers no cut by pixel_size"),
+    "no list of sizes": (Status.FAILED, "is E_UNSUPPORTED, expected"),
+    "no cuts": (Status.SKIPPED, "the decoder offers no cut by level, pixel_size, splats"),
+}
+
+
+def test_a_fault_of_a_program_for_cuts_has_an_outcome_of_its_own(faulty_cuts):
+    def check(fault):
+        options = DecoderSuiteOptions(pattern="valid/levels", levels=(5,))
+        (outcome,) = run_command(None, options, cuts=faulty_cuts(fault)).outcomes
+        status, message = CUT_FAULTS[fault]
+        assert ("valid/levels", "L5", status) == (outcome.name, outcome.level, outcome.status)
+        assert message in outcome.message
+        assert bool(message) == bool(outcome.message)
+        assert "TRE-9" in outcome.clauses
+        assert outcome.code == ("E_INDEX" if fault == "refusal" else "")
+
+    assert [] == failures({fault: fault for fault in CUT_FAULTS}, check)
+
+
+def test_long_cuts_are_shortened_in_messages(faulty_cuts):
+    options = DecoderSuiteOptions(pattern="extreme/levels_chain_of_256", levels=(5,))
+    (outcome,) = run_command(None, options, cuts=faulty_cuts("no list of sizes")).outcomes
+
+    assert Status.FAILED is outcome.status
+    assert len(outcome.message) < 300
+
+
+def test_cuts_are_requested_of_valid_files_with_levels_alone(faulty, faulty_cuts):
+    options = DecoderSuiteOptions(pattern="valid/quats,valid/levels,invalid/level_below", levels=(1, 5))
+
+    alone = run_command(None, options, cuts=faulty_cuts("none"))
+    assert [("valid/levels", "L5")] == [(one.name, one.level) for one in alone.outcomes]
+    without = run_command(faulty("refusal"), options)
+    assert [("valid/levels", "no command for cuts was given")] == [
+        (one.name, one.message) for one in without.outcomes if one.status is Status.SKIPPED
+    ]
+
+
+def test_a_refusal_by_our_own_cuts_is_a_failure(monkeypatch):
+    def refuse(*_):
+        raise FormatError("E_INDEX", 0, "TRE-5")
+
+    monkeypatch.setattr(adapter, "cuts_of", refuse)
+    (failure,) = run_builtin(DecoderSuiteOptions(pattern="valid/levels", levels=(5,))).failures
+
+    assert (Status.REFUSED, "E_INDEX") == (failure.status, failure.code)
+
+
 MISTAKE = "each accepted one is an error if your decoder reads META (CHK-7)"
 
 
@@ -290,13 +408,14 @@ def test_a_broken_frame_of_an_unread_chunk_has_to_be_refused(faulty):
 
 
 @pytest.mark.parametrize(
-    ("text", "levels"), [("1", (1,)), ("3", (1, 2, 3)), ("1,3", (1, 3)), ("L4", (1, 2, 3, 4)), ("3,1", (1, 3))]
+    ("text", "levels"),
+    [("1", (1,)), ("3", (1, 2, 3)), ("1,3", (1, 3)), ("L4", (1, 2, 3, 4)), ("5", (1, 2, 3, 4, 5)), ("3,1", (1, 3))],
 )
 def test_levels_are_all_up_to_one_or_those_named(text, levels):
     assert levels == parse_levels(text)
 
 
-@pytest.mark.parametrize("text", ["0", "5", "x", "1,9", ""])
+@pytest.mark.parametrize("text", ["0", "6", "x", "1,9", ""])
 def test_other_levels_are_refused(text):
     with pytest.raises(InputError):
         parse_levels(text)
@@ -308,6 +427,12 @@ def test_other_levels_are_refused(text):
 def test_a_command_that_cannot_be_run_is_refused_at_once(command):
     with pytest.raises(InputError):
         run_command(command, DecoderSuiteOptions(pattern="valid/quats"))
+
+
+@pytest.mark.parametrize("command", ["my-cuts {input}", "my-cuts {input} {outdir}"])
+def test_a_command_for_cuts_that_cannot_be_run_is_refused_at_once(command):
+    with pytest.raises(InputError):
+        run_command(None, DecoderSuiteOptions(pattern="valid/levels"), cuts=command)
 
 
 @pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"timeout": 0}, {"jobs": 0}, {"by": "fast"}])
@@ -437,6 +562,15 @@ def test_patterns_of_the_guides_match_vectors():
     recommended = _recommended()
     assert len(recommended) > 15
     assert [] == failures({word: word for word in recommended}, check)
+
+
+def test_a_command_for_cuts_alone_is_tested_at_l5_alone(faulty_cuts):
+    words = ("--cmd", faulty_cuts("one wrong"), "--filter", "valid/levels*", "--json")
+    result = invoke(*words)
+
+    assert 1 == result.exit_code
+    assert {"L5"} == {outcome["level"] for outcome in json.loads(result.stdout)["outcomes"]}
+    assert 0 == invoke("--filter", "valid/levels", "--level", "5").exit_code  # our own
 
 
 def test_an_invalid_level_is_reported_in_one_line():

@@ -26,7 +26,7 @@ def spec() -> SimpleNamespace:
     text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
     names = {
         "float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "isfinite": np.isfinite,
-        "floor": math.floor,
+        "floor": math.floor, "NO_PARENT": _spec.NO_PARENT,
     }  # fmt: skip
     names |= {"bits": lambda x: int(np.float32(x).view(np.uint32))}
     blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)

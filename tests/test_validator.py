@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -17,7 +18,7 @@ from csplat_authoring.coders import Deflate, deflate_dynamic, deflate_fixed, def
 from csplat_authoring.recipes import sound_recipes
 from csplat_authoring.recipes.deflate_streams import invalid_streams, valid_streams
 from csplat_authoring.samples import attributes, rich_scene, scene, tile
-from csplat_authoring.scene import Attribute, Chunk, StatedErrors
+from csplat_authoring.scene import Attribute, Chunk, Node, StatedErrors
 from csplat_conformance.manifest import load
 from csplat_conformance.validator import validate
 from csplat_conformance.validator.ancillary_chunks import JsonError, parse_json
@@ -52,7 +53,8 @@ UNBREAKABLE = {"AXI-1": "a stream of AXIS has three bytes at most (STR-2), which
 #: that are permissions; CBK-6 and CBK-7 only delimit other clauses.
 NOT_ABOUT_FILES = {
     "NUM-1", "ORD-1", "ANC-1", "ANC-2", "ANC-3", "HDR-12", "IDX-9", "DIR-3", "TIL-4", "COV-2", "CHK-2", "CHK-5",
-    "CHK-6", "CHK-7", "COD-4", "CBK-6", "CBK-7", "SER-6", "SER-7", "SRC-1", "SRC-2", "SRC-3", "SRC-4",
+    "CHK-6", "CHK-7", "CHK-8", "COD-4", "CBK-6", "CBK-7", "SER-6", "SER-7", "SRC-1", "SRC-2", "SRC-3", "SRC-4",
+    "TRE-9",
 }  # fmt: skip
 
 #: Vectors whose arrays, at SH degree 3, fill the decoders' default budget.
@@ -108,6 +110,7 @@ def test_one_defect_causes_few_violations(broken):
     ("name", "part"),
     [
         ("valid/chunks_reversed", "recommended order"),
+        ("valid/levels_in_reverse", "recommended order"),
         ("extreme/deflate_unused_bits", "unused bits after the final block"),
     ],
 )
@@ -184,7 +187,9 @@ def test_all_defects_of_a_file_are_reported():
 
 
 def test_violations_have_the_offsets_of_their_fields():
-    changes = {"index.unit_metres": -1.0, "tile[1].level": 3, "TILE.0.2/sh2.reserved_0": 1, "SERR/head.error_flags": 8}
+    changes = {
+        "index.unit_metres": -1.0, "tile[1].reserved_0": 3, "TILE.0.2/sh2.reserved_0": 1, "SERR/head.error_flags": 8,
+    }  # fmt: skip
     found = {one.field: one.offset for one in validate(RICH.patched(changes)).violations}
 
     assert {name: RICH.fields[name].offset for name in changes} == found
@@ -235,6 +240,83 @@ def test_the_number_of_violations_is_bounded():
 
     assert VIOLATIONS_MAX == len(found.violations)
     assert "at least" in found.remarks[-1]
+
+
+# Levels of detail ----------------------------------------------------------------------------------
+#: Two nodes of two tiles each, their parents, and the root.
+TREE = scene(
+    tiles=[tile(seed, 3 + seed, level=level) for seed, level in enumerate((0, 0, 0, 0, 1, 1, 2))],
+    nodes=(Node(2, 2), Node(3, 2), Node(4, 1, 0.5), Node(4, 1, 0.25), Node(_spec.NO_PARENT, 1, 0.5)),
+)
+
+
+def tree_violations(**changes):
+    """Return clauses and fields of the violations in TREE after changes: `n0_parent` is `node[0].parent`."""
+    fields = {f"TREE/node[{name[1]}].{name[3:]}": value for name, value in changes.items()}
+    return [(one.clause, one.field) for one in validate(build(TREE).patched(fields)).violations]
+
+
+def test_all_defects_of_a_tree_are_reported():
+    found = tree_violations(n0_parent=1, n1_error=-1.0, n2_error=0.75, n3_parent=9, n4_error=float("inf"))
+
+    assert [
+        ("TRE-5", "TREE/node[0].parent"),
+        ("TRE-8", "TREE/node[1].error"),
+        ("TRE-5", "TREE/node[3].parent"),
+        ("TRE-8", "TREE/node[4].error"),
+    ] == found
+
+
+def test_consequences_of_a_defect_of_a_tree_are_not_reported():
+    cases = {
+        "another parent": ({"n0_parent": 3}, ["TRE-6"]),  # node 2 had no other child
+        "no such parent": ({"n0_parent": 7}, ["TRE-5"]),  # node 2 may be the one that was meant
+        "one child fewer": ({"n2_parent": _spec.NO_PARENT}, ["TRE-7"]),
+        "infinite error": ({"n3_error": float("inf")}, ["TRE-8"]),  # the error of the root may be right
+        "a tile fewer": ({"n0_tile_count": 1}, ["TRE-3"]),  # levels and splats of all nodes are unknown
+        "a tile more": ({"n1_tile_count": 3}, ["TRE-3", "TRE-4"]),
+        "a tile more, and a parent of a lower number": ({"n4_tile_count": 2, "n4_parent": 0}, ["TRE-3", "TRE-5"]),
+    }
+
+    def check(case):
+        changes, clauses = case
+        assert sorted(clauses) == sorted(clause for clause, _ in tree_violations(**changes))
+
+    assert [] == failures(cases, check)
+
+
+def test_tiles_of_all_levels_are_checked():
+    changes = {f"TILE.{i}.0/opacities.stream.count": 99 for i in (0, 4, 6)}
+
+    assert {*changes} == {one.field for one in validate(build(TREE).patched(changes)).violations}
+
+
+def test_no_more_nodes_are_read_than_there_are_tiles():
+    many = replace(TREE, nodes=TREE.nodes + (Node(_spec.NO_PARENT, 1, 1.0),) * 50)
+    found = validate(build(many).data)
+
+    assert ["TRE-3"] == [one.clause for one in found.violations]
+    assert ["there are more nodes than tiles"] == [one.reason for one in found.unread]
+
+
+def test_the_order_that_is_recommended_for_levels_gets_no_remark():
+    stated_errors = Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(18, 0, 0, 0, ()))
+    made = replace(TREE, chunks=(Chunk(_spec.CHUNK_METADATA, text=b"{}"), stated_errors))
+    names = list(build(made).spans)
+
+    def remarks(*first):
+        """Return the number of remarks if some chunks precede the others."""
+        order = (*first, *(name for name in names if name not in first))
+        return len(validate(build(replace(made, order=order)).data).remarks)
+
+    tiles = [f"TILE.{number}.0" for number in (6, 4, 5, 0, 1, 2, 3)]
+    assert ["TREE", "META", *tiles, "SERR"] == names
+    assert [0, 1, 1, 1] == [remarks(), remarks("META"), remarks("TREE", "META", "TILE.4.0"), remarks("TREE", "SERR")]
+
+
+def test_the_budget_of_splats_is_that_of_level_0():
+    assert set() == clauses_of(build(TREE).data, splats_max=18)
+    assert {"LIM-1"} == clauses_of(build(TREE).data, splats_max=17)
 
 
 # Clauses that no decoder checks or no vector covers -----------------------------------------------
@@ -366,9 +448,10 @@ def test_the_validator_agrees_with_the_decoder_on_damaged_files():
 
 
 def error_of(data):
-    """Return the clause and code of the decoder's error, or None."""
+    """Return the clause and code of the decoder's error, or None. Only integers are decoded at all levels (CHK-8)."""
     try:
         csplat.decode(data, threads=1)
+        csplat.decode_integers(data, threads=1)
     except csplat.CsplatError as error:
         return error.clause, error.code
     return None

@@ -1,8 +1,8 @@
 /* csplat.h documents the interface, spec/format.md the format. Names of clauses, such as [HDR-1], are the specification's.
  *
  * In this order: bytes and errors, chunks, streams (6.1 to 6.3), header and index (4), codebooks (5.3), blocks (6.4),
- * values (7), texts (5.4), the public functions. No two floating-point operations are combined such that a compiler could
- * contract them. SPDX-License-Identifier: Apache-2.0 */
+ * values (7), texts (5.4), nodes and cuts (5.7), the public functions. No two floating-point operations are combined such
+ * that a compiler could contract them. SPDX-License-Identifier: Apache-2.0 */
 #include "csplat.h"
 
 #include <float.h>
@@ -47,6 +47,7 @@
 #define SPEC_RUN_MAX 65536
 #define SPEC_JSON_DEPTH_MAX 64
 #define SPEC_EXTRA_NAME_MAX 62
+#define SPEC_NO_PARENT INT64_C(4294967295)
 #define SPEC_ANCILLARY_ID_MIN 128
 #define SPEC_ANCILLARY_SCENE_FLAGS 240
 #define SPEC_ANCILLARY_CHUNK_FLAGS 65280
@@ -204,6 +205,10 @@
 #define SPEC_LAYER_RECORD_AT_SIZE 4
 #define SPEC_LAYER_RECORD_AT_OFFSET 8
 #define SPEC_LAYER_RECORD_AT_CRC 16
+#define SPEC_NODE_RECORD_SIZE 12
+#define SPEC_NODE_RECORD_AT_PARENT 0
+#define SPEC_NODE_RECORD_AT_TILE_COUNT 4
+#define SPEC_NODE_RECORD_AT_ERROR 8
 #define SPEC_CHUNK_HEADER_SIZE 12
 #define SPEC_CHUNK_HEADER_AT_TYPE 0
 #define SPEC_CHUNK_HEADER_AT_FLAGS 4
@@ -295,7 +300,7 @@ typedef struct chunk {
     uint32_t size, crc;
     uint8_t type[4];
     uint16_t flags;
-    uint8_t skipped;
+    uint8_t skipped; /* csplat_decode leaves the payload unread */
 } chunk;
 
 typedef struct book {
@@ -317,6 +322,7 @@ typedef struct tile {
     uint32_t splat_count, max_scale;
     uint16_t table_count;
     int16_t exponent;
+    uint8_t level;
 } tile;
 
 /* The bytes of a payload, and the clause that defines its end. */
@@ -362,7 +368,7 @@ struct csplat {
     const uint8_t *memory; /* the whole file, or NULL */
     csplat_error error;
     csplat_info info;
-    unsigned sh_degree_max; /* of the file's version */
+    unsigned sh_degree_max, level_max; /* of the file's version */
     attribute attributes[ATTRIBUTES_END];
     unsigned attribute_count;
     book *books;
@@ -372,11 +378,16 @@ struct csplat {
     chunk *chunks;
     size_t chunk_count;
     tile *tiles;
-    const chunk *texts[3], *stated;
+    uint32_t tile_count; /* of all levels */
+    const chunk *texts[3], *stated, *tree;
+    const csplat_node *nodes;       /* in node_memory; NULL until read */
+    const uint32_t *replaced_first; /* in order_memory, the nodes above level 0; NULL until a budget is given */
+    uint32_t node_count;
     buffer index_bytes, chunk_bytes, book_bytes;   /* copies of the source's bytes, if it is not in memory */
     buffer inflated, unrun, integers, entries, escapes, summands, rows, codes; /* working memory */
     buffer band_integers[SPEC_SH_DEGREE_MAX + 1], band_rows[SPEC_SH_DEGREE_MAX + 1];
     buffer indices[ATTRIBUTES_END], narrow[ATTRIBUTES_END], narrow_index, text, names;
+    buffer node_memory, child_splats, order_memory, replaced;
     const uint8_t *index;
     size_t index_size;
     uint64_t table_bytes;
@@ -422,6 +433,14 @@ static int64_t signed64(uint64_t x)
 static int get_i16(const uint8_t *p)
 {
     return (int)(get_u16(p) ^ 0x8000u) - 0x8000;
+}
+
+static float get_f32(const uint8_t *p)
+{
+    uint32_t bits = get_u32(p);
+    float x;
+    memcpy(&x, &bits, sizeof x);
+    return x;
 }
 
 static double get_f64(const uint8_t *p)
@@ -489,6 +508,12 @@ static void note(csplat *d, csplat_code code, const char *clause, uint64_t offse
     va_start(arguments, format);
     vsnprintf(e->message + used, sizeof e->message - used, format, arguments);
     va_end(arguments);
+}
+
+/* Refuse arguments of the caller. */
+static int refuse(csplat *d, const char *what)
+{
+    return fail(d, CSPLAT_E_INPUT, "", CSPLAT_NO_OFFSET, "%s", what);
 }
 
 static void *plain_allocate(void *user, size_t size)
@@ -976,6 +1001,7 @@ static int read_header(csplat *d)
                     "the file has version %u.%u, this decoder reads %d.%d to %d.%d", major, minor, SPEC_VERSION_MAJOR,
                     SPEC_VERSION_MINOR_OLDEST, SPEC_VERSION_MAJOR, SPEC_VERSION_MINOR);
     d->sh_degree_max = minor == 2 ? 3 : SPEC_SH_DEGREE_MAX;
+    d->level_max = minor == 2 ? 0 : UINT8_MAX;
     crc = crc32_of(d, p, SPEC_HEADER_AT_HEADER_CRC);
     if (crc != get_u32(p + SPEC_HEADER_AT_HEADER_CRC))
         return fail(d, CSPLAT_E_CRC, "HDR-3", SPEC_HEADER_AT_HEADER_CRC, "of the header, computed 0x%08lx",
@@ -1197,10 +1223,10 @@ static unsigned chunks_of_book(const book *b)
 /* Register the chunk of a directory record of a known type; each must occur once. */
 static int claim(csplat *d, const chunk *k, const uint8_t *p)
 {
-    static const char *const types[] = {SPEC_CHUNK_METADATA, SPEC_CHUNK_CAMERAS, SPEC_CHUNK_OPTIONS,
-                                        SPEC_CHUNK_STATED_ERRORS, SPEC_CHUNK_CODEBOOK};
+    static const char *const types[] = {SPEC_CHUNK_METADATA,      SPEC_CHUNK_CAMERAS, SPEC_CHUNK_OPTIONS,
+                                        SPEC_CHUNK_STATED_ERRORS, SPEC_CHUNK_TREE,    SPEC_CHUNK_CODEBOOK};
     static const unsigned flags[] = {SPEC_CHUNK_FLAG_SAFE_TO_COPY, SPEC_CHUNK_FLAG_SAFE_TO_COPY, 0, 0,
-                                     SPEC_CHUNK_FLAG_CRITICAL};
+                                     SPEC_CHUNK_FLAG_CRITICAL,     SPEC_CHUNK_FLAG_CRITICAL};
     const chunk **slot = NULL;
     unsigned type = 0, id = get_u16(p + SPEC_DIRECTORY_RECORD_AT_ID), layer = p[SPEC_DIRECTORY_RECORD_AT_LAYER];
     while (memcmp(k->type, types[type], 4) != 0)
@@ -1208,8 +1234,8 @@ static int claim(csplat *d, const chunk *k, const uint8_t *p)
     if ((k->flags & ~(unsigned)SPEC_ANCILLARY_CHUNK_FLAGS) != flags[type])
         return fail(d, CSPLAT_E_VALUE, "CHK-4", k->record + SPEC_DIRECTORY_RECORD_AT_FLAGS, "flags %u of %s, expected %u",
                     k->flags, types[type], flags[type]);
-    if (type < 4) {
-        slot = type < 3 ? &d->texts[type] : &d->stated;
+    if (type < 5) {
+        slot = type < 3 ? &d->texts[type] : type == 3 ? &d->stated : &d->tree;
         if (id || layer || *slot)
             return fail(d, CSPLAT_E_INDEX, "DIR-4", k->record, "%s with an id or a layer, or twice", types[type]);
     } else {
@@ -1230,7 +1256,7 @@ static int is_known(const uint8_t *type)
 {
     return !memcmp(type, SPEC_CHUNK_METADATA, 4) || !memcmp(type, SPEC_CHUNK_CAMERAS, 4) ||
            !memcmp(type, SPEC_CHUNK_OPTIONS, 4) || !memcmp(type, SPEC_CHUNK_STATED_ERRORS, 4) ||
-           !memcmp(type, SPEC_CHUNK_CODEBOOK, 4);
+           !memcmp(type, SPEC_CHUNK_TREE, 4) || !memcmp(type, SPEC_CHUNK_CODEBOOK, 4);
 }
 
 /* Read a size and an offset, which COV-1 checks later. */
@@ -1258,8 +1284,6 @@ static int read_directory(csplat *d, chunk *k, const uint8_t *p, uint64_t at)
         return fail(d, CSPLAT_E_VALUE, "DIR-1", at, "a TILE in the directory");
     if (flags & ~(unsigned)(SPEC_CHUNK_FLAG_CRITICAL | SPEC_CHUNK_FLAG_SAFE_TO_COPY | SPEC_ANCILLARY_CHUNK_FLAGS))
         return fail(d, CSPLAT_E_RESERVED, "RES-1", at + SPEC_DIRECTORY_RECORD_AT_FLAGS, "flags 0x%04x", flags);
-    if (!memcmp(p, SPEC_CHUNK_TREE, 4))
-        return fail(d, CSPLAT_E_UNSUPPORTED, "RES-2", at, "a chunk %.4s", (const char *)p);
     TRY(read_place(d, k, at, p + SPEC_DIRECTORY_RECORD_AT_SIZE, p + SPEC_DIRECTORY_RECORD_AT_OFFSET,
                    p + SPEC_DIRECTORY_RECORD_AT_CRC));
     if (is_known(p))
@@ -1276,6 +1300,7 @@ static int read_directory(csplat *d, chunk *k, const uint8_t *p, uint64_t at)
 /* Read the layers of a tile as chunks and check that the required ones are present. */
 static int read_layers(csplat *d, tile *t, chunk *k, unsigned count, size_t stride, const uint8_t *p, uint64_t at)
 {
+    const uint64_t first = at;
     int last = -1;
     if (count == 0 || p[0] != SPEC_LAYER_GEOMETRY)
         return fail(d, CSPLAT_E_INDEX, "TIL-2", t->record + SPEC_TILE_RECORD_AT_LAYER_COUNT, "a tile without layer 0");
@@ -1294,12 +1319,12 @@ static int read_layers(csplat *d, tile *t, chunk *k, unsigned count, size_t stri
                        p + SPEC_LAYER_RECORD_AT_CRC));
         memcpy(k[i].type, SPEC_CHUNK_TILE, 4);
         k[i].flags = SPEC_CHUNK_FLAG_CRITICAL;
-        k[i].skipped = layer >= SPEC_ANCILLARY_ID_MIN;
-        if (!k[i].skipped)
+        k[i].skipped = layer >= SPEC_ANCILLARY_ID_MIN || t->level > 0;
+        if (layer < SPEC_ANCILLARY_ID_MIN)
             t->layers[layer == SPEC_LAYER_EXTRA ? (unsigned)EXTRA : layer] = &k[i];
     }
-    if (!t->layers[EXTRA] != !d->info.extra_count)
-        return fail(d, CSPLAT_E_INDEX, "TIL-5", t->record, "a tile %s a layer of extra columns",
+    if (!t->layers[EXTRA] != (!d->info.extra_count || t->level > 0))
+        return fail(d, CSPLAT_E_INDEX, "TIL-5", first, "a tile of level %u %s a layer of extra columns", t->level,
                     t->layers[EXTRA] ? "has" : "lacks");
     return 1;
 }
@@ -1309,11 +1334,14 @@ static int read_tile(csplat *d, tile *t, const uint8_t *p)
     const uint64_t at = t->record;
     double high;
     t->splat_count = get_u32(p);
+    t->level = p[SPEC_TILE_RECORD_AT_LEVEL];
     t->exponent = (int16_t)get_i16(p + SPEC_TILE_RECORD_AT_EXPONENT);
     t->max_scale = get_u32(p + SPEC_TILE_RECORD_AT_MAX_SCALE);
     if (t->splat_count < 1 || t->splat_count > SPEC_TILE_SPLATS_MAX)
         return fail(d, CSPLAT_E_VALUE, "TIL-1", at, "a tile of %lu splats", (unsigned long)t->splat_count);
-    TRY(reserved(d, p + SPEC_TILE_RECORD_AT_LEVEL, 1, at + SPEC_TILE_RECORD_AT_LEVEL));
+    if (t->level > d->level_max || (t > d->tiles && t->level < t[-1].level))
+        return fail(d, CSPLAT_E_INDEX, "TIL-12", at + SPEC_TILE_RECORD_AT_LEVEL, "a tile of level %u %s", t->level,
+                    t->level > d->level_max ? "in a file of version 0.2" : "after one of a higher level");
     TRY(reserved(d, p + SPEC_TILE_RECORD_AT_RESERVED_0, 2, at + SPEC_TILE_RECORD_AT_RESERVED_0));
     if (!scaled(d->attributes[MEANS].step, t->exponent, -1022, 1023, &t->step))
         return fail(d, CSPLAT_E_VALUE, "TIL-9", at + SPEC_TILE_RECORD_AT_EXPONENT, "an exponent of %d", t->exponent);
@@ -1369,7 +1397,7 @@ static int check_coverage(csplat *d)
 static int count_layers(csplat *d, uint64_t at, size_t tile_size, size_t layer_size, uint64_t *layers)
 {
     *layers = 0;
-    for (uint32_t i = 0; i < d->info.tile_count; i++) {
+    for (uint32_t i = 0; i < d->tile_count; i++) {
         uint64_t left = d->index_size - at, wanted = tile_size;
         if (left >= wanted) {
             const uint8_t *p = d->index + at;
@@ -1387,8 +1415,9 @@ static int count_layers(csplat *d, uint64_t at, size_t tile_size, size_t layer_s
 
 static int read_tiles(csplat *d, uint64_t at, size_t tile_size, size_t layer_size, chunk *k)
 {
-    uint64_t first = 0;
-    for (uint32_t i = 0; i < d->info.tile_count; i++) {
+    csplat_info *info = &d->info;
+    uint64_t first = 0, splat_count = 0;
+    for (uint32_t i = 0; i < d->tile_count; i++) {
         tile *t = &d->tiles[i];
         const uint8_t *p = d->index + at;
         unsigned layers = p[SPEC_TILE_RECORD_AT_LAYER_COUNT];
@@ -1403,10 +1432,21 @@ static int read_tiles(csplat *d, uint64_t at, size_t tile_size, size_t layer_siz
         k += layers;
         at += layers * layer_size + 2 * (size_t)t->table_count;
         first += t->splat_count;
+        if (t->level == 0) {
+            info->tile_count = i + 1;
+            splat_count = first;
+        }
     }
-    return first == d->info.splat_count ||
-           fail(d, CSPLAT_E_INDEX, "IDX-7", SPEC_HEADER_SIZE + SPEC_INDEX_HEAD_AT_SPLAT_COUNT,
-                "%llu splats, in tiles %llu", (unsigned long long)d->info.splat_count, (unsigned long long)first);
+    info->coarse_tile_count = d->tile_count - info->tile_count;
+    if (splat_count != info->splat_count)
+        return fail(d, CSPLAT_E_INDEX, "IDX-7", SPEC_HEADER_SIZE + SPEC_INDEX_HEAD_AT_SPLAT_COUNT,
+                    "%llu splats, in tiles of level 0 %llu", (unsigned long long)info->splat_count,
+                    (unsigned long long)splat_count);
+    if (!d->tree && info->coarse_tile_count)
+        return fail(d, CSPLAT_E_INDEX, "TRE-1", d->tiles[info->tile_count].record + SPEC_TILE_RECORD_AT_LEVEL,
+                    "a tile of level %u, but no TREE", d->tiles[info->tile_count].level);
+    return !d->tree || info->coarse_tile_count ||
+           fail(d, CSPLAT_E_INDEX, "TRE-1", d->tree->record, "a TREE, but no tile of a level above 0");
 }
 
 static int read_index(csplat *d)
@@ -1422,7 +1462,7 @@ static int read_index(csplat *d)
             return fail(d, CSPLAT_E_VALUE, "IDX-8", SPEC_HEADER_SIZE + i, "records of %u bytes, expected at least %u", sizes[i],
                         least[i]);
     TRY(read_facts(d, head));
-    info->tile_count = get_u32(head + SPEC_INDEX_HEAD_AT_TILE_COUNT);
+    d->tile_count = get_u32(head + SPEC_INDEX_HEAD_AT_TILE_COUNT);
     counts[0] = d->attribute_count = head[SPEC_INDEX_HEAD_AT_ATTRIBUTE_COUNT];
     counts[1] = info->codebook_count = get_u16(head + SPEC_INDEX_HEAD_AT_CODEBOOK_COUNT);
     counts[2] = info->extra_count = get_u16(head + SPEC_INDEX_HEAD_AT_EXTRA_COUNT);
@@ -1446,7 +1486,7 @@ static int read_index(csplat *d)
     TRY(d->extras = allocate(d, counts[2], sizeof *d->extras));
     TRY(d->extra_names = allocate(d, counts[2], SPEC_EXTRA_NAME_MAX + 1));
     TRY(d->chunks = allocate(d, d->chunk_count, sizeof *d->chunks));
-    TRY(d->tiles = allocate(d, info->tile_count, sizeof *d->tiles));
+    TRY(d->tiles = allocate(d, d->tile_count, sizeof *d->tiles));
     info->codebooks = d->public_books;
     info->extras = d->extras;
     for (unsigned i = 0; i < counts[1]; i++, at += sizes[2])
@@ -1767,7 +1807,6 @@ static int read_morton(csplat *d, cursor *c, uint32_t n, uint32_t *q)
 static int read_means(csplat *d, cursor *c, const tile *t, unsigned coding, block *b)
 {
     const uint32_t n = t->splat_count;
-    uint64_t at = place(c);
     uint32_t *q;
     TRY(reserve(d, &d->integers, 3 * (uint64_t)n, sizeof *q));
     q = d->integers.data;
@@ -1789,8 +1828,9 @@ static int read_means(csplat *d, cursor *c, const tile *t, unsigned coding, bloc
             high = q[i] > high ? q[i] : high;
         }
         if (low != 0 || high != t->extent[axis])
-            return fail(d, CSPLAT_E_BOX, "TIL-10", at, "axis %u goes from %lu to %lu, expected 0 to %lu", axis,
-                        (unsigned long)low, (unsigned long)high, (unsigned long)t->extent[axis]);
+            return fail(d, CSPLAT_E_BOX, "TIL-10", t->record + SPEC_TILE_RECORD_AT_CORNER,
+                        "axis %u goes from %lu to %lu, expected 0 to %lu", axis, (unsigned long)low, (unsigned long)high,
+                        (unsigned long)t->extent[axis]);
     }
     return 1;
 }
@@ -2314,6 +2354,8 @@ static int read_extras(csplat *d, const tile *t, void *const *out)
     cursor c;
     if (!d->info.extra_count)
         return 1;
+    if (t->level > 0)
+        return refuse(d, "tiles above level 0 have no extra columns");
     TRY(load_layer(d, t, EXTRA, d->info.extra_count, &c));
     for (unsigned i = 0; i < d->info.extra_count; i++) {
         const csplat_extra *e = &d->extras[i];
@@ -2770,16 +2812,240 @@ static int read_stated_errors(csplat *d, csplat_stated_errors *out)
     return at_end(d, &c);
 }
 
+/* Levels of detail (5.7) ------------------------------------------------------------------------------------------------ */
+
+static void find_box(const tile *t, float min[3], float max[3])
+{
+    for (int i = 0; i < 3; i++) {
+        min[i] = (float)((double)t->corner[i] * t->step);
+        max[i] = (float)((double)(t->corner[i] + (int64_t)t->extent[i]) * t->step);
+    }
+}
+
+static void widen(csplat_node *n, const float min[3], const float max[3])
+{
+    for (int i = 0; i < 3; i++) {
+        n->min[i] = min[i] < n->min[i] ? min[i] : n->min[i];
+        n->max[i] = max[i] > n->max[i] ? max[i] : n->max[i];
+    }
+}
+
+/* Begin a node with its tiles. */
+static void begin_node(const csplat *d, csplat_node *n, uint32_t parent, uint32_t first_tile, uint32_t tile_count)
+{
+    memset(n, 0, sizeof *n);
+    n->parent = parent;
+    n->first_tile = first_tile;
+    n->tile_count = tile_count;
+    n->level = d->tiles[first_tile].level;
+    find_box(&d->tiles[first_tile], n->min, n->max);
+    for (uint32_t i = first_tile; i < first_tile + tile_count; i++) {
+        float min[3], max[3];
+        find_box(&d->tiles[i], min, max);
+        widen(n, min, max);
+        n->splat_count += d->tiles[i].splat_count;
+    }
+}
+
+/* Check TRE-2 and TRE-3. The tiles then bound the number of nodes. */
+static int check_tile_counts(csplat *d, const cursor *c)
+{
+    const size_t rest = c->size % SPEC_NODE_RECORD_SIZE;
+    uint32_t left = d->tile_count;
+    if (rest)
+        return fail(d, CSPLAT_E_STREAM, "TRE-2", c->offset + c->size - rest, "%llu bytes are not whole records",
+                    (unsigned long long)c->size);
+    for (size_t at = SPEC_NODE_RECORD_AT_TILE_COUNT; at < c->size; at += SPEC_NODE_RECORD_SIZE) {
+        const uint32_t count = get_u32(c->data + at);
+        if (count < 1 || count > left)
+            return fail(d, CSPLAT_E_INDEX, "TRE-3", c->offset + at, "a node of %lu tiles, expected 1 to %lu",
+                        (unsigned long)count, (unsigned long)left);
+        left -= count;
+    }
+    return !left || fail(d, CSPLAT_E_INDEX, "TRE-3", c->offset, "%lu tiles belong to no node", (unsigned long)left);
+}
+
+/* Check a node after its children, and add it to those of its parent. `at` is the offset of the first record. */
+static int check_node(csplat *d, csplat_node *nodes, uint64_t *child_splats, uint32_t count, uint32_t i, uint64_t at)
+{
+    const csplat_node *n = &nodes[i];
+    const uint64_t record = at + (uint64_t)i * SPEC_NODE_RECORD_SIZE;
+    if (n->level > 0 && !child_splats[i])
+        return fail(d, CSPLAT_E_INDEX, "TRE-6", record, "a node of level %u is not the parent of any", n->level);
+    if (n->level > 0 && n->splat_count > child_splats[i])
+        return fail(d, CSPLAT_E_INDEX, "TRE-7", record, "a node of %llu splats, its children have %llu",
+                    (unsigned long long)n->splat_count, (unsigned long long)child_splats[i]);
+    if (n->level > 0 ? !(n->error >= 0) || !is_finite(n->error) : n->error != 0)
+        return fail(d, CSPLAT_E_VALUE, "TRE-8", record + SPEC_NODE_RECORD_AT_ERROR, "an error of %g at level %u",
+                    (double)n->error, n->level);
+    if (n->parent == SPEC_NO_PARENT)
+        return 1;
+    if (n->parent >= count || nodes[n->parent].level <= n->level)
+        return fail(d, CSPLAT_E_INDEX, "TRE-5", record + SPEC_NODE_RECORD_AT_PARENT,
+                    "the parent %lu is not a node above level %u", (unsigned long)n->parent, n->level);
+    if (!(nodes[n->parent].error >= n->error))
+        return fail(d, CSPLAT_E_VALUE, "TRE-8",
+                    at + (uint64_t)n->parent * SPEC_NODE_RECORD_SIZE + SPEC_NODE_RECORD_AT_ERROR,
+                    "an error of %g, but that of a child is %g", (double)nodes[n->parent].error, (double)n->error);
+    child_splats[n->parent] += n->splat_count;
+    widen(&nodes[n->parent], n->min, n->max);
+    return 1;
+}
+
+static int read_tree(csplat *d, const cursor *c, csplat_node *nodes, uint64_t *child_splats, uint32_t count)
+{
+    uint32_t first = 0;
+    for (uint32_t i = 0; i < count; i++) {
+        const size_t at = (size_t)i * SPEC_NODE_RECORD_SIZE;
+        const uint8_t *p = c->data + at;
+        begin_node(d, &nodes[i], get_u32(p), first, get_u32(p + SPEC_NODE_RECORD_AT_TILE_COUNT));
+        nodes[i].error = get_f32(p + SPEC_NODE_RECORD_AT_ERROR);
+        child_splats[i] = 0;
+        first += nodes[i].tile_count;
+        if (d->tiles[first - 1].level != nodes[i].level) /* by TIL-12, levels do not descend */
+            return fail(d, CSPLAT_E_INDEX, "TRE-4", c->offset + at + SPEC_NODE_RECORD_AT_TILE_COUNT,
+                        "a node with tiles of the levels %u and %u", nodes[i].level, d->tiles[first - 1].level);
+    }
+    for (uint32_t i = 0; i < count; i++)
+        TRY(check_node(d, nodes, child_splats, count, i, c->offset));
+    return 1;
+}
+
+/* Read the nodes, unless that was done before. A file without TREE has one node of all tiles, if it has any. */
+static int read_nodes(csplat *d)
+{
+    cursor c = {0};
+    uint32_t count = d->tile_count > 0;
+    if (d->nodes)
+        return 1;
+    if (d->tree) {
+        TRY(load(d, d->tree, &d->chunk_bytes, CSPLAT_E_STREAM, "TRE-2", &c));
+        TRY(check_tile_counts(d, &c));
+        count = (uint32_t)(c.size / SPEC_NODE_RECORD_SIZE);
+    }
+    TRY(reserve(d, &d->node_memory, count, sizeof *d->nodes));
+    TRY(reserve(d, &d->child_splats, count, sizeof(uint64_t)));
+    if (d->tree)
+        TRY(read_tree(d, &c, d->node_memory.data, d->child_splats.data, count));
+    else if (count)
+        begin_node(d, d->node_memory.data, SPEC_NO_PARENT, 0, d->tile_count);
+    d->nodes = d->node_memory.data;
+    d->node_count = count;
+    return 1;
+}
+
+/* Return whether a cut contains a node, unless its children replace it. */
+static int is_reached(const csplat *d, const uint8_t *replaced, uint32_t i)
+{
+    return d->nodes[i].parent == SPEC_NO_PARENT || replaced[d->nodes[i].parent];
+}
+
+/* Mark the nodes that their children replace: cut_at_level and cut_at_pixel_size of the specification. */
+static void replace_where(const csplat *d, const csplat_cut *cut, uint8_t *replaced)
+{
+    for (uint32_t i = d->node_count; i-- > 0;) { /* parents come after their children */
+        const csplat_node *n = &d->nodes[i];
+        const int is_coarser = cut->kind == CSPLAT_CUT_LEVEL
+                                   ? n->level > cut->level
+                                   : n->error > cut->pixel_sizes[cut->pixel_size_count == 1 ? 0 : i];
+        replaced[i] = is_coarser && is_reached(d, replaced, i);
+    }
+}
+
+static int is_replaced_before(const void *context, uint32_t a, uint32_t b)
+{
+    const csplat_node *nodes = context;
+    return nodes[a].error > nodes[b].error || (nodes[a].error == nodes[b].error && a > b);
+}
+
+/* Mark the nodes that their children replace: cut_within of the specification. By TRE-8 and TRE-5 a parent has the larger
+ * error, or the same and the larger number. Sorted by both, every node follows its parent, and a cut replaces the first. */
+static int replace_within(csplat *d, uint64_t splats, uint8_t *replaced)
+{
+    uint32_t leaves = 0;
+    uint64_t count = 0;
+    memset(replaced, 0, d->node_count);
+    for (uint32_t i = 0; i < d->node_count; i++) {
+        count += d->nodes[i].parent == SPEC_NO_PARENT ? d->nodes[i].splat_count : 0;
+        leaves += d->nodes[i].level == 0;
+    }
+    if (count > splats)
+        return fail(d, CSPLAT_E_LIMIT, "TRE-9", CSPLAT_NO_OFFSET, "the coarsest cut has %llu splats, the limit is %llu",
+                    (unsigned long long)count, (unsigned long long)splats);
+    if (!d->replaced_first) {
+        uint32_t *order;
+        TRY(reserve(d, &d->order_memory, d->node_count - leaves, sizeof *order));
+        order = d->order_memory.data;
+        for (uint32_t i = leaves; i < d->node_count; i++)
+            order[i - leaves] = i;
+        sort(order, d->node_count - leaves, is_replaced_before, d->nodes);
+        d->replaced_first = order;
+    }
+    for (uint32_t i = 0; i < d->node_count - leaves; i++) {
+        const uint32_t n = d->replaced_first[i];
+        count += ((const uint64_t *)d->child_splats.data)[n] - d->nodes[n].splat_count; /* at least 0, by TRE-7 */
+        if (count > splats)
+            break;
+        replaced[n] = 1;
+    }
+    return 1;
+}
+
+static int touches(const float *box, const float min[3], const float max[3])
+{
+    for (int i = 0; box && i < 3; i++)
+        if (!(min[i] <= box[3 + i] && max[i] >= box[i]))
+            return 0;
+    return 1;
+}
+
+static int check_cut(csplat *d, const csplat_cut *cut)
+{
+    if ((unsigned)cut->kind > CSPLAT_CUT_SPLATS)
+        return refuse(d, "there is no such kind of cut");
+    if (cut->kind == CSPLAT_CUT_LEVEL && cut->level > UINT8_MAX)
+        return refuse(d, "there is no such level");
+    if (cut->kind == CSPLAT_CUT_PIXEL_SIZE && cut->pixel_size_count != 1 && cut->pixel_size_count != d->node_count)
+        return refuse(d, "pixel sizes are neither one nor one for each node");
+    for (uint32_t i = 0; cut->kind == CSPLAT_CUT_PIXEL_SIZE && i < cut->pixel_size_count; i++)
+        if (!(cut->pixel_sizes[i] >= 0))
+            return refuse(d, "a pixel size is not at least 0");
+    for (int i = 0; cut->box && i < 3; i++)
+        if (!(cut->box[i] <= cut->box[3 + i]))
+            return refuse(d, "a box whose smallest corner is not the first");
+    return 1;
+}
+
+static int select_tiles(csplat *d, const csplat_cut *cut, uint32_t *tiles, uint32_t *count)
+{
+    uint8_t *replaced;
+    TRY(read_nodes(d));
+    TRY(check_cut(d, cut));
+    TRY(reserve(d, &d->replaced, d->node_count, 1));
+    replaced = d->replaced.data;
+    if (cut->kind == CSPLAT_CUT_SPLATS)
+        TRY(replace_within(d, cut->splats, replaced));
+    else
+        replace_where(d, cut, replaced);
+    for (uint32_t i = 0; i < d->node_count; i++) {
+        const csplat_node *n = &d->nodes[i];
+        if (replaced[i] || !is_reached(d, replaced, i) || !touches(cut->box, n->min, n->max))
+            continue;
+        for (uint32_t k = n->first_tile; k < n->first_tile + n->tile_count; k++) {
+            float min[3], max[3];
+            find_box(&d->tiles[k], min, max);
+            if (n->level > 0 || touches(cut->box, min, max)) /* splats of coarser tiles may lie outside their boxes */
+                tiles[(*count)++] = k;
+        }
+    }
+    return 1;
+}
+
 /* Public functions ------------------------------------------------------------------------------------------------------ */
 
 static csplat_code done(csplat *d, int worked)
 {
     return worked ? CSPLAT_OK : d->error.code;
-}
-
-static int refuse(csplat *d, const char *what)
-{
-    return fail(d, CSPLAT_E_INPUT, "", CSPLAT_NO_OFFSET, "%s", what);
 }
 
 static csplat_code open_file(csplat **out, const void *memory, const csplat_source *source, const csplat_options *options,
@@ -2839,9 +3105,10 @@ void csplat_close(csplat *d)
 {
     if (!d)
         return;
-    buffer *const all[] = {&d->index_bytes, &d->chunk_bytes, &d->book_bytes, &d->inflated,     &d->unrun,
-                           &d->integers,    &d->entries,     &d->escapes,    &d->summands,     &d->rows,
-                           &d->codes,       &d->text,        &d->names,      &d->narrow_index};
+    buffer *const all[] = {&d->index_bytes,  &d->chunk_bytes,  &d->book_bytes, &d->inflated,     &d->unrun,
+                           &d->integers,     &d->entries,      &d->escapes,    &d->summands,     &d->rows,
+                           &d->codes,        &d->text,         &d->names,      &d->narrow_index, &d->node_memory,
+                           &d->child_splats, &d->order_memory, &d->replaced};
 #ifndef CSPLAT_NO_ZLIB
     if (d->zlib_began)
         inflateEnd(&d->zlib);
@@ -2880,7 +3147,7 @@ const csplat_error *csplat_last_error(const csplat *d)
 
 static int find_tile(csplat *d, uint32_t index, const tile **out)
 {
-    if (index >= d->info.tile_count)
+    if (index >= d->tile_count)
         return refuse(d, "there is no such tile");
     *out = &d->tiles[index];
     return 1;
@@ -2894,10 +3161,8 @@ csplat_code csplat_get_tile(csplat *d, uint32_t index, csplat_tile *out)
     memset(out, 0, sizeof *out);
     out->first = t->first;
     out->splat_count = t->splat_count;
-    for (int i = 0; i < 3; i++) {
-        out->min[i] = (float)((double)t->corner[i] * t->step);
-        out->max[i] = (float)((double)(t->corner[i] + (int64_t)t->extent[i]) * t->step);
-    }
+    out->level = t->level;
+    find_box(t, out->min, out->max);
     memcpy(&out->max_scale, &t->max_scale, sizeof out->max_scale);
     for (unsigned layer = 0; layer < EXTRA; layer++)
         if (t->layers[layer]) {
@@ -3038,6 +3303,20 @@ csplat_code csplat_read_packed_codebook(csplat *d, uint16_t id, unsigned band, c
     return done(d, pack(d, &d->narrow[0], columns, b->size, 3 * coefficients, 1, d->attributes[SH0 + band].step, out));
 }
 
+csplat_code csplat_read_nodes(csplat *d, const csplat_node **nodes, uint32_t *count)
+{
+    const int worked = read_nodes(d);
+    *nodes = d->nodes;
+    *count = d->node_count;
+    return done(d, worked);
+}
+
+csplat_code csplat_select(csplat *d, const csplat_cut *cut, uint32_t *tiles, uint32_t *count)
+{
+    *count = 0;
+    return done(d, select_tiles(d, cut, tiles, count));
+}
+
 csplat_code csplat_read_text(csplat *d, csplat_text which, const char **text, size_t *size)
 {
     *text = NULL;
@@ -3071,6 +3350,8 @@ static int check(csplat *d)
     for (int which = 0; which < 3; which++)
         if (d->texts[which])
             TRY(read_text(d, (csplat_text)which));
+    if (d->tree)
+        TRY(read_nodes(d));
     return !d->stated || read_stated_errors(d, &errors);
 }
 

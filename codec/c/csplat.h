@@ -10,6 +10,9 @@
  *     }
  *     csplat_close(file);
  *
+ * The tiles 0 to tile_count - 1 are the scene, level 0. A file with levels of detail has coarser versions of it in the tiles
+ * that follow; csplat_select selects the tiles to draw.
+ *
  * There is no global state. A csplat belongs to one thread at a time; threads can each open one on the same bytes.
  * Every function that can fail returns CSPLAT_OK, which is 0, or the code of the specification. After a failure the
  * csplat can still be used. SPDX-License-Identifier: Apache-2.0 */
@@ -28,6 +31,7 @@ extern "C" {
 #define CSPLAT_SH_DEGREE_MAX 4   /* maximum SH degree */
 /* end generated */
 #define CSPLAT_NO_OFFSET UINT64_MAX
+#define CSPLAT_NO_PARENT UINT32_MAX
 
 typedef struct csplat csplat;
 
@@ -100,8 +104,9 @@ typedef struct csplat_codebook {
 /* The contents of header and index. */
 typedef struct csplat_info {
     uint64_t file_size;
-    uint64_t splat_count;
-    uint32_t tile_count;
+    uint64_t splat_count;       /* of level 0 */
+    uint32_t tile_count;        /* of level 0: tiles 0 to tile_count - 1 */
+    uint32_t coarse_tile_count; /* of higher levels; their numbers follow */
     uint8_t sh_degree;
     uint8_t antialiased, flat; /* how to render: filter of Mip-Splatting, 2DGS */
     char axes[4];              /* directions of +x, +y, +z: letters of R L U D F B; "" if unknown */
@@ -116,13 +121,36 @@ typedef struct csplat_info {
 } csplat_info;
 
 typedef struct csplat_tile {
-    uint64_t first;       /* index of its first splat in the scene */
+    uint64_t first;       /* index of its first splat in the scene; tiles above level 0 continue from splat_count on */
     uint32_t splat_count;
+    uint8_t level;        /* 0 is the scene, higher levels are coarser */
     uint8_t bands;        /* bit l - 1 is set if it has SH band l; otherwise its coefficients are 0 */
     float min[3], max[3]; /* bounding box of the centres */
     float max_scale;      /* natural logarithm of the largest standard deviation */
     uint32_t bytes[CSPLAT_SH_DEGREE_MAX + 1]; /* sizes of layer 0 and of the SH bands in the file */
 } csplat_tile;
+
+/* A node of the levels of detail (specification, 5.7): tiles that are drawn together, or else replaced by the node's children. */
+typedef struct csplat_node {
+    uint32_t parent; /* number of the parent, which is larger, or CSPLAT_NO_PARENT */
+    uint32_t first_tile, tile_count;
+    uint8_t level;
+    uint64_t splat_count;
+    float error;          /* pixel size, in scene units at the node, from which on it may replace the splats below it */
+    float min[3], max[3]; /* region: bounding box of the centres of its splats and of those below it */
+} csplat_node;
+
+typedef enum csplat_cut_kind { CSPLAT_CUT_LEVEL, CSPLAT_CUT_PIXEL_SIZE, CSPLAT_CUT_SPLATS } csplat_cut_kind;
+
+/* A version of the scene, of nodes of one or several levels. If every field is 0, it is level 0. */
+typedef struct csplat_cut {
+    csplat_cut_kind kind;
+    uint32_t level;            /* LEVEL: the highest level to use, 0 to 255 */
+    uint32_t pixel_size_count; /* PIXEL_SIZE: 1, or the number of nodes */
+    const double *pixel_sizes; /* size of a pixel, scene units, at least 0: everywhere, or at each node */
+    uint64_t splats;           /* SPLATS: maximum number of splats */
+    const float *box;          /* [6], smallest and largest corner; select only what touches it. NULL: everything */
+} csplat_cut;
 
 /* Arrays for a tile's values; NULL to skip one. K = (degree + 1)^2 - 1, at most 24. */
 typedef struct csplat_floats {
@@ -200,11 +228,13 @@ csplat_code csplat_open(csplat **out, const csplat_source *source, const csplat_
 void csplat_close(csplat *file);
 
 const csplat_info *csplat_get_info(const csplat *file);
+/* Here and below, a tile may be of any level. */
 csplat_code csplat_get_tile(csplat *file, uint32_t tile, csplat_tile *out);
 const csplat_error *csplat_last_error(const csplat *file);
 
-/* Decode all splats into new arrays, which csplat_free_scene releases. If sh_degree is below the file's, higher bands are
- * neither read nor checked; otherwise the whole file is, as the specification requires of exact decoders. */
+/* Decode all splats of level 0 into new arrays, which csplat_free_scene releases. If sh_degree is below the file's, higher bands
+ * are neither read nor checked; otherwise the whole file is, as the specification requires of exact decoders. Of tiles above
+ * level 0 it checks CRC and chunk header, and leaves the payloads unread. */
 csplat_code csplat_decode(csplat *file, unsigned sh_degree, csplat_scene **out);
 void csplat_free_scene(csplat *file, csplat_scene *scene);
 
@@ -212,7 +242,7 @@ void csplat_free_scene(csplat *file, csplat_scene *scene);
 csplat_code csplat_read_tile(csplat *file, uint32_t tile, unsigned sh_degree, const csplat_floats *out);
 /* Read an SH band, [n][2 * band + 1][3]; 0 if the tile leaves it out. */
 csplat_code csplat_read_band(csplat *file, uint32_t tile, unsigned band, float *out);
-/* Read extra columns: out[i], unless it is NULL, receives the values of column i. */
+/* Read extra columns: out[i], unless it is NULL, receives the values of column i. Tiles above level 0 have none: E_INPUT. */
 csplat_code csplat_read_extras(csplat *file, uint32_t tile, void *const *out);
 csplat_code csplat_read_integers(csplat *file, uint32_t tile, const csplat_integers *out);
 
@@ -222,12 +252,20 @@ csplat_code csplat_read_packed_band(csplat *file, uint32_t tile, unsigned band, 
 /* Read a band of a codebook: its entries, followed by one row of zeros for splats without an entry. */
 csplat_code csplat_read_packed_codebook(csplat *file, uint16_t id, unsigned band, csplat_columns *out);
 
+/* Read the nodes of the levels of detail, which are valid until csplat_close. A file without levels has one node of all tiles, or
+ * none if it has no tiles. */
+csplat_code csplat_read_nodes(csplat *file, const csplat_node **nodes, uint32_t *count);
+/* Select the tiles of a cut, in ascending order. `tiles` has room for tile_count + coarse_tile_count numbers. E_LIMIT if even the
+ * coarsest cut has more splats than `splats`. */
+csplat_code csplat_select(csplat *file, const csplat_cut *cut, uint32_t *tiles, uint32_t *count);
+
 /* Read a JSON text, checked by section 5.4. It is valid until the next text is read. NULL if the file has none. */
 csplat_code csplat_read_text(csplat *file, csplat_text which, const char **text, size_t *size);
 /* *found is 0 if the file declares none. */
 csplat_code csplat_read_stated_errors(csplat *file, csplat_stated_errors *out, int *found);
 
-/* Check everything outside the tiles: CRCs of skipped chunks and layers, codebooks, texts, declared errors. */
+/* Check everything outside the tiles of level 0: CRCs of skipped chunks and layers and of coarser tiles, nodes, codebooks, texts,
+ * declared errors. */
 csplat_code csplat_check(csplat *file);
 
 /* "E_CRC" */

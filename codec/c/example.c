@@ -32,6 +32,9 @@ int main(int count, char **arguments)
     const csplat_info *info = csplat_get_info(file);
     printf("%llu splats, SH degree %u, %lu tile%s, axes %s\n", (unsigned long long)info->splat_count, info->sh_degree,
            (unsigned long)info->tile_count, info->tile_count == 1 ? "" : "s", info->axes[0] ? info->axes : "unknown");
+    if (info->coarse_tile_count)
+        printf("coarser levels: %lu tile%s\n", (unsigned long)info->coarse_tile_count,
+               info->coarse_tile_count == 1 ? "" : "s");
     const char *metadata;
     size_t size;
     if (csplat_read_text(file, CSPLAT_METADATA, &metadata, &size))

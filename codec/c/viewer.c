@@ -3,9 +3,9 @@
  *     cc -O3 csplat.c viewer.c -lz -lm -lglfw -lGL && ./a.out scene.csplat       drag to turn, scroll to zoom
  *     ./a.out scene.csplat out.ppm 'W H fx fy cx cy near VIEWMAT'                one picture; 12 numbers, row by row
  *
- * Textures hold the decoder's arrays unchanged. For each picture the CPU sorts the indices of the splats by depth; the
- * vertex shader draws a rectangle around each splat's ellipse and evaluates SH. If the GL library does not export its
- * functions (Windows), a loader is required. SPDX-License-Identifier: Apache-2.0 */
+ * It draws level 0. Textures hold the decoder's arrays unchanged. For each picture the CPU sorts the indices of the splats by
+ * depth; the vertex shader draws a rectangle around each splat's ellipse and evaluates SH. If the GL library does not export
+ * its functions (Windows), a loader is required. SPDX-License-Identifier: Apache-2.0 */
 #include "csplat.h"
 
 #define GLFW_INCLUDE_GLCOREARB

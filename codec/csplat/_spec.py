@@ -29,6 +29,7 @@ TRANSFORMS_MAX: Final = 4  # transforms of a stream
 RUN_MAX: Final = 65536  # elements in one run of RUN_LENGTH
 JSON_DEPTH_MAX: Final = 64  # arrays and objects of a JSON text that are open at once
 EXTRA_NAME_MAX: Final = 62  # bytes of an extra column's name
+NO_PARENT: Final = 4294967295  # `parent` of a node that has none, 2^32 − 1
 ANCILLARY_ID_MIN: Final = 128  # least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
 ANCILLARY_SCENE_FLAGS: Final = 240  # bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 ANCILLARY_CHUNK_FLAGS: Final = 65280  # bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
@@ -162,9 +163,9 @@ CHUNK_METADATA: Final = b"META"
 CHUNK_CAMERAS: Final = b"CAMS"
 CHUNK_OPTIONS: Final = b"OPTS"
 CHUNK_STATED_ERRORS: Final = b"SERR"
-CHUNK_TREE: Final = b"TREE"  # reserved
-CHUNK_NAMES: Final[dict[bytes, str]] = {b"TILE": "tile", b"CODB": "codebook", b"META": "metadata", b"CAMS": "cameras", b"OPTS": "options", b"SERR": "stated_errors"}
-CHUNK_FLAGS: Final[dict[bytes, tuple[str, ...]]] = {b"TILE": ("critical",), b"CODB": ("critical",), b"META": ("safe_to_copy",), b"CAMS": ("safe_to_copy",), b"OPTS": (), b"SERR": ()}
+CHUNK_TREE: Final = b"TREE"
+CHUNK_NAMES: Final[dict[bytes, str]] = {b"TILE": "tile", b"CODB": "codebook", b"META": "metadata", b"CAMS": "cameras", b"OPTS": "options", b"SERR": "stated_errors", b"TREE": "tree"}
+CHUNK_FLAGS: Final[dict[bytes, tuple[str, ...]]] = {b"TILE": ("critical",), b"CODB": ("critical",), b"META": ("safe_to_copy",), b"CAMS": ("safe_to_copy",), b"OPTS": (), b"SERR": (), b"TREE": ("critical",)}
 
 # Error codes
 ERROR_MAGIC: Final = "E_MAGIC"
@@ -421,6 +422,30 @@ def unpack_layer_record(data: bytes | bytearray | memoryview, offset: int = 0) -
 def pack_layer_record(r: LayerRecord) -> bytes:
     """Return the 20 bytes of a LayerRecord."""
     return LAYER_RECORD_STRUCT.pack(r.layer, r.reserved_0, r.reserved_1, r.size, r.offset, r.crc)
+
+
+class NodeRecord(NamedTuple):
+    """Node record."""
+
+    parent: int
+    tile_count: int
+    error: float
+
+
+NODE_RECORD_STRUCT: Final = struct.Struct("<IIf")
+NODE_RECORD_SIZE: Final = 12
+NODE_RECORD_OFFSETS: Final[dict[str, int]] = {"parent": 0, "tile_count": 4, "error": 8}
+
+
+def unpack_node_record(data: bytes | bytearray | memoryview, offset: int = 0) -> NodeRecord:
+    """Read a NodeRecord at a byte offset; raise struct.error if the data is too short."""
+    v = NODE_RECORD_STRUCT.unpack_from(data, offset)
+    return NodeRecord(v[0], v[1], v[2])
+
+
+def pack_node_record(r: NodeRecord) -> bytes:
+    """Return the 12 bytes of a NodeRecord."""
+    return NODE_RECORD_STRUCT.pack(r.parent, r.tile_count, r.error)
 
 
 class ChunkHeader(NamedTuple):

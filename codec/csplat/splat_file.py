@@ -12,13 +12,14 @@ import numpy as np
 
 from csplat import _spec
 from csplat.byte_store import FileWindow, Store
-from csplat.decoder import DecodedTile, Limits, decode, iter_tiles, read_cameras, read_header, read_metadata
+from csplat.decoder import DecodedTile, Limits, Node, decode, iter_tiles, read_cameras, read_header, read_metadata
 from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
 from csplat.decoder.decode_api import DecodeRequest, prepare_decode
 from csplat.decoder.limits import check_budget, float_bytes
 from csplat.decoder.reconstruct import tile_boxes
 from csplat.decoder.tiles import wanted_layers
+from csplat.decoder.tree import read_nodes, select_tiles
 from csplat.disk_files import BinaryWriter
 from csplat.errors import InputError
 from csplat.file_source import File
@@ -87,8 +88,20 @@ class SplatFile:
 
     @cached_property
     def boxes(self) -> F64:
-        """Boxes around the centres of each tile: [T, 2, 3] float64, scene units, relative to the origin."""
-        return tile_boxes(self.header)
+        """Boxes around the centres of each tile of level 0: [T, 2, 3] float64, scene units, relative to the origin."""
+        return tile_boxes(self.header, self.header.tiles)
+
+    @cached_property
+    def nodes(self) -> tuple[Node, ...]:
+        """Nodes of the levels of detail, read on first access; a file without levels has one, or none without tiles.
+
+        Raises:
+            FormatError: the TREE chunk breaks a clause.
+        """
+        with self._store.named_errors():
+            window = self.window()
+            window.fetch(self._chunks(_spec.CHUNK_TREE))
+            return read_nodes(window.view, self.header)
 
     @cached_property
     def metadata(self) -> dict[str, Any] | None:
@@ -111,12 +124,54 @@ class SplatFile:
         self._open = False
         self._store.close()
 
+    def cut(
+        self,
+        *,
+        level: int | None = None,
+        pixel_size: float | Sequence[float] | None = None,
+        max_splats: int | None = None,
+        box: Sequence[float] | None = None,
+    ) -> list[int]:
+        """Select the tiles of a version of the scene, coarser where less detail is needed, for `read`.
+
+        Args:
+            level: highest level of detail to use; 0 is the scene.
+            pixel_size: size of a pixel in scene units, for all nodes or for each of `nodes`: the coarsest version that
+                looks like the scene at this size.
+            max_splats: maximum number of splats: the version with the smallest errors. Only one of `level`,
+                `pixel_size` and `max_splats` can be given; default: `level=0`.
+            box: as in `tiles`. Tiles of level 0 are selected if their splats touch it, tiles of other levels if the
+                splats of level 0 that they stand for do.
+
+        Returns:
+            Indices of tiles, ascending.
+
+        Examples:
+            >>> import csplat
+            >>> with csplat.open("scene.csplat") as file:
+            ...     coarse = file.read(tiles=file.cut(level=1))  # this file has level 0 alone
+            >>> len(coarse)
+            1000
+
+        Raises:
+            InputError: an argument is invalid, or no tile touches the box.
+            LimitError: the coarsest version has more than `max_splats` splats.
+            FormatError: the TREE chunk breaks a clause.
+        """
+        corners = None if box is None else box_corners(box)
+        chosen = select_tiles(
+            self.header, self.nodes, level=level, pixel_size=pixel_size, max_splats=max_splats, box=corners
+        )
+        if corners is not None and not chosen:
+            raise _nothing_touches(self.header, corners)
+        return [tile.index for tile in chosen]
+
     def tiles(self, box: Sequence[float] | None = None, *, sh_degree: int | None = None) -> Iterator[DecodedTile]:
         """Decode tile by tile; memory holds the codebooks, one tile and a few megabytes of the file.
 
         Args:
             box: region whose tiles are read; tiles that touch it are returned whole. Two corners, x, y, z each, in any
-                order, in scene units relative to the origin. Default: all tiles.
+                order, in scene units relative to the origin. Default: all tiles of level 0.
             sh_degree: highest SH band to read; default: all.
 
         Raises:
@@ -124,7 +179,7 @@ class SplatFile:
             FormatError, LimitError: as in `csplat.decoder.iter_tiles`.
             StoreError, OSError: as in `csplat.open`.
         """
-        chosen = None if box is None else [tile.index for tile in tiles_touching(self.header, box)]
+        chosen = self._default_tiles() if box is None else [tile.index for tile in tiles_touching(self.header, box)]
         with self._store.named_errors():
             window = self.window()
             job = prepare_decode(window.view, self._limits, chosen, sh_degree)
@@ -138,7 +193,7 @@ class SplatFile:
 
         Args:
             box: as in `tiles`.
-            tiles: indices of the tiles to decode, in the order requested; excludes `box`.
+            tiles: indices of the tiles to decode, in the order requested, such as those of `cut`; excludes `box`.
             sh_degree: as in `tiles`.
 
         Examples:
@@ -157,6 +212,8 @@ class SplatFile:
             if tiles is not None:
                 raise InputError("box and tiles exclude each other")
             tiles = [tile.index for tile in tiles_touching(self.header, box)]
+        if tiles is None:
+            tiles = self._default_tiles()
         with self._store.named_errors():
             window = self.window()
             job = prepare_decode(window.view, self._limits, tiles, sh_degree)
@@ -169,7 +226,7 @@ class SplatFile:
     def extract(self, box: Sequence[float], output: str | os.PathLike[str] | BinaryWriter) -> ExtractResult:
         """Extract the tiles that touch a box; see `csplat.extract`."""
         with self._store.named_errors():
-            return write_extract(self.window(), self.header, tiles_touching(self.header, box), output)
+            return write_extract(self.window(), self.header, tiles_touching(self.header, box), self.nodes, output)
 
     def window(self) -> FileWindow:
         """Return a view into which parts of the file can be fetched."""
@@ -192,6 +249,10 @@ class SplatFile:
             side = []
         with self._store.named_errors():
             next(decoded, None)  # checks the chunks of a scene without tiles
+
+    def _default_tiles(self) -> Sequence[int] | None:
+        """Return the tiles of level 0, or `None` for a file without other levels, which is then read as a whole."""
+        return range(len(self.header.tiles)) if self.header.coarse_tiles else None
 
     def _chunks(self, *kinds: bytes) -> list[tuple[int, int]]:
         return [(one.offset, one.size) for one in self.header.directory if one.type in kinds]
@@ -237,7 +298,8 @@ def extract(
 ) -> ExtractResult:
     """Write the tiles of a file that touch a box as a file of their own.
 
-    Tiles are copied whole, including splats outside the box; values are preserved bit for bit. Declared error bounds
+    Tiles are copied whole, including splats outside the box; values are preserved bit for bit. Nodes of a file with
+    levels of detail are copied whole, those of coarser levels if everything below them is. Declared error bounds
     and the encoder's options, which refer to the whole file, are omitted, as are chunks of unknown types. Only header,
     index and the copied data are read, a few megabytes at a time.
 
@@ -299,7 +361,7 @@ def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[li
 
 
 def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
-    """Return the tiles whose boxes touch a box.
+    """Return the tiles of level 0 whose boxes touch a box.
 
     Args:
         header: the scene.
@@ -308,15 +370,30 @@ def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
     Raises:
         InputError: the box is not six finite numbers, or no tile touches it.
     """
+    corners = box_corners(box)
+    boxes = tile_boxes(header, header.tiles)
+    found = ((boxes[:, 0] <= corners[1]) & (boxes[:, 1] >= corners[0])).all(axis=1)
+    if not found.any():
+        raise _nothing_touches(header, corners)
+    return [header.tiles[index] for index in np.flatnonzero(found)]
+
+
+def box_corners(box: Sequence[float]) -> F64:
+    """Return the corners of a box, [2, 3], smallest first.
+
+    Raises:
+        InputError: the box is not six finite numbers.
+    """
     numbers = [float(value) for value in box]
     if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
         raise InputError(f"box is {tuple(box)!r}, expected six finite numbers: two corners, x, y, z each")
-    low, high = np.sort(np.reshape(numbers, (2, 3)), axis=0)
-    boxes = tile_boxes(header)
-    found = ((boxes[:, 0] <= high) & (boxes[:, 1] >= low)).all(axis=1)
-    if not found.any():
-        raise InputError(f"no tile touches the box {_corner_text(low)} to {_corner_text(high)}: {_extent_text(boxes)}")
-    return [header.tiles[index] for index in np.flatnonzero(found)]
+    return np.sort(np.reshape(numbers, (2, 3)), axis=0)
+
+
+def _nothing_touches(header: SceneHeader, corners: F64) -> InputError:
+    low, high = corners
+    extent = _extent_text(tile_boxes(header, header.tiles))
+    return InputError(f"no tile touches the box {_corner_text(low)} to {_corner_text(high)}: {extent}")
 
 
 def _corner_text(corner: F64) -> str:

@@ -11,15 +11,18 @@ from itertools import accumulate
 from csplat import _spec
 from csplat.byte_store import FileWindow
 from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk
+from csplat.decoder.tree import Node
 from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder.container import (
     FileChunk,
+    FileNode,
     FileTile,
     IndexedCodebook,
     LazyPayload,
     Payload,
     SceneFields,
     file_pieces,
+    tree_chunk,
 )
 
 #: Chunks that are copied to an extract; declared bounds and options refer to the whole file.
@@ -32,8 +35,8 @@ class ExtractResult:
     """The result of `csplat.extract`.
 
     Attributes:
-        tiles: indices of the extracted tiles in the source file.
-        splat_count: number of splats extracted.
+        tiles: indices of the extracted tiles in the source file, of all levels of detail.
+        splat_count: number of splats extracted, of level 0.
         size: size of the new file, bytes.
     """
 
@@ -43,33 +46,77 @@ class ExtractResult:
 
 
 def write_extract(
-    window: FileWindow, header: SceneHeader, tiles: Sequence[Tile], output: str | os.PathLike[str] | BinaryWriter
+    window: FileWindow,
+    header: SceneHeader,
+    tiles: Sequence[Tile],
+    nodes: Sequence[Node],
+    output: str | os.PathLike[str] | BinaryWriter,
 ) -> ExtractResult:
     """Write some tiles of a file as a file of their own.
+
+    In a file with levels of detail, leaves are written whole, and other nodes if all their children are.
 
     Args:
         window: the file.
         header: header of the file.
-        tiles: tiles to write, in file order.
+        tiles: tiles of level 0 to write, in file order.
+        nodes: nodes of the file.
         output: a path or an open binary file.
     """
+    kept = _kept_nodes(nodes, {tile.index for tile in tiles}) if header.coarse_tiles else []
+    tiles = [tile for number in kept for tile in nodes[number].tiles] if kept else tiles
     codebook_ids = {identity for tile in tiles for identity in tile.codebook_ids}
-    kept = [
+    records = [
         record
         for record in header.directory
         if record.type in _KEPT or (record.type == _spec.CHUNK_CODEBOOK and record.id in codebook_ids)
     ]
     copies = TileCopier(window)
     copied = [copies.of(tile) for tile in tiles]
-    copies.begin(kept)
-    chunks = [FileChunk(one.type, chunk_payload(window, one), one.id, one.layer) for one in kept]
+    copies.begin(records)
+    chunks = [FileChunk(one.type, chunk_payload(window, one), one.id, one.layer) for one in records]
+    if tiles[-1].level > 0:
+        chunks.append(tree_chunk(copy_nodes([nodes[number] for number in kept], kept, copied)))
     fields = scene_fields(window, header, codebook_ids, chunks)
     size = 0
     with open_writer(output) as stream:
         for part in file_pieces(fields, copied):
             stream.write(part)
             size += len(part)
-    return ExtractResult(tuple(tile.index for tile in tiles), sum(tile.splat_count for tile in tiles), size)
+    count = sum(tile.splat_count for tile in tiles if tile.level == 0)
+    return ExtractResult(tuple(tile.index for tile in tiles), count, size)
+
+
+def _kept_nodes(nodes: Sequence[Node], tiles: Container[int]) -> list[int]:
+    """Return the leaves with one of some tiles, and the nodes all of whose children are kept."""
+    kept: list[int] = []
+    is_kept = [False] * len(nodes)
+    for number, node in enumerate(nodes):  # children come before their parents
+        if node.level == 0:
+            is_kept[number] = any(tile.index in tiles for tile in node.tiles)
+        else:
+            is_kept[number] = all(is_kept[child] for child in node.children)
+        if is_kept[number]:
+            kept.append(number)
+    return kept
+
+
+def copy_nodes(nodes: Sequence[Node], numbers: Sequence[int], tiles: Sequence[FileTile]) -> list[FileNode]:
+    """Return some nodes of a file for another file.
+
+    Args:
+        nodes: the nodes.
+        numbers: their indices in the file; a parent that is not among them becomes none.
+        tiles: the copies of their tiles, in file order.
+    """
+    position = {number: place for place, number in enumerate(numbers)}
+    ends = [*accumulate(len(node.tiles) for node in nodes)]
+    return [
+        FileNode(
+            None if node.parent is None else position.get(node.parent), tiles[end - len(node.tiles) : end], node.error
+        )
+        for node, end in zip(nodes, ends, strict=True)
+    ]
 
 
 class ChunkPrefetcher:
@@ -128,7 +175,8 @@ class TileCopier:
             layers[layer] = LazyPayload(record.size - _spec.CHUNK_HEADER_SIZE, record.crc, read)
             records.append(record)
         return FileTile(
-            tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.codebook_ids
+            tile.splat_count, tile.exponent, tile.corner, tile.extent, tile.max_scale, layers, tile.codebook_ids,
+            tile.level,
         )  # fmt: skip
 
     def begin(self, extra: Sequence[_spec.DirectoryRecord]) -> None:

@@ -26,7 +26,8 @@ export class Assembly {
   constructor(header, tiles, wanted, limits, tableBytes, spare) {
     const { shDegree, integers, extra } = wanted;
     const count = tiles.reduce((sum, tile) => sum + tile.splatCount, 0);
-    const extras = extra ? header.extras : [];
+    const hasExtras = extra && tiles.every(({ level }) => level === 0); // TIL-5: tiles of coarser levels have none
+    const extras = hasExtras ? header.extras : [];
     checkBudget(count, arrayBytes(count, shDegree, extras, integers) + tableBytes, limits);
     this.count = count;
     this.wanted = wanted;
@@ -45,7 +46,7 @@ export class Assembly {
    */
   put({ blocks, extras }, tile, first) {
     for (const block of blocks) this.arrays.put(block, tile, first);
-    this.extras.put(extras, first);
+    if (this.extras.records.length) this.extras.put(extras, first);
   }
 
   /**

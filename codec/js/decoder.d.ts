@@ -21,7 +21,7 @@ export interface DecodeOptions {
   limits?: Limits;
   /** SH bands above this degree are not decoded (their chunks are still checked). */
   shDegree?: number;
-  /** Indices of the tiles to decode, in this order. Default: all tiles. */
+  /** Indices of the tiles to decode, in this order, of any level. Default: those of level 0; for integers all tiles. */
   tiles?: Iterable<number>;
   /** 'integers' returns the arrays of the spec, section 9.2. */
   form?: Form;
@@ -92,7 +92,9 @@ export interface LayerRecord extends ChunkPlace {
 
 export interface TileRecord {
   index: number;
-  /** Index of the tile's first splat in the whole scene. */
+  /** Level of detail: 0 is the scene, higher levels are coarser. */
+  level: number;
+  /** Number of splats in the tiles before this one: at level 0, the index of its first splat in the scene. */
   first: number;
   splatCount: number;
   /** Lattice of the means: exponent, step × 2^exponent, corner and extent in its integers. */
@@ -118,6 +120,7 @@ export interface Header {
   profile: string;
   fileSize: number;
   indexSize: number;
+  /** Splats of level 0, the scene. */
   splatCount: number;
   shDegree: number;
   antialiased: boolean;
@@ -132,7 +135,45 @@ export interface Header {
   codebooks: CodebookRecord[];
   extras: ExtraRecord[];
   directory: DirectoryRecord[];
+  /** The tiles of level 0. */
   tiles: TileRecord[];
+  /** The tiles of the coarser levels, whose indices follow; empty if the file has no levels of detail. */
+  coarseTiles: TileRecord[];
+}
+
+/** Some tiles of one level that are drawn together (spec 5.7). A parent is a coarser version of its children. */
+export interface TreeNode {
+  index: number;
+  level: number;
+  /** Index of the parent, which is larger than `index`; null for a root. */
+  parent: number | null;
+  /** Indices of the children, ascending; empty at level 0. */
+  children: number[];
+  /** Index of its first tile; the others follow. */
+  firstTile: number;
+  tileCount: number;
+  splatCount: number;
+  /** Size of a pixel, in scene units, from which on the node may replace the splats below it; 0 at level 0. */
+  error: number;
+  /** Region: the bounding box of the centres of its splats and of those of all nodes below it. */
+  min: number[];
+  max: number[];
+}
+
+/** A version of the scene: at most one of `level`, `pixelSize` and `maxSplats`. Default: level 0. */
+export interface CutOptions {
+  /** The highest level to use, 0 to 255. */
+  level?: number;
+  /** Use each node from its `error` on. Size of a pixel at the nodes, in scene units: one number, or one per node. */
+  pixelSize?: number | ArrayLike<number>;
+  /** Maximum number of splats of the version. Nodes with the largest errors are replaced first by their children. */
+  maxSplats?: number;
+  /**
+   * Select a part of the version: x, y, z of the smallest corner of a box and of the largest, relative to the header's
+   * origin. Of level 0, these are the tiles whose box touches it. Of a coarser node, they are all of its tiles if its
+   * region, from `min` to `max`, does.
+   */
+  box?: ArrayLike<number>;
 }
 
 export interface StatedErrors {
@@ -179,7 +220,7 @@ export interface Splats {
   sh0: Float32Array;
   /** [count, K, 3] */
   shN: Float32Array;
-  /** Extra columns by name. */
+  /** Extra columns by name. None if a tile of a coarser level is included: only level 0 has them. */
   extra: Record<string, ExtraArray>;
 }
 
@@ -257,7 +298,10 @@ export interface Whole extends Description {
 export type Scene = Splats & Whole;
 export type IntegerScene = IntegerSplats & Whole;
 
-/** Decode a whole file and check all of its checksums. */
+/**
+ * Decode a whole file and check all of its checksums. The result is level 0, or the tiles in the options; integers are by
+ * default those of all levels.
+ */
 export function decode(
   data: ArrayBuffer | ArrayBufferView,
   options: DecodeOptions & { form: 'integers' },
@@ -298,7 +342,7 @@ export interface ReadOptions {
 }
 
 export interface TilesOptions {
-  /** Indices of the tiles. Default: all tiles. */
+  /** Indices of the tiles, of any level. Default: those of level 0. */
   tiles?: Iterable<number>;
   form?: LayerForm;
   shDegree?: number;
@@ -357,6 +401,10 @@ export class CsplatReader {
     options: { form: 'packed'; signal?: AbortSignal },
   ): Promise<PackedBand | null>;
   describe(options?: { signal?: AbortSignal }): Promise<Description>;
+  /** Read the nodes of the levels of detail, children before parents. Without levels: one node of level 0, or none. */
+  nodes(): Promise<TreeNode[]>;
+  /** Select tiles, for `readTiles`, `readTile` or `decode`. A budget below that of the coarsest version is E_LIMIT. */
+  cut(options?: CutOptions): Promise<number[]>;
   /** Start to fetch layers that will be read soon; neighbours share a request. */
   prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;
 }

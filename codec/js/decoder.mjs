@@ -4,6 +4,7 @@
 //   const scene = await decode(bytes);              // the whole scene as Float32Arrays
 //   const reader = await CsplatReader.open(url);    // header and index, then only the parts that are read
 //   const tile = await reader.readTile(0, { shDegree: 1 });
+//   const tiles = await reader.cut({ maxSplats: 1e6 }); // of a coarser version of the scene, if the file has one
 
 import { Assembly } from './assemble.mjs';
 import { readFileHeader } from './container.mjs';
@@ -12,6 +13,8 @@ import { readIndex } from './file_index.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTiles, toBytes } from './options.mjs';
 import { Reader } from './reader.mjs';
 import * as spec from './spec.mjs';
+import { allTiles } from './tile_records.mjs';
+import { selectTiles } from './tree.mjs';
 import { MemorySource } from './whole_sources.mjs';
 import { byWorkers } from './workers.mjs';
 
@@ -21,6 +24,7 @@ export { CsplatError, FormatError, InputError, LimitError, UnsupportedError };
  * @typedef {import('./decoder.d.ts').DecodeOptions} DecodeOptions
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./decoder.d.ts').CutOptions} CutOptions
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./decoder.d.ts').TilesOptions} TilesOptions
  * @typedef {import('./tile_blocks.mjs').SceneContext} SceneContext
@@ -60,7 +64,8 @@ export async function decode(data, options = {}) {
   const integers = checkedForm(options.form);
   const reader = await Reader.open(source, { limits, inflate });
   const { header } = reader;
-  const tiles = checkedTiles(options.tiles, header);
+  // 9.2: the integer arrays have "all tiles of all levels concatenated".
+  const tiles = integers && options.tiles === undefined ? allTiles(header) : checkedTiles(options.tiles, header);
   const shDegree = checkedDegree(options.shDegree, header);
   const wanted = { shDegree, integers, extra: true };
   const assembly = new Assembly(header, tiles, wanted, reader.limits, reader.tableBytes);
@@ -109,6 +114,16 @@ export class CsplatReader extends Reader {
    */
   static open(from, options) {
     return /** @type {Promise<CsplatReader>} */ (super.open(from, options));
+  }
+
+  /**
+   * Select the tiles of a version of the scene, of a part of space if there is a box.
+   *
+   * @param {CutOptions} [options]
+   * @returns {Promise<number[]>} indices, ascending
+   */
+  async cut(options = {}) {
+    return selectTiles(await this.nodes(), this.header, options);
   }
 
   /**

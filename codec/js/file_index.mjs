@@ -19,6 +19,7 @@ const { ERROR_INDEX, ERROR_LIMIT, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE
  * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
  * @typedef {import('./decoder.d.ts').ChunkPlace} ChunkPlace
  * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./container.mjs').FileHeader} FileHeader
  * @typedef {ReturnType<typeof spec.unpackIndexHead>} IndexHead
  */
@@ -76,13 +77,19 @@ export function readIndex(bytes, file, limits) {
   checkDirectory(directory, codebooks, directoryOffset);
 
   /** @type {Header} */
-  const header = { ...scene, ...omit(file), attributes, codebooks, extras, directory, tiles: [], splatCount: 0 };
+  const header = {
+    ...scene,
+    ...omit(file),
+    ...{ attributes, codebooks, extras, directory, tiles: [], coarseTiles: [], splatCount: 0 },
+  };
   const ids = new Set(codebooks.map(({ id }) => id));
+  /** @type {TileRecord | undefined} */
+  let tile;
   for (let i = 0; i < head.tile_count; i++) {
-    const tile = readTile(index, head, header, i);
+    tile = readTile(index, head, header, tile);
     checkTables(tile, ids);
-    header.splatCount += tile.splatCount; // below 2^32 × 2^16
-    header.tiles.push(tile);
+    (tile.level === 0 ? header.tiles : header.coarseTiles).push(tile);
+    if (tile.level === 0) header.splatCount += tile.splatCount; // below 2^32 × 2^16
   }
   index.finish();
   if (head.splat_count !== BigInt(header.splatCount)) {
@@ -90,9 +97,10 @@ export function readIndex(bytes, file, limits) {
       ERROR_INDEX,
       spec.HEADER_SIZE + AT_HEAD.splat_count,
       'IDX-7',
-      `N is ${head.splat_count}, the tiles have ${header.splatCount}`,
+      `N is ${head.splat_count}, the tiles of level 0 have ${header.splatCount}`,
     );
   }
+  checkTree(header);
   checkCoverage(header, file.end);
   return header;
 }
@@ -342,9 +350,6 @@ function readDirectory(index, recordSize) {
   if (known & ~(spec.CHUNK_FLAG_CRITICAL | spec.CHUNK_FLAG_SAFE_TO_COPY)) {
     throw fault(ERROR_RESERVED, at + places.flags, 'RES-1', `chunk flags ${flags}`);
   }
-  if (type === spec.CHUNK_TREE) {
-    throw fault(ERROR_UNSUPPORTED, at, 'RES-2', `a chunk ${type}`);
-  }
   if (Object.hasOwn(spec.CHUNK_NAMES, type)) {
     const registered = registeredFlags(type);
     if (known !== registered)
@@ -393,4 +398,18 @@ function checkDirectory(directory, codebooks, offset) {
     }
   }
   if (due.size) throw fault(ERROR_INDEX, offset, 'DIR-5', `${due.size} chunks of codebooks are missing`);
+}
+
+/**
+ * TRE-1: "A file MUST contain a TREE chunk if a tile has a level above 0, and MUST NOT contain one otherwise".
+ *
+ * @param {Header} header
+ */
+function checkTree({ directory, coarseTiles: [coarse] }) {
+  const tree = directory.find(({ type }) => type === spec.CHUNK_TREE);
+  if (coarse && !tree) {
+    const at = coarse.recordOffset + spec.TILE_RECORD_OFFSETS.level;
+    throw fault(ERROR_INDEX, at, 'TRE-1', `a tile of level ${coarse.level}, but no chunk TREE`);
+  }
+  if (tree && !coarse) throw fault(ERROR_INDEX, tree.recordOffset, 'TRE-1', 'a chunk TREE, but no tile above level 0');
 }

@@ -1,12 +1,16 @@
 // Checks of the caller's arguments. Every error here is E_INPUT.
 
 import { InputError } from './errors.mjs';
+import { LEVEL_MAX } from './registry.mjs';
 import { BUDGET_BYTES_JS, BUDGET_JSON_BYTES } from './spec.mjs';
 
 /**
  * @typedef {import('./decoder.d.ts').Header} Header
  * @typedef {import('./decoder.d.ts').Limits} Limits
+ * @typedef {import('./decoder.d.ts').CutOptions} CutOptions
  */
+
+const CUTS = ['level', 'pixelSize', 'maxSplats']; // options of `cut` that exclude each other
 
 /**
  * @param {unknown} data
@@ -51,7 +55,7 @@ export function checkedDegree(shDegree, header) {
 /**
  * @param {Iterable<number> | undefined} tiles
  * @param {Header} header
- * @returns {Header['tiles']}
+ * @returns {Header['tiles']} of any level; by default those of level 0
  */
 export function checkedTiles(tiles, header) {
   if (tiles === undefined) return header.tiles;
@@ -64,9 +68,59 @@ export function checkedTiles(tiles, header) {
  * @param {Header} header
  */
 export function checkedTile(index, header) {
-  const tile = Number.isInteger(index) ? header.tiles[index] : undefined;
-  if (tile === undefined) throw new InputError(`tile ${index}: the file has ${header.tiles.length}`);
+  const { tiles, coarseTiles } = header;
+  const tile = Number.isInteger(index) ? (tiles[index] ?? coarseTiles[index - tiles.length]) : undefined;
+  if (tile === undefined) throw new InputError(`tile ${index}: the file has ${tiles.length + coarseTiles.length}`);
   return tile;
+}
+
+/**
+ * @param {CutOptions} options
+ * @param {number} nodeCount
+ * @returns {{level: number, pixelSizes?: number[], maxSplats?: number, box?: number[]}} a pixel size per node
+ */
+export function checkedSelection(options, nodeCount) {
+  for (const name of Object.keys(options)) {
+    if (!CUTS.includes(name) && name !== 'box') throw new InputError(`cut has no option ${name}`);
+  }
+  const given = CUTS.filter((name) => options[/** @type {keyof CutOptions} */ (name)] !== undefined);
+  if (given.length > 1) throw new InputError(`${given.join(' and ')} exclude each other`);
+  const { level = 0, pixelSize, maxSplats, box } = options;
+  if (!(Number.isInteger(level) && level >= 0 && level <= LEVEL_MAX))
+    throw new InputError(`level is ${level}, expected 0 to ${LEVEL_MAX}`);
+  if (maxSplats !== undefined) checkAmount('maxSplats', maxSplats);
+  return { level, pixelSizes: checkedSizes(pixelSize, nodeCount), maxSplats, box: checkedBox(box) };
+}
+
+/**
+ * @param {CutOptions['pixelSize']} size
+ * @param {number} nodeCount
+ */
+function checkedSizes(size, nodeCount) {
+  if (size === undefined) return undefined;
+  const sizes = typeof size === 'number' ? Array(nodeCount).fill(size) : Array.from(size ?? []);
+  if (sizes.length !== nodeCount)
+    throw new InputError(`pixelSize has ${sizes.length} numbers, expected one, or one for each of ${nodeCount} nodes`);
+  for (const one of sizes) checkAmount('pixelSize', one);
+  return sizes;
+}
+
+/**
+ * @param {string} name
+ * @param {unknown} value
+ */
+function checkAmount(name, value) {
+  if (typeof value !== 'number' || !(value >= 0)) throw new InputError(`${name} is ${value}, expected 0 or more`);
+}
+
+/** @param {CutOptions['box']} box */
+function checkedBox(box) {
+  if (box === undefined) return undefined;
+  const corners = Array.from(box ?? []);
+  const isBox = corners.length === 6 && corners.every((value) => typeof value === 'number');
+  if (!isBox || !corners.slice(0, 3).every((low, axis) => low <= corners[axis + 3]))
+    throw new InputError(`box is ${corners}, expected x, y, z of its smallest and of its largest corner`);
+  return corners;
 }
 
 /**

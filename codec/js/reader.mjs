@@ -14,9 +14,11 @@ import { readIndex } from './file_index.mjs';
 import { platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed_layers.mjs';
+import { Payload } from './payload.mjs';
 import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile_blocks.mjs';
+import { readNodes } from './tree.mjs';
 
 const FIRST_BYTES = 1 << 16; // bytes; header and index of most files up to about thirty million splats
 
@@ -33,6 +35,7 @@ const FIRST_BYTES = 1 << 16; // bytes; header and index of most files up to abou
  * @typedef {import('./decoder.d.ts').ReaderOptions} ReaderOptions
  * @typedef {import('./decoder.d.ts').ReadOptions} ReadOptions
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
+ * @typedef {import('./decoder.d.ts').TreeNode} TreeNode
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
@@ -121,6 +124,8 @@ export class Reader {
     this.open = new Map();
     /** @type {Map<LayerRecord, Bytes>} layers with such indices, for WebAssembly */
     this.kept = new Map();
+    /** @type {Promise<TreeNode[]> | null} */
+    this.tree = null;
     this.table = this.table.bind(this);
   }
 
@@ -293,24 +298,47 @@ export class Reader {
     const { version, splatCount } = this.header;
     const scene = { version, splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
     for (const record of this.header.directory) {
-      if (record.type === spec.CHUNK_CODEBOOK || !Object.hasOwn(spec.CHUNK_NAMES, record.type)) continue;
+      const { type } = record;
+      if (type === spec.CHUNK_CODEBOOK || type === spec.CHUNK_TREE || !Object.hasOwn(spec.CHUNK_NAMES, type)) continue;
       await describe(description, record, this.opened(await this.fetch(record, signal), record), scene);
     }
     return description;
   }
 
   /**
+   * Return the nodes of the levels of detail, read once.
+   *
+   * @returns {Promise<TreeNode[]>}
+   */
+  nodes() {
+    if (this.tree === null) {
+      this.tree = this.fetchNodes();
+      this.tree.catch(() => (this.tree = null)); // allows another try
+    }
+    return this.tree;
+  }
+
+  async fetchNodes() {
+    const record = this.header.directory.find(({ type }) => type === spec.CHUNK_TREE);
+    if (record === undefined) return readNodes(null, this.header);
+    const payload = this.opened(await this.fetch(record), record);
+    return readNodes(new Payload(payload, record.offset + spec.CHUNK_HEADER_SIZE, 'TRE-2'), this.header);
+  }
+
+  /**
    * Check everything that has not been read yet. CHK-2: a decoder of a whole file checks "the CRC of all chunks, known or
-   * not", and reads "all CODB chunks, used or not".
+   * not", and reads "TREE and all CODB chunks, used or not". The payloads of tiles remain unread (CHK-8).
    */
   async checkAll() {
-    const { directory, tiles } = this.header;
+    const { directory, tiles, coarseTiles } = this.header;
+    const layersOf = (/** @type {TileRecord[]} */ some) => some.flatMap(({ layers }) => layers);
+    await this.nodes();
     const chunks = new Map();
-    for (const place of [...directory, ...tiles.flatMap(({ layers }) => layers)]) {
+    for (const place of [...directory, ...layersOf(tiles), ...layersOf(coarseTiles)]) {
       if (!this.checked.has(place.offset)) chunks.set(place, await this.fetch(place));
     }
     const parts = new Map();
-    for (const record of directory) parts.set(record.offset, await this.fetch(record));
+    for (const place of [...directory, ...layersOf(coarseTiles)]) parts.set(place.offset, await this.fetch(place));
     if (!this.compiled?.reading(parts, this.checked, (decoder) => decoder.check())) {
       for (const { id, layer } of this.codebookChunks.values()) await this.table(id, layer);
     }

@@ -2,6 +2,9 @@
 
 import * as spec from './spec.mjs';
 
+/** Highest level of detail: the largest u8. */
+export const LEVEL_MAX = 255;
+
 /**
  * Return the name of a registry entry.
  *
@@ -17,6 +20,13 @@ export const nameOf = (names, id) => (Object.hasOwn(names, id) ? names[id] : und
  * @param {string} version
  */
 export const shDegreeMax = (version) => (version === '0.2' ? spec.LAYER_SH3 : spec.SH_DEGREE_MAX);
+
+/**
+ * Return the highest level of detail in files of a version.
+ *
+ * @param {string} version
+ */
+export const levelMax = (version) => (version === '0.2' ? 0 : LEVEL_MAX);
 
 /**
  * Return the flags that the registry assigns to a chunk type.

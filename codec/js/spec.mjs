@@ -21,6 +21,7 @@ export const TRANSFORMS_MAX = 4; // transforms of a stream
 export const RUN_MAX = 65536; // elements in one run of RUN_LENGTH
 export const JSON_DEPTH_MAX = 64; // arrays and objects of a JSON text that are open at once
 export const EXTRA_NAME_MAX = 62; // bytes of an extra column's name
+export const NO_PARENT = 4294967295; // `parent` of a node that has none, 2^32 − 1
 export const ANCILLARY_ID_MIN = 128; // least id of a layer or of a type of extra columns that may be skipped (ANC-2, ANC-3)
 export const ANCILLARY_SCENE_FLAGS = 240; // bits 4 to 7 of the scene flags, which may be skipped (ANC-1)
 export const ANCILLARY_CHUNK_FLAGS = 65280; // bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
@@ -154,9 +155,9 @@ export const CHUNK_METADATA = 'META';
 export const CHUNK_CAMERAS = 'CAMS';
 export const CHUNK_OPTIONS = 'OPTS';
 export const CHUNK_STATED_ERRORS = 'SERR';
-export const CHUNK_TREE = 'TREE'; // reserved
-export const CHUNK_NAMES = Object.freeze({ 'TILE': 'tile', 'CODB': 'codebook', 'META': 'metadata', 'CAMS': 'cameras', 'OPTS': 'options', 'SERR': 'stated_errors' });
-export const CHUNK_FLAGS = Object.freeze({ 'TILE': Object.freeze(['critical']), 'CODB': Object.freeze(['critical']), 'META': Object.freeze(['safe_to_copy']), 'CAMS': Object.freeze(['safe_to_copy']), 'OPTS': Object.freeze([]), 'SERR': Object.freeze([]) });
+export const CHUNK_TREE = 'TREE';
+export const CHUNK_NAMES = Object.freeze({ 'TILE': 'tile', 'CODB': 'codebook', 'META': 'metadata', 'CAMS': 'cameras', 'OPTS': 'options', 'SERR': 'stated_errors', 'TREE': 'tree' });
+export const CHUNK_FLAGS = Object.freeze({ 'TILE': Object.freeze(['critical']), 'CODB': Object.freeze(['critical']), 'META': Object.freeze(['safe_to_copy']), 'CAMS': Object.freeze(['safe_to_copy']), 'OPTS': Object.freeze([]), 'SERR': Object.freeze([]), 'TREE': Object.freeze(['critical']) });
 
 // Error codes
 export const ERROR_MAGIC = 'E_MAGIC';
@@ -348,6 +349,21 @@ export function unpackLayerRecord(view, at) {
     size: view.getUint32(at + 4, true),
     offset: view.getBigUint64(at + 8, true),
     crc: view.getUint32(at + 16, true),
+  };
+}
+
+export const NODE_RECORD_SIZE = 12;
+export const NODE_RECORD_OFFSETS = Object.freeze({ parent: 0, tile_count: 4, error: 8 });
+/**
+ * Node record. 64-bit integers are BigInt, u8[n] is a view.
+ * @param {DataView} view
+ * @param {number} at
+ */
+export function unpackNodeRecord(view, at) {
+  return {
+    parent: view.getUint32(at + 0, true),
+    tile_count: view.getUint32(at + 4, true),
+    error: view.getFloat32(at + 8, true),
   };
 }
 

@@ -2,10 +2,10 @@
 
 import { fault } from './errors.mjs';
 import { ldexp } from './lattice.mjs';
-import { nameOf, registeredFlags } from './registry.mjs';
+import { levelMax, nameOf, registeredFlags } from './registry.mjs';
 import * as spec from './spec.mjs';
 
-const { ERROR_INDEX, ERROR_RESERVED, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
+const { ERROR_INDEX, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
 const { TILE_RECORD_OFFSETS: AT, TILE_RECORD_STRIDES: STRIDES, LAYER_RECORD_OFFSETS: AT_LAYER } = spec;
 const TABLE_ID_SIZE = Uint16Array.BYTES_PER_ELEMENT;
 const AXES = [0, 1, 2];
@@ -22,24 +22,33 @@ const AXES = [0, 1, 2];
  */
 
 /**
+ * Return the tiles of all levels, in the order of the index.
+ *
+ * @param {Header} header
+ */
+export const allTiles = ({ tiles, coarseTiles }) => [...tiles, ...coarseTiles];
+
+/**
  * Read the record of one tile, with its layers and table ids.
  *
  * @param {Payload} index at the record
  * @param {RecordSizes} sizes
- * @param {Header} header with attributes and extras, and the previous tiles in `tiles`
- * @param {number} place index of the tile
+ * @param {Header} header with version, attributes and extras
+ * @param {TileRecord} [before] the tile before it
  * @returns {TileRecord}
  */
-export function readTile(index, sizes, header, place) {
+export function readTile(index, sizes, header, before) {
   const { fields, offset } = index.read(
     spec.unpackTileRecord,
     sizes.tile_size,
     spec.TILE_RECORD_RESERVED,
     'a tile record',
   );
-  const { splat_count: splatCount, exponent, extent, layer_count, table_count } = fields;
-  if (fields.level !== 0)
-    throw fault(ERROR_RESERVED, offset + AT.level, 'RES-1', `a tile of the level ${fields.level}`);
+  const { splat_count: splatCount, level, exponent, extent, layer_count, table_count } = fields;
+  const least = before?.level ?? 0;
+  const most = levelMax(header.version);
+  if (level < least || level > most)
+    throw fault(ERROR_INDEX, offset + AT.level, 'TIL-12', `level ${level}, expected ${least} to ${most}`);
   if (splatCount < 1 || splatCount > spec.TILE_SPLATS_MAX) {
     throw fault(ERROR_VALUE, offset, 'TIL-1', `a tile of ${splatCount} splats`);
   }
@@ -49,14 +58,15 @@ export function readTile(index, sizes, header, place) {
   const step = ldexp(header.attributes[spec.ATTRIBUTE_MEANS - 1].step, exponent);
   if (!(step > 0 && step < Infinity))
     throw fault(ERROR_VALUE, offset + AT.exponent, 'TIL-9', `a lattice with the exponent ${exponent}`);
-  const layers = readLayers(index, sizes.layer_size, layer_count, header);
+  const layers = readLayers(index, sizes.layer_size, fields, header);
   const tablesOffset = index.offset;
   const tables = [];
   for (let i = 0; i < table_count; i++)
     tables.push(index.view.getUint16(index.claim(TABLE_ID_SIZE, 'a table id'), true));
   return {
-    index: place,
-    first: header.splatCount, // N so far
+    index: before ? before.index + 1 : 0,
+    level,
+    first: before ? before.first + before.splatCount : 0,
     splatCount,
     exponent,
     corner,
@@ -99,11 +109,11 @@ function readCorner(corner, extent, offset) {
 /**
  * @param {Payload} index
  * @param {number} recordSize
- * @param {number} count
+ * @param {Pick<ReturnType<typeof spec.unpackTileRecord>, 'level' | 'layer_count'>} tile
  * @param {Header} header
  * @returns {LayerRecord[]}
  */
-function readLayers(index, recordSize, count, header) {
+function readLayers(index, recordSize, { level, layer_count: count }, header) {
   const start = index.offset;
   /** @type {LayerRecord[]} */
   const layers = [];
@@ -139,12 +149,12 @@ function readLayers(index, recordSize, count, header) {
   }
   if (count === 0) throw fault(ERROR_INDEX, start, 'TIL-2', 'no layers');
   const hasExtra = layers.some(({ layer }) => layer === spec.LAYER_EXTRA);
-  if (hasExtra !== header.extras.length > 0) {
+  if (hasExtra !== (level === 0 && header.extras.length > 0)) {
     throw fault(
       ERROR_INDEX,
       start,
       'TIL-5',
-      `${header.extras.length} extra columns, ${hasExtra ? 'a' : 'no'} layer of them`,
+      `${header.extras.length} extra columns, ${hasExtra ? 'a' : 'no'} layer of them in a tile of level ${level}`,
     );
   }
   return layers;
@@ -171,7 +181,7 @@ export function checkTables({ tables, tablesOffset }, codebooks) {
  * @param {number} start offset of the end of the index
  */
 export function checkCoverage(header, start) {
-  const places = [...header.directory, ...header.tiles.flatMap((tile) => tile.layers)];
+  const places = [...header.directory, ...allTiles(header).flatMap((tile) => tile.layers)];
   for (const { size, sizeField } of places) {
     const least = spec.CHUNK_HEADER_SIZE;
     if (size < least) throw fault(ERROR_INDEX, sizeField, 'CHK-3', `a chunk of ${size} bytes, its header has ${least}`);

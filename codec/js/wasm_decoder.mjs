@@ -133,7 +133,7 @@ export class WasmDecoder {
     spare = new WeakRef(this);
   }
 
-  /** Read and check everything outside the tiles: codebooks, texts, chunks of unknown types. */
+  /** Check everything outside the tiles of level 0: nodes, codebooks, texts, and the frames of chunks that are not read. */
   check() {
     return this.exports.check() !== 0;
   }

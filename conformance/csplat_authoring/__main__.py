@@ -93,6 +93,8 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
         expect = {"header": result.header}
         for key in ("integers", "floats", "extra"):
             expect[key] = summarise(getattr(result, key))
+        if result.cuts:
+            expect["cuts"] = result.cuts
     else:
         error = {"code": recipe.code, "clause": recipe.clauses[0], "offset": recipe.offset}
         error |= {"also": list(recipe.also), "optional": recipe.optional}

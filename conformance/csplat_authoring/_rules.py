@@ -74,7 +74,6 @@ RANGES: Final[tuple[Range, ...]] = (
     Range("codebook_record", "size", "", 1, 65536, "CBR-4", "E_VALUE"),
     Range("extra_record", "name_size", "", 1, 62, "EXR-1", "E_VALUE"),
     Range("tile_record", "splat_count", "", 1, 65536, "TIL-1", "E_VALUE"),
-    Range("tile_record", "level", "", 0, 0, "RES-1", "E_RESERVED"),
     Range("tile_record", "corner", "", -9007199254740992, 9007199254740992, "TIL-7", "E_VALUE"),
     Range("tile_record", "extent", "", 0, 16777215, "TIL-8", "E_VALUE"),
     Range("lattice_params", "exponent", "quats", 0, 0, "LAT-2", "E_VALUE"),

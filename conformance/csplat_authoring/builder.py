@@ -28,6 +28,8 @@ SIZED: Final = {
     "tile": "tile_record",
     "layer": "layer_record",
 }
+_TREE = "TREE"
+_LAST = ("CAMS", "OPTS", "SERR")  # chunks that no renderer needs, at the end of a file with levels
 _CODERS = {"stored": _spec.CODER_STORED, "deflate": _spec.CODER_DEFLATE}
 
 
@@ -125,7 +127,7 @@ def _index(scene: Scene, chunks: dict[str, Writer], offsets: dict[str, int]) -> 
     sizes = [out.size_of(name) for name in SIZED.values()]
     directory = scene.directory or tuple(n for n in scene.order or chunks if not n.startswith("TILE."))
     counts = [len(directory), len(scene.codebooks), len(scene.extras), len(scene.attributes)]
-    splats = sum(tile.splat_count for tile in scene.tiles)
+    splats = sum(tile.splat_count for tile in scene.finest.tiles)
     facts: list[Any] = [scene.sh_degree, scene.scene_flags, bytes(scene.axes), scene.unit_metres, scene.origin]
     out.structure("index", "index_head", [*sizes, 0, splats, len(scene.tiles), *counts, *facts])
     for attribute, record in scene.attributes.items():
@@ -149,6 +151,8 @@ def _directory(scene: Scene, name: str, chunk: Writer, offset: int) -> list[Any]
     if name.startswith("CODB."):
         _, book_id, layer = name.split(".")
         kind, ids = _spec.CHUNK_CODEBOOK, (int(book_id), int(layer))
+    elif name == _TREE and scene.nodes:
+        kind, ids = _spec.CHUNK_TREE, (0, 0)
     else:
         declared = dict(zip(_ancillary_names(scene), scene.chunks, strict=True))[name]
         kind, ids = declared.type, (declared.id, declared.layer)
@@ -163,7 +167,7 @@ def _tile_record(
     codebook_ids = sorted(used) if tile.codebook_ids is None else tile.codebook_ids
     columns = zip(*tile.blocks[_spec.ATTRIBUTE_MEANS].rows, strict=True)
     extent = tuple(max(column) for column in columns)
-    head: list[Any] = [tile.splat_count, 0, len(tile.layers), len(codebook_ids), tile.exponent, 0]
+    head: list[Any] = [tile.splat_count, tile.level, len(tile.layers), len(codebook_ids), tile.exponent, 0]
     scale = max_scale(scene, tile) if _spec.ATTRIBUTE_SCALES in tile.blocks else 0.0
     out.structure(f"tile[{i}]", "tile_record", [*head, tile.corner, extent, scale])
     for layer in tile.layers:
@@ -180,28 +184,39 @@ def _tile_record(
 def _chunks(scene: Scene) -> dict[str, Writer]:
     """Return all chunks by name, in the recommended order."""
     out = {}
+    if scene.nodes:
+        out[_TREE] = _frame_chunk(_spec.CHUNK_TREE, _flags(_spec.CHUNK_TREE), _tree(scene))
     for name, chunk in zip(_ancillary_names(scene), scene.chunks, strict=True):
         flags = chunk.flags if chunk.flags is not None else _flags(chunk.type)
         out[name] = _frame_chunk(chunk.type, flags, _ancillary(chunk))
+    # Without nodes, `last` is empty and the order that of the index.
+    last = [name for name in out if scene.nodes and name in _LAST]
     for layer in sorted({*_spec.LAYER_NAMES, *(layer for tile in scene.tiles for layer in tile.layers)}):
         for book in scene.codebooks:
             if layer in book.layers:
                 out[f"CODB.{book.id}.{layer}"] = _frame_chunk(
                     _spec.CHUNK_CODEBOOK, _flags(_spec.CHUNK_CODEBOOK), _codebook(book, layer)
                 )
-        for i, tile in enumerate(scene.tiles):
+        for i, tile in sorted(enumerate(scene.tiles), key=lambda item: -item[1].level):
             if layer in tile.layers:
                 payload = _tile(scene, tile, layer) if layer in _spec.LAYER_NAMES else _unknown(tile, layer)
                 out[f"TILE.{i}.{layer}"] = _frame_chunk(_spec.CHUNK_TILE, _flags(_spec.CHUNK_TILE), payload)
+    return out | {name: out.pop(name) for name in last}
+
+
+def _tree(scene: Scene) -> Writer:
+    out = Writer()
+    for n, node in enumerate(scene.nodes):
+        out.structure(f"node[{n}]", "node_record", [node.parent, node.tile_count, node.error])
     return out
 
 
 def _ancillary_names(scene: Scene) -> list[str]:
-    names: list[str] = []
+    names = [_TREE] if scene.nodes else []
     for chunk in scene.chunks:
         name = chunk.type.decode("latin-1")
         names.append(name + f"#{names.count(name)}" * (name in names))
-    return names
+    return names[bool(scene.nodes) :]
 
 
 def _flags(kind: bytes) -> int:

@@ -45,6 +45,7 @@ from csplat_authoring.scene import (
     Chunk,
     Codebook,
     Extra,
+    Node,
     Rows,
     Scene,
     StatedErrors,
@@ -215,6 +216,8 @@ def declared_scene(table: dict[str, Any]) -> Scene:
             values[key] = tuple(Extra(name, _DTYPES.get(dtype, dtype)) for name, dtype in value)
         elif key == "chunks":
             values[key] = tuple(_chunk(one) for one in value)
+        elif key == "nodes":
+            values[key] = tuple(Node(_spec.NO_PARENT if parent == "none" else parent, *rest) for parent, *rest in value)
         elif key == "tails":
             values[key] = tuple((kind, tail.encode("latin-1")) for kind, tail in value.items())
         elif key in ("gap", "trailing"):

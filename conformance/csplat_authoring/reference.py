@@ -26,12 +26,13 @@ _COLOURS = range(_spec.ATTRIBUTE_SH0, _spec.ATTRIBUTE_SH4 + 1)
 
 @dataclass
 class Expected:
-    """Header fields and arrays."""
+    """Header fields and arrays; for files with levels, some cuts and their tiles or error codes."""
 
     header: dict[str, Any]
     integers: dict[str, Array] = field(default_factory=dict)
     floats: dict[str, Array] = field(default_factory=dict)
     extra: dict[str, Array] = field(default_factory=dict)
+    cuts: list[tuple[str, list[int] | str]] = field(default_factory=list)
 
 
 def expected(scene: Scene) -> Expected:
@@ -39,6 +40,10 @@ def expected(scene: Scene) -> Expected:
     result = Expected(_header(scene))
     rows = {attribute: _all_rows(scene, attribute) for attribute in scene.attributes}
     result.integers = _integers(scene, rows)
+    if scene.nodes:
+        result.cuts = _cuts(scene)
+        scene = scene.finest
+        rows = {attribute: tiles[: len(scene.tiles)] for attribute, tiles in rows.items()}
     result.floats = _floats(scene, rows)
     for i, extra in enumerate(scene.extras):
         if extra.dtype not in EXTRA_DTYPES:
@@ -53,7 +58,7 @@ def expected(scene: Scene) -> Expected:
 def _header(scene: Scene) -> dict[str, Any]:
     return {
         "profile": _spec.PROFILE_NAMES[_spec.PROFILE_BASE],
-        "splat_count": sum(tile.splat_count for tile in scene.tiles),
+        "splat_count": sum(tile.splat_count for tile in scene.finest.tiles),
         "tile_count": len(scene.tiles),
         "sh_degree": scene.sh_degree,
         "scene_flags": [name for bit, name in _spec.SCENE_FLAG_NAMES.items() if scene.scene_flags & bit],
@@ -61,6 +66,70 @@ def _header(scene: Scene) -> dict[str, Any]:
         "unit_metres": scene.unit_metres or 0.0,  # 0 of either sign is 0
         "origin": list(scene.origin),
     }
+
+
+def _cuts(scene: Scene) -> list[tuple[str, list[int] | str]]:
+    """Return cuts by every level, by pixel sizes at and around each error, and by several budgets, with their tiles."""
+    nodes = [_Node(n, scene) for n in range(len(scene.nodes))]
+    for node in nodes:
+        node.children = [child for child in nodes if child.parent == node.number]
+    roots = [node for node in nodes if node.parent == _spec.NO_PARENT]
+    errors = [node.error for node in nodes]
+    around = {size for e in errors for size in (math.nextafter(e, -1.0), e, math.nextafter(e, math.inf)) if size >= 0}
+    mixed = [[errors[(step * n + 1) % len(errors)] for n in range(len(errors))] for step in (1, 3)]
+    sizes: list[float | list[float]] = [*sorted(around), 1e300, *mixed]
+    levels = sorted({node.level for node in nodes})
+    cuts: list[tuple[str, list[int] | str]] = [
+        (f"level {level}", _tiles_of(_descend(roots, [node.level > level for node in nodes])))
+        for level in (*levels[:: 1 + len(levels) // 8], 255)
+    ]
+    for size in sizes:
+        limits = size if isinstance(size, list) else [size] * len(nodes)
+        words = " ".join(map(repr, size if isinstance(size, list) else [size]))
+        is_replaced = [error > limit for error, limit in zip(errors, limits, strict=True)]
+        cuts.append((f"pixel_size {words}", _tiles_of(_descend(roots, is_replaced))))
+    least = sum(node.splats for node in roots)
+    most = sum(node.splats for node in nodes if node.level == 0)
+    budgets = sorted({least - 1, least, least + 1, (least + most) // 2, most - 1, most, 2**40})
+    return [*cuts, *((f"splats {budget}", _refine(roots, budget)) for budget in budgets)]
+
+
+class _Node:
+    def __init__(self, number: int, scene: Scene) -> None:
+        first = sum(node.tile_count for node in scene.nodes[:number])
+        record = scene.nodes[number]
+        self.number, self.parent = number, record.parent
+        self.error = float(np.float32(record.error))
+        self.tiles = [*range(first, first + record.tile_count)]
+        self.level = scene.tiles[first].level
+        self.splats = sum(scene.tiles[i].splat_count for i in self.tiles)
+        self.children: list[_Node] = []
+
+
+def _tiles_of(nodes: list[_Node]) -> list[int]:
+    return sorted(tile for node in nodes for tile in node.tiles)
+
+
+def _descend(nodes: list[_Node], is_replaced: list[bool]) -> list[_Node]:
+    """Return the first node from each of the given ones that is not replaced by its children."""
+    found: list[_Node] = []
+    for node in nodes:
+        found += _descend(node.children, is_replaced) if is_replaced[node.number] else [node]
+    return found
+
+
+def _refine(roots: list[_Node], budget: int) -> list[int] | str:
+    """Replace one node at a time while the budget lasts."""
+    cut = list(roots)
+    if sum(node.splats for node in cut) > budget:
+        return _spec.ERROR_LIMIT
+    while any(node.children for node in cut):
+        worst = max((node for node in cut if node.children), key=lambda node: (node.error, node.number))
+        finer = [node for node in cut if node is not worst] + worst.children
+        if sum(node.splats for node in finer) > budget:
+            break
+        cut = finer
+    return _tiles_of(cut)
 
 
 def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[list[int]]:

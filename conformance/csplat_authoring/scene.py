@@ -7,7 +7,7 @@ the arrays that a decoder must return.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from csplat import _spec
 
@@ -88,6 +88,7 @@ class Tile:
         exponent: exponent of the means.
         extras: blocks coded RAW, one per extra column.
         codebook_ids: ids of codebooks; None: those that the blocks use.
+        level: level of detail.
         order: attributes of layer 0 in the order of their blocks.
         tails: bytes after the last block, by layer.
         unknown: layers that this version does not define, with their payloads.
@@ -98,6 +99,7 @@ class Tile:
     exponent: int = 0
     extras: tuple[Block, ...] = ()
     codebook_ids: tuple[int, ...] | None = None
+    level: int = 0
     order: tuple[int, ...] = _LAYER_0
     tails: tuple[tuple[int, bytes], ...] = ()
     unknown: tuple[tuple[int, bytes], ...] = ()
@@ -185,11 +187,21 @@ class Chunk:
 
 
 @dataclass(frozen=True)
+class Node:
+    """A node record of the TREE chunk."""
+
+    parent: int
+    tile_count: int = 1
+    error: float = 0.0
+
+
+@dataclass(frozen=True)
 class Scene:
     """The contents of a file.
 
     Attributes:
         attributes: records by attribute (registry value), in the order of the file.
+        nodes: nodes of the TREE chunk, which exists if there are any.
         version_minor: minor version in the header.
         order: names of the chunks in their order; None: the order that the spec recommends.
         directory: names in the order of the directory; None: the order of the chunks.
@@ -203,6 +215,7 @@ class Scene:
     codebooks: tuple[Codebook, ...] = ()
     extras: tuple[Extra, ...] = ()
     chunks: tuple[Chunk, ...] = ()
+    nodes: tuple[Node, ...] = ()
     sh_degree: int = 0
     scene_flags: int = 0
     axes: tuple[int, int, int] = (0, 0, 0)
@@ -214,6 +227,11 @@ class Scene:
     trailing: bytes = b""
     tails: tuple[tuple[str, bytes], ...] = ()
     version_minor: int = _spec.VERSION_MINOR
+
+    @property
+    def finest(self) -> Scene:
+        """The same scene with the tiles of level 0 alone."""
+        return replace(self, tiles=tuple(tile for tile in self.tiles if tile.level == 0), nodes=())
 
 
 def attribute_named(name: str) -> int:

@@ -1,6 +1,7 @@
 """Run csplat's Python decoder by the protocol of the suite (`protocol`), or in this process.
 
 csplat conformance decoder --cmd 'python -m csplat_conformance.adapter {input} {outdir}'
+csplat conformance decoder --cmd 'python -m csplat_conformance.adapter --cuts {input} {cuts}'
 """
 
 from __future__ import annotations
@@ -35,6 +36,8 @@ _FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 def answer(data: bytes, limits: Limits | None = None, threads: int | None = None) -> Answer:
     """Decode a file to floats and to integers; both must accept it, or refuse it with the same error.
 
+    Only integers are decoded at all levels, so damage in a coarser level may be found by them alone.
+
     Args:
         data: the file.
         limits: budgets; default: those of the registry.
@@ -52,6 +55,38 @@ def answer(data: bytes, limits: Limits | None = None, threads: int | None = None
     sums = {key: (len(raw), hashlib.sha256(raw).hexdigest()) for key, raw in arrays.items()}
     floats = {key.removeprefix("floats."): raw for key, raw in arrays.items() if key.startswith("floats.")}
     return Answer(Status.PASSED, "", header, sums, floats, seconds=time.monotonic() - began)
+
+
+def cuts_of(data: bytes, lines: Sequence[str]) -> list[list[int] | str]:
+    """Select the tiles of cuts.
+
+    Args:
+        data: the file.
+        lines: a cut each: `level 1`, `pixel_size 0.5`, `pixel_size 0.5 0.25`, `splats 100`.
+
+    Returns:
+        For each cut, the indices of its tiles or an error code.
+
+    Raises:
+        CsplatError: the file is refused.
+    """
+    from csplat import splat_file  # not needed to read the manifest
+
+    result: list[list[int] | str] = []
+    with splat_file.open(data) as opened:
+        for line in lines:
+            name, *words = line.split()
+            numbers = [float(word) for word in words]
+            try:
+                if name == "pixel_size":
+                    result.append(opened.cut(pixel_size=numbers[0] if len(numbers) == 1 else numbers))
+                elif name == "level":
+                    result.append(opened.cut(level=int(words[0])))
+                else:
+                    result.append(opened.cut(max_splats=int(words[0])))
+            except LimitError as error:
+                result.append(error.code)
+    return result
 
 
 @lru_cache(maxsize=8)
@@ -85,6 +120,12 @@ def _decode(data: bytes, limits: Limits | None, threads: int | None) -> tuple[di
         except CsplatError as error:
             results.append(error)
     model, integers = results
+    if (
+        isinstance(integers, CsplatError)
+        and not isinstance(model, CsplatError)
+        and decoder.read_header(data).coarse_tiles
+    ):
+        raise integers
     if isinstance(model, CsplatError) or isinstance(integers, CsplatError):
         # A budget counts the bytes of the returned arrays, which differ between the two functions.
         if _place(model) != _place(integers) and not any(isinstance(result, LimitError) for result in results):
@@ -112,7 +153,7 @@ def _facts(header: Any) -> dict[str, Any]:
     return {
         "profile": header.profile,
         "splat_count": header.splat_count,
-        "tile_count": len(header.tiles),
+        "tile_count": len(header.all_tiles),
         "sh_degree": header.sh_degree,
         "scene_flags": [_spec.SCENE_FLAG_NAMES[bit] for bit, is_set in flags.items() if is_set],
         "axes": "" if header.coordinate_system == "unspecified" else header.coordinate_system,
@@ -129,9 +170,15 @@ def main(words: Sequence[str] | None = None) -> int:
     """
     parser = argparse.ArgumentParser(prog="csplat_conformance.adapter", description=__doc__)
     parser.add_argument("input", type=Path)
-    parser.add_argument("outdir", type=Path)
+    parser.add_argument("outdir", type=Path, help="with --cuts, the file of cuts")
+    parser.add_argument("--cuts", action="store_true", help="print the tiles of cuts")
     args = parser.parse_args(words)
     try:
+        if args.cuts:
+            lines = args.outdir.read_text(encoding="ascii").splitlines()
+            for tiles in cuts_of(args.input.read_bytes(), lines):
+                sys.stdout.write((tiles if isinstance(tiles, str) else " ".join(map(str, tiles))) + "\n")
+            return 0
         header, arrays = _decode(args.input.read_bytes(), None, None)
     except CsplatError as error:
         code, clause, offset = _place(error)

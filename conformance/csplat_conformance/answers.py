@@ -5,6 +5,7 @@
 | L1 | `header.json`; for invalid files the refusal |
 | L2 | the integer arrays of spec 9.2 |
 | L3 | the float arrays of spec section 3 and the extra columns, bit for bit, or by `tolerance` for the class renderer |
+| L5 | the tiles of cuts through the levels of detail (spec 5.7), by `compare_cuts` |
 
 L4, renders, is in `reference_renders`.
 """
@@ -12,7 +13,7 @@ L4, renders, is in `reference_renders`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -25,7 +26,12 @@ from csplat_conformance.tolerance import describe_deviation
 
 #: The levels of `compare_answer`, and the parts of the expected result that each compares.
 PARTS = {1: ("header",), 2: ("integers",), 3: ("floats", "extra")}
-LEVELS = (*PARTS, 4)
+RENDERS, CUTS = 4, 5
+LEVELS = (*PARTS, RENDERS, CUTS)
+
+#: Tiles of a cut, or an error code.
+Cut = Sequence[int] | str
+_SHOWN_MAX = 60  # characters of a cut in a message
 
 #: Returns the float arrays of a vector by its name.
 FloatsByVector = Callable[[str], Mapping[str, NDArray[Any]]]
@@ -41,6 +47,7 @@ class Answer:
         header: fields of header and index.
         arrays: size in bytes and SHA-256 of the raw little-endian values, by `part.name`, such as `floats.means`.
         floats: raw values by name, such as `means`, if they were kept for the class renderer.
+        cuts: tiles or error codes of the requested cuts, in their order.
         code: error code of a refusal.
         clause: clause of a refusal, if reported.
         offset: offset in the file of a refusal, if reported.
@@ -52,6 +59,7 @@ class Answer:
     header: Mapping[str, Any] = field(default_factory=dict)
     arrays: Mapping[str, tuple[int, str]] = field(default_factory=dict)
     floats: Mapping[str, bytes] = field(default_factory=dict)
+    cuts: Sequence[Cut] = ()
     code: str = ""
     clause: str | None = None
     offset: int | None = None
@@ -229,3 +237,56 @@ def _compare_values(vector: Vector, answer: Answer, key: str, near: FloatsByVect
         far = describe_deviation(name, answer.floats[name], near(vector.name)[name])
         return [(Status.FAILED, f"{key}: {far}")] if far else []
     return [(Status.FAILED, f"{key} differs")]
+
+
+# Cuts ----------------------------------------------------------------------------------------------
+
+
+def cuts_of_vector(vector: Vector) -> list[str]:
+    """Return the cuts to request, such as `level 1`; none for an invalid file or one without levels of detail."""
+    return [text for text, _ in vector.expect.get("cuts", ())]
+
+
+def compare_cuts(vector: Vector, answer: Answer) -> Outcome:
+    """Compare the cuts of an answer with those of the manifest (L5)."""
+    status, message = answer.status, answer.message
+    if status is Status.PASSED:
+        status, message = _compare_cuts(vector.expect["cuts"], answer.cuts)
+    code = "" if status is Status.PASSED else answer.code
+    return Outcome(vector.name, level_name(CUTS), status, tuple(vector.clauses), code, message, answer.seconds)
+
+
+def skip_cuts(vector: Vector, why: str) -> Outcome:
+    """Return a skipped outcome for the cuts of a vector, with the reason."""
+    return Outcome(vector.name, level_name(CUTS), Status.SKIPPED, tuple(vector.clauses), "", why)
+
+
+def _compare_cuts(expect: Sequence[tuple[str, Cut]], found: Sequence[Cut]) -> tuple[Status, str]:
+    if len(found) != len(expect):
+        status = Status.PARTIAL_OUTPUT if len(found) < len(expect) else Status.FAILED
+        return (status if found else Status.NO_OUTPUT), f"{len(found)} cuts, expected {len(expect)}, a line for each"
+    offered = {_kind(text) for (text, _), cut in zip(expect, found, strict=True) if cut != _spec.ERROR_UNSUPPORTED}
+    wrong = [
+        f"the cut {_shorten(text)!r} is {_shorten(_cut_text(cut))}, expected {_shorten(_cut_text(wanted))}"
+        for (text, wanted), cut in zip(expect, found, strict=True)
+        if cut != wanted and _kind(text) in offered
+    ]
+    if wrong:
+        more = f"; {len(wrong) - 1} of the other {len(expect) - 1} cuts are wrong, too" if len(wrong) > 1 else ""
+        return Status.FAILED, wrong[0] + more
+    missing = sorted({_kind(text) for text, _ in expect} - offered)
+    if missing:
+        return (Status.PASSED if offered else Status.SKIPPED), f"the decoder offers no cut by {', '.join(missing)}"
+    return Status.PASSED, ""
+
+
+def _kind(text: str) -> str:
+    return text.split(maxsplit=1)[0]
+
+
+def _cut_text(cut: Cut) -> str:
+    return cut if isinstance(cut, str) else " ".join(map(str, cut)) or "empty"
+
+
+def _shorten(text: str) -> str:
+    return text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}…"

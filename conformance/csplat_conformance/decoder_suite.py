@@ -15,12 +15,24 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
-from csplat.errors import InputError
+from csplat.errors import CsplatError, InputError
 from csplat_conformance import adapter, reference_renders
-from csplat_conformance.answers import LEVELS, PARTS, FloatsByVector, check_payload_consistency, compare_answer
-from csplat_conformance.conformance_report import ConformanceReport, Outcome
+from csplat_conformance.answers import (
+    CUTS,
+    LEVELS,
+    PARTS,
+    RENDERS,
+    Answer,
+    FloatsByVector,
+    check_payload_consistency,
+    compare_answer,
+    compare_cuts,
+    cuts_of_vector,
+    skip_cuts,
+)
+from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
 from csplat_conformance.manifest import VECTORS, Vector, load, select_names
-from csplat_conformance.protocol import ask_decoder, split_command
+from csplat_conformance.protocol import ask_cuts, ask_decoder, split_command
 from csplat_conformance.tolerance import CLASSES, EXACT, RENDERER
 
 TIMEOUT_SECONDS = 60.0  #: per vector; the largest has 65,536 splats
@@ -36,7 +48,7 @@ class DecoderSuiteOptions:
     Attributes:
         pattern: shell patterns of names of vectors, `valid/sh*,valid/rich`; None for all.
         clause: shell patterns of clauses, `HDR-*,LIM-1`; only vectors that cover one of them are run. None for all.
-        levels: levels to check, 1 to 4.
+        levels: levels to check, 1 to 5.
         exact: require refusals to match in code, clause and offset, even optional ones, as csplat's own decoders must.
         timeout: time limit of a process, seconds.
         jobs: number of processes at a time; None: one per core.
@@ -67,8 +79,8 @@ class DecoderSuiteOptions:
         return adapter.exact_floats if self.by == RENDERER else None
 
 
-def parse_levels(text: str) -> tuple[int, ...]:
-    """Parse levels: `3` means all up to 3, `1,3` those two.
+def parse_levels(text: str, last: int = LEVELS[-1]) -> tuple[int, ...]:
+    """Parse levels: `3` means all up to 3, `1,3` those two; `last` is the last level.
 
     Raises:
         InputError: there are no such levels.
@@ -76,10 +88,10 @@ def parse_levels(text: str) -> tuple[int, ...]:
     try:
         numbers = [int(part.strip().upper().removeprefix("L")) for part in text.split(",")]
     except ValueError:
-        raise InputError(f"the level is {text!r}, expected 1 to {LEVELS[-1]}, or a list such as 1,3") from None
-    if any(number not in LEVELS for number in numbers):
-        raise InputError(f"the level is {text!r}, expected 1 to {LEVELS[-1]}, or a list such as 1,3")
-    return tuple(level for level in LEVELS if level <= numbers[0]) if len(numbers) == 1 else tuple(sorted(set(numbers)))
+        raise InputError(f"the level is {text!r}, expected 1 to {last}, or a list such as 1,3") from None
+    if any(not 1 <= number <= last for number in numbers):
+        raise InputError(f"the level is {text!r}, expected 1 to {last}, or a list such as 1,3")
+    return tuple(range(1, numbers[0] + 1)) if len(numbers) == 1 else tuple(sorted(set(numbers)))
 
 
 def run_builtin(options: DecoderSuiteOptions | None = None, progress: CountProgress | None = None) -> ConformanceReport:
@@ -100,15 +112,24 @@ def run_builtin(options: DecoderSuiteOptions | None = None, progress: CountProgr
             outcomes = compare_answer(
                 vector, adapter.answer(vector.data), options.levels, exact=True, near=options.near
             )
-        if 4 in options.levels and vector.views:
+        if RENDERS in options.levels and vector.views:
             if reference_renders.can_render():
                 outcomes += reference_renders.score_own_renderer(vector)
             else:
                 outcomes += reference_renders.skip_views(vector, "needs the packages of the extra render")
+        if CUTS in options.levels and cuts_of_vector(vector):
+            outcomes.append(compare_cuts(vector, _own_cuts(vector)))
         return outcomes
 
     vectors = _select_vectors(options)
     return _make_report("csplat's decoder", map(run, vectors), len(vectors), options, progress)
+
+
+def _own_cuts(vector: Vector) -> Answer:
+    try:
+        return Answer(Status.PASSED, cuts=adapter.cuts_of(vector.data, cuts_of_vector(vector)))
+    except CsplatError as error:
+        return Answer(Status.REFUSED, str(error), code=error.code)
 
 
 def run_command(
@@ -116,14 +137,16 @@ def run_command(
     options: DecoderSuiteOptions | None = None,
     *,
     render: str | None = None,
+    cuts: str | None = None,
     progress: CountProgress | None = None,
 ) -> ConformanceReport:
-    """Run another decoder, another renderer, or both over the vectors.
+    """Run another decoder, another renderer, another program for cuts, or several of them over the vectors.
 
     Args:
-        command: command line of the decoder with `{input}` and `{outdir}`; None to test a renderer alone.
+        command: command line of the decoder with `{input}` and `{outdir}`; None to test the other programs alone.
         options: settings of the run.
         render: command line of the renderer with `{input}`, `{camera}` and `{out}` or `{outdir}`, for L4.
+        cuts: command line of the program for cuts with `{input}` and `{cuts}`, for L5.
         progress: called with the number of vectors that are done.
 
     Raises:
@@ -134,24 +157,31 @@ def run_command(
         split_command(command, ("input", "outdir"))
     if render is not None:
         split_command(render, ("input", "camera", "outdir" if "{outdir}" in render else "out"))
+    if cuts is not None:
+        split_command(cuts, ("input", "cuts"))
 
     def run(vector: Vector) -> list[Outcome]:
         outcomes = []
         if command is not None and any(level in options.levels for level in PARTS):
             answer = ask_decoder(command, VECTORS / vector.file, options.timeout, keep_floats=options.near is not None)
             outcomes = compare_answer(vector, answer, options.levels, exact=options.exact, near=options.near)
-        if 4 in options.levels:
+        if RENDERS in options.levels:
             if render is None:
                 outcomes += reference_renders.skip_views(vector, "no command of a renderer was given")
             else:
                 outcomes += reference_renders.score_renderer(vector, render, options.timeout)
+        wanted = cuts_of_vector(vector) if CUTS in options.levels else []
+        if wanted and cuts is not None:
+            outcomes.append(compare_cuts(vector, ask_cuts(cuts, VECTORS / vector.file, wanted, options.timeout)))
+        elif wanted:
+            outcomes.append(skip_cuts(vector, "no command for cuts was given"))
         return outcomes
 
     vectors = _select_vectors(options)
     if command is None:
-        vectors = [vector for vector in vectors if vector.views]
+        vectors = [v for v in vectors if (render and v.views) or (cuts and cuts_of_vector(v))]
     with ThreadPoolExecutor(options.jobs or os.cpu_count() or 1) as pool:
-        return _make_report(command or render or "", pool.map(run, vectors), len(vectors), options, progress)
+        return _make_report(command or render or cuts or "", pool.map(run, vectors), len(vectors), options, progress)
 
 
 def _select_vectors(options: DecoderSuiteOptions) -> list[Vector]:

@@ -32,7 +32,8 @@ class Vector:
         why: its purpose, one line.
         clauses: clauses that the vector covers.
         since: version of the format in which the vector was added.
-        expect: `header`, `integers`, `floats`, `extra`; empty for a refusal.
+        expect: `header`, `integers`, `floats`, `extra` and, if the file has levels of detail, `cuts` (pairs of a cut,
+            `level 1`, and its tiles or error code); empty for a refusal.
         error: `code`, `clause`, `offset`, `also` (other acceptable codes), `optional` (chunk type whose payload has the
             defect, if CHK-6 lets a decoder leave it unread and accept the file; otherwise empty).
         views: renders: `camera`, `picture` (path below the folder of the vectors), `sha256`, `psnr` (minimum, dB).

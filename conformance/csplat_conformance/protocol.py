@@ -6,6 +6,12 @@ The decoder exits with status 0 and writes to OUTDIR `header.json` and a file of
 little-endian, in C order: `integers.NAME.bin`, `floats.NAME.bin`, `extra.NAME.bin` (names of columns percent-encoded).
 Or it exits with status 1, its last line on standard output is JSON, `{"code": "E_CRC"}`, and OUTDIR stays empty.
 
+    my-cuts INPUT CUTS
+
+CUTS is a text file with a cut per line, `level 1`, `pixel_size 0.5` or `splats 100`. The program exits with status 0
+and prints a line for each: the numbers of its tiles, or an error code. If it refuses the file, it exits with status 1
+and a line of JSON as above.
+
 `run_program` runs any program with a time limit:
 
     >>> values = {"input": "a b.ply", "out": "x"}
@@ -23,10 +29,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -39,6 +46,7 @@ from csplat_conformance.conformance_report import Status
 
 _MESSAGE_MAX = 200  # characters of a program's message to keep
 _PARTS = ("integers", "floats", "extra")
+_NUMBER = re.compile("[0-9]{1,10}")  # a u32
 
 
 def ask_decoder(command: str, path: Path, timeout: float, *, keep_floats: bool = False) -> Answer:
@@ -71,6 +79,38 @@ def read_answer(end: ProcessEnd, outdir: Path, *, keep_floats: bool = False) -> 
     if end.returncode == 1:
         return _read_refusal(end, left)
     return _read_arrays(outdir, left, end.seconds, keep_floats=keep_floats)
+
+
+def ask_cuts(command: str, path: Path, cuts: Sequence[str], timeout: float) -> Answer:
+    """Run a program that cuts through levels of detail on one file.
+
+    Args:
+        command: command line with `{input}` and `{cuts}`.
+        path: the file.
+        cuts: the cuts to request.
+        timeout: as in `ask_decoder`.
+    """
+    with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as folder:
+        text = Path(folder) / "cuts.txt"
+        text.write_text("".join(f"{cut}\n" for cut in cuts), encoding="utf-8", newline="\n")
+        end = run_program(command, {"input": str(path), "cuts": str(text)}, timeout)
+    if end.status is not None:
+        return Answer(end.status, end.message + last_words(end), seconds=end.seconds)
+    return _read_refusal(end, []) if end.returncode == 1 else _read_cuts(end)
+
+
+def _read_cuts(end: ProcessEnd) -> Answer:
+    found: list[list[int] | str] = []
+    for line in end.stdout.decode("utf-8", "replace").splitlines():
+        words = line.split()
+        if all(_NUMBER.fullmatch(word) for word in words):
+            found.append([int(word) for word in words])
+        elif len(words) == 1 and words[0].startswith("E_"):
+            found.append(words[0])
+        else:
+            message = f"line {len(found) + 1} is {line[:_MESSAGE_MAX]!r}, expected numbers of tiles, or an error code"
+            return Answer(Status.WRONG_ANSWER, message, seconds=end.seconds)
+    return Answer(Status.PASSED, cuts=found, seconds=end.seconds)
 
 
 def _read_refusal(end: ProcessEnd, left: list[str]) -> Answer:

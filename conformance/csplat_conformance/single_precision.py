@@ -175,7 +175,8 @@ def _exact_values(model: Any, name: str) -> F32:
 def _file_values(files: Iterable[bytes]) -> Iterator[tuple[str, str, F32, F32]]:
     """Yield array name, accuracy, values and exact values of files."""
     for data in files:
-        header, model, integers = decoder.read_header(data), decoder.decode(data), decoder.decode_integers(data)
+        header, model = decoder.read_header(data), decoder.decode(data)
+        integers = decoder.decode_integers(data, tiles=range(len(header.tiles)))  # level 0, as in the model
         for accuracy, gpus in GPUS.items():
             for gpu in gpus:
                 for name, values in _gpu_values(integers, header, gpu):

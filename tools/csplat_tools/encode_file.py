@@ -107,12 +107,13 @@ def encode_file(
     importance: str | None = None,
     prune_unseen: bool = False,
     source_index: str | None = None,
+    levels: bool = False,
     out_of_core: OutOfCoreOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodedFile:
     """Read a scene file, encode it, and write the .csplat file.
 
-    A `target`, `importance` and `source_index` require the scene in memory, and exclude `out_of_core`.
+    A `target`, `importance`, `source_index` and `levels` require the scene in memory, and exclude `out_of_core`.
 
     Args:
         source: a scene in any format, or `-`; or one that `read_source` has read.
@@ -124,6 +125,7 @@ def encode_file(
         importance: a .npy file with one weight per splat of the source, or a file of `csplat sensitivity`.
         prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
+        levels: add levels of detail; excludes `target` and `importance`.
         out_of_core: memory, disk and workers.
         progress: progress callback.
 
@@ -132,14 +134,18 @@ def encode_file(
         CsplatError: the scene or the options are not valid.
         OSError: a file cannot be read or written.
     """
-    in_memory = target is not None or importance is not None or source_index is not None
+    in_memory = target is not None or importance is not None or source_index is not None or levels
     limits = out_of_core or OutOfCoreOptions()
     if prune_unseen and importance is None:
         raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
     if prune_unseen and target is not None:
         raise InputError("prune_unseen and a target are given, expected only one of them")
+    if levels and (target is not None or importance is not None):
+        raise InputError("levels of detail exclude a target and an importance")
     if in_memory and limits != OutOfCoreOptions():
-        raise InputError("a target, an importance and a source index exclude options for scenes larger than memory")
+        raise InputError(
+            "a target, an importance, a source index and levels exclude options for scenes larger than memory"
+        )
     start = time.perf_counter()
     if isinstance(source, LoadedModel):
         read = source
@@ -161,7 +167,11 @@ def encode_file(
                 local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
                 opened=opened, progress=progress,
             )  # fmt: skip
-    if importance is None:
+    if levels:
+        from csplat_tools.level_builder import encode_with_levels  # imports the renderer
+
+        result = encode_with_levels(read.model, options, progress=progress)
+    elif importance is None:
         result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
     else:
         from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer

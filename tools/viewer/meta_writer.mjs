@@ -4,6 +4,7 @@ import { CRC_SIZE, crc32 } from '../../codec/js/checksums.mjs';
 import { CsplatReader } from '../../codec/js/decoder.mjs';
 import { registeredFlags } from '../../codec/js/registry.mjs';
 import * as spec from '../../codec/js/spec.mjs';
+import { allTiles } from '../../codec/js/tile_records.mjs';
 
 const AT_HEADER = spec.HEADER_OFFSETS;
 const AT_INDEX = spec.INDEX_HEAD_OFFSETS;
@@ -41,8 +42,12 @@ export async function withUp(bytes, up) {
   const count = directory.length + (before ? 0 : 1);
   const indexSize = header.indexSize + (count - head.directory_count) * head.directory_size;
 
-  const others = [...directory.filter((place) => place !== before), ...header.tiles.flatMap(({ layers }) => layers)];
-  const first = before?.offset ?? 0; // a new META chunk comes first
+  const others = [
+    ...directory.filter((place) => place !== before),
+    ...allTiles(header).flatMap(({ layers }) => layers),
+  ];
+  const tree = directory.find(({ type }) => type === spec.CHUNK_TREE);
+  const first = before?.offset ?? (tree ? tree.offset + tree.size : 0); // a new META chunk comes first, or after TREE
   const chunks = [{ offset: first, bytes: meta, field: 0 }];
   for (const { offset, size, offsetField } of others) {
     chunks.push({ offset, bytes: source.subarray(offset, offset + size), field: offsetField });

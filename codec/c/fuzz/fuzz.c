@@ -3,7 +3,8 @@
  *     make fuzz-c
  *
  * Most mutants have their checksums repaired, and the offsets of all chunks if a chunk has changed its length, so that damage
- * gets past the container. If csplat_decode accepts a file, all other ways of reading must accept it too. */
+ * gets past the container. If csplat_decode accepts a file, all other ways of reading must accept it too. Tiles above level 0,
+ * whose payloads csplat_decode leaves unread, must be accepted by all of them or by none. */
 #include "../csplat.c"
 
 size_t LLVMFuzzerMutate(uint8_t *data, size_t size, size_t max_size);
@@ -166,48 +167,169 @@ static int read_bytes(void *user, uint64_t offset, size_t size, void *into)
     return 1;
 }
 
-/* Read by every other way than csplat_decode; return whether all of it was accepted. */
+/* Return the worst of the nodes that are in a cut and have children, or the number of nodes. */
+static uint32_t worst_of(const csplat_node *nodes, uint32_t count, const uint8_t *in_cut)
+{
+    uint32_t worst = count;
+    for (uint32_t i = 0; i < count; i++)
+        if (in_cut[i] && nodes[i].level > 0 && (worst == count || nodes[i].error >= nodes[worst].error))
+            worst = i;
+    return worst;
+}
+
+/* Mark the nodes of cut_within, step by step as the specification does; return 0 if there is no such cut. */
+static int cut_within(const csplat_node *nodes, uint32_t count, uint64_t budget, uint8_t *in_cut)
+{
+    uint64_t splats = 0;
+    for (uint32_t i = 0; i < count; i++)
+        if ((in_cut[i] = nodes[i].parent == CSPLAT_NO_PARENT))
+            splats += nodes[i].splat_count;
+    if (splats > budget)
+        return 0;
+    for (uint32_t worst; (worst = worst_of(nodes, count, in_cut)) < count;) {
+        splats -= nodes[worst].splat_count;
+        for (uint32_t i = 0; i < count; i++)
+            splats += nodes[i].parent == worst ? nodes[i].splat_count : 0;
+        if (splats > budget)
+            break;
+        for (uint32_t i = 0; i < count; i++)
+            in_cut[i] |= nodes[i].parent == worst;
+        in_cut[worst] = 0;
+    }
+    return 1;
+}
+
+/* Compare a cut within a budget with that of the slow function. */
+static void check_budget_cut(csplat *file, const csplat_node *nodes, uint32_t node_count, uint64_t budget)
+{
+    const csplat_info *info = csplat_get_info(file);
+    const csplat_cut cut = {CSPLAT_CUT_SPLATS, 0, 0, NULL, budget, NULL};
+    uint32_t *tiles = malloc(((size_t)info->tile_count + info->coarse_tile_count) * sizeof *tiles), count, at = 0;
+    uint8_t *in_cut = malloc(node_count);
+    csplat_code code;
+    if (!tiles || !in_cut)
+        abort();
+    code = csplat_select(file, &cut, tiles, &count);
+    if (cut_within(nodes, node_count, budget, in_cut) != (code == CSPLAT_OK) || (code && code != CSPLAT_E_LIMIT))
+        abort();
+    for (uint32_t i = 0; !code && i < node_count; i++)
+        for (uint32_t k = 0; in_cut[i] && k < nodes[i].tile_count; k++)
+            if (at == count || tiles[at++] != nodes[i].first_tile + k)
+                abort();
+    if (!code && at != count)
+        abort();
+    free(tiles);
+    free(in_cut);
+}
+
+/* Select at a pixel size, everywhere and in the region of the last node. */
+static void check_pixel_cut(csplat *file, const csplat_node *nodes, uint32_t node_count, double pixel_size)
+{
+    const csplat_info *info = csplat_get_info(file);
+    float box[] = {-FLT_MAX, -FLT_MAX, -FLT_MAX, FLT_MAX, FLT_MAX, FLT_MAX};
+    csplat_cut cut = {CSPLAT_CUT_PIXEL_SIZE, 0, 0, NULL, 0, box};
+    uint32_t *tiles = malloc(((size_t)info->tile_count + info->coarse_tile_count) * sizeof *tiles), count, again;
+    double *sizes = malloc(node_count * sizeof *sizes);
+    uint64_t splats = 0;
+    if (!tiles || !sizes)
+        abort();
+    for (uint32_t i = 0; i < node_count; i++)
+        sizes[i] = pixel_size;
+    cut.pixel_sizes = sizes;
+    cut.pixel_size_count = node_count;
+    if (csplat_select(file, &cut, tiles, &count))
+        abort();
+    for (uint32_t i = 0; i < count; i++) {
+        csplat_tile tile;
+        if (csplat_get_tile(file, tiles[i], &tile) || (i && tiles[i] <= tiles[i - 1]))
+            abort();
+        splats += tile.splat_count;
+    }
+    if (splats > info->splat_count || count == 0)
+        abort();
+    for (unsigned i = 0; i < 3; i++) {
+        box[i] = nodes[node_count - 1].min[i];
+        box[3 + i] = nodes[node_count - 1].max[i];
+    }
+    if (csplat_select(file, &cut, tiles, &again) || again == 0 || again > count)
+        abort();
+    free(tiles);
+    free(sizes);
+}
+
+/* Read nodes and cuts; return whether the nodes were accepted. */
+static int read_cuts(csplat *file)
+{
+    const csplat_node *nodes;
+    uint32_t count;
+    if (csplat_read_nodes(file, &nodes, &count))
+        return 0;
+    for (uint32_t i = 0; i < count && i < 50; i++) {
+        check_budget_cut(file, nodes, count, nodes[i].splat_count);
+        check_budget_cut(file, nodes, count, csplat_get_info(file)->splat_count - nodes[i].splat_count % 8);
+        check_pixel_cut(file, nodes, count, nodes[i].error);
+    }
+    return 1;
+}
+
+/* Read a tile by every other way than csplat_decode; return whether all of it was accepted. */
+static int read_tile_otherwise(csplat *file, uint32_t i)
+{
+    const csplat_info *info = csplat_get_info(file);
+    csplat_integers integers = {0};
+    csplat_packed_geometry geometry;
+    csplat_packed packed;
+    csplat_columns table;
+    csplat_tile tile;
+    csplat_floats floats = {0};
+    int32_t exponents[ATTRIBUTES_END - OPACITIES];
+    float *band;
+    int accepted = 1, whole;
+    csplat_get_tile(file, i, &tile);
+    integers.means = malloc(tile.splat_count * 3 * sizeof(int64_t));
+    integers.quats = malloc(tile.splat_count * 3 * sizeof(int32_t));
+    integers.sh[0] = malloc(tile.splat_count * 9 * sizeof(int64_t));
+    integers.exponents = exponents;
+    band = malloc(tile.splat_count * COLUMNS_MAX * sizeof(float));
+    if (!integers.means || !integers.quats || !integers.sh[0] || !band)
+        abort();
+    for (unsigned k = 1; k <= info->sh_degree; k++) { /* in either order, since a band may need the indices of a lower one */
+        const unsigned l = (info->file_size + i) % 2 ? k : info->sh_degree + 1 - k;
+        accepted &= csplat_read_packed_band(file, i, l, &packed) == CSPLAT_OK;
+        if (packed.index)
+            accepted &= csplat_read_packed_codebook(file, packed.codebook, l, &table) == CSPLAT_OK;
+        accepted &= csplat_read_band(file, i, l, band) == CSPLAT_OK;
+    }
+    accepted &= csplat_read_packed(file, i, &geometry) == CSPLAT_OK;
+    floats.means = band;
+    whole = csplat_read_tile(file, i, info->sh_degree, &floats) == CSPLAT_OK;
+    if (whole != (csplat_read_integers(file, i, &integers) == CSPLAT_OK) || whole != accepted)
+        abort();
+    if (tile.level == 0)
+        accepted &= csplat_read_extras(file, i, NULL) == CSPLAT_OK;
+    free(integers.means);
+    free(integers.quats);
+    free(integers.sh[0]);
+    free(band);
+    return accepted;
+}
+
+/* Read by every other way than csplat_decode; return whether all that it reads was accepted. */
 static int read_otherwise(csplat *file)
 {
     const csplat_info *info = csplat_get_info(file);
     int accepted = csplat_check(file) == CSPLAT_OK, found;
     csplat_stated_errors errors;
-    csplat_columns table;
     const char *text;
     size_t length;
     for (int which = 0; which < 3; which++)
         accepted &= csplat_read_text(file, (csplat_text)which, &text, &length) == CSPLAT_OK;
     accepted &= csplat_read_stated_errors(file, &errors, &found) == CSPLAT_OK;
-    for (uint32_t i = 0; i < info->tile_count; i++) {
-        csplat_integers integers = {0};
-        csplat_packed_geometry geometry;
-        csplat_packed packed;
-        csplat_tile tile;
-        int32_t exponents[ATTRIBUTES_END - OPACITIES];
-        float *band;
-        csplat_get_tile(file, i, &tile);
-        integers.means = malloc(tile.splat_count * 3 * sizeof(int64_t));
-        integers.quats = malloc(tile.splat_count * 3 * sizeof(int32_t));
-        integers.sh[0] = malloc(tile.splat_count * 9 * sizeof(int64_t));
-        integers.exponents = exponents;
-        band = malloc(tile.splat_count * COLUMNS_MAX * sizeof(float));
-        if (!integers.means || !integers.quats || !integers.sh[0] || !band)
-            abort();
-        for (unsigned k = 1; k <= info->sh_degree; k++) { /* in either order, since a band may need the indices of a lower one */
-            const unsigned l = (info->file_size + i) % 2 ? k : info->sh_degree + 1 - k;
-            accepted &= csplat_read_packed_band(file, i, l, &packed) == CSPLAT_OK;
-            if (packed.index)
-                accepted &= csplat_read_packed_codebook(file, packed.codebook, l, &table) == CSPLAT_OK;
-            accepted &= csplat_read_band(file, i, l, band) == CSPLAT_OK;
-        }
-        accepted &= csplat_read_packed(file, i, &geometry) == CSPLAT_OK;
-        accepted &= csplat_read_integers(file, i, &integers) == CSPLAT_OK;
-        accepted &= csplat_read_extras(file, i, NULL) == CSPLAT_OK;
-        free(integers.means);
-        free(integers.quats);
-        free(integers.sh[0]);
-        free(band);
-    }
+    accepted &= read_cuts(file);
+    for (uint32_t i = 0; i < info->tile_count; i++)
+        accepted &= read_tile_otherwise(file, i);
+    for (uint32_t i = 0; i < info->coarse_tile_count; i++)
+        read_tile_otherwise(file, info->tile_count + i);
     return accepted;
 }
 

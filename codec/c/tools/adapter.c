@@ -2,9 +2,9 @@
  *
  *     csplat conformance decoder --cmd 'csplat_adapter {input} {outdir}'
  *
- * Without arguments it reads them from standard input, alternating line by line, and answers each pair with a line of JSON,
- * which is {} if the file was decoded. Tests then need not start a process for each file. Three numbers are budgets: splats,
- * bytes, bytes of a text.
+ * `csplat_adapter --cuts {input} {cuts}` prints the tiles of each cut. Without arguments it reads input and folder from standard
+ * input, alternating line by line, and answers each pair with a line of JSON, which is {} if the file was decoded. Tests then
+ * need not start a process for each file. Three numbers are budgets: splats, bytes, bytes of a text.
  *
  * The file is decoded as a whole and tile by tile; from memory and through a callback; to floats, integers and packed
  * arrays. If two of these disagree, the adapter exits with status 2. */
@@ -32,6 +32,23 @@ static void *room(size_t count, size_t each)
     if (!memory)
         die("no memory");
     return memory;
+}
+
+/* Read a file, followed by a NUL. */
+static unsigned char *load(const char *path, size_t *count)
+{
+    FILE *input = fopen(path, "rb");
+    unsigned char *bytes;
+    if (!input)
+        die("cannot open");
+    fseek(input, 0, SEEK_END);
+    *count = (size_t)ftell(input);
+    rewind(input);
+    bytes = room(*count + 1, 1);
+    if (fread(bytes, 1, *count, input) != *count)
+        die("cannot read");
+    fclose(input);
+    return bytes;
 }
 
 static void refuse(const csplat_error *error)
@@ -66,11 +83,17 @@ static void put(const char *part, const char *name, const void *values, size_t b
     fclose(file);
 }
 
+/* Return the number of tiles of all levels. */
+static uint32_t tiles_of(const csplat_info *info)
+{
+    return info->tile_count + info->coarse_tile_count;
+}
+
 static void put_header(const csplat_info *info)
 {
     FILE *file = create("header", "");
     fprintf(file, "{\"profile\": \"base\", \"splat_count\": %llu, \"tile_count\": %lu, \"sh_degree\": %u, ",
-            (unsigned long long)info->splat_count, (unsigned long)info->tile_count, info->sh_degree);
+            (unsigned long long)info->splat_count, (unsigned long)tiles_of(info), info->sh_degree);
     fprintf(file, "\"scene_flags\": [%s%s%s], ", info->antialiased ? "\"antialiased\"" : "",
             info->antialiased && info->flat ? ", " : "", info->flat ? "\"flat\"" : "");
     fprintf(file, "\"axes\": \"%s\", \"unit_metres\": %.17g, \"origin\": [%.17g, %.17g, %.17g]}\n", info->axes,
@@ -165,7 +188,7 @@ static void compare_packed(csplat *file, uint32_t tile, size_t n, unsigned degre
     }
 }
 
-/* Check a tile that is read alone, through a callback, against its values in the whole scene. */
+/* Check a tile that is read alone, through a callback, against its values in the whole scene, if that contains it. */
 static void compare_floats(csplat *file, uint32_t tile, const csplat_tile *t, const csplat_scene *scene)
 {
     const size_t n = t->splat_count, k = ((size_t)scene->sh_degree + 1) * (scene->sh_degree + 1) - 1, first = (size_t)t->first;
@@ -173,8 +196,10 @@ static void compare_floats(csplat *file, uint32_t tile, const csplat_tile *t, co
     csplat_floats out = {0};
     out.means = means;
     out.shN = shN;
-    if (csplat_read_tile(file, tile, scene->sh_degree, &out) || memcmp(means, scene->values.means + 3 * first, 12 * n) ||
-        memcmp(shN, scene->values.shN + 3 * k * first, 12 * k * n))
+    if (csplat_read_tile(file, tile, scene->sh_degree, &out))
+        die("a tile is refused");
+    if (t->level == 0 && (memcmp(means, scene->values.means + 3 * first, 12 * n) ||
+                          memcmp(shN, scene->values.shN + 3 * k * first, 12 * k * n)))
         die("a tile differs from the whole");
     for (unsigned axis = 0; axis < 3; axis++) { /* [TIL-10]: some splats lie on each side of the box */
         float low = means[axis], high = low;
@@ -190,35 +215,60 @@ static void compare_floats(csplat *file, uint32_t tile, const csplat_tile *t, co
             die("a band is refused");
         for (size_t i = 0; i < n; i++)
             if (memcmp(band + i * 3 * (2 * l + 1), shN + 3 * (i * k + l * l - 1), 12 * (2 * (size_t)l + 1)))
-                die("a band differs from the whole");
+                die("a band differs from the tile");
     }
     free(means);
     free(shN);
     free(band);
 }
 
-/* Write all arrays of a decoded file. */
-static void put_all(csplat *file, csplat *other, const csplat_scene *scene)
+/* Check that nodes and cuts of level 0 are those of the tiles. */
+static void check_nodes(csplat *file)
+{
+    const csplat_info *info = csplat_get_info(file);
+    const csplat_cut cut = {CSPLAT_CUT_LEVEL, 0, 0, NULL, 0, NULL};
+    uint32_t *tiles = room(tiles_of(info), 4), node_count, tile_count, sum = 0;
+    const csplat_node *nodes;
+    if (csplat_read_nodes(file, &nodes, &node_count) || csplat_select(file, &cut, tiles, &tile_count))
+        die("the nodes are refused");
+    for (uint32_t i = 0; i < node_count; i++)
+        sum += nodes[i].tile_count;
+    if (sum != tiles_of(info) || tile_count != info->tile_count)
+        die("nodes or level 0 lack tiles");
+    for (uint32_t i = 0; i < tile_count; i++)
+        if (tiles[i] != i)
+            die("level 0 is not the first tiles");
+    free(tiles);
+}
+
+/* Write all arrays of a decoded file; return 1 if a tile above level 0 is refused. */
+static int put_all(csplat *file, csplat *other, const csplat_scene *scene)
 {
     csplat_integers all = {0};
-    uint32_t *tile_splats;
+    uint32_t *tile_splats, tile_count;
     const csplat_info *info;
-    size_t n, records;
+    csplat_tile t = {0};
+    size_t n, rows, records;
+    int refused = 0;
     info = csplat_get_info(file);
     n = (size_t)info->splat_count;
+    tile_count = tiles_of(info);
+    if (tile_count)
+        csplat_get_tile(file, tile_count - 1, &t);
+    rows = (size_t)t.first + t.splat_count; /* splats of all levels */
     records = 5 + (size_t)info->sh_degree;
-    tile_splats = room(info->tile_count, 4);
-    all.opacities = room(n, 4);
-    all.scales = room(n, 24);
-    all.quats = room(n, 12);
-    all.means = room(n, 24);
-    all.sh0 = room(n, 24);
-    all.exponents = room(info->tile_count * records, 4);
+    tile_splats = room(tile_count, 4);
+    all.opacities = room(rows, 4);
+    all.scales = room(rows, 24);
+    all.quats = room(rows, 12);
+    all.means = room(rows, 24);
+    all.sh0 = room(rows, 24);
+    all.exponents = room(tile_count * records, 4);
     for (unsigned band = 1; band <= CSPLAT_SH_DEGREE_MAX; band++)
-        all.sh[band - 1] = room(band <= info->sh_degree ? n : 0, 24 * (2 * (size_t)band + 1));
-    for (uint32_t i = 0; i < info->tile_count; i++) {
+        all.sh[band - 1] = room(band <= info->sh_degree ? rows : 0, 24 * (2 * (size_t)band + 1));
+    check_nodes(other);
+    for (uint32_t i = 0; i < tile_count && !refused; i++) {
         csplat_integers part = all;
-        csplat_tile t;
         size_t first;
         csplat_get_tile(file, i, &t);
         first = (size_t)t.first;
@@ -231,32 +281,38 @@ static void put_all(csplat *file, csplat *other, const csplat_scene *scene)
         part.exponents += i * records;
         for (unsigned band = 1; band <= info->sh_degree; band++)
             part.sh[band - 1] += 3 * (2 * band + 1) * first;
-        if (csplat_read_integers(file, i, &part))
+        if (!csplat_read_integers(file, i, &part)) {
+            compare_packed(other, i, t.splat_count, info->sh_degree, &part);
+            compare_floats(other, i, &t, scene);
+        } else if (t.level > 0) {
+            refuse(csplat_last_error(file));
+            refused = 1;
+        } else
             die("integers are refused");
-        compare_packed(other, i, t.splat_count, info->sh_degree, &part);
-        compare_floats(other, i, &t, scene);
     }
-    put_header(info);
-    put("integers.", "opacities", all.opacities, 4 * n);
-    put("integers.", "scales", all.scales, 24 * n);
-    put("integers.", "quats", all.quats, 12 * n);
-    put("integers.", "means", all.means, 24 * n);
-    put("integers.", "sh0", all.sh0, 24 * n);
-    for (unsigned band = 1; band <= info->sh_degree; band++) {
-        const char name[] = {'s', 'h', (char)('0' + band), 0};
-        put("integers.", name, all.sh[band - 1], 24 * (2 * (size_t)band + 1) * n);
+    if (!refused) {
+        put_header(info);
+        put("integers.", "opacities", all.opacities, 4 * rows);
+        put("integers.", "scales", all.scales, 24 * rows);
+        put("integers.", "quats", all.quats, 12 * rows);
+        put("integers.", "means", all.means, 24 * rows);
+        put("integers.", "sh0", all.sh0, 24 * rows);
+        for (unsigned band = 1; band <= info->sh_degree; band++) {
+            const char name[] = {'s', 'h', (char)('0' + band), 0};
+            put("integers.", name, all.sh[band - 1], 24 * (2 * (size_t)band + 1) * rows);
+        }
+        put("integers.", "tile_splats", tile_splats, 4 * (size_t)tile_count);
+        put("integers.", "exponents", all.exponents, 4 * tile_count * records);
+        put("floats.", "means", scene->values.means, 12 * n);
+        put("floats.", "quats", scene->values.quats, 16 * n);
+        put("floats.", "scales", scene->values.scales, 12 * n);
+        put("floats.", "opacities", scene->values.opacities, 4 * n);
+        put("floats.", "sh0", scene->values.sh0, 12 * n);
+        put("floats.", "shN", scene->values.shN, 12 * n * (records - 5 + 1) * (records - 5 + 1) - 12 * n);
+        for (uint32_t i = 0; i < info->extra_count; i++)
+            if (scene->extras[i])
+                put("extra.", info->extras[i].name, scene->extras[i], n * info->extras[i].bytes);
     }
-    put("integers.", "tile_splats", tile_splats, 4 * (size_t)info->tile_count);
-    put("integers.", "exponents", all.exponents, 4 * info->tile_count * records);
-    put("floats.", "means", scene->values.means, 12 * n);
-    put("floats.", "quats", scene->values.quats, 16 * n);
-    put("floats.", "scales", scene->values.scales, 12 * n);
-    put("floats.", "opacities", scene->values.opacities, 4 * n);
-    put("floats.", "sh0", scene->values.sh0, 12 * n);
-    put("floats.", "shN", scene->values.shN, 12 * n * (records - 5 + 1) * (records - 5 + 1) - 12 * n);
-    for (uint32_t i = 0; i < info->extra_count; i++)
-        if (scene->extras[i])
-            put("extra.", info->extras[i].name, scene->extras[i], n * info->extras[i].bytes);
     free(all.opacities);
     free(all.scales);
     free(all.quats);
@@ -266,6 +322,7 @@ static void put_all(csplat *file, csplat *other, const csplat_scene *scene)
     for (int band = 0; band < CSPLAT_SH_DEGREE_MAX; band++)
         free(all.sh[band]);
     free(tile_splats);
+    return refused;
 }
 
 /* Decode the file at a path; return 1 if it was refused. */
@@ -276,16 +333,8 @@ static int answer(const char *path)
     csplat_scene *scene = NULL;
     csplat_error error;
     int refused = 1;
-    FILE *input = fopen(path, "rb");
-    if (!input)
-        die("cannot open");
-    fseek(input, 0, SEEK_END);
-    source.size = size = (size_t)ftell(input);
-    rewind(input);
-    data = room(size, 1);
-    if (fread(data, 1, size, input) != size)
-        die("cannot read");
-    fclose(input);
+    data = load(path, &size);
+    source.size = size;
     if (csplat_open_memory(&file, data, size, &options, &error))
         refuse(&error);
     else if (csplat_decode(file, CSPLAT_SH_DEGREE_MAX, &scene))
@@ -293,14 +342,76 @@ static int answer(const char *path)
     else {
         if (csplat_open(&other, &source, &options, &error))
             die("through a callback it is refused");
-        put_all(file, other, scene);
+        refused = put_all(file, other, scene);
         csplat_close(other);
-        refused = 0;
     }
     if (file)
         csplat_free_scene(file, scene);
     csplat_close(file);
     free(data);
+    return refused;
+}
+
+/* Parse the text of a cut, a word and its numbers; `sizes` has room for all of them. */
+static csplat_cut read_cut(char *text, double *sizes)
+{
+    csplat_cut cut = {CSPLAT_CUT_LEVEL, 0, 0, NULL, 0, NULL};
+    char *word = strtok(text, " "), *number = strtok(NULL, " ");
+    if (!word || !number)
+        die("a cut without a number");
+    if (strcmp(word, "level") == 0)
+        cut.level = (uint32_t)strtoul(number, NULL, 10);
+    else if (strcmp(word, "splats") == 0) {
+        cut.kind = CSPLAT_CUT_SPLATS;
+        cut.splats = strtoull(number, NULL, 10);
+    } else if (strcmp(word, "pixel_size") == 0) {
+        cut.kind = CSPLAT_CUT_PIXEL_SIZE;
+        cut.pixel_sizes = sizes;
+        for (; number; number = strtok(NULL, " "))
+            sizes[cut.pixel_size_count++] = strtod(number, NULL);
+    } else
+        die("a cut of another kind");
+    return cut;
+}
+
+/* Print the tiles of each cut of a text; return 1 if the file was refused. */
+static int answer_cuts(const char *path, const char *cuts)
+{
+    csplat *file = NULL;
+    csplat_error error;
+    const csplat_node *nodes;
+    uint32_t *tiles, count;
+    size_t length;
+    char *text = (char *)load(cuts, &length);
+    double *sizes = room(length, sizeof *sizes);
+    int refused = 1;
+    data = load(path, &size);
+    if (csplat_open_memory(&file, data, size, &options, &error))
+        refuse(&error);
+    else if (csplat_read_nodes(file, &nodes, &count))
+        refuse(csplat_last_error(file));
+    else {
+        tiles = room(tiles_of(csplat_get_info(file)), 4);
+        for (char *line = text, *end; *line; line = end) {
+            csplat_cut cut;
+            csplat_code code;
+            end = line + strcspn(line, "\n");
+            if (*end)
+                *end++ = '\0';
+            cut = read_cut(line, sizes);
+            code = csplat_select(file, &cut, tiles, &count);
+            printf("%s", code ? csplat_code_name(code) : "");
+            for (uint32_t i = 0; i < count; i++)
+                printf("%s%lu", i ? " " : "", (unsigned long)tiles[i]);
+            printf("\n");
+        }
+        free(tiles);
+        refused = 0;
+    }
+    csplat_close(file);
+    free(data);
+    free(sizes);
+    free(text);
     return refused;
 }
 
@@ -311,12 +422,14 @@ int main(int count, char **arguments)
         directory = arguments[2];
         return answer(arguments[1]);
     }
+    if (count == 4 && strcmp(arguments[1], "--cuts") == 0)
+        return answer_cuts(arguments[2], arguments[3]);
     if (count == 4) {
         options.splats_max = strtoull(arguments[1], NULL, 10);
         options.bytes_max = strtoull(arguments[2], NULL, 10);
         options.json_bytes_max = strtoull(arguments[3], NULL, 10);
     } else if (count != 1)
-        die("usage: csplat_adapter [INPUT OUTDIR | SPLATS BYTES JSON_BYTES]");
+        die("usage: csplat_adapter [INPUT OUTDIR | --cuts INPUT CUTS | SPLATS BYTES JSON_BYTES]");
     directory = folder;
     while (fgets(path, sizeof path, stdin) && fgets(folder, sizeof folder, stdin)) {
         path[strcspn(path, "\n")] = folder[strcspn(folder, "\n")] = '\0';

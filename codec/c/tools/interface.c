@@ -1,8 +1,9 @@
-/* Tests beyond the conformance suite: failing callbacks, budgets, invalid arguments, a lower degree.
+/* Tests beyond the conformance suite: failing callbacks, budgets, invalid arguments, a lower degree, boxes of cuts.
  *
  *     interface FILE...        status 0, or the line number of a failed check on standard error */
 #include "csplat.h"
 
+#include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
@@ -52,6 +53,25 @@ static int fail_to_inflate(void *user, const uint8_t *coded, size_t coded_size, 
     return 0;
 }
 
+/* Return the number of tiles of all levels. */
+static uint32_t tiles_of(const csplat *d)
+{
+    return csplat_get_info(d)->tile_count + csplat_get_info(d)->coarse_tile_count;
+}
+
+/* Select all of level 0 by a budget. */
+static csplat_code select_all(csplat *d)
+{
+    uint32_t *tiles = malloc((tiles_of(d) + 1) * sizeof *tiles), count;
+    csplat_cut cut = {CSPLAT_CUT_SPLATS, 0, 0, NULL, UINT64_MAX, NULL};
+    csplat_code code;
+    HOLDS(tiles);
+    code = csplat_select(d, &cut, tiles, &count);
+    HOLDS(count == (code ? 0 : csplat_get_info(d)->tile_count));
+    free(tiles);
+    return code;
+}
+
 /* Open through callbacks, read everything, return the code. `d` is closed afterwards. */
 static csplat_code read_all(caller *c, size_t size, const csplat_options *options)
 {
@@ -61,9 +81,11 @@ static csplat_code read_all(caller *c, size_t size, const csplat_options *option
     csplat_packed_geometry geometry;
     csplat_columns columns;
     csplat_stated_errors errors;
+    const csplat_node *nodes;
     csplat *d;
     const char *text;
     size_t length;
+    uint32_t count;
     int found;
     csplat_code code = csplat_open(&d, &source, options, NULL);
     if (code)
@@ -75,7 +97,11 @@ static csplat_code read_all(caller *c, size_t size, const csplat_options *option
         code = csplat_read_text(d, (csplat_text)which, &text, &length);
     if (!code)
         code = csplat_read_stated_errors(d, &errors, &found);
-    for (uint32_t i = 0; i < csplat_get_info(d)->tile_count && !code; i++) {
+    if (!code)
+        code = csplat_read_nodes(d, &nodes, &count);
+    if (!code)
+        code = select_all(d);
+    for (uint32_t i = 0; i < tiles_of(d) && !code; i++) {
         code = csplat_read_packed(d, i, &geometry);
         for (unsigned band = 1; band <= csplat_get_info(d)->sh_degree && !code; band++) {
             code = csplat_read_packed_band(d, i, band, &packed);
@@ -156,7 +182,7 @@ static void arguments_are_checked(const unsigned char *data, size_t size)
     size_t length;
     csplat *d;
     HOLDS(!csplat_open_memory(&d, data, size, NULL, NULL));
-    HOLDS(csplat_get_tile(d, csplat_get_info(d)->tile_count, &tile) == CSPLAT_E_INPUT);
+    HOLDS(csplat_get_tile(d, tiles_of(d), &tile) == CSPLAT_E_INPUT);
     HOLDS(csplat_read_tile(d, 0, CSPLAT_SH_DEGREE_MAX + 1, &none) == CSPLAT_E_INPUT);
     HOLDS(csplat_read_tile(d, 0, CSPLAT_SH_DEGREE_MAX, &none) == CSPLAT_OK);
     HOLDS(csplat_read_integers(d, 0, &nothing) == CSPLAT_OK && csplat_read_extras(d, 0, NULL) == CSPLAT_OK);
@@ -174,6 +200,93 @@ static void arguments_are_checked(const unsigned char *data, size_t size)
     csplat_close(NULL);
 }
 
+static csplat_code select_by(csplat *d, csplat_cut cut, uint32_t *tiles, uint32_t *count)
+{
+    csplat_code code = csplat_select(d, &cut, tiles, count);
+    HOLDS(!code || *count == 0);
+    return code;
+}
+
+static void cuts_are_checked(const unsigned char *data, size_t size)
+{
+    const csplat_cut level_0 = {CSPLAT_CUT_LEVEL, 0, 0, NULL, 0, NULL};
+    double *sizes;
+    float box[6];
+    uint32_t *tiles, count, node_count;
+    const csplat_node *nodes, *root, *again;
+    const csplat_info *info;
+    csplat_cut cut;
+    csplat_tile tile;
+    csplat *d;
+    HOLDS(!csplat_open_memory(&d, data, size, NULL, NULL));
+    info = csplat_get_info(d);
+    HOLDS(!csplat_read_nodes(d, &nodes, &node_count) && !csplat_read_nodes(d, &again, &count));
+    HOLDS(nodes == again && count == node_count && node_count > 0);
+    root = &nodes[node_count - 1];
+    HOLDS(root->parent == CSPLAT_NO_PARENT && (root->level > 0) == (info->coarse_tile_count > 0));
+    tiles = malloc(tiles_of(d) * sizeof *tiles);
+    sizes = malloc((node_count + 1) * sizeof *sizes);
+    HOLDS(tiles && sizes);
+    for (uint32_t i = 0; i <= node_count; i++)
+        sizes[i] = HUGE_VAL;
+
+    cut = level_0;
+    HOLDS(!select_by(d, cut, tiles, &count) && count == info->tile_count && tiles[count - 1] == count - 1);
+    cut.level = 256;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+    cut.level = 255;
+    HOLDS(!select_by(d, cut, tiles, &count) && tiles[count - 1] == tiles_of(d) - 1);
+    cut.kind = (csplat_cut_kind)3;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+
+    cut.kind = CSPLAT_CUT_PIXEL_SIZE;
+    cut.pixel_sizes = sizes;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+    cut.pixel_size_count = node_count + 1;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+    cut.pixel_size_count = node_count;
+    HOLDS(!select_by(d, cut, tiles, &count) && tiles[count - 1] == tiles_of(d) - 1);
+    cut.pixel_size_count = 1;
+    HOLDS(!select_by(d, cut, tiles, &count) && tiles[count - 1] == tiles_of(d) - 1);
+    sizes[0] = -1e-300;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+    sizes[0] = NAN;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+
+    cut.kind = CSPLAT_CUT_SPLATS;
+    cut.splats = 0;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_LIMIT && csplat_last_error(d)->offset == CSPLAT_NO_OFFSET);
+    cut.splats = info->splat_count;
+    HOLDS(!select_by(d, cut, tiles, &count) && count == info->tile_count);
+
+    /* A corner of tile 0 touches its box. Of coarser levels, it touches the region of the node above tile 0. */
+    HOLDS(!csplat_get_tile(d, 0, &tile) && tile.level == 0 && !csplat_get_tile(d, tiles_of(d) - 1, &tile));
+    HOLDS((tile.first >= info->splat_count) == (tile.level > 0));
+    HOLDS(!csplat_get_tile(d, 0, &tile));
+    for (int i = 0; i < 3; i++)
+        box[i] = box[3 + i] = tile.max[i];
+    for (cut = level_0; cut.level < 256; cut.level++) {
+        cut.box = box;
+        HOLDS(!select_by(d, cut, tiles, &count) && count > 0 && (cut.level > 0 || tiles[0] == 0));
+    }
+    cut = level_0;
+    cut.box = box;
+    box[0] = box[3] = HUGE_VALF;
+    HOLDS(!select_by(d, cut, tiles, &count) && count == 0);
+    box[0] = -HUGE_VALF;
+    HOLDS(!select_by(d, cut, tiles, &count) && count > 0);
+    box[4] = nextafterf(box[1], -HUGE_VALF);
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+    box[4] = NAN;
+    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+
+    if (info->coarse_tile_count)
+        HOLDS(csplat_read_extras(d, info->tile_count, NULL) == (info->extra_count ? CSPLAT_E_INPUT : CSPLAT_OK));
+    free(tiles);
+    free(sizes);
+    csplat_close(d);
+}
+
 int main(int count, char **arguments)
 {
     for (int i = 1; i < count; i++) {
@@ -184,6 +297,7 @@ int main(int count, char **arguments)
         functions_of_the_caller_may_fail(data, size);
         budgets_hold(data, size);
         arguments_are_checked(data, size);
+        cuts_are_checked(data, size);
     }
     return 0;
 }

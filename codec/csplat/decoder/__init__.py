@@ -14,8 +14,8 @@ encoder.
 | `read_metadata`, `read_cameras`, `read_options`, `read_declared_bounds` | one chunk |
 
 Modules, each of which builds on the previous ones: `container` (file header, frames of chunks), `index`, `entropy`
-(streams), `blocks` (integers of one attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `limits`,
-`metadata`, `decode_api`.
+(streams), `blocks` (integers of one attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `tree`,
+`limits`, `metadata`, `decode_api`.
 """
 
 from csplat.decoder.container import ExtraColumn, SceneHeader, Tile
@@ -39,6 +39,7 @@ from csplat.decoder.metadata import (
     read_metadata,
     read_options,
 )
+from csplat.decoder.tree import Node
 
 __all__ = [
     "DeclaredBound",
@@ -47,6 +48,7 @@ __all__ = [
     "DecodedTile",
     "ExtraColumn",
     "Limits",
+    "Node",
     "SceneHeader",
     "Tile",
     "TileReader",

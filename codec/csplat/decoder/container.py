@@ -44,7 +44,8 @@ class Tile:
     Attributes:
         index: position of the record in the index.
         offset: offset of the record in the file.
-        start: index of the tile's first splat in a whole decode.
+        start: index of the tile's first splat among those of all tiles.
+        level: level of detail; 0 is the scene.
         splat_count: number of splats.
         exponent: the step of the means is step × 2^exponent.
         corner: smallest lattice integer per axis.
@@ -57,6 +58,7 @@ class Tile:
     index: int
     offset: int
     start: int
+    level: int
     splat_count: int
     exponent: int
     corner: tuple[int, int, int]
@@ -81,14 +83,15 @@ class SceneHeader:
         profile: name of the profile, `base`.
         file_size: size of the file, bytes.
         index_size: size of the index, bytes.
-        splat_count: N.
+        splat_count: N, the splats of level 0.
         sh_degree: 0 to 4.
         antialiased, flat, coordinate_system, unit_metres, origin: as in `SplatModel`.
         attributes: attribute records, ids ascending.
         codebooks: codebook records, ids ascending.
         extras: extra columns.
         directory: records of all chunks that are not tiles.
-        tiles: tiles in the order of their splats.
+        tiles: tiles of level 0, in the order of their splats.
+        coarse_tiles: tiles of the coarser levels, whose indices follow.
     """
 
     version: tuple[int, int]
@@ -107,6 +110,12 @@ class SceneHeader:
     extras: tuple[ExtraColumn, ...]
     directory: tuple[_spec.DirectoryRecord, ...]
     tiles: tuple[Tile, ...]
+    coarse_tiles: tuple[Tile, ...] = ()
+
+    @property
+    def all_tiles(self) -> tuple[Tile, ...]:
+        """Tiles of all levels, in the order of the index."""
+        return self.tiles + self.coarse_tiles
 
     def attribute(self, attribute: int) -> _spec.AttributeRecord:
         """Return an attribute's record; raise `KeyError` for a band above the scene's degree."""
@@ -116,7 +125,7 @@ class SceneHeader:
         return self.attributes[attribute - 1]
 
     def chunk(self, kind: bytes) -> _spec.DirectoryRecord | None:
-        """Return the directory record of the META, CAMS, OPTS or SERR chunk, `None` if there is none."""
+        """Return the directory record of the META, CAMS, OPTS, SERR or TREE chunk, `None` if there is none."""
         return next((record for record in self.directory if record.type == kind), None)
 
 

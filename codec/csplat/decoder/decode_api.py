@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
-from csplat.decoder.container import SceneHeader, Tile, open_chunk, view_of
+from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk, view_of
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits, check_budget, float_bytes, integer_bytes
 from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk
@@ -27,6 +27,7 @@ from csplat.decoder.reconstruct import (
     write_tile,
 )
 from csplat.decoder.tiles import read_tile
+from csplat.decoder.tree import Node, read_nodes
 from csplat.errors import InputError, LimitError, counted
 from csplat.file_source import PageReleaser
 from csplat.model import SplatModel, trusted_model
@@ -96,7 +97,7 @@ class DecodeRequest:
         tiles: tiles to decode, in the order requested.
         degree: highest SH band to decode.
         limits: limits on the size of the result.
-        whole: True if all tiles and bands are decoded.
+        whole: True if level 0 or all levels are decoded with all bands.
     """
 
     view: memoryview
@@ -105,6 +106,11 @@ class DecodeRequest:
     degree: int
     limits: Limits
     whole: bool
+
+    @property
+    def output_header(self) -> SceneHeader:
+        """The header, without extra columns if a tile of a coarser level, which has none, is decoded."""
+        return replace(self.header, extras=()) if any(tile.level for tile in self.tiles) else self.header
 
 
 @dataclass(frozen=True)
@@ -130,14 +136,19 @@ class TileReader:
         """Header and index."""
         return self.request.header
 
+    @property
+    def nodes(self) -> tuple[Node, ...]:
+        """Nodes of the levels of detail."""
+        return read_nodes(self.request.view, self.header)
+
     def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
         """Decode tiles one after the other, each to a model with the metadata of `metadata_model`.
 
         Args:
-            tiles: indices of the tiles to decode, in the order requested; default: all.
+            tiles: indices of the tiles to decode, in the order requested; default: all of level 0.
         """
         header = self.header
-        chosen = header.tiles if tiles is None else [header.tiles[index] for index in tiles]
+        chosen = header.tiles if tiles is None else [header.all_tiles[index] for index in tiles]
         texts = self.metadata_model.metadata, self.metadata_model.cameras
         for _, arrays in _iterate(replace(self.request, tiles=chosen), self.threads):
             yield _model_of(header, arrays, texts)
@@ -156,12 +167,13 @@ def decode(
     Args:
         data: the whole file: a path, which is mapped into memory; an open binary file; or bytes.
         limits: limits on size and memory; default: the registry's.
-        tiles: indices of the tiles to decode, in the order requested; default: all.
+        tiles: indices of the tiles to decode, in the order requested, of any level; default: all of level 0.
+            `csplat.open(data).cut(...)` selects those of a coarser version of the scene.
         sh_degree: highest SH band to decode; default: all.
         threads: number of threads; default: one per processor, up to 8.
 
     Returns:
-        The splats. A part is bit for bit the same part of a whole decode.
+        The splats. A part is bit for bit the same part of a whole decode. Coarser levels have no extra columns.
 
     Examples:
         >>> import csplat
@@ -172,8 +184,8 @@ def decode(
         (1000, 3, 3)
 
     Raises:
-        FormatError: the file breaks a clause. A whole decode checks all clauses, including the CRC of every chunk; a
-            partial decode checks what it reads.
+        FormatError: the file breaks a clause. A whole decode checks all clauses, including the CRC of every chunk, but
+            does not read the payloads of coarser levels; a partial decode checks what it reads.
         UnsupportedError: the file needs a feature that this version does not have.
         LimitError: the file exceeds `limits`.
         InputError: an argument is invalid.
@@ -192,7 +204,7 @@ def decode_scene(
 ) -> DecodedScene:
     """Decode a file, and return its other content and the checks made as well; arguments and errors as in `decode`."""
     request = prepare_decode(data, limits, tiles, sh_degree)
-    header, degree = request.header, request.degree
+    header, degree = request.output_header, request.degree
     check_budget(header, request.tiles, degree, float_bytes(header, degree), request.limits, whole=request.whole)
     count = sum(tile.splat_count for tile in request.tiles)
     arrays = _allocate(count, lambda: SplatArrays.empty(count, degree, header), request)
@@ -207,7 +219,9 @@ def decode_scene(
     _write_all(request, write, threads)
     model = _model_of(header, arrays, texts)
     checks = ("header_crc", "index_crc", "chunk_crc")
-    return DecodedScene(header, model, options, bounds, (*checks, "all_chunk_crcs") if request.whole else checks)
+    return DecodedScene(
+        request.header, model, options, bounds, (*checks, "all_chunk_crcs") if request.whole else checks
+    )
 
 
 def decode_integers(
@@ -218,8 +232,8 @@ def decode_integers(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Decode the integer arrays of spec 9.2; arguments and errors as in `decode`."""
-    request = prepare_decode(data, limits, tiles, sh_degree)
+    """Decode the integer arrays of spec 9.2, by default those of all levels; arguments and errors as in `decode`."""
+    request = prepare_decode(data, limits, tiles, sh_degree, every_level=True)
     header, degree = request.header, request.degree
     check_budget(header, request.tiles, degree, integer_bytes(degree), request.limits, whole=request.whole)
     count = sum(tile.splat_count for tile in request.tiles)
@@ -286,9 +300,14 @@ def open_tiles(data: File, *, limits: Limits | None = None, threads: int | None 
 
 
 def prepare_decode(
-    data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None
+    data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None, *, every_level: bool = False
 ) -> DecodeRequest:
-    """Check header and index; arguments and errors as in `decode`."""
+    """Check header and index; arguments and errors as in `decode`.
+
+    Args:
+        data, limits, tiles, sh_degree: as in `decode`.
+        every_level: decode all levels by default.
+    """
     view = view_of(data)
     header = parse_header(view, whole=True)
     degree = header.sh_degree
@@ -296,12 +315,13 @@ def prepare_decode(
         if not 0 <= sh_degree <= _spec.SH_DEGREE_MAX:
             raise InputError(f"sh_degree is {sh_degree}, expected 0 to {_spec.SH_DEGREE_MAX}")
         degree = min(degree, sh_degree)
-    chosen: Sequence[Tile] = header.tiles
+    chosen: Sequence[Tile] = header.all_tiles if every_level else header.tiles
     if tiles is not None:
+        known = header.all_tiles
         for index in tiles:
-            if not 0 <= index < len(header.tiles):
-                raise InputError(f"tile {index} does not exist, the file has {counted(len(header.tiles), 'tile')}")
-        chosen = [header.tiles[index] for index in tiles]
+            if not 0 <= index < len(known):
+                raise InputError(f"tile {index} does not exist, the file has {counted(len(known), 'tile')}")
+        chosen = [known[index] for index in tiles]
     whole = tiles is None and degree == header.sh_degree
     return DecodeRequest(view, header, chosen, degree, limits or Limits(), whole)
 
@@ -311,7 +331,7 @@ def _prepare_tiles(
 ) -> DecodeRequest:
     """Prepare a decode that holds one tile in memory at a time."""
     request = prepare_decode(data, limits, tiles, sh_degree)
-    header, degree = request.header, request.degree
+    header, degree = request.output_header, request.degree
     splat_bytes = float_bytes(header, degree)
     check_budget(header, request.tiles, degree, splat_bytes, request.limits, whole=request.whole, at_once=False)
     return request
@@ -327,13 +347,17 @@ def _allocate(count: int, make: Callable[[], _T], request: DecodeRequest) -> _T:
 
 
 def read_side_chunks(request: DecodeRequest) -> tuple[dict[str, Any] | None, DeclaredBounds | None]:
-    """For a whole decode, read and check the chunks that no tile refers to (CHK-2); return options and bounds."""
+    """For a whole decode, read and check the chunks that no decoded tile refers to; return options and bounds."""
     if not request.whole:
         return None, None
     view, header = request.view, request.header
     for record in header.directory:
         if record.type not in _spec.CHUNK_NAMES:
             open_chunk(view, record, record.type, record.flags, "CHK-2")
+    read_nodes(view, header)
+    for tile in header.all_tiles[len(request.tiles) :]:  # CHK-8: of all levels or of level 0
+        for layer in tile.layers.values():
+            open_chunk(view, layer, _spec.CHUNK_TILE, TILE_FLAGS, "CHK-8")
     with np.errstate(all="ignore"):
         check_unnamed_codebooks(view, header)
     options = json_chunk(view, header, _spec.CHUNK_OPTIONS, request.limits.json_bytes)
@@ -361,7 +385,7 @@ def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], N
 
 def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile, SplatArrays]]:
     """Decode tiles in order, each to arrays of its own."""
-    header = request.header
+    header = request.output_header
     table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
     pages = PageReleaser(request.view)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from csplat import _spec
@@ -43,7 +43,9 @@ _RECORD_SIZES: Final = {
     "tile_size": _spec.TILE_RECORD_SIZE,
     "layer_size": _spec.LAYER_RECORD_SIZE,
 }
-_SINGLE_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+_SINGLE_CHUNKS = (
+    _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS, _spec.CHUNK_TREE,
+)  # fmt: skip
 
 
 def read_header(data: File) -> SceneHeader:
@@ -88,6 +90,7 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
     directory = read_directory(view, directory_at)
     check_codebook_chunks(directory, directory_at, codebooks)
     tiles = read_tiles(view, directory_at.stop, end - 4, head, attributes[_spec.ATTRIBUTE_MEANS - 1].step, codebooks)
+    _check_levels(tiles, directory, directory_at, file.version_minor)
     check_coverage(directory, directory_at, tiles, head, end, file.file_size)
     letters = "".join(_spec.DIRECTION_LETTER[direction] for direction in head.axes)
     return SceneHeader(
@@ -106,7 +109,8 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
         codebooks=codebooks,
         extras=extras,
         directory=directory,
-        tiles=tiles,
+        tiles=tiles[: sum(tile.level == 0 for tile in tiles)],
+        coarse_tiles=tiles[sum(tile.level == 0 for tile in tiles) :],
     )
 
 
@@ -317,8 +321,6 @@ def _check_chunk_type(record: _spec.DirectoryRecord, at: int) -> None:
         )
         if flags != registered:
             raise FormatError(_spec.ERROR_VALUE, flags_at, "CHK-4", f"flags of {name}", found=flags, wanted=registered)
-    elif record.type == _spec.CHUNK_TREE:
-        raise UnsupportedError(f"chunk type {name}", offset=at, clause="RES-2")
     elif flags & _spec.CHUNK_FLAG_CRITICAL:
         if name[0].islower():
             raise FormatError(_spec.ERROR_VALUE, flags_at, "DIR-6", f"the private chunk type {name} is critical")
@@ -364,7 +366,7 @@ def read_tiles(
 ) -> tuple[Tile, ...]:
     """Read the tile records, which fill the index from offset `at` up to its CRC at `end`."""
     known = {book.codebook_id for book in codebooks}
-    tiles = []
+    tiles: list[Tile] = []
     start = 0
     for index in range(head.tile_count):
         tile, size = _read_tile(view, at, end, index, start, head)
@@ -376,10 +378,29 @@ def read_tiles(
     if at != end:
         found = f"{end - at} bytes"
         raise FormatError(_spec.ERROR_INDEX, at, "IDX-2", "bytes follow the last tile", found=found, wanted="the CRC")
-    if start != head.splat_count:
+    count = sum(tile.splat_count for tile in tiles if tile.level == 0)
+    if count != head.splat_count:
         offsets = _spec.INDEX_HEAD_OFFSETS
-        refuse_field(_spec.ERROR_INDEX, "IDX-7", head, _spec.HEADER_SIZE, offsets, "splat_count", start)
+        refuse_field(_spec.ERROR_INDEX, "IDX-7", head, _spec.HEADER_SIZE, offsets, "splat_count", count)
     return tuple(tiles)
+
+
+def _check_levels(
+    tiles: Sequence[Tile], directory: Sequence[_spec.DirectoryRecord], directory_at: range, version_minor: int
+) -> None:
+    """Check TIL-12 and TRE-1; directory records are at `directory_at`."""
+    offsets = _spec.TILE_RECORD_OFFSETS
+    for before, tile in zip([0, *(tile.level for tile in tiles)], tiles, strict=False):
+        most = 0 if version_minor == 2 else 255
+        if not before <= tile.level <= most:
+            refuse_field(_spec.ERROR_INDEX, "TIL-12", tile, tile.offset, offsets, "level", f"{before} to {most}")
+    coarse = next((tile for tile in tiles if tile.level > 0), None)
+    tree_at = next((at for at, one in zip(directory_at, directory, strict=True) if one.type == _spec.CHUNK_TREE), None)
+    if coarse is not None and tree_at is None:
+        at, detail = coarse.offset + offsets["level"], f"a tile of level {coarse.level}, and no TREE chunk"
+        raise FormatError(_spec.ERROR_INDEX, at, "TRE-1", detail)
+    if coarse is None and tree_at is not None:
+        raise FormatError(_spec.ERROR_INDEX, tree_at, "TRE-1", "a TREE chunk, and no tile of a level above 0")
 
 
 def check_coverage(
@@ -422,19 +443,18 @@ def _read_tile(view: memoryview, at: int, end: int, index: int, start: int, head
     if after > end:
         _ends_early(at)
     check_reserved(record, at, _spec.TILE_RECORD_OFFSETS)
-    if record.level != 0:
-        refuse_field(_spec.ERROR_RESERVED, "RES-1", record, at, _spec.TILE_RECORD_OFFSETS, "level", 0)
     raw = bytes(view[tables_at:after])
     tile = Tile(
         index=index,
         offset=at,
         start=start,
+        level=record.level,
         splat_count=record.splat_count,
         exponent=record.exponent,
         corner=record.corner,
         extent=record.extent,
         max_scale=record.max_scale,
-        layers=_read_layers(view, layers_at, record.layer_count, head),
+        layers=_read_layers(view, layers_at, record, head),
         codebook_ids=tuple(int.from_bytes(raw[i : i + 2], "little") for i in range(0, len(raw), 2)),
     )
     return tile, after - at
@@ -444,10 +464,12 @@ def _ends_early(at: int) -> NoReturn:
     raise FormatError(_spec.ERROR_INDEX, at, "IDX-2", "the index ends within a tile")
 
 
-def _read_layers(view: memoryview, at: int, count: int, head: _spec.IndexHead) -> dict[int, _spec.LayerRecord]:
+def _read_layers(
+    view: memoryview, at: int, tile: _spec.TileRecord, head: _spec.IndexHead
+) -> dict[int, _spec.LayerRecord]:
     layers: dict[int, _spec.LayerRecord] = {}
     offsets, last = _spec.LAYER_RECORD_OFFSETS, -1
-    for i in range(count):
+    for i in range(tile.layer_count):
         record_at = at + i * head.layer_size
         record = _spec.unpack_layer_record(view, record_at)
         check_reserved(record, record_at, offsets)
@@ -462,8 +484,8 @@ def _read_layers(view: memoryview, at: int, count: int, head: _spec.IndexHead) -
         layers[last] = record
     if not layers:
         raise FormatError(_spec.ERROR_INDEX, at, "TIL-2", "a tile without layers", wanted="layer 0")
-    if (_spec.LAYER_EXTRA in layers) != (head.extra_count > 0):
-        detail = f"layer EXTRA for {head.extra_count} extra columns"
+    if (_spec.LAYER_EXTRA in layers) != (head.extra_count > 0 and tile.level == 0):
+        detail = f"layer EXTRA at level {tile.level} for {head.extra_count} extra columns"
         raise FormatError(_spec.ERROR_INDEX, at, "TIL-5", detail, found=[*layers])
     return layers
 

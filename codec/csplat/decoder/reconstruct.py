@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.decoder.blocks import Block, CodebookBlock, ColumnBlock, SparseBlock, TileBlocks, runs, work_dtype
-from csplat.decoder.container import SceneHeader, refuse_field
+from csplat.decoder.container import SceneHeader, Tile, refuse_field
 from csplat.decoder.entropy import Ints
 from csplat.errors import FormatError
 from csplat.types import F32, F64
@@ -100,8 +100,9 @@ def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: 
         {band: header.attribute(attribute) for band, attribute in bands.items()},
         out.shN,
     )
-    for bits, column in zip(source.extra, out.extra.values(), strict=True):
-        column.view(bits.dtype)[:] = bits
+    if out.extra:  # a cut of coarser levels has none
+        for bits, column in zip(source.extra, out.extra.values(), strict=True):
+            column.view(bits.dtype)[:] = bits
 
 
 def empty_integers(count: int, tile_count: int, degree: int) -> dict[str, NDArray[Any]]:
@@ -174,17 +175,14 @@ def check_max_scale(source: TileBlocks, record: _spec.AttributeRecord, largest: 
 # Lattices: means, scales, colours (7.1, 7.2, 7.4) --------------------------------------------------
 
 
-def tile_boxes(header: SceneHeader) -> F64:
-    """Return the boxes around the centres of each tile's splats (spec 4.3.5).
+def tile_boxes(header: SceneHeader, tiles: Sequence[Tile]) -> F64:
+    """Return the boxes around the centres of the splats of some tiles (spec 4.3.5).
 
     Returns:
         [T, 2, 3] float64: smallest and largest corner in scene units, relative to the origin.
     """
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
-    boxes = np.empty((len(header.tiles), 2, 3), np.float64)
-    for tile in header.tiles:
-        boxes[tile.index] = tile.corners(step)
-    return boxes
+    return np.array([tile.corners(step) for tile in tiles], np.float64).reshape(len(tiles), 2, 3)
 
 
 def lattice_rows(

@@ -27,6 +27,7 @@ from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder import EncodeOptions
 from csplat.encoder.container import (
     FileChunk,
+    FileNode,
     FileTile,
     IndexedCodebook,
     LazyPayload,
@@ -34,6 +35,8 @@ from csplat.encoder.container import (
     chunk_crc,
     file_pieces,
     json_payload,
+    order_nodes,
+    tree_chunk,
 )
 from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
@@ -43,7 +46,7 @@ from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene_source import SceneSource
 from csplat.splat_file import SplatFile
 from csplat.splat_file import open as opened
-from csplat.tile_copy import ChunkPrefetcher, TileCopier, chunk_payload, scene_fields
+from csplat.tile_copy import ChunkPrefetcher, TileCopier, chunk_payload, copy_nodes, scene_fields
 
 #: Fields that must be equal because they determine how all splats of a file are rendered: words for messages, name.
 _SHARED_FIELDS = (
@@ -129,17 +132,21 @@ def merge(
                 why = f"they have {len(books.records):,} codebooks together, a file has at most {codebooks_max:,}"
         if why:
             return _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
-        tiles = [
-            tile
-            for one, scene, new in zip(windows, scenes, ids, strict=True)
-            for tile in renumber_tiles(one, scene.header, new, spool, len(scenes))
-        ]
+        nodes: list[FileNode] = []
+        for one, scene, new in zip(windows, scenes, ids, strict=True):
+            copied = renumber_tiles(one, scene.header, new, spool, len(scenes))
+            base = len(nodes)
+            own = copy_nodes(scene.nodes, range(len(scene.nodes)), copied)
+            nodes += [replace(node, parent=None if node.parent is None else base + node.parent) for node in own]
+        nodes = order_nodes(nodes)
+        tiles = [tile for node in nodes for tile in node.tiles]
+        tree = [tree_chunk(nodes)] if any(tile.level for tile in tiles) else []
         together = replace(
             fields[0],
             axes=next((one.axes for one in fields if any(one.axes)), fields[0].axes),
             unit_metres=next((one.unit_metres for one in fields if one.unit_metres), 0.0),
             codebooks=books.records,
-            chunks=[*_common_chunks(scenes), *books.chunks],
+            chunks=[*tree, *_common_chunks(scenes), *books.chunks],
         )
         return _write_merged(together, tiles, output)
 
@@ -199,7 +206,7 @@ def _write_merged(
         for part in file_pieces(scene, tiles):
             stream.write(part)
             size += len(part)
-    return MergeResult(sum(tile.splat_count for tile in tiles), len(tiles), size)
+    return MergeResult(sum(tile.splat_count for tile in tiles if tile.level == 0), len(tiles), size)
 
 
 def _encode_again(
@@ -308,7 +315,7 @@ class MergedCodebooks:
 
     def take(self, window: FileWindow, header: SceneHeader) -> dict[int, int]:
         """Add the codebooks that the tiles of a file reference; return the new ids by old id."""
-        used = {identity for tile in header.tiles for identity in tile.codebook_ids}
+        used = {identity for tile in header.all_tiles for identity in tile.codebook_ids}
         chunks = [one for one in header.directory if one.type == _spec.CHUNK_CODEBOOK and one.id in used]
         window.fetch((one.offset, one.size) for one in chunks)
         ids = {}
@@ -355,7 +362,7 @@ def renumber_tiles(
     naming = [
         (tile, tile.layers[layer])
         for layer in range(_spec.SH_DEGREE_MAX + 1)
-        for tile in header.tiles
+        for tile in header.all_tiles
         if layer in _naming_layers(header, tile, ids) & tile.layers.keys()
     ]
     turn = ChunkPrefetcher(window, [record for _, record in naming], files)
@@ -365,7 +372,7 @@ def renumber_tiles(
             changed.setdefault(tile.index, {})[record.layer] = stored
     window.forget()
     copies = TileCopier(window, files)
-    tiles = [copies.of(tile, changed.get(tile.index)) for tile in header.tiles]
+    tiles = [copies.of(tile, changed.get(tile.index)) for tile in header.all_tiles]
     return [
         replace(tile, codebook_ids=tuple(sorted({ids[identity] for identity in tile.codebook_ids}))) for tile in tiles
     ]

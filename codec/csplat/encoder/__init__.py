@@ -2,7 +2,7 @@
 
 `encode` and `encode_with_report` encode in one call, with the given options or to a `Target`. `EncodePlan` and
 `encode_tiles` encode in steps, for callers that refit colours to the quantised geometry; `fix_quantisation` is for
-callers that tune all values.
+callers that tune all values. `encode_levels` adds levels of detail.
 """
 
 from __future__ import annotations
@@ -10,12 +10,15 @@ from __future__ import annotations
 from csplat.encoder.encode_api import encode, encode_with_report
 from csplat.encoder.encode_options import PRESETS, Deflate, EncodeOptions, MeansCoding, PresetName, ShCoding
 from csplat.encoder.encode_plan import EncodePlan, Origin
+from csplat.encoder.error_bounds import covariance_entries
 from csplat.encoder.error_targets import meet_bounds
 from csplat.encoder.fixed_quantisation import DecodedValues, FixedQuantisation, FreeValues, fix_quantisation
 from csplat.encoder.kmeans import cluster
+from csplat.encoder.levels import LevelNode, encode_levels
 from csplat.encoder.pipeline import EncodedTiles, EncodeReport, EncodeResult, encode_tiles
 from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.quantisation_classes import max_class_count
+from csplat.encoder.shape_codebook import mean_axes
 from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor
 from csplat.encoder.target import SearchReport, Target
 
@@ -32,6 +35,7 @@ __all__ = [
     "FreeValues",
     "GaussNewtonBlocks",
     "Importance",
+    "LevelNode",
     "MeansCoding",
     "Origin",
     "PresetName",
@@ -41,10 +45,13 @@ __all__ = [
     "apply_weight_floor",
     "canonicalise_shape",
     "cluster",
+    "covariance_entries",
     "encode",
+    "encode_levels",
     "encode_tiles",
     "encode_with_report",
     "fix_quantisation",
     "max_class_count",
+    "mean_axes",
     "meet_bounds",
 ]

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from csplat import _spec
 from csplat.encoder.entropy import DeflateSettings, unsigned_stream
+
+#: Chunks that no renderer needs, which are last in a file with levels of detail.
+_LAST = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,7 @@ class FileTile:
     max_scale: float
     layers: Mapping[int, Payload]
     codebook_ids: tuple[int, ...] = ()
+    level: int = 0
 
 
 @dataclass(frozen=True)
@@ -70,7 +74,7 @@ class IndexedCodebook:
 
 @dataclass(frozen=True)
 class SceneFields:
-    """The contents of a file except tiles."""
+    """The contents of a file except tiles; the chunks may include one of nodes (`tree_chunk`)."""
 
     sh_degree: int
     scene_flags: int
@@ -81,6 +85,34 @@ class SceneFields:
     extras: Sequence[_spec.ExtraRecord] = ()
     codebooks: Sequence[IndexedCodebook] = ()
     chunks: Sequence[FileChunk] = field(default=())
+
+
+@dataclass(frozen=True)
+class FileNode:
+    """A node of the levels of detail: the index of its parent or `None`, its tiles, its error in scene units."""
+
+    parent: int | None
+    tiles: Sequence[FileTile]
+    error: float = 0.0
+
+
+def tree_chunk(nodes: Sequence[FileNode]) -> FileChunk:
+    """Return the TREE chunk (spec 5.7) of nodes in the order of their tiles."""
+    records = (
+        _spec.NodeRecord(_spec.NO_PARENT if node.parent is None else node.parent, len(node.tiles), node.error)
+        for node in nodes
+    )
+    return FileChunk(_spec.CHUNK_TREE, b"".join(map(_spec.pack_node_record, records)))
+
+
+def order_nodes(nodes: Sequence[FileNode]) -> list[FileNode]:
+    """Return nodes by ascending level, as the index requires (TIL-12), with renumbered parents."""
+    order = sorted(range(len(nodes)), key=lambda number: nodes[number].tiles[0].level)
+    position = {number: place for place, number in enumerate(order)}
+    return [
+        replace(nodes[number], parent=None if (parent := nodes[number].parent) is None else position[parent])
+        for number in order
+    ]
 
 
 def json_payload(value: Any, deflate: DeflateSettings) -> bytes:
@@ -128,14 +160,19 @@ def _ordered_chunks(
     scene: SceneFields, tiles: Sequence[FileTile]
 ) -> Iterator[tuple[tuple[int, int] | None, FileChunk]]:
     """Yield each chunk with its (tile, layer); `None` for chunks other than tiles."""
-    yield from ((None, chunk) for chunk in scene.chunks if chunk.type != _spec.CHUNK_CODEBOOK)
+    tree = [chunk for chunk in scene.chunks if chunk.type == _spec.CHUNK_TREE]
+    others = [chunk for chunk in scene.chunks if chunk.type not in (_spec.CHUNK_CODEBOOK, _spec.CHUNK_TREE)]
+    last = [chunk for chunk in others if tree and chunk.type in _LAST]
+    yield from ((None, chunk) for chunk in (*tree, *others) if chunk not in last)
+    coarsest_first = sorted(enumerate(tiles), key=lambda item: -item[1].level)
     for layer in _spec.LAYER_NAMES:
         for chunk in scene.chunks:
             if chunk.type == _spec.CHUNK_CODEBOOK and chunk.layer == layer:
                 yield None, chunk
-        for number, tile in enumerate(tiles):
+        for number, tile in coarsest_first:
             if layer in tile.layers:
                 yield (number, layer), FileChunk(_spec.CHUNK_TILE, tile.layers[layer], layer=layer)
+    yield from ((None, chunk) for chunk in last)
 
 
 def chunk_crc(kind: bytes, payload: Payload) -> int:
@@ -175,7 +212,7 @@ def _index(
         tile_size=_spec.TILE_RECORD_SIZE,
         layer_size=_spec.LAYER_RECORD_SIZE,
         reserved_0=0,
-        splat_count=sum(tile.splat_count for tile in tiles),
+        splat_count=sum(tile.splat_count for tile in tiles if tile.level == 0),
         tile_count=len(tiles),
         directory_count=len(directory),
         codebook_count=len(scene.codebooks),
@@ -199,7 +236,7 @@ def _index(
             _spec.pack_tile_record(
                 _spec.TileRecord(
                     splat_count=tile.splat_count,
-                    level=0,
+                    level=tile.level,
                     layer_count=len(tile.layers),
                     table_count=len(tile.codebook_ids),
                     exponent=tile.exponent,

@@ -21,7 +21,16 @@ from csplat import _spec
 from csplat.disk_files import atomic_writer
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import CodingParameters, StepFactors
-from csplat.encoder.container import FileChunk, FileTile, SceneFields, file_pieces, json_payload, tile_payload
+from csplat.encoder.container import (
+    FileChunk,
+    FileNode,
+    FileTile,
+    SceneFields,
+    file_pieces,
+    json_payload,
+    tile_payload,
+    tree_chunk,
+)
 from csplat.encoder.encode_plan import EncodePlan, Origin
 from csplat.encoder.error_bounds import (
     ErrorSums,
@@ -147,14 +156,16 @@ class EncodedTiles:
     Attributes:
         plan: the complete plan.
         codebooks: codebooks of the file.
-        tiles: the tiles.
+        tiles: the tiles of the scene.
         errors: errors to declare.
+        nodes: nodes of the levels of detail with their tiles, by ascending level; none if there is one level.
     """
 
     plan: EncodePlan
     codebooks: FileCodebooks
     tiles: Sequence[EncodedTile]
     errors: ErrorSums
+    nodes: Sequence[FileNode] = ()
 
     @property
     def source_index(self) -> NDArray[np.int64]:
@@ -162,6 +173,10 @@ class EncodedTiles:
         rows = np.concatenate([part.rows for part in self.tiles]) if self.tiles else np.zeros(0, np.int64)
         index: NDArray[np.int64] = self.plan.origin.source_index[rows]
         return index
+
+    def with_node_errors(self, errors: Sequence[float]) -> EncodedTiles:
+        """Return the same tiles with other errors of `nodes`."""
+        return replace(self, nodes=[replace(node, error=e) for node, e in zip(self.nodes, errors, strict=True)])
 
     def against(self, source: SplatModel, decoded: SplatModel) -> EncodedTiles:
         """Return the same tiles with declared errors that refer to another scene than the one encoded.
@@ -190,8 +205,13 @@ class EncodedTiles:
     ) -> EncodeReport:
         """Write the file to a stream; arguments and errors are those of `write`."""
         settings = {**(metadata or {}), **encoding_settings(self.plan, self.codebooks.sh_plan)}
-        scene = scene_fields(self.plan, self.codebooks, file_chunks(self.plan, self.errors, settings))
+        chunks = file_chunks(self.plan, self.errors, settings)
         tiles = [part.tile for part in self.tiles]
+        if self.nodes:
+            tiles = [tile for node in self.nodes for tile in node.tiles]
+        if any(tile.level for tile in tiles):
+            chunks.append(tree_chunk(self.nodes))
+        scene = scene_fields(self.plan, self.codebooks, chunks)
         size, payloads = 0, sum(len(payload) for tile in tiles for payload in tile.layers.values())
         for piece in file_pieces(scene, tiles):
             stream.write(piece)

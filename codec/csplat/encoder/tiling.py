@@ -64,7 +64,7 @@ def cut_scene(
     classes: QuantisationClasses | None = None,
     buckets: Sequence[Rows] | None = None,
 ) -> list[TileSplats]:
-    """Partition a scene into tiles: by class or bucket, by outliers, and by space.
+    """Partition a scene into tiles: by bucket, by class, by outliers, and by space.
 
     An outlier is a value that does not fit the file's lattice and would coarsen that of up to 65,535 other splats in
     its tile. Splats with outliers in the same attributes share tiles, after the other tiles of their class or bucket.
@@ -73,15 +73,17 @@ def cut_scene(
         model: the scene.
         parameters: steps and tile size.
         classes: quantisation classes; `None`: all splats have the same steps.
-        buckets: `bucket_rows` of the model, if known.
+        buckets: rows of the parts to cut by themselves; default: the whole scene with classes, otherwise `bucket_rows`.
     """
     flags = _outlier_flags(model, parameters)
+    groups, factors = flags, [SAME_STEPS]
     if classes is not None:
         groups = classes.index if flags is None else classes.index + np.uint8(len(classes.factors)) * flags
-        return _cut_groups(model.means, np.arange(len(model)), groups, classes.factors, parameters)
+        factors = [*classes.factors]
+        buckets = [np.arange(len(model))] if buckets is None else buckets
     tiles: list[TileSplats] = []
     for rows in bucket_rows(model.means) if buckets is None else buckets:
-        tiles += _cut_groups(model.means, rows, None if flags is None else flags[rows], [SAME_STEPS], parameters)
+        tiles += _cut_groups(model.means, rows, None if groups is None else groups[rows], factors, parameters)
     return tiles
 
 

@@ -13,13 +13,15 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from csplat.decoder import decode, open_tiles
+from csplat.decoder.tree import select_tiles
 from csplat.detect import detect_content, detect_name, read_head, refusal
 from csplat.disk_files import local_file
 from csplat.editing.transform import DEFAULT_AXES, convert_axes
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.file_source import File
 from csplat.formats.format import ARRAYS, Format
 from csplat.lint import Finding, refuse
@@ -257,9 +259,24 @@ def format_by_name(name: str) -> Format:
 
 
 @contextmanager
-def _open_csplat(path: Path) -> Iterator[SceneSource]:
+def _open_csplat(path: Path, level: int = 0) -> Iterator[SceneSource]:
+    """Open a level of detail (`Format.open`, `Format.open_level`); a file with level 0 alone is read as a whole."""
     opened = open_tiles(path)
-    yield SceneSource(opened.header.splat_count, opened.metadata_model, opened.models)
+    header, last = opened.header, max((tile.level for tile in opened.header.coarse_tiles), default=0)
+    if level > last:
+        wanted = "0: it has no other levels" if last == 0 else f"0 to {last}"
+        raise InputError(f"{path.name}: the level is {level}, expected {wanted}")
+    if last == 0:
+        yield SceneSource(header.splat_count, opened.metadata_model, opened.models)
+        return
+    cuts = [select_tiles(header, opened.nodes, level=one) for one in range(last + 1)]
+    counts = tuple(sum(tile.splat_count for tile in tiles) for tiles in cuts)
+    metadata_model = replace(opened.metadata_model, extra={}) if level else opened.metadata_model
+    blocks = partial(opened.models, [tile.index for tile in cuts[level]] if level else None)
+    findings = [
+        Finding("levels", last, f"{counted(last, 'coarser level')} of detail: level {level} alone is read", "note")
+    ]
+    yield SceneSource(counts[level], metadata_model, blocks, findings, levels=counts)
 
 
 def _write_csplat(path: Path, scene: SceneSource) -> None:
@@ -283,6 +300,7 @@ _PLY_FORMAT = Format(
 _CSPLAT_FORMAT = Format(
     name=_CSPLAT,
     open=_open_csplat,
+    open_level=_open_csplat,
     write=_write_csplat,
     degree=MAX_SH_DEGREE,
     splat_bytes=(7.0, 8.0, 9.0, 10.0, 10.3),

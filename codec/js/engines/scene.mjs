@@ -152,7 +152,12 @@ export class SplatScene {
   /** Fetch SH bands as soon as layer 0 has arrived: no earlier, to not compete with it, and no later, to not idle. */
   fetchBandsNext() {
     const { life, header, degree } = this;
-    const base = header.tiles.reduce((end, { layers: [{ offset, size }] }) => Math.max(end, offset + size), 0); // layer 0 comes first
+    const end = header.tiles.reduce((most, { layers: [{ offset, size }] }) => Math.max(most, offset + size), 0); // layer 0 comes first
+    // Coarser tiles come before it, but are not fetched.
+    const base = header.coarseTiles.reduce(
+      (sum, { layers: [{ offset, size }] }) => sum - (offset < end ? size : 0),
+      end,
+    );
     life.onBytes = () => {
       if (life.received < base || life.signal.aborted) return;
       life.onBytes = () => {};

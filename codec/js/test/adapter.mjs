@@ -1,6 +1,7 @@
 // Adapts this decoder to the protocol of the conformance runner (conformance/IMPLEMENTERS.md), one process per file:
 //
 //   csplat conformance decoder --cmd 'node codec/js/test/adapter.mjs {input} {outdir}'
+//   csplat conformance decoder --cmd 'node codec/js/test/adapter.mjs --cuts {input} {cuts}'
 //
 // With --serve, one process answers for any number of files. A request on standard input is a u32, the file's size, and the
 // file; an answer is a line of JSON, either {code, offset, clause} or {header, arrays: {name: [bytes, SHA-256]}}.
@@ -10,12 +11,14 @@ import { readFileSync, writeFileSync } from 'node:fs';
 import { join } from 'node:path';
 import { pathToFileURL } from 'node:url';
 
+import { cutOptions } from './cuts.mjs';
+
 const FLOATS = ['means', 'quats', 'scales', 'opacities', 'sh0', 'shN'];
 const INTEGERS = ['opacities', 'scales', 'quats', 'means', 'sh0', 'sh1', 'sh2', 'sh3', 'sh4', 'tile_splats', 'exponents']; // prettier-ignore
 
 /** Folder of the decoder; a copy may be tested instead. */
 const folder = process.env.CSPLAT_JS ? pathToFileURL(`${process.env.CSPLAT_JS}/`) : new URL('../', import.meta.url);
-const { CsplatError, decode } = await import(new URL('decoder.mjs', folder).href);
+const { CsplatError, CsplatReader, decode } = await import(new URL('decoder.mjs', folder).href);
 const { zlibInflate } = await import(new URL('inflate.mjs', folder).href);
 const inflate = await zlibInflate();
 
@@ -53,7 +56,7 @@ async function decoded(bytes, limits = {}) {
   const facts = {
     profile: header.profile,
     splat_count: header.splatCount,
-    tile_count: header.tiles.length,
+    tile_count: header.tiles.length + header.coarseTiles.length,
     sh_degree: header.shDegree,
     scene_flags: ['antialiased', 'flat'].filter((name) => header[name]),
     axes: header.axes,
@@ -93,6 +96,30 @@ async function once(input, outdir) {
   }
 }
 
+/**
+ * Print the tiles of cuts, one a line.
+ *
+ * @param {string} input
+ * @param {string} cuts path of a text with lines such as `level 1`, `pixel_size 0.5`, `splats 100`
+ */
+async function cut(input, cuts) {
+  try {
+    const { buffer, byteOffset, length } = readFileSync(input);
+    const reader = await CsplatReader.open(buffer.slice(byteOffset, byteOffset + length));
+    await reader.nodes();
+    for (const line of readFileSync(cuts, 'utf8').split('\n').filter(Boolean)) {
+      const tiles = await reader.cut(cutOptions(line)).catch((error) => {
+        if (error instanceof CsplatError) return [error.code];
+        throw error;
+      });
+      console.log(tiles.join(' '));
+    }
+  } catch (error) {
+    console.log(refusal(error));
+    process.exitCode = 1;
+  }
+}
+
 /** @param {Uint8Array} bytes @param {object} limits */
 async function answer(bytes, limits) {
   try {
@@ -124,6 +151,7 @@ async function serve(limits) {
   }
 }
 
-const [first, second] = process.argv.slice(2);
+const [first, second, third] = process.argv.slice(2);
 if (first === '--serve') await serve(JSON.parse(second ?? '{}'));
+else if (first === '--cuts') await cut(second, third);
 else await once(first, second);

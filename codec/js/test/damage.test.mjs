@@ -50,6 +50,7 @@ test('flipped bits under repaired checksums give a scene or a CsplatError', asyn
     ['valid/rich', 7],
     ['extreme/seeded', 23],
     ['valid/codebook_shape_escape', 3],
+    ['valid/levels_of_the_rich_scene', 11],
   ]) {
     const file = vector(name);
     let random = 1;

@@ -176,9 +176,14 @@ test('scenes are upright in the axes of an engine', () => {
   }
 });
 
-for (const options of [{}, { progressive: true }, { workers: 0 }]) {
-  test(`a load requests every byte once: ${JSON.stringify(options)}`, async () => {
-    const bytes = vector('valid/combined_codebooks');
+for (const [name, options] of [
+  ['valid/combined_codebooks', {}],
+  ['valid/combined_codebooks', { progressive: true }],
+  ['valid/combined_codebooks', { workers: 0 }],
+  ['valid/levels_of_the_rich_scene', { progressive: true }],
+]) {
+  test(`${name}: a load requests every byte at most once: ${JSON.stringify(options)}`, async () => {
+    const bytes = vector(name);
     const asked = [];
     const fetch = async (_url, { headers }) => {
       const [first, last] = new Headers(headers).get('range').slice(6).split('-').map(Number);

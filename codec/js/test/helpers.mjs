@@ -7,6 +7,7 @@ import { CRC_SIZE, crc32 } from '../checksums.mjs';
 import { CsplatError, readHeader } from '../decoder.mjs';
 import { streamInflate } from '../inflate.mjs';
 import { DIRECTORY_RECORD_OFFSETS, HEADER_OFFSETS, HEADER_SIZE, LAYER_RECORD_OFFSETS } from '../spec.mjs';
+import { allTiles } from '../tile_records.mjs';
 
 const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
 
@@ -69,7 +70,8 @@ export async function refusal(run) {
  * @param {(bytes: Uint8Array, view: DataView) => void} change
  */
 export function forged(file, change) {
-  const { directory, tiles, indexSize } = readHeader(file);
+  const header = readHeader(file);
+  const { directory, indexSize } = header;
   const bytes = file.slice();
   const view = new DataView(bytes.buffer);
   change(bytes, view);
@@ -77,7 +79,7 @@ export function forged(file, change) {
   seal(0, HEADER_OFFSETS.header_crc);
   const [toCrc, layerToCrc] = [DIRECTORY_RECORD_OFFSETS, LAYER_RECORD_OFFSETS].map(({ crc, offset }) => crc - offset);
   for (const { offset, size, offsetField } of directory) seal(offset, offset + size, offsetField + toCrc);
-  for (const { offset, size, offsetField } of tiles.flatMap((tile) => tile.layers))
+  for (const { offset, size, offsetField } of allTiles(header).flatMap((tile) => tile.layers))
     seal(offset, offset + size, offsetField + layerToCrc);
   seal(HEADER_SIZE, HEADER_SIZE + indexSize - CRC_SIZE);
   return bytes;

@@ -29,7 +29,18 @@ from csplat_authoring.samples import (
     tile,
     with_stream_codings,
 )
-from csplat_authoring.scene import PLAIN, Attribute, Block, Chunk, Codebook, Extra, Scene, StatedErrors, Stream
+from csplat_authoring.scene import (
+    PLAIN,
+    Attribute,
+    Block,
+    Chunk,
+    Codebook,
+    Extra,
+    Node,
+    Scene,
+    StatedErrors,
+    Stream,
+)
 
 _extreme = partial(valid_recipe, "extreme")
 _RUNS = (_spec.TRANSFORM_RUN_LENGTH,)
@@ -234,6 +245,13 @@ def _lattice(step: float, mapping: int = _spec.MAPPING_LATTICE, chroma_shift: in
 _COLUMN = _spec.COLUMN_MAX
 
 
+def _levels() -> Scene:
+    top = 255  # largest u8
+    tiles = [tile(level, 1, level=level) for level in range(top + 1)]
+    nodes = [Node(level + 1, 1, 1.0 if level else 0.0) for level in range(top)]
+    return scene(tiles=tiles, nodes=(*nodes, Node(_spec.NO_PARENT, 1, 1.0)))
+
+
 def edge_recipes() -> list[Recipe]:
     """Return the recipes of this module."""
     lifted = Attribute(_spec.MAPPING_YCOCG, 2.0**-30, chroma_shift=16)
@@ -262,6 +280,12 @@ def edge_recipes() -> list[Recipe]:
                 ),
             )
             for name, degree in (("column_limits_of_bands", 3), ("column_limits_of_band_4", 4))
+        ),
+        _extreme(
+            "levels_chain_of_256",
+            "a node of one splat on every level, all of them with the same error but for level 0",
+            "TIL-12 TRE-5 TRE-8 TRE-9",
+            _levels(),
         ),
         _extreme(
             "codebook_bounds",

@@ -336,7 +336,7 @@ class CellTree:
     @classmethod
     def of(cls, header: SceneHeader, count: int, most: int) -> CellTree:
         """Divide space into cells of about `most` of `count` splats, estimated from the tiles of a file."""
-        boxes = tile_boxes(header)
+        boxes = tile_boxes(header, header.tiles)
         points = (boxes[:, None, 0] + _OCTANT_CENTRES * (boxes[:, None, 1] - boxes[:, None, 0])).reshape(-1, 3)
         weights = np.repeat([float(tile.splat_count) for tile in header.tiles], len(_OCTANT_CENTRES))
         depth = max(0, int(np.ceil(np.log2(max(1.0, count / most))))) if len(points) else 0
@@ -452,7 +452,7 @@ class PartnerSearch:
     def _boxes(self) -> tuple[F64, F64]:
         """Boxes of the tiles, [T, 2, 3], and the distances within which their splats' partners are expected, [T]."""
         tiles, step = self.opened.header.tiles, self.opened.header.attribute(_spec.ATTRIBUTE_MEANS).step
-        boxes = tile_boxes(self.opened.header)
+        boxes = tile_boxes(self.opened.header, self.opened.header.tiles)
         # The diagonal of a cell, plus the rounding of the centre to float32.
         return boxes, np.array([np.ldexp(step, tile.exponent) for tile in tiles]) + np.abs(boxes).max((1, 2)) * 2.0**-21
 

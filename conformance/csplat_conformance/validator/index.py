@@ -25,6 +25,7 @@ _SIZES_MIN = {
 _STEP_MIN = Fraction(1, 2**1022)
 _SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
+_LEVEL_MAX = 255  # the largest value of a u8
 _AXIS_OF_DIRECTION = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
 
 Head = PlacedRecord[_spec.IndexHead]
@@ -39,6 +40,7 @@ class Index:
     Attributes:
         head: the index head.
         degree_max: largest SH degree of the file's version.
+        level_max: highest level of detail of the file's version.
         degree: `sh_degree`; `None` if that version does not support it.
         attributes: attribute records by registry value.
         steps: steps that obey ATT-6, by registry value.
@@ -52,6 +54,7 @@ class Index:
 
     head: Head
     degree_max: int
+    level_max: int
     degree: int | None
     attributes: dict[int, AttributeAt] = field(default_factory=dict)
     steps: dict[int, float] = field(default_factory=dict)
@@ -89,7 +92,8 @@ def read_records(view: memoryview, end: int, version_minor: int, log: ViolationL
     head = read_record(view, _spec.IndexHead, start, "index")
     record = head.record
     degree_max = 3 if version_minor == 2 else _spec.SH_DEGREE_MAX  # IDX-3
-    index = Index(head, degree_max, record.sh_degree if record.sh_degree <= degree_max else None)
+    level_max = 0 if version_minor == 2 else _LEVEL_MAX  # TIL-12
+    index = Index(head, degree_max, level_max, record.sh_degree if record.sh_degree <= degree_max else None)
     kinds = ("attribute", "codebook", "extra", "directory", "tile")
     needed = index.size_of("head") + sum(getattr(record, f"{kind}_count") * index.size_of(kind) for kind in kinds)
     if start + needed > end:
@@ -281,7 +285,9 @@ def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], name
     names.add(name)
 
 
-_SINGLE_CHUNKS = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+#: Chunks that 4.3.6 recommends at the end of a file with levels.
+_LAST_CHUNKS = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+_SINGLE_CHUNKS = (_spec.CHUNK_METADATA, *_LAST_CHUNKS, _spec.CHUNK_TREE)
 #: The first layer after those of this version; the order of later layers is not checked (4.3.6).
 _LAYER_END = max(_spec.LAYER_NAMES) + 1
 
@@ -297,6 +303,7 @@ class Chunk:
         record: directory or layer record; both have `size` and `offset`.
         identity: codebook id, or index of the tile.
         layer: layer of the record.
+        level: level of detail of the tile; 0 for chunks of the directory.
         whole: whether its bytes exist and do not overlap another chunk.
     """
 
@@ -306,6 +313,7 @@ class Chunk:
     record: PlacedRecord[Any]
     identity: int
     layer: int
+    level: int = 0
     whole: bool = False
 
     @property
@@ -318,12 +326,18 @@ class Chunk:
         """Size in bytes with the chunk header."""
         return int(self.record.record.size)
 
-    @property
-    def rank(self) -> tuple[int, int]:
-        """Rank in the order that 4.3.6 recommends: ancillary chunks, then by layer, codebooks before tiles."""
+    def rank(self, *, has_levels: bool) -> tuple[int, ...]:
+        """Return the rank in the order that 4.3.6 recommends.
+
+        TREE and ancillary chunks come first, then each layer, codebooks before tiles, and the highest level first.
+        """
         if self.kind == _spec.CHUNK_TILE:
-            return (self.layer, 1)
-        return (self.layer, 0) if self.kind == _spec.CHUNK_CODEBOOK else (-1, 0)
+            return (self.layer, 1, -self.level, self.identity)
+        if self.kind == _spec.CHUNK_CODEBOOK:
+            return (self.layer, 0)
+        if self.kind == _spec.CHUNK_TREE:
+            return (-2,)
+        return (_LAYER_END,) if has_levels and self.kind in _LAST_CHUNKS else (-1,)
 
 
 def registered_flags(kind: bytes) -> int:
@@ -383,8 +397,6 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
     if kind in _spec.CHUNK_NAMES:
         if flags & ~unlisted != registered_flags(kind):
             log.add_field("CHK-4", placed, "flags", f"{record.flags:#06x}, expected {registered_flags(kind):#06x}")
-    elif kind == _spec.CHUNK_TREE:
-        log.add_field("RES-2", placed, "type", f"{kind.decode()} is reserved")
     elif flags & _spec.CHUNK_FLAG_CRITICAL:
         if kind[:1].islower():
             log.add_field("DIR-6", placed, "flags", f"{kind!r} is private and critical")
@@ -452,7 +464,8 @@ def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], start: int, file_
             "header.file_size",
             f"the last chunk ends at {expected}, the file at {file_size}",
         )
-    ranks = [chunk.rank for chunk in ordered if chunk.layer < _LAYER_END]
+    has_levels = any(chunk.level for chunk in chunks)
+    ranks = [chunk.rank(has_levels=has_levels) for chunk in ordered if chunk.layer < _LAYER_END]
     if ranks != sorted(ranks):
         log.remarks.append("the chunks are not in the recommended order (4.3.6)")
 
@@ -507,9 +520,14 @@ class Tile:
         """Number of splats."""
         return self.record.record.splat_count
 
+    @property
+    def level(self) -> int:
+        """Level of detail."""
+        return self.record.record.level
+
 
 def read_tiles(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> list[Tile]:
-    """Read the tile records; check that they fill the index up to its CRC (IDX-2), and that their sum is N (IDX-7).
+    """Read the tile records; check that they fill the index (IDX-2), and that those of level 0 have N splats (IDX-7).
 
     Args:
         view: the file.
@@ -530,12 +548,14 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, log: Violation
             log.skip(f"tile[{len(tiles)}] and later tiles", "the index ends before them")
             return tiles
         tiles.append(_read_tile(view, at, len(tiles), index, log))
+        _check_level(log, tiles[-1], tiles[-2].level if len(tiles) > 1 else 0, index)
         at += size
     if at != end:
         log.add("IDX-2", at, "index.rest", f"{end - at} bytes follow the last tile")
-    total = sum(tile.count for tile in tiles)
+    total = sum(tile.count for tile in tiles if tile.level == 0)
     if total != head.splat_count:
-        log.add_field("IDX-7", index.head, "splat_count", f"{head.splat_count}, expected {total}, the sum of the tiles")
+        message = f"{head.splat_count}, expected {total}, the sum of the tiles of level 0"
+        log.add_field("IDX-7", index.head, "splat_count", message)
     return tiles
 
 
@@ -551,8 +571,6 @@ def _read_tile(view: memoryview, at: int, number: int, index: Index, log: Violat
     placed = read_record(view, _spec.TileRecord, at, f"tile[{number}]")
     log.check_reserved(placed)
     tile = Tile(number, placed)
-    if placed.record.level:
-        log.add_field("RES-1", placed, "level", f"{placed.record.level} is reserved, expected 0")
     if not 1 <= tile.count <= _spec.TILE_SPLATS_MAX:
         log.add_field("TIL-1", placed, "splat_count", f"{tile.count}, expected 1 to {_spec.TILE_SPLATS_MAX}")
     _check_tile_box(log, tile, index)
@@ -560,6 +578,15 @@ def _read_tile(view: memoryview, at: int, number: int, index: Index, log: Violat
     _read_layers(view, at, tile, index, log)
     _read_codebook_ids(view, at + placed.record.layer_count * index.size_of("layer"), tile, index, log)
     return tile
+
+
+def _check_level(log: ViolationLog, tile: Tile, lowest: int, index: Index) -> None:
+    """Check TIL-12, given the level of the tile before."""
+    if tile.level > index.level_max:
+        message = f"{tile.level}, expected at most {index.level_max} in the file's version"
+        log.add_field("TIL-12", tile.record, "level", message)
+    elif tile.level < lowest:
+        log.add_field("TIL-12", tile.record, "level", f"{tile.level} after {lowest}, expected ascending levels")
 
 
 def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
@@ -594,7 +621,7 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
             log.add_field("RES-2", placed, "layer", f"{layer} is not a layer of this version")
         if index.degree is not None and layer in _SH_LAYERS and layer > index.degree:
             log.add_field("TIL-3", placed, "layer", f"band {layer}, expected at most sh_degree, {index.degree}")
-        chunk = Chunk(f"TILE.{tile.index}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.index, layer)
+        chunk = Chunk(f"TILE.{tile.index}.{layer}", _spec.CHUNK_TILE, flags, placed, tile.index, layer, tile.level)
         tile.chunks.append(check_chunk_size(log, chunk))
         last = max(last, layer)
         at += index.size_of("layer")
@@ -602,9 +629,9 @@ def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: Viola
         log.add("TIL-2", start, f"{tile.record.name}.layer", "no layer, expected layer 0")
         return  # TIL-5 follows from this
     has_extra = any(chunk.layer == _spec.LAYER_EXTRA for chunk in tile.chunks)
-    if has_extra != bool(index.head.record.extra_count):
-        verb = "has" if has_extra else "lacks"
-        message = f"the tile {verb} the extra layer, but the scene has {index.head.record.extra_count} extra columns"
+    if has_extra != (tile.level == 0 and index.head.record.extra_count > 0):
+        verb, extras = "has" if has_extra else "lacks", index.head.record.extra_count
+        message = f"a tile of level {tile.level} that {verb} the extra layer; the scene has {extras} extra columns"
         log.add("TIL-5", start, f"{tile.record.name}.layer", message)
 
 

@@ -23,6 +23,7 @@ from csplat_conformance.validator.index import (
     read_tiles,
 )
 from csplat_conformance.validator.tiles import CodebookEntries, TileChecker, read_codebook
+from csplat_conformance.validator.tree import check_tree, find_tree
 from csplat_conformance.validator.violation_log import (
     Payload,
     PlacedRecord,
@@ -42,6 +43,7 @@ _END_CLAUSES = {
     _spec.CHUNK_CAMERAS: "JSN-2",
     _spec.CHUNK_OPTIONS: "JSN-2",
     _spec.CHUNK_STATED_ERRORS: "SER-3",
+    _spec.CHUNK_TREE: "TRE-2",
 }
 _STAGE = "validating"
 
@@ -60,8 +62,8 @@ def validate(
     Args:
         data: the file, complete or truncated.
         json_bytes_max: budget for one JSON text (STR-8), in bytes.
-        splats_max: budget of splats (LIM-1), above which the tiles are not read. Default: none, because only one tile
-            is in memory at a time.
+        splats_max: budget of splats of level 0 (LIM-1), above which the tiles are not read. Default: none, because only
+            one tile is in memory at a time.
         progress: called with the fraction of the tiles that were checked.
 
     Returns:
@@ -122,8 +124,8 @@ def _check(
     else:
         log.skip("the chunks", "the index does not list all of them")
         return
-    books = _read_directory_chunks(view, directory, index, json_bytes_max, log)
-    if splats_max is not None and sum(tile.count for tile in tiles) > splats_max:
+    books = _read_directory_chunks(view, directory, tiles, index, json_bytes_max, log)
+    if splats_max is not None and sum(tile.count for tile in tiles if tile.level == 0) > splats_max:
         log.add_field("LIM-1", index.head, "splat_count", f"{counts.splats}, expected at most {splats_max} (budget)")
         log.skip("the tiles", "the number of splats exceeds the budget")
         return
@@ -194,10 +196,11 @@ def _index_end(view: memoryview, header: Header, log: ViolationLog) -> int | Non
 
 
 def _read_directory_chunks(
-    view: memoryview, directory: list[Chunk], index: Index, json_bytes_max: int, log: ViolationLog
+    view: memoryview, directory: list[Chunk], tiles: list[Tile], index: Index, json_bytes_max: int, log: ViolationLog
 ) -> CodebookEntries:
     """Read every chunk of the directory, used or not, known or not (CHK-2)."""
     books: CodebookEntries = {}
+    tree = find_tree(log, directory, tiles)
     for chunk in directory:
         if not chunk.whole:
             continue
@@ -208,6 +211,10 @@ def _read_directory_chunks(
             _read_payload(payload, log, partial(check_declared_bounds, payload, index))
         elif chunk.kind == _spec.CHUNK_CODEBOOK:
             _read_payload(payload, log, partial(read_codebook, payload, chunk, index, books))
+        elif chunk is tree:
+            _read_payload(payload, log, partial(check_tree, payload, tiles))
+        elif chunk.kind == _spec.CHUNK_TREE:
+            log.skip(payload.name, "the file must not contain it")
     return books
 
 

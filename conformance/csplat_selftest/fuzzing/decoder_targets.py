@@ -259,6 +259,8 @@ class ValidatorTarget(DecoderTarget):
             warnings.simplefilter("error")
             try:
                 decoder.decode(data, limits=LIMITS, threads=1)
+                if decoder.read_header(data).coarse_tiles:
+                    decoder.decode_integers(data, limits=LIMITS, threads=1)  # reads the coarser levels, too
             except CsplatError as caught:
                 error = caught
             if error is not None and error.code == _spec.ERROR_LIMIT:  # budgets are not part of the format

@@ -15,6 +15,7 @@ import typer
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.types import Progress
+from csplat_conformance.answers import CUTS, RENDERS
 from csplat_conformance.conformance_report import ConformanceReport, to_json, to_junit, to_table
 from csplat_conformance.decoder_suite import (
     TIMEOUT_SECONDS,
@@ -61,11 +62,8 @@ def root() -> None:
 
 @conformance.command()
 def decoder(
-    program: Annotated[
-        str | None, typer.Option("--cmd", metavar="COMMAND", help="Decoder, with {input} and {outdir}.")
-    ] = None,
-    render_program: Annotated[
-        str | None, typer.Option("--render-cmd", metavar="COMMAND", help="Renderer: {input} {camera} {out}.")
+    programs: Annotated[
+        list[str] | None, typer.Option("--cmd", metavar="COMMAND", help="Decoder, with {input} and {outdir}.")
     ] = None,
     level: Annotated[str | None, typer.Option(metavar="N", help="Levels 1 to N, or a list: 1,3. Default: 3.")] = None,
     filters: Annotated[
@@ -89,34 +87,50 @@ def decoder(
     """Test a decoder with the test vectors.
 
     L1: header and errors. L2: integers. L3: floats, bit for bit, or within
-    the tolerance of --class renderer (spec 9.2). L4: images of --render-cmd.
-    Without a command, csplat's own decoder is tested. Otherwise a decoder
-    writes its results to {outdir}, or exits with status 1 and a line of JSON
-    with the error code: conformance/IMPLEMENTERS.md explains how.
+    the tolerance of --class renderer (spec 9.2). L4: images of a command with
+    {camera}. L5: tiles of cuts through the levels of detail, of a command
+    with {cuts}. --cmd can be repeated. Without it, csplat's own decoder is
+    tested. Otherwise a decoder writes its results to {outdir}, or exits with
+    status 1 and a line of JSON with the error code:
+    conformance/IMPLEMENTERS.md explains how.
 
     Examples:
       csplat conformance decoder --filter 'invalid/*'
       csplat conformance decoder --cmd 'dec {input} {outdir}' --filter 'HDR-*'
       csplat conformance decoder --cmd 'dec {input} {outdir}' --junit all.xml
-      csplat conformance decoder --render-cmd 'draw {input} {camera} {out}'
+      csplat conformance decoder --cmd 'draw {input} {camera} {out}'
+      csplat conformance decoder --cmd 'select-tiles {input} {cuts}'
     """
     out = Output(force, report, as_json, quiet)
     _check_reports(out, junit)
     patterns = [one.strip() for text in filters or () for one in text.split(",")]
     clauses = [one for one in patterns if _CLAUSE.fullmatch(one)]
     names = [one for one in patterns if one not in clauses]
-    # A renderer alone is tested at L4 alone.
-    levels = shared.checked(parse_levels, level or ("3" if render_program is None else "4"))
+    program, render_program, cut_program = _commands(programs or [])
+    # The commands that are given select the default: a renderer alone is tested at L4 alone.
+    more = [str(number) for number, given in ((RENDERS, render_program), (CUTS, cut_program)) if given is not None]
+    levels = shared.checked(parse_levels, level or ",".join(["1", "2", "3", *more]))
     seconds = shared.check_range("--timeout", timeout, *_TIMEOUT_RANGE) or TIMEOUT_SECONDS
     options = shared.checked(
         DecoderSuiteOptions, _joined(names), _joined(clauses), levels, timeout=seconds, jobs=jobs, by=by
     )
     with out.bar() as bar:
-        if program is None and render_program is None:
+        if not programs:
             result = run_builtin(options, _moved(bar))
         else:
-            result = run_command(program, options, render=render_program, progress=_moved(bar))
+            result = run_command(program, options, render=render_program, cuts=cut_program, progress=_moved(bar))
     _publish(result, out, junit, "no vector is chosen")
+
+
+def _commands(programs: Sequence[str]) -> tuple[str | None, str | None, str | None]:
+    """Return the commands of a decoder, a renderer and cuts by their names in braces; `None` if there is none."""
+    found: dict[str, str] = {}
+    for program in programs:
+        kind = next((kind for kind in ("cuts", "camera") if f"{{{kind}}}" in program), "decoder")
+        if kind in found:
+            raise typer.BadParameter(f"--cmd has two commands of one kind: {found[kind]!r} and {program!r}")
+        found[kind] = program
+    return found.get("decoder"), found.get("camera"), found.get("cuts")
 
 
 @conformance.command()
@@ -174,7 +188,7 @@ def encoder(
         made = write_inputs(_checked_folder(folder, force=out.force), _joined(filters))
         out.publish(made, f"{counted(len(made['inputs']), 'input')} in {folder}")
         return
-    levels = tuple(f"L{number}" for number in shared.checked(parse_levels, level or "4"))
+    levels = tuple(f"L{number}" for number in shared.checked(parse_levels, level or "4", last=4))
     kept = _checked_folder(keep, force=out.force) if keep is not None else None
     render_score, reason = _render_scorer(levels, quiet=out.quiet)
     least = PSNR_MIN if min_psnr is None else min_psnr

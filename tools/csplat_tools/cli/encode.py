@@ -33,7 +33,9 @@ from csplat_tools.scene_files import LoadedModel, read_source
 from csplat_tools.views import ViewSet
 
 #: Parameters that require the whole scene in memory.
-IN_MEMORY = ("target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index")
+IN_MEMORY = (
+    "target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index", "levels",
+)  # fmt: skip
 
 
 def encode(
@@ -61,6 +63,9 @@ def encode(
         str | None, typer.Option(metavar="FILE", hidden=True, help="File of `csplat sensitivity`, or .npy weights.")
     ] = None,
     source_index: shared.SourceIndexOutput = None,
+    levels: Annotated[
+        bool, typer.Option("--levels", hidden=True, help="Add levels of detail for viewers, a third more splats.")
+    ] = False,
     memory: shared.HiddenMemory = None,
     resume: Annotated[bool, typer.Option("--resume", hidden=True, help="Go on from OUT.csplat.work.")] = False,
     dask: shared.HiddenDask = None,
@@ -106,13 +111,14 @@ def encode(
     precision = {"--target-psnr": target_psnr, "--target-size": target_size, "--max-psnr-drop": max_psnr_drop}
     rendered = {**precision, "--keep": keep}
     targets = {**rendered, "--max-error": max_error}
-    whole = {**targets, "--importance": importance, "--source-index": source_index}
+    whole = {**targets, "--importance": importance, "--source-index": source_index, "--levels": levels}
     out_of_core = {"--memory": memory, "--resume": resume, "--dask": dask, "--dry-run": dry_run}
     shared.refuse_together(rendered)
     shared.refuse_together({"--attribute-psnr": attribute_psnr}, precision)
     shared.refuse_together({"--keep": keep}, {"--no-prune": no_prune, "--importance": importance})
     shared.refuse_together({"--effort": effort}, {"--no-prune": no_prune})
     shared.refuse_together(out_of_core, whole)
+    shared.refuse_together({"--levels": levels}, {**targets, "--importance": importance})
     shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
     shared.require_one({"--no-prune": no_prune}, {**precision, "--max-error": max_error})
     shared.require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
@@ -134,6 +140,8 @@ def encode(
             return
         out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
         check_name(output, ".csplat", "encode", source)
+        if levels:
+            prepare_renderer(quiet=out.quiet)
         scene: str | LoadedModel = source
         around = None
         if target is not None:
@@ -148,7 +156,7 @@ def encode(
                 around = _find_views(scene.model, options, target, views, out)
         encoded = encode_file(
             scene, output, options, target=target, views=around, overrides=overrides, importance=importance,
-            source_index=source_index, out_of_core=limits, progress=progress,
+            source_index=source_index, levels=levels, out_of_core=limits, progress=progress,
         )  # fmt: skip
         _publish(encoded, source, output, threads, out, up=up, progress=progress)
 

@@ -98,6 +98,7 @@ RENAMED_OPTIONS = {
     "--plots": "is gone: -o PAGE.html has the plots",
     "--preset": "is an option of `csplat encode`: encode the scene first",
     "--set": "is gone: EncodeOptions, FinetuneOptions, SimplifyOptions and TrainOptions take such settings in Python",
+    "--render-cmd": "is part of --cmd now: a command with {camera} is a renderer",
     "--sh-degree": "is gone here: `csplat convert --sh-degree` writes a scene with fewer bands",
     "--source-index": "is an option of encode, finetune, verify and compare",
     "--strict": "is an argument of csplat.read in Python now; `csplat lint` lists defects",

@@ -23,6 +23,7 @@ from csplat.decoder import (
     read_metadata,
     read_options,
 )
+from csplat.decoder.tree import read_nodes
 from csplat.disk_files import finite_or_none
 from csplat.editing.up_axis import UP, up_of
 from csplat.errors import FormatError
@@ -115,12 +116,25 @@ class CodebookSummary:
 
 
 @dataclass(frozen=True)
+class LevelSummary:
+    """A level of detail: nodes, tiles, splats, bytes of its tiles, smallest and largest error of its nodes."""
+
+    level: int
+    nodes: int
+    tiles: int
+    splats: int
+    size_bytes: int
+    errors: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class FileDescription:
     """The content of a .csplat file; sizes in bytes.
 
     Attributes:
         header: header and index.
-        attributes, layers: attributes and layers by name, in the order of the registry.
+        attributes, layers: attributes and layers by name, in the order of the registry; of all levels of detail.
+        levels: levels of detail, finest first; none if level 0 is the only one.
         codebooks: codebooks in the order of the index.
         overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
             chunks.
@@ -132,6 +146,7 @@ class FileDescription:
     header: SceneHeader
     attributes: Mapping[str, AttributeSummary]
     layers: Mapping[str, LayerSummary]
+    levels: Sequence[LevelSummary]
     codebooks: Sequence[CodebookSummary]
     overhead: Mapping[str, int]
     cameras: int | None
@@ -179,6 +194,7 @@ class FileDescription:
                 for name, one in self.attributes.items()
             },
             "layers": {name: asdict(one) for name, one in self.layers.items()},
+            "levels": [asdict(one) for one in self.levels],
             "overhead": dict(self.overhead),
             "codebooks": [asdict(one) for one in self.codebooks],
             "extra_columns": [{"name": extra.name, "dtype": extra.dtype} for extra in header.extras],
@@ -212,6 +228,7 @@ def describe_file(data: bytes | mmap) -> FileDescription:
         header,
         attributes,
         _layers(header),
+        _levels(data, header),
         [_codebook(header, record) for record in header.codebooks],
         _overhead(header, use),
         None if cameras is None else len(cameras),
@@ -294,7 +311,7 @@ def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, Attrib
         )
     codebooks = {record.codebook_id: record for record in header.codebooks}
     use: dict[int, AttributeUsage] = {}
-    for tile in header.tiles:
+    for tile in header.all_tiles:
         for layer in (one for id_, one in tile.layers.items() if id_ in _spec.LAYER_NAMES):
             _walk_tile(_Cursor(data, layer.offset, layer.size), codebooks, use)
     for chunk in header.directory:
@@ -407,7 +424,7 @@ def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> Attribute
 
 def _layers(header: SceneHeader) -> dict[str, LayerSummary]:
     tile_bytes, tile_count, codebook_bytes = Counter[int](), Counter[int](), Counter[int]()
-    for tile in header.tiles:
+    for tile in header.all_tiles:
         for id_, layer in tile.layers.items():
             tile_bytes[id_] += layer.size
             tile_count[id_] += 1
@@ -421,6 +438,21 @@ def _layers(header: SceneHeader) -> dict[str, LayerSummary]:
         )
         for id_, size in sizes.items()
     }
+
+
+def _levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSummary]:
+    if not header.coarse_tiles:
+        return []
+    nodes = read_nodes(memoryview(data), header)
+    found = []
+    for level in sorted({node.level for node in nodes}):
+        own = [node for node in nodes if node.level == level]
+        tiles = [tile for node in own for tile in node.tiles]
+        size = sum(layer.size for tile in tiles for layer in tile.layers.values())
+        errors = [node.error for node in own]
+        splats = sum(node.splat_count for node in own)
+        found.append(LevelSummary(level, len(own), len(tiles), splats, size, (min(errors), max(errors))))
+    return found
 
 
 def _overhead(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[str, int]:

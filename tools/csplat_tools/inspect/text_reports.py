@@ -13,6 +13,7 @@ from csplat_tools.inspect.file_description import (
     CodebookSummary,
     FileDescription,
     LayerSummary,
+    LevelSummary,
     describe_coding,
     describe_scene,
     format_headline,
@@ -133,6 +134,7 @@ def format_description(description: FileDescription) -> str:
         _entry_sizes(
             "layer", description.layers, size, [counted(one.tiles, "tile") for one in description.layers.values()]
         ),
+        *([_level_table(description.levels)] if description.levels else []),
         "other bytes: " + ", ".join(f"{name} {number}" for name, number in description.overhead.items()),
     ]
     if description.codebooks:
@@ -145,6 +147,17 @@ def format_description(description: FileDescription) -> str:
         if value
     ]
     return "\n\n".join(parts)
+
+
+def _level_table(levels: Sequence[LevelSummary]) -> str:
+    rows = [
+        (
+            str(one.level), one.size_bytes, one.splats, one.nodes, one.tiles,
+            " to ".join(f"{error:.3g}" for error in sorted({*one.errors})),
+        )
+        for one in levels
+    ]  # fmt: skip
+    return format_table(("level", "bytes", "splats", "nodes", "tiles", "errors, scene units"), rows)
 
 
 def _scene(description: FileDescription) -> str:

@@ -4,6 +4,7 @@ import { readFileSync, readdirSync } from 'node:fs';
 import { test } from 'node:test';
 
 import { decode } from '../../../codec/js/decoder.mjs';
+import { allTiles } from '../../../codec/js/tile_records.mjs';
 import { withUp } from '../meta_writer.mjs';
 
 const FOLDER = new URL('../../../conformance/csplat_conformance/vectors/valid/', import.meta.url);
@@ -16,8 +17,10 @@ const read = (name) => new Uint8Array(readFileSync(new URL(name, FOLDER))).buffe
 async function facts(bytes) {
   const { header, metadata, checks, ...rest } = await decode(bytes);
   const { axes, unitMetres, origin, attributes, splatCount } = header;
-  assert.equal(checks.chunks, header.directory.length + header.tiles.flatMap(({ layers }) => layers).length);
-  return { metadata, axes, rest, other: { unitMetres, origin, attributes, splatCount } };
+  const tiles = allTiles(header);
+  assert.equal(checks.chunks, header.directory.length + tiles.flatMap(({ layers }) => layers).length);
+  const contents = tiles.flatMap(({ layers }) => layers.map(({ crc }) => crc));
+  return { metadata, axes, rest, other: { unitMetres, origin, attributes, splatCount, contents } };
 }
 
 test('everything but the metadata is kept', async () => {

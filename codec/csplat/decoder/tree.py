@@ -1,0 +1,250 @@
+"""Read the nodes of the levels of detail, and cut through them (spec 5.7)."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from csplat import _spec
+from csplat.decoder.container import SceneHeader, Tile, open_chunk
+from csplat.decoder.reconstruct import tile_boxes
+from csplat.errors import FormatError, InputError, LimitError
+from csplat.types import F64
+
+
+@dataclass(frozen=True)
+class Node:
+    """A node of the levels of detail.
+
+    Attributes:
+        tiles: its tiles.
+        parent: index of the parent, which is after this node; `None` for a root.
+        children: indices of the children.
+        level: level of detail; 0 for a leaf.
+        splat_count: number of splats.
+        error: smallest pixel size, in scene units at the node, at which it may replace the splats below it.
+    """
+
+    tiles: tuple[Tile, ...]
+    parent: int | None
+    children: tuple[int, ...]
+    level: int
+    splat_count: int
+    error: float
+
+
+def read_nodes(view: memoryview, header: SceneHeader) -> tuple[Node, ...]:
+    """Read and check the TREE chunk (TRE-2 to TRE-8).
+
+    Args:
+        view: the file, or a part that contains the chunk.
+        header: header and index.
+
+    Returns:
+        The nodes; without a TREE chunk, one node of all tiles, or none if there are no tiles.
+    """
+    chunk = header.chunk(_spec.CHUNK_TREE)
+    if chunk is None:
+        return (Node(header.tiles, None, (), 0, header.splat_count, 0.0),) if header.tiles else ()
+    cursor = open_chunk(view, chunk, chunk.type, chunk.flags, "TRE-2")
+    start, size = cursor.at, cursor.end - cursor.at
+    rest = size % _spec.NODE_RECORD_SIZE
+    if rest:
+        at, wanted = cursor.end - rest, f"multiples of {_spec.NODE_RECORD_SIZE} bytes"
+        raise FormatError(_spec.ERROR_STREAM, at, "TRE-2", "the payload of TREE", found=f"{size} bytes", wanted=wanted)
+    offsets = range(start, cursor.end, _spec.NODE_RECORD_SIZE)
+    records: list[_spec.NodeRecord] = []
+    tiles = _share_tiles(view, offsets, start, header.all_tiles, records)
+    children = _find_children(records, tiles, offsets)
+    nodes = tuple(
+        Node(
+            own,
+            None if record.parent == _spec.NO_PARENT else record.parent,
+            tuple(below),
+            own[0].level,
+            sum(tile.splat_count for tile in own),
+            record.error,
+        )
+        for record, own, below in zip(records, tiles, children, strict=True)
+    )
+    for at, node in zip(offsets, nodes, strict=True):
+        _check_node(nodes, node, at)
+    return nodes
+
+
+def _share_tiles(
+    view: memoryview, offsets: range, start: int, tiles: tuple[Tile, ...], records: list[_spec.NodeRecord]
+) -> list[tuple[Tile, ...]]:
+    """Read the records and return the tiles of each node (TRE-3, TRE-4)."""
+    count_at = _spec.NODE_RECORD_OFFSETS["tile_count"]
+    result: list[tuple[Tile, ...]] = []
+    first = 0
+    for at in offsets:
+        record = _spec.unpack_node_record(view, at)
+        left = len(tiles) - first
+        if not 1 <= record.tile_count <= left:
+            found, wanted = record.tile_count, f"1 to {left}, the tiles that are left"
+            raise FormatError(_spec.ERROR_INDEX, at + count_at, "TRE-3", "tile_count", found=found, wanted=wanted)
+        own = tiles[first : first + record.tile_count]
+        if own[0].level != own[-1].level:  # TIL-12: the levels of tiles do not descend
+            detail = f"a node has tiles of the levels {own[0].level} and {own[-1].level}"
+            raise FormatError(_spec.ERROR_INDEX, at + count_at, "TRE-4", detail)
+        records.append(record)
+        result.append(own)
+        first += record.tile_count
+    if first != len(tiles):
+        raise FormatError(
+            _spec.ERROR_INDEX, start, "TRE-3", "tiles of all nodes together", found=first, wanted=len(tiles)
+        )
+    return result
+
+
+def _find_children(
+    records: Sequence[_spec.NodeRecord], tiles: Sequence[tuple[Tile, ...]], offsets: range
+) -> list[list[int]]:
+    """Check TRE-5 and return the children of each node."""
+    children: list[list[int]] = [[] for _ in records]
+    for number, (record, own) in enumerate(zip(records, tiles, strict=True)):
+        if record.parent == _spec.NO_PARENT:
+            continue
+        if record.parent >= len(records) or tiles[record.parent][0].level <= own[0].level:
+            at = offsets[number] + _spec.NODE_RECORD_OFFSETS["parent"]
+            wanted = f"a node of a level above {own[0].level}"
+            raise FormatError(_spec.ERROR_INDEX, at, "TRE-5", "parent", found=record.parent, wanted=wanted)
+        children[record.parent].append(number)
+    return children
+
+
+def _check_node(nodes: Sequence[Node], node: Node, at: int) -> None:
+    """Check TRE-6 to TRE-8 for a node whose record is at an offset."""
+    error_at = at + _spec.NODE_RECORD_OFFSETS["error"]
+    if node.level == 0:
+        if node.error != 0.0:
+            raise FormatError(_spec.ERROR_VALUE, error_at, "TRE-8", "error of a leaf", found=node.error, wanted=0)
+        return
+    below = [nodes[child] for child in node.children]
+    if not below:
+        raise FormatError(_spec.ERROR_INDEX, at, "TRE-6", f"a node of level {node.level} has no children")
+    most = sum(child.splat_count for child in below)
+    if node.splat_count > most:
+        wanted = f"at most {most}, those of its children"
+        raise FormatError(_spec.ERROR_INDEX, at, "TRE-7", "splats of a node", found=node.splat_count, wanted=wanted)
+    least = max(child.error for child in below)
+    if not max(least, 0.0) <= node.error < math.inf:
+        wanted = f"finite, at least {least}"
+        raise FormatError(_spec.ERROR_VALUE, error_at, "TRE-8", "error", found=node.error, wanted=wanted)
+
+
+def select_tiles(
+    header: SceneHeader,
+    nodes: Sequence[Node],
+    *,
+    level: int | None = None,
+    pixel_size: float | Sequence[float] | None = None,
+    max_splats: int | None = None,
+    box: F64 | None = None,
+) -> list[Tile]:
+    """Select the tiles of a cut, in the order of the index.
+
+    Args:
+        header: header and index.
+        nodes: the result of `read_nodes`.
+        level: the highest level to use, 0 to 255.
+        pixel_size: size of a pixel at each node, scene units, one number or one per node, at least 0.
+        max_splats: maximum number of splats. At most one of these three is given; default: level 0.
+        box: [2, 3] corners of a box, smallest first; of level 0, only tiles whose box touches it are selected, and of
+            coarser nodes only those whose region does.
+
+    Raises:
+        InputError: several of the three are given, or one is out of its range.
+        LimitError: the coarsest cut has more than `max_splats` splats.
+    """
+    given = [
+        name
+        for name, value in (("level", level), ("pixel_size", pixel_size), ("max_splats", max_splats))
+        if value is not None
+    ]
+    if len(given) > 1:
+        raise InputError(f"{' and '.join(given)} exclude each other")
+    if pixel_size is not None:
+        cut = _at_pixel_size(nodes, pixel_size)
+    elif max_splats is not None:
+        cut = _within(nodes, max_splats)
+    else:
+        most = 0 if level is None else level
+        if not 0 <= most <= 255:
+            raise InputError(f"level is {level}, expected 0 to 255")
+        cut = _cut_where(nodes, lambda number: nodes[number].level > most)
+    if box is None:
+        return [tile for number in cut for tile in nodes[number].tiles]
+    boxes = tile_boxes(header, header.all_tiles)
+    touching = ((boxes[:, 0] <= box[1]) & (boxes[:, 1] >= box[0])).all(axis=1)
+    regions = node_regions(header, nodes)
+    inside = ((regions[:, 0] <= box[1]) & (regions[:, 1] >= box[0])).all(axis=1)
+    return [
+        tile for number in cut for tile in nodes[number].tiles
+        if (touching[tile.index] if tile.level == 0 else inside[number])
+    ]  # fmt: skip
+
+
+def node_regions(header: SceneHeader, nodes: Sequence[Node]) -> F64:
+    """Return the regions of nodes: [n, 2, 3] float64, corners of boxes around all splats below, smallest first."""
+    boxes = tile_boxes(header, header.all_tiles)
+    regions = np.empty((len(nodes), 2, 3))
+    for number, node in enumerate(nodes):  # children come before their parents
+        parts = np.concatenate([boxes[[tile.index for tile in node.tiles]], regions[list(node.children)]])
+        regions[number] = parts[:, 0].min(axis=0), parts[:, 1].max(axis=0)
+    return regions
+
+
+def _cut_where(nodes: Sequence[Node], is_replaced: Callable[[int], bool]) -> list[int]:
+    """Return the first node from each root that its children do not replace, ascending."""
+    replaced = np.zeros(len(nodes), bool)
+    cut = []
+    for number in reversed(range(len(nodes))):  # parents come after their children
+        parent = nodes[number].parent
+        if parent is not None and not replaced[parent]:
+            continue
+        if is_replaced(number):
+            replaced[number] = True
+        else:
+            cut.append(number)
+    return cut[::-1]
+
+
+def _at_pixel_size(nodes: Sequence[Node], pixel_size: float | Sequence[float]) -> list[int]:
+    sizes = [pixel_size] * len(nodes) if isinstance(pixel_size, (int, float)) else list(pixel_size)
+    if len(sizes) != len(nodes):
+        raise InputError(f"pixel_size has {len(sizes)} numbers, expected one, or one for each of {len(nodes)} nodes")
+    for size in sizes:
+        if not size >= 0.0:
+            raise InputError(f"pixel_size is {size}, expected 0 or more")
+    return _cut_where(nodes, lambda number: nodes[number].error > sizes[number])
+
+
+def _within(nodes: Sequence[Node], max_splats: int) -> list[int]:
+    """Replace the node with the largest error, of equals the last, until the budget would be exceeded."""
+    if max_splats < 0:
+        raise InputError(f"max_splats is {max_splats}, expected 0 or more")
+    cut = {number for number, node in enumerate(nodes) if node.parent is None}
+    count = sum(nodes[number].splat_count for number in cut)
+    if count > max_splats:
+        raise LimitError("max_splats", count, max_splats, clause="TRE-9")
+    queue = [(-nodes[number].error, -number) for number in cut if nodes[number].level > 0]
+    heapq.heapify(queue)
+    while queue:
+        number = -heapq.heappop(queue)[1]
+        children = nodes[number].children
+        count += sum(nodes[child].splat_count for child in children) - nodes[number].splat_count
+        if count > max_splats:
+            break
+        cut.remove(number)
+        cut.update(children)
+        for child in children:
+            if nodes[child].level > 0:
+                heapq.heappush(queue, (-nodes[child].error, -child))
+    return sorted(cut)

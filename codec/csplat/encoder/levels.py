@@ -1,0 +1,101 @@
+"""Encode a scene with levels of detail (spec 5.7), which a caller with a renderer has built."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.encoder.container import FileNode, order_nodes
+from csplat.encoder.encode_plan import EncodePlan, clip_scales
+from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tile, encode_tiles
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats
+from csplat.encoder.tiling import cut_scene
+from csplat.errors import InputError
+from csplat.model import SplatModel, check_model
+from csplat.types import Progress, null_progress
+
+Rows = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class LevelNode:
+    """A node of the levels of detail.
+
+    Attributes:
+        level: 0 for a leaf, and above the level of each child otherwise.
+        parent: index of the parent; `None` for a root.
+        rows: rows of the scene, for a leaf.
+        splats: the splats of a coarser node, no more than its children have together.
+        error: pixel size from which on the node may replace the splats below it, scene units; at least that of each
+            child, 0 for a leaf.
+    """
+
+    level: int
+    parent: int | None
+    rows: Rows | None = None
+    splats: SplatModel | None = None
+    error: float = 0.0
+
+
+def encode_levels(plan: EncodePlan, nodes: Sequence[LevelNode], progress: Progress | None = None) -> EncodedTiles:
+    """Encode the tiles of a scene and of its coarser versions.
+
+    All choices are made for the scene alone, so that level 0 has the same steps and codebooks as without other levels.
+
+    Args:
+        plan: the plan of the scene.
+        nodes: the nodes, whose leaves hold each splat once.
+        progress: see `EncodePlan.of`.
+
+    Raises:
+        InputError: the leaves do not hold each splat once, a parent is not above its child, or a value fits no lattice.
+    """
+    _check_nodes(nodes, len(plan.model))
+    progress = progress or null_progress
+    plan, codebooks = plan.choose_sh_coding(progress)
+    leaves = [number for number, node in enumerate(nodes) if node.level == 0]
+    of_leaves = [
+        cut_scene(plan.model, plan.parameters, plan.classes, [rows])
+        for rows in (nodes[number].rows for number in leaves) if rows is not None
+    ]  # fmt: skip
+    plan = replace(plan, tiles=[tile for tiles in of_leaves for tile in tiles])
+    encoded = encode_tiles(plan, codebooks, progress=progress)
+    parts = iter(encoded.tiles)
+    made = {number: [next(parts) for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
+    for done, (number, node) in enumerate((at, node) for at, node in enumerate(nodes) if node.splats is not None):
+        assert node.splats is not None
+        made[number] = _encode_coarse(node.splats, plan, codebooks)
+        progress("levels", (done + 1) / (len(nodes) - len(leaves)))
+    tree = [
+        FileNode(node.parent, [replace(part.tile, level=node.level) for part in made[number]], node.error)
+        for number, node in enumerate(nodes)
+    ]
+    return replace(encoded, nodes=order_nodes(tree))
+
+
+def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
+    rows = [node.rows for node in nodes if node.rows is not None]
+    if not np.array_equal(np.sort(np.concatenate(rows)) if rows else [], np.arange(count)):
+        raise InputError("the leaves do not hold each splat of the scene once")
+    for node in nodes:
+        if node.parent is not None and not nodes[node.parent].level > node.level:
+            raise InputError(f"the parent of a node of level {node.level} has level {nodes[node.parent].level}")
+
+
+def _encode_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> list[EncodedTile]:
+    """Encode the splats of a coarser node with the steps and SH codebooks of the scene."""
+    check_model("the encoder", splats)
+    splats = clip_scales(splats)
+    tiles = cut_scene(splats, plan.parameters, None, [np.arange(len(splats))])
+    sh_plan = _assign_coarse(splats, plan, codebooks)
+    return [encode_tile(splats, tile, plan.parameters, sh_plan) for tile in tiles]
+
+
+def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> ShCodingPlan:
+    if codebooks.sh_plan.book is not None and codebooks.rule is None:  # no rule for splats that were not trained on
+        return replace(codebooks.sh_plan, weights=None, book=None, extras=())
+    assigned = assign_splats(codebooks, splats, plan.parameters, plan.options.thread_count)
+    return replace(assigned, extras=())

@@ -1,0 +1,138 @@
+"""Check TREE, the nodes of the levels of detail (spec 5.7)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from csplat import _spec
+from csplat_conformance.validator.index import Chunk, Tile
+from csplat_conformance.validator.violation_log import Payload, PlacedRecord, UnreadableError, ViolationLog
+
+
+@dataclass
+class _Node:
+    """A node record and the facts that the other records and the index add.
+
+    Attributes:
+        record: the node record.
+        level: level of its tiles; `None` if they are unknown or have several levels.
+        splat_count: number of splats; `None` if its tiles are unknown.
+        children: nodes with a valid `parent` that is this node.
+        has_all_children: whether no earlier node has an invalid `parent`, which may stand for this node.
+    """
+
+    record: PlacedRecord[_spec.NodeRecord]
+    level: int | None = None
+    splat_count: int | None = None
+    children: list[_Node] = field(default_factory=list)
+    has_all_children: bool = True
+
+    @property
+    def error(self) -> float:
+        """`error` of the record."""
+        return self.record.record.error
+
+    @property
+    def has_valid_error(self) -> bool:
+        """True if the error is possible at the node's level, whatever those of its children are (TRE-8)."""
+        return self.error == 0.0 if self.level == 0 else 0.0 <= self.error < math.inf
+
+
+def find_tree(log: ViolationLog, directory: Sequence[Chunk], tiles: Sequence[Tile]) -> Chunk | None:
+    """Check TRE-1; return the chunk with the nodes, `None` if no tile has a level above 0."""
+    coarse = next((tile for tile in tiles if tile.level), None)
+    chunk = next((chunk for chunk in directory if chunk.kind == _spec.CHUNK_TREE), None)
+    if coarse is None:
+        if chunk is not None:
+            log.add_field("TRE-1", chunk.record, "type", "a TREE chunk, but no tile has a level above 0")
+        return None
+    if chunk is None:
+        log.add_field("TRE-1", coarse.record, "level", f"{coarse.level}, but there is no TREE chunk")
+    return chunk
+
+
+def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
+    """Check the payload of TREE: TRE-2 to TRE-8. Clauses about tiles that a node may not have are not checked.
+
+    Raises:
+        UnreadableError: the payload does not consist of whole records.
+    """
+    log, start = payload.log, payload.at
+    count, rest = divmod(payload.left, _spec.NODE_RECORD_SIZE)
+    if rest:
+        payload.at = payload.end - rest
+        message = f"the payload ends within the record, {rest} of {_spec.NODE_RECORD_SIZE} bytes are left"
+        log.add("TRE-2", payload.at, f"{payload.name}/node[{count}]", message)
+        raise UnreadableError
+    # Each node has a tile, so one of these breaks TRE-3 if there are more nodes.
+    nodes = [_Node(payload.structure(_spec.NodeRecord, f"node[{n}]")) for n in range(min(count, len(tiles) + 1))]
+    _assign_tiles(log, nodes, tiles, (start, f"{payload.name}/node"))
+    if payload.left:
+        log.skip(f"{payload.name} from byte {payload.at} on", "there are more nodes than tiles")
+    _find_children(log, nodes, count)
+    for node in nodes:
+        _check_node(log, node)
+
+
+def _assign_tiles(log: ViolationLog, nodes: Sequence[_Node], tiles: Sequence[Tile], start: tuple[int, str]) -> None:
+    """Check TRE-3 and TRE-4, and set levels and numbers of splats if TRE-3 holds."""
+    found: list[tuple[int | None, int]] = []
+    first = 0
+    for node in nodes:
+        count, left = node.record.record.tile_count, len(tiles) - first
+        if not 1 <= count <= left:
+            log.add_field("TRE-3", node.record, "tile_count", f"{count}, expected 1 or more of {left} left")
+            return
+        own = tiles[first : first + count]
+        levels = sorted({tile.level for tile in own})
+        if len(levels) > 1:
+            log.add_field("TRE-4", node.record, "tile_count", f"tiles of levels {levels[0]} to {levels[-1]}")
+        found.append((levels[0] if len(levels) == 1 else None, sum(tile.count for tile in own)))
+        first += count
+    if first < len(tiles):
+        log.add("TRE-3", *start, f"{first} tiles of all nodes, expected {len(tiles)}")
+        return
+    for node, (level, splat_count) in zip(nodes, found, strict=True):
+        node.level, node.splat_count = level, splat_count
+
+
+def _find_children(log: ViolationLog, nodes: Sequence[_Node], count: int) -> None:
+    """Check TRE-5, and set the children of the nodes."""
+    all_valid = True
+    for n, node in enumerate(nodes):
+        parent = node.record.record.parent
+        if parent != _spec.NO_PARENT and not _is_above(nodes, count, n, parent):
+            log.add_field("TRE-5", node.record, "parent", f"{parent}, expected a node of a higher level, or none")
+            all_valid = False
+        elif parent < len(nodes):
+            nodes[parent].children.append(node)
+        node.has_all_children = all_valid
+
+
+def _is_above(nodes: Sequence[_Node], count: int, n: int, parent: int) -> bool:
+    """Return False if node `parent` does not exist, or certainly does not have a higher level than node `n`."""
+    if parent >= len(nodes):
+        return parent < count
+    level, below = nodes[parent].level, nodes[n].level
+    return parent > n if level is None or below is None else level > below
+
+
+def _check_node(log: ViolationLog, node: _Node) -> None:
+    """Check TRE-6 to TRE-8."""
+    # An error that is invalid by itself is no bound for that of the parent.
+    least = max((child.error for child in node.children if child.has_valid_error), default=0.0)
+    if not node.has_valid_error:
+        expected = "0 at level 0" if node.level == 0 else "finite and not negative"
+        log.add_field("TRE-8", node.record, "error", f"{node.error:.9g}, expected {expected}")
+    elif node.level != 0 and node.error < least:
+        log.add_field("TRE-8", node.record, "error", f"{node.error:.9g}, expected at least {least:.9g}, as of a child")
+    if not node.level or not node.has_all_children:
+        return
+    most = sum(child.splat_count or 0 for child in node.children)
+    if not node.children:
+        log.add_field("TRE-6", node.record, "parent", f"a node of level {node.level} that is no node's parent")
+    elif (node.splat_count or 0) > most:
+        message = f"a node of {node.splat_count} splats, expected at most {most}, those of its children"
+        log.add_field("TRE-7", node.record, "parent", message)

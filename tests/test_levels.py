@@ -1,0 +1,386 @@
+"""Levels of detail: cuts through the nodes, reading, copying and encoding them, and the first builder."""
+
+import io
+import math
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_editing import extract
+from test_spec_pseudocode import spec  # noqa: F401 - a fixture
+from typer.testing import CliRunner
+
+import csplat
+from csplat import InputError, LimitError, _spec, decode, read_header
+from csplat.decoder.container import SceneHeader
+from csplat.decoder.tree import Node, select_tiles
+from csplat.encoder import EncodeOptions, EncodePlan
+from csplat.encoder.levels import LevelNode, encode_levels
+from csplat_conformance.manifest import VECTORS, load
+from csplat_conformance.validator import validate
+from csplat_tools.cli.app import app
+from csplat_tools.level_builder import build_levels, encode_with_levels, kd_groups, measure_errors, merge_neighbours
+
+TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
+RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
+NOTHING = next(VECTORS / one.file for one in load() if one.expect and one.expect["header"]["tile_count"] == 0)
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@pytest.fixture(scope="module")
+def model(sample_path):
+    return csplat.read_ply(sample_path).select(slice(0, 1200))
+
+
+@pytest.fixture(scope="module")
+def data(model):
+    """A file of four leaves in two levels above, with errors that grow."""
+    leaves = kd_groups(model.means, 4)
+    halves = [merge_neighbours(model.select(np.concatenate(leaves[at : at + 2]))) for at in (0, 2)]
+    nodes = [LevelNode(0, 4 + number // 2, rows=rows) for number, rows in enumerate(leaves)]
+    nodes += [LevelNode(1, 6, splats=half, error=error) for half, error in zip(halves, (0.5, 0.25), strict=True)]
+    nodes.append(LevelNode(2, None, splats=merge_neighbours(halves[0]), error=1.0))
+    return encode_levels(EncodePlan.of(model), nodes).write().data
+
+
+def same(one, other):
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ARRAYS)
+
+
+# Cuts ----------------------------------------------------------------------------------------------
+
+
+@st.composite
+def trees(draw):
+    """Draw nodes of any shape; node k has tile k, of k + 1 splats for a leaf."""
+    levels = sorted(draw(st.lists(st.integers(0, 4), min_size=1, max_size=12)))
+    levels = [0] * max(1, levels.count(0)) + [level for level in levels if level]
+    parents: list[int | None] = []
+    for number, level in enumerate(levels):
+        above = [other for other in range(number + 1, len(levels)) if levels[other] > level]
+        parents.append(draw(st.sampled_from([None, *above])))
+    children = [[child for child, parent in enumerate(parents) if parent == number] for number in range(len(levels))]
+    kept = []  # a node above level 0 without children is no node
+    for number, level in enumerate(levels):
+        if level == 0 or any(child in kept for child in children[number]):
+            kept.append(number)
+    place = {number: at for at, number in enumerate(kept)}
+    nodes: list[Node] = []
+    tiles = _tiles([levels[number] for number in kept], draw)
+    for number in kept:
+        below = tuple(place[child] for child in children[number] if child in place)
+        at = place[number]
+        parent = parents[number]
+        least = max((nodes[child].error for child in below), default=0.0)
+        error = 0.0 if levels[number] == 0 else least + draw(st.sampled_from([0.0, 0.5, 1.0]))
+        count = sum(nodes[child].splat_count for child in below) or 1
+        splats = draw(st.integers(1, count)) if below else at + 1
+        nodes.append(
+            Node((tiles[at],), None if parent is None else place[parent], below, levels[number], splats, error)
+        )
+    return nodes
+
+
+def _tiles(levels, draw):
+    header = read_header(TREE)
+    like = header.tiles[0]
+    return [
+        replace(like, index=at, level=level, corner=(draw(st.integers(-50, 50)), 0, 0), extent=(3, 3, 3))
+        for at, level in enumerate(levels)
+    ]
+
+
+def header_of(nodes) -> SceneHeader:
+    tiles = [node.tiles[0] for node in nodes]
+    split = sum(tile.level == 0 for tile in tiles)
+    return replace(read_header(TREE), tiles=tuple(tiles[:split]), coarse_tiles=tuple(tiles[split:]))
+
+
+@given(nodes=trees(), level=st.integers(0, 5), budget=st.integers(0, 40), seed=st.integers(0, 9))
+def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):  # noqa: F811 - a fixture
+    header = header_of(nodes)
+    plain = [replace(node, parent=_spec.NO_PARENT if node.parent is None else node.parent) for node in nodes]
+    sizes = np.random.default_rng(seed).choice([0.0, 0.25, 0.5, 1.0, math.inf], len(nodes)).tolist()
+
+    def selected(**what):
+        return [tile.index for tile in select_tiles(header, nodes, **what)]
+
+    assert spec.cut_at_level(plain, level) == selected(level=level)
+    assert spec.cut_at_pixel_size(plain, sizes) == selected(pixel_size=sizes)
+    expected = spec.cut_within(plain, budget)
+    if expected is None:
+        with pytest.raises(LimitError, match="max_splats: needs"):
+            selected(max_splats=budget)
+    else:
+        assert expected == selected(max_splats=budget)
+
+
+@given(nodes=trees(), level=st.integers(0, 5), low=st.floats(-1, 1), width=st.floats(0, 0.1))
+def test_a_box_selects_nodes_whose_region_touches_it(nodes, level, low, width):
+    header = header_of(nodes)
+    box = np.array([[low, -9, -9], [low + width, 9, 9]])
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+
+    def region(number):
+        parts = [nodes[number].tiles[0].corners(step), *map(region, nodes[number].children)]
+        return np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
+
+    def touches(number):
+        low, high = region(number)
+        return bool((low <= box[1]).all() and (high >= box[0]).all())
+
+    whole = [tile.index for tile in select_tiles(header, nodes, level=level)]
+    part = [tile.index for tile in select_tiles(header, nodes, level=level, box=box)]
+    assert [number for number in whole if touches(number)] == part
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ({"level": 1, "max_splats": 9}, "level and max_splats exclude each other"),
+        ({"level": -1}, "level is -1, expected 0 to 255"),
+        ({"level": 256}, "level is 256, expected 0 to 255"),
+        ({"pixel_size": -0.5}, "pixel_size is -0.5, expected 0 or more"),
+        ({"pixel_size": math.nan}, "pixel_size is nan, expected 0 or more"),
+        ({"pixel_size": [1.0, 2.0]}, "pixel_size has 2 numbers, expected one, or one for each of 13 nodes"),
+        ({"max_splats": -1}, "max_splats is -1, expected 0 or more"),
+        ({"box": (1, 2, 3)}, "expected six finite numbers"),
+        ({"box": (9e9, 0, 0, 9e9, 1, 1)}, "no tile touches the box"),
+    ],
+)
+def test_refuses_arguments_of_a_cut(what, message):
+    with csplat.open(TREE) as file, pytest.raises(InputError, match=message):
+        file.cut(**what)
+
+
+def test_a_file_without_levels_is_one_node():
+    with csplat.open(VECTORS / "valid" / "two_tiles.csplat") as file:
+        assert [0, 1] == file.cut() == file.cut(level=3) == file.cut(pixel_size=9.0) == file.cut(max_splats=5)
+        with pytest.raises(LimitError, match="max_splats: needs 5, allowed 4"):
+            file.cut(max_splats=4)
+    with csplat.open(NOTHING) as file:
+        assert () == file.nodes
+        assert [] == file.cut(max_splats=0)
+
+
+# Reading -------------------------------------------------------------------------------------------
+
+
+def test_the_default_is_level_0_everywhere(data, model, tmp_path):
+    path = tmp_path / "levels.csplat"
+    path.write_bytes(data)
+    header = read_header(data)
+    assert len(model) == header.splat_count < sum(tile.splat_count for tile in header.all_tiles)
+    whole = decode(data)
+    with csplat.open(path) as file:
+        assert same(whole, file.read())
+        assert same(whole, file.read(tiles=file.cut()))
+        assert len(header.tiles) == len(list(file.tiles())) == len(file.boxes)
+    assert same(whole, csplat.read(path))
+
+
+def test_a_cut_has_the_values_of_its_tiles(data):
+    with csplat.open(data) as file:
+        tiles = file.cut(level=1)
+        assert {1} == {file.header.all_tiles[index].level for index in tiles}
+        coarse = file.read(tiles=tiles)
+        parts = [decode(data, tiles=[index]) for index in tiles]
+    for name in ARRAYS:
+        assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(coarse, name))
+    assert all(len(decode(data, tiles=file.cut(max_splats=count))) <= count for count in (150, 300, 700, 1200))
+
+
+def test_a_cut_reads_its_part_of_a_file(data):
+    with csplat.open(data) as file:
+        coarsest = file.cut(level=2)
+        sizes = [layer.size for index in coarsest for layer in file.header.all_tiles[index].layers.values()]
+        before = file.bytes_read
+        file.read(tiles=coarsest)
+        assert file.bytes_read - before < len(data) / 2
+    begin = max(layer.offset + layer.size for layer in file.header.all_tiles[coarsest[0]].layers.values())
+    first = file.header.all_tiles[coarsest[0]].layers[0]
+    tree = file.header.chunk(_spec.CHUNK_TREE)
+    assert tree.offset == _spec.HEADER_SIZE + file.header.index_size
+    assert all(first.offset < tile.layers[0].offset for tile in file.header.all_tiles[:-1])
+    assert sum(sizes) < begin
+
+
+def test_coarser_levels_have_no_extra_columns():
+    assert ["label"] == list(decode(RICH.read_bytes()).extra)
+    with csplat.open(RICH) as file:
+        assert {} == file.read(tiles=file.cut(level=1)).extra
+        assert {} == file.read(tiles=[0, 2]).extra
+        assert ["label"] == list(file.read(tiles=[0]).extra)
+
+
+def test_levels_of_a_file_are_scenes_to_convert(data, tmp_path):
+    path, ply = tmp_path / "levels.csplat", tmp_path / "coarse.ply"
+    path.write_bytes(data)
+    result = CliRunner().invoke(app, ["convert", str(path), str(ply), "--level", "1"])
+    assert 0 == result.exit_code, result.output
+    assert "2 coarser levels of detail: level 1 alone is read" in result.output
+    with csplat.open(data) as file:
+        assert len(file.read(tiles=file.cut(level=1))) == len(csplat.read_ply(ply))
+    result = CliRunner().invoke(app, ["convert", str(path), str(ply), "--level", "3", "--force"])
+    assert 1 == result.exit_code
+    assert "the level is 3, expected 0 to 2" in result.output
+
+
+def test_info_lists_the_levels(data, tmp_path):
+    path = tmp_path / "levels.csplat"
+    path.write_bytes(data)
+    result = CliRunner().invoke(app, ["info", str(path), "--json"])
+    assert 0 == result.exit_code, result.output
+    import json
+
+    levels = json.loads(result.stdout)["levels"]
+    assert [(0, 4), (1, 2), (2, 1)] == [(one["level"], one["nodes"]) for one in levels]
+    assert [[0.0, 0.0], [0.25, 0.5], [1.0, 1.0]] == [one["errors"] for one in levels]
+    tiles = [tile for tile in read_header(data).all_tiles if tile.level == 1]
+    assert sum(layer.size for tile in tiles for layer in tile.layers.values()) == levels[1]["size_bytes"]
+
+
+# Copying -------------------------------------------------------------------------------------------
+
+
+def test_a_part_has_whole_leaves_and_the_nodes_above_them(data):
+    with csplat.open(data) as file:
+        nodes, step = file.nodes, file.header.attributes[3].step
+    low, high = nodes[0].tiles[0].corners(step)
+    middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+    part, cut = extract(data, (*middle, *middle))
+    assert () == tuple(validate(cut).violations)
+    with csplat.open(cut) as file:
+        assert same(decode(data, tiles=part.tiles), decode(cut, tiles=range(len(part.tiles))))
+        kept = [node for node in file.nodes if node.level == 0]
+        assert sum(node.splat_count for node in kept) == part.splat_count == len(decode(cut))
+        assert 1 <= len(kept) < 4
+        for node in file.nodes:
+            assert node.level == 0 or 2 == len(node.children)
+    whole, copy = extract(data, (-1e6, -1e6, -1e6, 1e6, 1e6, 1e6))
+    assert [node.error for node in csplat.open(data).nodes] == [node.error for node in csplat.open(copy).nodes]
+    assert len(whole.tiles) == len(read_header(data).all_tiles)
+
+
+def test_merged_files_are_a_forest(data, model):
+    plain = csplat.encode(model.select(slice(0, 300)))
+    again = io.BytesIO()
+    merged = csplat.merge([data, data], again)
+    assert "" == merged.why
+    assert () == tuple(validate(again.getvalue()).violations)
+    with csplat.open(again.getvalue()) as file:
+        levels = [node.level for node in file.nodes]
+        assert sorted(levels) == levels
+        assert 2 == sum(node.parent is None for node in file.nodes)
+        once, twice = decode(data, tiles=csplat.open(data).cut(level=1)), file.read(tiles=file.cut(level=1))
+    assert np.array_equal(np.concatenate([once.means, once.means]), twice.means)
+    other = io.BytesIO()
+    assert csplat.merge([data, plain], other).why  # other steps: encoded again, without levels
+    assert () == read_header(other.getvalue()).coarse_tiles
+
+
+# Encoding ------------------------------------------------------------------------------------------
+
+
+def test_level_0_of_a_file_is_the_scene_with_the_errors_of_a_plain_file(data, model):
+    plain = csplat.encode_with_report(model)
+    nodes = [LevelNode(0, None, rows=rows) for rows in kd_groups(model.means, 4)]
+    cut = encode_levels(EncodePlan.of(model), nodes).write()
+    assert () == read_header(cut.data).coarse_tiles  # leaves alone are no levels
+    assert () == tuple(validate(data).violations) == tuple(validate(cut.data).violations)
+    assert same(decode(data), decode(cut.data))
+    for measure, pair in plain.report.errors.items():
+        assert cut.report.errors[measure] == pytest.approx(pair, rel=0.2), measure
+    assert np.array_equal(np.sort(cut.source_index), np.arange(len(model)))
+
+
+@pytest.mark.parametrize("options", [{"preset": "small"}, {"preset": "fast", "sh_degree": 0}, {"means_coding": "axis"}])
+def test_files_with_levels_are_valid_with_any_options(model, options):
+    leaves = kd_groups(model.means, 2)
+    nodes = [LevelNode(0, 2, rows=rows) for rows in leaves]
+    nodes.append(LevelNode(7, None, splats=merge_neighbours(model), error=2.0))
+    data = encode_levels(EncodePlan.of(model, EncodeOptions(**options)), nodes).write().data
+    assert () == tuple(validate(data).violations)
+    assert len(model) == len(decode(data))
+
+
+def test_refuses_leaves_that_are_not_the_scene(model):
+    plan = EncodePlan.of(model)
+    with pytest.raises(InputError, match="the leaves do not hold each splat"):
+        encode_levels(plan, [LevelNode(0, None, rows=np.arange(5))])
+    nodes = [LevelNode(0, 1, rows=np.arange(len(model))), LevelNode(0, None, rows=np.arange(0))]
+    with pytest.raises(InputError, match="the parent of a node of level 0 has level 0"):
+        encode_levels(plan, nodes)
+
+
+# Building ------------------------------------------------------------------------------------------
+
+
+@given(count=st.integers(1, 40), parts=st.integers(1, 40))
+def test_groups_hold_each_point_once_and_are_of_equal_size(count, parts):
+    points = np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32)
+    groups = kd_groups(points, min(count, parts))
+    sizes = [len(rows) for rows in groups]
+    assert min(count, parts) == len(groups)
+    assert 1 <= min(sizes)
+    assert max(sizes) - min(sizes) <= 1
+    assert list(range(count)) == sorted(np.concatenate(groups).tolist())
+
+
+def test_merged_splats_keep_mean_covariance_and_light():
+    """Two equal splats next to each other, on the x axis: variance 1 + 1 along it."""
+    quats = np.zeros((2, 4), np.float32)
+    quats[:, 0] = 1.0
+    two = csplat.SplatModel(
+        means=np.array([[-1, 0, 0], [1, 0, 0]], np.float32), quats=quats, scales=np.zeros((2, 3), np.float32),
+        opacities=np.full(2, 0.25, np.float32), sh0=np.array([[1, 0, 0], [0, 1, 0]], np.float32),
+        shN=np.zeros((2, 0, 3), np.float32),
+    )  # fmt: skip
+    one = merge_neighbours(two)
+    assert 1 == len(one)
+    assert [0.0, 0.0, 0.0] == one.means[0].tolist()
+    assert [0.5, 0.5, 0.0] == one.sh0[0].tolist()
+    deviations = np.sort(np.exp(one.scales[0]))
+    assert deviations == pytest.approx([1.0, 1.0, math.sqrt(2.0)], rel=1e-6)
+    area = (2.0 * math.sqrt(2.0) + 1.0) / 3.0
+    assert one.opacities[0] == pytest.approx(2 * 0.25 / area, rel=1e-6)
+
+
+def test_a_built_tree_has_a_quarter_of_the_splats_on_each_level_and_growing_errors(model):
+    nodes = build_levels(model, 100, 30)
+    counts = [sum(len(one.splats) for one in nodes if one.level == level) for level in range(1, nodes[-1].level + 1)]
+    for finer, coarser in pairwise([len(model), *counts]):
+        assert finer / 4 <= coarser <= finer / 4 + 4
+    result = encode_with_levels(model, leaf_splats=100, root_splats=30)
+    assert () == tuple(validate(result.data).violations)
+    with csplat.open(result.data) as file:
+        assert 1 == sum(node.parent is None for node in file.nodes)
+        errors = [node.error for node in file.nodes]
+        assert errors[-1] == max(errors) > 0.0
+        assert len(file.read(tiles=file.cut(level=255))) <= 30
+    assert errors == measure_errors(result.data)
+
+
+def test_a_node_that_is_its_splats_has_the_smallest_error(model):
+    """A parent with the splats of its only child looks like it at every pixel size."""
+    rows = np.arange(len(model))
+    nodes = [LevelNode(0, 1, rows=rows), LevelNode(1, None, splats=replace(model, extra={}))]
+    data = encode_levels(EncodePlan.of(model), nodes).write().data
+    with csplat.open(data) as file:
+        low, high = file.boxes[0]
+    radius = np.linalg.norm(high - low) / 2
+    assert measure_errors(data)[1] == pytest.approx(radius / 256, rel=1e-6)
+
+
+def test_encode_writes_levels(tmp_path, sample_path):
+    out = tmp_path / "levels.csplat"
+    words = ["encode", str(sample_path), str(out), "--levels"]
+    result = CliRunner().invoke(app, words)
+    assert 0 == result.exit_code, result.output
+    assert () == tuple(validate(out.read_bytes()).violations)
+    refused = CliRunner().invoke(app, [*words, "--force", "--target-size", "9kB"])
+    assert 2 == refused.exit_code
+    assert "--levels" in refused.output
