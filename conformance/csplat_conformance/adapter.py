@@ -70,22 +70,23 @@ def cuts_of(data: bytes, lines: Sequence[str]) -> list[list[int] | str]:
     Raises:
         CsplatError: the file is refused.
     """
-    from csplat import splat_file  # not needed to read the manifest
+    from csplat import decoder  # not needed to read the manifest
+    from csplat.decoder.tree import read_nodes, select_tiles
 
+    header = decoder.read_header(data)
+    nodes = read_nodes(memoryview(data), header)
     result: list[list[int] | str] = []
-    with splat_file.open(data) as opened:
-        for line in lines:
-            name, *words = line.split()
-            numbers = [float(word) for word in words]
-            try:
-                if name == "pixel_size":
-                    result.append(opened.cut(pixel_size=numbers[0] if len(numbers) == 1 else numbers))
-                elif name == "level":
-                    result.append(opened.cut(level=int(words[0])))
-                else:
-                    result.append(opened.cut(max_splats=int(words[0])))
-            except LimitError as error:
-                result.append(error.code)
+    for line in lines:
+        name, *words = line.split()
+        sizes = [float(word) for word in words] if name == "pixel_size" else None
+        pixel_size = sizes[0] if sizes is not None and len(sizes) == 1 else sizes
+        level = int(words[0]) if name == "level" else None
+        max_splats = int(words[0]) if name == "splats" else None
+        try:
+            tiles = select_tiles(header, nodes, level=level, pixel_size=pixel_size, max_splats=max_splats)
+            result.append([tile.index for tile in tiles])
+        except LimitError as error:
+            result.append(error.code)
     return result
 
 

@@ -41,6 +41,9 @@ def main() -> int:
     )
     parser.add_argument("--decoder", choices=(*_DECODERS,), default="python")
     parser.add_argument("--count", type=int, default=400, help="number of mutants (default 400)")
+    parser.add_argument(
+        "--only", metavar="TEXT", default="", help="mutants of files or of lines that contain this text"
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of the choice of mutants (default 0)")
     parser.add_argument("--jobs", type=int, default=1, help="parallel processes (default 1)")
     args = parser.parse_args()
@@ -50,7 +53,7 @@ def main() -> int:
     global _decoder  # noqa: PLW0603 - forked workers inherit it; it cannot be pickled as an argument
     try:
         _decoder = _DECODERS[args.decoder](fuzzed(_FILES, args.seed))
-        chosen = sample(_decoder, args.count, args.seed)
+        chosen = sample(_decoder, args.count, args.seed, args.only)
     except InputError as error:
         sys.stderr.write(f"error: {error}\n")
         return 1

@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import os
 import select
+import shlex
 import signal
 import subprocess
 import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_loader
@@ -22,8 +23,10 @@ from typing import Any, Final
 from csplat import decoder
 from csplat.errors import InputError
 from csplat_conformance import adapter
-from csplat_conformance.answers import Answer
+from csplat_conformance.answers import Answer, cuts_of_vector
 from csplat_conformance.conformance_report import Status
+from csplat_conformance.manifest import VECTORS, Vector
+from csplat_conformance.protocol import ask_cuts
 from csplat_selftest.decoder_processes import (
     C_ADAPTER,
     C_SOURCES,
@@ -34,7 +37,15 @@ from csplat_selftest.decoder_processes import (
     js_folder,
 )
 from csplat_selftest.fuzzing.decoder_targets import C_LIMITS, JS_LIMITS, LIMITS
-from csplat_selftest.mutation.mutants import Fate, Mutant, MutantResult, difference, failing, verdict
+from csplat_selftest.mutation.mutants import (
+    Fate,
+    Mutant,
+    MutantResult,
+    difference,
+    failing,
+    failing_cuts,
+    verdict,
+)
 from csplat_selftest.mutation.operators import c_mutants, python_mutants
 
 NO_FORK = "this system cannot fork processes, which mutants require: use Linux or macOS"
@@ -115,6 +126,7 @@ class PythonDecoder:
             return
         # One thread is five times faster; then use all threads, which have separate code.
         caught = next((name for threads in (1, None) if (name := failing(_ask(threads)))), "")
+        caught = caught or failing_cuts(_ask_cuts)
         _tell(writing, caught)
         if not caught:
             _tell(writing, difference(_fuzzed_answer, self._files, self._expected))
@@ -143,6 +155,18 @@ def _ask(threads: int | None) -> Any:
             return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
 
     return ask
+
+
+def _ask_cuts(vector: Vector) -> Answer:
+    try:
+        return Answer(Status.PASSED, cuts=adapter.cuts_of(vector.data, cuts_of_vector(vector)))
+    except Exception as error:  # noqa: BLE001 - a mutant may fail in any way
+        return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
+
+
+def _run_cuts(command: str) -> Callable[[Vector], Answer]:
+    """Return a function that runs a command with `{input}` and `{cuts}` on a vector."""
+    return lambda vector: ask_cuts(command, VECTORS / vector.file, cuts_of_vector(vector), _FILE_SECONDS)
 
 
 def _fuzzed_answer(data: bytes) -> Answer:
@@ -201,6 +225,7 @@ def _line(reading: int, otherwise: str) -> str:
 # JavaScript ----------------------------------------------------------------------------------------
 
 _OPERATORS = Path("test", "operators.mjs")
+_CUTS: Final = ("tree.mjs", "options.mjs")  # modules of cuts; starting a process for each vector takes a second
 #: Modules that are not part of decoding whole files, WebAssembly, or generated tables.
 _OTHERS: Final = (
     "spec.mjs",
@@ -263,6 +288,9 @@ class JavaScriptDecoder:
                 (folder / file).write_text(changed, encoding="utf-8")
             with JsDecoder(folder, timeout=_FILE_SECONDS) as decoder:
                 caught = failing(decoder.ask)
+            if not caught and mutant.file in _CUTS:
+                script = shlex.quote(str(js_folder() / "test" / "adapter.mjs"))
+                caught = failing_cuts(_run_cuts(f"env CSPLAT_JS={name} node {script} --cuts {{input}} {{cuts}}"))
             if caught:
                 return MutantResult(mutant, Fate.CAUGHT, caught)
             with JsDecoder(folder, JS_LIMITS, _FILE_SECONDS) as decoder:
@@ -322,6 +350,7 @@ class NativeDecoder:
             compile_c(program, self._written(mutant, Path(name)), *objects, "-lm")
             with CDecoder(program, timeout=_FILE_SECONDS) as decoder:
                 caught = failing(decoder.ask)
+            caught = caught or failing_cuts(_run_cuts(f"{program} --cuts {{input}} {{cuts}}"))
             if caught:
                 return MutantResult(mutant, Fate.CAUGHT, caught)
             with CDecoder(program, C_LIMITS, _FILE_SECONDS) as decoder:

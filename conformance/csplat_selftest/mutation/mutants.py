@@ -9,7 +9,7 @@ from enum import StrEnum
 from functools import cache
 from typing import Any, Protocol
 
-from csplat_conformance.answers import PARTS, Answer, compare_answer
+from csplat_conformance.answers import PARTS, Answer, compare_answer, compare_cuts, cuts_of_vector
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import Vector, load
 from csplat_selftest.fuzzing.decoder_targets import DecoderTarget
@@ -92,9 +92,10 @@ class Decoder(Protocol):
         ...
 
 
-def sample(decoder: Decoder, count: int, seed: int) -> list[Mutant]:
-    """Choose random valid mutants, in the order of the files."""
-    mixed = list(decoder.mutants)
+def sample(decoder: Decoder, count: int, seed: int, only: str = "") -> list[Mutant]:
+    """Choose random valid mutants, in the order of the files, of those whose file or line contains a text."""
+    lines = {file: ["", *text.splitlines()] for file, text in decoder.texts.items()}
+    mixed = [one for one in decoder.mutants if only in one.file or only in lines[one.file][one.line]]
     random.Random(seed).shuffle(mixed)  # noqa: S311 - repeatable, no secret
     chosen: list[Mutant] = []
     for mutant in mixed:
@@ -161,6 +162,16 @@ def failing(ask: Ask) -> str:
         if not all(one.good for one in outcomes):
             return vector.name
     return ""
+
+
+def failing_cuts(ask: Callable[[Vector], Answer]) -> str:
+    """Return the name of the first vector whose cuts fail, or an empty string.
+
+    Args:
+        ask: selects the tiles of the cuts of a vector.
+    """
+    chosen = (vector for vector, _ in vectors() if cuts_of_vector(vector))
+    return next((f"cuts of {vector.name}" for vector in chosen if not compare_cuts(vector, ask(vector)).good), "")
 
 
 def fuzzed(count: int, seed: int) -> list[bytes]:
