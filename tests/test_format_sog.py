@@ -12,6 +12,9 @@ from tables import failures
 import csplat
 from csplat.errors import InputError
 from csplat.formats import detect_format, open_scene
+from csplat.formats.sog.sog_reader import read_leaf_numbers
+from csplat_conformance.validator import validate
+from csplat_tools.encode_file import encode_file
 
 Image = pytest.importorskip("PIL.Image", reason="SOG is pictures")
 
@@ -151,6 +154,26 @@ def levels(tmp_path, **changes):
         "tree": {"children": [{"lods": one}, {"lods": two}]}, **changes,
     }  # fmt: skip
     return foldered(tmp_path / "a", {**files, "lod-meta.json": json.dumps(meta).encode()})
+
+
+def test_leaves_are_numbered_in_the_order_of_the_splats(tmp_path):
+    path = levels(tmp_path)
+    assert [0] * 5 + [1] * 3 + [2] * 5 == read_leaf_numbers(path).tolist()
+    assert [0] * 3 + [1] * 2 + [2] * 5 == read_leaf_numbers(path / "lod-meta.json", 1).tolist()
+    with pytest.raises(InputError, match="it is not streamed SOG"):
+        read_leaf_numbers(foldered(tmp_path / "b", files_of(*splats())))
+
+
+def test_levels_of_streamed_sog_become_nodes_of_a_file(tmp_path):
+    path, out = levels(tmp_path), tmp_path / "out.csplat"
+    encode_file(str(path), str(out), csplat.EncodeOptions(), levels=True)
+    assert () == tuple(validate(out.read_bytes()).violations)
+    with csplat.open(out) as file, open_scene(path, level=1) as coarse:
+        assert [(0, 3, 5), (0, 4, 3), (0, None, 5), (1, None, 3), (1, None, 2)] == [
+            (node.level, node.parent, node.splat_count) for node in file.nodes
+        ]
+        assert coarse.count == len(file.read(tiles=file.cut(level=1)))
+        assert all(node.error > 0 for node in file.nodes if node.level)
 
 
 def test_a_part_without_a_level_uses_its_nearest(tmp_path):

@@ -54,7 +54,7 @@ typedef enum csplat_code {
     CSPLAT_E_CODEBOOK, /* an index, a count or a codebook that does not fit */
     CSPLAT_E_BOX, /* a tile's record does not describe its splats */
     CSPLAT_E_JSON, /* a JSON chunk is not UTF-8 JSON of the right kind */
-    CSPLAT_E_LIMIT, /* the decoder's budget is too small */
+    CSPLAT_E_LIMIT, /* a budget, of the decoder or of a cut, is too small */
     CSPLAT_E_INPUT, /* the caller's data or arguments, not a file, are at fault */
     /* end generated */
 } csplat_code;

@@ -125,7 +125,7 @@ def encode_file(
         importance: a .npy file with one weight per splat of the source, or a file of `csplat sensitivity`.
         prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
-        levels: add levels of detail; excludes `target` and `importance`.
+        levels: add levels of detail, those of the source if it is streamed SOG; excludes `target` and `importance`.
         out_of_core: memory, disk and workers.
         progress: progress callback.
 
@@ -147,11 +147,18 @@ def encode_file(
             "a target, an importance, a source index and levels exclude options for scenes larger than memory"
         )
     start = time.perf_counter()
+    nodes = None
     if isinstance(source, LoadedModel):
         read = source
     else:
         with source_path(source) as local, ExitStack() as stack:
             opened: SceneSource | None = None
+            if levels and detect_format(local).name == "sog":
+                from csplat_tools.level_builder import read_streamed_levels
+
+                with open_scene(local) as scene:
+                    has_levels = len(scene.levels) > 1
+                nodes = read_streamed_levels(local) if has_levels else None
             if not in_memory and may_exceed_memory(local, limits):
                 if progress is not None:
                     progress("opening", 0.0)
@@ -170,7 +177,7 @@ def encode_file(
     if levels:
         from csplat_tools.level_builder import encode_with_levels  # imports the renderer
 
-        result = encode_with_levels(read.model, options, progress=progress)
+        result = encode_with_levels(read.model, options, nodes=nodes, progress=progress)
     elif importance is None:
         result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
     else:

@@ -1,5 +1,7 @@
 """Build the levels of detail of a scene: merge neighbours by their moments, and measure the errors with the renderer.
 
+Levels that a scene has already, in streamed SOG, are taken instead.
+
 Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent, in which four neighbouring
 splats become one; above the last common parent, a chain of nodes goes on to a few thousand splats. `error` of each node
 is measured as specified (spec E.5), on the decoded splats of the finished file.
@@ -10,6 +12,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,9 +30,12 @@ from csplat.encoder import (
     mean_axes,
 )
 from csplat.errors import InputError
+from csplat.formats import open_scene
+from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
+from csplat.scene_source import join_blocks
 from csplat.splat_file import open as opened
-from csplat.types import F32, F64, Progress, null_progress
+from csplat.types import F32, F64, I64, Progress, null_progress
 from csplat_render.camera import Camera, look_at
 from csplat_render.rasteriser import Rasteriser
 
@@ -54,6 +61,7 @@ def encode_with_levels(
     model: SplatModel,
     options: EncodeOptions | None = None,
     *,
+    nodes: Sequence[LevelNode] | None = None,
     leaf_splats: int = LEAF_SPLATS,
     root_splats: int = ROOT_SPLATS,
     progress: Progress | None = None,
@@ -63,6 +71,7 @@ def encode_with_levels(
     Args:
         model: the scene, of one splat or more.
         options: default: the preset "balanced".
+        nodes: nodes of the scene, whose errors are measured; `None`: build them.
         leaf_splats, root_splats: see `build_levels`.
         progress: called with the stage and the fraction done, 0 to 1.
 
@@ -72,11 +81,58 @@ def encode_with_levels(
     if len(model) == 0:
         raise InputError("a scene without splats has no levels of detail")
     progress = progress or null_progress
-    nodes = build_levels(model, leaf_splats, root_splats, progress)
+    settings: dict[str, Any] = {"levels": "of the source"}
+    if nodes is None:
+        nodes = build_levels(model, leaf_splats, root_splats, progress)
+        settings = {"levels": {"merged": _MERGED, "leaf_splats": leaf_splats, "root_splats": root_splats}}
     encoded = encode_levels(EncodePlan.of(model, options, progress=progress), nodes, progress)
     if any(node.level for node in nodes):
         encoded = encoded.with_node_errors(measure_errors(encoded.write().data, progress))
-    return encoded.write({"levels": {"merged": _MERGED, "leaf_splats": leaf_splats, "root_splats": root_splats}})
+    return encoded.write(settings)
+
+
+def read_streamed_levels(path: Path) -> list[LevelNode]:
+    """Return the levels of detail of streamed SOG: each leaf of its tree becomes a chain of nodes.
+
+    Raises:
+        InputError: the file is damaged, or no streamed SOG.
+        OSError: it cannot be read.
+    """
+    with open_scene(path) as scene:
+        count = len(scene.levels)
+    levels = []
+    for level in range(count):
+        with open_scene(path, level=level) as scene:
+            levels.append((scene.model(), read_leaf_numbers(path, level)))
+    return chain_leaves(levels)
+
+
+def chain_leaves(levels: Sequence[tuple[SplatModel, I64]]) -> list[LevelNode]:
+    """Return a chain of nodes for each leaf, without levels that have no fewer splats than the finer one.
+
+    Args:
+        levels: the splats of each level, finest first, and the number of the leaf of each splat.
+    """
+    nodes: list[LevelNode] = []
+    finest = levels[0][1]
+    for leaf in np.unique(finest):
+        nodes.append(LevelNode(0, None, rows=np.flatnonzero(finest == leaf)))
+        splat_count = int(np.count_nonzero(finest == leaf))
+        for level, (model, numbers) in enumerate(levels[1:], 1):
+            rows = np.flatnonzero(numbers == leaf)
+            if 0 < len(rows) < splat_count:
+                nodes[-1] = replace(nodes[-1], parent=len(nodes))
+                nodes.append(LevelNode(level, None, splats=_with_bands(model.select(rows), levels[0][0])))
+                splat_count = len(rows)
+    return nodes
+
+
+def _with_bands(splats: SplatModel, scene: SplatModel) -> SplatModel:
+    """Return splats with as many SH coefficients as those of a scene, and without extra columns."""
+    shN = np.zeros((len(splats), *scene.shN.shape[1:]), np.float32)
+    kept = min(shN.shape[1], splats.shN.shape[1])
+    shN[:, :kept] = splats.shN[:, :kept]
+    return replace(splats, shN=shN, extra={})
 
 
 def build_levels(
@@ -94,7 +150,8 @@ def build_levels(
         progress: called with the fraction of the levels that are done.
     """
     groups = kd_groups(model.means, math.ceil(len(model) / leaf_splats))
-    parts = [model.select(rows) for rows in groups]
+    plain = replace(model, extra={}, means_double=None)
+    parts = [plain.select(rows) for rows in groups]
     nodes = [LevelNode(0, None, rows=rows) for rows in groups]
     below = list(range(len(nodes)))  # the nodes without a parent
     splat_count, level = len(model), 0
@@ -105,7 +162,7 @@ def build_levels(
         first = len(nodes)
         for at in range(0, len(below), _CHILDREN):
             children = below[at : at + _CHILDREN]
-            merged.append(merge_neighbours(concatenated(parts[at : at + _CHILDREN])))
+            merged.append(merge_neighbours(join_blocks(plain, parts[at : at + _CHILDREN])))
             for child in children:
                 nodes[child] = replace(nodes[child], parent=len(nodes))
             nodes.append(LevelNode(level, None, splats=merged[-1]))
@@ -190,21 +247,6 @@ def _areas(scales: F32) -> F64:
     """Return the areas of the projections of ellipsoids, averaged over directions, up to a factor (Knud Thomsen)."""
     a, b, c = np.exp(scales.astype(np.float64)).T
     return np.asarray((a * b + a * c + b * c) / 3.0)
-
-
-def concatenated(parts: Sequence[SplatModel]) -> SplatModel:
-    """Return the splats of several models with the metadata of the first, without extra columns."""
-    return replace(
-        parts[0],
-        means=np.concatenate([part.means for part in parts]),
-        quats=np.concatenate([part.quats for part in parts]),
-        scales=np.concatenate([part.scales for part in parts]),
-        opacities=np.concatenate([part.opacities for part in parts]),
-        sh0=np.concatenate([part.sh0 for part in parts]),
-        shN=np.concatenate([part.shN for part in parts]),
-        extra={},
-        means_double=None,
-    )
 
 
 def measure_errors(data: bytes, progress: Progress = null_progress) -> list[float]:

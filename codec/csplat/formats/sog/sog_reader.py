@@ -23,7 +23,7 @@ from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply.columns import alpha_of_logits
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
-from csplat.types import F32, U8, U16
+from csplat.types import F32, I64, U8, U16
 
 _MAX_OFFSET = 1 << 40  # splats
 _KEYS = ("means", "quats", "scales", "sh0", "lodLevels", "tree")  # a meta.json of another program has none of these
@@ -36,6 +36,30 @@ def open_sog(path: Path, level: int = 0) -> Iterator[SceneSource]:
     parts, name = find_parts(path)
     with parts.kept_open():
         yield _open_scene(path, parts, name, level)
+
+
+def read_leaf_numbers(path: Path, level: int = 0) -> I64:
+    """Return the leaf of each splat of a level of streamed SOG, in the order of `open_sog`.
+
+    Leaves are numbered in the order of the tree; splats of the environment have the number after the last. A leaf
+    without a level has that of the next coarser one, else of its coarsest.
+
+    Raises:
+        InputError: the file is no streamed SOG, or damaged.
+        OSError: it cannot be read.
+    """
+    parts, name = find_parts(path)
+    with parts.kept_open():
+        meta = parts.json(name)
+        if "tree" not in meta:
+            parts.refuse("it is not streamed SOG, which has a tree of levels")
+        _, leaves = _read_leaves(parts, meta)
+        ranges = sorted((*_range_at(leaf, level), number) for number, leaf in enumerate(leaves))
+        around = 0
+        if "environment" in meta:
+            around = read_meta(*parts.inner(use_slashes(meta["environment"].text()))).count
+    numbers = [np.full(stop - start, number, np.int64) for _, start, stop, number in ranges]
+    return np.concatenate([*numbers, np.full(around, len(leaves), np.int64)])
 
 
 def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> SceneSource:

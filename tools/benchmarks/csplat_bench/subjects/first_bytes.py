@@ -19,12 +19,13 @@ import csplat
 from csplat import _spec
 from csplat.decoder import Node, SceneHeader, decode
 from csplat.model import SplatModel
+from csplat.scene_source import join_blocks
 from csplat_bench.protocol import Measure, Setup
 from csplat_bench.scenes import find_scene
 from csplat_bench.suites import Case
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.level_builder import concatenated, encode_with_levels
+from csplat_tools.level_builder import encode_with_levels
 from csplat_tools.views import comparison_cameras
 
 
@@ -94,7 +95,7 @@ def show(data: bytes, header: SceneHeader, nodes: Sequence[Node], size: int) -> 
         _decode(data, [tile for tile in drawn if degrees[tile] == degree], degree, header)
         for degree in range(header.sh_degree + 1)
     ]
-    return concatenated(parts)
+    return join_blocks(parts[0].select(slice(0, 0)), parts)
 
 
 def _covers(header: SceneHeader, book: int, layer: int) -> bool:
