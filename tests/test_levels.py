@@ -15,10 +15,15 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat import InputError, LimitError, _spec, decode, read_header
+from csplat.decoder import decode_scene
 from csplat.decoder.container import SceneHeader
 from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
 from csplat.encoder.levels import LevelNode, encode_levels
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.encoders import all_inputs
+from csplat_conformance.encoders.file_checks import SplatPairs
+from csplat_conformance.encoders.render_checks import check_renders
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
@@ -373,6 +378,23 @@ def test_a_node_that_is_its_splats_has_the_smallest_error(model):
         low, high = file.boxes[0]
     radius = np.linalg.norm(high - low) / 2
     assert measure_errors(data)[1] == pytest.approx(radius / 256, rel=1e-6)
+
+
+def test_a_scene_without_splats_has_no_levels(model):
+    data = encode_with_levels(model.select(slice(0, 0))).data
+    assert (0, ()) == (read_header(data).splat_count, read_header(data).all_tiles)
+
+
+def test_the_suite_of_encoders_reports_how_levels_look(model, data):
+    case = next(one for one in all_inputs() if one.renders)
+    pairs = SplatPairs(np.arange(len(model)), 0, 0, 0)
+    verdict = check_renders(
+        case, Source.of(model), decode_scene(data), pairs, data, lambda _, shown: float(len(shown)), 100.0
+    )
+    with csplat.open(data) as file:
+        counts = {str(level): float(len(file.read(tiles=file.cut(level=level)))) for level in (1, 2)}
+    assert counts == verdict.details["levels"]
+    assert "; level 1 " in verdict.message
 
 
 def test_encode_writes_levels(tmp_path, sample_path):

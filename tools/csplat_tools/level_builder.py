@@ -29,7 +29,6 @@ from csplat.encoder import (
     encode_levels,
     mean_axes,
 )
-from csplat.errors import InputError
 from csplat.formats import open_scene
 from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
@@ -69,21 +68,19 @@ def encode_with_levels(
     """Encode a scene with levels of detail, in memory.
 
     Args:
-        model: the scene, of one splat or more.
+        model: the scene.
         options: default: the preset "balanced".
         nodes: nodes of the scene, whose errors are measured; `None`: build them.
         leaf_splats, root_splats: see `build_levels`.
         progress: called with the stage and the fraction done, 0 to 1.
 
     Raises:
-        InputError: the scene has no splats, a value fits no lattice, or an option is not allowed for the model.
+        InputError: a value fits no lattice, or an option is not allowed for the model.
     """
-    if len(model) == 0:
-        raise InputError("a scene without splats has no levels of detail")
     progress = progress or null_progress
     settings: dict[str, Any] = {"levels": "of the source"}
     if nodes is None:
-        nodes = build_levels(model, leaf_splats, root_splats, progress)
+        nodes = build_levels(model, leaf_splats, root_splats, progress) if len(model) else []
         settings = {"levels": {"merged": _MERGED, "leaf_splats": leaf_splats, "root_splats": root_splats}}
     encoded = encode_levels(EncodePlan.of(model, options, progress=progress), nodes, progress)
     if any(node.level for node in nodes):

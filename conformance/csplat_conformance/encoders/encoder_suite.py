@@ -318,11 +318,11 @@ def _check_levels(
     yield "L2", content
     errors, alone = check_errors(case, scene, pairs)
     yield "L3", errors
-    yield "L4", _check_renders(case, scene, pairs, len(data), alone if "L3" in checks.levels else "", checks)
+    yield "L4", _check_renders(case, scene, pairs, data, alone if "L3" in checks.levels else "", checks)
 
 
 def _check_renders(
-    case: EncoderInput, scene: DecodedScene, pairs: SplatPairs, size_bytes: int, alone: str, checks: CheckOptions
+    case: EncoderInput, scene: DecodedScene, pairs: SplatPairs, data: bytes, alone: str, checks: CheckOptions
 ) -> Verdict:
     """Check L4, if it is requested or needed.
 
@@ -330,7 +330,7 @@ def _check_renders(
         case: the input.
         scene: the decoded scene.
         pairs: the source splat of each decoded splat.
-        size_bytes: size of the file.
+        data: the file.
         alone: the reason why only renders can check the file; empty if errors were verified.
         checks: the checks to make.
     """
@@ -339,7 +339,7 @@ def _check_renders(
     if not (alone or "L4" in checks.levels):
         return Verdict(Status.SKIPPED)
     if checks.render_score is not None:
-        return check_renders(case, case.source(), scene, pairs, size_bytes, checks.render_score, checks.psnr_min)
+        return check_renders(case, case.source(), scene, pairs, data, checks.render_score, checks.psnr_min)
     if alone:
         return Verdict(Status.FAILED, f"{alone}: only renders can check it, and {checks.no_render_reason}")
     return Verdict(Status.SKIPPED, checks.no_render_reason)

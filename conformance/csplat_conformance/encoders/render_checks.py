@@ -9,7 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from csplat.decoder import DecodedScene
+from csplat.decoder import DecodedScene, SceneHeader, decode
+from csplat.decoder.tree import read_nodes, select_tiles
 from csplat.model import SplatModel
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.declared_bounds import Source
@@ -26,32 +27,43 @@ def check_renders(
     source: Source,
     scene: DecodedScene,
     pairs: SplatPairs,
-    size_bytes: int,
+    data: bytes,
     render_score: RenderScore,
     psnr_min: float,
 ) -> Verdict:
-    """Check L4: renders of the file match those of the source.
+    """Check L4: renders of the file match those of the source. Coarser levels of detail are reported, not judged.
 
     Args:
         case: the input.
         source: the scene of the input.
         scene: the decoded scene.
         pairs: the source splat of each decoded splat.
-        size_bytes: size of the file.
+        data: the file.
         render_score: computes the PSNR.
         psnr_min: lowest PSNR that passes, dB; see `EncoderInput.psnr_required`.
     """
     model, decoded = source.to_model(scene.model.origin), scene.model
     psnr = render_score(model, decoded)
     figures, required = peer_figures(case.name), case.psnr_required(psnr_min)
-    details = {"psnr": psnr, "wanted": required, "bytes": size_bytes, "beside": figures}
-    size = f"in {size_bytes:,} bytes{format_figures(figures)}"
+    details = {"psnr": psnr, "wanted": required, "bytes": len(data), "beside": figures}
+    size = f"in {len(data):,} bytes{format_figures(figures)}"
+    if scene.header.coarse_tiles:
+        details["levels"] = levels = _score_levels(model, data, scene.header, render_score)
+        size += "".join(f"; level {level} {value:.1f} dB" for level, value in levels.items())
     if not psnr >= required:
         details["exact"] = exact = _score_exact_attributes(model, decoded, pairs, render_score)
         cost = ", ".join(f"{name} {value:.1f}" for name, value in exact.items())
         blame = f"; with the source's {cost}" if cost else ""
         return Verdict(Status.FAILED, f"{psnr:.2f} dB, expected at least {required:g}, {size}{blame}", details=details)
     return Verdict(Status.PASSED, f"{psnr:.2f} dB {size}", details=details)
+
+
+def _score_levels(source: SplatModel, data: bytes, header: SceneHeader, render_score: RenderScore) -> dict[str, float]:
+    """Return the PSNR of each level of detail above 0."""
+    nodes = read_nodes(memoryview(data), header)
+    levels = sorted({node.level for node in nodes if node.level})
+    cuts = {level: [tile.index for tile in select_tiles(header, nodes, level=level)] for level in levels}
+    return {str(level): render_score(source, decode(data, tiles=tiles)) for level, tiles in cuts.items()}
 
 
 def _score_exact_attributes(
