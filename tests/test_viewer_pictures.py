@@ -21,6 +21,7 @@ from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import load_cameras
 from csplat_render.virtual_cameras import virtual_cameras
+from csplat_tools.level_builder import encode_with_levels
 
 pytestmark = [pytest.mark.slow, pytest.mark.area(name="chromium")]
 
@@ -117,6 +118,16 @@ def test_the_antialiased_flag_is_honoured(engine, part, camera):
         pictures.append(engine.picture(camera))
         assert psnr(pictures[-1], reference(decode(data), camera)) >= GOOD
     assert psnr(*pictures) < 44
+
+
+def test_level_0_of_a_file_with_levels_of_detail_is_drawn(engine, part, camera):
+    data = encode_with_levels(part, leaf_splats=700, root_splats=200).data
+    assert read_header(data).coarse_tiles
+    assert engine.open(data) is None
+    model = decode(data)
+    assert psnr(engine.picture(camera), reference(model, camera)) >= GOOD
+    engine.page.evaluate("engine.requestFrame(), engine.settled()")
+    assert len(part) == len(model) == engine.stats()["splatsResident"]
 
 
 def test_background_and_degree_can_be_chosen(engine, part, camera):

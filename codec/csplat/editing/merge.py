@@ -89,7 +89,7 @@ def merge(
     Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH degree,
     origin and extra columns. That is true for parts of one file (`extract`) and files encoded with the same steps.
     Codebooks get new ids. Copying takes memory for the codebooks of one file and a few megabytes. Other files are
-    decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more;
+    decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more, and levels of detail;
     `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
     Metadata and cameras are kept if they are the same in all files. If one file leaves axes or unit open, another may
@@ -131,6 +131,7 @@ def merge(
             if len(books.records) > codebooks_max:
                 why = f"they have {len(books.records):,} codebooks together, a file has at most {codebooks_max:,}"
         if why:
+            why += "; levels of detail are left out" * any(scene.header.coarse_tiles for scene in scenes)
             return _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
         nodes: list[FileNode] = []
         for one, scene, new in zip(windows, scenes, ids, strict=True):
