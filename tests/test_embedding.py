@@ -197,10 +197,10 @@ def check_stream(given, scene):
 def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=200)))
-    whole, part = samples("python")
+    whole, part, cut = samples("python")
     assert len([line for line in whole.splitlines() if line.strip()]) <= 5
     said = []
-    for program in (whole, part):
+    for program in (whole, part, cut):
         exec(program, {"__name__": "__main__"})  # noqa: S102  # the guide's own lines
         said.append(capsys.readouterr().out)
     assert f"{len(model)} float32 4 {model.coordinate_system}\n" == said[0]
@@ -209,6 +209,7 @@ def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
     assert [str(place) for place in range(10)] == [line.split()[0] for line in tiles if not line.startswith(" ")]
     assert last.endswith(f" of {(tmp_path / 'scene.csplat').stat().st_size}")
     assert 0 < len(decode(tmp_path / "part.csplat")) < len(model)
+    assert f"{len(model)} [(0, 0.0)]\n" == said[2]
 
 
 @pytest.mark.area(name="chromium")

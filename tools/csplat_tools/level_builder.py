@@ -180,10 +180,8 @@ def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
         Rows of each group, in spatial order; their numbers differ by 1 at most.
     """
     order = np.arange(len(points))
-    sizes, counts = (
-        np.array([len(points)], np.int64),
-        np.array([count], np.int64),
-    )  # numbers of splats and groups in each box
+    sizes = np.array([len(points)], np.int64)  # points in each box
+    counts = np.array([count], np.int64)  # groups in each box
     while counts.max() > 1:
         starts = np.cumsum(sizes) - sizes
         inside = points[order]
@@ -202,7 +200,8 @@ def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
 def merge_neighbours(splats: SplatModel) -> SplatModel:
     """Merge groups of up to four neighbouring splats to one with the same mean, covariance and opacity × area.
 
-    Sums weight each splat by opacity × area. Opacity is at most 0.99; splats that would need more grow instead.
+    Sums weight each splat by opacity × area. Opacity is limited to 0.99; splats that grow instead, to keep the product,
+    look up to 4 dB worse (fox60k_noreg).
     """
     groups = kd_groups(splats.means, math.ceil(len(splats) / _MERGED))
     order = np.concatenate(groups)
@@ -283,7 +282,7 @@ def _error_of(rasteriser: Rasteriser, coarse: SplatModel, fine: SplatModel, box:
     radius = float(np.linalg.norm(box[1] - box[0])) / 2.0
     if radius == 0.0:
         radius = float(np.exp(np.float64(fine.scales.max())))
-    levels = 1 + _RADIUS_PIXELS.bit_length() - 1  # pixels of 1 to 256 pixels of the images
+    levels = _RADIUS_PIXELS.bit_length()  # pixel sizes of 1 to 256 pixels of the images
     squares, pixels = np.zeros(levels), np.zeros(levels, np.int64)
     for camera in _cameras(box.mean(axis=0), radius):
         a, b = (_image(rasteriser, splats, camera) for splats in (coarse, fine))

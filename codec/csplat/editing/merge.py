@@ -89,8 +89,8 @@ def merge(
     Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH degree,
     origin and extra columns. That is true for parts of one file (`extract`) and files encoded with the same steps.
     Codebooks get new ids. Copying takes memory for the codebooks of one file and a few megabytes. Other files are
-    decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more, and levels of detail;
-    `MergeResult.why` gives the reason. Pending data is kept in temporary files.
+    decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more, and levels of
+    detail; `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
     Metadata and cameras are kept if they are the same in all files. If one file leaves axes or unit open, another may
     specify them. Merged files of copied tiles declare no error bounds and no options, because nothing is measured.
