@@ -348,10 +348,10 @@ OTHER_PROGRAMS = [
     "sh-bands", "sharp-elements", "unusual-header", "unusual-rows", "vertical-axis",
 ]  # fmt: skip
 
-#: Findings on glTF, .splat, .ksplat, SOG and checkpoints.
+#: Findings on glTF, .splat, .ksplat, SOG, checkpoints and .csplat.
 OTHER_FORMATS = [
-    "linear-colours", "log-scales", "logit-opacities", "negative-scales", "other-scenes", "out-of-range-opacities",
-    "ranks", "short-buffer", "spz-axes", "unclear-scales", "zero-rows", "zip-names",
+    "levels", "linear-colours", "log-scales", "logit-opacities", "negative-scales", "other-scenes",
+    "out-of-range-opacities", "ranks", "short-buffer", "spz-axes", "unclear-scales", "zero-rows", "zip-names",
 ]  # fmt: skip
 
 

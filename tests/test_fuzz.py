@@ -2,6 +2,7 @@
 
 import importlib.util
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -289,7 +290,7 @@ def test_the_program_prints_its_tally(tmp_path):
     assert (0, "") == (run.returncode, run.stderr)
     assert "others: 12 executions" in run.stdout
     assert "lines of functions" in run.stdout
-    assert "of 29 modules ran" in run.stdout
+    assert re.search(r"of the text of [1-9]\d modules ran", run.stdout)
     assert "0 kinds of findings" in run.stdout
 
 
