@@ -301,7 +301,7 @@ def arguments_of(monkeypatch, module, name, words):
 
 @pytest.mark.parametrize(("words", "name", "given"), [
     (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {}),
-    (["compare", "scene.ply", "scene.csplat", "--mode", "fast"], "compare", {"mode": "fast"}),
+    (["compare", "scene.ply", "scene.csplat", "--backend", "fast"], "compare", {"mode": "fast", "backend": "cpu"}),
     (["tradeoff", "scene.ply", "--what", "presets"], "tradeoff", {"say": None}),
 ])  # fmt: skip
 @pytest.mark.usefixtures("views_once")

@@ -201,7 +201,7 @@ def test_a_distorting_size_is_refused(ply, cameras, tmp_path):
         ("--cameras", "x.json", "--up", "z"),
         ("--orbit", "0"),
         ("--orbit", "3", "--size", "12"),
-        ("--orbit", "3", "--mode", "wrong"),
+        ("--orbit", "3", "--backend", "wrong"),
     ],
 )
 def test_a_wrong_command_line_has_status_2(ply, tmp_path, words):

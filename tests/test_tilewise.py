@@ -391,9 +391,9 @@ def test_without_an_index_the_errors_are_reported_as_unknown(files_of_both, came
 @pytest.mark.usefixtures("no_least")
 def test_mode_exact_of_scenes_beyond_the_memory_is_refused(files_of_both, monkeypatch):
     monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
-    result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--mode", "exact"])
+    result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--backend", "exact"])
     assert 1 == result.exit_code
-    assert ["error: --mode exact requires both scenes in memory, and they do not fit: use standard (E_INPUT)"] == [
+    assert ["error: --backend exact requires both scenes in memory, and they do not fit: use cpu (E_INPUT)"] == [
         line for line in result.stderr.splitlines() if "exact" in line
     ]
 

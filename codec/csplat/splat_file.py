@@ -6,13 +6,23 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
 from csplat import _spec
 from csplat.byte_store import FileWindow, Store
-from csplat.decoder import DecodedTile, Limits, Node, decode, iter_tiles, read_cameras, read_header, read_metadata
+from csplat.decoder import (
+    DecodedTile,
+    Limits,
+    Node,
+    decode,
+    iter_packed,
+    iter_tiles,
+    read_cameras,
+    read_header,
+    read_metadata,
+)
 from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
 from csplat.decoder.decode_api import DecodeRequest, prepare_decode
@@ -24,9 +34,12 @@ from csplat.disk_files import BinaryWriter
 from csplat.errors import InputError
 from csplat.file_source import File
 from csplat.model import SplatModel
+from csplat.packed import PackedTile
 from csplat.remote_store import open_store
 from csplat.tile_copy import ExtractResult, write_extract
 from csplat.types import F64
+
+_T = TypeVar("_T")
 
 
 class SplatFile:
@@ -186,6 +199,23 @@ class SplatFile:
             decoded = iter_tiles(window.view, limits=self._limits, tiles=chosen, sh_degree=sh_degree)
         return self._iterate(window, job, decoded)
 
+    def packed_tiles(self, tiles: Sequence[int] | None = None, *, sh_degree: int | None = None) -> Iterator[PackedTile]:
+        """Decode tile by tile to integers and the tables that tiles share, as a renderer on a GPU keeps them.
+
+        Args:
+            tiles: as in `read`.
+            sh_degree: as in `tiles`.
+
+        Raises:
+            InputError, FormatError, LimitError, StoreError, OSError: as in `tiles`.
+        """
+        chosen = self._default_tiles() if tiles is None else tiles
+        with self._store.named_errors():
+            window = self.window()
+            job = prepare_decode(window.view, self._limits, chosen, sh_degree)
+            decoded = iter_packed(window.view, limits=self._limits, tiles=chosen, sh_degree=sh_degree)
+        return self._iterate(window, job, decoded)
+
     def read(
         self, box: Sequence[float] | None = None, *, tiles: Sequence[int] | None = None, sh_degree: int | None = None
     ) -> SplatModel:
@@ -234,7 +264,7 @@ class SplatFile:
             raise InputError(f"{self.name} is closed")
         return FileWindow(self._store, self._head)
 
-    def _iterate(self, window: FileWindow, job: DecodeRequest, decoded: Iterator[DecodedTile]) -> Iterator[DecodedTile]:
+    def _iterate(self, window: FileWindow, job: DecodeRequest, decoded: Iterator[_T]) -> Iterator[_T]:
         side = _side(job)
         for batch in _batches(job.tiles, job.degree, self._store.sizes.batch):
             if not self._open:

@@ -45,6 +45,9 @@ COMPENSATION_MIN = 0.000025
 Mode = Literal["exact", "standard", "fast"]
 MODES: tuple[Mode, ...] = ("exact", "standard", "fast")
 
+#: What renders: the CPU; a GPU; a GPU if there is one, otherwise the CPU; or the GPU's shaders on the CPU, for tests.
+Backend = Literal["cpu", "gpu", "auto", "software"]
+
 
 _THRESHOLDS = {
     "standard": (ALPHA_MIN, TRANSMITTANCE_MIN),
@@ -123,9 +126,20 @@ class UncheckedSplats:
     shN: Array
 
 
+class Render(Protocol):
+    """A rendered image, by any backend."""
+
+    @property
+    def rgb(self) -> Array: ...  # noqa: D102 - as in `RenderResult`
+    @property
+    def alpha(self) -> Array: ...  # noqa: D102 - as in `RenderResult`
+    @property
+    def ignored(self) -> int: ...  # noqa: D102 - as in `RenderResult`
+
+
 @dataclass(frozen=True, eq=False)
 class RenderResult:
-    """A rendered image.
+    """An image rendered on the CPU.
 
     Attributes:
         rgb: [H, W, 3], not clipped: colours may exceed 1.

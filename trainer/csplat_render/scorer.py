@@ -18,14 +18,14 @@ from csplat.model import SplatModel
 from csplat.types import F32, F64, Mask, Progress
 from csplat_render import metrics
 from csplat_render.camera import Camera, relative_to
-from csplat_render.conventions import Mode, RenderResult
+from csplat_render.conventions import Mode, Render
 
 #: Called for each view with its index, the reference image and the render, [H, W, 3] in 0..1.
 OnView = Callable[[int, F32, F32], None]
 
 
 class Renderable(Protocol):
-    """A scene that renders itself because it is not in memory."""
+    """A scene that renders itself because it is not in memory, or in that of a GPU."""
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -34,7 +34,7 @@ class Renderable(Protocol):
 
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
-    ) -> Callable[[Camera], RenderResult]:
+    ) -> Callable[[Camera], Render]:
         """Return a function that renders the scene, like `renderer` of this module."""
         ...
 
@@ -191,7 +191,7 @@ class Scorer:
             progress("comparing", 1.0)
         return metrics.Scores.of(each, ignored)
 
-    def _renderer(self, model: SplatModel | Renderable) -> Callable[[Camera], RenderResult]:
+    def _renderer(self, model: SplatModel | Renderable) -> Callable[[Camera], Render]:
         render = renderer(model, self.background, mode=self.mode, threads=self.threads)
         if self.origin is None:
             return render
@@ -201,7 +201,7 @@ class Scorer:
 
 def renderer(
     model: SplatModel | Renderable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
-) -> Callable[[Camera], RenderResult]:
+) -> Callable[[Camera], Render]:
     """Return a function that renders a scene for a camera and reuses its memory between calls.
 
     Args:
@@ -222,6 +222,6 @@ def renderer(
     return lambda camera: rasteriser.forward(model, camera, background=background, antialiased=model.antialiased)
 
 
-def _render_reference(render: Callable[[Camera], RenderResult], camera: Camera) -> ReferenceImage:
+def _render_reference(render: Callable[[Camera], Render], camera: Camera) -> ReferenceImage:
     result = render(camera)
     return ReferenceImage(result.rgb, result.alpha >= metrics.COVERED_ALPHA, result.ignored)

@@ -18,6 +18,7 @@ from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk, 
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits, check_budget, float_bytes, integer_bytes
 from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk
+from csplat.decoder.packed import pack_tables, pack_tile
 from csplat.decoder.reconstruct import (
     SplatArrays,
     empty_integers,
@@ -31,10 +32,11 @@ from csplat.decoder.tree import Node, read_nodes
 from csplat.errors import InputError, LimitError, counted
 from csplat.file_source import PageReleaser
 from csplat.model import SplatModel, trusted_model
+from csplat.packed import PackedTile
 from csplat.types import F32
 
 if TYPE_CHECKING:
-    from csplat.decoder.blocks import TileBlocks
+    from csplat.decoder.blocks import Codebook, TileBlocks
     from csplat.file_source import File
 
 _THREADS_MAX = 8  # maximum by default; more threads are limited by memory bandwidth
@@ -281,6 +283,35 @@ def iter_tiles(
     return iterate()
 
 
+def iter_packed(
+    data: File,
+    *,
+    limits: Limits | None = None,
+    tiles: Sequence[int] | None = None,
+    sh_degree: int | None = None,
+    threads: int = 1,
+) -> Iterator[PackedTile]:
+    """Decode to integers and tables tile by tile, see `csplat.packed`; extra columns are left out.
+
+    Arguments and errors are those of `iter_tiles`.
+    """
+    request = _prepare_tiles(data, limits, tiles, sh_degree)
+    header = request.header
+
+    def iterate() -> Iterator[PackedTile]:
+        read_side_chunks(request)
+        if request.whole:
+            _read_texts(request)
+        with np.errstate(all="ignore"):
+            books = read_codebooks(request.view, header, request.tiles, request.degree)
+        tables = pack_tables(books, header)
+        yield from _each_tile(
+            request, lambda _index, source: pack_tile(source, header, tables), threads, ahead=1, books=books
+        )
+
+    return iterate()
+
+
 def open_tiles(data: File, *, limits: Limits | None = None, threads: int | None = None) -> TileReader:
     """Open a file to decode its tiles on demand.
 
@@ -401,7 +432,12 @@ def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile
 
 
 def _each_tile(
-    request: DecodeRequest, convert: Callable[[int, TileBlocks], _T], threads: int | None, *, ahead: int
+    request: DecodeRequest,
+    convert: Callable[[int, TileBlocks], _T],
+    threads: int | None,
+    *,
+    ahead: int,
+    books: Mapping[int, Codebook] | None = None,
 ) -> Iterator[_T]:
     """Read and convert tiles in threads; NumPy and zlib release the GIL on large data.
 
@@ -412,10 +448,12 @@ def _each_tile(
         convert: returns the result for a tile's position in `request.tiles` and its blocks.
         threads: as in `decode`.
         ahead: number of tiles, finished or waiting, in addition to those being decoded.
+        books: the codebooks of these tiles; `None`: they are read here.
     """
     view, header, degree, tiles = request.view, request.header, request.degree, request.tiles
-    with np.errstate(all="ignore"):
-        books = read_codebooks(view, header, tiles, degree)
+    if books is None:
+        with np.errstate(all="ignore"):
+            books = read_codebooks(view, header, tiles, degree)
 
     def decode_tile(index: int) -> _T:
         # No warnings: the reconstruction checks for overflow itself.

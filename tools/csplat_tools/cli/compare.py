@@ -41,7 +41,7 @@ def compare(
     lpips: Annotated[
         str | None, typer.Option(metavar="FILE.npz", help="Weights of LPIPS, or auto. Default: none.")
     ] = None,
-    mode: shared.ModeOption = "standard",
+    backend: shared.BackendOption = "cpu",
     test_every: shared.TestEvery = None,
     source_index: Annotated[
         str | None,
@@ -59,7 +59,8 @@ def compare(
     of black, or of the given views; at most 99 dB. Compare only values for
     the same cameras and background. With --data, A and B are also scored
     against the held-out images. Scenes that do not fit in memory are rendered
-    from the disk. Requires the render extra.
+    from the disk. --backend gpu computes PSNR on a GPU (extra gpu), which
+    may differ in the third decimal. Requires the render extra.
 
     Examples:
       csplat compare scene.ply scene.csplat
@@ -76,11 +77,12 @@ def compare(
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")
     require_renderer()
+    mode, device = shared.parse_backend(backend, out)
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
     with open_scenes((a, b)) as (source, other), out.bar() as progress:
         if isinstance(source, OpenedScene):
             if mode == "exact":
-                raise InputError("--mode exact requires both scenes in memory, and they do not fit: use standard")
+                raise InputError("--backend exact requires both scenes in memory, and they do not fit: use cpu")
             out.remark(
                 f"A and B do not fit in {format_bytes(source.memory_bytes)} of memory: they are rendered from the disk"
             )
@@ -92,11 +94,11 @@ def compare(
             from csplat_tools.views.view_sets import total_render_seconds
 
             out.announce_time(
-                lambda: 2 * total_render_seconds(model, around.test, mode=mode), "--mode standard takes seconds"
+                lambda: 2 * total_render_seconds(model, around.test, mode=mode), "--backend cpu takes seconds"
             )
         compared = csplat_tools.compare(
             source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, background=views.colour,
-            mode=mode, force=out.force,
+            mode=mode, backend=device, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), progress=progress,
         )  # fmt: skip
     out.publish(compared.as_json(), format_comparison(compared, Path(a).name, Path(b).name))

@@ -93,6 +93,7 @@ RENAMED_OPTIONS = {
     "--lambda": "is an option of `csplat finetune`, and byte_cost of FinetuneOptions in Python",
     "--lpips": "is an option of `csplat compare`, and an argument of read_setting and run_finetuning in Python",
     "--lr-factor": "is FinetuneOptions.scaled in Python now",
+    "--mode": "is called --backend now: cpu, exact, fast, gpu or auto",
     "--max-loss": "is called --max-psnr-drop now",
     "--no-antialiased": "is antialiased of scenes in Python now",
     "--plots": "is gone: -o PAGE.html has the plots",

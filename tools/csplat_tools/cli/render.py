@@ -36,7 +36,7 @@ def render(
     orbit: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="N cameras around or along. Default: none.")
     ] = None,
-    mode: shared.ModeOption = "standard",
+    backend: shared.BackendOption = "cpu",
     fps: Annotated[
         float, typer.Option(metavar="RATE", show_default=False, help="Frames per second. Default: 25.")
     ] = DEFAULT_FPS,
@@ -55,12 +55,13 @@ def render(
     Renders are named after the images of their cameras, or numbered. Camera
     files: our own list of {K, viewmat, W, H, near, image}, INRIA's
     cameras.json, camera paths of nerfstudio, and transforms.json. An orbit
-    shows a whole object; with cameras it follows them. MP4 requires the film
-    extra, and everything the render extra.
+    shows a whole object; with cameras it follows them. --backend gpu renders
+    on a GPU (extra gpu); exact and fast are a slow and a fast mode of the
+    CPU. MP4 requires the film extra, and everything the render extra.
 
     Examples:
       csplat render scene.csplat turn.mp4 --orbit 120
-      csplat render room.ply room.webp --orbit 240 --data capture
+      csplat render room.ply room.webp --orbit 240 --data capture --backend gpu
       csplat render scene.ply held-out --data capture
       csplat render scene.ply views --cameras test.json --background white
     """
@@ -78,7 +79,10 @@ def render(
     out.check(output if is_video else None, inputs=(source, *views.inputs))
     if not is_video:
         check_name(output, ".webp", "render", source)
+    if depth and backend in ("gpu", "auto", "software"):
+        raise typer.BadParameter(f"--depth requires --backend cpu, exact or fast, found {backend}")
     require_renderer()
+    mode, device = shared.parse_backend(backend, out)
     with out.bar() as progress:
         read = load_model(source)
         out.print_findings(read.findings)
@@ -90,7 +94,7 @@ def render(
             shared.take_estimated_up(estimate_up(model), out, given=up)
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
-            model, shots, output, background=views.colour, mode=mode, force=out.force,
+            model, shots, output, background=views.colour, mode=mode, backend=device, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet), progress=progress,
         )  # fmt: skip
     if rendered.ignored_count:

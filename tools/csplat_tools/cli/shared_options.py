@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
@@ -20,7 +20,7 @@ from csplat.editing.up_axis import Direction, unit_up
 from csplat.encoder import PresetName, Target
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel, check_axes
-from csplat_render import Mode
+from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import NUMBER, parse_size_bytes, print_data
@@ -91,8 +91,10 @@ Data = Annotated[str | None, typer.Option(metavar="DATA", help="Data set of the 
 Background = Annotated[str | None, _background]
 HiddenBackground = Annotated[str | None, hidden(_background)]
 TestEvery = Annotated[int | None, typer.Option(metavar="N", hidden=True, help="Hold out every Nth image. Default: 8.")]
-ModeOption = Annotated[
-    Mode, typer.Option(metavar="MODE", show_default=False, help="exact, standard, fast. Default: standard.")
+RendererName = Literal["cpu", "exact", "fast", "gpu", "auto", "software"]
+BackendOption = Annotated[
+    RendererName,
+    typer.Option("--backend", metavar="NAME", show_default=False, help="cpu, exact, fast, gpu, auto. Default: cpu."),
 ]
 
 # Encoding, training, tuning
@@ -130,6 +132,26 @@ HiddenDryRun = Annotated[bool, hidden(_dry_run)]
 _keep_extra = typer.Option("--keep-extra", help="Keep columns that splats do not have.")
 KeepExtra = Annotated[bool, _keep_extra]
 HiddenKeepExtra = Annotated[bool, hidden(_keep_extra)]
+
+
+def parse_backend(name: RendererName, out: Output) -> tuple[Mode, Backend]:
+    """Return the mode and the backend of a renderer; for `auto`, remark if there is no GPU.
+
+    Args:
+        name: `cpu`; its slow and its fast mode, `exact` and `fast`; `gpu`; `auto`, a GPU if there is one; or
+            `software`, the GPU's shaders on the CPU.
+        out: the command's output.
+
+    Raises:
+        InputError: there is no GPU.
+    """
+    if name == "cpu" or name == "exact" or name == "fast":
+        return ("standard" if name == "cpu" else name), "cpu"
+    from csplat_render.gpu.device import find_device
+
+    device, reason = find_device(name)
+    out.remark(f"rendering on {device.adapter}" if device else f"{reason}: rendering on the CPU")
+    return "standard", name if device else "cpu"
 
 
 def refuse_together(*groups: Mapping[str, object]) -> None:

@@ -21,11 +21,14 @@ from csplat.scene_source import SceneSource
 from csplat.types import F32, Progress, null_progress
 from csplat_conformance.declared_bounds import Source, find_partners, lattice_radii, measure_pairs, verify_out_of_core
 from csplat_conformance.declared_bounds.measurement import merge_errors
-from csplat_render import Mode
+from csplat_render import Backend, Mode
 from csplat_render.camera import Camera, resized
+from csplat_render.gpu.device import Device, find_device
+from csplat_render.gpu.renderer import GpuScene
+from csplat_render.gpu.scoring import compare_scenes
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
-from csplat_render.scorer import OnView, Scorer
+from csplat_render.scorer import OnView, Renderable, Scorer
 from csplat_tools.file_streams import is_csplat
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
@@ -145,6 +148,7 @@ def compare(
     amplification: float = 10.0,
     background: Colour | None = None,
     mode: Mode = "standard",
+    backend: Backend = "cpu",
     force: bool = False,
     memory_bytes: int | None = None,
     prepare: Callable[[], object] | None = None,
@@ -162,6 +166,8 @@ def compare(
         amplification: factor of the difference.
         background: red, green, blue, 0..1; `None`: that of the views.
         mode: mode of the renderer.
+        backend: what renders, as in `csplat_render.render`. A GPU computes PSNR alone, unless images are needed for
+            something else: `pictures`, `lpips`, or the images of a data set. Both scenes have to fit in memory.
         force: existing files in `pictures` may be replaced.
         memory_bytes: approximate limit of the memory, without images of a data set; scenes that do not fit together
             are compared out of core. `None`: half of the free memory.
@@ -193,15 +199,26 @@ def compare(
         if pictures is not None:
             names = image_names([camera.image for camera in views.test])
             viewers.append(_ImageWriter(os.fspath(pictures), names, image_scorer, amplification, force=force))
+        first: SplatModel | Renderable
+        second: SplatModel | Renderable
         first, second, errors = _measure(source, other, views.test, source_index, progress)
         if prepare is not None:
             prepare()
         image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
         viewers += [] if image_scores is None else [image_scores]
-        scorer = views.test_scorer(first, mode=mode, background=background, progress=progress)
-        quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
+        device, _ = find_device(backend)
+        if device is not None:
+            first, second = (_on_gpu(one, device) for one in (first, second))
+        if isinstance(first, GpuScene) and isinstance(second, GpuScene) and not viewers and distance is None:
+            colour = background or views.test_background
+            quality = compare_scenes(first, second, views.test, colour, progress=progress)
+            ignored = first.ignored
+        else:
+            scorer = views.test_scorer(first, mode=mode, background=background, progress=progress)
+            quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
+            ignored = scorer.reference(0).ignored
         return Comparison(
-            source, other, errors, quality, scorer.reference(0).ignored, views.name,
+            source, other, errors, quality, ignored, views.name,
             None if image_scores is None else {"split": views.split, **image_scores.as_json()},
             views.background, mode, views.notes, time.perf_counter() - start,
         )  # fmt: skip
@@ -363,6 +380,12 @@ def _measure(
         "scenes are rendered: TMPDIR sets another folder",
     )
     return first, second, attribute_errors_out_of_core(source, other, source_index, progress=progress)
+
+
+def _on_gpu(scene: SplatModel | Renderable, device: Device) -> GpuScene:
+    if not isinstance(scene, SplatModel):
+        raise InputError("a GPU renders scenes in memory, and they do not fit: use the backend cpu")
+    return GpuScene(device, [scene])
 
 
 class _ImageScores:

@@ -13,11 +13,12 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.training_record import TrainingRecord
 from csplat.types import F32, Progress
-from csplat_render import Camera, Mode, render
+from csplat_render import Backend, Camera, Mode
 from csplat_render.camera import resized
 from csplat_render.camera_files import load_cameras
 from csplat_render.camera_paths import orbit_cameras
-from csplat_render.conventions import RenderResult
+from csplat_render.conventions import Render, RenderResult
+from csplat_render.scorer import Renderable, renderer
 from csplat_tools.file_streams import check_output, write_array
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import check_film, image_names, make_output_folder, to_uint8, write_film, write_png
@@ -90,6 +91,7 @@ def render_folder(
     *,
     background: Colour | None = None,
     mode: Mode = "standard",
+    backend: Backend = "cpu",
     depth: bool = False,
     alpha: bool = False,
     force: bool = False,
@@ -103,18 +105,20 @@ def render_folder(
         cameras: the views. Renders are named after their images, or by numbers.
         folder: the folder for the files; it is made if missing.
         background: red, green, blue, 0..1; `None`: that of the scene's training if known, else black.
-        mode: `exact`, `standard` or `fast`.
+        mode, backend: see `csplat_render.render`.
         depth: write NAME.depth.npy, too, [H, W] float32: mean depth along the camera's axis, scene units; 0 in pixels
-            without splats.
+            without splats. Requires the backend cpu.
         alpha: write NAME.alpha.png, too; 255 is opaque.
         force: existing files may be replaced.
         prepare: called when the folder has been checked, before the first render.
         progress: progress callback.
 
     Raises:
-        InputError: a file exists; or the renderer is not installed.
+        InputError: a file exists; the renderer is not installed; there is no GPU, or it cannot give the depth.
         OSError: a file cannot be written.
     """
+    if depth and backend != "cpu":
+        raise InputError(f"the depth requires the backend cpu, found {backend}")
     require_renderer()
     require_images()
     names = image_names([camera.image for camera in cameras])
@@ -123,7 +127,7 @@ def render_folder(
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
     with _remove_if_empty(target if is_new else None):
-        renders = _renders(model, cameras, background, mode, prepare, progress)
+        renders = _renders(model, cameras, background, mode, backend, prepare, progress)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
             files.append(target / f"{name}.png")
@@ -133,6 +137,7 @@ def render_folder(
                 write_png(files[-1], to_uint8(result.alpha))
             if depth:
                 files.append(target / f"{name}.depth.npy")
+                assert isinstance(result, RenderResult)  # the CPU's
                 write_array(str(files[-1]), _mean_depth(result.depth, result.alpha))
     return Rendered(tuple(files), ignored)
 
@@ -145,6 +150,7 @@ def render_film(
     fps: float,
     background: Colour | None = None,
     mode: Mode = "standard",
+    backend: Backend = "cpu",
     force: bool = False,
     prepare: Callable[[], object] | None = None,
     progress: Progress | None = None,
@@ -156,7 +162,7 @@ def render_film(
         cameras: the views, at least one, of one size.
         path: path of the file; its ending determines the format, see `write_film`.
         fps: frames per second.
-        background, mode, prepare, progress: see `render_folder`.
+        background, mode, backend, prepare, progress: see `render_folder`.
         force: an existing file may be replaced.
 
     Raises:
@@ -167,11 +173,26 @@ def render_film(
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
     frames, ignored = [], 0
-    for result in _renders(model, cameras, background, mode, prepare, progress):
+    for result in _renders(model, cameras, background, mode, backend, prepare, progress):
         ignored = max(ignored, result.ignored)
         frames.append(to_uint8(result.rgb))
     write_film(path, frames, fps)
     return Rendered((Path(path),), ignored)
+
+
+def on_backend(model: SplatModel, backend: Backend) -> SplatModel | Renderable:
+    """Return a scene to render, in the memory of the GPU if the backend is one.
+
+    Raises:
+        InputError: there is no GPU, or it has too little memory.
+    """
+    if backend == "cpu":
+        return model
+    from csplat_render.gpu.device import find_device
+    from csplat_render.gpu.renderer import GpuScene
+
+    device, _ = find_device(backend)
+    return model if device is None else GpuScene(device, [model])
 
 
 def _renders(
@@ -179,17 +200,19 @@ def _renders(
     cameras: Sequence[Camera],
     background: Colour | None,
     mode: Mode,
+    backend: Backend,
     prepare: Callable[[], object] | None,
     progress: Progress | None,
-) -> Iterator[RenderResult]:
+) -> Iterator[Render]:
     if prepare is not None:
         prepare()
     record = TrainingRecord.of(model.metadata)
     behind = background or (record.background if record else BLACK)
+    draw = renderer(on_backend(model, backend), behind, mode=mode)
     for number, camera in enumerate(cameras):
         if progress is not None:
             progress("rendering", number / len(cameras))
-        yield render(model, camera, background=behind, mode=mode)
+        yield draw(camera)
     if progress is not None:
         progress("rendering", 1.0)
 

@@ -1,0 +1,383 @@
+"""The renderer on a GPU, by an adapter that emulates one, and the layout that its shaders read.
+
+Tests of the area need wgpu (extra `gpu`) and a Vulkan driver; Debian's mesa-vulkan-drivers has one for the CPU.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import call
+from oracle import VIEW, adversarial, extreme_splats, facing, random_splats
+
+import csplat
+from csplat.decoder import iter_packed, iter_tiles
+from csplat.errors import InputError, LimitError
+from csplat_authoring.builder import build
+from csplat_authoring.samples import rich_scene
+from csplat_conformance.manifest import VECTORS
+from csplat_render import render
+from csplat_render.conventions import UncheckedSplats
+from csplat_render.gpu import device as devices
+from csplat_render.gpu.packing import BLOCK, SharedTables, pack_splats, pack_tile
+from csplat_render.gpu.renderer import GpuRenderer, GpuScene
+from csplat_render.gpu.scoring import compare_scenes
+from csplat_render.metrics import psnr
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import virtual_cameras
+
+
+def area(test):
+    """Mark a test that needs an adapter."""
+    return pytest.mark.area(name="gpu")(pytest.mark.usefixtures("device")(test))
+
+
+_LEAST_PSNR = 74.0  # dB, of any scene against the rasteriser on the CPU
+
+
+@pytest.fixture(scope="module")
+def device():
+    try:
+        return devices.open_device(software=True)
+    except InputError as error:
+        pytest.skip(f"{error}: install csplat[gpu] and mesa-vulkan-drivers")
+
+
+@pytest.fixture(scope="module")
+def sample(sample_path):
+    """The sample scene, and its file with codebooks."""
+    model = csplat.read_ply(sample_path)
+    return model, csplat.encode(model, csplat.EncodeOptions(preset="balanced"))
+
+
+# The layout --------------------------------------------------------------------------------------------------------
+def values_of(packed):
+    return (packed.integers.astype(np.float64) * packed.step).astype(np.float32)
+
+
+def bands_of(tile, count):
+    """Return the SH coefficients of a packed tile."""
+    values = np.zeros((len(tile.opacities), count, 3), np.float32)
+    for band, packed in tile.bands.items():
+        rows = values_of(packed.rows)
+        if packed.table is not None:
+            rows = np.concatenate([values_of(packed.table), rows])[packed.index]
+        values[:, band * band - 1 : (band + 1) ** 2 - 1] = rows
+    return values
+
+
+def test_packed_tiles_have_the_values_of_decoded_ones():
+    files = [path for path in sorted(VECTORS.rglob("valid/*.csplat")) if path.stat().st_size < 1 << 14]
+    assert len(files) > 100
+    kinds = set()
+    for path in files:
+        for tile, packed in zip(iter_tiles(path), iter_packed(path), strict=True):
+            np.testing.assert_array_equal(tile.means, values_of(packed.means))
+            np.testing.assert_array_equal(tile.scales, values_of(packed.scales))
+            np.testing.assert_array_equal(tile.sh0, values_of(packed.sh0))
+            np.testing.assert_array_equal(tile.shN, bands_of(packed, tile.shN.shape[1]))
+            shares = packed.opacities / packed.opacity_levels
+            alpha = shares**2 if packed.opacities_squared else shares
+            np.testing.assert_allclose(tile.opacities, alpha, rtol=1e-6)
+            scaled = packed.quats / (packed.quat_levels * np.sqrt(2.0))
+            np.testing.assert_allclose(tile.quats[:, 1:], scaled, rtol=1e-6, atol=1e-9)
+            kinds |= {(packed.opacities_squared, *(band.table is not None for band in packed.bands.values()))}
+    assert len(kinds) > 4
+
+
+class Reader:
+    """Reads a splat of a packed tile as layout.wgsl does."""
+
+    def __init__(self, tile, splat):
+        self.tile, self.bit = tile, 0
+        words_per_splat = int(tile.constants[0, 1])
+        first = splat // BLOCK * BLOCK * words_per_splat + splat % BLOCK
+        words = tile.words[first : first + BLOCK * words_per_splat : BLOCK]
+        self.bits = int.from_bytes(words.astype("<u4").tobytes(), "little")
+
+    def field(self, width):
+        value = self.bits >> self.bit & (1 << width) - 1
+        self.bit += width
+        return float(np.uint32(value).view(np.float32)) if width == 32 else value
+
+
+def floats(words):
+    return words.view(np.float32).astype(np.float64)
+
+
+def test_packed_words_hold_every_field():
+    data = build(rich_scene()).data
+    for tile in iter_packed(data):
+        words = pack_tile(tile, SharedTables(1 << 20), np.zeros(3), antialiased=False)
+        bits = [int(word) >> shift & 255 for word in words.constants[1, :2] for shift in (0, 8, 16, 24)]
+        for splat in range(len(tile.opacities)):
+            reader = Reader(words, splat)
+            means = words.corner + words.step * np.array([reader.field(width) for width in bits[:3]])
+            np.testing.assert_allclose(tile.means.integers[splat] * tile.means.step, means)
+            assert tile.opacities[splat] == reader.field(bits[3])
+            for packed, width, row in ((tile.scales, bits[4], 2), (None, bits[5], 0), (tile.sh0, bits[6], 3)):
+                found = np.array([reader.field(width) for _ in range(3)])
+                if packed is None:
+                    assert (tile.quats[splat] + tile.quat_levels).tolist() == found.tolist()
+                else:
+                    *offsets, step = floats(words.constants[row])
+                    np.testing.assert_allclose(packed.integers[splat] * packed.step, offsets + found * step, rtol=1e-6)
+
+
+def test_splats_with_nan_have_no_opacity():
+    arrays = extreme_splats(count=4)
+    arrays["shN"][1, 2, 0] = np.nan
+    arrays["means"][2, 0] = np.inf
+    words = pack_splats(UncheckedSplats(**arrays), 0, 4, np.zeros(3), antialiased=True)
+    assert 2 == words.ignored
+    assert [0.0 if bad else alpha for alpha, bad in zip(arrays["opacities"], (0, 1, 1, 0), strict=True)] == [
+        np.float32(words.words[3 * BLOCK + splat].view(np.float32)) for splat in range(4)
+    ]
+
+
+def test_codebooks_that_do_not_fit_are_refused():
+    tile = next(iter_packed(build(rich_scene()).data))
+    with pytest.raises(LimitError, match="codebooks"):
+        pack_tile(tile, SharedTables(1), np.zeros(3), antialiased=False)
+
+
+def test_the_shaders_have_the_constants_of_the_rasteriser():
+    from csplat_render import conventions, metrics
+
+    folder = Path(__file__).resolve().parent.parent / "codec" / "wgsl"
+    text = "\n".join(path.read_text(encoding="utf-8") for path in folder.glob("*.wgsl"))
+    for name in ("ALPHA_MIN", "ALPHA_CAP", "TRANSMITTANCE_MIN", "DILATION", "COMPENSATION_MIN"):
+        found = float(text.partition(f"const {name} = ")[2].partition(";")[0])
+        assert getattr(conventions, name) == pytest.approx(found, rel=1e-12)
+    assert f"const COVERED_ALPHA = {metrics.COVERED_ALPHA};" in text
+
+
+# Passes ------------------------------------------------------------------------------------------------------------
+@area
+@pytest.mark.parametrize("count", [1, 255, 4096, 4097, 20_000])
+def test_the_sort_is_stable(device, count):
+    rng = np.random.default_rng(count)
+    keys = rng.integers(0, 1 << 31, count, dtype=np.uint32)
+    keys[rng.random(count) < 0.5] = 77
+    scene = GpuScene(device, [UncheckedSplats(**extreme_splats(count=1))])
+    renderer = GpuRenderer(scene)
+    buffers = [device.uploaded(keys), device.buffer(4 * count)]
+    values = [device.buffer(4 * count) for _ in range(2)]
+    device.upload(renderer._counters, np.array([count, 0, 0, 0], np.uint32))
+    device.upload(renderer._groups, np.array([-(-count // 4096), 1, 1], np.uint32))
+    device.run(renderer._passes_of_sort(buffers, values, 32, 0, of_pairs=False))
+    order = np.argsort(keys, kind="stable")
+    np.testing.assert_array_equal(keys[order], device.read(buffers[0], 4 * count).view(np.uint32))
+    np.testing.assert_array_equal(order, device.read(values[0], 4 * count).view(np.uint32))
+
+
+@area
+def test_records_are_in_the_order_of_the_splats(device):
+    arrays = random_splats(3000, 0, seed=1)
+    arrays["means"][::2, 2] -= 10.0  # behind the camera
+    scene = GpuScene(device, [UncheckedSplats(**arrays)])
+    renderer = GpuRenderer(scene)
+    found = renderer.render(VIEW)
+    assert 1500 >= found.visible > 500
+    centres = device.read(renderer._ellipses, 16 * found.visible).view(np.float32).reshape(-1, 4)[:, :2]
+    camera = arrays["means"] @ VIEW.viewmat[:3, :3].T + VIEW.viewmat[:3, 3]
+    pixels = camera @ VIEW.K.T
+    pixels = pixels[:, :2] / pixels[:, 2:]
+    drawn = device.read(renderer._looks, 16 * found.visible).view(np.float32).reshape(-1, 4)[:, 1] > 0
+    places = [int(np.argmin(np.abs(pixels - centre).sum(1))) for centre in centres[drawn]]
+    assert sorted(places) == places
+
+
+# Renders -----------------------------------------------------------------------------------------------------------
+def assert_same(model, view, found, least=_LEAST_PSNR, **options):
+    wanted = render(model, view, **options)
+    assert psnr(wanted.rgb, found.rgb) >= least
+    assert psnr(np.repeat(wanted.alpha[..., None], 3, 2), np.repeat(found.alpha[..., None], 3, 2)) >= least
+    assert wanted.ignored == found.ignored
+
+
+@area
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_renders_of_models_agree_with_the_rasteriser(degree, antialiased):
+    model = UncheckedSplats(**random_splats(500, degree, seed=degree))
+    options = {"background": (0.2, 0.5, 0.9), "antialiased": antialiased}
+    assert_same(model, VIEW, render(model, VIEW, backend="software", **options), **options)
+
+
+@area
+def test_renders_of_files_agree_with_the_rasteriser(device, sample):
+    model, data = sample
+    for preset in ("fast", "balanced", "small"):
+        coded = csplat.encode(model, csplat.EncodeOptions(preset=preset))
+        with csplat.open(coded) as file:
+            renderer = GpuRenderer(GpuScene(device, [file]))
+        decoded = csplat.decode(coded)
+        for view in virtual_cameras(model)[:2]:
+            found = renderer.render(view)
+            assert_same(decoded, view, found)
+            np.testing.assert_array_equal(found.rgb, renderer.render(view).rgb)
+    with csplat.open(data) as file:
+        assert_same(csplat.decode(data, sh_degree=1), view, render(file, view, backend="software", sh_degree=1))
+        np.testing.assert_array_equal(render(csplat.decode(data), view).rgb, render(file, view).rgb)
+
+
+@area
+@pytest.mark.parametrize(("name", "case"), list(adversarial()))
+def test_adversarial_splats_survive(name, case):
+    model = UncheckedSplats(**case.arrays)
+    found = render(model, case.view, backend="software", antialiased=case.antialiased)
+    wanted = render(model, case.view, antialiased=case.antialiased)
+    assert np.isfinite(found.rgb).all(), name
+    if case.view.near > 1e-20:  # nearer than that, products leave float32
+        assert psnr(wanted.rgb, found.rgb) >= 50.0
+
+
+@area
+@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
+def test_splats_with_nan_are_ignored_and_counted(name):
+    arrays = extreme_splats(count=30)
+    arrays[name].reshape(30, -1)[:3, -1] = np.nan
+    model = UncheckedSplats(**arrays)
+    assert_same(model, facing(), render(model, facing(), backend="software"))
+
+
+@area
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (1, 100), (333, 1), (8192, 40)])
+def test_renders_of_any_size_agree(width, height):
+    model = UncheckedSplats(**extreme_splats())
+    view = facing(width=width, height=height)
+    assert_same(model, view, render(model, view, backend="software"))
+
+
+@area
+@pytest.mark.parametrize("log_scale", [-80.0, -20.0, 20.0, 80.0])
+def test_extreme_scales_survive(log_scale):
+    model = UncheckedSplats(**extreme_splats(scales=log_scale))
+    assert_same(model, facing(), render(model, facing(), backend="software"), least=60.0)
+
+
+@area
+def test_empty_and_invisible_scenes_are_the_background():
+    colour = np.float32([0.1, 0.2, 0.3])
+    for arrays in (extreme_splats(count=0), extreme_splats(means=(0.0, 0.0, -9.0)), extreme_splats(opacities=0.0)):
+        found = render(UncheckedSplats(**arrays), facing(), backend="software", background=colour)
+        np.testing.assert_array_equal(found.rgb, np.broadcast_to(colour, found.rgb.shape))
+        assert not found.alpha.any()
+
+
+@area
+def test_splats_of_equal_depth_are_drawn_in_order():
+    arrays = extreme_splats(count=2, degree=0, means=0.0, opacities=0.9, scales=-1.0)
+    arrays["sh0"][:] = [[1.7, -1.7, -1.7], [-1.7, 1.7, -1.7]]
+    model = UncheckedSplats(**arrays)
+    assert_same(model, facing(), render(model, facing(), backend="software"))
+
+
+@area
+def test_several_scenes_are_rendered_as_one(device, sample):
+    model, data = sample
+    moved = replace(model, origin=(0.3, 0.0, 0.1), means=model.means - np.float32([0.3, 0.0, 0.1]))
+    fine = csplat.encode(moved, csplat.EncodeOptions(preset="fast"))
+    view = virtual_cameras(model)[0]
+    with csplat.open(data) as one, csplat.open(fine) as other:
+        found = GpuRenderer(GpuScene(device, [one, other, model])).render(view)
+    first, second = csplat.decode(data), csplat.decode(fine)
+    arrays = {
+        name: np.concatenate([getattr(part, name) for part in (first, second, model)])
+        for name in ("quats", "scales", "opacities", "sh0", "shN")
+    }
+    means = np.concatenate([first.means, second.means + np.float32([0.3, 0.0, 0.1]), model.means])
+    assert_same(UncheckedSplats(means=means, **arrays), view, found)
+
+
+@area
+def test_slices_and_steps_do_not_change_a_bit(device, sample):
+    model, _ = sample
+    view = virtual_cameras(model)[0]
+    scene = GpuScene(device, [model])
+    whole = GpuRenderer(scene).render(view)
+    assert 1 == whole.steps
+    tiles = -(-view.W // 16) * -(-view.H // 16)
+    for limits in (
+        {"records_max": 300},
+        {"pairs_max": BLOCK * tiles},
+        {"records_max": 500, "pairs_max": BLOCK * tiles},
+    ):
+        found = GpuRenderer(scene, **limits).render(view)
+        np.testing.assert_array_equal(whole.rgb, found.rgb)
+        np.testing.assert_array_equal(whole.alpha, found.alpha)
+        assert (whole.visible, whole.pairs) == (found.visible, found.pairs)
+    bands = GpuRenderer(scene, pairs_max=BLOCK * tiles // 5).render(view)
+    assert psnr(whole.rgb, bands.rgb) > 90.0
+
+
+@area
+def test_too_many_splats_of_one_depth_are_refused(device):
+    model = UncheckedSplats(**extreme_splats(count=300, means=0.0, opacities=0.9))
+    with pytest.raises(LimitError, match="equal depth"):
+        GpuRenderer(GpuScene(device, [model]), records_max=256).render(facing())
+
+
+@area
+def test_a_row_of_pixels_that_does_not_fit_is_refused(device):
+    model = UncheckedSplats(**extreme_splats())
+    with pytest.raises(LimitError, match="pixels of a row"):
+        GpuRenderer(GpuScene(device, [model]), pairs_max=BLOCK).render(facing(width=100))
+
+
+@area
+def test_scores_are_those_of_the_rasteriser(device, sample):
+    model, data = sample
+    views = virtual_cameras(model)[:2]
+    decoded = replace(csplat.decode(data), origin=(0.0, 0.0, 0.0))
+    wanted = Scorer.of_source(model, views, (0.1, 0.9, 0.4)).scores(decoded, ssim=False)
+    found = compare_scenes(GpuScene(device, [model]), GpuScene(device, [decoded]), views, (0.1, 0.9, 0.4))
+    for name in ("psnr", "psnr_mean", "psnr_worst", "psnr_covered"):
+        assert getattr(wanted, name) == pytest.approx(getattr(found, name), abs=0.01)
+    assert wanted.cover == pytest.approx(found.cover, abs=1e-4)
+    assert wanted.worst_view == found.worst_view
+
+
+# Interface ---------------------------------------------------------------------------------------------------------
+@area
+def test_commands_take_a_backend(sample_path, tmp_path):
+    coded, folder = tmp_path / "a.csplat", tmp_path / "renders"
+    call("encode", str(sample_path), str(coded))
+    call("render", str(coded), str(folder), "--orbit", "2", "--size", "64x48", "--backend", "software", "--alpha")
+    assert 4 == len(list(folder.iterdir()))
+    compared = call("compare", str(sample_path), str(coded), "--backend", "software").stdout
+    assert "psnr" in compared
+    assert "ssim" not in compared
+    pictures = tmp_path / "pictures"
+    words = ("--backend", "software", "--pictures", str(pictures))
+    assert "ssim" in call("compare", str(sample_path), str(coded), *words).stdout
+    assert 8 == len(list(pictures.iterdir()))
+
+
+@area
+def test_what_a_gpu_cannot_do_is_refused():
+    model = UncheckedSplats(**extreme_splats())
+    with pytest.raises(InputError, match="mode fast requires the backend cpu"):
+        render(model, facing(), mode="fast", backend="software")
+    with pytest.raises(InputError, match="background"):
+        render(model, facing(), background=(0, 0), backend="software")
+
+
+def test_invalid_backends_are_refused():
+    with pytest.raises(InputError, match="'vulkan', expected one of cpu, gpu, auto, software"):
+        render(UncheckedSplats(**extreme_splats()), facing(), backend="vulkan")
+
+
+def test_without_a_gpu_auto_warns_and_gpu_is_an_error(monkeypatch):
+    def none(**_options):
+        raise InputError("no GPU was found, only a toaster")
+
+    monkeypatch.setattr(devices, "open_device", none)
+    model = UncheckedSplats(**extreme_splats())
+    with pytest.raises(InputError, match="only a toaster: the backend cpu needs none"):
+        render(model, facing(), backend="gpu")
+    with pytest.warns(UserWarning, match="only a toaster: rendering on the CPU"):
+        found = render(model, facing(), backend="auto")
+    np.testing.assert_array_equal(render(model, facing()).rgb, found.rgb)

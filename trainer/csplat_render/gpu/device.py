@@ -1,0 +1,248 @@
+"""Open a GPU through wgpu (Vulkan, Metal, Direct3D 12) and run the compute shaders of `codec/wgsl` on it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.errors import InputError, missing_package
+from csplat_render.conventions import Backend
+
+#: The shaders lie next to this package in a wheel, and in a folder of their own in a checkout.
+_FOLDERS = (
+    Path(__file__).resolve().parent.parent / "wgsl",
+    Path(__file__).resolve().parents[3] / "codec" / "wgsl",
+)
+
+#: Source files of each pass; `common.wgsl` precedes them all.
+_PASSES = {
+    "cull": ("layout", "cull"),
+    "compact": ("scan", "compact"),
+    "project": ("layout", "project"),
+    "sort": ("scan", "sort"),
+    "bin": ("scan", "bin"),
+    "ranges": ("ranges",),
+    "blend": ("blend",),
+    "dispatch": ("dispatch",),
+    "difference": ("difference",),
+}
+
+_HARDWARE = ("DiscreteGPU", "IntegratedGPU", "VirtualGPU")
+_KINDS = (*_HARDWARE, "CPU", "Unknown")  # in the order of preference
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """A GPU, or software that acts as one.
+
+    Attributes:
+        name: name of the device.
+        kind: `DiscreteGPU`, `IntegratedGPU`, `VirtualGPU`, `CPU` or `Unknown`, as wgpu reports it.
+        backend: `Vulkan`, `Metal`, `D3D12` or `OpenGL`.
+    """
+
+    name: str
+    kind: str
+    backend: str
+
+    @property
+    def is_hardware(self) -> bool:
+        """True unless software emulates the GPU."""
+        return self.kind in _HARDWARE
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.kind}, {self.backend})"
+
+
+Count = int | tuple[int, int] | tuple[Any, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Call:
+    """A pass with its buffers and the number of its workgroups, see `Device.bind`."""
+
+    pipeline: Any
+    group: Any
+    count: Count
+
+
+class Device:
+    """A GPU with its compiled passes; see `open_device`.
+
+    Attributes:
+        adapter: the GPU.
+        binding_max: size of the largest buffer that a shader can read, bytes.
+    """
+
+    def __init__(self, wgpu: Any, adapter: Any, binding_max: int | None) -> None:
+        self.adapter = _describe(adapter)
+        limits = adapter.limits
+        wanted = {}
+        if binding_max is None:
+            names = ("max-buffer-size", "max-storage-buffer-binding-size")
+            wanted = {name: limits[name] for name in names}
+        self._wgpu = wgpu
+        self._device = adapter.request_device_sync(required_limits=wanted)
+        largest = min(self._device.limits[name] for name in ("max-buffer-size", "max-storage-buffer-binding-size"))
+        self.binding_max = min(binding_max or largest, largest, 1 << 30)
+        self._pipelines: dict[tuple[str, str], Any] = {}
+
+    def buffer(self, size_bytes: int, *, uniform: bool = False, indirect: bool = False) -> Any:
+        """Return a buffer of zeros for shaders.
+
+        Raises:
+            InputError: the GPU has too little memory.
+        """
+        usage = self._wgpu.BufferUsage
+        flags = usage.COPY_DST | usage.COPY_SRC | (usage.UNIFORM if uniform else usage.STORAGE)
+        size = max(16, -(-size_bytes // 16) * 16)
+        with self._named_errors():
+            return self._device.create_buffer(size=size, usage=flags | (usage.INDIRECT if indirect else 0))
+
+    def upload(self, buffer: Any, array: NDArray[Any], offset: int = 0) -> None:
+        """Write an array to a buffer; its size is a multiple of four bytes."""
+        flat = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        for start in range(0, len(flat), _UPLOAD):
+            self._device.queue.write_buffer(buffer, offset + start, flat[start : start + _UPLOAD])
+
+    def uploaded(self, array: NDArray[Any], **usage: bool) -> Any:
+        """Return a buffer with the content of an array."""
+        buffer = self.buffer(array.nbytes, **usage)
+        if array.nbytes:
+            self.upload(buffer, array)
+        return buffer
+
+    def read(self, buffer: Any, size_bytes: int) -> NDArray[np.uint8]:
+        """Wait for the GPU, and read the beginning of a buffer.
+
+        Raises:
+            InputError: the GPU failed or was lost.
+        """
+        with self._named_errors():
+            return np.frombuffer(self._device.queue.read_buffer(buffer, 0, size_bytes), np.uint8)
+
+    def run(self, calls: Sequence[Call], *, clear: Sequence[Any] = ()) -> None:
+        """Run passes one after the other, after those of earlier calls; some buffers are filled with zeros before.
+
+        Raises:
+            InputError: the GPU failed or was lost.
+        """
+        with self._named_errors():
+            self._run(calls, clear)
+
+    def _run(self, calls: Sequence[Call], clear: Sequence[Any]) -> None:
+        encoder = self._device.create_command_encoder()
+        for buffer in clear:
+            encoder.clear_buffer(buffer)
+        compute = encoder.begin_compute_pass()
+        for call in calls:
+            compute.set_pipeline(call.pipeline)
+            compute.set_bind_group(0, call.group)
+            if isinstance(call.count, int):
+                compute.dispatch_workgroups(call.count)
+            elif isinstance(call.count[0], int):
+                compute.dispatch_workgroups(*call.count)
+            else:
+                compute.dispatch_workgroups_indirect(*call.count)
+        compute.end()
+        self._device.queue.submit([encoder.finish()])
+
+    def bind(self, name: str, entry: str, count: Count, *buffers: Any) -> Call:
+        """Return a pass with its buffers.
+
+        Args:
+            name: the pass, see `shader_source`.
+            entry: its entry point.
+            count: number of workgroups: of one or two dimensions, or a buffer and the offset of three numbers in it.
+            buffers: the buffers of the bindings from 0 on; `None` for those that the entry point does not use.
+        """
+        pipeline = self._pipeline(name, entry)
+        entries = [
+            {"binding": slot, "resource": {"buffer": buffer, "offset": 0, "size": buffer.size}}
+            for slot, buffer in enumerate(buffers)
+            if buffer is not None
+        ]
+        group = self._device.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries)
+        return Call(pipeline, group, count)
+
+    @contextmanager
+    def _named_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except self._wgpu.GPUOutOfMemoryError:
+            raise InputError(f"{self.adapter} has too little memory") from None
+        except self._wgpu.GPUError as error:
+            raise InputError(f"{self.adapter} failed: {str(error).strip().splitlines()[0]}") from None
+
+    def _pipeline(self, name: str, entry: str) -> Any:
+        found = self._pipelines.get((name, entry))
+        if found is None:
+            module = self._device.create_shader_module(label=name, code=shader_source(name))
+            compute = {"module": module, "entry_point": entry}
+            found = self._pipelines[name, entry] = self._device.create_compute_pipeline(layout="auto", compute=compute)
+        return found
+
+
+_UPLOAD = 1 << 26  # bytes per write
+
+
+def shader_source(name: str) -> str:
+    """Return the WGSL of a pass."""
+    folder = next(folder for folder in _FOLDERS if folder.is_dir())
+    parts = [(folder / f"{part}.wgsl").read_text(encoding="utf-8") for part in ("common", *_PASSES[name])]
+    return "\n".join(parts)
+
+
+def find_device(backend: Backend) -> tuple[Device | None, str]:
+    """Return the GPU of a backend; or `None` for the CPU and, for `auto`, the reason.
+
+    Raises:
+        InputError: there is no such backend; or no GPU, and the backend requires one.
+    """
+    if backend not in get_args(Backend):
+        raise InputError(f"the backend is {backend!r}, expected one of {', '.join(get_args(Backend))}")
+    if backend == "cpu":
+        return None, ""
+    try:
+        return open_device(software=backend == "software"), ""
+    except InputError as error:
+        if backend != "auto":
+            raise InputError(f"{error}: the backend cpu needs none") from None
+        return None, str(error)
+
+
+@cache
+def open_device(*, software: bool = False, binding_max: int | None = None) -> Device:
+    """Open the fastest GPU of this machine; the same device is returned every time.
+
+    Args:
+        software: use an adapter that emulates a GPU on the CPU, for tests.
+        binding_max: size of the largest buffer, bytes; `None`: what the GPU allows.
+
+    Raises:
+        InputError: wgpu is not installed, or there is no such GPU; the message names what was found.
+    """
+    try:
+        import wgpu
+    except ModuleNotFoundError as error:
+        raise missing_package(error, extra="gpu") from None
+    adapters = [found for found in wgpu.gpu.enumerate_adapters_sync() if found.info["backend_type"] != "OpenGL"]
+    adapters.sort(key=lambda found: _KINDS.index(_describe(found).kind))
+    usable = [found for found in adapters if _describe(found).is_hardware is not software]
+    if not usable:
+        found = ", ".join(str(_describe(adapter)) for adapter in adapters) or "no adapter"
+        raise InputError(f"no {'software adapter' if software else 'GPU'} was found, only {found}")
+    return Device(wgpu, usable[0], binding_max)
+
+
+def _describe(adapter: Any) -> Adapter:
+    info = adapter.info
+    kind = info["adapter_type"]
+    return Adapter(info["device"], kind if kind in _KINDS else _KINDS[-1], info["backend_type"])

@@ -1,0 +1,420 @@
+"""`GpuRenderer`: render scenes on a GPU, by screen tiles, from the integers of their files.
+
+An image is made in bands of rows that fit the buffers; a band, in slices of depth, nearest first, that fit the buffers
+of records; and a slice, in steps that fit the buffer of pairs of splat and screen tile. Most images are one band, one
+slice and one step. Pixels pass from one step to the next, so that slices and steps do not change the image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from csplat.errors import InputError, LimitError
+from csplat.packed import PackedTile
+from csplat.types import F32, F64
+from csplat_render.camera import Camera
+from csplat_render.conventions import HasSplats, Mode, view_vector
+from csplat_render.gpu.device import Call, Device
+from csplat_render.gpu.packing import BLOCK, MODEL_TILE, TILE_ROWS, SharedTables, TileWords, pack_splats, pack_tile
+
+#: Words of a buffer of tiles, 32 MiB: a quarter of WebGPU's default limit. The largest tile has 6.5 million.
+_PAGE_WORDS = 1 << 23
+
+_SCREEN_TILE = 16  # pixels, width and height
+_RECORD_BYTES = 16  # in each of the two buffers of records
+_LEAST_PAIRS = 1 << 20  # room for pairs at first, 16 MB
+_MOST_PAIRS = 1 << 26  # fewer than the saturation of the sums in scan.wgsl
+_RUN = 4096  # elements per workgroup of a sort
+_DEPTH_BITS = 15  # bits of a key that tell slices apart at once
+_LAST_KEY = 0x7F7FFFFF  # bits of the largest finite depth
+_SORT_RECORDS, _BLOCKS_OF_RANKS, _SORT_PAIRS = 0, 1, 2  # rows of the table of workgroups in dispatch.wgsl
+
+#: `View` of common.wgsl.
+_VIEW = np.dtype(
+    [
+        ("rows", "<f4", (3, 4)), ("focal", "<f4", 4), ("slopes", "<f4", 4), ("size", "<f4", 2), ("near", "<f4"),
+        ("first_key", "<u4"), ("last_key", "<u4"), ("screen_tiles_x", "<u4"), ("screen_tiles", "<u4"),
+        ("records", "<u4"), ("pairs", "<u4"), ("blocks", "<u4"), ("block_table", "<u4"), ("tile_table", "<u4"),
+        ("depth_shift", "<u4"), ("unused", "<u4", 3),
+    ]
+)  # fmt: skip
+
+
+@runtime_checkable
+class PackedFile(Protocol):
+    """A file opened by `csplat.open`."""
+
+    @property
+    def header(self) -> Any: ...  # noqa: D102 - as in `csplat.SplatFile`
+
+    def packed_tiles(  # noqa: D102 - as in `csplat.SplatFile`
+        self, tiles: Sequence[int] | None = None, *, sh_degree: int | None = None
+    ) -> Iterator[PackedTile]: ...
+
+    def read(self, *, sh_degree: int | None = None) -> HasSplats: ...  # noqa: D102 - as in `csplat.SplatFile`
+
+
+@dataclass(frozen=True, eq=False)
+class GpuRender:
+    """An image rendered on a GPU.
+
+    Attributes:
+        rgb: [H, W, 3] float32, not clipped.
+        alpha: [H, W] float32, 1 − transmittance.
+        ignored: number of splats with NaN or infinity.
+        visible: number of splats that passed the culling.
+        pairs: number of pairs of splat and screen tile.
+        steps: number of steps; more than 1 if the image exceeded the buffers.
+    """
+
+    rgb: F32
+    alpha: F32
+    ignored: int
+    visible: int
+    pairs: int
+    steps: int
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """A buffer of tiles: their words, the number of its first block, and the number of blocks."""
+
+    words: Any
+    info: Any
+    blocks: int
+
+
+class GpuScene:
+    """Scenes in the memory of a GPU, rendered as one.
+
+    Args:
+        device: the GPU.
+        scenes: models, or files opened by `csplat.open`, at least one.
+        antialiased: apply the mip-splatting filter; `None`: each scene's own setting.
+        sh_degree: highest SH degree; `None`: that of each scene.
+
+    Attributes:
+        device: the GPU.
+        origin: origin of the first scene, to which cameras are relative.
+        splat_count: number of splats.
+        ignored: number of splats with NaN or infinity, which are not drawn.
+        size_bytes: GPU memory of the scenes, bytes.
+
+    Raises:
+        InputError: the GPU has too little memory.
+        LimitError: the codebooks exceed the largest buffer of the GPU.
+        CsplatError: a file is invalid, as in `csplat.decode`.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        scenes: Sequence[PackedFile | HasSplats],
+        *,
+        antialiased: bool | None = None,
+        sh_degree: int | None = None,
+    ) -> None:
+        self.device = device
+        self.origin = _origin_of(scenes[0])
+        self.splat_count = self.ignored = self.size_bytes = self.block_count = 0
+        self.pages: list[Page] = []
+        tables = SharedTables(device.binding_max // 4)
+        constants: list[NDArray[np.uint32]] = []
+        owners: list[NDArray[np.uint32]] = []
+        corners: list[F64] = []
+        steps: list[float] = []
+        page: list[NDArray[np.uint32]] = []
+        words = first_block = 0
+        for tile in _tiles_of(scenes, tables, antialiased, sh_degree):
+            if page and words + len(tile.words) > _PAGE_WORDS:
+                self._add_page(page, first_block)
+                page, words, first_block = [], 0, self.block_count
+            constants.append(tile.placed(words, self.block_count))
+            owners.append(np.full(tile.blocks, len(corners), np.uint32))
+            corners.append(tile.corner)
+            steps.append(tile.step)
+            page.append(tile.words)
+            words += len(tile.words)
+            self.block_count += tile.blocks
+            self.splat_count += tile.splats
+            self.ignored += tile.ignored
+        if page:
+            self._add_page(page, first_block)
+        self._corners = np.array(corners, np.float64).reshape(-1, 3)
+        self._places = np.zeros((len(corners), 4), np.float32)
+        self._places[:, 3] = steps
+        self.tile_table = len(corners)
+        self.block_table = len(corners) * (1 + TILE_ROWS)
+        blocks = np.concatenate([*owners, np.zeros(-self.block_count % 4, np.uint32)]).reshape(-1, 4)
+        self.tiles = self._upload(np.concatenate([self._places.view(np.uint32), *constants, blocks]))
+        self.tables = self._upload(np.concatenate([*tables.runs, np.zeros(4, np.uint32)]))
+
+    def renderer(
+        self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+    ) -> Callable[[Camera], GpuRender]:
+        """Return a function that renders the scene, like `csplat_render.scorer.renderer`.
+
+        Raises:
+            InputError: the mode is not `standard`.
+        """
+        del threads  # the CPU's
+        if mode != "standard":
+            raise InputError(f"mode {mode} requires the backend cpu: the GPU has standard alone")
+        own = GpuRenderer(self)
+        return lambda camera: own.render(camera, background=background)
+
+    def place(self, view: F64) -> None:
+        """Write the corners of the tiles in camera coordinates, computed in float64."""
+        if len(self._places):
+            self._places[:, :3] = self._corners @ view[:9].reshape(3, 3).T + view[9:12]
+            self.device.upload(self.tiles, self._places)
+
+    def _upload(self, array: NDArray[Any], **usage: bool) -> Any:
+        buffer = self.device.uploaded(array, **usage)
+        self.size_bytes += buffer.size
+        return buffer
+
+    def _add_page(self, runs: list[NDArray[np.uint32]], first_block: int) -> None:
+        info = np.array([first_block, 0, 0, 0], np.uint32)
+        words = self._upload(np.concatenate(runs))
+        self.pages.append(Page(words, self._upload(info, uniform=True), self.block_count - first_block))
+
+
+def _origin_of(scene: PackedFile | HasSplats) -> tuple[float, float, float]:
+    origin = scene.header.origin if isinstance(scene, PackedFile) else getattr(scene, "origin", None)
+    return origin or (0.0, 0.0, 0.0)
+
+
+def _tiles_of(
+    scenes: Sequence[PackedFile | HasSplats], tables: SharedTables, antialiased: bool | None, sh_degree: int | None
+) -> Iterator[TileWords]:
+    first = _origin_of(scenes[0])
+    for scene in scenes:
+        shift = np.subtract(_origin_of(scene), first)
+        if isinstance(scene, PackedFile):
+            own = scene.header.antialiased if antialiased is None else antialiased
+            for tile in scene.packed_tiles(sh_degree=sh_degree):
+                yield pack_tile(tile, tables, shift, antialiased=own)
+            continue
+        own = bool(getattr(scene, "antialiased", False)) if antialiased is None else antialiased
+        count = len(scene.means)
+        for start in range(0, count, MODEL_TILE):
+            stop = min(count, start + MODEL_TILE)
+            yield pack_splats(scene, start, stop, shift, antialiased=own, sh_degree=sh_degree)
+
+
+class GpuRenderer:
+    """Renders a scene in memory of a GPU; buffers are kept from one image to the next.
+
+    Args:
+        scene: the scene.
+        records_max: maximum number of splats per slice of depth; `None`: what the largest buffer holds.
+        pairs_max: maximum number of pairs per step; `None`: likewise.
+    """
+
+    def __init__(self, scene: GpuScene, *, records_max: int | None = None, pairs_max: int | None = None) -> None:
+        self.scene = scene
+        self.device = device = scene.device
+        slots = max(1, scene.block_count * BLOCK)
+        self._records = min(slots, device.binding_max // _RECORD_BYTES, records_max or slots)
+        self._pairs_max = min(device.binding_max // 4, _MOST_PAIRS, pairs_max or _MOST_PAIRS)
+        self._pairs_wanted = _LEAST_PAIRS
+        self._pairs = 0
+        self._size = (0, 0)
+        self._view = device.buffer(_VIEW.itemsize, uniform=True)
+        self._counters = device.buffer(16)
+        self._groups = device.buffer(48, indirect=True)
+        self._blocks = device.buffer(36 * scene.block_count)
+        self._depths = device.buffer(4 << _DEPTH_BITS)
+        self._ellipses, self._looks = (device.buffer(_RECORD_BYTES * self._records) for _ in range(2))
+        keys, values = ([device.buffer(4 * self._records) for _ in range(2)] for _ in range(2))
+        self._order = values[0]
+        self._sums = device.buffer(4 * -(-self._records // BLOCK))
+        self._project = self._passes_of_projection(keys, values)
+        self._count_depths = [
+            device.bind("cull", "count_depths", page.blocks, *self._page(page), None, self._depths)
+            for page in scene.pages
+        ]
+        self._step: list[Call] = []
+
+    def render(self, camera: Camera, *, background: ArrayLike = (0.0, 0.0, 0.0)) -> GpuRender:
+        """Render a image.
+
+        Args:
+            camera: the camera to render from.
+            background: red, green, blue of the background.
+
+        Raises:
+            LimitError: more splats than the buffers hold have the same depth, or the image is too wide for them.
+            InputError: the background is invalid, or the GPU has not enough memory.
+        """
+        colour = np.asarray(background, np.float32)
+        if colour.shape != (3,) or not np.isfinite(colour).all():
+            raise InputError(f"the background is {background!r}, expected three numbers")
+        rgb, alpha = np.empty((camera.H, camera.W, 3), np.float32), np.empty((camera.H, camera.W), np.float32)
+        visible = pairs = steps = 0
+        for rows in self.bands(camera):
+            counts = self.draw(camera, rows)
+            pixels = self.device.read(self.pixels, 16 * len(rows) * camera.W).view(np.float32)
+            pixels = pixels.reshape(len(rows), camera.W, 4)
+            left = np.abs(pixels[..., 3:])
+            rgb[rows.start : rows.stop] = pixels[..., :3] + left * colour
+            alpha[rows.start : rows.stop] = 1 - left[..., 0]
+            visible, pairs, steps = visible + counts[0], pairs + counts[1], steps + counts[2]
+        return GpuRender(rgb, alpha, self.scene.ignored, visible, pairs, steps)
+
+    def bands(self, camera: Camera) -> list[range]:
+        """Return the rows of a image in bands that fit the buffers, after making room for the pixels of one."""
+        columns = -(-camera.W // _SCREEN_TILE)
+        rows = min(self.device.binding_max // (16 * camera.W * _SCREEN_TILE), self._pairs_max // (BLOCK * columns))
+        if rows < 1:
+            raise LimitError("pixels of a row on the GPU", camera.W, self._pairs_max // BLOCK * _SCREEN_TILE)
+        height = min(camera.H, rows * _SCREEN_TILE)
+        self._make_room(camera.W, height)
+        return [range(start, min(camera.H, start + height)) for start in range(0, camera.H, height)]
+
+    def draw(self, camera: Camera, rows: range) -> tuple[int, int, int]:
+        """Draw a band of a image to `pixels`; return the numbers of visible splats, pairs and steps."""
+        device = self.device
+        self.scene.place(view_vector(camera))
+        view = self._view_of(camera, rows)
+        device.upload(self._view, view)
+        device.run(self._clear)
+        visible = pairs = steps = 0
+        for first_key, last_key in self._slices(view):
+            view["first_key"], view["last_key"] = first_key, last_key
+            device.upload(self._view, view)
+            calls = self._project + self._step
+            while True:
+                device.run(calls, clear=[self._ranges])
+                counters = device.read(self._counters, 16).view(np.uint32)
+                pairs, steps = pairs + int(counters[1]), steps + 1
+                if int(counters[2]) * BLOCK >= int(counters[0]):
+                    break
+                self._pairs_wanted = min(2 * self._pairs, self._pairs_max)  # for the next image
+                calls = self._step
+            visible += int(counters[0])
+        return visible, pairs, steps
+
+    def _view_of(self, camera: Camera, rows: range) -> NDArray[Any]:
+        values = view_vector(camera)
+        view = np.zeros((), _VIEW)
+        view["rows"][:, :3] = values[:9].reshape(3, 3)
+        view["focal"] = values[12:16] - (0, 0, 0, rows.start)
+        view["slopes"] = values[17:21]
+        view["size"] = camera.W, len(rows)
+        view["near"] = camera.near
+        view["last_key"] = _LAST_KEY
+        columns = -(-camera.W // _SCREEN_TILE)
+        view["screen_tiles_x"], view["screen_tiles"] = columns, columns * -(-len(rows) // _SCREEN_TILE)
+        view["records"], view["pairs"] = self._records, self._pairs
+        scene = self.scene
+        view["blocks"], view["block_table"], view["tile_table"] = scene.block_count, scene.block_table, scene.tile_table
+        return view
+
+    def _slices(self, view: NDArray[Any]) -> list[tuple[int, int]]:
+        """Return first and last key of slices of depth, each with as many splats as the records hold."""
+        if self.scene.block_count * BLOCK <= self._records:
+            return [(0, _LAST_KEY)]
+        return list(self._divide(view, 0, _LAST_KEY, 16))
+
+    def _divide(self, view: NDArray[Any], first: int, last: int, shift: int) -> Iterator[tuple[int, int]]:
+        view["first_key"], view["last_key"], view["depth_shift"] = first, last, shift
+        self.device.upload(self._view, view)
+        self.device.run(self._count_depths, clear=[self._depths])
+        counts = self.device.read(self._depths, 4 << _DEPTH_BITS).view(np.uint32)
+        begin, total = first, 0
+        for place in np.flatnonzero(counts):
+            key = first + (int(place) << shift)
+            count = int(counts[place])
+            if total + count > self._records and total:
+                yield begin, key - 1
+                begin, total = key, 0
+            if count > self._records:
+                if shift == 0:
+                    raise LimitError("splats of equal depth on the GPU", count, self._records)
+                yield from self._divide(view, key, min(last, key + (1 << shift) - 1), max(0, shift - _DEPTH_BITS))
+                begin, total = key + (1 << shift), 0
+            total += count if count <= self._records else 0
+        if total or begin == first:
+            yield begin, last
+
+    def _page(self, page: Page) -> tuple[Any, ...]:
+        return self._view, page.info, self.scene.tiles, page.words
+
+    def _passes_of_projection(self, keys: list[Any], values: list[Any]) -> list[Call]:
+        """Return the passes that find the visible splats of a slice, project them and sort them by depth."""
+        bind, scene = self.device.bind, self.scene
+        culls = [bind("cull", "cull", page.blocks, *self._page(page), self._blocks) for page in scene.pages]
+        projections = [
+            bind(
+                "project", "project", page.blocks,
+                *self._page(page), scene.tables, self._blocks, self._ellipses, self._looks, keys[0],
+            )
+            for page in scene.pages
+        ]  # fmt: skip
+        return [
+            *culls,
+            bind("compact", "compact", 1, self._view, self._counters, self._blocks),
+            bind("dispatch", "after_compact", 1, self._view, self._counters, self._groups),
+            *projections,
+            *self._passes_of_sort(keys, values, 32, _SORT_RECORDS, of_pairs=False),
+        ]
+
+    def _passes_of_sort(
+        self, keys: list[Any], values: list[Any], bits: int, groups: int, *, of_pairs: bool
+    ) -> list[Call]:
+        """Return the passes of a sort by some bits; the result is in the buffers of the number of passes modulo two."""
+        device = self.device
+        table = device.buffer(4 * 256 * (1 + -(-keys[0].size // (4 * _RUN))))
+        calls = []
+        for digit in range(-(-bits // 8)):
+            radix = device.uploaded(
+                np.array([8 * digit, of_pairs, digit == 0 and not of_pairs, 0], np.uint32), uniform=True
+            )
+            a, b = digit % 2, 1 - digit % 2
+            here = self._groups, 12 * groups
+            calls += [
+                device.bind("sort", "count", here, radix, self._counters, keys[a], None, None, None, table),
+                device.bind("sort", "scan", 256, radix, self._counters, keys[a], None, None, None, table),
+                device.bind(
+                    "sort", "scatter", here, radix, self._counters, keys[a], values[a], keys[b], values[b], table
+                ),
+            ]
+        return calls
+
+    def _make_room(self, width: int, height: int) -> None:
+        """Set up the buffers whose size depends on the image, and the passes that use them."""
+        columns, rows = -(-width // _SCREEN_TILE), -(-height // _SCREEN_TILE)
+        pairs = max(min(self._pairs_wanted, self._pairs_max), BLOCK * columns * rows)
+        if (width, height) == self._size and pairs == self._pairs:
+            return
+        device, bind = self.device, self.device.bind
+        self._size, self._pairs = (width, height), pairs
+        self.pixels = device.buffer(16 * width * height)
+        self._ranges = device.buffer(8 * columns * rows)
+        keys, values = ([device.buffer(4 * pairs) for _ in range(2)] for _ in range(2))
+        bits = max(1, (columns * rows - 1).bit_length())
+        done = -(-bits // 8) % 2
+        records = self._ellipses, self._looks
+        blocks = self._groups, 12 * _BLOCKS_OF_RANKS
+        self._clear = [
+            bind("dispatch", "clear_pixels", (-(-width * height // 16384), 64), self._view, None, None, self.pixels)
+        ]
+        self._step = [
+            bind("bin", "count", blocks, self._view, self._counters, self._order, *records, self._sums),
+            bind("bin", "scan", 1, self._view, self._counters, None, None, None, self._sums),
+            bind("dispatch", "after_scan", 1, None, self._counters, self._groups),
+            bind(
+                "bin", "emit", blocks, self._view, self._counters, self._order, *records, self._sums, keys[0], values[0]
+            ),
+            *self._passes_of_sort(keys, values, bits, _SORT_PAIRS, of_pairs=True),
+            bind("ranges", "find", (self._groups, 12 * _SORT_PAIRS), self._counters, keys[done], self._ranges),
+            bind("blend", "blend", (columns, rows), self._view, *records, values[done], self._ranges, self.pixels),
+            bind("dispatch", "next_step", 1, None, self._counters),
+        ]

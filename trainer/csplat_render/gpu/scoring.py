@@ -1,0 +1,75 @@
+"""Compare the renders of two scenes on a GPU; only sums are read back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from csplat.types import Progress
+from csplat_render.camera import Camera, relative_to
+from csplat_render.gpu.renderer import GpuRenderer, GpuScene
+from csplat_render.metrics import Scores, ViewScore, psnr_of_mse
+
+_RUN = 4096  # pixels per sum
+
+
+def compare_scenes(
+    source: GpuScene,
+    other: GpuScene,
+    cameras: Sequence[Camera],
+    background: ArrayLike = (0.0, 0.0, 0.0),
+    *,
+    progress: Progress | None = None,
+) -> Scores:
+    """Measure the PSNR of a scene's renders against those of its source; other metrics are `None`.
+
+    Args:
+        source, other: the scenes, on one device.
+        cameras: the views, at least one, relative to the origin of `source`.
+        background: red, green, blue of the background.
+        progress: called with the stage and the completed fraction.
+
+    Raises:
+        InputError, LimitError: as in `GpuRenderer.render`; there are no views.
+    """
+    first, second = GpuRenderer(source), GpuRenderer(other)
+    shift = np.subtract(other.origin, source.origin)
+    each = []
+    for number, camera in enumerate(cameras):
+        if progress is not None:
+            progress("comparing", number / len(cameras))
+        each.append(_compare_view(first, second, camera, relative_to(shift, camera), background))
+    if progress is not None:
+        progress("comparing", 1.0)
+    return Scores.of(each, other.ignored)
+
+
+def _compare_view(
+    first: GpuRenderer, second: GpuRenderer, camera: Camera, moved: Camera, background: ArrayLike
+) -> ViewScore:
+    device, sums = first.device, np.zeros(4)
+    second.bands(moved)  # makes room; the bands are the same
+    for rows in first.bands(camera):
+        for one, view in ((first, camera), (second, moved)):
+            one.draw(view, rows)
+        pixels = len(rows) * camera.W
+        runs = -(-pixels // _RUN)
+        backdrop = np.zeros(8, np.float32)
+        backdrop[:3] = background
+        backdrop.view(np.uint32)[4] = pixels
+        found = device.buffer(16 * runs)
+        uniform = device.uploaded(backdrop, uniform=True)
+        device.run([device.bind("difference", "difference", runs, uniform, first.pixels, second.pixels, found)])
+        sums += device.read(found, 16 * runs).view(np.float32).reshape(runs, 4).sum(axis=0, dtype=np.float64)
+    count = camera.W * camera.H
+    mse, covered = sums[0] / (3 * count), sums[2]
+    return ViewScore(
+        camera.image,
+        count,
+        float(mse),
+        psnr_of_mse(float(mse)),
+        float(sums[1] / (3 * covered)) if covered else None,
+        float(covered / count),
+    )
