@@ -226,6 +226,13 @@ class EnginePage(_ServedPage):
         """Make the engine."""
         self.page.evaluate(f"make({options})")
 
+    def start_again(self, options: str = "{}") -> None:
+        """Make the engine with other options, on a canvas of its own, since a canvas keeps its kind of context."""
+        self.page.evaluate(
+            "engine.close(), document.getElementById('canvas').outerHTML = '<canvas id=canvas></canvas>'"
+        )
+        self.start(options)
+
     def open(self, data: bytes, path: str = "/scene.csplat") -> dict[str, Any] | None:
         """Show a file; return the error, or None."""
         return self.page.evaluate("open_", self.site.add(path, data))
@@ -259,9 +266,12 @@ class EnginePage(_ServedPage):
 ROOT = Path(__file__).resolve().parent.parent
 SERVED = ("tools/viewer", "codec/js", "conformance/csplat_conformance/vectors")
 
-#: WebGL2 on the CPU, with float render targets and float blending; deterministic pictures at one pixel per pixel.
+#: WebGL2, with float render targets and float blending, and WebGPU on the CPU; deterministic pictures at one pixel per
+#: pixel.
 ARGUMENTS = [
     "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+    "--enable-unsafe-webgpu", "--use-webgpu-adapter=swiftshader",
+    "--enable-features=Vulkan", "--use-vulkan=swiftshader",  # without these, a canvas of WebGPU loses the device
     "--disable-dev-shm-usage", "--force-device-scale-factor=1", "--force-color-profile=srgb", "--no-proxy-server",
 ]  # fmt: skip
 

@@ -343,6 +343,59 @@ def test_the_picture_returns_after_the_loss_of_the_gpu(engine, part, camera):
     assert (engine.picture(camera) == before).all()
 
 
+# WebGPU --------------------------------------------------------------------------------------------
+@pytest.fixture
+def gpu_engine(engine):
+    """The engine on WebGPU, on the CPU."""
+    engine.start_again('{ backend: "webgpu" }')
+    assert engine.stats()["glRenderer"].endswith("(WebGPU)")
+    yield engine
+    engine.start_again()
+
+
+def test_webgpu_draws_as_the_rasteriser_does(gpu_engine, part, camera):
+    for preset in ("fast", "balanced"):
+        data = encode(part, EncodeOptions(preset=preset))
+        assert gpu_engine.open(data) is None
+        model = decode(data)
+        picture = gpu_engine.picture(camera, (0.2, 0.6, 0.4))
+        assert psnr(picture, reference(model, camera, (0.2, 0.6, 0.4))) >= GOOD
+        np.testing.assert_array_equal(picture, gpu_engine.picture(camera, (0.2, 0.6, 0.4)))
+    assert psnr(gpu_engine.picture(camera, degree=1), reference(model, camera, sh_degree=1)) >= GOOD
+
+
+def test_webgpu_draws_pictures_that_exceed_its_buffers(gpu_engine, sample):
+    gpu_engine.open(encode(sample, FAST))
+    (camera,) = views(sample, 1, 80)
+    whole = gpu_engine.picture(camera)
+    tiles = math.ceil(camera.W / 16) * math.ceil(camera.H / 16)
+    for most in (256 * tiles, 256 * tiles * 2 // 5):  # a block of splats in all, and in 2 of 5 rows of screen tiles
+        gpu_engine.page.evaluate(f"void (engine.renderer.pairsWanted = engine.renderer.pairsMax = {most})")
+        assert psnr(whole, gpu_engine.picture(camera)) >= GOOD
+    assert gpu_engine.page.evaluate("engine.renderer.steps") > 1
+
+
+def test_webgpu_returns_after_the_loss_of_the_gpu(gpu_engine, part, camera):
+    gpu_engine.open(encode(part, FAST))
+    before = gpu_engine.picture(camera)
+    gpu_engine.page.evaluate("void (window.lost = engine.renderer).device.device.destroy()")
+    gpu_engine.page.wait_for_function("engine.renderer !== lost && engine.opening.isDone")
+    assert ["E_CONTEXT", False] == gpu_engine.page.evaluate("[errors[0].code, errors[0].fatal]")
+    np.testing.assert_array_equal(before, gpu_engine.picture(camera))
+    gpu_engine.page.evaluate("void (errors.length = 0)")
+
+
+def test_without_webgpu_webgl_2_draws(engine, part, camera):
+    engine.page.evaluate("void (navigator.gpu.requestAdapter = async () => null)")
+    engine.start_again('{ backend: "webgpu" }')
+    data = encode(part, FAST)
+    engine.open(data)
+    assert psnr(engine.picture(camera), reference(decode(data), camera)) >= GOOD
+    assert not engine.stats()["glRenderer"].endswith("(WebGPU)")
+    engine.page.evaluate("delete navigator.gpu.requestAdapter")
+
+
+# Failures ------------------------------------------------------------------------------------------
 def test_without_webgl_2_there_is_no_engine(engine):
     made = """async () => {
       const canvas = document.getElementById('canvas');

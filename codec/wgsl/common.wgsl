@@ -19,6 +19,7 @@ struct View {
   block_table: u32, // row of the table of tiles at which the tiles of blocks begin
   tile_table: u32, // the same of the constants of tiles; places come first
   depth_shift: u32, // bits of a key that `count_depths` leaves out
+  sh_degree: u32, // the highest that is shown
 }
 
 struct Counters {

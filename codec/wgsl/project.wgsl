@@ -4,11 +4,12 @@
 @group(0) @binding(1) var<uniform> page: Page;
 @group(0) @binding(2) var<storage, read> tiles: array<vec4<u32>>;
 @group(0) @binding(3) var<storage, read> words: array<u32>;
-@group(0) @binding(4) var<storage, read> tables: array<u32>; // codebooks
-@group(0) @binding(5) var<storage, read> blocks: array<u32>; // for each block: place of the first record, 8 words of bits
-@group(0) @binding(6) var<storage, read_write> ellipses: array<vec4<f32>>; // centre, the longer half-axis; pixels
-@group(0) @binding(7) var<storage, read_write> looks: array<vec4<u32>>; // shorter half-axis, opacity (0: not drawn), colour
-@group(0) @binding(8) var<storage, read_write> keys: array<u32>;
+@group(0) @binding(4) var<storage, read> rows: array<u32>; // indices and rows of coefficients of the page's tiles
+@group(0) @binding(5) var<storage, read> tables: array<u32>; // codebooks
+@group(0) @binding(6) var<storage, read> blocks: array<u32>; // for each block: place of the first record, 8 words of bits
+@group(0) @binding(7) var<storage, read_write> ellipses: array<vec4<f32>>; // centre, the longer half-axis; pixels
+@group(0) @binding(8) var<storage, read_write> looks: array<vec4<u32>>; // shorter half-axis, opacity (0: not drawn), colour
+@group(0) @binding(9) var<storage, read_write> keys: array<u32>;
 
 const PIXELS_MAX = 1e8; // the longest standard deviation on the picture, so that fourth powers stay finite
 
@@ -41,7 +42,7 @@ fn open_row(word: u32, bits: u32, offset: f32, step: f32, is_table: bool) {
 
 fn coefficient() -> f32 {
   if (row_fields == 0u) {
-    if (row_is_table) { row_held = tables[row_word]; } else { row_held = words[row_word]; }
+    if (row_is_table) { row_held = tables[row_word]; } else { row_held = rows[row_word]; }
     row_word += 1u;
     row_fields = 32u / row_bits;
   }
@@ -74,7 +75,7 @@ fn open_band(tile: Tile, local: u32, band: u32) -> bool { // false: the tile has
   if (kind == BAND_CODEBOOK) {
     let index_bits = (head.x >> 2u) & 63u;
     let fields = 32u / index_bits;
-    let index = extractBits(words[head.y + local / fields], index_bits * (local % fields), index_bits);
+    let index = extractBits(rows[head.y + local / fields], index_bits * (local % fields), index_bits);
     if (index < more.w) {
       let table_bits = (head.x >> 8u) & 63u;
       open_row(head.z + index * row_words(columns, table_bits), table_bits, bitcast<f32>(more.x), bitcast<f32>(more.z), true);
@@ -88,20 +89,21 @@ fn open_band(tile: Tile, local: u32, band: u32) -> bool { // false: the tile has
 
 fn colour_of(tile: Tile, local: u32, sh0: vec3<f32>, d: vec3<f32>) -> vec3<f32> {
   var sum = 0.5 + 0.28209479177387814 * sh0;
+  let degree = min(tile.degree, view.sh_degree);
   let s = d * d;
-  if (tile.degree >= 1u && open_band(tile, local, 1u)) {
+  if (degree >= 1u && open_band(tile, local, 1u)) {
     sum += -0.4886025119029199 * d.y * coefficients();
     sum += 0.4886025119029199 * d.z * coefficients();
     sum += -0.4886025119029199 * d.x * coefficients();
   }
-  if (tile.degree >= 2u && open_band(tile, local, 2u)) {
+  if (degree >= 2u && open_band(tile, local, 2u)) {
     sum += 1.0925484305920792 * d.x * d.y * coefficients();
     sum += -1.0925484305920792 * d.y * d.z * coefficients();
     sum += 0.31539156525252005 * (2.0 * s.z - s.x - s.y) * coefficients();
     sum += -1.0925484305920792 * d.x * d.z * coefficients();
     sum += 0.5462742152960396 * (s.x - s.y) * coefficients();
   }
-  if (tile.degree >= 3u && open_band(tile, local, 3u)) {
+  if (degree >= 3u && open_band(tile, local, 3u)) {
     sum += -0.5900435899266435 * d.y * (3.0 * s.x - s.y) * coefficients();
     sum += 2.890611442640554 * d.x * d.y * d.z * coefficients();
     sum += -0.4570457994644658 * d.y * (4.0 * s.z - s.x - s.y) * coefficients();
@@ -110,7 +112,7 @@ fn colour_of(tile: Tile, local: u32, sh0: vec3<f32>, d: vec3<f32>) -> vec3<f32> 
     sum += 1.445305721320277 * d.z * (s.x - s.y) * coefficients();
     sum += -0.5900435899266435 * d.x * (s.x - 3.0 * s.y) * coefficients();
   }
-  if (tile.degree >= 4u && open_band(tile, local, 4u)) {
+  if (degree >= 4u && open_band(tile, local, 4u)) {
     sum += 2.5033429417967046 * d.x * d.y * (s.x - s.y) * coefficients();
     sum += -1.7701307697799304 * d.y * d.z * (3.0 * s.x - s.y) * coefficients();
     sum += 0.9461746957575601 * d.x * d.y * (7.0 * s.z - 1.0) * coefficients();

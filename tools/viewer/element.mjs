@@ -13,7 +13,7 @@ import { SceneViewer } from './viewer.mjs';
  * @typedef {import('./types.d.ts').Progress} Progress
  */
 
-const WISHES = ['camera', 'view', 'up', 'axes', 'background'];
+const WISHES = ['camera', 'view', 'up', 'axes', 'background', 'backend'];
 const HOW =
   'Arrow keys fly, Shift and arrow keys turn around it, plus and minus zoom, R returns to the initial view, Escape leaves the scene.';
 const AHEAD = '50% 0px'; // distance from the window at which an element starts to load

@@ -33,12 +33,17 @@ export { EngineError };
  *   start a worker
  */
 export async function createEngine(canvas, options = {}) {
-  const renderer = createRenderer(canvas, options.pictureFormat);
+  /** @type {SplatEngine | null} */
+  let engine = null;
+  /** @type {(hasDrawn: boolean) => void} */
+  const lost = (hasDrawn) => engine?.gpuLost(hasDrawn, lost);
+  const renderer = await createRenderer(canvas, options, lost);
   if (renderer === null) {
     throw new EngineError({ code: E_WEBGL2, message: 'this browser does not support WebGL 2, or it is disabled' });
   }
   try {
-    return new SplatEngine(canvas, renderer, options);
+    engine = new SplatEngine(canvas, renderer, options);
+    return engine;
   } catch (error) {
     renderer.dispose();
     throw error;
@@ -94,7 +99,7 @@ class SplatEngine {
     this.listeners = new AbortController();
     const { signal } = this.listeners;
     canvas.addEventListener('webglcontextlost', (event) => this.contextLost(event), { signal });
-    canvas.addEventListener('webglcontextrestored', () => this.contextRestored(), { signal });
+    canvas.addEventListener('webglcontextrestored', () => this.restore(() => {}), { signal });
   }
 
   get header() {
@@ -124,7 +129,8 @@ class SplatEngine {
     const opening = new SceneLoad(source, ++this.sceneCount, this.stats, this.options, settle);
     this.opening = opening;
     const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
-      if (this.opening === opening) this.tell({ type: 'open', scene: opening.scene, source: readable });
+      if (this.opening !== opening) return;
+      this.tell({ type: 'open', scene: opening.scene, source: readable, sort: !this.renderer.capabilities.sorts });
     };
     // In WebKit, the worker of a file: page cannot read a Blob, but the page can.
     if (self.origin !== 'null' || !(source instanceof Blob)) return tell(source);
@@ -221,7 +227,7 @@ class SplatEngine {
     for (let i = 0; i < count; i++) {
       const start = performance.now();
       this.drawNow();
-      this.renderer.wait();
+      await this.renderer.wait();
       times.push(performance.now() - start);
     }
     return times;
@@ -303,13 +309,35 @@ class SplatEngine {
   /** @param {Event} event */
   contextLost(event) {
     event.preventDefault(); // otherwise the context would not be restored
+    this.reportLoss();
+  }
+
+  reportLoss() {
     const message = 'the browser has lost the GPU; the picture returns when it is restored';
     this.options.onError?.({ code: E_CONTEXT, message, fatal: false });
   }
 
-  contextRestored() {
-    const renderer = createRenderer(this.canvas, this.options.pictureFormat);
+  /**
+   * @param {boolean} hasDrawn false if this GPU cannot draw at all
+   * @param {(hasDrawn: boolean) => void} lost called when the next GPU is lost
+   */
+  gpuLost(hasDrawn, lost) {
+    if (this.listeners.signal.aborted) return;
+    if (!hasDrawn)
+      return this.fail(new EngineError({ code: E_CONTEXT, message: 'the GPU of WebGPU was lost at once' }));
+    this.reportLoss();
+    this.restore(lost);
+  }
+
+  /**
+   * Create another renderer, and read the scene again.
+   *
+   * @param {(hasDrawn: boolean) => void} lost
+   */
+  async restore(lost) {
+    const renderer = await createRenderer(this.canvas, this.options, lost);
     if (renderer === null) return;
+    if (this.listeners.signal.aborted) return renderer.dispose();
     this.renderer = renderer;
     const { opening } = this;
     if (opening && !opening.error) this.begin(opening.source, opening.settle);

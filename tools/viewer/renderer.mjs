@@ -1,6 +1,7 @@
-// The interface of rendering back ends, and the choice of one. A WebGPU back end would be added here.
+// The interface of rendering back ends, and the choice of one.
 
 import { WebGl2Renderer } from './webgl2.mjs';
+import { WebGpuRenderer } from './webgpu.mjs';
 
 /** @typedef {import('./types.d.ts').PictureFormat} PictureFormat */
 
@@ -19,13 +20,14 @@ import { WebGl2Renderer } from './webgl2.mjs';
  * @property {string} name name of the device, as reported by the driver
  * @property {PictureFormat} pictureFormat format of the picture before it is shown
  * @property {number} splatsMax maximum number of splats
+ * @property {boolean} sorts whether it culls and sorts on the GPU, and needs no order
  *
  * Bytes on the GPU: attributes and tables; the order of splats; render targets and projected splats.
  *
  * @typedef {{attributes: number, order: number, work: number}} Bytes
  *
  * Draws splats. Slots number the splats tile after tile, see `layoutSlots` of texels.mjs. The order must not contain
- * splats that have not been uploaded. All methods but `dispose` may do nothing after the context is lost.
+ * splats that have not been uploaded. All methods but `dispose` may do nothing after the context or the GPU is lost.
  *
  * @typedef {object} Renderer
  * @property {Capabilities} capabilities
@@ -40,20 +42,21 @@ import { WebGl2Renderer } from './webgl2.mjs';
  * @property {(order: Uint32Array, count: number) => void} setOrder slots, farthest first
  * @property {(view: import('./types.d.ts').View, look: {background: number[], shDegree: number}) => void} draw to the
  *   canvas, which has the size of the view
- * @property {() => Uint8Array} readPixels the result of the preceding `draw`, RGBA, top row first
+ * @property {() => Uint8Array | Promise<Uint8Array>} readPixels the result of the preceding `draw`, RGBA, top row first
  * @property {() => Promise<void>} finished resolves when the GPU has completed its work
- * @property {() => void} wait do the same synchronously
+ * @property {() => void | Promise<void>} wait do the same, synchronously if possible
  * @property {() => void} dispose free everything
  */
 
 /**
- * Create the best back end that the browser supports.
+ * Create a back end.
  *
  * @param {HTMLCanvasElement} canvas
- * @param {PictureFormat} [format] format of the picture before it is shown; default: the fastest without visible
- *   differences
- * @returns {Renderer | null} null if there is none
+ * @param {Pick<import('./types.d.ts').EngineOptions, 'backend' | 'pictureFormat'>} options
+ * @param {(hasDrawn: boolean) => void} lost called when the GPU of WebGPU is lost, with whether it has drawn anything
+ * @returns {Promise<Renderer | null>} null if there is none
  */
-export function createRenderer(canvas, format) {
-  return WebGl2Renderer.create(canvas, format);
+export async function createRenderer(canvas, { backend = 'webgl2', pictureFormat }, lost) {
+  const renderer = backend === 'webgpu' ? await WebGpuRenderer.create(canvas, lost) : null;
+  return renderer ?? WebGl2Renderer.create(canvas, pictureFormat);
 }

@@ -91,11 +91,11 @@ void main() {
   float nz = float(field((layout0.x >> 10) & 31u));
   vec3 p = corner.xyz + uRotation * (vec3(nx, ny, nz) * corner.w);
   if (!(p.z > uNear)) return;
-  vec3 quat = field3((layout0.x >> 15) & 31u);
-  vec3 logScales = values(layout0.y & 63u, scaleLattice);
   float opacity = float(field((layout0.x >> 20) & 31u)) / uOpacityLevels;
   if (uOpacitySquare) opacity *= opacity;
   if (!(opacity >= ${1 / 255})) return;
+  vec3 logScales = values(layout0.y & 63u, scaleLattice);
+  vec3 quat = field3((layout0.x >> 15) & 31u);
 
   vec4 e = ellipseOf(p, logScales, axesOf(quat));
   float a = e.x + 0.3, b = e.y, c = e.z + 0.3;

@@ -1,6 +1,6 @@
-// Packs a tile's integers into texels of four 32-bit words. shaders.mjs reads the same layout.
+// Packs a tile's integers into texels of four 32-bit words. shaders.mjs and codec/wgsl/layout.wgsl read them.
 //
-// Geometry is a string of bits per splat: means x y z, quats x y z, scales (three), opacity, sh0 r g b. The tile determines
+// Geometry is a string of bits per splat: means x y z, opacity, scales (three), quats x y z, sh0 r g b. The tile determines
 // the bits of each field. The first 128 bits are a texel; the rest follows in a separate array of words. Colours of SH bands
 // are rows of equal fields that do not cross words: entries of a codebook, or one row per splat. Indices of a codebook are
 // such fields too. Each of these arrays of words is padded to whole texels.
@@ -82,9 +82,9 @@ export function packGeometry(tile, opacities, quats) {
   const words = Math.max(TEXEL_WORDS, Math.ceil(total / 32));
   const writer = new BitWriter(count, words);
   for (let axis = 0; axis < 3; axis++) writer.put(tile.means.columns, axis * count, 0, meansBits[axis]);
-  for (let c = 0; c < 3; c++) writer.put(tile.quats.columns, c * count, tile.quats.offsets[c] + levels, bits.quats);
-  for (let c = 0; c < 3; c++) writer.put(scales.fields, c * count, 0, bits.scales);
   writer.put(tile.opacities.columns, 0, tile.opacities.offsets[0], bits.opacities);
+  for (let c = 0; c < 3; c++) writer.put(scales.fields, c * count, 0, bits.scales);
+  for (let c = 0; c < 3; c++) writer.put(tile.quats.columns, c * count, tile.quats.offsets[c] + levels, bits.quats);
   for (let c = 0; c < 3; c++) writer.put(sh0.fields, c * count, 0, bits.sh0);
   return { count, ...splitTexels(writer.words, count, words), bits, scales: scales.values, sh0: sh0.values };
 }

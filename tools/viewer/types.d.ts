@@ -103,7 +103,9 @@ export interface EngineOptions {
   background?: [number, number, number];
   /** Creates the worker that decodes and sorts. */
   workerFactory?: () => Worker;
-  /** Default: the fastest format that can be blended without visible differences. */
+  /** What draws; WebGL 2, too, if the browser has no WebGPU. Default: webgl2. */
+  backend?: 'webgl2' | 'webgpu';
+  /** Format of WebGL 2. Default: the fastest that can be blended without visible differences. */
   pictureFormat?: PictureFormat;
   onProgress?: (progress: Progress) => void;
   /** Called once header, index, metadata and cameras have arrived. */

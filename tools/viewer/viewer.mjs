@@ -84,6 +84,7 @@ export class SceneViewer {
     try {
       const engine = await createEngine(this.canvas, {
         background: this.background,
+        backend: this.wishes.backend,
         onHeader: (header, description) => {
           this.view.read(header, description);
           engine.setBackground(this.background);

@@ -52,6 +52,7 @@ export class WebGl2Renderer {
       name,
       pictureFormat: this.picture.format,
       splatsMax: gl.getParameter(gl.MAX_TEXTURE_SIZE) * ROW_TEXELS,
+      sorts: false,
     };
     /** @type {SceneTextures | null} */
     this.scene = null;

@@ -12,7 +12,7 @@ import { DepthSorter } from './sort.mjs';
  *
  * Messages to the worker: `scene` counts the calls of `open`, `id` the cameras.
  *
- * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer}
+ * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer, sort: boolean}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
  *   | {type: 'rewrite', up: number[], port: MessagePort}
@@ -58,6 +58,7 @@ class Job {
     this.splatCount = 0; // number of splats in `tiles`
     /** @type {{id: number, view: View} | null} */
     this.camera = null;
+    this.sorts = true;
     this.sorter = new DepthSorter();
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     /** @type {Uint32Array<ArrayBuffer>[]} */
@@ -68,7 +69,7 @@ class Job {
 
   /** @param {Request} request */
   take(request) {
-    if (request.type === 'open') this.open(request.scene, request.source);
+    if (request.type === 'open') this.open(request.scene, request.source, request.sort);
     else if (request.type === 'view') {
       this.camera = request;
       this.sortSoon(0);
@@ -92,10 +93,12 @@ class Job {
   /**
    * @param {number} scene
    * @param {string | Blob | ArrayBuffer} source
+   * @param {boolean} sorts whether the renderer needs an order
    */
-  async open(scene, source) {
+  async open(scene, source, sorts) {
     this.reset();
     this.scene = scene;
+    this.sorts = sorts;
     this.source = source;
     const { signal } = this.abort;
     /** @type {(message: any, transfer?: Transferable[]) => void} */
@@ -174,6 +177,12 @@ class Job {
     if (this.camera === null || this.scene === 0) return;
     const { id, view } = this.camera;
     const { splatCount, visible } = this;
+    if (!this.sorts) {
+      const { scene, tiles } = this;
+      const nothing = { order: new Uint32Array(0), count: splatCount, cullMs: 0, sortMs: 0 };
+      this.scope.postMessage({ type: 'order', scene, id, tiles: tiles.length, ...nothing });
+      return;
+    }
     if (visible.depths.length < splatCount) {
       visible.depths = new Float32Array(splatCount);
       visible.slots = new Uint32Array(splatCount);

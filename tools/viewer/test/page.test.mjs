@@ -21,18 +21,21 @@ test('an empty address has no parameters', () => {
     size: null,
     background: null,
     ui: true,
+    backend: 'webgl2',
   });
 });
 
 test('every parameter is read', () => {
   const { wishes, complaints } = readWishes(
-    new URLSearchParams('scene=/a.csplat&camera=[]&view=3&axes=RUB&size=512x384&background=%23ff8000&ui=0'),
+    new URLSearchParams(
+      'scene=/a.csplat&camera=[]&view=3&axes=RUB&size=512x384&background=%23ff8000&ui=0&backend=webgpu',
+    ),
   );
   assert.deepEqual(complaints, []);
   assert.deepEqual(wishes.size, { width: 512, height: 384 });
   assert.deepEqual(wishes.background, [1, 128 / 255, 0]);
-  const { scene, camera, view, axes, ui } = wishes;
-  assert.deepEqual([scene, camera, view, axes, ui], ['/a.csplat', '[]', 3, 'RUB', false]);
+  const { scene, camera, view, axes, ui, backend } = wishes;
+  assert.deepEqual([scene, camera, view, axes, ui, backend], ['/a.csplat', '[]', 3, 'RUB', false, 'webgpu']);
 });
 
 test('up is normalised', () => {
@@ -45,7 +48,7 @@ test('up is normalised', () => {
   assert.deepEqual(up('1e300,0,-0'), [1, 0, -0]);
 });
 
-const WRONG = ['size=0x5', 'size=20', 'background=red', 'axes=RLF', 'axes=RDFU', 'view=-1', 'view=x'];
+const WRONG = ['size=0x5', 'size=20', 'background=red', 'axes=RLF', 'axes=RDFU', 'view=-1', 'view=x', 'backend=cpu'];
 const NOWHERE = ['up=z', 'up=0,1', 'up=0,0,0', 'up=1,2,3,4', 'up=1,e,2', 'up=1e999,0,0'];
 for (const query of [...WRONG, ...NOWHERE]) {
   test(`${query} is reported and ignored`, () => {

@@ -38,10 +38,10 @@ function unpack(texels, i, tile, header) {
       ((n) => (bits === 32 ? float(n) : Math.fround(offsets[c]) + n * Math.fround(step)))(take(bits)),
     );
   const means = texels.bits.means.map((bits, axis) => (tile.corner[axis] + take(bits)) * tile.step);
+  const level = take(texels.bits.opacities) / opacity.levels;
+  const scales = values(texels.bits.scales, texels.scales);
   const q = [0, 1, 2].map(() => take(texels.bits.quats) - quat.levels);
   const w = Math.sqrt(2 * quat.levels ** 2 - q[0] ** 2 - q[1] ** 2 - q[2] ** 2);
-  const scales = values(texels.bits.scales, texels.scales);
-  const level = take(texels.bits.opacities) / opacity.levels;
   return {
     means,
     quats: [w, ...q].map((one) => one / (quat.levels * Math.SQRT2)),

@@ -31,6 +31,7 @@ _LEAST_PAIRS = 1 << 20  # room for pairs at first, 16 MB
 _MOST_PAIRS = 1 << 26  # fewer than the saturation of the sums in scan.wgsl
 _RUN = 4096  # elements per workgroup of a sort
 _DEPTH_BITS = 15  # bits of a key that tell slices apart at once
+_ALL_BANDS = 4  # the highest SH degree
 _LAST_KEY = 0x7F7FFFFF  # bits of the largest finite depth
 _SORT_RECORDS, _BLOCKS_OF_RANKS, _SORT_PAIRS = 0, 1, 2  # rows of the table of workgroups in dispatch.wgsl
 
@@ -40,7 +41,7 @@ _VIEW = np.dtype(
         ("rows", "<f4", (3, 4)), ("focal", "<f4", 4), ("slopes", "<f4", 4), ("size", "<f4", 2), ("near", "<f4"),
         ("first_key", "<u4"), ("last_key", "<u4"), ("screen_tiles_x", "<u4"), ("screen_tiles", "<u4"),
         ("records", "<u4"), ("pairs", "<u4"), ("blocks", "<u4"), ("block_table", "<u4"), ("tile_table", "<u4"),
-        ("depth_shift", "<u4"), ("unused", "<u4", 3),
+        ("depth_shift", "<u4"), ("sh_degree", "<u4"), ("unused", "<u4", 2),
     ]
 )  # fmt: skip
 
@@ -309,6 +310,7 @@ class GpuRenderer:
         view["slopes"] = values[17:21]
         view["size"] = camera.W, len(rows)
         view["near"] = camera.near
+        view["sh_degree"] = _ALL_BANDS
         view["last_key"] = _LAST_KEY
         columns = -(-camera.W // _SCREEN_TILE)
         view["screen_tiles_x"], view["screen_tiles"] = columns, columns * -(-len(rows) // _SCREEN_TILE)
@@ -354,7 +356,7 @@ class GpuRenderer:
         projections = [
             bind(
                 "project", "project", page.blocks,
-                *self._page(page), scene.tables, self._blocks, self._ellipses, self._looks, keys[0],
+                *self._page(page), page.words, scene.tables, self._blocks, self._ellipses, self._looks, keys[0],
             )
             for page in scene.pages
         ]  # fmt: skip
