@@ -16,6 +16,8 @@ from csplat.decoder import iter_packed, iter_tiles
 from csplat.errors import InputError, LimitError
 from csplat_authoring.builder import build
 from csplat_authoring.samples import rich_scene
+from csplat_bench.protocol import AbsentError, Setup
+from csplat_bench.subjects.gpu_rendering import STAGES, measure_gpu
 from csplat_conformance.manifest import VECTORS
 from csplat_render import render
 from csplat_render.conventions import UncheckedSplats
@@ -338,6 +340,24 @@ def test_scores_are_those_of_the_rasteriser(device, sample):
         assert getattr(wanted, name) == pytest.approx(getattr(found, name), abs=0.01)
     assert wanted.cover == pytest.approx(found.cover, abs=1e-4)
     assert wanted.worst_view == found.worst_view
+
+
+@area
+def test_the_benchmark_measures_every_stage(sample_path, tmp_path):
+    options = {"size": [64, 48], "views": 1, "frames": 2, "software": True}
+    setup = Setup(work=tmp_path, peers=tmp_path, data=tmp_path, csplat=[], options=options)
+    with measure_gpu(setup, str(sample_path), []) as measure:
+        one, two, floats = (
+            measure({"layout": layout, "copies": copies})
+            for layout, copies in (("packed", 1), ("packed", 2), ("floats", 2))
+        )
+        with pytest.raises(AbsentError):
+            measure({"layout": "gsplat", "copies": 1})
+    assert 2 * one["splats"] == two["splats"] == floats["splats"]
+    assert two["bytes_per_splat"] < 0.3 * floats["bytes_per_splat"]
+    for row in (one, two, floats):
+        assert row["frame_ms"] == pytest.approx(sum(row[f"{stage.replace(' ', '_')}_ms"] for stage in STAGES), rel=0.5)
+        assert row["psnr"] >= _LEAST_PSNR
 
 
 # Interface ---------------------------------------------------------------------------------------------------------

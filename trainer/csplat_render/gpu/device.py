@@ -73,12 +73,17 @@ class Call:
     count: Count
 
 
+#: Passes with a name.
+Stage = tuple[str, list[Call]]
+
+
 class Device:
     """A GPU with its compiled passes; see `open_device`.
 
     Attributes:
         adapter: the GPU.
         binding_max: size of the largest buffer that a shader can read, bytes.
+        has_timestamps: True if `time` can measure.
     """
 
     def __init__(self, wgpu: Any, adapter: Any, binding_max: int | None) -> None:
@@ -89,7 +94,9 @@ class Device:
             names = ("max-buffer-size", "max-storage-buffer-binding-size")
             wanted = {name: limits[name] for name in names}
         self._wgpu = wgpu
-        self._device = adapter.request_device_sync(required_limits=wanted)
+        self.has_timestamps = _TIMESTAMPS in adapter.features
+        features = [_TIMESTAMPS] if self.has_timestamps else []
+        self._device = adapter.request_device_sync(required_limits=wanted, required_features=features)
         largest = min(self._device.limits[name] for name in ("max-buffer-size", "max-storage-buffer-binding-size"))
         self.binding_max = min(binding_max or largest, largest, 1 << 30)
         self._pipelines: dict[tuple[str, str], Any] = {}
@@ -135,24 +142,45 @@ class Device:
             InputError: the GPU failed or was lost.
         """
         with self._named_errors():
-            self._run(calls, clear)
+            encoder = self._encoder(clear)
+            _encode(encoder.begin_compute_pass(), calls)
+            self._device.queue.submit([encoder.finish()])
 
-    def _run(self, calls: Sequence[Call], clear: Sequence[Any]) -> None:
+    def time(self, stages: Sequence[Stage], *, clear: Sequence[Any] = ()) -> list[float]:
+        """Run stages one after the other like `run`, and return the milliseconds of each.
+
+        Raises:
+            InputError: the GPU has no timestamps, failed, or was lost.
+        """
+        if not self.has_timestamps:
+            raise InputError(f"{self.adapter} has no timestamps")
+        # The interface of wgpu lacks the unit of timestamps, nanoseconds; on some GPUs it is not 1.
+        from wgpu.backends.wgpu_native import lib
+
+        count = 2 * len(stages)
+        with self._named_errors():
+            encoder = self._encoder(clear)
+            queries = self._device.create_query_set(type="timestamp", count=count)
+            for number, (_, calls) in enumerate(stages):
+                writes = {
+                    "query_set": queries,
+                    "beginning_of_pass_write_index": 2 * number,
+                    "end_of_pass_write_index": 2 * number + 1,
+                }
+                _encode(encoder.begin_compute_pass(timestamp_writes=writes), calls)
+            usage = self._wgpu.BufferUsage
+            stamps = self._device.create_buffer(size=8 * count, usage=usage.QUERY_RESOLVE | usage.COPY_SRC)
+            encoder.resolve_query_set(queries, 0, count, stamps, 0)
+            self._device.queue.submit([encoder.finish()])
+            unit = lib.wgpuQueueGetTimestampPeriod(self._device.queue._internal)  # noqa: SLF001 - see above
+        times = self.read(stamps, 8 * count).view(np.uint64).astype(np.int64).reshape(-1, 2)
+        return [float(end - begin) * unit * 1e-6 for begin, end in times]
+
+    def _encoder(self, clear: Sequence[Any]) -> Any:
         encoder = self._device.create_command_encoder()
         for buffer in clear:
             encoder.clear_buffer(buffer)
-        compute = encoder.begin_compute_pass()
-        for call in calls:
-            compute.set_pipeline(call.pipeline)
-            compute.set_bind_group(0, call.group)
-            if isinstance(call.count, int):
-                compute.dispatch_workgroups(call.count)
-            elif isinstance(call.count[0], int):
-                compute.dispatch_workgroups(*call.count)
-            else:
-                compute.dispatch_workgroups_indirect(*call.count)
-        compute.end()
-        self._device.queue.submit([encoder.finish()])
+        return encoder
 
     def bind(self, name: str, entry: str, count: Count, *buffers: Any) -> Call:
         """Return a pass with its buffers.
@@ -190,7 +218,21 @@ class Device:
         return found
 
 
+def _encode(compute: Any, calls: Sequence[Call]) -> None:
+    for call in calls:
+        compute.set_pipeline(call.pipeline)
+        compute.set_bind_group(0, call.group)
+        if isinstance(call.count, int):
+            compute.dispatch_workgroups(call.count)
+        elif isinstance(call.count[0], int):
+            compute.dispatch_workgroups(*call.count)
+        else:
+            compute.dispatch_workgroups_indirect(*call.count)
+    compute.end()
+
+
 _UPLOAD = 1 << 26  # bytes per write
+_TIMESTAMPS = "timestamp-query"
 
 
 def shader_source(name: str) -> str:

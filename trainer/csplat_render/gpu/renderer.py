@@ -19,7 +19,7 @@ from csplat.packed import PackedTile
 from csplat.types import F32, F64
 from csplat_render.camera import Camera
 from csplat_render.conventions import HasSplats, Mode, view_vector
-from csplat_render.gpu.device import Call, Device
+from csplat_render.gpu.device import Call, Device, Stage
 from csplat_render.gpu.packing import BLOCK, MODEL_TILE, TILE_ROWS, SharedTables, TileWords, pack_splats, pack_tile
 
 #: Words of a buffer of tiles, 32 MiB: a quarter of WebGPU's default limit. The largest tile has 6.5 million.
@@ -236,12 +236,12 @@ class GpuRenderer:
         keys, values = ([device.buffer(4 * self._records) for _ in range(2)] for _ in range(2))
         self._order = values[0]
         self._sums = device.buffer(4 * -(-self._records // BLOCK))
-        self._project = self._passes_of_projection(keys, values)
+        self._projection = self._stages_of_projection(keys, values)
         self._count_depths = [
             device.bind("cull", "count_depths", page.blocks, *self._page(page), None, self._depths)
             for page in scene.pages
         ]
-        self._step: list[Call] = []
+        self._step: list[Stage] = []
 
     def render(self, camera: Camera, *, background: ArrayLike = (0.0, 0.0, 0.0)) -> GpuRender:
         """Render a image.
@@ -279,8 +279,17 @@ class GpuRenderer:
         self._make_room(camera.W, height)
         return [range(start, min(camera.H, start + height)) for start in range(0, camera.H, height)]
 
-    def draw(self, camera: Camera, rows: range) -> tuple[int, int, int]:
-        """Draw a band of a image to `pixels`; return the numbers of visible splats, pairs and steps."""
+    def draw(self, camera: Camera, rows: range, times: dict[str, float] | None = None) -> tuple[int, int, int]:
+        """Draw a band of an image to `pixels`.
+
+        Args:
+            camera: the camera.
+            rows: the band, one of `bands`.
+            times: the milliseconds of each stage are added to it; this needs timestamps. `None`: none are measured.
+
+        Returns:
+            The numbers of visible splats, pairs and steps.
+        """
         device = self.device
         self.scene.place(view_vector(camera))
         view = self._view_of(camera, rows)
@@ -290,17 +299,35 @@ class GpuRenderer:
         for first_key, last_key in self._slices(view):
             view["first_key"], view["last_key"] = first_key, last_key
             device.upload(self._view, view)
-            calls = self._project + self._step
+            stages = self._projection + self._step
             while True:
-                device.run(calls, clear=[self._ranges])
+                self._run(stages, times)
                 counters = device.read(self._counters, 16).view(np.uint32)
                 pairs, steps = pairs + int(counters[1]), steps + 1
                 if int(counters[2]) * BLOCK >= int(counters[0]):
                     break
                 self._pairs_wanted = min(2 * self._pairs, self._pairs_max)  # for the next image
-                calls = self._step
+                stages = self._step
             visible += int(counters[0])
         return visible, pairs, steps
+
+    def time(self, camera: Camera) -> dict[str, float]:
+        """Render an image, and return the milliseconds of each stage on the GPU, without reading the image back.
+
+        Raises:
+            InputError: the GPU has no timestamps.
+        """
+        times: dict[str, float] = {}
+        for rows in self.bands(camera):
+            self.draw(camera, rows, times)
+        return times
+
+    def _run(self, stages: list[Stage], times: dict[str, float] | None) -> None:
+        if times is None:
+            self.device.run([call for _, calls in stages for call in calls], clear=[self._ranges])
+            return
+        for (name, _), spent in zip(stages, self.device.time(stages, clear=[self._ranges]), strict=True):
+            times[name] = times.get(name, 0.0) + spent
 
     def _view_of(self, camera: Camera, rows: range) -> NDArray[Any]:
         values = view_vector(camera)
@@ -349,7 +376,7 @@ class GpuRenderer:
     def _page(self, page: Page) -> tuple[Any, ...]:
         return self._view, page.info, self.scene.tiles, page.words
 
-    def _passes_of_projection(self, keys: list[Any], values: list[Any]) -> list[Call]:
+    def _stages_of_projection(self, keys: list[Any], values: list[Any]) -> list[Stage]:
         """Return the passes that find the visible splats of a slice, project them and sort them by depth."""
         bind, scene = self.device.bind, self.scene
         culls = [bind("cull", "cull", page.blocks, *self._page(page), self._blocks) for page in scene.pages]
@@ -360,12 +387,12 @@ class GpuRenderer:
             )
             for page in scene.pages
         ]  # fmt: skip
+        compact = bind("compact", "compact", 1, self._view, self._counters, self._blocks)
+        after = bind("dispatch", "after_compact", 1, self._view, self._counters, self._groups)
         return [
-            *culls,
-            bind("compact", "compact", 1, self._view, self._counters, self._blocks),
-            bind("dispatch", "after_compact", 1, self._view, self._counters, self._groups),
-            *projections,
-            *self._passes_of_sort(keys, values, 32, _SORT_RECORDS, of_pairs=False),
+            ("cull", [*culls, compact, after]),
+            ("project", projections),
+            ("depth sort", self._passes_of_sort(keys, values, 32, _SORT_RECORDS, of_pairs=False)),
         ]
 
     def _passes_of_sort(
@@ -408,15 +435,17 @@ class GpuRenderer:
         self._clear = [
             bind("dispatch", "clear_pixels", (-(-width * height // 16384), 64), self._view, None, None, self.pixels)
         ]
-        self._step = [
+        bins = [
             bind("bin", "count", blocks, self._view, self._counters, self._order, *records, self._sums),
             bind("bin", "scan", 1, self._view, self._counters, None, None, None, self._sums),
             bind("dispatch", "after_scan", 1, None, self._counters, self._groups),
             bind(
-                "bin", "emit", blocks, self._view, self._counters, self._order, *records, self._sums, keys[0], values[0]
+                "bin", "emit", blocks,
+                self._view, self._counters, self._order, *records, self._sums, keys[0], values[0],
             ),
-            *self._passes_of_sort(keys, values, bits, _SORT_PAIRS, of_pairs=True),
-            bind("ranges", "find", (self._groups, 12 * _SORT_PAIRS), self._counters, keys[done], self._ranges),
-            bind("blend", "blend", (columns, rows), self._view, *records, values[done], self._ranges, self.pixels),
-            bind("dispatch", "next_step", 1, None, self._counters),
-        ]
+        ]  # fmt: skip
+        sort = self._passes_of_sort(keys, values, bits, _SORT_PAIRS, of_pairs=True)
+        find = bind("ranges", "find", (self._groups, 12 * _SORT_PAIRS), self._counters, keys[done], self._ranges)
+        blend = bind("blend", "blend", (columns, rows), self._view, *records, values[done], self._ranges, self.pixels)
+        following = bind("dispatch", "next_step", 1, None, self._counters)
+        self._step = [("bin", bins), ("tile sort", [*sort, find]), ("blend", [blend, following])]

@@ -17,6 +17,7 @@ from csplat_bench.subjects.engine_loaders import measure_loaders
 from csplat_bench.subjects.file_parts import measure_parts
 from csplat_bench.subjects.files import measure_files
 from csplat_bench.subjects.first_bytes import measure_first_bytes
+from csplat_bench.subjects.gpu_rendering import measure_gpu
 from csplat_bench.subjects.large_scenes import measure_commands
 from csplat_bench.subjects.photographs import measure_photographs
 from csplat_bench.subjects.rendering import measure_rendering
@@ -36,6 +37,7 @@ SUBJECTS: dict[str, Subject] = {
     "file_parts": measure_parts,
     "files": measure_files,
     "first_bytes": measure_first_bytes,
+    "gpu_rendering": measure_gpu,
     "large_scenes": measure_commands,
     "photographs": measure_photographs,
     "rendering": measure_rendering,
