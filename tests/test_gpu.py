@@ -377,6 +377,18 @@ def test_commands_take_a_backend(sample_path, tmp_path):
 
 
 @area
+def test_a_lost_gpu_is_an_error_and_opened_again():
+    model = UncheckedSplats(**extreme_splats())
+    before = render(model, facing(), backend="software")
+    lost = devices.open_device(software=True)
+    renderer = GpuRenderer(GpuScene(lost, [model]))
+    lost._device.destroy()
+    with pytest.raises(InputError, match=r"failed: .*lost"):
+        renderer.render(facing())
+    np.testing.assert_array_equal(before.rgb, render(model, facing(), backend="software").rgb)
+
+
+@area
 def test_what_a_gpu_cannot_do_is_refused():
     model = UncheckedSplats(**extreme_splats())
     with pytest.raises(InputError, match="mode fast requires the backend cpu"):

@@ -114,10 +114,15 @@ class Device:
             return self._device.create_buffer(size=size, usage=flags | (usage.INDIRECT if indirect else 0))
 
     def upload(self, buffer: Any, array: NDArray[Any], offset: int = 0) -> None:
-        """Write an array to a buffer; its size is a multiple of four bytes."""
+        """Write an array to a buffer; its size is a multiple of four bytes.
+
+        Raises:
+            InputError: the GPU failed or was lost.
+        """
         flat = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
-        for start in range(0, len(flat), _UPLOAD):
-            self._device.queue.write_buffer(buffer, offset + start, flat[start : start + _UPLOAD])
+        with self._named_errors():
+            for start in range(0, len(flat), _UPLOAD):
+                self._device.queue.write_buffer(buffer, offset + start, flat[start : start + _UPLOAD])
 
     def uploaded(self, array: NDArray[Any], **usage: bool) -> Any:
         """Return a buffer with the content of an array."""
@@ -207,7 +212,8 @@ class Device:
         except self._wgpu.GPUOutOfMemoryError:
             raise InputError(f"{self.adapter} has too little memory") from None
         except self._wgpu.GPUError as error:
-            raise InputError(f"{self.adapter} failed: {str(error).strip().splitlines()[0]}") from None
+            open_device.cache_clear()  # the next call opens the GPU again
+            raise InputError(f"{self.adapter} failed: {str(error).strip().splitlines()[-1].strip()}") from None
 
     def _pipeline(self, name: str, entry: str) -> Any:
         found = self._pipelines.get((name, entry))
@@ -262,7 +268,7 @@ def find_device(backend: Backend) -> tuple[Device | None, str]:
 
 @cache
 def open_device(*, software: bool = False, binding_max: int | None = None) -> Device:
-    """Open the fastest GPU of this machine; the same device is returned every time.
+    """Open the fastest GPU of this machine; the same device is returned every time, until it fails.
 
     Args:
         software: use an adapter that emulates a GPU on the CPU, for tests.
