@@ -121,12 +121,8 @@ def _decode(data: bytes, limits: Limits | None, threads: int | None) -> tuple[di
         except CsplatError as error:
             results.append(error)
     model, integers = results
-    if (
-        isinstance(integers, CsplatError)
-        and not isinstance(model, CsplatError)
-        and decoder.read_header(data).coarse_tiles
-    ):
-        raise integers
+    if isinstance(integers, CsplatError) and _has_levels(data):
+        raise integers  # `decode` leaves coarser payloads unread, and of two faults it may find the other one first
     if isinstance(model, CsplatError) or isinstance(integers, CsplatError):
         # A budget counts the bytes of the returned arrays, which differ between the two functions.
         if _place(model) != _place(integers) and not any(isinstance(result, LimitError) for result in results):
@@ -137,6 +133,15 @@ def _decode(data: bytes, limits: Limits | None, threads: int | None) -> tuple[di
     arrays |= {f"integers.{name}": _raw(array) for name, array in integers.items()}
     arrays |= {f"extra.{name}": _raw(array) for name, array in model.extra.items()}
     return _facts(decoder.read_header(data)), arrays
+
+
+def _has_levels(data: bytes) -> bool:
+    from csplat import decoder
+
+    try:
+        return bool(decoder.read_header(data).coarse_tiles)
+    except CsplatError:
+        return False
 
 
 def _place(result: Any) -> tuple[str, str | None, int | None]:
