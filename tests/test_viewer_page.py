@@ -399,6 +399,31 @@ def test_all_controls_have_a_name_and_can_be_reached_by_keys(viewer, make_model)
     assert {"canvas", "reset", "details", "open", "help"} <= reached
 
 
+@pytest.mark.area(name="chromium")
+def test_the_page_measures_itself(viewer, make_model, tmp_path):
+    model = make_model(100, 0)
+    viewer.show(encode(model), "balls.csplat")
+    page = viewer.page
+    page.keyboard.press("m")
+    page.wait_for_selector("#measured", timeout=120_000)
+    assert "100 splats" in viewer.text("#measured-what")
+    backends = ["webgl2", "webgpu-tiles", "webgpu-quads"]
+    assert backends == page.locator("#measured-table td:first-child").all_inner_texts()
+    with page.expect_download() as saved:
+        page.click("#measured-save")
+    assert "balls-frames.json" == saved.value.suggested_filename
+    saved.value.save_as(tmp_path / "frames.json")
+    report = json.loads((tmp_path / "frames.json").read_text())
+    assert [len(model), 240, 180, []] == [report[name] for name in ("splats", "width", "height", "missing")]
+    for name, result in zip(backends, report["results"], strict=True):
+        assert name == result["backend"]
+        assert 0 < min(result["viewMs"]) <= result["frameMs"] <= max(result["viewMs"])
+        assert result["loadMs"] > 0
+        assert result["sceneBytes"] > 0
+    page.keyboard.press("Escape")
+    assert viewer.hides("#measured")
+
+
 def test_a_phone_shows_all_tools(viewer, make_model):
     page = viewer.page
     page.set_viewport_size({"width": 360, "height": 640})

@@ -346,43 +346,108 @@ def test_the_picture_returns_after_the_loss_of_the_gpu(engine, part, camera):
 # WebGPU --------------------------------------------------------------------------------------------
 @pytest.fixture
 def gpu_engine(engine):
-    """The engine on WebGPU, on the CPU."""
-    engine.start_again('{ backend: "webgpu" }')
-    assert engine.stats()["glRenderer"].endswith("(WebGPU)")
-    yield engine
+    """The engine on WebGPU, on the CPU; a function makes it with a back end."""
+
+    def start(backend="webgpu-tiles"):
+        engine.start_again(f"{{ backend: '{backend}' }}")
+        assert "(WebGPU, " in engine.page.evaluate("engine.renderer.capabilities.name")
+        return engine
+
+    yield start
     engine.start_again()
 
 
-def test_webgpu_draws_as_the_rasteriser_does(gpu_engine, part, camera):
+@pytest.mark.parametrize(("backend", "least"), [("webgpu-tiles", 57), ("webgpu-quads", 55)])
+def test_webgpu_draws_as_the_rasteriser_does(gpu_engine, part, camera, backend, least):
+    engine = gpu_engine(backend)
     for preset in ("fast", "balanced"):
         data = encode(part, EncodeOptions(preset=preset))
-        assert gpu_engine.open(data) is None
+        assert engine.open(data) is None
         model = decode(data)
-        picture = gpu_engine.picture(camera, (0.2, 0.6, 0.4))
-        assert psnr(picture, reference(model, camera, (0.2, 0.6, 0.4))) >= GOOD
-        np.testing.assert_array_equal(picture, gpu_engine.picture(camera, (0.2, 0.6, 0.4)))
-    assert psnr(gpu_engine.picture(camera, degree=1), reference(model, camera, sh_degree=1)) >= GOOD
+        picture = engine.picture(camera, (0.2, 0.6, 0.4))
+        assert psnr(picture, reference(model, camera, (0.2, 0.6, 0.4))) >= least
+        np.testing.assert_array_equal(picture, engine.picture(camera, (0.2, 0.6, 0.4)))
+    assert psnr(engine.picture(camera, degree=1), reference(model, camera, sh_degree=1)) >= least
+
+
+@pytest.mark.parametrize("backend", ["webgpu-tiles", "webgpu-quads"])
+def test_webgpu_draws_extremes_as_the_rasteriser_does(gpu_engine, backend):
+    files = {name: encode(model, FAST) for name, model in EXTREMES.items()}
+    assert {} == unlike(gpu_engine(backend), files, lambda _: in_front(size=200), 45)
 
 
 def test_webgpu_draws_pictures_that_exceed_its_buffers(gpu_engine, sample):
-    gpu_engine.open(encode(sample, FAST))
+    engine = gpu_engine()
+    engine.open(encode(sample, FAST))
     (camera,) = views(sample, 1, 80)
-    whole = gpu_engine.picture(camera)
+    whole = engine.picture(camera)
     tiles = math.ceil(camera.W / 16) * math.ceil(camera.H / 16)
     for most in (256 * tiles, 256 * tiles * 2 // 5):  # a block of splats in all, and in 2 of 5 rows of screen tiles
-        gpu_engine.page.evaluate(f"void (engine.renderer.pairsWanted = engine.renderer.pairsMax = {most})")
-        assert psnr(whole, gpu_engine.picture(camera)) >= GOOD
-    assert gpu_engine.page.evaluate("engine.renderer.steps") > 1
+        engine.page.evaluate(f"void (engine.renderer.tiles.pairsWanted = engine.renderer.tiles.pairsMax = {most})")
+        assert psnr(whole, engine.picture(camera)) >= GOOD
+    assert engine.page.evaluate("engine.renderer.tiles.steps") > 1
+
+
+@pytest.mark.parametrize("backend", ["webgpu-tiles", "webgpu-quads"])
+def test_webgpu_draws_more_splats_than_its_records_hold(gpu_engine, part, camera, backend):
+    engine = gpu_engine(backend)
+    data = encode(part, FAST)
+    engine.open(data)
+    whole = engine.picture(camera)
+    engine.page.evaluate("void (engine.renderer.projection.recordsMax = 256)")
+    engine.open(data)
+    np.testing.assert_array_equal(whole, engine.picture(camera))
+    assert engine.page.evaluate("engine.renderer.projection.slices.length") > 4
+
+
+def test_more_splats_of_one_depth_than_webgpu_holds_are_refused(gpu_engine):
+    engine = gpu_engine()
+    engine.page.evaluate("void (engine.renderer.projection.recordsMax = 256)")
+    engine.look(in_front())
+    assert engine.open(encode(make(np.zeros((300, 3))), FAST)) is None
+    engine.page.wait_for_function("errors.length")
+    assert ["E_LIMIT"] == engine.page.evaluate("errors.map(({ code }) => code)")
+    engine.page.evaluate("void (errors.length = 0)")
+
+
+def test_webgpu_chooses_how_to_blend_when_the_scene_is_complete(gpu_engine, part, camera):
+    engine = gpu_engine("webgpu")
+    data = encode(part, FAST)
+    engine.open(data)
+    assert psnr(engine.picture(camera), reference(decode(data), camera)) >= GOOD
+    chosen = engine.page.evaluate(
+        "[engine.renderer.isChosen, !!engine.renderer.quads.picture, !!engine.renderer.tiles.target]"
+    )
+    assert chosen in ([True, True, False], [True, False, True])
+
+
+def test_software_is_not_chosen_but_draws_correctly(engine):
+    assert "(WebGPU" not in engine.page.evaluate("engine.renderer.capabilities.name")
+    found = engine.page.evaluate(
+        """async () => {
+          const { WebGpuRenderer } = await import('/tools/viewer/webgpu.mjs');
+          const { Device } = await import('/tools/viewer/webgpu_device.mjs');
+          const { isSound } = await import('/tools/viewer/webgpu_check.mjs');
+          const renderer = new WebGpuRenderer(await Device.open(false), 'auto');
+          const found = [await isSound(renderer)];
+          renderer.projection.setView = () => {}; // a GPU that does not draw
+          found.push(await isSound(renderer));
+          renderer.dispose();
+          return [...found, await Device.open(true)];
+        }"""
+    )
+    assert [True, False, None] == found
 
 
 def test_webgpu_returns_after_the_loss_of_the_gpu(gpu_engine, part, camera):
-    gpu_engine.open(encode(part, FAST))
-    before = gpu_engine.picture(camera)
-    gpu_engine.page.evaluate("void (window.lost = engine.renderer).device.device.destroy()")
-    gpu_engine.page.wait_for_function("engine.renderer !== lost && engine.opening.isDone")
-    assert ["E_CONTEXT", False] == gpu_engine.page.evaluate("[errors[0].code, errors[0].fatal]")
-    np.testing.assert_array_equal(before, gpu_engine.picture(camera))
-    gpu_engine.page.evaluate("void (errors.length = 0)")
+    engine = gpu_engine()
+    engine.open(encode(part, FAST))
+    before = engine.picture(camera)
+    engine.page.evaluate("void (window.lost = engine.renderer).device.device.destroy()")
+    engine.page.wait_for_function("engine.renderer !== lost && engine.opening.isDone")
+    assert ["E_CONTEXT", False] == engine.page.evaluate("[errors[0].code, errors[0].fatal]")
+    np.testing.assert_array_equal(before, engine.picture(camera))
+    engine.page.evaluate("void (errors.length = 0)")
 
 
 def test_without_webgpu_webgl_2_draws(engine, part, camera):
@@ -391,7 +456,7 @@ def test_without_webgpu_webgl_2_draws(engine, part, camera):
     data = encode(part, FAST)
     engine.open(data)
     assert psnr(engine.picture(camera), reference(decode(data), camera)) >= GOOD
-    assert not engine.stats()["glRenderer"].endswith("(WebGPU)")
+    assert "(WebGPU" not in engine.stats()["glRenderer"]
     engine.page.evaluate("delete navigator.gpu.requestAdapter")
 
 

@@ -18,11 +18,6 @@ var<workgroup> colours: array<vec2<f32>, 64>; // green, blue
 var<workgroup> open: atomic<u32>; // threads with pixels that are not finished
 var<workgroup> open_now: u32;
 
-fn unpack_colour(n: vec2<u32>) -> vec3<f32> {
-  let green = (n.x >> 21u) | ((n.y & 0x3ffu) << 11u);
-  return bitcast<vec3<f32>>(vec3<u32>(n.x & 0x1fffffu, green, n.y >> 10u) << vec3<u32>(10u));
-}
-
 fn pixel_at(i: u32, inside: bool) -> vec4<f32> {
   if (!inside) { return vec4<f32>(0.0); }
   return pixels[i];

@@ -37,3 +37,14 @@ const COMPENSATION_MIN = 0.000025;
 
 const BLOCK = 256u; // splats of a workgroup, all of one tile
 const SCREEN_TILE = 16u; // pixels, width and height
+
+// Colours of records: three floats of 21 bits, without signs, an exponent of 8 bits and a mantissa of 13.
+fn pack_colour(colour: vec3<f32>) -> vec2<u32> {
+  let n = (bitcast<vec3<u32>>(colour) + 512u) >> vec3<u32>(10u);
+  return vec2<u32>(n.x | (n.y << 21u), (n.y >> 11u) | (n.z << 10u));
+}
+
+fn unpack_colour(n: vec2<u32>) -> vec3<f32> {
+  let green = (n.x >> 21u) | ((n.y & 0x3ffu) << 11u);
+  return bitcast<vec3<f32>>(vec3<u32>(n.x & 0x1fffffu, green, n.y >> 10u) << vec3<u32>(10u));
+}

@@ -1,8 +1,9 @@
 // Numbers of workgroups of the passes that follow, from what has been counted; and the step from one part to the next.
+// `groups` holds x y z of the sort of records, of blocks of ranks and of the sort of pairs, then what a draw of quads takes.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read_write> counters: Counters;
-@group(0) @binding(2) var<storage, read_write> groups: array<u32>; // x y z of: sort of records, blocks of ranks, sort of pairs
+@group(0) @binding(2) var<storage, read_write> groups: array<u32>;
 
 fn put(at: u32, count: u32) {
   groups[3u * at] = count;
@@ -15,6 +16,10 @@ fn after_compact() {
   let visible = min(counters.visible, view.records);
   put(0u, (visible + 4095u) / 4096u);
   put(1u, (visible + 255u) / 256u);
+  groups[9] = 4u; // vertices
+  groups[10] = visible; // instances
+  groups[11] = 0u; // the first of each
+  groups[12] = 0u;
   counters.first_block = 0u;
   counters.last_block = 0u;
 }

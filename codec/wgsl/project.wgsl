@@ -126,12 +126,6 @@ fn colour_of(tile: Tile, local: u32, sh0: vec3<f32>, d: vec3<f32>) -> vec3<f32> 
   return clamp(sum, vec3<f32>(0.0), vec3<f32>(1e30));
 }
 
-// Three floats of 21 bits, without signs: an exponent of 8 bits and a mantissa of 13.
-fn pack_colour(colour: vec3<f32>) -> vec2<u32> {
-  let n = (bitcast<vec3<u32>>(colour) + 512u) >> vec3<u32>(10u);
-  return vec2<u32>(n.x | (n.y << 21u), (n.y >> 11u) | (n.z << 10u));
-}
-
 @compute @workgroup_size(256)
 fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
   let block = page.first_block + group.x;

@@ -7,7 +7,7 @@
 //   await engine.open('scene.csplat');
 
 import { NO_CAMERA, viewOf } from './camera_maths.mjs';
-import { EngineError, E_CONTEXT, E_INPUT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
+import { EngineError, E_CONTEXT, E_INPUT, E_LIMIT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
 import { FrameScheduler } from './frame_scheduler.mjs';
 import { SceneLoad } from './scene_load.mjs';
 import { createRenderer } from './renderer.mjs';
@@ -35,9 +35,11 @@ export { EngineError };
 export async function createEngine(canvas, options = {}) {
   /** @type {SplatEngine | null} */
   let engine = null;
-  /** @type {(hasDrawn: boolean) => void} */
-  const lost = (hasDrawn) => engine?.gpuLost(hasDrawn, lost);
-  const renderer = await createRenderer(canvas, options, lost);
+  const losses = {
+    lost: (/** @type {boolean} */ hasDrawn) => engine?.gpuLost(hasDrawn, losses),
+    failed: (/** @type {string} */ code, /** @type {string} */ message) => engine?.gpuFailed(code, message),
+  };
+  const renderer = await createRenderer(canvas, options, losses);
   if (renderer === null) {
     throw new EngineError({ code: E_WEBGL2, message: 'this browser does not support WebGL 2, or it is disabled' });
   }
@@ -99,7 +101,7 @@ class SplatEngine {
     this.listeners = new AbortController();
     const { signal } = this.listeners;
     canvas.addEventListener('webglcontextlost', (event) => this.contextLost(event), { signal });
-    canvas.addEventListener('webglcontextrestored', () => this.restore(() => {}), { signal });
+    canvas.addEventListener('webglcontextrestored', () => this.restore('webgl2'), { signal });
   }
 
   get header() {
@@ -220,15 +222,18 @@ class SplatEngine {
     });
   }
 
-  /** @param {number} count */
-  async timeFrames(count) {
+  /**
+   * @param {number} count
+   * @param {number} [together]
+   */
+  async timeFrames(count, together = 1) {
     await this.settled();
     const times = [];
     for (let i = 0; i < count; i++) {
       const start = performance.now();
-      this.drawNow();
+      for (let frame = 0; frame < together; frame++) this.drawNow();
       await this.renderer.wait();
-      times.push(performance.now() - start);
+      times.push((performance.now() - start) / together);
     }
     return times;
   }
@@ -287,9 +292,14 @@ class SplatEngine {
     this.renderer.draw(this.view ?? viewOf(NO_CAMERA, width, height), this.look);
   }
 
-  drawFrame() {
+  async drawFrame() {
     this.drawNow();
-    return this.renderer.finished();
+    try {
+      await this.renderer.finished();
+    } catch (error) {
+      if (!(error instanceof RangeError)) throw error;
+      this.gpuFailed(E_LIMIT, error.message);
+    }
   }
 
   /**
@@ -299,7 +309,15 @@ class SplatEngine {
   frameDrawn(frameMs, fps) {
     const { stats, opening } = this;
     const { attributes, order, work } = this.renderer.bytes;
-    Object.assign(stats, { frameMs, fps, gpuBytes: attributes + order, workBytes: work });
+    const { name, pictureFormat } = this.renderer.capabilities; // may change after the scene is complete
+    Object.assign(stats, {
+      frameMs,
+      fps,
+      gpuBytes: attributes + order,
+      workBytes: work,
+      glRenderer: name,
+      pictureFormat,
+    });
     stats.gpuBytesPerSplat = stats.splatsResident ? attributes / stats.splatsResident : 0;
     stats.shDegree = Math.min(this.look.shDegree, opening?.header?.shDegree ?? 0);
     if (opening?.isOrderWhole && stats.firstPictureMs === 0) stats.firstPictureMs = performance.now() - opening.begun;
@@ -318,24 +336,40 @@ class SplatEngine {
   }
 
   /**
-   * @param {boolean} hasDrawn false if this GPU cannot draw at all
-   * @param {(hasDrawn: boolean) => void} lost called when the next GPU is lost
+   * Report that the GPU cannot draw the scene, once.
+   *
+   * @param {string} code
+   * @param {string} message
    */
-  gpuLost(hasDrawn, lost) {
+  gpuFailed(code, message) {
+    const { opening } = this;
+    if (!opening || opening.hasFailedToDraw) return;
+    opening.hasFailedToDraw = true;
+    this.fail(new EngineError({ code, message: `the GPU cannot draw the scene: ${message}` }));
+  }
+
+  /**
+   * @param {boolean} hasDrawn false if this GPU cannot draw at all
+   * @param {import('./renderer.mjs').Losses} losses of the next GPU
+   */
+  gpuLost(hasDrawn, losses) {
     if (this.listeners.signal.aborted) return;
-    if (!hasDrawn)
-      return this.fail(new EngineError({ code: E_CONTEXT, message: 'the GPU of WebGPU was lost at once' }));
+    if (!hasDrawn) {
+      const message = 'WebGPU lost the GPU at once; the backend webgl2 may draw the scene';
+      return this.fail(new EngineError({ code: E_CONTEXT, message }));
+    }
     this.reportLoss();
-    this.restore(lost);
+    this.restore(this.options.backend, losses);
   }
 
   /**
    * Create another renderer, and read the scene again.
    *
-   * @param {(hasDrawn: boolean) => void} lost
+   * @param {import('./types.d.ts').EngineOptions['backend']} backend
+   * @param {import('./renderer.mjs').Losses} [losses] of a GPU of WebGPU
    */
-  async restore(lost) {
-    const renderer = await createRenderer(this.canvas, this.options, lost);
+  async restore(backend, losses = { lost() {}, failed() {} }) {
+    const renderer = await createRenderer(this.canvas, { ...this.options, backend }, losses);
     if (renderer === null) return;
     if (this.listeners.signal.aborted) return renderer.dispose();
     this.renderer = renderer;

@@ -3,6 +3,7 @@
 // Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
 // `window.csplatViewer` lets programs control the page; its `ready` resolves when the scene has been drawn completely.
 
+import { MeasureCard, measure } from './measure.mjs';
 import { SaveUpOffer, upWord } from './save_up.mjs';
 import { Overlay, element } from './overlay.mjs';
 import { embedded, nameOf, readWishes } from './page.mjs';
@@ -46,6 +47,12 @@ const { view } = showing;
 document.documentElement.classList.toggle('bare', !wishes.ui);
 document.documentElement.classList.toggle('fixed', wishes.size !== null);
 
+const measured = new MeasureCard();
+
+/** The scene that is shown. @type {{source: string | Blob | ArrayBuffer, name: string} | null} */
+let current = null;
+let isMeasuring = false;
+
 let shade = 0; // index of the current background
 
 /**
@@ -56,6 +63,8 @@ let shade = 0; // index of the current background
  */
 async function show(source, name) {
   shade = 0;
+  current = { source, name };
+  measured.hide();
   overlay.begin(name);
   keep.hide();
   tools(false);
@@ -107,6 +116,19 @@ function turnUpright() {
   } else keep.show(overlay.name, up);
 }
 
+async function measureFrames() {
+  if (!current || isMeasuring) return;
+  isMeasuring = true;
+  const { width, height } = showing.stage;
+  try {
+    measured.show(await measure({ ...current, rig: showing.rig, width, height }, (text) => overlay.toast(text)));
+  } catch (error) {
+    overlay.toast(`Nothing was measured: ${error instanceof Error ? error.message : error}`);
+  } finally {
+    isMeasuring = false;
+  }
+}
+
 async function fullScreen() {
   try {
     await (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
@@ -121,6 +143,7 @@ const ACTIONS = {
   KeyF: () => void fullScreen(),
   KeyH: () => overlay.toggleHelp(),
   KeyI: () => overlay.toggleStatistics(),
+  KeyM: () => void measureFrames(),
   KeyO: () => overlay.chooseFile(),
   KeyU: turnUpright,
   KeyB: () => otherBackground(1),
@@ -129,6 +152,7 @@ const ACTIONS = {
   Escape: () => {
     overlay.hideError();
     keep.hide();
+    measured.hide();
   },
   Digit0: () => shDegree(0),
   Digit1: () => shDegree(1),
@@ -144,6 +168,7 @@ const BUTTONS = {
   next: 'BracketRight',
   'help-upright': 'KeyU',
   'help-background': 'KeyB',
+  'help-measure': 'KeyM',
 };
 
 function listen() {

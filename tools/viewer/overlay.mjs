@@ -10,15 +10,16 @@ import { explain } from './messages.mjs';
 
 const TOAST_MS = 2600;
 const STATISTICS_MS = 250; // interval between updates
+const SAVING_MS = 60000; // time for the browser to start saving
 
 /** @type {(value: number) => string} */
 const count = (value) => Math.round(value).toLocaleString('en');
 
 /** @type {(bytes: number) => string} MB = 10^6 bytes */
-const megabytes = (bytes) => (bytes < 1e7 ? (bytes / 1e6).toFixed(2) : (bytes / 1e6).toFixed(1));
+export const megabytes = (bytes) => (bytes < 1e7 ? (bytes / 1e6).toFixed(2) : (bytes / 1e6).toFixed(1));
 
 /** @type {(ms: number) => string} */
-const milliseconds = (ms) => `${ms < 10 ? ms.toFixed(1) : count(ms)} ms`;
+export const milliseconds = (ms) => `${ms < 10 ? ms.toFixed(1) : count(ms)} ms`;
 
 /**
  * @template {HTMLElement} T
@@ -30,6 +31,19 @@ export function element(id, kind) {
   const found = document.getElementById(id);
   if (!(found instanceof kind)) throw new Error(`the page has no ${id}`);
   return found;
+}
+
+/**
+ * Let the browser save a file.
+ *
+ * @param {BlobPart} content
+ * @param {string} name
+ * @param {string} type media type
+ */
+export function saveFile(content, name, type) {
+  const href = URL.createObjectURL(new Blob([content], { type }));
+  Object.assign(document.createElement('a'), { href, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(href), SAVING_MS);
 }
 
 /** @param {string} id */
@@ -51,7 +65,7 @@ export class Overlay {
     html('error-close').addEventListener('click', () => this.hideError());
     html('details').addEventListener('click', () => this.toggleStatistics());
     html('help').addEventListener('click', () => this.toggleHelp());
-    for (const id of ['help-close', 'help-upright', 'help-background']) {
+    for (const id of ['help-close', 'help-upright', 'help-background', 'help-measure']) {
       html(id).addEventListener('click', () => this.toggleHelp());
     }
     const input = element('file', HTMLInputElement);

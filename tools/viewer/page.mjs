@@ -14,7 +14,7 @@ import { unitDirection } from './vectors.mjs';
  * @property {{width: number, height: number} | null} size size of the drawing buffer, pixels
  * @property {[number, number, number] | null} background 0 to 1; overrides the file's
  * @property {boolean} ui false to show only the scene
- * @property {'webgl2' | 'webgpu'} backend what draws
+ * @property {import('./types.d.ts').Backend} backend what draws
  *
  * The data that `csplat export-html` embeds in the page.
  * @typedef {object} Embedded
@@ -58,7 +58,7 @@ export function readWishes(query) {
     return found;
   };
   const axes = match('axes', AXES, 'three letters as RDF');
-  const backend = match('backend', /^webgl2$|^webgpu$/, 'webgl2 or webgpu');
+  const backend = match('backend', /^(auto|webgl2|webgpu(-tiles|-quads)?)$/, 'auto, webgl2 or webgpu');
   const view = match('view', /^\d{1,6}$/, 'a number from 0');
   return {
     wishes: {
@@ -71,7 +71,7 @@ export function readWishes(query) {
       size: size && { width: Number(size[1]), height: Number(size[2]) },
       background: colour ? /** @type {any} */ (colour.slice(1).map((two) => parseInt(two, 16) / 255)) : null,
       ui: query.get('ui') !== '0',
-      backend: backend?.[0] === 'webgpu' ? 'webgpu' : 'webgl2',
+      backend: /** @type {import('./types.d.ts').Backend} */ (backend?.[0] ?? 'auto'),
     },
     complaints,
   };

@@ -49,14 +49,22 @@ import { WebGpuRenderer } from './webgpu.mjs';
  */
 
 /**
+ * What to call when drawing becomes impossible.
+ *
+ * @typedef {object} Losses
+ * @property {(hasDrawn: boolean) => void} lost the GPU of WebGPU is lost; whether it has drawn anything
+ * @property {(code: string, message: string) => void} failed WebGPU reports an error, such as too little memory
+ */
+
+/**
  * Create a back end.
  *
  * @param {HTMLCanvasElement} canvas
  * @param {Pick<import('./types.d.ts').EngineOptions, 'backend' | 'pictureFormat'>} options
- * @param {(hasDrawn: boolean) => void} lost called when the GPU of WebGPU is lost, with whether it has drawn anything
+ * @param {Losses} losses
  * @returns {Promise<Renderer | null>} null if there is none
  */
-export async function createRenderer(canvas, { backend = 'webgl2', pictureFormat }, lost) {
-  const renderer = backend === 'webgpu' ? await WebGpuRenderer.create(canvas, lost) : null;
+export async function createRenderer(canvas, { backend = 'auto', pictureFormat }, losses) {
+  const renderer = backend === 'webgl2' ? null : await WebGpuRenderer.create(canvas, backend, losses);
   return renderer ?? WebGl2Renderer.create(canvas, pictureFormat);
 }

@@ -1,6 +1,6 @@
 // Offers to save the up direction that the user chose: as a rewritten file, or with a command.
 
-import { element } from './overlay.mjs';
+import { element, saveFile } from './overlay.mjs';
 
 /**
  * @typedef {import('./vectors.mjs').Vec3} Vec3
@@ -11,7 +11,6 @@ import { element } from './overlay.mjs';
 
 const DIGITS = 1e6; // a precision of a millionth of a radian
 const AXES = ['x', 'y', 'z'];
-const LINK_MS = 60000; // time for the browser to start saving
 
 /**
  * Round a direction as stored in files.
@@ -92,11 +91,7 @@ export class SaveUpOffer {
     const { name, up } = this;
     button.disabled = true;
     try {
-      const bytes = await this.hooks.file(up);
-      const href = URL.createObjectURL(new Blob([bytes], { type: 'model/vnd.csplat' }));
-      const link = Object.assign(document.createElement('a'), { href, download: name || 'scene.csplat' });
-      link.click();
-      setTimeout(() => URL.revokeObjectURL(href), LINK_MS);
+      saveFile(await this.hooks.file(up), name || 'scene.csplat', 'model/vnd.csplat');
     } catch (error) {
       this.hooks.say(`The file could not be written: ${error instanceof Error ? error.message : error}`);
     } finally {

@@ -38,6 +38,8 @@ export class SceneLoad {
     this.bounds = null;
     /** Whether everything is decoded. */
     this.isDone = false;
+    /** Whether the GPU failed to draw it. */
+    this.hasFailedToDraw = false;
     this.tilesHere = 0;
     /** The last sort: its camera and number of tiles. */
     this.order = { id: 0, tiles: 0 };

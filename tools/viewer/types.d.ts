@@ -98,13 +98,20 @@ export interface ErrorReport {
 /** Format of the target of blending. Bytes are rounded after each layer, a last resort. */
 export type PictureFormat = 'RGBA16F' | 'RGBA32F' | 'RGBA8';
 
+/**
+ * What draws. `webgpu` blends by screen tiles, in binary32, or as quads, in half floats, whichever a measurement finds faster;
+ * the other names say which. `auto` is `webgpu` on hardware that draws a small scene correctly. All draw with WebGL 2 in a
+ * browser without WebGPU.
+ */
+export type Backend = 'auto' | 'webgl2' | 'webgpu' | 'webgpu-tiles' | 'webgpu-quads';
+
 export interface EngineOptions {
   /** Red, green, blue, 0 to 1. */
   background?: [number, number, number];
   /** Creates the worker that decodes and sorts. */
   workerFactory?: () => Worker;
-  /** What draws; WebGL 2, too, if the browser has no WebGPU. Default: webgl2. */
-  backend?: 'webgl2' | 'webgpu';
+  /** What draws. Default: auto. */
+  backend?: Backend;
   /** Format of WebGL 2. Default: the fastest that can be blended without visible differences. */
   pictureFormat?: PictureFormat;
   onProgress?: (progress: Progress) => void;
@@ -131,8 +138,11 @@ export interface Engine {
   readPixels(): Promise<Uint8Array>;
   /** Return the scene's file with an up direction, a unit vector, in its metadata. */
   fileWithUp(up: [number, number, number]): Promise<Uint8Array<ArrayBuffer>>;
-  /** Draw frames one after the other, waiting for each, and return the milliseconds of each. For benchmarks. */
-  timeFrames(count: number): Promise<number[]>;
+  /**
+   * Draw frames, waiting after each or after so many together, and return the milliseconds per frame of each wait. For
+   * benchmarks.
+   */
+  timeFrames(count: number, together?: number): Promise<number[]>;
   readonly stats: Stats;
   readonly bounds: Bounds | null;
   readonly header: Header | null;

@@ -5,6 +5,7 @@ import { ShaderPrograms } from './shader_programs.mjs';
 import { SceneTextures } from './scene_textures.mjs';
 import { RECORD_COLUMNS, ROW_TEXELS } from './shader_attributes.mjs';
 import { Picture, Quads, pictureFormat } from './framebuffers.mjs';
+import { SOFTWARE } from './webgpu_device.mjs';
 
 /**
  * @typedef {import('./texels.mjs').BandTexels} BandTexels
@@ -16,9 +17,6 @@ import { Picture, Quads, pictureFormat } from './framebuffers.mjs';
  * @typedef {import('./types.d.ts').PictureFormat} PictureFormat
  * @typedef {import('./types.d.ts').View} View
  */
-
-/** Names of software drivers. */
-const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 
 /** @implements {Renderer} */
 export class WebGl2Renderer {

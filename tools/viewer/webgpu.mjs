@@ -1,9 +1,13 @@
-// The WebGPU back end: culling, projection, sort and blending by screen tiles on the GPU, as csplat_render/gpu/renderer.py
-// does, with the same shaders. renderer.mjs documents its methods.
+// The WebGPU back end: culling, projection, sort and blending on the GPU, with the shaders of csplat_render/gpu. Pictures are
+// blended by screen tiles or as quads, as options say or a short measurement decides. renderer.mjs documents its methods.
 
-import { slopeLimits } from './camera_maths.mjs';
+import { E_CONTEXT, E_LIMIT } from './engine_error.mjs';
+import { isSound } from './webgpu_check.mjs';
 import { Device } from './webgpu_device.mjs';
+import { Projection } from './webgpu_projection.mjs';
+import { Quads } from './webgpu_quads.mjs';
 import { BLOCK, GpuScene } from './webgpu_scene.mjs';
+import { ScreenTiles } from './webgpu_tiles.mjs';
 import * as WGSL from './wgsl.mjs';
 
 /**
@@ -11,89 +15,103 @@ import * as WGSL from './wgsl.mjs';
  * @typedef {import('./texels.mjs').GeometryTexels} GeometryTexels
  * @typedef {import('./texels.mjs').Rows} Rows
  * @typedef {import('./renderer.mjs').Capabilities} Capabilities
+ * @typedef {import('./renderer.mjs').Losses} Losses
  * @typedef {import('./renderer.mjs').Renderer} Renderer
  * @typedef {import('./renderer.mjs').SceneLayout} SceneLayout
+ * @typedef {import('./types.d.ts').Backend} Backend
  * @typedef {import('./types.d.ts').View} View
- * @typedef {import('./webgpu_device.mjs').Call} Call
- *
- * Buffers that depend on the size of the picture, and the passes that use them.
- * @typedef {{width: number, height: number, pairs: number, pixels: GPUBuffer, ranges: GPUBuffer, owned: GPUBuffer[],
- *   clear: Call[], step: Call[], group: GPUBindGroup}} Target
- *
- * Buffers that depend on the number of splats, and the passes of the sort.
- * @typedef {{records: number, blocks: GPUBuffer, ellipses: GPUBuffer, looks: GPUBuffer, keys: GPUBuffer, order: GPUBuffer,
- *   sums: GPUBuffer, owned: GPUBuffer[], sort: Call[]}} Records
+ * @typedef {ScreenTiles | Quads} Method
+ * @typedef {{view: View, look: {background: number[], shDegree: number}}} Picture
  */
 
-const SCREEN_TILE = 16; // pixels
-const RECORD_BYTES = 16; // in each of the two buffers of records
-const LEAST_PAIRS = 1 << 20;
-const MOST_PAIRS = 1 << 26;
-const RUN = 4096; // elements per workgroup of a sort
-const VIEW_BYTES = 144;
-const LAST_KEY = 0x7f7fffff;
-const MOST_BANDS = 256;
-const [SORT_RECORDS, BLOCKS_OF_RANKS, SORT_PAIRS] = [0, 12, 24]; // offsets in the table of workgroups
+const COUNTER_BYTES = 16;
+const MOST_PARTS = 4096; // bands times slices of a picture
+const BLOCK_BYTES = 36; // of the largest buffer with something per block of splats
+const TRIES = 3;
 
 /** @implements {Renderer} */
 export class WebGpuRenderer {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {(hasDrawn: boolean) => void} lost called when the GPU is lost
+   * @param {Backend} backend `auto` requires hardware that draws a small scene as it should
+   * @param {Losses} losses
    * @returns {Promise<WebGpuRenderer | null>} null if the browser has no WebGPU
    */
-  static async create(canvas, lost) {
-    const device = await Device.open().catch(() => null);
-    const context = device && canvas.getContext('webgpu');
-    if (!device || !context) return null;
-    const renderer = new WebGpuRenderer(device, context);
+  static async create(canvas, backend, { lost, failed }) {
+    const device = await Device.open(backend === 'auto').catch(() => null);
+    if (!device) return null;
+    const renderer = new WebGpuRenderer(device, backend);
+    if ((backend === 'auto' && !(await isSound(renderer))) || !renderer.show(canvas)) {
+      renderer.dispose();
+      return null;
+    }
     device.device.lost.then(() => {
       const isNews = !device.isLost; // it was not disposed of
       device.isLost = true;
       if (isNews) lost(renderer.hasDrawn);
     });
+    device.device.onuncapturederror = ({ error }) =>
+      failed(error instanceof GPUOutOfMemoryError ? E_LIMIT : E_CONTEXT, error.message);
     return renderer;
   }
 
   /**
    * @param {Device} device
-   * @param {GPUCanvasContext} context
+   * @param {Backend} backend
    */
-  constructor(device, context) {
+  constructor(device, backend) {
     this.device = device;
-    this.context = context;
-    const format = navigator.gpu.getPreferredCanvasFormat();
-    context.configure({ device: device.device, format, alphaMode: 'opaque' });
-    this.pipelines = { canvas: presentPipeline(device, format), bytes: presentPipeline(device, 'rgba8unorm') };
-    this.view = device.buffer(VIEW_BYTES, GPUBufferUsage.UNIFORM);
+    this.projection = new Projection(device);
+    this.tiles = new ScreenTiles(this.projection);
+    this.quads = new Quads(this.projection);
+    /** @type {Method} */
+    this.method = backend === 'webgpu-quads' ? this.quads : this.tiles;
+    /** Whether the method is settled. */
+    this.isChosen = backend === 'webgpu-quads' || backend === 'webgpu-tiles';
     this.backdrop = device.buffer(32, GPUBufferUsage.UNIFORM);
-    this.counters = device.buffer(16);
-    this.groups = device.buffer(48, GPUBufferUsage.STORAGE | GPUBufferUsage.INDIRECT);
+    /** Counters of each part of the last picture. */
+    this.counts = device.buffer(COUNTER_BYTES * MOST_PARTS);
+    this.partCount = 0;
+    this.present = presentPipelines(device, 'rgba8unorm');
+    this.presentOnCanvas = this.present;
+    /** @type {GPUCanvasContext | null} */
+    this.context = null;
     /** @type {Capabilities} */
     this.capabilities = {
-      name: `${device.name} (WebGPU)`,
+      name: '',
       pictureFormat: 'RGBA32F',
-      splatsMax: Math.floor(device.bindingMax / RECORD_BYTES),
+      splatsMax: Math.floor(device.bindingMax / BLOCK_BYTES) * BLOCK,
       sorts: true,
     };
+    this.use(this.method);
     /** @type {GpuScene | null} */
     this.scene = null;
-    /** @type {Records | null} */
-    this.records = null;
-    /** Passes that use buffers of the scene; null if one was replaced. @type {Call[] | null} */
-    this.project = null;
-    /** @type {Target | null} */
-    this.target = null;
+    this.isWhole = false;
     this.hasDrawn = false;
-    /** Pairs of splat and screen tile that the buffers may hold. */
-    this.pairsMax = Math.min(device.bindingMax / 4, MOST_PAIRS);
-    this.pairsWanted = LEAST_PAIRS;
-    this.steps = 1;
-    /** @type {{view: View, look: {background: number[], shDegree: number}} | null} */
+    /** The last picture. @type {Picture | null} */
     this.last = null;
-    /** Counters of each band of the last picture. */
-    this.counts = device.buffer(16 * MOST_BANDS);
-    this.bandCount = 0;
+  }
+
+  /**
+   * Draw on a canvas from now on.
+   *
+   * @param {HTMLCanvasElement} canvas
+   * @returns {boolean} whether it can
+   */
+  show(canvas) {
+    const { device } = this;
+    this.context = canvas.getContext('webgpu');
+    const format = navigator.gpu.getPreferredCanvasFormat();
+    this.context?.configure({ device: device.device, format, alphaMode: 'opaque' });
+    this.presentOnCanvas = presentPipelines(device, format);
+    return this.context !== null;
+  }
+
+  /** @param {Method} method of blending, from now on */
+  use(method) {
+    this.method = method;
+    this.capabilities.name = `${this.device.name} (WebGPU, ${method.name})`;
+    this.capabilities.pictureFormat = method === this.quads ? 'RGBA16F' : 'RGBA32F';
   }
 
   get bytes() {
@@ -101,17 +119,23 @@ export class WebGpuRenderer {
     return { attributes, order: 0, work: this.device.bytes - attributes };
   }
 
-  /** @param {SceneLayout} layout */
+  /** @param {SceneLayout | null} layout null for no scene */
   allocate(layout) {
-    this.#forget();
+    const { device, projection } = this;
+    this.tiles.forget();
+    this.quads.forget();
+    projection.setScene(null);
     this.scene?.dispose();
     this.scene = null;
-    const scene = new GpuScene(this.device, layout, () => (this.project = null));
+    this.isWhole = false;
+    if (!layout) return;
+    const scene = new GpuScene(device, layout, () => (projection.passes = null));
     if (scene.blockCount * BLOCK > this.capabilities.splatsMax) {
       scene.dispose();
       throw new RangeError(`${scene.blockCount * BLOCK} splats, this GPU can hold ${this.capabilities.splatsMax}`);
     }
     this.scene = scene;
+    projection.setScene(scene);
   }
 
   /**
@@ -142,6 +166,7 @@ export class WebGpuRenderer {
 
   complete() {
     this.scene?.trim();
+    this.isWhole = true;
   }
 
   setOrder() {}
@@ -151,283 +176,157 @@ export class WebGpuRenderer {
    * @param {{background: number[], shDegree: number}} look
    */
   draw(view, look) {
-    if (this.device.isLost || !(view.width > 0 && view.height > 0)) return;
+    if (this.device.isLost || !this.context || !(view.width > 0 && view.height > 0)) return;
     this.last = { view, look };
-    this.#drawTo(this.pipelines.canvas, this.context.getCurrentTexture());
+    this.#drawTo(this.context.getCurrentTexture(), this.presentOnCanvas, this.method, this.last);
   }
 
   /**
-   * Draw the last view again into a texture.
-   *
-   * @param {GPURenderPipeline} pipeline
    * @param {GPUTexture} texture
+   * @param {ReturnType<typeof presentPipelines>} present
+   * @param {Method} method
+   * @param {Picture} picture
    */
-  #drawTo(pipeline, texture) {
-    if (!this.last) return;
-    const { device, scene } = this;
-    const { view, look } = this.last;
+  #drawTo(texture, present, method, { view, look }) {
+    const { projection, scene, device } = this;
     const { queue } = device.device;
     scene?.place(view);
-    const bands = this.#bands(view);
-    this.bandCount = bands.length;
-    bands.forEach(([first, rows], band) => {
-      const target = this.#targetOf(view.width, bands[0][1]);
-      const { records } = this.#recordsOf();
-      queue.writeBuffer(this.view, 0, viewOf(view, first, rows, scene, records, target.pairs, look.shDegree));
-      queue.writeBuffer(this.backdrop, 0, backdropOf(look.background, view.width, first));
-      const encoder = device.device.createCommandEncoder();
-      device.encode(encoder, [...target.clear, ...this.#projectPasses()]);
-      for (let step = 0; step < this.steps; step++) {
-        encoder.clearBuffer(target.ranges);
-        device.encode(encoder, target.step);
-      }
-      encoder.copyBufferToBuffer(this.counters, 0, this.counts, 16 * band, 16);
-      const pass = encoder.beginRenderPass({
-        colorAttachments: [{ view: texture.createView(), loadOp: band === 0 ? 'clear' : 'load', storeOp: 'store' }],
+    const bands = method.prepare(view);
+    const slices = method.isFarthestFirst ? [...projection.slices].reverse() : projection.slices;
+    this.partCount = bands.length * slices.length;
+    bands.forEach((band, b) => {
+      queue.writeBuffer(this.backdrop, 0, backdropOf(look.background, view.width, band[0]));
+      slices.forEach((slice, s) => {
+        projection.setView({ view, band, slice, shDegree: look.shDegree, pairs: method.pairs });
+        const encoder = device.device.createCommandEncoder();
+        device.encode(encoder, projection.calls);
+        method.encode(encoder, s === 0);
+        const part = b * slices.length + s;
+        if (part < MOST_PARTS) {
+          encoder.copyBufferToBuffer(projection.counters, 0, this.counts, COUNTER_BYTES * part, COUNTER_BYTES);
+        }
+        if (s === slices.length - 1) this.#presentBand(encoder, texture, present[method.presents], method, band);
+        queue.submit([encoder.finish()]);
       });
-      pass.setPipeline(pipeline);
-      pass.setBindGroup(0, this.#presentGroup(pipeline, target));
-      pass.setScissorRect(0, first, view.width, rows);
-      pass.draw(3);
-      pass.end();
-      queue.submit([encoder.finish()]);
     });
+  }
+
+  /**
+   * @param {GPUCommandEncoder} encoder
+   * @param {GPUTexture} texture
+   * @param {GPURenderPipeline} pipeline
+   * @param {Method} method
+   * @param {[number, number]} band
+   */
+  #presentBand(encoder, texture, pipeline, method, [first, rows]) {
+    const group = this.device.device.createBindGroup({
+      layout: pipeline.getBindGroupLayout(0),
+      entries: [{ binding: 0, resource: { buffer: this.backdrop } }, ...method.entries],
+    });
+    const pass = encoder.beginRenderPass({
+      colorAttachments: [{ view: texture.createView(), loadOp: first === 0 ? 'clear' : 'load', storeOp: 'store' }],
+    });
+    pass.setPipeline(pipeline);
+    pass.setBindGroup(0, group);
+    pass.setScissorRect(0, first, texture.width, rows);
+    pass.draw(3);
+    pass.end();
   }
 
   async readPixels() {
-    if (!this.last || this.device.isLost) return new Uint8Array(0);
     await this.finished();
-    const { device } = this.device;
-    const { width, height } = this.last.view;
+    if (!this.last || this.device.isLost) return new Uint8Array(0);
+    return this.pixelsOf(this.last);
+  }
+
+  /**
+   * Draw a picture that fits the buffers, and read it.
+   *
+   * @param {Picture} picture
+   * @returns {Promise<Uint8Array>} RGBA, top row first
+   */
+  async pixelsOf(picture) {
+    const { device } = this;
+    const { width, height } = picture.view;
+    const texture = device.picture(width, height, 'rgba8unorm');
+    this.#drawTo(texture, this.present, this.method, picture);
     const bytesPerRow = Math.ceil((4 * width) / 256) * 256;
-    const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.COPY_SRC;
-    const texture = device.createTexture({ size: [width, height], format: 'rgba8unorm', usage });
-    this.#drawTo(this.pipelines.bytes, texture);
-    const buffer = device.createBuffer({
-      size: bytesPerRow * height,
-      usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST,
-    });
-    const encoder = device.createCommandEncoder();
+    const buffer = device.buffer(bytesPerRow * height);
+    const encoder = device.device.createCommandEncoder();
     encoder.copyTextureToBuffer({ texture }, { buffer, bytesPerRow }, [width, height]);
-    device.queue.submit([encoder.finish()]);
-    await buffer.mapAsync(GPUMapMode.READ);
-    const rows = new Uint8Array(buffer.getMappedRange());
+    device.device.queue.submit([encoder.finish()]);
+    const words = await device.read(buffer, bytesPerRow * height);
     const pixels = new Uint8Array(4 * width * height);
+    const rows = new Uint8Array(words?.buffer ?? new ArrayBuffer(0));
     for (let y = 0; y < height; y++)
       pixels.set(rows.subarray(y * bytesPerRow, y * bytesPerRow + 4 * width), 4 * width * y);
-    buffer.destroy();
-    texture.destroy();
+    device.free(buffer);
+    device.free(texture);
     return pixels;
   }
 
-  /** Resolves when the picture is complete; one that exceeded the buffers is drawn again, in larger ones or more steps. */
+  /**
+   * Resolves when the picture is complete; one that exceeded the buffers is drawn again, in larger ones or in parts. Rejects
+   * with a RangeError if that is impossible.
+   */
   async finished() {
     while (this.last && !this.device.isLost) {
       const isComplete = await this.#isComplete();
       this.hasDrawn ||= !this.device.isLost;
-      if (isComplete) return;
-      if (this.pairsWanted < this.pairsMax) this.pairsWanted *= 2;
-      else this.steps++;
+      if (isComplete) break;
       this.draw(this.last.view, this.last.look);
     }
+    if (this.isWhole && !this.isChosen) await this.#choose();
   }
 
   async wait() {
     await this.finished();
   }
 
-  /** Return whether the last picture fitted the buffers; true if the GPU is lost. */
+  /** Return whether the last picture fitted the buffers, after making room for the next; true if the GPU is lost. */
   async #isComplete() {
-    const { device } = this.device;
-    const size = 16 * this.bandCount;
-    const buffer = device.createBuffer({ size, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
-    const encoder = device.createCommandEncoder();
-    encoder.copyBufferToBuffer(this.counts, 0, buffer, 0, size);
-    device.queue.submit([encoder.finish()]);
-    try {
-      await buffer.mapAsync(GPUMapMode.READ);
-    } catch {
-      return true;
+    const { projection, partCount, method, last } = this;
+    const counters = await this.device.read(this.counts, COUNTER_BYTES * Math.min(partCount, MOST_PARTS));
+    if (!counters || !last) return true;
+    const { count } = projection.records;
+    let isComplete = true;
+    for (let at = 0; at < counters.length; at += COUNTER_BYTES / 4) {
+      const [visible, , firstBlock] = counters.subarray(at);
+      if (visible > count) {
+        await projection.divide(last.view);
+        return false;
+      }
+      if (method === this.tiles && firstBlock * BLOCK < visible) isComplete = false;
     }
-    const counters = new Uint32Array(buffer.getMappedRange().slice(0));
-    buffer.destroy();
-    for (let band = 0; band < this.bandCount; band++) {
-      const [visible, , firstBlock] = counters.subarray(4 * band);
-      if (firstBlock * BLOCK < visible) return false;
+    if (!isComplete) this.tiles.enlarge();
+    return isComplete;
+  }
+
+  /** Draw the last view by both methods, and use the faster from now on. */
+  async #choose() {
+    const { device, last } = this;
+    if (!last || device.isLost) return;
+    this.isChosen = true;
+    const texture = device.picture(last.view.width, last.view.height, 'rgba8unorm');
+    const times = [];
+    for (const method of [this.tiles, this.quads]) {
+      let least = Infinity; // the first try compiles
+      for (let n = 0; n < TRIES && !device.isLost; n++) {
+        const start = performance.now();
+        this.#drawTo(texture, this.present, method, last);
+        await device.device.queue.onSubmittedWorkDone();
+        least = Math.min(least, performance.now() - start);
+      }
+      times.push(least);
     }
-    return true;
-  }
-
-  /**
-   * Divide a picture into bands of rows that fit the buffers.
-   *
-   * @param {View} view
-   * @returns {[number, number][]} first row and number of rows
-   */
-  #bands({ width, height }) {
-    const columns = Math.ceil(width / SCREEN_TILE);
-    const { bindingMax } = this.device;
-    const rows = Math.floor(Math.min(bindingMax / (16 * width * SCREEN_TILE), this.pairsMax / (BLOCK * columns)));
-    const band = Math.min(height, Math.max(1, rows) * SCREEN_TILE);
-    /** @type {[number, number][]} */
-    const bands = [];
-    for (let first = 0; first < height; first += band) bands.push([first, Math.min(band, height - first)]);
-    return bands;
-  }
-
-  /**
-   * @param {number} width
-   * @param {number} height
-   * @returns {Target}
-   */
-  #targetOf(width, height) {
-    const [columns, rows] = [Math.ceil(width / SCREEN_TILE), Math.ceil(height / SCREEN_TILE)];
-    const pairs = Math.max(Math.min(this.pairsWanted, this.pairsMax), BLOCK * columns * rows);
-    const { ellipses, looks, order, sums } = this.#recordsOf();
-    const known = this.target;
-    if (known && known.width === width && known.height === height && known.pairs === pairs) return known;
-    this.#freeTarget();
-    const { device } = this;
-    const [pixels, ranges] = [device.buffer(16 * width * height), device.buffer(8 * columns * rows)];
-    const keys = [device.buffer(4 * pairs), device.buffer(4 * pairs)];
-    const values = [device.buffer(4 * pairs), device.buffer(4 * pairs)];
-    const bits = Math.max(1, 32 - Math.clz32(columns * rows - 1));
-    const done = Math.ceil(bits / 8) % 2;
-    const blocks = { buffer: this.groups, offset: BLOCKS_OF_RANKS };
-    const sort = this.#sortPasses(keys, values, bits, SORT_PAIRS, pairs);
-    const { view, counters, groups } = this;
-    const bind = device.bind.bind(device);
-    const group = device.device.createBindGroup({
-      layout: this.pipelines.canvas.getBindGroupLayout(0),
-      entries: [this.backdrop, pixels].map((buffer, binding) => ({ binding, resource: { buffer } })),
-    });
-    this.target = {
-      width,
-      height,
-      pairs,
-      pixels,
-      ranges,
-      owned: [pixels, ranges, ...keys, ...values, ...sort.owned],
-      clear: [
-        bind('dispatch', 'clear_pixels', [Math.ceil((width * height) / (64 * BLOCK)), 64], view, null, null, pixels),
-      ],
-      step: [
-        bind('bin', 'count', blocks, view, counters, order, ellipses, looks, sums),
-        bind('bin', 'scan', 1, view, counters, null, null, null, sums),
-        bind('dispatch', 'after_scan', 1, null, counters, groups),
-        bind('bin', 'emit', blocks, view, counters, order, ellipses, looks, sums, keys[0], values[0]),
-        ...sort.calls,
-        bind('ranges', 'find', { buffer: groups, offset: SORT_PAIRS }, counters, keys[done], ranges),
-        bind('blend', 'blend', [columns, rows], view, ellipses, looks, values[done], ranges, pixels),
-        bind('dispatch', 'next_step', 1, null, counters),
-      ],
-      group,
-    };
-    return this.target;
-  }
-
-  /**
-   * @param {GPURenderPipeline} pipeline
-   * @param {Target} target
-   */
-  #presentGroup(pipeline, target) {
-    if (pipeline === this.pipelines.canvas) return target.group;
-    return this.device.device.createBindGroup({
-      layout: pipeline.getBindGroupLayout(0),
-      entries: [this.backdrop, target.pixels].map((buffer, binding) => ({ binding, resource: { buffer } })),
-    });
-  }
-
-  /** @returns {Records} */
-  #recordsOf() {
-    if (this.records) return this.records;
-    const { device } = this;
-    const blockCount = this.scene?.blockCount ?? 0;
-    const count = Math.max(1, blockCount * BLOCK);
-    const pair = (/** @type {number} */ bytes) => [device.buffer(bytes * count), device.buffer(bytes * count)];
-    const [[ellipses, looks], keys, values] = [pair(RECORD_BYTES), pair(4), pair(4)];
-    const [blocks, sums] = [device.buffer(36 * blockCount), device.buffer(4 * Math.ceil(count / BLOCK))];
-    const { calls, owned } = this.#sortPasses(keys, values, 32, SORT_RECORDS, count);
-    this.records = {
-      records: count,
-      blocks,
-      ellipses,
-      looks,
-      keys: keys[0],
-      order: values[0],
-      sums,
-      owned: [blocks, sums, ellipses, looks, ...keys, ...values, ...owned],
-      sort: calls,
-    };
-    return this.records;
-  }
-
-  /** Return the passes that find the splats in view, project them and sort them by depth. */
-  #projectPasses() {
-    if (this.project) return this.project;
-    const { device, scene, view, counters, groups } = this;
-    const { blocks, ellipses, looks, keys, sort } = this.#recordsOf();
-    const bind = device.bind.bind(device);
-    const pages = (scene?.pages ?? []).filter((page) => page.blocks > 0);
-    const table = scene?.table ?? null;
-    const tables = scene?.tables.buffer ?? null;
-    this.project = [
-      ...pages.map((page) => bind('cull', 'cull', page.blocks, view, page.info, table, page.geometry.buffer, blocks)),
-      bind('compact', 'compact', 1, view, counters, blocks),
-      bind('dispatch', 'after_compact', 1, view, counters, groups),
-      ...pages.map(({ blocks: count, info, geometry, rows }) => {
-        const source = [view, info, table, geometry.buffer, rows.buffer, tables];
-        return bind('project', 'project', count, ...source, blocks, ellipses, looks, keys);
-      }),
-      ...sort,
-    ];
-    return this.project;
-  }
-
-  /**
-   * Return the passes of a sort by some bits, and the buffers that they own.
-   *
-   * @param {GPUBuffer[]} keys two
-   * @param {GPUBuffer[]} values two
-   * @param {number} bits
-   * @param {number} offset of the number of workgroups
-   * @param {number} count elements at most
-   */
-  #sortPasses(keys, values, bits, offset, count) {
-    const { device, counters } = this;
-    const ofPairs = offset === SORT_PAIRS;
-    const table = device.buffer(4 * 256 * (1 + Math.ceil(count / RUN)));
-    const owned = [table];
-    const here = { buffer: this.groups, offset };
-    /** @type {Call[]} */
-    const calls = [];
-    for (let digit = 0; digit < Math.ceil(bits / 8); digit++) {
-      const radix = device.uniform(new Uint32Array([8 * digit, ofPairs ? 1 : 0, digit === 0 && !ofPairs ? 1 : 0, 0]));
-      owned.push(radix);
-      const [a, b] = [digit % 2, 1 - (digit % 2)];
-      calls.push(
-        device.bind('sort', 'count', here, radix, counters, keys[a], null, null, null, table),
-        device.bind('sort', 'scan', 256, radix, counters, keys[a], null, null, null, table),
-        device.bind('sort', 'scatter', here, radix, counters, keys[a], values[a], keys[b], values[b], table),
-      );
-    }
-    return { calls, owned };
-  }
-
-  #freeTarget() {
-    for (const buffer of this.target?.owned ?? []) this.device.free(buffer);
-    this.target = null;
-  }
-
-  /** Free what depends on the number of splats. */
-  #forget() {
-    this.#freeTarget();
-    for (const buffer of this.records?.owned ?? []) this.device.free(buffer);
-    this.records = this.project = null;
+    device.free(texture);
+    const [chosen, other] = times[1] < times[0] ? [this.quads, this.tiles] : [this.tiles, this.quads];
+    this.use(chosen);
+    other.forget();
   }
 
   dispose() {
-    this.context.unconfigure();
+    this.context?.unconfigure();
     this.device.dispose();
   }
 }
@@ -436,40 +335,15 @@ export class WebGpuRenderer {
  * @param {Device} device
  * @param {GPUTextureFormat} format
  */
-function presentPipeline({ device }, format) {
+function presentPipelines({ device }, format) {
   const module = device.createShaderModule({ label: 'present', code: WGSL.PRESENT });
-  return device.createRenderPipeline({
-    layout: 'auto',
-    vertex: { module, entryPoint: 'cover' },
-    fragment: { module, entryPoint: 'present', targets: [{ format }] },
-  });
-}
-
-/**
- * Return the content of `View` in common.wgsl.
- *
- * @param {View} view
- * @param {number} first first row of the band
- * @param {number} rows
- * @param {GpuScene | null} scene
- * @param {number} records
- * @param {number} pairs
- * @param {number} shDegree
- */
-function viewOf(view, first, rows, scene, records, pairs, shDegree) {
-  const { viewmat: m, fx, fy, cx, cy, width, near } = view;
-  const words = new Uint32Array(VIEW_BYTES / 4);
-  const floats = new Float32Array(words.buffer);
-  floats.set([m[0], m[1], m[2], 0, m[4], m[5], m[6], 0, m[8], m[9], m[10], 0]);
-  floats.set([fx, fy, cx, cy - first], 12);
-  floats.set(slopeLimits(view), 16);
-  floats.set([width, rows, near], 20);
-  const columns = Math.ceil(width / SCREEN_TILE);
-  const { blockCount = 0, blockTable = 0, tileTable = 0 } = scene ?? {};
-  const degree = Math.min(shDegree, 4);
-  words.set([0, LAST_KEY, columns, columns * Math.ceil(rows / SCREEN_TILE), records, pairs], 23);
-  words.set([blockCount, blockTable, tileTable, 0, degree], 29);
-  return words;
+  const pipeline = (/** @type {string} */ entryPoint) =>
+    device.createRenderPipeline({
+      layout: 'auto',
+      vertex: { module, entryPoint: 'cover' },
+      fragment: { module, entryPoint, targets: [{ format }] },
+    });
+  return { present: pipeline('present'), present_quads: pipeline('present_quads') };
 }
 
 /**

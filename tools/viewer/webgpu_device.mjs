@@ -26,6 +26,9 @@ const PASSES = {
 /** Bytes of the largest buffers that csplat uses. */
 const MOST_BYTES = 1 << 30;
 
+/** Names of software that acts as a GPU. */
+export const SOFTWARE = /swiftshader|llvmpipe|lavapipe|softpipe|software|basic render/i;
+
 /** What WebGPU guarantees, bytes. */
 const DEFAULT_BINDING = 1 << 27;
 
@@ -33,11 +36,12 @@ export class Device {
   /**
    * Open the GPU that the browser prefers.
    *
+   * @param {boolean} hardware whether it must not be software
    * @returns {Promise<Device | null>} null if there is none
    */
-  static async open() {
+  static async open(hardware) {
     const adapter = await navigator.gpu?.requestAdapter({ powerPreference: 'high-performance' });
-    if (!adapter) return null;
+    if (!adapter || (hardware && isSoftware(adapter))) return null;
     const { maxStorageBufferBindingSize, maxBufferSize } = adapter.limits;
     const most = Math.min(maxStorageBufferBindingSize, maxBufferSize, MOST_BYTES);
     const requiredLimits =
@@ -78,11 +82,47 @@ export class Device {
     return buffer;
   }
 
-  /** @param {GPUBuffer | null} buffer */
-  free(buffer) {
-    if (buffer === null) return;
-    this.bytes -= buffer.size;
-    buffer.destroy();
+  /**
+   * Return a texture to draw on.
+   *
+   * @param {number} width
+   * @param {number} height
+   * @param {'rgba8unorm' | 'rgba16float'} format
+   */
+  picture(width, height, format) {
+    const usage = GPUTextureUsage.RENDER_ATTACHMENT | GPUTextureUsage.COPY_SRC | GPUTextureUsage.TEXTURE_BINDING;
+    const texture = this.device.createTexture({ size: [width, height], format, usage });
+    this.bytes += textureBytes(texture);
+    return texture;
+  }
+
+  /** @param {GPUBuffer | GPUTexture | null} owned */
+  free(owned) {
+    if (owned === null) return;
+    this.bytes -= 'size' in owned ? owned.size : textureBytes(owned);
+    owned.destroy();
+  }
+
+  /**
+   * Read the beginning of a buffer after all work so far.
+   *
+   * @param {GPUBuffer} buffer
+   * @param {number} bytes
+   * @returns {Promise<Uint32Array<ArrayBuffer> | null>} null if the GPU is lost
+   */
+  async read(buffer, bytes) {
+    const copy = this.device.createBuffer({ size: bytes, usage: GPUBufferUsage.MAP_READ | GPUBufferUsage.COPY_DST });
+    const encoder = this.device.createCommandEncoder();
+    encoder.copyBufferToBuffer(buffer, 0, copy, 0, bytes);
+    this.device.queue.submit([encoder.finish()]);
+    try {
+      await copy.mapAsync(GPUMapMode.READ);
+    } catch {
+      return null;
+    }
+    const words = new Uint32Array(copy.getMappedRange().slice(0));
+    copy.destroy();
+    return words;
   }
 
   /**
@@ -127,6 +167,18 @@ export class Device {
     this.isLost = true;
     this.device.destroy();
   }
+}
+
+/** @param {GPUTexture} texture */
+const textureBytes = ({ width, height, format }) => width * height * (format === 'rgba16float' ? 8 : 4);
+
+/** @param {GPUAdapter & {isFallbackAdapter?: boolean}} adapter */
+function isSoftware({ info, isFallbackAdapter }) {
+  return (
+    info.isFallbackAdapter ||
+    isFallbackAdapter ||
+    SOFTWARE.test(`${info.vendor} ${info.architecture} ${info.description}`)
+  );
 }
 
 /** Words on the GPU that grow; a larger buffer replaces a full one. */

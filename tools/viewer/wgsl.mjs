@@ -179,10 +179,6 @@ var<workgroup> forms: array<vec4<f32>, 64>;
 var<workgroup> colours: array<vec2<f32>, 64>;
 var<workgroup> open: atomic<u32>;
 var<workgroup> open_now: u32;
-fn unpack_colour(n: vec2<u32>) -> vec3<f32> {
-  let green = (n.x >> 21u) | ((n.y & 0x3ffu) << 11u);
-  return bitcast<vec3<f32>>(vec3<u32>(n.x & 0x1fffffu, green, n.y >> 10u) << vec3<u32>(10u));
-}
 fn pixel_at(i: u32, inside: bool) -> vec4<f32> {
   if (!inside) { return vec4<f32>(0.0); }
   return pixels[i];
@@ -299,6 +295,14 @@ const DILATION = 0.3;
 const COMPENSATION_MIN = 0.000025;
 const BLOCK = 256u;
 const SCREEN_TILE = 16u;
+fn pack_colour(colour: vec3<f32>) -> vec2<u32> {
+  let n = (bitcast<vec3<u32>>(colour) + 512u) >> vec3<u32>(10u);
+  return vec2<u32>(n.x | (n.y << 21u), (n.y >> 11u) | (n.z << 10u));
+}
+fn unpack_colour(n: vec2<u32>) -> vec3<f32> {
+  let green = (n.x >> 21u) | ((n.y & 0x3ffu) << 11u);
+  return bitcast<vec3<f32>>(vec3<u32>(n.x & 0x1fffffu, green, n.y >> 10u) << vec3<u32>(10u));
+}
 `;
 export const COMPACT = `
 @group(0) @binding(0) var<uniform> view: View;
@@ -408,6 +412,10 @@ fn after_compact() {
   let visible = min(counters.visible, view.records);
   put(0u, (visible + 4095u) / 4096u);
   put(1u, (visible + 255u) / 256u);
+  groups[9] = 4u;
+  groups[10] = visible;
+  groups[11] = 0u;
+  groups[12] = 0u;
   counters.first_block = 0u;
   counters.last_block = 0u;
 }
@@ -548,14 +556,23 @@ export const PRESENT = `
 struct Backdrop { colour: vec4<f32>, width: u32, first_row: u32, unused0: u32, unused1: u32 }
 @group(0) @binding(0) var<uniform> backdrop: Backdrop;
 @group(0) @binding(1) var<storage, read> pixels: array<vec4<f32>>;
+@group(0) @binding(2) var quads: texture_2d<f32>;
 @vertex
 fn cover(@builtin(vertex_index) corner: u32) -> @builtin(position) vec4<f32> {
   return vec4<f32>(select(-1.0, 3.0, corner == 1u), select(-1.0, 3.0, corner == 2u), 0.0, 1.0);
 }
+fn before_backdrop(colour: vec3<f32>, transmittance: f32) -> vec4<f32> {
+  return vec4<f32>(clamp(colour + transmittance * backdrop.colour.rgb, vec3<f32>(0.0), vec3<f32>(1.0)), 1.0);
+}
 @fragment
 fn present(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {
   let pixel = pixels[(u32(at.y) - backdrop.first_row) * backdrop.width + u32(at.x)];
-  return vec4<f32>(clamp(pixel.rgb + abs(pixel.w) * backdrop.colour.rgb, vec3<f32>(0.0), vec3<f32>(1.0)), 1.0);
+  return before_backdrop(pixel.rgb, abs(pixel.w));
+}
+@fragment
+fn present_quads(@builtin(position) at: vec4<f32>) -> @location(0) vec4<f32> {
+  let pixel = textureLoad(quads, vec2<u32>(at.xy), 0);
+  return before_backdrop(pixel.rgb, 1.0 - pixel.a);
 }
 `;
 export const PROJECT = `
@@ -674,10 +691,6 @@ fn colour_of(tile: Tile, local: u32, sh0: vec3<f32>, d: vec3<f32>) -> vec3<f32> 
   }
   return clamp(sum, vec3<f32>(0.0), vec3<f32>(1e30));
 }
-fn pack_colour(colour: vec3<f32>) -> vec2<u32> {
-  let n = (bitcast<vec3<u32>>(colour) + 512u) >> vec3<u32>(10u);
-  return vec2<u32>(n.x | (n.y << 21u), (n.y >> 11u) | (n.z << 10u));
-}
 @compute @workgroup_size(256)
 fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
   let block = page.first_block + group.x;
@@ -731,6 +744,49 @@ fn project(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_in
   let local = (block - tile.first_block) * BLOCK + lane;
   let colour = pack_colour(colour_of(tile, local, sh0, direction));
   looks[at] = vec4<u32>(bitcast<u32>(sqrt(shorter)), bitcast<u32>(opacity), colour);
+}
+`;
+export const QUADS = `
+@group(0) @binding(0) var<uniform> view: View;
+@group(0) @binding(1) var<storage, read> counters: Counters;
+@group(0) @binding(2) var<storage, read> order: array<u32>;
+@group(0) @binding(3) var<storage, read> ellipses: array<vec4<f32>>;
+@group(0) @binding(4) var<storage, read> looks: array<vec4<u32>>;
+const COLOUR_MAX = 60000.0;
+struct Corner {
+  @builtin(position) position: vec4<f32>,
+  @location(0) @interpolate(flat) centre: vec2<f32>,
+  @location(1) @interpolate(flat) axes: vec4<f32>,
+  @location(2) @interpolate(flat) colour: vec4<f32>,
+}
+@vertex
+fn corner(@builtin(vertex_index) vertex: u32, @builtin(instance_index) instance: u32) -> Corner {
+  let record = order[min(counters.visible, view.records) - 1u - instance];
+  let ellipse = ellipses[record];
+  let look = looks[record];
+  let opacity = bitcast<f32>(look.y);
+  if (!(opacity > 0.0)) { return Corner(vec4<f32>(2.0, 2.0, 2.0, 1.0), vec2<f32>(0.0), vec4<f32>(0.0), vec4<f32>(0.0)); }
+  let longer = length(ellipse.zw);
+  let shorter = bitcast<f32>(look.x);
+  let axis = ellipse.zw / longer;
+  let across = vec2<f32>(-axis.y, axis.x);
+  let farthest = length(abs(ellipse.xy - 0.5 * view.size) + 0.5 * view.size);
+  let reach = sqrt(2.0 * log(max(opacity / ALPHA_MIN, 1.0))) * 1.0001 + 1e-3;
+  let half_axes = min(reach * vec2<f32>(longer, shorter), vec2<f32>(farthest));
+  let side = vec2<f32>(f32(vertex & 1u), f32(vertex >> 1u)) * 2.0 - 1.0;
+  let pixel = ellipse.xy + side.x * half_axes.x * axis + side.y * half_axes.y * across;
+  let position = vec4<f32>(2.0 * pixel.x / view.size.x - 1.0, 1.0 - 2.0 * pixel.y / view.size.y, 0.0, 1.0);
+  let colour = min(unpack_colour(look.zw), vec3<f32>(COLOUR_MAX));
+  return Corner(position, ellipse.xy, vec4<f32>(axis / longer, across / shorter), vec4<f32>(colour, opacity));
+}
+@fragment
+fn splat(at: Corner) -> @location(0) vec4<f32> {
+  let d = at.position.xy - at.centre;
+  let u = dot(d, at.axes.xy);
+  let v = dot(d, at.axes.zw);
+  let alpha = min(at.colour.a * exp(-0.5 * (u * u + v * v)), ALPHA_CAP);
+  if (!(alpha >= ALPHA_MIN)) { discard; }
+  return vec4<f32>(at.colour.rgb * alpha, alpha);
 }
 `;
 export const RANGES = `

@@ -21,21 +21,21 @@ test('an empty address has no parameters', () => {
     size: null,
     background: null,
     ui: true,
-    backend: 'webgl2',
+    backend: 'auto',
   });
 });
 
 test('every parameter is read', () => {
   const { wishes, complaints } = readWishes(
     new URLSearchParams(
-      'scene=/a.csplat&camera=[]&view=3&axes=RUB&size=512x384&background=%23ff8000&ui=0&backend=webgpu',
+      'scene=/a.csplat&camera=[]&view=3&axes=RUB&size=512x384&background=%23ff8000&ui=0&backend=webgpu-quads',
     ),
   );
   assert.deepEqual(complaints, []);
   assert.deepEqual(wishes.size, { width: 512, height: 384 });
   assert.deepEqual(wishes.background, [1, 128 / 255, 0]);
   const { scene, camera, view, axes, ui, backend } = wishes;
-  assert.deepEqual([scene, camera, view, axes, ui, backend], ['/a.csplat', '[]', 3, 'RUB', false, 'webgpu']);
+  assert.deepEqual([scene, camera, view, axes, ui, backend], ['/a.csplat', '[]', 3, 'RUB', false, 'webgpu-quads']);
 });
 
 test('up is normalised', () => {

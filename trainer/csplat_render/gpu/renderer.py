@@ -229,7 +229,7 @@ class GpuRenderer:
         self._size = (0, 0)
         self._view = device.buffer(_VIEW.itemsize, uniform=True)
         self._counters = device.buffer(16)
-        self._groups = device.buffer(48, indirect=True)
+        self._groups = device.buffer(64, indirect=True)
         self._blocks = device.buffer(36 * scene.block_count)
         self._depths = device.buffer(4 << _DEPTH_BITS)
         self._ellipses, self._looks = (device.buffer(_RECORD_BYTES * self._records) for _ in range(2))

@@ -35,7 +35,7 @@ _KEYS = (
 _MAKE = """async () => {
   const { createEngine } = await import('/tools/viewer/engine.mjs');
   window.bench?.close();
-  window.bench = await createEngine(document.createElement('canvas'));
+  window.bench = await createEngine(document.createElement('canvas'), { backend: 'webgl2' });
 }"""
 _LOOK = """(view) => {
   const [camera, width, height] = view;
