@@ -1,5 +1,8 @@
 // Lists the screen tiles of each splat, in the order of depth. A step takes as many blocks of 256 splats as the buffer of
 // pairs holds; the host asks for further steps until all are drawn.
+//
+// `emit` writes exactly as many pairs as `count` found, even if a driver rounds differently in both: it leaves out what is
+// too much, which touches a screen tile by a rounding error, and fills up with a record that draws nothing.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read_write> counters: Counters;
@@ -7,8 +10,9 @@
 @group(0) @binding(3) var<storage, read> ellipses: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> looks: array<vec4<u32>>;
 @group(0) @binding(5) var<storage, read_write> sums: array<u32>; // pairs of each block, then place of its first pair
-@group(0) @binding(6) var<storage, read_write> pair_keys: array<u32>; // screen tiles
-@group(0) @binding(7) var<storage, read_write> pair_values: array<u32>; // records
+@group(0) @binding(6) var<storage, read_write> pair_counts: array<u32>; // by rank; WHOLE_BOX: of all screen tiles of the box
+@group(0) @binding(7) var<storage, read_write> pair_keys: array<u32>; // screen tiles
+@group(0) @binding(8) var<storage, read_write> pair_values: array<u32>; // records
 
 struct Box { low: vec2<u32>, high: vec2<u32> } // screen tiles; high is past the last
 
@@ -64,9 +68,12 @@ const FEW = 64u; // screen tiles of a box that one thread goes through, row by r
 
 fn area_of(e: Extent) -> u32 { return (e.box.high.x - e.box.low.x) * (e.box.high.y - e.box.low.y); }
 
+const WHOLE_BOX = 0x80000000u;
+
 fn pairs_of(e: Extent) -> u32 {
   let area = area_of(e);
-  if (area > FEW || e.box.high.x - e.box.low.x < 2u) { return area; }
+  if (area > FEW) { return area | WHOLE_BOX; }
+  if (e.box.high.x - e.box.low.x < 2u) { return area; }
   var sum = 0u;
   for (var row = e.box.low.y; row < e.box.high.y; row++) {
     let ends = row_of(e, row);
@@ -77,16 +84,17 @@ fn pairs_of(e: Extent) -> u32 {
 
 fn visible() -> u32 { return min(counters.visible, view.records); }
 
-fn pairs_at(block: u32, lane: u32) -> u32 {
-  let rank = block * BLOCK + lane;
-  if (block < counters.first_block || rank >= visible()) { return 0u; }
-  return pairs_of(extent_of(order[rank]));
-}
-
 @compute @workgroup_size(256)
 fn count(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-  let before = sum_before(lane, pairs_at(group.x, lane));
-  if (lane == 255u) { sums[group.x] = partial[255]; }
+  let block = group.x;
+  let rank = block * BLOCK + lane;
+  var pairs = 0u;
+  if (block >= counters.first_block && rank < visible()) {
+    pairs = pairs_of(extent_of(order[rank]));
+    pair_counts[rank] = pairs;
+  }
+  let before = sum_before(lane, pairs & ~WHOLE_BOX);
+  if (lane == 255u) { sums[block] = partial[255]; }
 }
 
 var<workgroup> block_count: u32;
@@ -136,40 +144,48 @@ fn put(at: u32, column: u32, row: u32, record: u32) {
   pair_values[at] = record;
 }
 
+fn put_nothing(at: u32) {
+  pair_keys[at] = 0u;
+  pair_values[at] = view.records; // the record after the last, which is empty
+}
+
 var<workgroup> large: atomic<u32>;
 var<workgroup> large_count: u32;
 var<workgroup> large_box: array<vec4<u32>, 256>; // low, width, record
-var<workgroup> large_run: array<vec2<u32>, 256>; // first pair, pairs
+var<workgroup> large_run: array<vec3<u32>, 256>; // first pair, pairs, screen tiles of the box
 
 // A thread writes the pairs of its splat; those of large splats are written by all threads together.
 @compute @workgroup_size(256)
 fn emit(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
   if (lane == 0u) { atomicStore(&large, 0u); }
   let block = group.x;
-  let in_step = block >= counters.first_block && block < counters.last_block;
   let rank = block * BLOCK + lane;
   var e = Extent(vec2<f32>(0.0), Box(vec2<u32>(0u), vec2<u32>(0u)), 0.0, 0.0, 0.0, 0.0);
   var record = 0u;
-  if (in_step && rank < visible()) {
+  var pairs = 0u;
+  if (block >= counters.first_block && block < counters.last_block && rank < visible()) {
     record = order[rank];
     e = extent_of(record);
+    pairs = pair_counts[rank];
   }
-  var at = sums[block] + sum_before(lane, pairs_of(e));
+  let first = sums[block] + sum_before(lane, pairs & ~WHOLE_BOX);
   let width = e.box.high.x - e.box.low.x;
-  let area = area_of(e);
-  if (area > FEW) {
+  if ((pairs & WHOLE_BOX) != 0u) {
     let k = atomicAdd(&large, 1u);
     large_box[k] = vec4<u32>(e.box.low, width, record);
-    large_run[k] = vec2<u32>(at, area);
-  } else if (area > 0u) {
-    for (var row = e.box.low.y; row < e.box.high.y; row++) {
+    large_run[k] = vec3<u32>(first, pairs & ~WHOLE_BOX, area_of(e));
+  } else {
+    let end = first + pairs;
+    var at = first;
+    for (var row = e.box.low.y; row < e.box.high.y && at < end; row++) {
       var ends = vec2<u32>(e.box.low.x, e.box.high.x);
       if (width >= 2u) { ends = row_of(e, row); }
-      for (var column = ends.x; column < ends.y; column++) {
+      for (var column = ends.x; column < ends.y && at < end; column++) {
         put(at, column, row, record);
         at += 1u;
       }
     }
+    for (; at < end; at++) { put_nothing(at); }
   }
   workgroupBarrier();
   if (lane == 0u) { large_count = atomicLoad(&large); }
@@ -177,6 +193,8 @@ fn emit(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
   for (var k = 0u; k < count; k++) {
     let box = large_box[k];
     let run = large_run[k];
-    for (var i = lane; i < run.y; i += 256u) { put(run.x + i, box.x + i % box.z, box.y + i / box.z, box.w); }
+    for (var i = lane; i < run.y; i += 256u) {
+      if (i < run.z) { put(run.x + i, box.x + i % box.z, box.y + i / box.z, box.w); } else { put_nothing(run.x + i); }
+    }
   }
 }

@@ -1,11 +1,11 @@
-// Numbers of workgroups of the passes that follow, from what has been counted; and the step from one part to the next.
+// Numbers of workgroups of the passes that follow, from what has been counted; and the way from one step to the next.
 // `groups` holds x y z of the sort of records, of blocks of ranks and of the sort of pairs, then what a draw of quads takes.
 
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read_write> counters: Counters;
 @group(0) @binding(2) var<storage, read_write> groups: array<u32>;
 
-fn put(at: u32, count: u32) {
+fn set_groups(at: u32, count: u32) {
   groups[3u * at] = count;
   groups[3u * at + 1u] = 1u;
   groups[3u * at + 2u] = 1u;
@@ -14,8 +14,8 @@ fn put(at: u32, count: u32) {
 @compute @workgroup_size(1)
 fn after_compact() {
   let visible = min(counters.visible, view.records);
-  put(0u, (visible + 4095u) / 4096u);
-  put(1u, (visible + 255u) / 256u);
+  set_groups(0u, (visible + 4095u) / 4096u);
+  set_groups(1u, (visible + 255u) / 256u);
   groups[9] = 4u; // vertices
   groups[10] = visible; // instances
   groups[11] = 0u; // the first of each
@@ -26,7 +26,7 @@ fn after_compact() {
 
 @compute @workgroup_size(1)
 fn after_scan() {
-  put(2u, (counters.pairs + 4095u) / 4096u);
+  set_groups(2u, (counters.pairs + 4095u) / 4096u);
 }
 
 @compute @workgroup_size(1)
@@ -37,7 +37,7 @@ fn next_step() {
 @group(0) @binding(3) var<storage, read_write> pixels: array<vec4<f32>>;
 
 @compute @workgroup_size(256)
-fn clear_pixels(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) all: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-  let i = (group.y * all.x + group.x) * 256u + lane;
+fn clear_pixels(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) counts: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+  let i = (group.y * counts.x + group.x) * 256u + lane;
   if (i < u32(view.size.x) * u32(view.size.y)) { pixels[i] = vec4<f32>(0.0, 0.0, 0.0, 1.0); }
 }

@@ -2,7 +2,6 @@
 
 const TILE_ROWS = 12u;
 const BAND_NONE = 0u;
-const BAND_ROWS = 1u;
 const BAND_CODEBOOK = 2u;
 const OPACITY_SQUARED = 0x1000000u;
 const ANTIALIASED = 0x2000000u;

@@ -11,9 +11,9 @@ fn sum_before(lane: u32, value: u32) -> u32 {
   workgroupBarrier();
   partial[lane] = value;
   workgroupBarrier();
-  for (var step = 1u; step < 256u; step <<= 1u) {
+  for (var reach = 1u; reach < 256u; reach <<= 1u) {
     var before = 0u;
-    if (lane >= step) { before = partial[lane - step]; }
+    if (lane >= reach) { before = partial[lane - reach]; }
     workgroupBarrier();
     partial[lane] = saturating(partial[lane], before);
     workgroupBarrier();

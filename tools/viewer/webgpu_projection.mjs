@@ -12,7 +12,7 @@ import { BLOCK } from './webgpu_scene.mjs';
  *
  * Buffers that depend on the number of splats, and the passes of the sort.
  * @typedef {{count: number, blocks: GPUBuffer, ellipses: GPUBuffer, looks: GPUBuffer, keys: GPUBuffer, order: GPUBuffer,
- *   sums: GPUBuffer, depths: GPUBuffer, owned: GPUBuffer[], sort: Call[]}} Records
+ *   sums: GPUBuffer, pairCounts: GPUBuffer, depths: GPUBuffer, owned: GPUBuffer[], sort: Call[]}} Records
  *
  * What the content of `View` in common.wgsl depends on.
  * @typedef {object} Part
@@ -43,7 +43,7 @@ export class Projection {
     this.view = device.buffer(VIEW_BYTES, GPUBufferUsage.UNIFORM);
     this.counters = device.buffer(16);
     this.groups = device.buffer(64, GPUBufferUsage.STORAGE | GPUBufferUsage.INDIRECT);
-    this.recordsMax = Math.min(device.bindingMax / RECORD_BYTES, MOST_RECORDS);
+    this.recordsMax = Math.min(device.bindingMax / RECORD_BYTES - 1, MOST_RECORDS);
     /** @type {GpuScene | null} */
     this.scene = null;
     /** @type {Records | null} */
@@ -69,12 +69,30 @@ export class Projection {
     const blockCount = this.scene?.blockCount ?? 0;
     const count = Math.max(1, Math.min(blockCount * BLOCK, this.recordsMax));
     const pair = (/** @type {number} */ bytes) => [device.buffer(bytes * count), device.buffer(bytes * count)];
-    const [[ellipses, looks], keys, values] = [pair(RECORD_BYTES), pair(4), pair(4)];
+    const [keys, values] = [pair(4), pair(4)];
+    const recordBytes = RECORD_BYTES * (count + 1); // the last record draws nothing, see bin.wgsl
+    const [ellipses, looks, pairCounts] = [
+      device.buffer(recordBytes),
+      device.buffer(recordBytes),
+      device.buffer(4 * count),
+    ];
     const [blocks, sums] = [device.buffer(36 * blockCount), device.buffer(4 * Math.ceil(count / BLOCK))];
     const depths = device.buffer(4 << DEPTH_BITS);
     const { calls, owned } = this.sortPasses(keys, values, 32, GROUPS.sortRecords, count);
-    owned.push(blocks, sums, depths, ellipses, looks, ...keys, ...values);
-    this.known = { count, blocks, ellipses, looks, keys: keys[0], order: values[0], sums, depths, owned, sort: calls };
+    owned.push(blocks, sums, pairCounts, depths, ellipses, looks, ...keys, ...values);
+    this.known = {
+      count,
+      blocks,
+      ellipses,
+      looks,
+      keys: keys[0],
+      order: values[0],
+      sums,
+      pairCounts,
+      depths,
+      owned,
+      sort: calls,
+    };
     return this.known;
   }
 

@@ -28,6 +28,7 @@ const TEXEL_WORDS = 4;
 const USUAL_WORDS = 5; // of a splat, at first
 const BAND_ROWS = 1;
 const BAND_CODEBOOK = 2;
+const FLOAT_MAX = 3.4e38;
 const SQUARED = 1 << 24;
 const ANTIALIASED = 1 << 25;
 
@@ -198,7 +199,7 @@ export class GpuScene {
         ),
         TEXEL_WORDS * tile,
       );
-      this.places[TEXEL_WORDS * tile + 3] = step;
+      this.places[TEXEL_WORDS * tile + 3] = Math.min(step, FLOAT_MAX);
     });
     this.#write(0, this.places);
   }

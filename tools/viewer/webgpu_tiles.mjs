@@ -65,7 +65,7 @@ export class ScreenTiles {
     if (known && known.width === width && known.height === height && known.pairs === pairs) return;
     this.forget();
     const { device, view, counters, groups, records } = this.projection;
-    const { ellipses, looks, order, sums } = records;
+    const { ellipses, looks, order, sums, pairCounts } = records;
     const [pixels, ranges] = [device.buffer(16 * width * height), device.buffer(8 * columns * rows)];
     const keys = [device.buffer(4 * pairs), device.buffer(4 * pairs)];
     const values = [device.buffer(4 * pairs), device.buffer(4 * pairs)];
@@ -85,10 +85,10 @@ export class ScreenTiles {
         bind('dispatch', 'clear_pixels', [Math.ceil((width * height) / (64 * BLOCK)), 64], view, null, null, pixels),
       ],
       step: [
-        bind('bin', 'count', blocks, view, counters, order, ellipses, looks, sums),
+        bind('bin', 'count', blocks, view, counters, order, ellipses, looks, sums, pairCounts),
         bind('bin', 'scan', 1, view, counters, null, null, null, sums),
         bind('dispatch', 'after_scan', 1, null, counters, groups),
-        bind('bin', 'emit', blocks, view, counters, order, ellipses, looks, sums, keys[0], values[0]),
+        bind('bin', 'emit', blocks, view, counters, order, ellipses, looks, sums, pairCounts, keys[0], values[0]),
         ...sort.calls,
         bind('ranges', 'find', { buffer: groups, offset: GROUPS.sortPairs }, counters, keys[done], ranges),
         bind('blend', 'blend', [columns, rows], view, ellipses, looks, values[done], ranges, pixels),

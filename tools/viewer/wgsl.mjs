@@ -7,8 +7,9 @@ export const BIN = `
 @group(0) @binding(3) var<storage, read> ellipses: array<vec4<f32>>;
 @group(0) @binding(4) var<storage, read> looks: array<vec4<u32>>;
 @group(0) @binding(5) var<storage, read_write> sums: array<u32>;
-@group(0) @binding(6) var<storage, read_write> pair_keys: array<u32>;
-@group(0) @binding(7) var<storage, read_write> pair_values: array<u32>;
+@group(0) @binding(6) var<storage, read_write> pair_counts: array<u32>;
+@group(0) @binding(7) var<storage, read_write> pair_keys: array<u32>;
+@group(0) @binding(8) var<storage, read_write> pair_values: array<u32>;
 struct Box { low: vec2<u32>, high: vec2<u32> }
 struct Extent {
   centre: vec2<f32>,
@@ -56,9 +57,11 @@ fn row_of(e: Extent, row: u32) -> vec2<u32> {
 }
 const FEW = 64u;
 fn area_of(e: Extent) -> u32 { return (e.box.high.x - e.box.low.x) * (e.box.high.y - e.box.low.y); }
+const WHOLE_BOX = 0x80000000u;
 fn pairs_of(e: Extent) -> u32 {
   let area = area_of(e);
-  if (area > FEW || e.box.high.x - e.box.low.x < 2u) { return area; }
+  if (area > FEW) { return area | WHOLE_BOX; }
+  if (e.box.high.x - e.box.low.x < 2u) { return area; }
   var sum = 0u;
   for (var row = e.box.low.y; row < e.box.high.y; row++) {
     let ends = row_of(e, row);
@@ -67,15 +70,17 @@ fn pairs_of(e: Extent) -> u32 {
   return sum;
 }
 fn visible() -> u32 { return min(counters.visible, view.records); }
-fn pairs_at(block: u32, lane: u32) -> u32 {
-  let rank = block * BLOCK + lane;
-  if (block < counters.first_block || rank >= visible()) { return 0u; }
-  return pairs_of(extent_of(order[rank]));
-}
 @compute @workgroup_size(256)
 fn count(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-  let before = sum_before(lane, pairs_at(group.x, lane));
-  if (lane == 255u) { sums[group.x] = partial[255]; }
+  let block = group.x;
+  let rank = block * BLOCK + lane;
+  var pairs = 0u;
+  if (block >= counters.first_block && rank < visible()) {
+    pairs = pairs_of(extent_of(order[rank]));
+    pair_counts[rank] = pairs;
+  }
+  let before = sum_before(lane, pairs & ~WHOLE_BOX);
+  if (lane == 255u) { sums[block] = partial[255]; }
 }
 var<workgroup> block_count: u32;
 var<workgroup> end_of_step: atomic<u32>;
@@ -121,38 +126,45 @@ fn put(at: u32, column: u32, row: u32, record: u32) {
   pair_keys[at] = row * view.screen_tiles_x + column;
   pair_values[at] = record;
 }
+fn put_nothing(at: u32) {
+  pair_keys[at] = 0u;
+  pair_values[at] = view.records;
+}
 var<workgroup> large: atomic<u32>;
 var<workgroup> large_count: u32;
 var<workgroup> large_box: array<vec4<u32>, 256>;
-var<workgroup> large_run: array<vec2<u32>, 256>;
+var<workgroup> large_run: array<vec3<u32>, 256>;
 @compute @workgroup_size(256)
 fn emit(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
   if (lane == 0u) { atomicStore(&large, 0u); }
   let block = group.x;
-  let in_step = block >= counters.first_block && block < counters.last_block;
   let rank = block * BLOCK + lane;
   var e = Extent(vec2<f32>(0.0), Box(vec2<u32>(0u), vec2<u32>(0u)), 0.0, 0.0, 0.0, 0.0);
   var record = 0u;
-  if (in_step && rank < visible()) {
+  var pairs = 0u;
+  if (block >= counters.first_block && block < counters.last_block && rank < visible()) {
     record = order[rank];
     e = extent_of(record);
+    pairs = pair_counts[rank];
   }
-  var at = sums[block] + sum_before(lane, pairs_of(e));
+  let first = sums[block] + sum_before(lane, pairs & ~WHOLE_BOX);
   let width = e.box.high.x - e.box.low.x;
-  let area = area_of(e);
-  if (area > FEW) {
+  if ((pairs & WHOLE_BOX) != 0u) {
     let k = atomicAdd(&large, 1u);
     large_box[k] = vec4<u32>(e.box.low, width, record);
-    large_run[k] = vec2<u32>(at, area);
-  } else if (area > 0u) {
-    for (var row = e.box.low.y; row < e.box.high.y; row++) {
+    large_run[k] = vec3<u32>(first, pairs & ~WHOLE_BOX, area_of(e));
+  } else {
+    let end = first + pairs;
+    var at = first;
+    for (var row = e.box.low.y; row < e.box.high.y && at < end; row++) {
       var ends = vec2<u32>(e.box.low.x, e.box.high.x);
       if (width >= 2u) { ends = row_of(e, row); }
-      for (var column = ends.x; column < ends.y; column++) {
+      for (var column = ends.x; column < ends.y && at < end; column++) {
         put(at, column, row, record);
         at += 1u;
       }
     }
+    for (; at < end; at++) { put_nothing(at); }
   }
   workgroupBarrier();
   if (lane == 0u) { large_count = atomicLoad(&large); }
@@ -160,7 +172,9 @@ fn emit(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_index
   for (var k = 0u; k < count; k++) {
     let box = large_box[k];
     let run = large_run[k];
-    for (var i = lane; i < run.y; i += 256u) { put(run.x + i, box.x + i % box.z, box.y + i / box.z, box.w); }
+    for (var i = lane; i < run.y; i += 256u) {
+      if (i < run.z) { put(run.x + i, box.x + i % box.z, box.y + i / box.z, box.w); } else { put_nothing(run.x + i); }
+    }
   }
 }
 `;
@@ -402,7 +416,7 @@ export const DISPATCH = `
 @group(0) @binding(0) var<uniform> view: View;
 @group(0) @binding(1) var<storage, read_write> counters: Counters;
 @group(0) @binding(2) var<storage, read_write> groups: array<u32>;
-fn put(at: u32, count: u32) {
+fn set_groups(at: u32, count: u32) {
   groups[3u * at] = count;
   groups[3u * at + 1u] = 1u;
   groups[3u * at + 2u] = 1u;
@@ -410,8 +424,8 @@ fn put(at: u32, count: u32) {
 @compute @workgroup_size(1)
 fn after_compact() {
   let visible = min(counters.visible, view.records);
-  put(0u, (visible + 4095u) / 4096u);
-  put(1u, (visible + 255u) / 256u);
+  set_groups(0u, (visible + 4095u) / 4096u);
+  set_groups(1u, (visible + 255u) / 256u);
   groups[9] = 4u;
   groups[10] = visible;
   groups[11] = 0u;
@@ -421,7 +435,7 @@ fn after_compact() {
 }
 @compute @workgroup_size(1)
 fn after_scan() {
-  put(2u, (counters.pairs + 4095u) / 4096u);
+  set_groups(2u, (counters.pairs + 4095u) / 4096u);
 }
 @compute @workgroup_size(1)
 fn next_step() {
@@ -429,15 +443,14 @@ fn next_step() {
 }
 @group(0) @binding(3) var<storage, read_write> pixels: array<vec4<f32>>;
 @compute @workgroup_size(256)
-fn clear_pixels(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) all: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
-  let i = (group.y * all.x + group.x) * 256u + lane;
+fn clear_pixels(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) counts: vec3<u32>, @builtin(local_invocation_index) lane: u32) {
+  let i = (group.y * counts.x + group.x) * 256u + lane;
   if (i < u32(view.size.x) * u32(view.size.y)) { pixels[i] = vec4<f32>(0.0, 0.0, 0.0, 1.0); }
 }
 `;
 export const LAYOUT = `
 const TILE_ROWS = 12u;
 const BAND_NONE = 0u;
-const BAND_ROWS = 1u;
 const BAND_CODEBOOK = 2u;
 const OPACITY_SQUARED = 0x1000000u;
 const ANTIALIASED = 0x2000000u;
@@ -813,9 +826,9 @@ fn sum_before(lane: u32, value: u32) -> u32 {
   workgroupBarrier();
   partial[lane] = value;
   workgroupBarrier();
-  for (var step = 1u; step < 256u; step <<= 1u) {
+  for (var reach = 1u; reach < 256u; reach <<= 1u) {
     var before = 0u;
-    if (lane >= step) { before = partial[lane - step]; }
+    if (lane >= reach) { before = partial[lane - reach]; }
     workgroupBarrier();
     partial[lane] = saturating(partial[lane], before);
     workgroupBarrier();

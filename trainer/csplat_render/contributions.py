@@ -48,10 +48,10 @@ from csplat_render.blending import (
     transmit,
 )
 from csplat_render.camera import Camera
-from csplat_render.conventions import TRANSMITTANCE_MIN, Array, HasSplats
+from csplat_render.conventions import TRANSMITTANCE_MIN, Array, HasSplats, checked_splats
 from csplat_render.kernels import device_function, parallel_kernel, thread_count
 from csplat_render.projection import BLOCK, sh_basis, view_direction
-from csplat_render.rasteriser import Rasteriser, checked_splats
+from csplat_render.rasteriser import Rasteriser
 
 # Colours are limited so that squares of their differences, summed over a tile, stay within float32.
 _MAX_COLOUR = 1e15

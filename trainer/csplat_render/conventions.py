@@ -16,9 +16,10 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError
+from csplat.model import sh_degree_of
 from csplat_render.camera import Camera
 
 #: Square pixels, added to both variances of the projected covariance.
@@ -124,6 +125,45 @@ class UncheckedSplats:
     opacities: Array
     sh0: Array
     shN: Array
+
+
+def checked_splats(splats: HasSplats, dtype: Any) -> UncheckedSplats:
+    """Convert the arrays to contiguous ones of a dtype, and check their shapes."""
+    means = np.ascontiguousarray(splats.means, dtype)
+    n = len(means) if means.ndim else 0
+    shapes: dict[str, tuple[int, ...]] = {
+        "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 3)
+    }  # fmt: skip
+    arrays = {name: np.ascontiguousarray(getattr(splats, name), dtype) for name in (*shapes, "shN")}
+    for name, shape in shapes.items():
+        if arrays[name].shape != shape:
+            raise InputError(f"{name} has shape {list(arrays[name].shape)}, expected {list(shape)}")
+    shN = arrays["shN"]
+    if shN.ndim != 3 or shN.shape[::2] != (n, 3):
+        raise InputError(f"shN has shape {list(shN.shape)}, expected [{n}, K, 3]")
+    sh_degree_of(shN.shape[1])
+    return UncheckedSplats(**arrays)
+
+
+def checked_degree(sh_degree: int | None, coefficient_count: int) -> int:
+    """Return the SH degree to render, at most that of the coefficients."""
+    available = sh_degree_of(coefficient_count)
+    if sh_degree is None:
+        return available
+    if sh_degree < 0:
+        raise InputError(f"sh_degree is {sh_degree}, expected 0 or more")
+    return min(sh_degree, available)
+
+
+def checked_background(background: ArrayLike, dtype: Any) -> Array:
+    """Return a background as an array of three finite numbers."""
+    try:
+        colour = np.asarray(background, dtype)
+    except (TypeError, ValueError):
+        colour = np.zeros(0)
+    if colour.shape != (3,) or not np.isfinite(colour).all():
+        raise InputError(f"the background is {background!r}, expected red, green and blue")
+    return colour
 
 
 class Render(Protocol):

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from csplat.errors import InputError, LimitError
-from csplat.model import sh_degree_of
 from csplat_render.binning import (
     CHUNKS,
     TILE,
@@ -33,6 +32,9 @@ from csplat_render.conventions import (
     RenderResult,
     UncheckedSplats,
     VisibleSplats,
+    checked_background,
+    checked_degree,
+    checked_splats,
     thresholds_of,
     view_vector,
 )
@@ -127,8 +129,8 @@ class Rasteriser:
             LimitError: there are more than `MAX_INTERSECTIONS`.
         """
         arrays = checked_splats(splats, self.dtype)
-        degree = _checked_degree(sh_degree, arrays.shN.shape[1])
-        colour = _checked_background(background, self.dtype)
+        degree = checked_degree(sh_degree, arrays.shN.shape[1])
+        colour = checked_background(background, self.dtype)
         width, height = camera.W, camera.H
         pixels = _checked_state(state, (height, width, 5), self.dtype)
         if self.gradients and state is not None:
@@ -163,7 +165,7 @@ class Rasteriser:
     def find_visible(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> VisibleSplats:
         """Find the splats that a render would show, and their depths; the arguments are those of `forward`."""
         arrays = checked_splats(splats, self.dtype)
-        degree = _checked_degree(None, arrays.shN.shape[1])
+        degree = checked_degree(None, arrays.shN.shape[1])
         with thread_count(self.threads):
             *_, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
         near, box = self._buffers["near"].copy(), self._buffers["box"]
@@ -282,40 +284,6 @@ class Rasteriser:
         view = store[:size].reshape(shape)
         self._buffers[name] = view
         return view
-
-
-def checked_splats(splats: HasSplats, dtype: Any) -> UncheckedSplats:
-    """Convert the arrays to contiguous ones of a dtype, and check their shapes."""
-    means = np.ascontiguousarray(splats.means, dtype)
-    n = len(means) if means.ndim else 0
-    shapes: dict[str, tuple[int, ...]] = {
-        "means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh0": (n, 3)
-    }  # fmt: skip
-    arrays = {name: np.ascontiguousarray(getattr(splats, name), dtype) for name in (*shapes, "shN")}
-    for name, shape in shapes.items():
-        if arrays[name].shape != shape:
-            raise InputError(f"{name} has shape {list(arrays[name].shape)}, expected {list(shape)}")
-    shN = arrays["shN"]
-    if shN.ndim != 3 or shN.shape[::2] != (n, 3):
-        raise InputError(f"shN has shape {list(shN.shape)}, expected [{n}, K, 3]")
-    sh_degree_of(shN.shape[1])
-    return UncheckedSplats(**arrays)
-
-
-def _checked_degree(sh_degree: int | None, coefficient_count: int) -> int:
-    available = sh_degree_of(coefficient_count)
-    if sh_degree is None:
-        return available
-    if sh_degree < 0:
-        raise InputError(f"sh_degree is {sh_degree}, expected 0 or more")
-    return min(sh_degree, available)
-
-
-def _checked_background(background: ArrayLike, dtype: Any) -> Array:
-    colour = np.asarray(background, dtype)
-    if colour.shape != (3,) or not np.isfinite(colour).all():
-        raise InputError(f"the background is {background!r}, expected red, green and blue")
-    return colour
 
 
 def _checked_state(state: Array | None, shape: Sequence[int], dtype: Any) -> Array:

@@ -96,7 +96,8 @@ class Device:
         self._wgpu = wgpu
         self.has_timestamps = _TIMESTAMPS in adapter.features
         features = [_TIMESTAMPS] if self.has_timestamps else []
-        self._device = adapter.request_device_sync(required_limits=wanted, required_features=features)
+        with self._named_errors():
+            self._device = adapter.request_device_sync(required_limits=wanted, required_features=features)
         largest = min(self._device.limits[name] for name in ("max-buffer-size", "max-storage-buffer-binding-size"))
         self.binding_max = min(binding_max or largest, largest, 1 << 30)
         self._pipelines: dict[tuple[str, str], Any] = {}
@@ -113,8 +114,8 @@ class Device:
         with self._named_errors():
             return self._device.create_buffer(size=size, usage=flags | (usage.INDIRECT if indirect else 0))
 
-    def upload(self, buffer: Any, array: NDArray[Any], offset: int = 0) -> None:
-        """Write an array to a buffer; its size is a multiple of four bytes.
+    def upload(self, buffer: Any, array: NDArray[Any]) -> None:
+        """Write an array to the beginning of a buffer; its size is a multiple of four bytes.
 
         Raises:
             InputError: the GPU failed or was lost.
@@ -122,7 +123,7 @@ class Device:
         flat = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
         with self._named_errors():
             for start in range(0, len(flat), _UPLOAD):
-                self._device.queue.write_buffer(buffer, offset + start, flat[start : start + _UPLOAD])
+                self._device.queue.write_buffer(buffer, start, flat[start : start + _UPLOAD])
 
     def uploaded(self, array: NDArray[Any], **usage: bool) -> Any:
         """Return a buffer with the content of an array."""
@@ -195,14 +196,18 @@ class Device:
             entry: its entry point.
             count: number of workgroups: of one or two dimensions, or a buffer and the offset of three numbers in it.
             buffers: the buffers of the bindings from 0 on; `None` for those that the entry point does not use.
+
+        Raises:
+            InputError: the GPU failed or was lost, or a buffer is that of another GPU.
         """
-        pipeline = self._pipeline(name, entry)
         entries = [
             {"binding": slot, "resource": {"buffer": buffer, "offset": 0, "size": buffer.size}}
             for slot, buffer in enumerate(buffers)
             if buffer is not None
         ]
-        group = self._device.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries)
+        with self._named_errors():
+            pipeline = self._pipeline(name, entry)
+            group = self._device.create_bind_group(layout=pipeline.get_bind_group_layout(0), entries=entries)
         return Call(pipeline, group, count)
 
     @contextmanager
@@ -211,9 +216,10 @@ class Device:
             yield
         except self._wgpu.GPUOutOfMemoryError:
             raise InputError(f"{self.adapter} has too little memory") from None
-        except self._wgpu.GPUError as error:
+        except (self._wgpu.GPUError, RuntimeError) as error:  # wgpu raises the latter if a buffer cannot be read
             open_device.cache_clear()  # the next call opens the GPU again
-            raise InputError(f"{self.adapter} failed: {str(error).strip().splitlines()[-1].strip()}") from None
+            last = str(error).strip().rpartition("\n")[2].strip()
+            raise InputError(f"{self.adapter} failed: {last or type(error).__name__}") from None
 
     def _pipeline(self, name: str, entry: str) -> Any:
         found = self._pipelines.get((name, entry))
@@ -281,6 +287,8 @@ def open_device(*, software: bool = False, binding_max: int | None = None) -> De
         import wgpu
     except ModuleNotFoundError as error:
         raise missing_package(error, extra="gpu") from None
+    except (ImportError, OSError) as error:
+        raise InputError(f"wgpu cannot be loaded: {error}") from None
     adapters = [found for found in wgpu.gpu.enumerate_adapters_sync() if found.info["backend_type"] != "OpenGL"]
     adapters.sort(key=lambda found: _KINDS.index(_describe(found).kind))
     usable = [found for found in adapters if _describe(found).is_hardware is not software]

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from csplat.errors import LimitError
 from csplat.packed import PackedBand, PackedColumns, PackedTile
 from csplat.types import F64
-from csplat_render.conventions import HasSplats
+from csplat_render.conventions import UncheckedSplats
 
 Words = NDArray[np.uint32]
 
@@ -142,42 +142,35 @@ def pack_tile(tile: PackedTile, tables: SharedTables, shift: F64, *, antialiased
     return writer.finish(corner * tile.means.step + shift, tile.means.step)
 
 
-def pack_splats(
-    splats: HasSplats, start: int, stop: int, shift: F64, *, antialiased: bool, sh_degree: int | None = None
-) -> TileWords:
+def pack_splats(splats: UncheckedSplats, part: slice, shift: F64, *, antialiased: bool, sh_degree: int) -> TileWords:
     """Pack some splats of a model as binary32 patterns; those with NaN or infinity get an opacity of 0.
 
     Args:
-        splats: the model.
-        start, stop: the splats, at most 65,536.
+        splats: the model, float32.
+        part: the splats, at most 65,536.
         shift, antialiased: as in `pack_tile`.
-        sh_degree: highest SH degree; `None`: the model's.
+        sh_degree: highest SH degree, at most the model's.
     """
-    part = slice(start, stop)
-    means, quats = np.asarray(splats.means[part], np.float64), np.asarray(splats.quats[part], np.float64)
-    scales, opacities = np.asarray(splats.scales[part], np.float32), np.asarray(splats.opacities[part], np.float32)
-    sh0, shN = np.asarray(splats.sh0[part], np.float32), np.asarray(splats.shN[part], np.float32)
-    with np.errstate(invalid="ignore", over="ignore"):
-        sums = [means.sum(axis=1), quats.sum(axis=1), scales.sum(axis=1), sh0.sum(axis=1), shN.sum(axis=(1, 2))]
-        valid = np.isfinite(np.sum(sums, axis=0) + opacities)
-        means, quats = np.where(valid[:, None], means, 0.0), np.where(valid[:, None], quats, 0.0)
-        corner = means[valid].mean(axis=0) if valid.any() else np.zeros(3)
-        lengths = np.sqrt((quats * quats).sum(axis=1, keepdims=True))
-        quats = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1.0), (1.0, 0.0, 0.0, 0.0))
-    writer = _TileWriter(stop - start)
-    for columns in (means - corner, np.where(valid, opacities, 0.0)[:, None], scales, quats, sh0):
-        writer.put(_patterns(columns).T, [_PATTERN] * columns.shape[1])
+    means, quats, scales = splats.means[part], splats.quats[part].astype(np.float64), splats.scales[part]
+    opacities, sh0 = splats.opacities[part], splats.sh0[part]
+    shN = splats.shN[part, : (sh_degree + 1) ** 2 - 1].reshape(len(means), -1)
+    columns = np.concatenate([means, splats.quats[part], scales, opacities[:, None], sh0, shN], axis=1)
+    valid = np.isfinite(columns).all(axis=1)
+    # The median, as outliers would cost all others their precision.
+    corner = np.median(means[valid].astype(np.float64), axis=0) if valid.any() else np.zeros(3)
+    offsets = np.where(valid[:, None], means - corner, 0.0)
+    quats = np.where(valid[:, None], quats, 0.0)
+    lengths = np.sqrt((quats * quats).sum(axis=1, keepdims=True))
+    quats = np.where(lengths > 0, quats / np.where(lengths > 0, lengths, 1.0), (1.0, 0.0, 0.0, 0.0))
+    writer = _TileWriter(len(means))
+    for fields in (offsets, np.where(valid, opacities, 0.0)[:, None], scales, quats, sh0):
+        writer.put(_patterns(fields).T, [_PATTERN] * fields.shape[1])
     writer.set_constants(
         _ANTIALIASED if antialiased else 0, [_PATTERN] * 3, _PATTERN, _PATTERN, _PATTERN, _PATTERN, 1, 1
     )
-    first = 0
-    for band in range(1, 5 if sh_degree is None else sh_degree + 1):
-        width = 2 * band + 1
-        if first + width > shN.shape[1]:
-            break
-        rows = _Rows(_patterns(shN[:, first : first + width].reshape(stop - start, -1)).reshape(-1), _PATTERN, 0.0, 1.0)
-        writer.put_rows(band, rows)
-        first += width
+    for band in range(1, sh_degree + 1):
+        coefficients = shN[:, 3 * (band * band - 1) : 3 * ((band + 1) ** 2 - 1)]
+        writer.put_rows(band, _Rows(_patterns(coefficients).reshape(-1), _PATTERN, 0.0, 1.0))
     return writer.finish(corner + shift, 1.0, int(np.count_nonzero(~valid)))
 
 

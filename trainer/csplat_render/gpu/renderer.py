@@ -18,7 +18,14 @@ from csplat.errors import InputError, LimitError
 from csplat.packed import PackedTile
 from csplat.types import F32, F64
 from csplat_render.camera import Camera
-from csplat_render.conventions import HasSplats, Mode, view_vector
+from csplat_render.conventions import (
+    HasSplats,
+    Mode,
+    checked_background,
+    checked_degree,
+    checked_splats,
+    view_vector,
+)
 from csplat_render.gpu.device import Call, Device, Stage
 from csplat_render.gpu.packing import BLOCK, MODEL_TILE, TILE_ROWS, SharedTables, TileWords, pack_splats, pack_tile
 
@@ -29,11 +36,15 @@ _SCREEN_TILE = 16  # pixels, width and height
 _RECORD_BYTES = 16  # in each of the two buffers of records
 _LEAST_PAIRS = 1 << 20  # room for pairs at first, 16 MB
 _MOST_PAIRS = 1 << 26  # fewer than the saturation of the sums in scan.wgsl
+_MOST_RECORDS = 65535 * BLOCK  # workgroups of a pass
 _RUN = 4096  # elements per workgroup of a sort
 _DEPTH_BITS = 15  # bits of a key that tell slices apart at once
 _ALL_BANDS = 4  # the highest SH degree
 _LAST_KEY = 0x7F7FFFFF  # bits of the largest finite depth
 _SORT_RECORDS, _BLOCKS_OF_RANKS, _SORT_PAIRS = 0, 1, 2  # rows of the table of workgroups in dispatch.wgsl
+
+#: `Counters` of common.wgsl.
+_COUNTERS = np.dtype([(name, "<u4") for name in ("visible", "pairs", "first_block", "last_block")])
 
 #: `View` of common.wgsl.
 _VIEW = np.dtype(
@@ -107,7 +118,7 @@ class GpuScene:
         size_bytes: GPU memory of the scenes, bytes.
 
     Raises:
-        InputError: the GPU has too little memory.
+        InputError: there are no scenes, array shapes do not match, or the GPU has too little memory.
         LimitError: the codebooks exceed the largest buffer of the GPU.
         CsplatError: a file is invalid, as in `csplat.decode`.
     """
@@ -120,6 +131,8 @@ class GpuScene:
         antialiased: bool | None = None,
         sh_degree: int | None = None,
     ) -> None:
+        if not scenes:
+            raise InputError("there are no scenes to render")
         self.device = device
         self.origin = _origin_of(scenes[0])
         self.splat_count = self.ignored = self.size_bytes = self.block_count = 0
@@ -148,7 +161,7 @@ class GpuScene:
             self._add_page(page, first_block)
         self._corners = np.array(corners, np.float64).reshape(-1, 3)
         self._places = np.zeros((len(corners), 4), np.float32)
-        self._places[:, 3] = steps
+        self._places[:, 3] = np.minimum(steps, np.finfo(np.float32).max)
         self.tile_table = len(corners)
         self.block_table = len(corners) * (1 + TILE_ROWS)
         blocks = np.concatenate([*owners, np.zeros(-self.block_count % 4, np.uint32)]).reshape(-1, 4)
@@ -172,7 +185,8 @@ class GpuScene:
     def place(self, view: F64) -> None:
         """Write the corners of the tiles in camera coordinates, computed in float64."""
         if len(self._places):
-            self._places[:, :3] = self._corners @ view[:9].reshape(3, 3).T + view[9:12]
+            with np.errstate(over="ignore"):  # what is infinitely far is not drawn
+                self._places[:, :3] = self._corners @ view[:9].reshape(3, 3).T + view[9:12]
             self.device.upload(self.tiles, self._places)
 
     def _upload(self, array: NDArray[Any], **usage: bool) -> Any:
@@ -203,10 +217,11 @@ def _tiles_of(
                 yield pack_tile(tile, tables, shift, antialiased=own)
             continue
         own = bool(getattr(scene, "antialiased", False)) if antialiased is None else antialiased
-        count = len(scene.means)
-        for start in range(0, count, MODEL_TILE):
-            stop = min(count, start + MODEL_TILE)
-            yield pack_splats(scene, start, stop, shift, antialiased=own, sh_degree=sh_degree)
+        splats = checked_splats(scene, np.float32)
+        degree = checked_degree(sh_degree, splats.shN.shape[1])
+        for start in range(0, len(splats.means), MODEL_TILE):
+            part = slice(start, start + MODEL_TILE)
+            yield pack_splats(splats, part, shift, antialiased=own, sh_degree=degree)
 
 
 class GpuRenderer:
@@ -222,29 +237,34 @@ class GpuRenderer:
         self.scene = scene
         self.device = device = scene.device
         slots = max(1, scene.block_count * BLOCK)
-        self._records = min(slots, device.binding_max // _RECORD_BYTES, records_max or slots)
+        self._records = min(slots, device.binding_max // _RECORD_BYTES - 1, _MOST_RECORDS, records_max or slots)
         self._pairs_max = min(device.binding_max // 4, _MOST_PAIRS, pairs_max or _MOST_PAIRS)
         self._pairs_wanted = _LEAST_PAIRS
         self._pairs = 0
         self._size = (0, 0)
         self._view = device.buffer(_VIEW.itemsize, uniform=True)
-        self._counters = device.buffer(16)
+        self._counters = device.buffer(_COUNTERS.itemsize)
         self._groups = device.buffer(64, indirect=True)
         self._blocks = device.buffer(36 * scene.block_count)
         self._depths = device.buffer(4 << _DEPTH_BITS)
-        self._ellipses, self._looks = (device.buffer(_RECORD_BYTES * self._records) for _ in range(2))
+        # The last record draws nothing, see bin.wgsl.
+        self._ellipses, self._looks = (device.buffer(_RECORD_BYTES * (self._records + 1)) for _ in range(2))
         keys, values = ([device.buffer(4 * self._records) for _ in range(2)] for _ in range(2))
         self._order = values[0]
         self._sums = device.buffer(4 * -(-self._records // BLOCK))
+        self._pair_counts = device.buffer(4 * self._records)
         self._projection = self._stages_of_projection(keys, values)
         self._count_depths = [
             device.bind("cull", "count_depths", page.blocks, *self._page(page), None, self._depths)
             for page in scene.pages
         ]
+        self.pixels: Any = None
+        self._ranges: Any = None
+        self._clear: list[Call] = []
         self._step: list[Stage] = []
 
     def render(self, camera: Camera, *, background: ArrayLike = (0.0, 0.0, 0.0)) -> GpuRender:
-        """Render a image.
+        """Render an image.
 
         Args:
             camera: the camera to render from.
@@ -254,9 +274,7 @@ class GpuRenderer:
             LimitError: more splats than the buffers hold have the same depth, or the image is too wide for them.
             InputError: the background is invalid, or the GPU has not enough memory.
         """
-        colour = np.asarray(background, np.float32)
-        if colour.shape != (3,) or not np.isfinite(colour).all():
-            raise InputError(f"the background is {background!r}, expected three numbers")
+        colour = checked_background(background, np.float32)
         rgb, alpha = np.empty((camera.H, camera.W, 3), np.float32), np.empty((camera.H, camera.W), np.float32)
         visible = pairs = steps = 0
         for rows in self.bands(camera):
@@ -270,11 +288,12 @@ class GpuRenderer:
         return GpuRender(rgb, alpha, self.scene.ignored, visible, pairs, steps)
 
     def bands(self, camera: Camera) -> list[range]:
-        """Return the rows of a image in bands that fit the buffers, after making room for the pixels of one."""
+        """Return the rows of an image in bands that fit the buffers, after making room for the pixels of one."""
         columns = -(-camera.W // _SCREEN_TILE)
-        rows = min(self.device.binding_max // (16 * camera.W * _SCREEN_TILE), self._pairs_max // (BLOCK * columns))
-        if rows < 1:
-            raise LimitError("pixels of a row on the GPU", camera.W, self._pairs_max // BLOCK * _SCREEN_TILE)
+        widest = min(self.device.binding_max // (16 * _SCREEN_TILE), self._pairs_max // BLOCK * _SCREEN_TILE)
+        if columns * _SCREEN_TILE > widest:
+            raise LimitError("pixels of a row on the GPU", camera.W, widest)
+        rows = widest // (columns * _SCREEN_TILE)
         height = min(camera.H, rows * _SCREEN_TILE)
         self._make_room(camera.W, height)
         return [range(start, min(camera.H, start + height)) for start in range(0, camera.H, height)]
@@ -284,7 +303,7 @@ class GpuRenderer:
 
         Args:
             camera: the camera.
-            rows: the band, one of `bands`.
+            rows: the band, one of those that `bands` returned last.
             times: the milliseconds of each stage are added to it; this needs timestamps. `None`: none are measured.
 
         Returns:
@@ -302,13 +321,16 @@ class GpuRenderer:
             stages = self._projection + self._step
             while True:
                 self._run(stages, times)
-                counters = device.read(self._counters, 16).view(np.uint32)
-                pairs, steps = pairs + int(counters[1]), steps + 1
-                if int(counters[2]) * BLOCK >= int(counters[0]):
+                counters = device.read(self._counters, _COUNTERS.itemsize).view(_COUNTERS)[0]
+                found = int(counters["visible"])
+                if found > self._records:
+                    raise InputError(f"{device.adapter} failed: {found} splats in a slice of {self._records}")
+                pairs, steps = pairs + int(counters["pairs"]), steps + 1
+                if int(counters["first_block"]) * BLOCK >= found:
                     break
                 self._pairs_wanted = min(2 * self._pairs, self._pairs_max)  # for the next image
                 stages = self._step
-            visible += int(counters[0])
+            visible += found
         return visible, pairs, steps
 
     def time(self, camera: Camera) -> dict[str, float]:
@@ -348,30 +370,44 @@ class GpuRenderer:
 
     def _slices(self, view: NDArray[Any]) -> list[tuple[int, int]]:
         """Return first and last key of slices of depth, each with as many splats as the records hold."""
-        if self.scene.block_count * BLOCK <= self._records:
-            return [(0, _LAST_KEY)]
-        return list(self._divide(view, 0, _LAST_KEY, 16))
+        starts = [0]
+        if self.scene.block_count * BLOCK > self._records:
+            self._find_starts(view.copy(), starts, 0, (0, _LAST_KEY), 31 - _DEPTH_BITS)
+        return list(zip(starts, [start - 1 for start in starts[1:]] + [_LAST_KEY], strict=True))
 
-    def _divide(self, view: NDArray[Any], first: int, last: int, shift: int) -> Iterator[tuple[int, int]]:
-        view["first_key"], view["last_key"], view["depth_shift"] = first, last, shift
+    def _find_starts(self, view: NDArray[Any], starts: list[int], count: int, keys: tuple[int, int], shift: int) -> int:
+        """Append the first keys of further slices, from splats by the upper bits of their keys.
+
+        Args:
+            view: the view; its slice is changed.
+            starts: the first keys so far.
+            count: number of splats since the last of these.
+            keys: the first and last key of the search.
+            shift: number of lower bits that are left out.
+
+        Returns:
+            The number of splats since the last start.
+
+        Raises:
+            LimitError: more splats than the records hold have the same depth.
+        """
+        view["first_key"], view["last_key"], view["depth_shift"] = *keys, shift
         self.device.upload(self._view, view)
         self.device.run(self._count_depths, clear=[self._depths])
         counts = self.device.read(self._depths, 4 << _DEPTH_BITS).view(np.uint32)
-        begin, total = first, 0
         for place in np.flatnonzero(counts):
-            key = first + (int(place) << shift)
-            count = int(counts[place])
-            if total + count > self._records and total:
-                yield begin, key - 1
-                begin, total = key, 0
-            if count > self._records:
-                if shift == 0:
-                    raise LimitError("splats of equal depth on the GPU", count, self._records)
-                yield from self._divide(view, key, min(last, key + (1 << shift) - 1), max(0, shift - _DEPTH_BITS))
-                begin, total = key + (1 << shift), 0
-            total += count if count <= self._records else 0
-        if total or begin == first:
-            yield begin, last
+            key, found = keys[0] + (int(place) << shift), int(counts[place])
+            if count + found <= self._records:
+                count += found
+            elif shift:
+                last = min(keys[1], key + (1 << shift) - 1)
+                count = self._find_starts(view, starts, count, (key, last), max(0, shift - _DEPTH_BITS))
+            elif found > self._records:
+                raise LimitError("splats of equal depth on the GPU", found, self._records)
+            else:
+                starts.append(key)
+                count = found
+        return count
 
     def _page(self, page: Page) -> tuple[Any, ...]:
         return self._view, page.info, self.scene.tiles, page.words
@@ -420,32 +456,43 @@ class GpuRenderer:
     def _make_room(self, width: int, height: int) -> None:
         """Set up the buffers whose size depends on the image, and the passes that use them."""
         columns, rows = -(-width // _SCREEN_TILE), -(-height // _SCREEN_TILE)
-        pairs = max(min(self._pairs_wanted, self._pairs_max), BLOCK * columns * rows)
+        least = BLOCK * columns * rows
+        pairs = max(min(self._pairs_wanted, self._pairs_max), least)
         if (width, height) == self._size and pairs == self._pairs:
             return
+        self._size, self._pairs, self._clear, self._step = (0, 0), 0, [], []
+        self.pixels = self._ranges = None
+        try:
+            self._allocate(width, height, pairs)
+        except InputError:
+            if pairs == least:
+                raise
+            pairs = self._pairs_max = max(least, pairs // 2)  # there is no room for more
+            self._allocate(width, height, pairs)
+
+    def _allocate(self, width: int, height: int, pairs: int) -> None:
+        columns, rows = -(-width // _SCREEN_TILE), -(-height // _SCREEN_TILE)
         device, bind = self.device, self.device.bind
-        self._size, self._pairs = (width, height), pairs
         self.pixels = device.buffer(16 * width * height)
         self._ranges = device.buffer(8 * columns * rows)
         keys, values = ([device.buffer(4 * pairs) for _ in range(2)] for _ in range(2))
         bits = max(1, (columns * rows - 1).bit_length())
         done = -(-bits // 8) % 2
         records = self._ellipses, self._looks
+        splats = self._view, self._counters, self._order, *records, self._sums, self._pair_counts
         blocks = self._groups, 12 * _BLOCKS_OF_RANKS
         self._clear = [
             bind("dispatch", "clear_pixels", (-(-width * height // 16384), 64), self._view, None, None, self.pixels)
         ]
         bins = [
-            bind("bin", "count", blocks, self._view, self._counters, self._order, *records, self._sums),
+            bind("bin", "count", blocks, *splats),
             bind("bin", "scan", 1, self._view, self._counters, None, None, None, self._sums),
             bind("dispatch", "after_scan", 1, None, self._counters, self._groups),
-            bind(
-                "bin", "emit", blocks,
-                self._view, self._counters, self._order, *records, self._sums, keys[0], values[0],
-            ),
+            bind("bin", "emit", blocks, *splats, keys[0], values[0]),
         ]  # fmt: skip
         sort = self._passes_of_sort(keys, values, bits, _SORT_PAIRS, of_pairs=True)
         find = bind("ranges", "find", (self._groups, 12 * _SORT_PAIRS), self._counters, keys[done], self._ranges)
         blend = bind("blend", "blend", (columns, rows), self._view, *records, values[done], self._ranges, self.pixels)
         following = bind("dispatch", "next_step", 1, None, self._counters)
         self._step = [("bin", bins), ("tile sort", [*sort, find]), ("blend", [blend, following])]
+        self._size, self._pairs = (width, height), pairs

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from csplat.types import Progress
 from csplat_render.camera import Camera, relative_to
+from csplat_render.conventions import checked_background
 from csplat_render.gpu.renderer import GpuRenderer, GpuScene
 from csplat_render.metrics import Scores, ViewScore, psnr_of_mse
 
@@ -34,20 +35,21 @@ def compare_scenes(
     Raises:
         InputError, LimitError: as in `GpuRenderer.render`; there are no views.
     """
+    colour = checked_background(background, np.float32)
     first, second = GpuRenderer(source), GpuRenderer(other)
     shift = np.subtract(other.origin, source.origin)
     each = []
     for number, camera in enumerate(cameras):
         if progress is not None:
             progress("comparing", number / len(cameras))
-        each.append(_compare_view(first, second, camera, relative_to(shift, camera), background))
+        each.append(_compare_view(first, second, camera, relative_to(shift, camera), colour))
     if progress is not None:
         progress("comparing", 1.0)
     return Scores.of(each, other.ignored)
 
 
 def _compare_view(
-    first: GpuRenderer, second: GpuRenderer, camera: Camera, moved: Camera, background: ArrayLike
+    first: GpuRenderer, second: GpuRenderer, camera: Camera, moved: Camera, background: NDArray[np.float32]
 ) -> ViewScore:
     device, sums = first.device, np.zeros(4)
     second.bands(moved)  # makes room; the bands are the same
