@@ -130,6 +130,43 @@ def test_level_0_of_a_file_with_levels_of_detail_is_drawn(engine, part, camera):
     assert len(part) == len(model) == engine.stats()["splatsResident"]
 
 
+@pytest.mark.parametrize("backend", ["webgl2", "webgpu-tiles"])
+def test_the_whole_scene_is_shown_coarsely_while_a_file_with_levels_arrives(engine, sample, backend):
+    engine.start_again(f"{{ backend: '{backend}' }}")
+    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    model, (camera,) = decode(data), views(sample, 1, 96)
+    engine.look(camera)
+    engine.site.bytes_per_second = 20_000
+    try:
+        engine.page.evaluate("(url) => void (window.opened = engine.open(url))", engine.site.add("/scene.csplat", data))
+        engine.page.wait_for_function("engine.stats.firstPictureMs > 0")
+        stats = engine.stats()
+        early = engine.picture_of_now(camera)
+    finally:
+        engine.site.bytes_per_second = 0
+    assert stats["splatsResident"] < len(model) / 2
+    assert 0 < stats["firstPictureBytes"] < len(data) / 2
+    engine.page.evaluate("opened")
+    whole = engine.picture(camera)
+    assert psnr(whole, reference(model, camera)) >= GOOD
+    assert psnr(early, whole) > psnr(np.zeros_like(whole), whole) + 6
+    assert len(model) == engine.stats()["splatsResident"] >= engine.stats()["splatsDrawn"]
+    engine.start_again()
+
+
+@pytest.mark.parametrize("backend", ["webgl2", "webgpu-tiles"])
+def test_what_exceeds_the_budget_of_splats_is_drawn_coarsely(engine, sample, backend):
+    engine.start_again(f"{{ backend: '{backend}', splatBudget: 4000 }}")
+    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    engine.open(data)
+    (camera,) = views(sample, 1, 96)
+    picture = engine.picture(camera)
+    assert 100 < engine.stats()["splatsDrawn"] <= 4000
+    wanted = reference(decode(data), camera)
+    assert 15 < psnr(picture, wanted) < 45
+    engine.start_again()
+
+
 def test_background_and_degree_can_be_chosen(engine, part, camera):
     data = encode(part, FAST)
     engine.open(data)

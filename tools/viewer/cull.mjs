@@ -8,6 +8,7 @@ import { ALPHA_MIN, DILATION, REACH_MAX, slopeLimits } from './camera_maths.mjs'
  * Data of a tile for culling.
  *
  * @typedef {object} CullTile
+ * @property {number} index of the tile
  * @property {number} count splats
  * @property {number} slot slot of the first splat
  * @property {Uint8Array | Uint16Array | Uint32Array | Float64Array} means [3 × count] integers, column after column

@@ -66,6 +66,18 @@ function startWorker({ workerFactory }) {
   }
 }
 
+/** Maximum number of splats that are drawn of a file with levels of detail, if the CPU sorts them, and if the GPU does. */
+const [SORTED_SPLATS, UNSORTED_SPLATS] = [3e6, 6e6];
+
+/** Gigabytes of memory below which a device gets half of that. */
+const SMALL_GB = 4;
+
+/** @param {boolean} sort whether the CPU sorts */
+function usualBudget(sort) {
+  const { deviceMemory = SMALL_GB } = /** @type {{deviceMemory?: number}} */ (navigator);
+  return (sort ? SORTED_SPLATS : UNSORTED_SPLATS) / (deviceMemory < SMALL_GB ? 2 : 1);
+}
+
 /** @implements {Engine} */
 class SplatEngine {
   /**
@@ -132,7 +144,9 @@ class SplatEngine {
     this.opening = opening;
     const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
       if (this.opening !== opening) return;
-      this.tell({ type: 'open', scene: opening.scene, source: readable, sort: !this.renderer.capabilities.sorts });
+      const sort = !this.renderer.capabilities.sorts;
+      const budget = this.options.splatBudget ?? usualBudget(sort);
+      this.tell({ type: 'open', scene: opening.scene, source: readable, sort, budget });
     };
     // In WebKit, the worker of a file: page cannot read a Blob, but the page can.
     if (self.origin !== 'null' || !(source instanceof Blob)) return tell(source);
@@ -276,7 +290,7 @@ class SplatEngine {
       this.fail(error);
     }
     if (reply.type === 'order') this.worker.postMessage({ type: 'recycle', order: reply.order }, [reply.order.buffer]);
-    if (['header', 'band', 'order', 'done'].includes(reply.type)) this.requestFrame();
+    if (['header', 'band', 'cut', 'order', 'done'].includes(reply.type)) this.requestFrame();
     this.wake();
   }
 
@@ -320,7 +334,7 @@ class SplatEngine {
     });
     stats.gpuBytesPerSplat = stats.splatsResident ? attributes / stats.splatsResident : 0;
     stats.shDegree = Math.min(this.look.shDegree, opening?.header?.shDegree ?? 0);
-    if (opening?.isOrderWhole && stats.firstPictureMs === 0) stats.firstPictureMs = performance.now() - opening.begun;
+    if (opening?.order.isWhole && stats.firstPictureMs === 0) stats.firstPictureMs = performance.now() - opening.begun;
     this.options.onFrame?.(stats);
   }
 

@@ -1,6 +1,8 @@
-// Reads a file for the viewer: layer 0 of all tiles first, then the SH bands. Packs each part for the GPU as it arrives.
+// Reads a file for the viewer: layer 0 of all tiles first, those of coarser levels before, then the SH bands of level 0.
+// Packs each part for the GPU as it arrives.
 
 import { CsplatReader } from '../../codec/js/decoder.mjs';
+import { allTiles } from '../../codec/js/tile_records.mjs';
 import { SAMPLE_COUNT, showing } from './bounds.mjs';
 import { toCamera } from './camera_maths.mjs';
 import { reachClass } from './cull.mjs';
@@ -19,8 +21,9 @@ import { layoutSlots, packBand, packGeometry, packRows } from './texels.mjs';
  * Receives the parts of a file.
  *
  * @typedef {object} Sink
- * @property {(header: Header, description: any) => void} header
- * @property {(tile: number, texels: GeometryTexels, cull: CullTile, samples: Samples) => void} geometry
+ * @property {(header: Header, description: any, nodes: import('./types.d.ts').TreeNode[]) => void} header nodes of the
+ *   levels of detail; none if the file has no levels
+ * @property {(tile: number, texels: GeometryTexels, cull: CullTile, samples: Samples) => void} geometry samples of level 0
  * @property {(codebook: number, layer: number, rows: Rows) => void} table
  * @property {(tile: number, layer: number, band: BandTexels) => void} band
  * @property {(progress: {phase: 'open' | 'layers', received: number, fileSize: number, splatsDone: number,
@@ -53,21 +56,24 @@ export async function load(source, sink, signal) {
   });
   const { header } = reader;
   const description = await reader.describe({ signal });
+  const nodes = header.coarseTiles.length > 0 ? await reader.nodes() : [];
   Object.assign(state, { fileSize: header.fileSize, splatCount: header.splatCount });
   const isLocal = typeof source !== 'string'; // the decoder then reports no received bytes
   if (isLocal) state.received = header.indexSize;
-  sink.header(header, description);
+  sink.header(header, description, nodes);
   tell(0);
   const order = tileOrder(header.tiles, sink.view());
+  const coarse = tileOrder(header.coarseTiles, sink.view()).sort((a, b) => b.level - a.level);
   const tables = new Set();
-  const starts = layoutSlots(header.tiles).starts;
+  const { starts } = layoutSlots(allTiles(header));
   for (let layer = 0; layer <= header.shDegree; layer++) {
-    for await (const tile of fetched(reader, order, layer, signal)) {
+    const wanted = layer === 0 ? [...coarse, ...order] : order;
+    for await (const tile of fetched(reader, wanted, layer, signal)) {
       const begun = performance.now() - reader.waitedMs;
       if (layer === 0) await readGeometry(reader, tile, starts[tile.index], sink, signal);
       else await readBand(reader, tile, layer, tables, sink, signal);
       state.decodeMs += performance.now() - reader.waitedMs - begun;
-      if (layer === 0) state.splatsDone += tile.splatCount;
+      if (layer === 0 && tile.level === 0) state.splatsDone += tile.splatCount;
       if (isLocal) state.received += tile.layers.find((one) => one.layer === layer)?.size ?? 0;
       tell(layer);
     }
@@ -85,7 +91,7 @@ export async function load(source, sink, signal) {
  * @param {View | null} view
  */
 export function tileOrder(tiles, view) {
-  if (view === null) return tiles;
+  if (view === null) return [...tiles];
   const distance = (/** @type {TileRecord} */ { min, max }) => {
     const centre = [0, 1, 2].map((axis) => (min[axis] + max[axis]) / 2);
     const half = Math.hypot(max[0] - min[0], max[1] - min[1], max[2] - min[2]) / 2;
@@ -147,7 +153,8 @@ async function readGeometry(reader, tile, slot, sink, signal) {
   const texels = packGeometry(packed, opacities, quats);
   const stride = Math.max(1, Math.floor(reader.header.splatCount / SAMPLE_COUNT));
   const alphas = alphasOf(packed, opacities);
-  sink.geometry(index, texels, cullTile(packed, alphas, tile, slot), samplesOf(packed, alphas, stride));
+  const samples = tile.level === 0 ? samplesOf(packed, alphas, stride) : noSamples();
+  sink.geometry(index, texels, cullTile(packed, alphas, tile, slot), samples);
 }
 
 /**
@@ -178,7 +185,7 @@ const logScale = ({ scales: { columns, offsets, step }, count }, column, i) =>
  * @param {number} slot
  * @returns {CullTile}
  */
-function cullTile(packed, alphas, { extent, maxScale }, slot) {
+function cullTile(packed, alphas, { index, extent, maxScale }, slot) {
   const { count, means } = packed;
   const reaches = new Uint8Array(count);
   for (let i = 0; i < count; i++) {
@@ -186,8 +193,11 @@ function cullTile(packed, alphas, { extent, maxScale }, slot) {
     reaches[i] = reachClass(alphas[i], largest);
   }
   const reach = 4 * Math.exp(maxScale); // 4 exceeds REACH_MAX plus the rounding of the classes
-  return { count, slot, means: means.columns, corner: means.offsets, step: means.step, extent, reach, reaches };
+  return { index, count, slot, means: means.columns, corner: means.offsets, step: means.step, extent, reach, reaches };
 }
+
+/** @returns {Samples} */
+const noSamples = () => ({ points: new Float32Array(0), weights: new Float32Array(0) });
 
 /**
  * Sample every `stride`-th splat.

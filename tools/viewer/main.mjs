@@ -1,6 +1,7 @@
 // The page: an engine, a camera that the user moves, and the overlay.
 //
 // Parameters: ?scene=URL&camera=JSON-or-its-URL&view=0&up=x,y,z&seems=x,y,z&axes=RDF&size=WxH&background=rrggbb&ui=0
+// &backend=webgl2
 // `window.csplatViewer` lets programs control the page; its `ready` resolves when the scene has been drawn completely.
 
 import { MeasureCard, measure } from './measure.mjs';

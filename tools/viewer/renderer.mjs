@@ -40,6 +40,7 @@ import { WebGpuRenderer } from './webgpu.mjs';
  *   tile, after the table it refers to; a codebook's lowest band first
  * @property {() => void} complete everything has been uploaded: free reserved memory
  * @property {(order: Uint32Array, count: number) => void} setOrder slots, farthest first
+ * @property {(tiles: Uint32Array) => void} setCut the tiles to draw, for renderers that sort; all if it is never called
  * @property {(view: import('./types.d.ts').View, look: {background: number[], shDegree: number}) => void} draw to the
  *   canvas, which has the size of the view
  * @property {() => Uint8Array | Promise<Uint8Array>} readPixels the result of the preceding `draw`, RGBA, top row first

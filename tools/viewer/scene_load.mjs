@@ -41,15 +41,15 @@ export class SceneLoad {
     /** Whether the GPU failed to draw it. */
     this.hasFailedToDraw = false;
     this.tilesHere = 0;
-    /** The last sort: its camera and number of tiles. */
-    this.order = { id: 0, tiles: 0 };
+    /** The last sort: its camera, the number of tiles of level 0 that were here, and whether it covers the scene. */
+    this.order = { id: 0, tiles: 0, isWhole: false };
     /** @type {number[]} samples of splats */
     this.points = [];
     /** @type {number[]} */
     this.weights = [];
   }
 
-  /** Whether layer 0 of all tiles has arrived. */
+  /** Whether layer 0 of all tiles of level 0 has arrived. */
   get isWhole() {
     return this.header !== null && this.tilesHere === this.header.tiles.length;
   }
@@ -63,7 +63,7 @@ export class SceneLoad {
     return this.isDone && (viewId === 0 || (this.order.id === viewId && this.isOrderWhole));
   }
 
-  /** Whether the last sort included all tiles. */
+  /** Whether the last sort included all tiles of level 0. */
   get isOrderWhole() {
     return this.order.id > 0 && this.order.tiles === this.header?.tiles.length;
   }
@@ -79,6 +79,7 @@ export class SceneLoad {
     else if (reply.type === 'geometry') this.#takeGeometry(reply, renderer);
     else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
     else if (reply.type === 'band') renderer.uploadBand(reply.tile, reply.layer, reply.band);
+    else if (reply.type === 'cut') renderer.setCut(reply.tiles);
     else if (reply.type === 'order') this.#takeOrder(reply, renderer);
     else if (reply.type === 'error') throw new EngineError(reply.error);
     else {
@@ -104,7 +105,7 @@ export class SceneLoad {
     const [opacities, , quats] = header.attributes;
     try {
       renderer.allocate({
-        tiles,
+        tiles: [...tiles, ...header.coarseTiles],
         shDegree,
         antialiased: header.antialiased,
         opacityLevels: opacities.levels,
@@ -124,7 +125,7 @@ export class SceneLoad {
   /** @param {Reply & {type: 'progress'}} reply */
   #takeProgress({ progress, decodeMs }) {
     Object.assign(this.stats, { received: progress.received, decodeMs });
-    if (this.isWhole) this.stats.firstPictureBytes ||= progress.received;
+    if (this.isWhole || this.order.isWhole) this.stats.firstPictureBytes ||= progress.received;
     this.hooks.onProgress?.(progress);
   }
 
@@ -134,8 +135,10 @@ export class SceneLoad {
    */
   #takeGeometry({ tile, texels, samples }, renderer) {
     renderer.uploadGeometry(tile, texels);
-    this.stats.splatsResident += texels.count;
-    this.tilesHere++;
+    if (this.header && tile < this.header.tiles.length) {
+      this.stats.splatsResident += texels.count;
+      this.tilesHere++;
+    }
     for (const value of samples.points) this.points.push(value);
     for (const weight of samples.weights) this.weights.push(weight);
     if (this.header && this.isWhole) this.bounds = this.#boundsOfSamples(this.header);
@@ -145,9 +148,9 @@ export class SceneLoad {
    * @param {Reply & {type: 'order'}} reply
    * @param {Renderer} renderer
    */
-  #takeOrder({ id, tiles, order, count, cullMs, sortMs }, renderer) {
+  #takeOrder({ id, tiles, isWhole, order, count, cullMs, sortMs }, renderer) {
     renderer.setOrder(order, count);
-    this.order = { id, tiles };
+    this.order = { id, tiles, isWhole };
     Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });
   }
 

@@ -1,8 +1,8 @@
 // Types shared by the viewer's modules. engine.mjs is the entry point for pages.
 
-import type { Description, Header, TileRecord } from '../../codec/js/decoder.d.ts';
+import type { Description, Header, TileRecord, TreeNode } from '../../codec/js/decoder.d.ts';
 
-export type { Description, Header, TileRecord };
+export type { Description, Header, TileRecord, TreeNode };
 
 /** A pinhole camera, in pixels of the drawing buffer; the centre of the first pixel is at (0.5, 0.5). */
 export interface Camera {
@@ -63,7 +63,7 @@ export interface Stats {
   /** Bytes of attributes and tables per splat on the GPU, and the bytes of float32 attributes. */
   gpuBytesPerSplat: number;
   expandedBytesPerSplat: number;
-  /** Time from `open` until a frame showed the whole scene with layer 0, and the bytes received for it. 0 before. */
+  /** Time from `open` until a frame showed the whole scene, at any level, and the bytes received for it. 0 before. */
   firstPictureMs: number;
   firstPictureBytes: number;
   /** Displayed SH degree: the minimum of the requested degree and the file's. */
@@ -112,6 +112,11 @@ export interface EngineOptions {
   workerFactory?: () => Worker;
   /** What draws. Default: auto. */
   backend?: Backend;
+  /**
+   * Maximum number of splats drawn of a file with levels of detail; parts that are far away are then drawn coarsely. Default:
+   * 6 million with WebGPU, 3 million with WebGL 2, half of that on small devices.
+   */
+  splatBudget?: number;
   /** Format of WebGL 2. Default: the fastest that can be blended without visible differences. */
   pictureFormat?: PictureFormat;
   onProgress?: (progress: Progress) => void;

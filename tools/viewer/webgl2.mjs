@@ -107,6 +107,8 @@ export class WebGl2Renderer {
     this.scene?.putOrder(order, count);
   }
 
+  setCut() {}
+
   /**
    * @param {View} view
    * @param {{background: number[], shDegree: number}} look

@@ -171,6 +171,11 @@ export class WebGpuRenderer {
 
   setOrder() {}
 
+  /** @param {Uint32Array} tiles */
+  setCut(tiles) {
+    this.scene?.setCut(tiles);
+  }
+
   /**
    * @param {View} view
    * @param {{background: number[], shDegree: number}} look

@@ -75,6 +75,8 @@ export class GpuScene {
     this.indices = new Map();
     this.constants = new Uint32Array(TEXEL_WORDS * TILE_ROWS * tiles.length);
     this.places = new Float32Array(TEXEL_WORDS * tiles.length);
+    /** Which tiles are drawn; null for all. @type {Set<number> | null} */
+    this.cut = null;
     this.#putBlocks();
   }
 
@@ -182,7 +184,18 @@ export class GpuScene {
   /** @param {number} tile */
   #putConstants(tile) {
     const words = TEXEL_WORDS * TILE_ROWS;
-    this.#write(16 * (this.tileTable + TILE_ROWS * tile), this.constants.slice(words * tile, words * (tile + 1)));
+    const constants = this.constants.slice(words * tile, words * (tile + 1));
+    if (this.cut && !this.cut.has(tile)) constants[3] = 0; // no splats
+    this.#write(16 * (this.tileTable + TILE_ROWS * tile), constants);
+  }
+
+  /** @param {Uint32Array} tiles the tiles to draw */
+  setCut(tiles) {
+    const before = this.cut;
+    this.cut = new Set(tiles);
+    for (let tile = 0; tile < this.layout.tiles.length; tile++) {
+      if (before?.has(tile) !== this.cut.has(tile)) this.#putConstants(tile);
+    }
   }
 
   /**

@@ -1,6 +1,7 @@
 // The viewer's worker: reads and packs the file and sorts the visible splats. engine.mjs sends it requests.
 
 import { cull } from './cull.mjs';
+import { chooseTiles } from './level_cut.mjs';
 import { load } from './loader.mjs';
 import { withUp } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
@@ -12,7 +13,7 @@ import { DepthSorter } from './sort.mjs';
  *
  * Messages to the worker: `scene` counts the calls of `open`, `id` the cameras.
  *
- * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer, sort: boolean}
+ * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer, sort: boolean, budget: number}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
  *   | {type: 'rewrite', up: number[], port: MessagePort}
@@ -26,11 +27,13 @@ import { DepthSorter } from './sort.mjs';
  *
  * @typedef {{scene: number} & (
  *   | {type: 'header', header: import('./types.d.ts').Header, description: import('./types.d.ts').Description}
+ *   | {type: 'cut', tiles: Uint32Array<ArrayBuffer>}
  *   | {type: 'progress', progress: import('./types.d.ts').Progress, decodeMs: number}
  *   | {type: 'geometry', tile: number, texels: import('./texels.mjs').GeometryTexels, samples: import('./loader.mjs').Samples}
  *   | {type: 'table', codebook: number, layer: number, rows: import('./texels.mjs').Rows}
  *   | {type: 'band', tile: number, layer: number, band: import('./texels.mjs').BandTexels}
- *   | {type: 'order', id: number, tiles: number, order: Uint32Array<ArrayBuffer>, count: number, cullMs: number, sortMs: number}
+ *   | {type: 'order', id: number, tiles: number, isWhole: boolean, order: Uint32Array<ArrayBuffer>, count: number,
+ *      cullMs: number, sortMs: number}
  *   | {type: 'done'}
  *   | {type: 'error', error: ErrorReport})} Reply
  */
@@ -53,12 +56,20 @@ class Job {
     /** @type {string | Blob | ArrayBuffer} */
     this.source = new ArrayBuffer(0);
     this.abort = new AbortController();
-    /** @type {CullTile[]} */
+    /** @type {import('./types.d.ts').Header | null} */
+    this.header = null;
+    /** Nodes of the levels of detail. @type {import('./types.d.ts').TreeNode[]} */
+    this.nodes = [];
+    /** Tiles that are here. @type {CullTile[]} */
     this.tiles = [];
-    this.splatCount = 0; // number of splats in `tiles`
+    /** Tiles that are drawn, of `tiles`. @type {CullTile[]} */
+    this.drawn = [];
+    this.isWhole = false; // `drawn` covers the whole scene
+    this.splatCount = 0; // number of splats in `drawn`
     /** @type {{id: number, view: View} | null} */
     this.camera = null;
     this.sorts = true;
+    this.budget = Infinity; // splats
     this.sorter = new DepthSorter();
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     /** @type {Uint32Array<ArrayBuffer>[]} */
@@ -69,7 +80,7 @@ class Job {
 
   /** @param {Request} request */
   take(request) {
-    if (request.type === 'open') this.open(request.scene, request.source, request.sort);
+    if (request.type === 'open') this.open(request);
     else if (request.type === 'view') {
       this.camera = request;
       this.sortSoon(0);
@@ -83,22 +94,22 @@ class Job {
     this.scene = 0;
     this.abort.abort();
     this.abort = new AbortController();
-    this.tiles = [];
+    this.header = null;
+    this.nodes = [];
+    this.tiles = this.drawn = [];
+    this.isWhole = false;
     this.splatCount = 0;
     this.spare = [];
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     this.sorter = new DepthSorter();
   }
 
-  /**
-   * @param {number} scene
-   * @param {string | Blob | ArrayBuffer} source
-   * @param {boolean} sorts whether the renderer needs an order
-   */
-  async open(scene, source, sorts) {
+  /** @param {Request & {type: 'open'}} request `sort`: the renderer needs an order; `budget` of splats */
+  async open({ scene, source, sort, budget }) {
     this.reset();
     this.scene = scene;
-    this.sorts = sorts;
+    this.sorts = sort;
+    this.budget = budget;
     this.source = source;
     const { signal } = this.abort;
     /** @type {(message: any, transfer?: Transferable[]) => void} */
@@ -135,14 +146,20 @@ class Job {
    */
   sink(post) {
     return {
-      header: (header, description) => post({ type: 'header', header, description }),
+      header: (header, description, nodes) => {
+        this.header = header;
+        this.nodes = nodes;
+        post({ type: 'header', header, description });
+        if (nodes.length > 0 && !this.sorts) post({ type: 'cut', tiles: new Uint32Array(0) });
+        this.choose();
+      },
       geometry: (tile, texels, culled, samples) => {
         this.tiles.push(culled);
         this.tiles.sort((a, b) => a.slot - b.slot); // keeps equal depths in the order of the file
-        this.splatCount += culled.count;
         const transfer = [texels.first.buffer, samples.points.buffer, samples.weights.buffer];
         if (texels.more) transfer.push(texels.more.buffer);
         post({ type: 'geometry', tile, texels, samples }, transfer);
+        this.choose();
         this.sortSoon(SORT_INTERVAL_MS);
       },
       table: (codebook, layer, rows) => post({ type: 'table', codebook, layer, rows }, [rows.texels.buffer]),
@@ -156,6 +173,26 @@ class Job {
       progress: ({ decodeMs, ...progress }) => post({ type: 'progress', progress, decodeMs }),
       view: () => this.camera?.view ?? null,
     };
+  }
+
+  /** Choose the tiles to draw, of those that are here. */
+  choose() {
+    const { header, nodes, tiles } = this;
+    if (nodes.length === 0) {
+      this.drawn = tiles;
+      this.isWhole = tiles.length === header?.tiles.length;
+    } else {
+      const here = new Map(tiles.map((tile) => [tile.index, tile]));
+      const cut = chooseTiles(nodes, (tile) => here.has(tile), this.camera?.view ?? null, this.budget);
+      const before = this.drawn;
+      this.drawn = cut.tiles.flatMap((tile) => here.get(tile) ?? []);
+      this.isWhole = cut.isWhole;
+      const isNew = this.drawn.length !== before.length || this.drawn.some((tile, i) => tile !== before[i]);
+      if (isNew && !this.sorts) {
+        this.scope.postMessage({ type: 'cut', scene: this.scene, tiles: Uint32Array.from(cut.tiles) });
+      }
+    }
+    this.splatCount = this.drawn.reduce((sum, { count }) => sum + count, 0);
   }
 
   /**
@@ -175,12 +212,13 @@ class Job {
 
   sort() {
     if (this.camera === null || this.scene === 0) return;
+    if (this.nodes.length > 0) this.choose();
     const { id, view } = this.camera;
-    const { splatCount, visible } = this;
+    const { scene, splatCount, visible, isWhole } = this;
+    const tiles = this.tiles.filter(({ index }) => index < (this.header?.tiles.length ?? 0)).length;
+    const reply = /** @type {const} */ ({ type: 'order', scene, id, tiles, isWhole });
     if (!this.sorts) {
-      const { scene, tiles } = this;
-      const nothing = { order: new Uint32Array(0), count: splatCount, cullMs: 0, sortMs: 0 };
-      this.scope.postMessage({ type: 'order', scene, id, tiles: tiles.length, ...nothing });
+      this.scope.postMessage({ ...reply, order: new Uint32Array(0), count: splatCount, cullMs: 0, sortMs: 0 });
       return;
     }
     if (visible.depths.length < splatCount) {
@@ -188,17 +226,14 @@ class Job {
       visible.slots = new Uint32Array(splatCount);
     }
     const start = performance.now();
-    cull(this.tiles, view, visible);
+    cull(this.drawn, view, visible);
     const culled = performance.now();
     let order = this.spare.pop();
     if (order === undefined || order.length < visible.count) order = new Uint32Array(splatCount);
     this.sorter.sort(visible.depths, visible.slots, visible.count, order);
     this.sortedAt = performance.now();
     const times = { cullMs: culled - start, sortMs: this.sortedAt - culled };
-    const { scene, tiles } = this;
-    this.scope.postMessage({ type: 'order', scene, id, tiles: tiles.length, order, count: visible.count, ...times }, [
-      order.buffer,
-    ]);
+    this.scope.postMessage({ ...reply, order, count: visible.count, ...times }, [order.buffer]);
   }
 }
 

@@ -91,7 +91,7 @@ test('tiles nearest to the camera come first, tiles behind it last', () => {
     10,
   );
   assert.deepEqual(tileOrder(tiles, view), [tiles[2], tiles[3], tiles[0], tiles[1]]);
-  assert.equal(tileOrder(tiles, null), tiles);
+  assert.deepEqual(tileOrder(tiles, null), tiles);
 });
 
 test('bounds come from boxes first, then from samples', async () => {
@@ -115,4 +115,26 @@ test('bounds come from boxes first, then from samples', async () => {
 test('weighted quantiles', () => {
   const at = (share) => weightedQuantile(Float64Array.of(3, 1, 2), Float32Array.of(1, 1, 2), share);
   assert.deepEqual([0, 0.25, 0.5, 0.75, 1].map(at), [1, 1, 2, 2, 3]);
+});
+
+test('of a file with levels, coarser ones come first, and bands of level 0 alone', async () => {
+  const source = bytes('valid/levels_of_the_rich_scene');
+  const levels = new Map(
+    [...readHeader(source).tiles, ...readHeader(source).coarseTiles].map((one) => [one.index, one.level]),
+  );
+  const events = await loaded(new Blob([source]));
+  const geometry = events.filter(({ type }) => type === 'geometry');
+  const order = geometry.map(({ tile }) => levels.get(tile));
+  assert.ok(new Set(order).size > 1);
+  assert.deepEqual(
+    order,
+    [...order].sort((a, b) => b - a),
+  );
+  assert.equal(geometry.length, levels.size);
+  for (const { tile, texels, cull, samples } of geometry) {
+    assert.equal(cull.index, tile);
+    assert.equal(cull.count, texels.count);
+    assert.equal(samples.weights.length > 0, levels.get(tile) === 0);
+  }
+  for (const { tile } of events.filter(({ type }) => type === 'band')) assert.equal(levels.get(tile), 0);
 });
