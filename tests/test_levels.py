@@ -21,14 +21,19 @@ from csplat.decoder.container import SceneHeader
 from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
 from csplat.encoder.levels import LevelNode, encode_levels
+from csplat.scene_source import join_blocks
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders import all_inputs
 from csplat_conformance.encoders.file_checks import SplatPairs
 from csplat_conformance.encoders.render_checks import check_renders
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.validator import validate
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import virtual_cameras
+from csplat_tools import level_builder
 from csplat_tools.cli.app import app
 from csplat_tools.level_builder import build_levels, encode_with_levels, kd_groups, measure_errors, merge_neighbours
+from csplat_tools.level_fitting import LevelFitter
 
 TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
 RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
@@ -369,6 +374,54 @@ def test_a_built_tree_has_a_quarter_of_the_splats_on_each_level_and_growing_erro
         assert errors[-1] == max(errors) > 0.0
         assert len(file.read(tiles=file.cut(level=255))) <= 30
     assert errors == measure_errors(result.data)
+
+
+def test_fitted_levels_look_better_than_merged_ones(model, monkeypatch):
+    cameras = virtual_cameras(model, 3, 96, 72)
+    scorer = Scorer.of_source(model, cameras)
+    scores = []
+    for splats in (level_builder.FITTED_SPLATS, 0):
+        monkeypatch.setattr(level_builder, "FITTED_SPLATS", splats)
+        parts = [one.splats for one in build_levels(model, 400, 400) if one.level == 1]
+        scores.append(scorer.psnr(join_blocks(parts[0], parts)))
+    assert scores[0] > scores[1] + 3.0
+
+
+def test_levels_are_the_same_each_time(model):
+    one, other = (build_levels(model, 400, 100) for _ in range(2))
+    assert len(one) == len(other)
+    for first, second in zip(one, other, strict=True):
+        assert first.level == second.level
+        assert first.parent == second.parent
+        assert first.splats is None or same(first.splats, second.splats)
+
+
+def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(model):
+    """Behind a wall of opaque splats, no camera sees the others."""
+    rng = np.random.default_rng(0)
+    hidden = model.select(np.arange(200))
+    hidden = replace(
+        hidden,
+        means=rng.uniform(-0.05, 0.05, (200, 3)).astype(np.float32),
+        scales=np.full((200, 3), -7.0, np.float32),
+        opacities=rng.uniform(0.1, 1.0, 200).astype(np.float32),
+    )
+    wall = model.select(np.arange(600))
+    sides = rng.normal(size=(600, 3))
+    wall = replace(
+        wall,
+        means=(sides / np.linalg.norm(sides, axis=1, keepdims=True)).astype(np.float32),
+        scales=np.full((600, 3), -1.0, np.float32),
+        opacities=np.ones(600, np.float32),
+    )
+    scene = replace(join_blocks(wall, [wall, hidden]), means_double=None)
+    nodes = np.repeat([0, 1, 2], [600, 199, 1])
+    rows, splats = LevelFitter(scene).fit(scene, nodes, 200, 1)
+    assert len(rows) == len(splats) <= 202
+    assert {0, 1, 2} == set(nodes[rows])
+    kept = rows[(rows >= 600) & (rows < 799)]
+    assert 25 <= len(kept) <= 75
+    assert scene.opacities[kept].min() >= np.sort(scene.opacities[600:])[-76]
 
 
 def test_a_node_that_is_its_splats_has_the_smallest_error(model):

@@ -205,6 +205,20 @@ def test_unseen_splats_are_not_refitted(source):
         assert (getattr(source, name)[seen] != getattr(adjusted, name)[seen]).mean() > 0.9
 
 
+def test_centres_move_back_if_a_refit_moves_them(source):
+    cameras = camera_sequence(source, 12, (96, 72))
+    wanted = render_all(source, cameras)
+    sizes = np.exp(source.scales.mean(axis=1, keepdims=True))
+    shifted = replace(source, means=source.means + 0.3 * sizes, means_double=None)
+    fixed, moved = (refit_splats(shifted, cameras, wanted, steps=120, moves=moves) for moves in (False, True))
+    np.testing.assert_array_equal(shifted.means, fixed.means)
+    errors = [
+        np.mean([(a - b) ** 2 for a, b in zip(render_all(one, cameras), wanted, strict=True)]) for one in (fixed, moved)
+    ]
+    assert errors[1] < 0.7 * errors[0]
+    assert (np.abs(moved.means - shifted.means) <= 30 * sizes).all()
+
+
 def test_alphas_of_a_refit_stay_within_0_and_1(source):
     cameras = camera_sequence(source, 4, (48, 36))
     wanted = render_all(source, cameras)

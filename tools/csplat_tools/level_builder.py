@@ -1,10 +1,12 @@
-"""Build the levels of detail of a scene: merge neighbours by their moments, and measure the errors with the renderer.
+"""Build the levels of detail of a scene, and measure their errors with the renderer.
 
 Levels that a scene has already, in streamed SOG, are taken instead.
 
-Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent, in which four neighbouring
-splats become one; above the last common parent, a chain of nodes goes on to a few thousand splats. `error` of each node
-is measured as specified (spec E.5), on the decoded splats of the finished file.
+Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent; above the last common one,
+a chain of nodes goes on to a few thousand splats. Each level has a quarter of the splats of the finer one, those that
+matter most, fitted to renders of the scene (`level_fitting.py`). In larger scenes, four neighbouring splats are merged
+to one by their moments instead. `error` of each node is measured as specified (spec E.5), on the decoded splats of the
+finished file.
 """
 
 from __future__ import annotations
@@ -37,11 +39,15 @@ from csplat.splat_file import open as opened
 from csplat.types import F32, F64, I64, Progress, null_progress
 from csplat_render.camera import Camera, look_at
 from csplat_render.rasteriser import Rasteriser
+from csplat_tools.level_fitting import LevelFitter, areas
 
 #: Maximum number of splats of a leaf; smaller leaves take more bytes, larger ones load later when they are seen.
 LEAF_SPLATS = 1 << 14
 #: Maximum number of splats of a root: about 50 kB, the first picture of a scene.
 ROOT_SPLATS = 1 << 12
+
+#: Number of splats up to which levels are fitted.
+FITTED_SPLATS = 2_000_000
 
 _MERGED = 4  # splats that become one
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
@@ -81,7 +87,8 @@ def encode_with_levels(
     settings: dict[str, Any] = {"levels": "of the source"}
     if nodes is None:
         nodes = build_levels(model, leaf_splats, root_splats, progress) if len(model) else []
-        settings = {"levels": {"merged": _MERGED, "leaf_splats": leaf_splats, "root_splats": root_splats}}
+        how = "fitted" if len(model) <= FITTED_SPLATS else "merged"
+        settings = {"levels": {"splats": how, "leaf_splats": leaf_splats, "root_splats": root_splats}}
     encoded = encode_levels(EncodePlan.of(model, options, progress=progress), nodes, progress)
     if any(node.level for node in nodes):
         encoded = encoded.with_node_errors(measure_errors(encoded.write().data, progress))
@@ -148,24 +155,31 @@ def build_levels(
     """
     groups = kd_groups(model.means, math.ceil(len(model) / leaf_splats))
     plain = replace(model, extra={}, means_double=None)
-    parts = [plain.select(rows) for rows in groups]
     nodes = [LevelNode(0, None, rows=rows) for rows in groups]
-    below = list(range(len(nodes)))  # the nodes without a parent
-    splat_count, level = len(model), 0
+    node_count, splats, level = len(nodes), plain, 0
+    places = np.empty(len(model), np.int64)  # the node of each splat, counted per level
+    for place, rows in enumerate(groups):
+        places[rows] = place
     steps = max(1, math.ceil(math.log(len(model) / root_splats, _MERGED)))
-    while len(below) > 1 or splat_count > root_splats:
+    while node_count > 1 or len(splats) > root_splats:
         level += 1
-        merged: list[SplatModel] = []
         first = len(nodes)
-        for at in range(0, len(below), _CHILDREN):
-            children = below[at : at + _CHILDREN]
-            merged.append(merge_neighbours(join_blocks(plain, parts[at : at + _CHILDREN])))
-            for child in children:
-                nodes[child] = replace(nodes[child], parent=len(nodes))
-            nodes.append(LevelNode(level, None, splats=merged[-1]))
-        parts, below = merged, list(range(first, len(nodes)))
-        splat_count = sum(map(len, parts))
-        progress("merging", min(1.0, level / steps))
+        for child in range(node_count):
+            at = first - node_count + child
+            nodes[at] = replace(nodes[at], parent=first + child // _CHILDREN)
+        node_count = math.ceil(node_count / _CHILDREN)
+        places //= _CHILDREN
+        if len(model) <= FITTED_SPLATS:
+            count = max(node_count, math.ceil(len(splats) / _MERGED))
+            kept, splats = LevelFitter(plain, progress).fit(splats, places, count, level)
+            places = places[kept]
+        else:
+            merged = [merge_neighbours(splats.select(np.flatnonzero(places == place))) for place in range(node_count)]
+            splats = join_blocks(plain, merged)
+            places = np.repeat(np.arange(node_count), [len(part) for part in merged])
+        parts = (splats.select(np.flatnonzero(places == place)) for place in range(node_count))
+        nodes += [LevelNode(level, None, splats=part) for part in parts]
+        progress("building levels", min(1.0, level / steps))
     return nodes
 
 
@@ -208,7 +222,7 @@ def merge_neighbours(splats: SplatModel) -> SplatModel:
     starts = np.cumsum([0, *(len(rows) for rows in groups[:-1])])
     group = np.repeat(np.arange(len(groups)), [len(rows) for rows in groups])
     chosen = splats.select(order)
-    light = chosen.opacities * _areas(chosen.scales)
+    light = chosen.opacities * areas(chosen.scales)
     weights = np.maximum(light, np.finfo(np.float64).tiny)
     weights = weights / np.add.reduceat(weights, starts)[group]
 
@@ -225,7 +239,7 @@ def merge_neighbours(splats: SplatModel) -> SplatModel:
     trace = np.maximum(covariances[:3].sum(axis=0), np.finfo(np.float64).tiny)
     quats, scales = mean_axes(covariances / trace)
     scales = (scales + 0.5 * np.log(trace)[:, None]).astype(np.float32)
-    opacities = np.add.reduceat(light, starts) / _areas(scales)
+    opacities = np.add.reduceat(light, starts) / areas(scales)
     return replace(
         chosen.select(slice(0, len(groups))),
         means=means.astype(np.float32),
@@ -237,12 +251,6 @@ def merge_neighbours(splats: SplatModel) -> SplatModel:
         extra={},
         means_double=None,
     )
-
-
-def _areas(scales: F32) -> F64:
-    """Return the areas of the projections of ellipsoids, averaged over directions, up to a factor (Knud Thomsen)."""
-    a, b, c = np.exp(scales.astype(np.float64)).T
-    return np.asarray((a * b + a * c + b * c) / 3.0)
 
 
 def measure_errors(data: bytes, progress: Progress = null_progress) -> list[float]:

@@ -3,8 +3,8 @@
 Colours, opacities, scales and rotations are fitted together, one small view per step, so that neighbours of pruned
 splats cover for them, and other values compensate for quantisation. The step length is proportional to the error. Least
 squares over all views at once (linear for colours alone) overfit the training views; descent does not, and after three
-passes over the views gains the same on held-out views. Centres are fixed, since otherwise scenes with few views get
-worse.
+passes over the views gains the same on held-out views. Centres are fixed unless asked for, since scenes with few views
+get worse if they move.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from csplat_trainer.parameters import Parameters, adam_step, from_model
 from csplat_trainer.tuned_scene import TunedScene
 
 #: Learning rates of the first steps per unit of the root mean square error, which is limited to `_LARGEST_ERROR`.
-_RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04}
+_RATES = {"logits": 1.95, "scales": 0.39, "quats": 0.023, "sh0": 0.1, "shN": 0.04, "offsets": 0.39}
 _SH_FACTOR = 2.0  # factor of the step length for scenes without SH; not used through quantisers
 _LARGEST_ERROR = 0.04  # root mean square error, 0 to 1, above which steps do not get longer
 _BETA2 = 0.98  # Adam's decay rate of squared gradients; errors fall too fast for a longer memory
@@ -37,6 +37,7 @@ _LAST_RATE = 0.02  # fraction of the learning rates in the last steps
 _RATE_EXPONENT = 0.07 * 10.0 / math.log(10.0)  # k of bytes ∝ error^-k, for 7 % of the bytes per dB after a refit
 _LEAST_QUANTISED = 0.1  # least fraction of a file's error that is attributed to quantisation
 _CENTRE_BITS = 24.0  # typical bits of a splat's centre, which is fixed
+_SIZE_LIMIT = 60.0  # of logarithms of sizes
 _SAMPLE = 8  # every Nth view is rendered to measure the error
 
 
@@ -47,6 +48,7 @@ def refit_splats(
     *,
     steps: int,
     background: ArrayLike = (0.0, 0.0, 0.0),
+    moves: bool = False,
     seed: int = 0,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -59,6 +61,7 @@ def refit_splats(
         references: [H, W, 3], the reference image of each view.
         steps: number of steps, one view each.
         background: red, green, blue behind the splats.
+        moves: fit the centres instead of `shN`, whose values codebooks then still have; `means_double` is dropped.
         seed: seed of the order of the views.
         threads: number of threads; `None` for all. The result does not depend on it.
         progress: progress callback.
@@ -67,7 +70,7 @@ def refit_splats(
         The scene; splats that no view shows are unchanged.
     """
     views = _TrainingViews(cameras, references, background, model.antialiased, threads)
-    refit = _FloatRefit(views, steps, seed, progress, model)
+    refit = _FloatRefit(views, steps, seed, progress, model, moves=moves)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
     refit.run(factor * _step_length(views.rms(refit.splats())))
     return refit.applied_to(model)
@@ -182,23 +185,38 @@ class _FloatRefit(_Refit):
     """A refit of values without quantisation."""
 
     def __init__(
-        self, views: _TrainingViews, steps: int, seed: int, progress: Progress | None, model: SplatModel
+        self,
+        views: _TrainingViews,
+        steps: int,
+        seed: int,
+        progress: Progress | None,
+        model: SplatModel,
+        *,
+        moves: bool,
     ) -> None:
         super().__init__(views, steps, seed, progress)
-        self._means = model.means
-        self._parameters = Parameters.starting_at(_values_to_fit(model))
+        self._start, self._moves = model.means, moves
+        values = _values_to_fit(model)
+        if moves:  # in units of the size of each splat
+            values["offsets"] = np.zeros_like(model.means)
+            self._sizes = np.exp(np.clip(model.scales.mean(axis=1, keepdims=True), -_SIZE_LIMIT, _SIZE_LIMIT))
+        self._parameters = Parameters.starting_at(values)
         self._parameters.beta2 = _BETA2
 
     def splats(self) -> UncheckedSplats:
         """Return the splats to render."""
         v = self._parameters.values
-        return UncheckedSplats(self._means, v["quats"], v["scales"], self._parameters.alphas, v["sh0"], v["shN"])
+        means = self._start + self._sizes * v["offsets"] if self._moves else self._start
+        return UncheckedSplats(means, v["quats"], v["scales"], self._parameters.alphas, v["sh0"], v["shN"])
 
     def _move(self, view: int, rates: dict[str, float]) -> float:
         splats = self.splats()
         error, gradients = self._views.gradients(splats, view)
         slopes: dict[str, Any] = {name: getattr(gradients, name) for name in ("quats", "scales", "sh0", "shN")}
         slopes["logits"] = gradients.opacities * splats.opacities * (np.float32(1.0) - splats.opacities)
+        if self._moves:
+            slopes["offsets"] = gradients.means * self._sizes
+            rates = {**rates, "shN": 0.0}
         adam_step(self._parameters, slopes, rates)
         return error
 
@@ -212,9 +230,13 @@ class _FloatRefit(_Refit):
         moved = np.zeros(len(before), bool)
         for name in ("logits", "scales", "sh0", "shN"):
             moved |= (values[name] != start[name]).reshape(len(before), -1).any(axis=1)
+        means = self.splats().means
+        moved &= np.isfinite(means).all(axis=1)
         for array in values.values():
             moved &= np.isfinite(array).reshape(len(before), -1).all(axis=1)
         rows = moved[:, None]
+        if self._moves:
+            before = replace(before, means=np.where(rows, means, before.means), means_double=None)
         return replace(
             before,
             opacities=np.where(moved, alphas, before.opacities),

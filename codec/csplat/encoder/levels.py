@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.encoder.coding_parameters import SAME_STEPS, StepFactors
 from csplat.encoder.container import FileNode, order_nodes
 from csplat.encoder.encode_plan import EncodePlan, clip_scales
 from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tile, encode_tiles
@@ -18,6 +19,9 @@ from csplat.model import SplatModel, check_model
 from csplat.types import Progress, null_progress
 
 Rows = NDArray[np.intp]
+
+#: Steps of levels above 1, whose splats differ from the scene by far more than this.
+_COARSE_STEPS = StepFactors(opacities=2, scales=1, quats=2, sh0=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +71,7 @@ def encode_levels(plan: EncodePlan, nodes: Sequence[LevelNode], progress: Progre
     made = {number: [next(parts) for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
     for done, (number, node) in enumerate((at, node) for at, node in enumerate(nodes) if node.splats is not None):
         assert node.splats is not None
-        made[number] = _encode_coarse(node.splats, plan, codebooks)
+        made[number] = _encode_coarse(node.splats, node.level, plan, codebooks)
         progress("levels", (done + 1) / (len(nodes) - len(leaves)))
     tree = [
         FileNode(node.parent, [replace(part.tile, level=node.level) for part in made[number]], node.error)
@@ -85,11 +89,15 @@ def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
             raise InputError(f"the parent of a node of level {node.level} has level {nodes[node.parent].level}")
 
 
-def _encode_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> list[EncodedTile]:
-    """Encode the splats of a coarser node with the steps and SH codebooks of the scene."""
+def _encode_coarse(splats: SplatModel, level: int, plan: EncodePlan, codebooks: FileCodebooks) -> list[EncodedTile]:
+    """Encode the splats of a coarser node with the SH codebooks of the scene, and with coarser steps."""
     check_model("the encoder", splats)
     splats = clip_scales(splats)
-    tiles = cut_scene(splats, plan.parameters, None, [np.arange(len(splats))])
+    factors = SAME_STEPS if level == 1 else _COARSE_STEPS
+    tiles = [
+        replace(tile, exponent=tile.exponent + level, factors=factors)
+        for tile in cut_scene(splats, plan.parameters, None, [np.arange(len(splats))])
+    ]
     sh_plan = _assign_coarse(splats, plan, codebooks)
     return [encode_tile(splats, tile, plan.parameters, sh_plan) for tile in tiles]
 

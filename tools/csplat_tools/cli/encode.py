@@ -64,7 +64,10 @@ def encode(
     ] = None,
     source_index: shared.SourceIndexOutput = None,
     levels: Annotated[
-        bool, typer.Option("--levels", hidden=True, help="Add levels of detail for viewers, a third more splats.")
+        bool,
+        typer.Option(
+            "--levels", hidden=True, help="Add levels of detail for viewers: a third more splats, and minutes of work."
+        ),
     ] = False,
     memory: shared.HiddenMemory = None,
     resume: Annotated[bool, typer.Option("--resume", hidden=True, help="Go on from OUT.csplat.work.")] = False,

@@ -19,6 +19,7 @@ from csplat_bench.subjects.files import measure_files
 from csplat_bench.subjects.first_bytes import measure_first_bytes
 from csplat_bench.subjects.gpu_rendering import measure_gpu
 from csplat_bench.subjects.large_scenes import measure_commands
+from csplat_bench.subjects.level_quality import measure_levels
 from csplat_bench.subjects.photographs import measure_photographs
 from csplat_bench.subjects.rendering import measure_rendering
 from csplat_bench.subjects.training_steps import measure_training
@@ -39,6 +40,7 @@ SUBJECTS: dict[str, Subject] = {
     "first_bytes": measure_first_bytes,
     "gpu_rendering": measure_gpu,
     "large_scenes": measure_commands,
+    "level_quality": measure_levels,
     "photographs": measure_photographs,
     "rendering": measure_rendering,
     "training_steps": measure_training,

@@ -1,0 +1,103 @@
+"""How levels of detail look: level k against the scene, at 1/2^k and 1/2^(k - 1) of the size of its cameras.
+
+A case is a `level`, from 1, and its `maker`: `fitted` or `merged`, as `csplat encode --levels` builds small and large
+scenes; `decimate` or `decimate-adaptive` of splat-transform, at the same number of splats. Seconds are those of all
+levels for csplat, of this one for splat-transform. Splats are not quantised. PSNR is pooled over eight cameras.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from csplat.decoder import decode
+from csplat.model import SplatModel
+from csplat.ply import read_ply, write_ply
+from csplat.scene_source import join_blocks
+from csplat_bench.measuring import run_program
+from csplat_bench.peers import CAP_SECONDS, find_splat_transform
+from csplat_bench.protocol import AbsentError, Measure, Setup
+from csplat_bench.scenes import find_scene
+from csplat_bench.suites import Case
+from csplat_render import Camera
+from csplat_render.camera import resized
+from csplat_render.metrics import psnr_of_mse, ssim
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.virtual_cameras import virtual_cameras
+from csplat_tools import level_builder
+
+_CAMERAS = 8
+_SHARE = 0.25  # of the splats of the finer level
+
+
+@contextmanager
+def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
+    """Yield the function that measures a level."""
+    model, cameras = _scene(setup, name)
+    source = setup.work / f"{name}-levels.ply"
+    write_ply(source, model)
+    rasteriser = Rasteriser(gradients=False)
+
+    def render(splats: SplatModel, camera: Camera) -> np.ndarray:
+        return rasteriser.forward(splats, camera, antialiased=splats.antialiased).rgb.clip(0.0, 1.0)
+
+    @cache
+    def build(maker: str) -> tuple[dict[int, SplatModel], float]:
+        usual, start = level_builder.FITTED_SPLATS, time.perf_counter()
+        level_builder.FITTED_SPLATS = len(model) if maker == "fitted" else 0
+        try:
+            nodes = level_builder.build_levels(model)
+        finally:
+            level_builder.FITTED_SPLATS = usual
+        parts: dict[int, list[SplatModel]] = {}
+        for node in nodes:
+            if node.splats is not None:
+                parts.setdefault(node.level, []).append(node.splats)
+        levels = {level: join_blocks(some[0], some) for level, some in parts.items()}
+        return levels, time.perf_counter() - start
+
+    def measure(case: Case) -> Mapping[str, Any]:
+        maker, level = case["maker"], case["level"]
+        if maker in ("fitted", "merged"):
+            levels, seconds = build(maker)
+            if level not in levels:
+                raise AbsentError(f"{name} has {len(levels)} coarser levels")
+            coarse = levels[level]
+        else:
+            coarse, seconds = _decimated(setup, source, maker, round(len(model) * _SHARE**level))
+        scores: dict[str, float] = {}
+        for suffix, factor in (("", 0.5**level), ("_finer", 0.5 ** (level - 1))):
+            views = [resized(one, max(1, round(one.W * factor)), max(1, round(one.H * factor))) for one in cameras]
+            pairs = [(render(model, view), render(coarse, view)) for view in views]
+            errors = [np.mean((a - b) ** 2, dtype=np.float64) for a, b in pairs]
+            scores[f"psnr{suffix}"] = psnr_of_mse(float(np.mean(errors)))
+            scores[f"ssim{suffix}"] = float(np.mean([ssim(a, b) for a, b in pairs]))
+        return {"splats": len(model), "level_splats": len(coarse), "seconds": seconds, **scores}
+
+    yield measure
+
+
+def _scene(setup: Setup, name: str) -> tuple[SplatModel, list[Camera]]:
+    """Return a PLY or `.csplat` scene, and its cameras: those of the data folder, else virtual ones."""
+    coded = setup.data / "splats" / f"{name}.csplat"
+    if coded.exists():
+        model = decode(coded)
+        return model, list(virtual_cameras(model, _CAMERAS))
+    scene = find_scene(name, setup.data, setup.work)
+    model = read_ply(scene.path)
+    every = max(1, len(scene.cameras) // _CAMERAS)
+    return model, list(scene.cameras[::every][:_CAMERAS] or virtual_cameras(model, _CAMERAS))
+
+
+def _decimated(setup: Setup, source: Path, option: str, count: int) -> tuple[SplatModel, float]:
+    output = setup.work / f"{source.stem}-{option}-{count}.ply"
+    start = time.perf_counter()
+    words = [*find_splat_transform(setup.peers), "-g", "cpu", "-q", "-w", source, f"--{option}", count, output]
+    run_program([str(word) for word in words], CAP_SECONDS)
+    return read_ply(output), time.perf_counter() - start
