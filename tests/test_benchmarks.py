@@ -602,6 +602,18 @@ def test_the_renderer_is_measured(sample_path, tmp_path):
     assert 30.0 < fast["psnr"] < 60.0
 
 
+def test_levels_are_compared_at_their_size(sample_path, tmp_path):
+    setup = Setup(work=tmp_path, peers=tmp_path, data=tmp_path, csplat=[])
+    with SUBJECTS["level_quality"](setup, str(sample_path), []) as measure:
+        fitted, merged = (measure({"maker": maker, "level": 1}) for maker in ("fitted", "merged"))
+        with pytest.raises(AbsentError, match="coarser levels"):
+            measure({"maker": "merged", "level": 9})
+    assert fitted["level_splats"] == pytest.approx(fitted["splats"] / 4, rel=0.01)
+    assert fitted["psnr"] > merged["psnr"] + 3.0
+    assert fitted["ssim"] > merged["ssim"]
+    assert fitted["seconds"] > merged["seconds"] > 0.0
+
+
 def test_training_steps_are_measured(tmp_path):
     write_blender(tmp_path / "images" / "dots")
     (row,) = measure_once(tmp_path, "training", "200:40x40", [], data_set="dots", warm=2, steps=5)

@@ -40,7 +40,7 @@ _SHARE = 0.25  # of the splats of the finer level
 def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that measures a level."""
     model, cameras = _scene(setup, name)
-    source = setup.work / f"{name}-levels.ply"
+    source = setup.work / f"{Path(name).stem}-levels.ply"
     write_ply(source, model)
     rasteriser = Rasteriser(gradients=False)
 
