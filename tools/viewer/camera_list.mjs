@@ -166,7 +166,7 @@ export class CameraList {
    * @returns {boolean} whether it was moved
    */
   place(bounds, splatCount, atOnce) {
-    if (!this.waits || (bounds.coarse && this.bounds)) return false;
+    if (!this.waits || bounds === this.bounds) return false;
     this.bounds = bounds;
     this.waits = bounds.coarse;
     const pose = this.#firstPose(bounds, splatCount);

@@ -21,9 +21,10 @@ import { layoutSlots, packBand, packGeometry, packRows } from './texels.mjs';
  * Receives the parts of a file.
  *
  * @typedef {object} Sink
- * @property {(header: Header, description: any, nodes: import('./types.d.ts').TreeNode[]) => void} header nodes of the
- *   levels of detail; none if the file has no levels
- * @property {(tile: number, texels: GeometryTexels, cull: CullTile, samples: Samples) => void} geometry samples of level 0
+ * @property {(header: Header, description: any, nodes: import('./types.d.ts').TreeNode[], roots: number) => void} header
+ *   nodes of the levels of detail, none if the file has no levels; number of tiles of the coarsest version
+ * @property {(tile: number, texels: GeometryTexels, cull: CullTile, samples: Samples) => void} geometry samples of level 0,
+ *   and of the coarsest version, which comes first
  * @property {(codebook: number, layer: number, rows: Rows) => void} table
  * @property {(tile: number, layer: number, band: BandTexels) => void} band
  * @property {(progress: {phase: 'open' | 'layers', received: number, fileSize: number, splatsDone: number,
@@ -60,7 +61,8 @@ export async function load(source, sink, signal) {
   Object.assign(state, { fileSize: header.fileSize, splatCount: header.splatCount });
   const isLocal = typeof source !== 'string'; // the decoder then reports no received bytes
   if (isLocal) state.received = header.indexSize;
-  sink.header(header, description, nodes);
+  const roots = new Set(coarsestTiles(header, nodes));
+  sink.header(header, description, nodes, roots.size);
   tell(0);
   const order = tileOrder(header.tiles, sink.view());
   const coarse = tileOrder(header.coarseTiles, sink.view()).sort((a, b) => b.level - a.level);
@@ -70,7 +72,7 @@ export async function load(source, sink, signal) {
     const wanted = layer === 0 ? [...coarse, ...order] : order;
     for await (const tile of fetched(reader, wanted, layer, signal)) {
       const begun = performance.now() - reader.waitedMs;
-      if (layer === 0) await readGeometry(reader, tile, starts[tile.index], sink, signal);
+      if (layer === 0) await readGeometry(reader, tile, starts[tile.index], roots.has(tile), sink, signal);
       else await readBand(reader, tile, layer, tables, sink, signal);
       state.decodeMs += performance.now() - reader.waitedMs - begun;
       if (layer === 0 && tile.level === 0) state.splatsDone += tile.splatCount;
@@ -142,18 +144,19 @@ async function* fetched(reader, order, layer, signal) {
  * @param {CsplatReader} reader
  * @param {TileRecord} tile
  * @param {number} slot slot of its first splat
+ * @param {boolean} isRoot whether it is of the coarsest version
  * @param {Sink} sink
  * @param {AbortSignal} signal
  */
-async function readGeometry(reader, tile, slot, sink, signal) {
+async function readGeometry(reader, tile, slot, isRoot, sink, signal) {
   const { index } = tile;
   /** @type {PackedGeometry} */
   const packed = await reader.readLayer(index, 0, { form: 'packed', signal });
   const [opacities, , quats] = reader.header.attributes;
   const texels = packGeometry(packed, opacities, quats);
-  const stride = Math.max(1, Math.floor(reader.header.splatCount / SAMPLE_COUNT));
+  const stride = isRoot ? 1 : Math.max(1, Math.floor(reader.header.splatCount / SAMPLE_COUNT));
   const alphas = alphasOf(packed, opacities);
-  const samples = tile.level === 0 ? samplesOf(packed, alphas, stride) : noSamples();
+  const samples = isRoot || tile.level === 0 ? samplesOf(packed, alphas, stride) : noSamples();
   sink.geometry(index, texels, cullTile(packed, alphas, tile, slot), samples);
 }
 
@@ -194,6 +197,18 @@ function cullTile(packed, alphas, { index, extent, maxScale }, slot) {
   }
   const reach = 4 * Math.exp(maxScale); // 4 exceeds REACH_MAX plus the rounding of the classes
   return { index, count, slot, means: means.columns, corner: means.offsets, step: means.step, extent, reach, reaches };
+}
+
+/**
+ * Return the tiles of the coarsest version of a scene with levels of detail.
+ *
+ * @param {Header} header
+ * @param {import('./types.d.ts').TreeNode[]} nodes
+ */
+function coarsestTiles(header, nodes) {
+  const tiles = allTiles(header);
+  const roots = nodes.filter(({ parent }) => parent === null);
+  return roots.flatMap(({ firstTile, tileCount }) => tiles.slice(firstTile, firstTile + tileCount));
 }
 
 /** @returns {Samples} */

@@ -43,10 +43,11 @@ export class SceneLoad {
     this.tilesHere = 0;
     /** The last sort: its camera, the number of tiles of level 0 that were here, and whether it covers the scene. */
     this.order = { id: 0, tiles: 0, isWhole: false };
-    /** @type {number[]} samples of splats */
-    this.points = [];
-    /** @type {number[]} */
-    this.weights = [];
+    /** Number of tiles of the coarsest version that have not arrived. */
+    this.rootsMissing = 0;
+    /** Samples of splats of level 0, and of the coarsest version. */
+    this.samples = { points: /** @type {number[]} */ ([]), weights: /** @type {number[]} */ ([]) };
+    this.rootSamples = { points: /** @type {number[]} */ ([]), weights: /** @type {number[]} */ ([]) };
   }
 
   /** Whether layer 0 of all tiles of level 0 has arrived. */
@@ -100,7 +101,7 @@ export class SceneLoad {
    * @param {Reply & {type: 'header'}} reply
    * @param {Renderer} renderer
    */
-  #takeHeader({ header, description }, renderer) {
+  #takeHeader({ header, description, roots }, renderer) {
     const { splatCount, fileSize, shDegree, tiles } = header;
     const [opacities, , quats] = header.attributes;
     try {
@@ -117,7 +118,8 @@ export class SceneLoad {
       throw error;
     }
     this.header = header;
-    this.bounds = tiles.length ? coarseBounds(header) : this.#boundsOfSamples(header);
+    this.rootsMissing = roots;
+    this.bounds = tiles.length ? coarseBounds(header) : this.#boundsOf(header, this.samples);
     Object.assign(this.stats, { splatCount, fileSize, expandedBytesPerSplat: expandedBytes(shDegree) });
     this.hooks.onHeader?.(header, description);
   }
@@ -139,9 +141,15 @@ export class SceneLoad {
       this.stats.splatsResident += texels.count;
       this.tilesHere++;
     }
-    for (const value of samples.points) this.points.push(value);
-    for (const weight of samples.weights) this.weights.push(weight);
-    if (this.header && this.isWhole) this.bounds = this.#boundsOfSamples(this.header);
+    if (!this.header) return;
+    const isCoarse = tile >= this.header.tiles.length;
+    const { points, weights } = isCoarse ? this.rootSamples : this.samples;
+    for (const value of samples.points) points.push(value);
+    for (const weight of samples.weights) weights.push(weight);
+    if (!isCoarse && this.isWhole) this.bounds = this.#boundsOf(this.header, this.samples);
+    else if (isCoarse && samples.weights.length > 0 && --this.rootsMissing === 0) {
+      this.bounds = { ...this.#boundsOf(this.header, this.rootSamples), coarse: true };
+    }
   }
 
   /**
@@ -154,8 +162,11 @@ export class SceneLoad {
     Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });
   }
 
-  /** @param {Header} header */
-  #boundsOfSamples(header) {
-    return fineBounds(header, Float32Array.from(this.points), Float32Array.from(this.weights));
+  /**
+   * @param {Header} header
+   * @param {{points: number[], weights: number[]}} samples
+   */
+  #boundsOf(header, { points, weights }) {
+    return fineBounds(header, Float32Array.from(points), Float32Array.from(weights));
   }
 }

@@ -26,7 +26,8 @@ import { DepthSorter } from './sort.mjs';
  * Messages of the worker; all carry `scene`.
  *
  * @typedef {{scene: number} & (
- *   | {type: 'header', header: import('./types.d.ts').Header, description: import('./types.d.ts').Description}
+ *   | {type: 'header', header: import('./types.d.ts').Header, description: import('./types.d.ts').Description,
+ *      roots: number}
  *   | {type: 'cut', tiles: Uint32Array<ArrayBuffer>}
  *   | {type: 'progress', progress: import('./types.d.ts').Progress, decodeMs: number}
  *   | {type: 'geometry', tile: number, texels: import('./texels.mjs').GeometryTexels, samples: import('./loader.mjs').Samples}
@@ -146,10 +147,10 @@ class Job {
    */
   sink(post) {
     return {
-      header: (header, description, nodes) => {
+      header: (header, description, nodes, roots) => {
         this.header = header;
         this.nodes = nodes;
-        post({ type: 'header', header, description });
+        post({ type: 'header', header, description, roots });
         if (nodes.length > 0 && !this.sorts) post({ type: 'cut', tiles: new Uint32Array(0) });
         this.choose();
       },
