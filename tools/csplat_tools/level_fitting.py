@@ -19,7 +19,7 @@ from csplat_tools.views import HELD_OUT_COUNT, camera_sequence
 from csplat_trainer.pruning import MeasuredViews, PruningOrder, total_error
 from csplat_trainer.splat_refit import refit_splats
 
-_PIXELS_PER_SPLAT = 8.0  # of a view of level 1, per splat; views of each coarser level are half as wide
+_PIXELS_PER_SPLAT = 8.0  # pixels of a view per splat of level 1; views of each coarser level are half as wide
 _WIDTHS = (128, 640)  # pixels, the smallest and largest views of level 1
 _LEAST_WIDTH = 64
 _VIEWS = (40, 120)

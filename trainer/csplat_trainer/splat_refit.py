@@ -37,7 +37,7 @@ _LAST_RATE = 0.02  # fraction of the learning rates in the last steps
 _RATE_EXPONENT = 0.07 * 10.0 / math.log(10.0)  # k of bytes ∝ error^-k, for 7 % of the bytes per dB after a refit
 _LEAST_QUANTISED = 0.1  # least fraction of a file's error that is attributed to quantisation
 _CENTRE_BITS = 24.0  # typical bits of a splat's centre, which is fixed
-_SIZE_LIMIT = 60.0  # of logarithms of sizes
+_SIZE_LIMIT = 60.0  # largest logarithm of a size, so that exponentials stay finite
 _SAMPLE = 8  # every Nth view is rendered to measure the error
 
 

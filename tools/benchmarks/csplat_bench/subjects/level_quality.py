@@ -1,4 +1,4 @@
-"""How levels of detail look: level k against the scene, at 1/2^k and 1/2^(k - 1) of the size of its cameras.
+"""Levels of detail next to the scene: level k at 1/2^k and 1/2^(k - 1) of the size of its cameras.
 
 A case is a `level`, from 1, and its `maker`: `fitted` or `merged`, as `csplat encode --levels` builds small and large
 scenes; `decimate` or `decimate-adaptive` of splat-transform, at the same number of splats. Seconds are those of all
@@ -33,7 +33,7 @@ from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools import level_builder
 
 _CAMERAS = 8
-_SHARE = 0.25  # of the splats of the finer level
+_SHARE = 0.25  # splats of a level, as a share of the finer one
 
 
 @contextmanager
