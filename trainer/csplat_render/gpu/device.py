@@ -35,7 +35,7 @@ _PASSES = {
 }
 
 _HARDWARE = ("DiscreteGPU", "IntegratedGPU", "VirtualGPU")
-_KINDS = (*_HARDWARE, "CPU", "Unknown")  # in the order of preference
+_KINDS = (*_HARDWARE, "CPU", "Unknown")  # the preferred ones first
 
 
 @dataclass(frozen=True)

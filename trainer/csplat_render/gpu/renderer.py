@@ -328,7 +328,7 @@ class GpuRenderer:
                 pairs, steps = pairs + int(counters["pairs"]), steps + 1
                 if int(counters["first_block"]) * BLOCK >= found:
                     break
-                self._pairs_wanted = min(2 * self._pairs, self._pairs_max)  # for the next image
+                self._pairs_wanted = min(2 * self._pairs, self._pairs_max)  # the next image gets larger buffers
                 stages = self._step
             visible += found
         return visible, pairs, steps
