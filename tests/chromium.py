@@ -320,6 +320,7 @@ class Site:
         requests: all that came, in order.
         ranges: False for a server that ignores Range and answers 200 with everything.
         bytes_per_second: speed of each answer to a path that a test added; 0 for no limit.
+        breaks: True for connections that break in the middle of a later part of such a path.
         policy: the Content-Security-Policy of all answers, if any.
     """
 
@@ -327,6 +328,7 @@ class Site:
         self.requests: list[Request] = []
         self.ranges = True
         self.bytes_per_second = 0
+        self.breaks = False
         self.policy = ""
         self._files: dict[str, bytes | Path] = {}
         self._web = web_files()  # from the package that is being tested, a checkout or a wheel
@@ -389,6 +391,8 @@ class Site:
         for name, value in {**headers, "Content-Length": str(len(body)), "Cache-Control": "no-store"}.items():
             handler.send_header(name, value)
         handler.end_headers()
+        if self.breaks and path in self._files and asked and not asked.startswith("bytes=0-"):
+            body, handler.close_connection = body[: len(body) // 2], True
         if handler.command == "GET":
             self._send(handler, body, slow=path in self._files)
 

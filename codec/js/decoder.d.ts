@@ -320,6 +320,8 @@ export interface ByteSource {
   prefetch?(ranges: ByteRange[], signal?: AbortSignal): void;
   /** Size of the file, if known. */
   size?: number | null;
+  /** Whether later bytes arrive later, since the whole file is on its way. */
+  readonly isSequential?: boolean;
 }
 
 export interface ReaderOptions {
@@ -407,6 +409,10 @@ export class CsplatReader {
   cut(options?: CutOptions): Promise<number[]>;
   /** Start to fetch layers that will be read soon; neighbours share a request. */
   prefetch(wanted: Iterable<LayerRequest>, options?: { signal?: AbortSignal }): void;
+  /** Forget what `readLayer` keeps of a tile for its other layers; they can still be read. */
+  forget(index: number): void;
+  /** Whether parts near the end of the file arrive later than others, since the server sends it from its beginning. */
+  readonly arrivesInOrder: boolean;
 }
 
 /** Codes of the spec, section 12. */

@@ -40,9 +40,11 @@ export class InputError extends CsplatError {
   /**
    * @param {string} detail
    * @param {unknown} [cause]
+   * @param {boolean} [isTransient] whether the same request may succeed later: the connection or the server failed
    */
-  constructor(detail, cause) {
+  constructor(detail, cause, isTransient = false) {
     super(ERROR_INPUT, detail, { cause });
+    this.isTransient = isTransient;
   }
 }
 

@@ -166,7 +166,7 @@ export class Reader {
       const read = await this.readLayer(record.index, band, { form: 'packed', signal });
       sh.push(read && read.sh);
     }
-    for (const place of record.layers) this.kept.delete(place);
+    this.forget(record.index);
     return { ...geometry, sh };
   }
 
@@ -367,6 +367,21 @@ export class Reader {
       }
     }
     this.source.prefetch?.([...places], signal);
+  }
+
+  /** Whether parts near the end of the file arrive later than others: the server sends it from its beginning. */
+  get arrivesInOrder() {
+    return this.source.isSequential ?? false;
+  }
+
+  /**
+   * Forget what reads of a tile have left for its other layers.
+   *
+   * @param {number} index
+   */
+  forget(index) {
+    for (const place of checkedTile(index, this.header).layers) this.kept.delete(place);
+    this.open.delete(index);
   }
 
   /**

@@ -5,6 +5,7 @@ import { BlobSource, MemorySource, WholeSource, asInputError, bodyParts, shortDa
 
 const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
 const REQUEST_BYTES = 1 << 23; // bytes; joined ranges do not exceed this
+const TRANSIENT = new Set([408, 429]); // HTTP statuses below 500 after which the same request may succeed
 
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
@@ -68,7 +69,8 @@ async function request(url, start, end, way, signal) {
   }
   if (response.status !== 200 && response.status !== 206 && response.status !== 416) {
     await response.body?.cancel();
-    throw new InputError(`${url}: HTTP status ${response.status}`);
+    const isTransient = TRANSIENT.has(response.status) || response.status >= 500;
+    throw new InputError(`${url}: HTTP status ${response.status}`, undefined, isTransient);
   }
   return response;
 }
@@ -127,6 +129,11 @@ export class HttpSource {
     this.whole = null;
   }
 
+  /** Whether later bytes arrive later: the server has sent the whole file. */
+  get isSequential() {
+    return this.whole !== null;
+  }
+
   /**
    * @param {number} offset
    * @param {number} size
@@ -164,7 +171,7 @@ export class HttpSource {
    * Start to fetch parts that will be read soon; neighbours share a request.
    *
    * @param {ByteRange[]} wanted
-   * @param {AbortSignal} [signal]
+   * @param {AbortSignal} [signal] cancels the requests, and drops what has arrived
    */
   prefetch(wanted, signal) {
     const missing = wanted
@@ -186,7 +193,9 @@ export class HttpSource {
     }
     for (const range of joined) {
       const entry = { ...range, bytes: this.fetch(range.start, range.end, signal) };
-      entry.bytes.catch(() => (this.fetched = this.fetched.filter((one) => one !== entry))); // allows another try
+      const drop = () => (this.fetched = this.fetched.filter((one) => one !== entry)); // allows another try
+      entry.bytes.catch(drop);
+      signal?.addEventListener('abort', drop, { once: true });
       this.fetched.push(entry);
     }
   }

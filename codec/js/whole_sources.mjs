@@ -26,7 +26,7 @@ export const shortData = (offset, size) =>
  */
 export function asInputError(error, url) {
   const isAbort = error instanceof Error && (error.name === 'AbortError' || error.name === 'TimeoutError');
-  return isAbort || error instanceof CsplatError ? error : new InputError(`${url}: ${error}`, error);
+  return isAbort || error instanceof CsplatError ? error : new InputError(`${url}: ${error}`, error, true);
 }
 
 /**
@@ -82,6 +82,8 @@ export class WholeSource {
   }
 
   constructor() {
+    /** Whether later bytes arrive later. */
+    this.isSequential = true;
     /** @type {Bytes} */
     this.bytes = new Uint8Array(0);
     this.filled = 0;

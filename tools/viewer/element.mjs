@@ -6,6 +6,7 @@
 import { E_CONTEXT } from './engine_error.mjs';
 import { explain } from './messages.mjs';
 import { nameOf, readWishes } from './page.mjs';
+import { loadedShare } from './statistics.mjs';
 import { SceneViewer } from './viewer.mjs';
 
 /**
@@ -226,7 +227,7 @@ export class CsplatView extends HTMLElement {
 
   /** @param {Progress} progress */
   #progressed(progress) {
-    const share = progress.fileSize > 0 ? Math.min(1, progress.received / progress.fileSize) : 0;
+    const share = loadedShare(progress);
     this.#bar.style.transform = `scaleX(${share})`;
     this.#progress.setAttribute('aria-valuenow', String(Math.round(100 * share)));
     this.#tell('progress', progress);

@@ -69,13 +69,23 @@ function startWorker({ workerFactory }) {
 /** Maximum number of splats that are drawn of a file with levels of detail, if the CPU sorts them, and if the GPU does. */
 const [SORTED_SPLATS, UNSORTED_SPLATS] = [3e6, 6e6];
 
-/** Gigabytes of memory below which a device gets half of that. */
+/** Gigabytes of memory below which a device gets half of that, as do users who save data. */
 const SMALL_GB = 4;
 
-/** @param {boolean} sort whether the CPU sorts */
-function usualBudget(sort) {
-  const { deviceMemory = SMALL_GB } = /** @type {{deviceMemory?: number}} */ (navigator);
-  return (sort ? SORTED_SPLATS : UNSORTED_SPLATS) / (deviceMemory < SMALL_GB ? 2 : 1);
+/** Error in pixels until which splats are refined, and for users who save data. */
+const [USUAL_PIXELS, SAVING_PIXELS] = [0.25, 1];
+
+/**
+ * @param {EngineOptions} options
+ * @param {boolean} sort whether the CPU sorts
+ * @returns {import('./tile_stream.mjs').Aims}
+ */
+function aimsOf({ splatBudget, pixelError }, sort) {
+  const device = /** @type {{deviceMemory?: number, connection?: {saveData?: boolean}}} */ (navigator);
+  const { deviceMemory = SMALL_GB, connection } = device;
+  const saves = connection?.saveData === true;
+  const usual = (sort ? SORTED_SPLATS : UNSORTED_SPLATS) / (saves || deviceMemory < SMALL_GB ? 2 : 1);
+  return { budget: splatBudget ?? usual, pixels: pixelError ?? (saves ? SAVING_PIXELS : USUAL_PIXELS), around: !saves };
 }
 
 /** @implements {Engine} */
@@ -114,6 +124,9 @@ class SplatEngine {
     const { signal } = this.listeners;
     canvas.addEventListener('webglcontextlost', (event) => this.contextLost(event), { signal });
     canvas.addEventListener('webglcontextrestored', () => this.restore('webgl2'), { signal });
+    const seen = () => this.tell({ type: 'pause', isPaused: document.visibilityState === 'hidden' });
+    document.addEventListener('visibilitychange', seen, { signal });
+    seen();
   }
 
   get header() {
@@ -140,13 +153,13 @@ class SplatEngine {
    */
   begin(source, settle) {
     this.stats = emptyStats(this.renderer.capabilities);
-    const opening = new SceneLoad(source, ++this.sceneCount, this.stats, this.options, settle);
+    const sort = !this.renderer.capabilities.sorts;
+    const aims = aimsOf(this.options, sort);
+    const opening = new SceneLoad(source, ++this.sceneCount, this.stats, aims.budget, this.options, settle);
     this.opening = opening;
     const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
       if (this.opening !== opening) return;
-      const sort = !this.renderer.capabilities.sorts;
-      const budget = this.options.splatBudget ?? usualBudget(sort);
-      this.tell({ type: 'open', scene: opening.scene, source: readable, sort, budget });
+      this.tell({ type: 'open', scene: opening.scene, source: readable, sort, aims });
     };
     // In WebKit, the worker of a file: page cannot read a Blob, but the page can.
     if (self.origin !== 'null' || !(source instanceof Blob)) return tell(source);
@@ -203,7 +216,7 @@ class SplatEngine {
     }
   }
 
-  /** Resolves when everything is decoded and sorted for the current camera. */
+  /** Resolves when everything that the current camera requires is decoded and sorted. */
   async sorted() {
     for (;;) {
       if (this.opening?.error) throw this.opening.error;

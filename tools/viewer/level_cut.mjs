@@ -1,24 +1,60 @@
-// Which tiles of a file with levels of detail are drawn: the finest that are here, within a budget of splats.
+// Choices in a file with levels of detail: the tiles that are drawn, of those that are here, and the tiles to request.
 
 import { slopeLimits } from './camera_maths.mjs';
 
 /**
+ * @typedef {import('./types.d.ts').Header} Header
  * @typedef {import('./types.d.ts').TreeNode} TreeNode
  * @typedef {import('./types.d.ts').View} View
- * @typedef {{tiles: number[], isWhole: boolean}} Cut isWhole: it covers the whole scene
+ *
+ * Nodes in a view.
+ *
+ * @typedef {object} Looks
+ * @property {Float64Array} pixels error of each node where its box is nearest to the camera, pixels
+ * @property {Float64Array} distance of its box from the camera, scene units
+ * @property {boolean[]} isSeen whether it may be in view
+ *
+ * `isWhole`: the tiles cover the whole scene. `refined`: the nodes whose children, or nodes below them, are drawn.
+ *
+ * @typedef {{tiles: number[], isWhole: boolean, refined: Set<number>}} Cut
+ *
+ * A node to request. `isNeeded` for the picture: it is a root, or its parent is seen and to be refined. `isDrawn`: it is part of
+ * the picture that is aimed at, not only drawn until finer ones are here, nor out of view. `urgency`: the error in pixels of
+ * what it replaces, infinite for a root.
+ *
+ * @typedef {{node: TreeNode, isNeeded: boolean, isDrawn: boolean, urgency: number, distance: number}} Wish
  */
 
+/** Factor by which the error of a refined node counts more, so that small movements do not exchange it back and forth. */
+const INERTIA = 1.25;
+
 /**
- * Choose the tiles to draw. A node is drawn until its children, or nodes below them, can be drawn in its place, all of them;
- * and as long as its error is below a number of pixels, the smallest for which the splats keep to the budget.
+ * Return the nodes of a file, or a root for each tile if it has no levels of detail.
+ *
+ * @param {Header} header
+ * @param {TreeNode[]} nodes of the file
+ * @returns {TreeNode[]}
+ */
+export function nodesOrTiles({ tiles, coarseTiles }, nodes) {
+  if (coarseTiles.length > 0) return nodes;
+  return tiles.map(({ index, splatCount, min, max }) => {
+    const place = { index, level: 0, parent: null, children: [], firstTile: index, tileCount: 1 };
+    return { ...place, splatCount, error: 0, min, max };
+  });
+}
+
+/**
+ * Choose the tiles to draw. A node is drawn until its children, or nodes below them, can be drawn in its place, all of them.
+ * If these would be too many splats, the nodes of the smallest errors stay.
  *
  * @param {TreeNode[]} nodes children before parents
  * @param {(tile: number) => boolean} isHere
- * @param {View | null} view
+ * @param {Looks} looks
  * @param {number} budget maximum number of splats, unless the coarsest nodes have more
+ * @param {Set<number>} [before] `refined` of the preceding cut
  * @returns {Cut} tiles ascending
  */
-export function chooseTiles(nodes, isHere, view, budget) {
+export function chooseTiles(nodes, isHere, looks, budget, before = new Set()) {
   /** @type {boolean[]} whether a node's own tiles are all here */
   const isLoaded = [];
   /** @type {boolean[]} whether the node, or the nodes below it, cover its part of the scene */
@@ -30,61 +66,161 @@ export function chooseTiles(nodes, isHere, view, budget) {
     canRefine[index] = children.length > 0 && children.every((child) => isCovered[child]);
     isCovered[index] = isLoaded[index] || canRefine[index];
   }
-  const roots = nodes.filter(({ parent }) => parent === null).map(({ index }) => index);
-  const errors = nodes.map((node) => (view ? errorInPixels(node, view) : Infinity));
-  const cutAt = (/** @type {number} */ pixels) => {
-    const chosen = [];
-    const pending = [...roots];
-    while (pending.length) {
-      const node = nodes[Number(pending.pop())];
-      const { index, children } = node;
-      const isFine = errors[index] <= pixels;
-      if (children.length > 0 && (!isLoaded[index] || (canRefine[index] && !isFine))) pending.push(...children);
-      else chosen.push(node);
-    }
-    return { chosen, count: chosen.reduce((sum, { splatCount }) => sum + splatCount, 0) };
-  };
-  let cut = cutAt(-1);
-  if (cut.count > budget) {
-    const sorted = Float64Array.from(errors).sort();
-    let [low, high] = [0, sorted.length - 1];
-    while (low < high) {
-      const middle = (low + high) >> 1;
-      if (cutAt(sorted[middle]).count > budget) low = middle + 1;
-      else high = middle;
-    }
-    cut = cutAt(sorted[low]);
-  }
-  const tiles = cut.chosen.flatMap(({ firstTile, tileCount }) => tilesOf(firstTile, tileCount).filter(isHere));
-  return { tiles: tiles.sort((a, b) => a - b), isWhole: roots.every((root) => isCovered[root]) };
+  const errors = nodes.map(({ index }) => {
+    if (!looks.isSeen[index]) return 0;
+    return looks.pixels[index] * (before.has(index) ? INERTIA : 1);
+  });
+  const refined = refine(nodes, errors, budget, {
+    must: (node) => node.children.length > 0 && !isLoaded[node.index],
+    may: ({ index }) => canRefine[index],
+  });
+  const tiles = nodes.flatMap(({ index, parent, firstTile, tileCount }) => {
+    const isChosen = !refined.has(index) && (parent === null || refined.has(parent));
+    return isChosen ? tilesOf(firstTile, tileCount).filter(isHere) : [];
+  });
+  const isWhole = nodes.every(({ index, parent }) => parent !== null || isCovered[index]);
+  return { tiles: tiles.sort((a, b) => a - b), isWhole, refined };
 }
 
 /**
- * Return the error of a node in pixels where its box is nearest to the camera; 0 if it is out of view.
+ * Choose the nodes to request for a view: what is in view until the errors are small or the budget is used up, and around
+ * it what a turn of the camera would show.
  *
- * @param {TreeNode} node
- * @param {View} view
+ * @param {TreeNode[]} nodes children before parents
+ * @param {Looks} looks
+ * @param {{budget: number, pixels: number, around: boolean}} aims maximum number of splats to draw; error that is small
+ *   enough, pixels; whether to request what is out of view
+ * @returns {Wish[]} the most urgent first
  */
-function errorInPixels({ error, min, max }, view) {
-  const { viewmat: m, fx, fy, near } = view;
-  const [x0, x1, y0, y1] = slopeLimits(view);
-  const half = [0, 1, 2].map((axis) => (max[axis] - min[axis]) / 2);
-  const along = (/** @type {number[]} */ row) => {
-    const centre = row[3] + [0, 1, 2].reduce((sum, axis) => sum + row[axis] * (min[axis] + half[axis]), 0);
-    const reach = [0, 1, 2].reduce((sum, axis) => sum + Math.abs(row[axis]) * half[axis], 0);
-    return [centre - reach, centre + reach];
+export function chooseWishes(nodes, looks, { budget, pixels: least, around }) {
+  const { pixels, distance, isSeen } = looks;
+  const errors = nodes.map(({ index }) => (isSeen[index] ? pixels[index] : 0));
+  const refined = refine(nodes, errors, budget, {
+    must: () => false,
+    may: ({ index, children }) => children.length > 0 && errors[index] > least,
+  });
+  const isRefined = (/** @type {TreeNode} */ { index, children }) => {
+    return isSeen[index] ? refined.has(index) : around && children.length > 0 && pixels[index] > least;
   };
+  /** @type {Wish[]} */
+  const wishes = [];
+  const pending = nodes
+    .filter(({ parent }) => parent === null)
+    .map((node) => ({ node, urgency: Infinity, isNeeded: true }));
+  for (let one = pending.pop(); one; one = pending.pop()) {
+    const { node, urgency, isNeeded } = one;
+    const { index, children, parent } = node;
+    const opens = isRefined(node);
+    const isDrawn = !opens && (isSeen[index] || !isNeeded || parent === null);
+    wishes.push({ node, isNeeded, isDrawn, urgency, distance: distance[index] });
+    for (const child of opens ? children : []) {
+      pending.push({ node: nodes[child], urgency: pixels[index], isNeeded: isSeen[index] });
+    }
+  }
+  return wishes.sort(
+    (a, b) =>
+      Number(b.isNeeded) - Number(a.isNeeded) ||
+      (a.urgency === b.urgency ? 0 : b.urgency - a.urgency) ||
+      Number(isSeen[b.node.index]) - Number(isSeen[a.node.index]) ||
+      a.distance - b.distance ||
+      a.node.firstTile - b.node.firstTile,
+  );
+}
+
+/**
+ * Return how nodes look in a view. Without one, all are seen, with infinite errors.
+ *
+ * @param {TreeNode[]} nodes
+ * @param {View | null} view
+ * @returns {Looks}
+ */
+export function looksOf(nodes, view) {
+  /** @type {Looks} */
+  const looks = { pixels: new Float64Array(nodes.length), distance: new Float64Array(nodes.length), isSeen: [] };
+  if (view === null) {
+    looks.pixels.fill(Infinity);
+    looks.isSeen = nodes.map(() => true);
+    return looks;
+  }
+  const { viewmat: m, fx, fy, near } = view;
   const rows = [0, 4, 8].map((at) => [m[at], m[at + 1], m[at + 2], m[at + 3]]);
-  const beyond = (/** @type {number} */ axis, /** @type {number} */ sign, /** @type {number} */ slope) =>
-    along(rows[axis].map((value, k) => sign * (value - slope * rows[2][k])))[1] < 0;
-  const [x, y, z] = rows.map(along);
-  if (z[1] <= near || beyond(0, 1, x0) || beyond(0, -1, x1) || beyond(1, 1, y0) || beyond(1, -1, y1)) return 0;
-  const nearest = (/** @type {number[]} */ [low, high]) => Math.max(low, -high, 0);
-  return (error * Math.max(fx, fy)) / Math.max(near, Math.hypot(nearest(x), nearest(y), nearest(z)));
+  const [x0, x1, y0, y1] = slopeLimits(view);
+  const [right, down, forward] = rows;
+  const sides = [
+    { row: right, sign: 1, slope: x0 },
+    { row: right, sign: -1, slope: x1 },
+    { row: down, sign: 1, slope: y0 },
+    { row: down, sign: -1, slope: y1 },
+  ].map(({ row, sign, slope }) => row.map((value, k) => sign * (value - slope * forward[k])));
+  for (const { index, error, min, max } of nodes) {
+    const farthest = reach(forward, min, max)[1];
+    looks.isSeen[index] = farthest > near && sides.every((side) => reach(side, min, max)[1] >= 0);
+    const away = rows.map((row) => {
+      const [low, high] = reach(row, min, max);
+      return Math.max(low, -high, 0);
+    });
+    looks.distance[index] = Math.hypot(away[0], away[1], away[2]);
+    looks.pixels[index] = (error * Math.max(fx, fy)) / Math.max(near, looks.distance[index]);
+  }
+  return looks;
+}
+
+/**
+ * Return the smallest and largest value of a linear function in a box.
+ *
+ * @param {number[]} row
+ * @param {number[]} min
+ * @param {number[]} max
+ */
+function reach(row, min, max) {
+  let low = row[3];
+  let high = row[3];
+  for (let axis = 0; axis < 3; axis++) {
+    const a = row[axis] * min[axis];
+    const b = row[axis] * max[axis];
+    low += Math.min(a, b);
+    high += Math.max(a, b);
+  }
+  return [low, high];
+}
+
+/**
+ * Cut a tree: from its roots on, refine the node of the largest error, again and again, until the next one would exceed a
+ * budget.
+ *
+ * @param {TreeNode[]} nodes children before parents
+ * @param {number[]} errors not above those of the parents
+ * @param {number} budget splats
+ * @param {{must: (node: TreeNode) => boolean, may: (node: TreeNode) => boolean}} rules whether a node has to be refined, and
+ *   whether it can be
+ * @returns {Set<number>} the nodes that are refined
+ */
+function refine(nodes, errors, budget, { must, may }) {
+  /** @type {Set<number>} */
+  const refined = new Set();
+  let count = 0;
+  const take = (/** @type {TreeNode} */ node) => {
+    count += node.splatCount;
+    if (must(node)) open(node);
+  };
+  const open = (/** @type {TreeNode} */ { index, splatCount, children }) => {
+    refined.add(index);
+    count -= splatCount;
+    for (const child of children) take(nodes[child]);
+  };
+  for (const node of nodes) if (node.parent === null) take(node);
+  for (const node of [...nodes].sort((a, b) => errors[b.index] - errors[a.index] || b.index - a.index)) {
+    const isInCut = !refined.has(node.index) && (node.parent === null || refined.has(node.parent));
+    if (!isInCut || !may(node)) continue;
+    const added = node.children.reduce((sum, child) => sum + nodes[child].splatCount, -node.splatCount);
+    if (count + added > budget) break;
+    open(node);
+  }
+  return refined;
 }
 
 /**
  * @param {number} first
  * @param {number} count
  */
-const tilesOf = (first, count) => Array.from({ length: count }, (_, i) => first + i);
+export const tilesOf = (first, count) => Array.from({ length: count }, (_, i) => first + i);

@@ -42,7 +42,10 @@ const showing = new SceneViewer(canvas, wishes, {
     overlay.statistics(stats, false);
     overlay.done();
   },
-  failed: (report) => overlay.error(report, showing.engine !== null && report.code !== 'E_CONTEXT'),
+  failed: (report) => {
+    if (report.code === 'E_INPUT' && !report.fatal) overlay.toast('The connection is lost. It is tried again.');
+    else overlay.error(report, showing.engine !== null && report.code !== 'E_CONTEXT');
+  },
 });
 const { view } = showing;
 document.documentElement.classList.toggle('bare', !wishes.ui);

@@ -1,6 +1,7 @@
 // The overlay: progress, statistics, messages and drop target. Independent of scenes.
 
 import { explain } from './messages.mjs';
+import { loadedShare } from './statistics.mjs';
 
 /**
  * @typedef {import('./types.d.ts').Progress} Progress
@@ -114,12 +115,12 @@ export class Overlay {
   }
 
   /** @param {Progress} progress */
-  progress({ received, fileSize, splatsDone, splatCount, layer, phase }) {
-    const share = fileSize > 0 ? received / fileSize : 0;
-    this.#bar(Math.min(1, share));
+  progress(progress) {
+    const { received, missing, splatsDone, splatCount, layer, phase } = progress;
+    this.#bar(loadedShare(progress));
     const what = layer > 0 ? `colour detail ${layer} of 3` : `${count(splatsDone)} of ${count(splatCount)} splats`;
     html('summary').textContent =
-      phase === 'open' ? 'Opening …' : `${what} · ${megabytes(received)} of ${megabytes(fileSize)} MB`;
+      phase === 'open' ? 'Opening …' : `${what} · ${megabytes(received)} of ${megabytes(received + missing)} MB`;
   }
 
   /** Show that the scene is complete. */

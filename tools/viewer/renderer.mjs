@@ -10,6 +10,8 @@ import { WebGpuRenderer } from './webgpu.mjs';
  *
  * @typedef {object} SceneLayout
  * @property {{splatCount: number, corner: number[], step: number}[]} tiles
+ * @property {number[]} pages slots of each page, see `pagesOf` of texels.mjs
+ * @property {number} drawn number of splats that a picture usually has at most
  * @property {number} shDegree
  * @property {boolean} antialiased opacities are compensated for the dilation
  * @property {number} opacityLevels
@@ -26,15 +28,16 @@ import { WebGpuRenderer } from './webgpu.mjs';
  *
  * @typedef {{attributes: number, order: number, work: number}} Bytes
  *
- * Draws splats. Slots number the splats tile after tile, see `layoutSlots` of texels.mjs. The order must not contain
- * splats that have not been uploaded. All methods but `dispose` may do nothing after the context or the GPU is lost.
+ * Draws splats, each in a slot. The order must not contain splats that are not there. All methods but `dispose` may do nothing after the context or the GPU is lost.
  *
  * @typedef {object} Renderer
  * @property {Capabilities} capabilities
  * @property {Bytes} bytes
  * @property {(scene: SceneLayout) => void} allocate replace the previous scene and allocate memory for a new one; throws
  *   a RangeError if there is not enough
- * @property {(tile: number, texels: import('./texels.mjs').GeometryTexels) => void} uploadGeometry layer 0 of a tile
+ * @property {(tile: number, texels: import('./texels.mjs').GeometryTexels, slot: number) => void} uploadGeometry layer 0
+ *   of a tile, and the slot of its first splat
+ * @property {(tile: number) => void} evict free the memory of a tile, which the order has no splats of
  * @property {(codebook: number, layer: number, rows: import('./texels.mjs').Rows) => void} uploadTable entries of a codebook
  * @property {(tile: number, layer: number, band: import('./texels.mjs').BandTexels) => void} uploadBand an SH band of a
  *   tile, after the table it refers to; a codebook's lowest band first

@@ -19,13 +19,15 @@ export class SceneLoad {
    * @param {string | Blob | ArrayBuffer} source
    * @param {number} scene number that distinguishes the worker's messages from those for earlier scenes
    * @param {import('./types.d.ts').Stats} stats statistics of this scene; changed in place
-   * @param {Pick<import('./types.d.ts').EngineOptions, 'onHeader' | 'onProgress'>} hooks
+   * @param {number} budget splats to draw
+   * @param {Pick<import('./types.d.ts').EngineOptions, 'onHeader' | 'onProgress' | 'onError'>} hooks
    * @param {Settle} settle
    */
-  constructor(source, scene, stats, hooks, settle) {
+  constructor(source, scene, stats, budget, hooks, settle) {
     this.source = source;
     this.scene = scene;
     this.stats = stats;
+    this.budget = budget;
     this.hooks = hooks;
     this.settle = settle;
     /** Start time, milliseconds. */
@@ -36,37 +38,26 @@ export class SceneLoad {
     this.header = null;
     /** @type {Bounds | null} */
     this.bounds = null;
-    /** Whether everything is decoded. */
+    /** Whether everything that a view requires was here once. */
     this.isDone = false;
     /** Whether the GPU failed to draw it. */
     this.hasFailedToDraw = false;
-    this.tilesHere = 0;
-    /** The last sort: its camera, the number of tiles of level 0 that were here, and whether it covers the scene. */
-    this.order = { id: 0, tiles: 0, isWhole: false };
-    /** Number of tiles of the coarsest version that have not arrived. */
+    /** The last sort: its camera, and whether all that the view requires was here, and all of the scene at any level. */
+    this.order = { id: 0, isComplete: false, isWhole: false };
+    /** Number of tiles of the coarsest version that have not arrived, and samples of their splats. */
     this.rootsMissing = 0;
-    /** Samples of splats of level 0, and of the coarsest version. */
     this.samples = { points: /** @type {number[]} */ ([]), weights: /** @type {number[]} */ ([]) };
-    this.rootSamples = { points: /** @type {number[]} */ ([]), weights: /** @type {number[]} */ ([]) };
-  }
-
-  /** Whether layer 0 of all tiles of level 0 has arrived. */
-  get isWhole() {
-    return this.header !== null && this.tilesHere === this.header.tiles.length;
+    /** Splats of each tile that is here. @type {Map<number, number>} */
+    this.resident = new Map();
   }
 
   /**
-   * Whether everything is decoded and sorted.
+   * Whether everything that a view requires is decoded and sorted.
    *
    * @param {number} viewId id of the camera, 0 without one
    */
   isSorted(viewId) {
-    return this.isDone && (viewId === 0 || (this.order.id === viewId && this.isOrderWhole));
-  }
-
-  /** Whether the last sort included all tiles of level 0. */
-  get isOrderWhole() {
-    return this.order.id > 0 && this.order.tiles === this.header?.tiles.length;
+    return this.isDone && (viewId === 0 || (this.order.id === viewId && this.order.isComplete));
   }
 
   /**
@@ -78,12 +69,18 @@ export class SceneLoad {
     if (reply.type === 'header') this.#takeHeader(reply, renderer);
     else if (reply.type === 'progress') this.#takeProgress(reply);
     else if (reply.type === 'geometry') this.#takeGeometry(reply, renderer);
-    else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
+    else if (reply.type === 'evict') {
+      renderer.evict(reply.tile);
+      this.stats.splatsResident -= this.resident.get(reply.tile) ?? 0;
+      this.resident.delete(reply.tile);
+    } else if (reply.type === 'table') renderer.uploadTable(reply.codebook, reply.layer, reply.rows);
     else if (reply.type === 'band') renderer.uploadBand(reply.tile, reply.layer, reply.band);
     else if (reply.type === 'cut') renderer.setCut(reply.tiles);
     else if (reply.type === 'order') this.#takeOrder(reply, renderer);
-    else if (reply.type === 'error') throw new EngineError(reply.error);
-    else {
+    else if (reply.type === 'error') {
+      if (reply.error.fatal) throw new EngineError(reply.error);
+      this.hooks.onError?.(reply.error);
+    } else {
       renderer.complete();
       this.isDone = true;
       this.settle.resolve();
@@ -101,12 +98,14 @@ export class SceneLoad {
    * @param {Reply & {type: 'header'}} reply
    * @param {Renderer} renderer
    */
-  #takeHeader({ header, description, roots }, renderer) {
+  #takeHeader({ opened: { header, description, roots, pages } }, renderer) {
     const { splatCount, fileSize, shDegree, tiles } = header;
     const [opacities, , quats] = header.attributes;
     try {
       renderer.allocate({
         tiles: [...tiles, ...header.coarseTiles],
+        pages,
+        drawn: header.coarseTiles.length > 0 ? this.budget : splatCount,
         shDegree,
         antialiased: header.antialiased,
         opacityLevels: opacities.levels,
@@ -119,7 +118,7 @@ export class SceneLoad {
     }
     this.header = header;
     this.rootsMissing = roots;
-    this.bounds = tiles.length ? coarseBounds(header) : this.#boundsOf(header, this.samples);
+    this.bounds = tiles.length ? coarseBounds(header) : this.#boundsOf(header);
     Object.assign(this.stats, { splatCount, fileSize, expandedBytesPerSplat: expandedBytes(shDegree) });
     this.hooks.onHeader?.(header, description);
   }
@@ -127,7 +126,7 @@ export class SceneLoad {
   /** @param {Reply & {type: 'progress'}} reply */
   #takeProgress({ progress, decodeMs }) {
     Object.assign(this.stats, { received: progress.received, decodeMs });
-    if (this.isWhole || this.order.isWhole) this.stats.firstPictureBytes ||= progress.received;
+    if (this.header && this.rootsMissing === 0) this.stats.firstPictureBytes ||= progress.received;
     this.hooks.onProgress?.(progress);
   }
 
@@ -135,38 +134,28 @@ export class SceneLoad {
    * @param {Reply & {type: 'geometry'}} reply
    * @param {Renderer} renderer
    */
-  #takeGeometry({ tile, texels, samples }, renderer) {
-    renderer.uploadGeometry(tile, texels);
-    if (this.header && tile < this.header.tiles.length) {
-      this.stats.splatsResident += texels.count;
-      this.tilesHere++;
-    }
-    if (!this.header) return;
-    const isCoarse = tile >= this.header.tiles.length;
-    const { points, weights } = isCoarse ? this.rootSamples : this.samples;
-    for (const value of samples.points) points.push(value);
-    for (const weight of samples.weights) weights.push(weight);
-    if (!isCoarse && this.isWhole) this.bounds = this.#boundsOf(this.header, this.samples);
-    else if (isCoarse && samples.weights.length > 0 && --this.rootsMissing === 0) {
-      this.bounds = { ...this.#boundsOf(this.header, this.rootSamples), coarse: true };
-    }
+  #takeGeometry({ tile, slot, texels, samples }, renderer) {
+    renderer.uploadGeometry(tile, texels, slot);
+    this.resident.set(tile, texels.count);
+    this.stats.splatsResident += texels.count;
+    if (!this.header || samples.weights.length === 0) return;
+    for (const value of samples.points) this.samples.points.push(value);
+    for (const weight of samples.weights) this.samples.weights.push(weight);
+    if (--this.rootsMissing === 0) this.bounds = this.#boundsOf(this.header);
   }
 
   /**
    * @param {Reply & {type: 'order'}} reply
    * @param {Renderer} renderer
    */
-  #takeOrder({ id, tiles, isWhole, order, count, cullMs, sortMs }, renderer) {
+  #takeOrder({ id, isComplete, isWhole, order, count, cullMs, sortMs }, renderer) {
     renderer.setOrder(order, count);
-    this.order = { id, tiles, isWhole };
+    this.order = { id, isComplete, isWhole };
     Object.assign(this.stats, { splatsDrawn: count, cullMs, sortMs });
   }
 
-  /**
-   * @param {Header} header
-   * @param {{points: number[], weights: number[]}} samples
-   */
-  #boundsOf(header, { points, weights }) {
-    return fineBounds(header, Float32Array.from(points), Float32Array.from(weights));
+  /** @param {Header} header */
+  #boundsOf(header) {
+    return fineBounds(header, Float32Array.from(this.samples.points), Float32Array.from(this.samples.weights));
   }
 }

@@ -1,7 +1,7 @@
 // The textures of one scene: attributes as the tiles' integers, codebooks as tables, constants of tiles, and the order.
 
 import { toCamera } from './camera_maths.mjs';
-import { BLOCK_SPLATS, layoutSlots } from './texels.mjs';
+import { BLOCK_SPLATS } from './texels.mjs';
 import { UNITS } from './shader_programs.mjs';
 import { BAND_CODEBOOK, BAND_ROWS, tileTexels } from './shader_attributes.mjs';
 import { Records } from './framebuffers.mjs';
@@ -23,20 +23,19 @@ export class SceneTextures {
    */
   constructor(gl, layout, splatsMax) {
     const { tiles } = layout;
-    const { starts, slotCount } = layoutSlots(tiles);
+    const slotCount = layout.pages.reduce((sum, slots) => sum + slots, 0);
     if (slotCount > splatsMax) throw new RangeError(`${slotCount} splats, this GPU can hold ${splatsMax}`);
     const { words, word, floats } = formats(gl);
     this.gl = gl;
     this.layout = layout;
-    this.starts = starts;
     this.first = new LinearTexture(gl, words, slotCount);
     this.store = new Store(gl, words);
     this.tileTexels = tileTexels(layout.shDegree);
     this.tiles = new LinearTexture(gl, words, this.tileTexels * tiles.length);
     this.places = new LinearTexture(gl, floats, tiles.length);
     this.blocks = new LinearTexture(gl, word, slotCount / BLOCK_SPLATS);
-    this.order = new LinearTexture(gl, word, slotCount);
-    this.records = new Records(gl, slotCount);
+    this.order = new LinearTexture(gl, word, Math.min(slotCount, layout.drawn));
+    this.records = new Records(gl, Math.min(slotCount, layout.drawn));
     this.count = 0; // number of splats in the order
     this.constants = new Uint32Array(4 * this.tileTexels * tiles.length);
     this.constantFloats = new Float32Array(this.constants.buffer);
@@ -45,7 +44,8 @@ export class SceneTextures {
     this.tables = new Map();
     /** @type {Map<string, number>} offsets of the indices, by tile and codebook */
     this.indices = new Map();
-    this.putBlocks();
+    /** Ranges of the store that each tile takes. @type {Map<number, {start: number, size: number}[]>} */
+    this.held = new Map();
   }
 
   get bytes() {
@@ -53,30 +53,23 @@ export class SceneTextures {
     return textures.reduce((sum, { bytes }) => sum + bytes, 0);
   }
 
-  /** Write the tile of each block of slots. */
-  putBlocks() {
-    const { starts, layout } = this;
-    layout.tiles.forEach(({ splatCount }, tile) => {
-      const count = Math.ceil(splatCount / BLOCK_SPLATS);
-      this.blocks.write(starts[tile] / BLOCK_SPLATS, new Uint32Array(count).fill(tile));
-    });
-  }
-
   /**
    * @param {number} tile
    * @param {GeometryTexels} texels
+   * @param {number} slot of its first splat
    */
-  putGeometry(tile, { first, more, moreWords, bits, scales, sh0 }) {
-    const start = this.starts[tile];
-    this.first.write(start, first);
+  putGeometry(tile, { count, first, more, moreWords, bits, scales, sh0 }, slot) {
+    const block = slot / BLOCK_SPLATS;
+    this.first.write(slot, first);
+    this.blocks.write(block, new Uint32Array(Math.ceil(count / BLOCK_SPLATS)).fill(tile));
     const [x, y, z] = bits.means;
     const at = 4 * this.tileTexels * tile;
     this.constants.set(
       [
         x | (y << 5) | (z << 10) | (bits.quats << 15) | (bits.opacities << 20),
         bits.scales | (bits.sh0 << 8),
-        more ? this.store.append(more) : 0,
-        moreWords | ((start / BLOCK_SPLATS) << 4),
+        more ? this.#append(tile, more) : 0,
+        moreWords | (block << 4),
       ],
       at,
     );
@@ -90,7 +83,7 @@ export class SceneTextures {
    * @param {Rows} rows
    */
   putTable(codebook, layer, rows) {
-    this.tables.set(`${codebook}.${layer}`, { at: this.store.append(rows.texels), rows });
+    this.tables.set(`${codebook}.${layer}`, { at: this.store.append(rows.texels).start, rows });
   }
 
   /**
@@ -100,7 +93,7 @@ export class SceneTextures {
    */
   putBand(tile, layer, { rows, codebook }) {
     const at = 4 * (this.tileTexels * tile + 1 + 2 * layer);
-    const rowsAt = rows ? this.store.append(rows.texels) : 0;
+    const rowsAt = rows ? this.#append(tile, rows.texels) : 0;
     const rowBits = rows ? rows.bits : 1;
     const table = codebook && this.tables.get(`${codebook.id}.${layer}`);
     if (!codebook || !table) {
@@ -109,13 +102,34 @@ export class SceneTextures {
     } else {
       const key = `${tile}.${codebook.id}`; // all bands of a codebook have the same indices
       let indexAt = this.indices.get(key);
-      if (indexAt === undefined) this.indices.set(key, (indexAt = this.store.append(codebook.index)));
+      if (indexAt === undefined) this.indices.set(key, (indexAt = this.#append(tile, codebook.index)));
       const bits = (codebook.indexBits << 2) | (table.rows.bits << 8) | (rowBits << 16);
       this.constants.set([BAND_CODEBOOK | bits, indexAt, table.at, rowsAt], at);
       this.constantFloats.set([table.rows.offset, rows ? rows.offset : 0, table.rows.step], at + 4);
       this.constants[at + 7] = codebook.size;
     }
     this.putConstants(tile);
+  }
+
+  /**
+   * Append texels of a tile to the store, and return the position of the first.
+   *
+   * @param {number} tile
+   * @param {Uint32Array} texels
+   */
+  #append(tile, texels) {
+    const range = this.store.append(texels);
+    this.held.set(tile, [...(this.held.get(tile) ?? []), range]);
+    return range.start;
+  }
+
+  /** @param {number} tile that is freed; the order has none of its splats */
+  evict(tile) {
+    for (const range of this.held.get(tile) ?? []) this.store.give(range);
+    this.held.delete(tile);
+    for (const key of this.indices.keys()) if (key.startsWith(`${tile}.`)) this.indices.delete(key);
+    const first = 4 * this.tileTexels * tile;
+    this.constants.fill(0, first, first + 4 * this.tileTexels);
   }
 
   /** @param {number} tile */
@@ -129,6 +143,7 @@ export class SceneTextures {
    * @param {number} count
    */
   putOrder(order, count) {
+    if (count > this.order.width * this.order.rows) this.order.resize(count);
     this.order.write(0, order.subarray(0, count));
     this.count = count;
   }

@@ -39,3 +39,10 @@ export function emptyStats({ name, pictureFormat }) {
  * @param {number} shDegree
  */
 export const expandedBytes = (shDegree) => 4 * (3 + 4 + 3 + 1 + 3 * (shDegree + 1) ** 2);
+
+/**
+ * Return the loaded share of what a view requires, 0 to 1.
+ *
+ * @param {import('./types.d.ts').Progress} progress
+ */
+export const loadedShare = ({ phase, received, missing }) => (phase === 'open' ? 0 : received / (received + missing));

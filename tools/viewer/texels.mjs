@@ -33,8 +33,11 @@
  * @typedef {{rows: Rows | null, codebook: {id: number, size: number, index: Uint32Array<ArrayBuffer>, indexBits: number} | null}} BandTexels
  */
 
-/** The first slot of a tile is a multiple of this, so that a table of blocks gives the tile of a splat. */
-export const BLOCK_SPLATS = 64;
+/** The first slot of a tile is a multiple of this: a workgroup of WebGPU draws a block, and a table gives its tile. */
+export const BLOCK_SPLATS = 256;
+
+/** Slots of a page: the buffers of its tiles stay below WebGPU's default limit, whatever their fields. */
+const PAGE_SLOTS = BLOCK_SPLATS << 10;
 
 /** Integers of up to this many bits, and their sums with offsets of the same size, are exact in binary32. */
 const EXACT_BITS = 23;
@@ -42,19 +45,29 @@ const FLOAT_BITS = 32;
 const TEXEL_WORDS = 4;
 
 /**
- * Assign the first slots of tiles.
+ * Divide slots of splats into pages, which tiles do not cross.
  *
  * @param {{splatCount: number}[]} tiles
- * @returns {{starts: number[], slotCount: number}} slotCount includes the unused slots between tiles
+ * @param {number} most number of splats beyond which not all tiles are kept
+ * @returns {{pages: number[], starts: number[] | null}} slots of each page; first slot of each tile, null if not all are kept
  */
-export function layoutSlots(tiles) {
-  const starts = [];
-  let slotCount = 0;
-  for (const { splatCount } of tiles) {
-    starts.push(slotCount);
-    slotCount += Math.ceil(splatCount / BLOCK_SPLATS) * BLOCK_SPLATS;
+export function pagesOf(tiles, most) {
+  if (tiles.reduce((sum, { splatCount }) => sum + splatCount, 0) > most) {
+    const count = Math.ceil(most / PAGE_SLOTS);
+    const largest = tiles.reduce((slots, { splatCount }) => Math.max(slots, splatCount), most / count);
+    return { pages: new Array(count).fill(Math.ceil(largest / BLOCK_SPLATS) * BLOCK_SPLATS), starts: null };
   }
-  return { starts, slotCount };
+  const pages = [0];
+  const starts = [];
+  let start = 0;
+  for (const { splatCount } of tiles) {
+    const slots = Math.ceil(splatCount / BLOCK_SPLATS) * BLOCK_SPLATS;
+    if (pages[pages.length - 1] + slots > PAGE_SLOTS) pages.push(0);
+    pages[pages.length - 1] += slots;
+    starts.push(start);
+    start += slots;
+  }
+  return { pages, starts };
 }
 
 /**

@@ -1,5 +1,6 @@
 // Growing textures that are addressed by one number, row by row.
 
+import { Ranges } from './ranges.mjs';
 import { ROW_TEXELS } from './shader_attributes.mjs';
 
 /**
@@ -123,14 +124,14 @@ export class LinearTexture {
 /** @param {number} texels */
 const rowsFor = (texels) => Math.max(1, Math.ceil(texels / ROW_TEXELS));
 
-/** A texture that texels are appended to. */
+/** A texture of texels in ranges, which grows. */
 export class Store {
   /**
    * @param {WebGL2RenderingContext} gl
    * @param {Format} format
    */
   constructor(gl, format) {
-    this.used = 0;
+    this.ranges = new Ranges();
     this.linear = new LinearTexture(gl, format, ROW_TEXELS);
   }
 
@@ -138,19 +139,24 @@ export class Store {
    * Append texels.
    *
    * @param {Texels} data
-   * @returns {number} the position of the first
+   * @returns {{start: number, size: number}} their place
    */
   append(data) {
-    const first = this.used;
-    const end = first + data.length / this.linear.format.channels;
-    if (end > this.linear.rows * ROW_TEXELS) this.linear.resize(Math.max(end, 1.5 * first));
-    this.linear.write(first, data);
-    this.used = end;
-    return first;
+    const size = data.length / this.linear.format.channels;
+    const start = this.ranges.take(size) ?? 0; // there is always room
+    const { end } = this.ranges;
+    if (end > this.linear.rows * ROW_TEXELS) this.linear.resize(Math.max(end, 1.5 * this.linear.rows * ROW_TEXELS));
+    this.linear.write(start, data);
+    return { start, size };
+  }
+
+  /** @param {{start: number, size: number}} range that is freed */
+  give({ start, size }) {
+    this.ranges.give(start, size);
   }
 
   /** Free unused capacity. */
   trim() {
-    if (rowsFor(this.used) < this.linear.rows) this.linear.resize(this.used);
+    if (rowsFor(this.ranges.end) < this.linear.rows) this.linear.resize(this.ranges.end);
   }
 }

@@ -31,17 +31,17 @@ export interface Bounds {
   /** Box of the centres of all splats, including far outliers. */
   boxMin: [number, number, number];
   boxMax: [number, number, number];
-  /** [S, 3], means of up to about 20,000 splats from the whole scene; corners of tiles until layer 0 has arrived. */
+  /** [S, 3], means of up to about 20,000 splats of the coarsest version; corners of tiles until it has arrived. */
   samples: Float32Array;
   /** [S], visibility weight of each: square root of alpha times the area of its ellipse. */
   weights: Float32Array;
-  /** True before layer 0 is complete: only the boxes of the tiles are known. */
+  /** True before the coarsest version is complete: only the boxes of the tiles are known. */
   coarse: boolean;
 }
 
 export interface Stats {
   splatCount: number;
-  /** Splats whose layer 0 is on the GPU. */
+  /** Splats whose layer 0 is on the GPU, at any level. */
   splatsResident: number;
   /** Splats that passed the cull for the last sort. */
   splatsDrawn: number;
@@ -76,8 +76,10 @@ export interface Progress {
   /** `open` until header and index have arrived, then `layers`. */
   phase: 'open' | 'layers';
   received: number;
+  /** Bytes that the view requires and that have not arrived. */
+  missing: number;
   fileSize: number;
-  /** Splats whose layer 0 is decoded. */
+  /** Splats whose layer 0 is decoded, without those of coarser levels. */
   splatsDone: number;
   splatCount: number;
   /** The layer being read: 0, then the SH bands from 1 on. */
@@ -114,9 +116,15 @@ export interface EngineOptions {
   backend?: Backend;
   /**
    * Maximum number of splats drawn of a file with levels of detail; parts that are far away are then drawn coarsely. Default:
-   * 6 million with WebGPU, 3 million with WebGL 2, half of that on small devices.
+   * 6 million with WebGPU, 3 million with WebGL 2, half of that on small devices and for users who save data. Twice as many
+   * are kept in memory.
    */
   splatBudget?: number;
+  /**
+   * Error, in pixels, below which parts of a file with levels of detail are not refined further. Default: 0.25; 1 for users who
+   * save data, and what is out of view is then not loaded.
+   */
+  pixelError?: number;
   /** Format of WebGL 2. Default: the fastest that can be blended without visible differences. */
   pictureFormat?: PictureFormat;
   onProgress?: (progress: Progress) => void;
@@ -128,7 +136,10 @@ export interface EngineOptions {
 }
 
 export interface Engine {
-  /** Replace the scene. Resolves when all of it is decoded, rejects with an EngineError. */
+  /**
+   * Replace the scene. Resolves when everything that the view requires is decoded, all of it without levels of detail; rejects
+   * with an EngineError.
+   */
   open(source: string | URL | Blob | ArrayBuffer): Promise<void>;
   setCamera(camera: Camera): void;
   /** Set the size of the drawing buffer, pixels. */
@@ -137,7 +148,7 @@ export interface Engine {
   /** Show SH bands up to this degree. */
   setShDegree(degree: number): void;
   requestFrame(): void;
-  /** Resolves when everything is decoded, sorted for the current camera, and drawn. */
+  /** Resolves when everything that the current camera requires is decoded, sorted, and drawn. */
   settled(): Promise<void>;
   /** Return the settled picture: RGBA, top row first. */
   readPixels(): Promise<Uint8Array>;

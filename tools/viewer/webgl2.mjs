@@ -72,9 +72,15 @@ export class WebGl2Renderer {
   /**
    * @param {number} tile
    * @param {GeometryTexels} texels
+   * @param {number} slot
    */
-  uploadGeometry(tile, texels) {
-    this.scene?.putGeometry(tile, texels);
+  uploadGeometry(tile, texels, slot) {
+    this.scene?.putGeometry(tile, texels, slot);
+  }
+
+  /** @param {number} tile */
+  evict(tile) {
+    this.scene?.evict(tile);
   }
 
   /**

@@ -6,7 +6,8 @@ import { isSound } from './webgpu_check.mjs';
 import { Device } from './webgpu_device.mjs';
 import { Projection } from './webgpu_projection.mjs';
 import { Quads } from './webgpu_quads.mjs';
-import { BLOCK, GpuScene } from './webgpu_scene.mjs';
+import { BLOCK_SPLATS } from './texels.mjs';
+import { GpuScene } from './webgpu_scene.mjs';
 import { ScreenTiles } from './webgpu_tiles.mjs';
 import * as WGSL from './wgsl.mjs';
 
@@ -80,7 +81,7 @@ export class WebGpuRenderer {
     this.capabilities = {
       name: '',
       pictureFormat: 'RGBA32F',
-      splatsMax: Math.floor(device.bindingMax / BLOCK_BYTES) * BLOCK,
+      splatsMax: Math.floor(device.bindingMax / BLOCK_BYTES) * BLOCK_SPLATS,
       sorts: true,
     };
     this.use(this.method);
@@ -130,9 +131,11 @@ export class WebGpuRenderer {
     this.isWhole = false;
     if (!layout) return;
     const scene = new GpuScene(device, layout, () => (projection.passes = null));
-    if (scene.blockCount * BLOCK > this.capabilities.splatsMax) {
+    if (scene.blockCount * BLOCK_SPLATS > this.capabilities.splatsMax) {
       scene.dispose();
-      throw new RangeError(`${scene.blockCount * BLOCK} splats, this GPU can hold ${this.capabilities.splatsMax}`);
+      throw new RangeError(
+        `${scene.blockCount * BLOCK_SPLATS} splats, this GPU can hold ${this.capabilities.splatsMax}`,
+      );
     }
     this.scene = scene;
     projection.setScene(scene);
@@ -141,9 +144,15 @@ export class WebGpuRenderer {
   /**
    * @param {number} tile
    * @param {GeometryTexels} texels
+   * @param {number} slot
    */
-  uploadGeometry(tile, texels) {
-    this.scene?.putGeometry(tile, texels);
+  uploadGeometry(tile, texels, slot) {
+    this.scene?.putGeometry(tile, texels, slot);
+  }
+
+  /** @param {number} tile */
+  evict(tile) {
+    this.scene?.evict(tile);
   }
 
   /**
@@ -301,7 +310,7 @@ export class WebGpuRenderer {
         await projection.divide(last.view);
         return false;
       }
-      if (method === this.tiles && firstBlock * BLOCK < visible) isComplete = false;
+      if (method === this.tiles && firstBlock * BLOCK_SPLATS < visible) isComplete = false;
     }
     if (!isComplete) this.tiles.enlarge();
     return isComplete;

@@ -1,6 +1,6 @@
 // Whether a GPU draws what it should, so that WebGPU is chosen only where it works.
 
-import { packGeometry } from './texels.mjs';
+import { packGeometry, pagesOf } from './texels.mjs';
 
 const SIZE = 32; // pixels
 const FOCAL = 12; // pixels
@@ -48,8 +48,10 @@ export async function isSound(renderer) {
     sh0: column(...channels),
   };
   const layout = { antialiased: false, opacityLevels: LEVELS, opacitySquare: false, quatLevels: LEVELS };
-  renderer.allocate({ ...layout, shDegree: 0, tiles: [{ splatCount: BALLS.length, corner: [0, 0, 0], step: 1 }] });
-  renderer.uploadGeometry(0, packGeometry(geometry, { levels: LEVELS }, { levels: LEVELS }));
+  const tiles = [{ splatCount: BALLS.length, corner: [0, 0, 0], step: 1 }];
+  const { pages } = pagesOf(tiles, Infinity);
+  renderer.allocate({ ...layout, shDegree: 0, tiles, pages, drawn: BALLS.length });
+  renderer.uploadGeometry(0, packGeometry(geometry, { levels: LEVELS }, { levels: LEVELS }), 0);
   const half = SIZE / 2;
   const view = { viewmat: IDENTITY, fx: FOCAL, fy: FOCAL, cx: half, cy: half, width: SIZE, height: SIZE, near: 0.2 };
   let isRight = true;

@@ -1,5 +1,6 @@
 // A WebGPU device with its compiled passes and growing buffers. The shaders are those of csplat_render/gpu.
 
+import { Ranges } from './ranges.mjs';
 import * as WGSL from './wgsl.mjs';
 
 /**
@@ -181,7 +182,7 @@ function isSoftware({ info, isFallbackAdapter }) {
   );
 }
 
-/** Words on the GPU that grow; a larger buffer replaces a full one. */
+/** Words on the GPU, in ranges; a larger buffer replaces a full one. */
 export class Words {
   /**
    * @param {Device} device
@@ -191,20 +192,25 @@ export class Words {
   constructor(device, capacity, replaced) {
     this.device = device;
     this.replaced = replaced;
-    this.count = 0;
+    this.ranges = new Ranges();
     this.buffer = device.buffer(4 * capacity);
   }
 
   /**
    * @param {Uint32Array<ArrayBuffer>} words
-   * @returns {number} place of the first
+   * @returns {{start: number, size: number}} their place
    */
   append(words) {
-    const { device, count } = this;
-    this.#reserve(count + words.length);
-    device.device.queue.writeBuffer(this.buffer, 4 * count, words);
-    this.count += words.length;
-    return count;
+    const { device, ranges } = this;
+    const start = ranges.take(words.length) ?? 0; // there is always room
+    this.#reserve(ranges.end);
+    device.device.queue.writeBuffer(this.buffer, 4 * start, words);
+    return { start, size: words.length };
+  }
+
+  /** @param {{start: number, size: number}} range that is freed */
+  give({ start, size }) {
+    this.ranges.give(start, size);
   }
 
   /** @param {number} words */
@@ -218,7 +224,8 @@ export class Words {
 
   /** Free reserved memory. */
   trim() {
-    if (this.buffer.size > 4 * this.count + 1024) this.#move(4 * this.count);
+    const { end } = this.ranges;
+    if (this.buffer.size > 4 * end + 1024) this.#move(4 * end);
   }
 
   /** @param {number} bytes */

@@ -2,7 +2,7 @@
 // drawn in slices of depth, nearest first.
 
 import { slopeLimits } from './camera_maths.mjs';
-import { BLOCK } from './webgpu_scene.mjs';
+import { BLOCK_SPLATS } from './texels.mjs';
 
 /**
  * @typedef {import('./types.d.ts').View} View
@@ -67,7 +67,8 @@ export class Projection {
     if (this.known) return this.known;
     const { device } = this;
     const blockCount = this.scene?.blockCount ?? 0;
-    const count = Math.max(1, Math.min(blockCount * BLOCK, this.recordsMax));
+    const drawn = this.scene?.layout.drawn ?? 0;
+    const count = Math.max(1, Math.min(blockCount * BLOCK_SPLATS, drawn, this.recordsMax));
     const pair = (/** @type {number} */ bytes) => [device.buffer(bytes * count), device.buffer(bytes * count)];
     const [keys, values] = [pair(4), pair(4)];
     const recordBytes = RECORD_BYTES * (count + 1); // the last record draws nothing, see bin.wgsl
@@ -76,7 +77,7 @@ export class Projection {
       device.buffer(recordBytes),
       device.buffer(4 * count),
     ];
-    const [blocks, sums] = [device.buffer(36 * blockCount), device.buffer(4 * Math.ceil(count / BLOCK))];
+    const [blocks, sums] = [device.buffer(36 * blockCount), device.buffer(4 * Math.ceil(count / BLOCK_SPLATS))];
     const depths = device.buffer(4 << DEPTH_BITS);
     const { calls, owned } = this.sortPasses(keys, values, 32, GROUPS.sortRecords, count);
     owned.push(blocks, sums, pairCounts, depths, ellipses, looks, ...keys, ...values);
@@ -109,7 +110,7 @@ export class Projection {
       bind('compact', 'compact', 1, view, counters, blocks),
       bind('dispatch', 'after_compact', 1, view, counters, groups),
       ...pages.map((page) => {
-        const source = [...this.#source(page), page.rows.buffer, tables];
+        const source = [...this.#source(page), page.rows?.buffer ?? null, tables];
         return bind('project', 'project', page.blocks, ...source, blocks, ellipses, looks, keys);
       }),
       ...sort,
@@ -118,12 +119,12 @@ export class Projection {
   }
 
   #pages() {
-    return (this.scene?.pages ?? []).filter((page) => page.blocks > 0);
+    return (this.scene?.pages ?? []).filter((page) => page.geometry !== null);
   }
 
   /** @param {import('./webgpu_scene.mjs').Page} page */
   #source(page) {
-    return [this.view, page.info, this.scene?.table ?? null, page.geometry.buffer];
+    return [this.view, page.info, this.scene?.table ?? null, page.geometry?.buffer ?? null];
   }
 
   /**

@@ -1,6 +1,7 @@
 // The memory of one scene on a WebGPU device. csplat_render/gpu/packing.py describes the layout.
 
 import { toCamera } from './camera_maths.mjs';
+import { BLOCK_SPLATS } from './texels.mjs';
 import { Words } from './webgpu_device.mjs';
 
 /**
@@ -11,18 +12,14 @@ import { Words } from './webgpu_device.mjs';
  * @typedef {import('./types.d.ts').View} View
  * @typedef {import('./webgpu_device.mjs').Device} Device
  *
- * Tiles whose words share two buffers.
- * @typedef {{blocks: number, info: GPUBuffer, geometry: Words, rows: Words}} Page
+ * @typedef {{start: number, size: number}} Range
+ *
+ * Blocks whose tiles' words share two buffers, which are created with the first tile.
+ * @typedef {{first: number, blocks: number, info: GPUBuffer, geometry: Words | null, rows: Words | null}} Page
  */
-
-/** Splats of a workgroup, all of one tile. */
-export const BLOCK = 256;
 
 /** Rows of four words per tile in the table of constants. */
 const TILE_ROWS = 12;
-
-/** Blocks of a page: the buffers of its tiles stay below WebGPU's default limit, whatever their fields. */
-const PAGE_BLOCKS = 1 << 10;
 
 const TEXEL_WORDS = 4;
 const USUAL_WORDS = 5; // of a splat, at first
@@ -41,30 +38,17 @@ export class GpuScene {
   constructor(device, layout, replaced) {
     this.device = device;
     this.layout = layout;
+    this.replaced = replaced;
     const { tiles } = layout;
-    /** First block of each tile. @type {number[]} */
-    this.starts = [];
-    /** Index of each tile's page. @type {number[]} */
-    this.pageOf = [];
-    const counts = [0]; // blocks of each page
     this.blockCount = 0;
-    for (const { splatCount } of tiles) {
-      const blocks = Math.ceil(splatCount / BLOCK);
-      const last = counts.length - 1;
-      if (counts[last] + blocks > PAGE_BLOCKS) counts.push(blocks);
-      else counts[last] += blocks;
-      this.pageOf.push(counts.length - 1);
-      this.starts.push(this.blockCount);
-      this.blockCount += blocks;
-    }
-    let first = 0;
     /** @type {Page[]} */
-    this.pages = counts.map((blocks) => {
-      const info = device.uniform(Uint32Array.of(first, 0, 0, 0));
-      first += blocks;
-      const geometry = new Words(device, USUAL_WORDS * BLOCK * blocks, replaced);
-      return { blocks, info, geometry, rows: new Words(device, BLOCK * blocks, replaced) };
+    this.pages = layout.pages.map((slots) => {
+      const [first, blocks] = [this.blockCount, slots / BLOCK_SPLATS];
+      this.blockCount += blocks;
+      return { first, blocks, info: device.uniform(Uint32Array.of(first, 0, 0, 0)), geometry: null, rows: null };
     });
+    /** What each tile takes of its page. @type {Map<number, {page: Page, geometry: Range, rows: Range[]}>} */
+    this.held = new Map();
     this.tileTable = tiles.length;
     this.blockTable = tiles.length * (1 + TILE_ROWS);
     this.table = device.buffer(16 * (this.blockTable + Math.ceil(this.blockCount / 4)));
@@ -77,21 +61,22 @@ export class GpuScene {
     this.places = new Float32Array(TEXEL_WORDS * tiles.length);
     /** Which tiles are drawn; null for all. @type {Set<number> | null} */
     this.cut = null;
-    this.#putBlocks();
   }
 
   get bytes() {
-    const buffers = this.pages.flatMap(({ geometry, rows }) => [geometry.buffer, rows.buffer]);
-    return [this.table, this.tables.buffer, ...buffers].reduce((sum, { size }) => sum + size, 0);
+    const words = [this.tables, ...this.pages.flatMap(({ geometry, rows }) => [geometry, rows])];
+    return words.reduce((sum, one) => sum + (one?.buffer.size ?? 0), this.table.size);
   }
 
-  /** Write the tile of each block. */
-  #putBlocks() {
-    const owners = new Uint32Array(Math.ceil(this.blockCount / 4) * 4);
-    this.layout.tiles.forEach(({ splatCount }, tile) => {
-      owners.fill(tile, this.starts[tile], this.starts[tile] + Math.ceil(splatCount / BLOCK));
-    });
-    this.#write(16 * this.blockTable, owners);
+  /**
+   * Write the tile of blocks. A block that is part of no tile may refer to any: it has none of its splats.
+   *
+   * @param {number} tile
+   * @param {number} first block
+   * @param {number} count
+   */
+  #putBlocks(tile, first, count) {
+    this.#write(16 * this.blockTable + 4 * first, new Uint32Array(count).fill(tile));
   }
 
   /**
@@ -103,17 +88,35 @@ export class GpuScene {
   }
 
   /**
+   * @param {number} slot
+   * @returns {Page & {geometry: Words, rows: Words}}
+   */
+  #pageOf(slot) {
+    const block = slot / BLOCK_SPLATS;
+    const page = this.pages.find(({ first, blocks }) => first <= block && block < first + blocks);
+    if (!page) throw new RangeError(`slot ${slot} of ${BLOCK_SPLATS * this.blockCount}`);
+    if (page.geometry === null) {
+      page.geometry = new Words(this.device, USUAL_WORDS * BLOCK_SPLATS * page.blocks, this.replaced);
+      page.rows = new Words(this.device, BLOCK_SPLATS * page.blocks, this.replaced);
+      this.replaced();
+    }
+    return /** @type {Page & {geometry: Words, rows: Words}} */ (page);
+  }
+
+  /**
    * @param {number} tile
    * @param {GeometryTexels} texels
+   * @param {number} slot of its first splat
    */
-  putGeometry(tile, texels) {
+  putGeometry(tile, texels, slot) {
     const { antialiased, opacityLevels, opacitySquare, quatLevels } = this.layout;
     const { count, bits, scales, sh0 } = texels;
-    const page = this.pages[this.pageOf[tile]];
-    const word = page.geometry.append(planesOf(texels));
+    const page = this.#pageOf(slot);
+    const geometry = page.geometry.append(planesOf(texels));
+    this.held.set(tile, { page, geometry, rows: [] });
     const flags = (antialiased ? ANTIALIASED : 0) | (opacitySquare ? SQUARED : 0);
     const [x, y, z] = bits.means;
-    this.#set(tile, 0, [word, TEXEL_WORDS + texels.moreWords, this.starts[tile], count | flags]);
+    this.#set(tile, 0, [geometry.start, TEXEL_WORDS + texels.moreWords, slot / BLOCK_SPLATS, count | flags]);
     this.#set(tile, 1, [
       x | (y << 8) | (z << 16) | (bits.opacities << 24),
       bits.scales | (bits.quats << 8) | (bits.sh0 << 16),
@@ -123,6 +126,7 @@ export class GpuScene {
     this.#set(tile, 2, new Uint32Array(Float32Array.of(...scales.offsets, scales.step).buffer));
     this.#set(tile, 3, new Uint32Array(Float32Array.of(...sh0.offsets, sh0.step).buffer));
     this.#putConstants(tile);
+    this.#putBlocks(tile, slot / BLOCK_SPLATS, Math.ceil(count / BLOCK_SPLATS));
   }
 
   /**
@@ -131,7 +135,7 @@ export class GpuScene {
    * @param {Rows} rows
    */
   putTable(codebook, layer, rows) {
-    this.tableOf.set(`${codebook}.${layer}`, { at: this.tables.append(rows.texels), rows });
+    this.tableOf.set(`${codebook}.${layer}`, { at: this.tables.append(rows.texels).start, rows });
   }
 
   /**
@@ -140,8 +144,15 @@ export class GpuScene {
    * @param {BandTexels} band
    */
   putBand(tile, layer, { rows, codebook }) {
-    const store = this.pages[this.pageOf[tile]].rows;
-    const rowsAt = rows ? store.append(rows.texels) : 0;
+    const held = this.held.get(tile);
+    if (!held?.page.rows) return;
+    const store = held.page.rows;
+    const append = (/** @type {Uint32Array<ArrayBuffer>} */ words) => {
+      const range = store.append(words);
+      held.rows.push(range);
+      return range.start;
+    };
+    const rowsAt = rows ? append(rows.texels) : 0;
     const rowBits = rows ? rows.bits : 1;
     const table = codebook && this.tableOf.get(`${codebook.id}.${layer}`);
     const head = 2 + 2 * layer;
@@ -151,7 +162,7 @@ export class GpuScene {
     } else {
       const key = `${tile}.${codebook.id}`; // all bands of a codebook have the same indices
       let indexAt = this.indices.get(key);
-      if (indexAt === undefined) this.indices.set(key, (indexAt = store.append(codebook.index)));
+      if (indexAt === undefined) this.indices.set(key, (indexAt = append(codebook.index)));
       const bits = (codebook.indexBits << 2) | (table.rows.bits << 8) | (rowBits << 16);
       this.#set(tile, head, [BAND_CODEBOOK | bits, indexAt, table.at, rowsAt]);
       this.#setFloats(tile, head + 1, [table.rows.offset, rows ? rows.offset : 0, table.rows.step], codebook.size);
@@ -159,6 +170,18 @@ export class GpuScene {
     const second = TEXEL_WORDS * (TILE_ROWS * tile + 1) + 1;
     const degree = Math.max(layer, this.constants[second] >>> 24);
     this.constants[second] = (this.constants[second] & 0xffffff) | (degree << 24);
+    this.#putConstants(tile);
+  }
+
+  /** @param {number} tile that is freed */
+  evict(tile) {
+    const held = this.held.get(tile);
+    if (!held) return;
+    this.held.delete(tile);
+    held.page.geometry?.give(held.geometry);
+    for (const range of held.rows) held.page.rows?.give(range);
+    for (const key of this.indices.keys()) if (key.startsWith(`${tile}.`)) this.indices.delete(key);
+    this.constants.fill(0, TEXEL_WORDS * TILE_ROWS * tile, TEXEL_WORDS * TILE_ROWS * (tile + 1));
     this.#putConstants(tile);
   }
 
@@ -219,7 +242,7 @@ export class GpuScene {
 
   /** Free reserved memory. */
   trim() {
-    for (const words of [this.tables, ...this.pages.flatMap(({ geometry, rows }) => [geometry, rows])]) words.trim();
+    for (const words of [this.tables, ...this.pages.flatMap(({ geometry, rows }) => [geometry, rows])]) words?.trim();
   }
 
   dispose() {
@@ -227,8 +250,8 @@ export class GpuScene {
     this.tables.dispose();
     for (const { info, geometry, rows } of this.pages) {
       this.device.free(info);
-      geometry.dispose();
-      rows.dispose();
+      geometry?.dispose();
+      rows?.dispose();
     }
   }
 }
@@ -239,13 +262,14 @@ export class GpuScene {
  * @param {GeometryTexels} texels
  */
 function planesOf({ count, first, more, moreWords }) {
-  const blocks = Math.ceil(count / BLOCK);
+  const blocks = Math.ceil(count / BLOCK_SPLATS);
   const stride = TEXEL_WORDS + moreWords;
-  const planes = new Uint32Array(blocks * BLOCK * stride);
+  const planes = new Uint32Array(blocks * BLOCK_SPLATS * stride);
   for (let splat = 0; splat < count; splat++) {
-    let at = Math.floor(splat / BLOCK) * BLOCK * stride + (splat % BLOCK);
-    for (let word = 0; word < TEXEL_WORDS; word++, at += BLOCK) planes[at] = first[TEXEL_WORDS * splat + word];
-    for (let word = 0; word < moreWords && more; word++, at += BLOCK) planes[at] = more[moreWords * splat + word];
+    let at = Math.floor(splat / BLOCK_SPLATS) * BLOCK_SPLATS * stride + (splat % BLOCK_SPLATS);
+    for (let word = 0; word < TEXEL_WORDS; word++, at += BLOCK_SPLATS) planes[at] = first[TEXEL_WORDS * splat + word];
+    for (let word = 0; word < moreWords && more; word++, at += BLOCK_SPLATS)
+      planes[at] = more[moreWords * splat + word];
   }
   return planes;
 }

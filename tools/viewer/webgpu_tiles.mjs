@@ -1,7 +1,7 @@
 // Blends records by screen tiles, in binary32: lists the screen tiles of each splat, sorts these pairs, and blends each
 // screen tile in workgroup memory. What exceeds the buffers is drawn in bands of rows and in steps.
 
-import { BLOCK } from './webgpu_scene.mjs';
+import { BLOCK_SPLATS } from './texels.mjs';
 import { GROUPS, SCREEN_TILE } from './webgpu_projection.mjs';
 
 /**
@@ -45,7 +45,9 @@ export class ScreenTiles {
   prepare({ width, height }) {
     const columns = Math.ceil(width / SCREEN_TILE);
     const { bindingMax } = this.projection.device;
-    const rows = Math.floor(Math.min(bindingMax / (16 * width * SCREEN_TILE), this.pairsMax / (BLOCK * columns)));
+    const rows = Math.floor(
+      Math.min(bindingMax / (16 * width * SCREEN_TILE), this.pairsMax / (BLOCK_SPLATS * columns)),
+    );
     const band = Math.min(height, Math.max(1, rows) * SCREEN_TILE);
     this.#makeRoom(width, band);
     /** @type {[number, number][]} */
@@ -60,7 +62,7 @@ export class ScreenTiles {
    */
   #makeRoom(width, height) {
     const [columns, rows] = [Math.ceil(width / SCREEN_TILE), Math.ceil(height / SCREEN_TILE)];
-    const pairs = Math.max(Math.min(this.pairsWanted, this.pairsMax), BLOCK * columns * rows);
+    const pairs = Math.max(Math.min(this.pairsWanted, this.pairsMax), BLOCK_SPLATS * columns * rows);
     const known = this.target;
     if (known && known.width === width && known.height === height && known.pairs === pairs) return;
     this.forget();
@@ -82,7 +84,15 @@ export class ScreenTiles {
       ranges,
       owned: [pixels, ranges, ...keys, ...values, ...sort.owned],
       clear: [
-        bind('dispatch', 'clear_pixels', [Math.ceil((width * height) / (64 * BLOCK)), 64], view, null, null, pixels),
+        bind(
+          'dispatch',
+          'clear_pixels',
+          [Math.ceil((width * height) / (64 * BLOCK_SPLATS)), 64],
+          view,
+          null,
+          null,
+          pixels,
+        ),
       ],
       step: [
         bind('bin', 'count', blocks, view, counters, order, ellipses, looks, sums, pairCounts),

@@ -1,10 +1,10 @@
-// The viewer's worker: reads and packs the file and sorts the visible splats. engine.mjs sends it requests.
+// The viewer's worker: reads and packs what the view requires and sorts the visible splats. engine.mjs sends it requests.
 
 import { cull } from './cull.mjs';
 import { chooseTiles } from './level_cut.mjs';
-import { load } from './loader.mjs';
 import { withUp } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
+import { TileStream } from './tile_stream.mjs';
 
 /**
  * @typedef {import('./cull.mjs').CullTile} CullTile
@@ -13,9 +13,11 @@ import { DepthSorter } from './sort.mjs';
  *
  * Messages to the worker: `scene` counts the calls of `open`, `id` the cameras.
  *
- * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer, sort: boolean, budget: number}
+ * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer, sort: boolean,
+ *      aims: import('./tile_stream.mjs').Aims}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
+ *   | {type: 'pause', isPaused: boolean}
  *   | {type: 'rewrite', up: number[], port: MessagePort}
  *   | {type: 'stop'}} Request
  *
@@ -26,17 +28,21 @@ import { DepthSorter } from './sort.mjs';
  * Messages of the worker; all carry `scene`.
  *
  * @typedef {{scene: number} & (
- *   | {type: 'header', header: import('./types.d.ts').Header, description: import('./types.d.ts').Description,
- *      roots: number}
+ *   | {type: 'header', opened: import('./tile_stream.mjs').Opened}
  *   | {type: 'cut', tiles: Uint32Array<ArrayBuffer>}
  *   | {type: 'progress', progress: import('./types.d.ts').Progress, decodeMs: number}
- *   | {type: 'geometry', tile: number, texels: import('./texels.mjs').GeometryTexels, samples: import('./loader.mjs').Samples}
+ *   | {type: 'geometry', tile: number, slot: number, texels: import('./texels.mjs').GeometryTexels,
+ *      samples: import('./tile_stream.mjs').Samples}
+ *   | {type: 'evict', tile: number}
  *   | {type: 'table', codebook: number, layer: number, rows: import('./texels.mjs').Rows}
  *   | {type: 'band', tile: number, layer: number, band: import('./texels.mjs').BandTexels}
- *   | {type: 'order', id: number, tiles: number, isWhole: boolean, order: Uint32Array<ArrayBuffer>, count: number,
+ *   | {type: 'order', id: number, isComplete: boolean, isWhole: boolean, order: Uint32Array<ArrayBuffer>, count: number,
  *      cullMs: number, sortMs: number}
  *   | {type: 'done'}
  *   | {type: 'error', error: ErrorReport})} Reply
+ *
+ * `order`: `isWhole` if it covers the scene, at any level, `isComplete` if everything that the view requires was here. `done`:
+ * so it was for the first time.
  */
 
 /** Minimum interval between sorts while tiles arrive. */
@@ -57,20 +63,19 @@ class Job {
     /** @type {string | Blob | ArrayBuffer} */
     this.source = new ArrayBuffer(0);
     this.abort = new AbortController();
-    /** @type {import('./types.d.ts').Header | null} */
-    this.header = null;
-    /** Nodes of the levels of detail. @type {import('./types.d.ts').TreeNode[]} */
-    this.nodes = [];
-    /** Tiles that are here. @type {CullTile[]} */
-    this.tiles = [];
-    /** Tiles that are drawn, of `tiles`. @type {CullTile[]} */
+    /** @type {TileStream | null} */
+    this.stream = null;
+    /** Tiles that are drawn. @type {CullTile[]} */
     this.drawn = [];
+    /** Nodes that finer ones are drawn for. @type {Set<number>} */
+    this.refined = new Set();
     this.isWhole = false; // `drawn` covers the whole scene
+    this.isDone = false; // everything that a view requires was here once
+    this.isPaused = false;
     this.splatCount = 0; // number of splats in `drawn`
     /** @type {{id: number, view: View} | null} */
     this.camera = null;
     this.sorts = true;
-    this.budget = Infinity; // splats
     this.sorter = new DepthSorter();
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     /** @type {Uint32Array<ArrayBuffer>[]} */
@@ -85,6 +90,9 @@ class Job {
     else if (request.type === 'view') {
       this.camera = request;
       this.sortSoon(0);
+    } else if (request.type === 'pause') {
+      this.isPaused = request.isPaused;
+      this.stream?.pause(this.isPaused);
     } else if (request.type === 'rewrite') this.rewrite(request.up, request.port);
     else if (request.type === 'stop') this.reset();
     else if (this.spare.length < 2) this.spare.push(request.order);
@@ -95,34 +103,37 @@ class Job {
     this.scene = 0;
     this.abort.abort();
     this.abort = new AbortController();
-    this.header = null;
-    this.nodes = [];
-    this.tiles = this.drawn = [];
-    this.isWhole = false;
+    this.stream = null;
+    this.drawn = [];
+    this.refined = new Set();
+    this.isWhole = this.isDone = false;
     this.splatCount = 0;
     this.spare = [];
     this.visible = { depths: new Float32Array(0), slots: new Uint32Array(0), count: 0 };
     this.sorter = new DepthSorter();
   }
 
-  /** @param {Request & {type: 'open'}} request `sort`: the renderer needs an order; `budget` of splats */
-  async open({ scene, source, sort, budget }) {
+  /** @param {Request & {type: 'open'}} request `sort`: the renderer needs an order */
+  async open({ scene, source, sort, aims }) {
     this.reset();
     this.scene = scene;
     this.sorts = sort;
-    this.budget = budget;
     this.source = source;
-    const { signal } = this.abort;
+    const { abort } = this;
+    const { signal } = abort;
     /** @type {(message: any, transfer?: Transferable[]) => void} */
     const post = (message, transfer = []) => {
       if (!signal.aborted) this.scope.postMessage({ ...message, scene }, transfer);
     };
     try {
-      await load(source, this.sink(post), signal);
-      this.sort(); // includes the last tiles in the order before `done` is sent
-      post({ type: 'done' });
+      const stream = await TileStream.open(source, this.sink(post), aims, signal);
+      this.stream = stream;
+      stream.pause(this.isPaused);
+      stream.setView(this.camera?.view ?? null);
+      await stream.failed;
     } catch (error) {
-      post({ type: 'error', error: reportOf(error) });
+      post({ type: 'error', error: reportOf(error, true) });
+      abort.abort(); // ends what is left of the reading
     }
   }
 
@@ -137,31 +148,29 @@ class Job {
       const bytes = await withUp(await whole(this.source), up);
       port.postMessage({ bytes }, [bytes.buffer]);
     } catch (error) {
-      port.postMessage({ error: reportOf(error) });
+      port.postMessage({ error: reportOf(error, true) });
     }
   }
 
   /**
    * @param {(message: any, transfer?: Transferable[]) => void} post
-   * @returns {import('./loader.mjs').Sink}
+   * @returns {import('./tile_stream.mjs').Sink}
    */
   sink(post) {
     return {
-      header: (header, description, nodes, roots) => {
-        this.header = header;
-        this.nodes = nodes;
-        post({ type: 'header', header, description, roots });
-        if (nodes.length > 0 && !this.sorts) post({ type: 'cut', tiles: new Uint32Array(0) });
-        this.choose();
+      header: (opened) => {
+        post({ type: 'header', opened });
+        if (!this.sorts) post({ type: 'cut', tiles: new Uint32Array(0) });
       },
-      geometry: (tile, texels, culled, samples) => {
-        this.tiles.push(culled);
-        this.tiles.sort((a, b) => a.slot - b.slot); // keeps equal depths in the order of the file
+      geometry: (tile, texels, { slot }, samples) => {
         const transfer = [texels.first.buffer, samples.points.buffer, samples.weights.buffer];
         if (texels.more) transfer.push(texels.more.buffer);
-        post({ type: 'geometry', tile, texels, samples }, transfer);
-        this.choose();
+        post({ type: 'geometry', tile, slot, texels, samples }, transfer);
         this.sortSoon(SORT_INTERVAL_MS);
+      },
+      evict: (tile) => {
+        if (this.drawn.some(({ index }) => index === tile)) this.sort(); // its slots are given to another
+        post({ type: 'evict', tile });
       },
       table: (codebook, layer, rows) => post({ type: 'table', codebook, layer, rows }, [rows.texels.buffer]),
       band: (tile, layer, band) => {
@@ -172,28 +181,37 @@ class Job {
         );
       },
       progress: ({ decodeMs, ...progress }) => post({ type: 'progress', progress, decodeMs }),
-      view: () => this.camera?.view ?? null,
+      warn: (error) => post({ type: 'error', error: reportOf(error, false) }),
+      complete: () => {
+        this.sort(); // includes the last tiles in the order before `done` is sent
+        if (!this.isDone) post({ type: 'done' });
+        this.isDone = true;
+      },
     };
   }
 
-  /** Choose the tiles to draw, of those that are here. */
-  choose() {
-    const { header, nodes, tiles } = this;
-    if (nodes.length === 0) {
-      this.drawn = tiles;
-      this.isWhole = tiles.length === header?.tiles.length;
-    } else {
-      const here = new Map(tiles.map((tile) => [tile.index, tile]));
-      const cut = chooseTiles(nodes, (tile) => here.has(tile), this.camera?.view ?? null, this.budget);
-      const before = this.drawn;
-      this.drawn = cut.tiles.flatMap((tile) => here.get(tile) ?? []);
-      this.isWhole = cut.isWhole;
-      const isNew = this.drawn.length !== before.length || this.drawn.some((tile, i) => tile !== before[i]);
-      if (isNew && !this.sorts) {
-        this.scope.postMessage({ type: 'cut', scene: this.scene, tiles: Uint32Array.from(cut.tiles) });
-      }
-    }
+  /**
+   * Choose the tiles to draw, of those that are here.
+   *
+   * @param {TileStream} stream
+   */
+  choose({ nodes, here, looks, aims, hasLevels }) {
+    const { tiles, isWhole, refined } = chooseTiles(
+      nodes,
+      (tile) => here.has(tile),
+      looks,
+      hasLevels ? aims.budget : Infinity,
+      this.refined,
+    );
+    const before = this.drawn;
+    this.drawn = tiles.flatMap((tile) => here.get(tile) ?? []);
+    this.isWhole = isWhole;
+    this.refined = refined;
     this.splatCount = this.drawn.reduce((sum, { count }) => sum + count, 0);
+    const isNew = this.drawn.length !== before.length || this.drawn.some((tile, i) => tile !== before[i]);
+    if (isNew && !this.sorts) {
+      this.scope.postMessage({ type: 'cut', scene: this.scene, tiles: Uint32Array.from(tiles) });
+    }
   }
 
   /**
@@ -212,12 +230,13 @@ class Job {
   }
 
   sort() {
-    if (this.camera === null || this.scene === 0) return;
-    if (this.nodes.length > 0) this.choose();
-    const { id, view } = this.camera;
+    const { stream, camera } = this;
+    if (camera === null || stream === null) return;
+    const { id, view } = camera;
+    if (stream.view !== view) stream.setView(view);
+    this.choose(stream);
     const { scene, splatCount, visible, isWhole } = this;
-    const tiles = this.tiles.filter(({ index }) => index < (this.header?.tiles.length ?? 0)).length;
-    const reply = /** @type {const} */ ({ type: 'order', scene, id, tiles, isWhole });
+    const reply = /** @type {const} */ ({ type: 'order', scene, id, isComplete: stream.isComplete, isWhole });
     if (!this.sorts) {
       this.scope.postMessage({ ...reply, order: new Uint32Array(0), count: splatCount, cullMs: 0, sortMs: 0 });
       return;
@@ -253,9 +272,10 @@ async function whole(source) {
 
 /**
  * @param {unknown} error
+ * @param {boolean} fatal whether the scene is given up
  * @returns {ErrorReport}
  */
-function reportOf(error) {
+function reportOf(error, fatal) {
   const { code, message, offset, clause } = /** @type {any} */ (error instanceof Error ? error : { message: error });
   const isOurs = typeof code === 'string';
   return {
@@ -263,10 +283,11 @@ function reportOf(error) {
     message: String(message),
     ...(offset !== null && offset !== undefined && { offset }),
     ...(clause && { clause }),
-    fatal: true,
+    fatal,
   };
 }
 
 const scope = /** @type {Scope} */ (/** @type {unknown} */ (globalThis));
 const job = new Job(scope);
 scope.onmessage = (/** @type {{data: Request}} */ { data }) => job.take(data);
+globalThis.addEventListener?.('online', () => job.stream?.retry());

@@ -3,7 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { viewOf } from '../camera_maths.mjs';
-import { chooseTiles } from '../level_cut.mjs';
+import { chooseTiles, chooseWishes, looksOf } from '../level_cut.mjs';
 
 /** Two leaves of two tiles and one of one tile; a parent of the first two; a root. Tiles 0 to 4 are of level 0. */
 const node = (index, level, parent, children, firstTile, tileCount, error, splatCount, min, max) => ({
@@ -16,7 +16,10 @@ const NODES = [
   node(3, 1, 4, [0, 1], 5, 1, 0.1, 500, [-10, -1, -1], [0, 1, 1]),
   node(4, 2, null, [2, 3], 6, 1, 0.2, 100, [-10, -1, -1], [10, 1, 1]),
 ];
-const cut = (...here) => chooseTiles(NODES, (tile) => here.includes(tile), null, Infinity);
+const cut = (...here) => {
+  const { tiles, isWhole } = chooseTiles(NODES, (tile) => here.includes(tile), looksOf(NODES, null), Infinity);
+  return { tiles, isWhole };
+};
 
 test('a node is drawn until all of its children are here', () => {
   assert.deepEqual(cut(6), { tiles: [6], isWhole: true });
@@ -42,7 +45,7 @@ const from = (x) => {
   const viewmat = [1, 0, 0, -x, 0, 1, 0, 0, 0, 0, 1, 20, 0, 0, 0, 1];
   return viewOf({ viewmat, fx: 100, fy: 100, cx: 50, cy: 50 }, 100, 100);
 };
-const within = (budget, view) => chooseTiles(NODES, () => true, view, budget).tiles;
+const within = (budget, view) => chooseTiles(NODES, () => true, looksOf(NODES, view), budget).tiles;
 
 test('over the budget, nodes of small errors in pixels stay', () => {
   assert.deepEqual(within(3000, from(0)), [0, 1, 2, 3, 4]);
@@ -54,7 +57,48 @@ test('over the budget, nodes of small errors in pixels stay', () => {
 test('what is out of view is coarse', () => {
   const away = from(0);
   away.viewmat = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, -50, 0, 0, 0, 1]; // behind the camera
-  assert.deepEqual(within(2999, away), [6]);
+  assert.deepEqual(within(1499, away), [6]);
+  assert.deepEqual(within(2999, away), [4, 5]); // as far as it fits
   assert.deepEqual(within(3000, away), [0, 1, 2, 3, 4]); // all of it fits
   assert.deepEqual(within(2000, from(20)), [4, 5]); // only leaf 2 is in view, at the left
+});
+
+test('a small movement does not exchange what is drawn', () => {
+  const choose = (view, refined) => chooseTiles(NODES, () => true, looksOf(NODES, view), 2500, refined);
+  const near = choose(from(-4));
+  assert.deepEqual([...near.refined], [4]);
+  assert.deepEqual(choose(from(-4), near.refined).tiles, near.tiles);
+});
+
+const wishes = (view, aims) =>
+  chooseWishes(NODES, looksOf(NODES, view), { budget: Infinity, pixels: 0, around: false, ...aims });
+const numbers = (some) => some.map(({ node: { index } }) => index);
+
+test('the roots are requested first, then children of the largest errors', () => {
+  assert.deepEqual(numbers(wishes(null, { pixels: Infinity })), [4]); // without a camera
+  const all = wishes(from(0));
+  assert.deepEqual(numbers(all).slice(0, 3).sort(), [2, 3, 4]);
+  assert.equal(numbers(all)[0], 4);
+  assert.deepEqual(numbers(all).slice(3).sort(), [0, 1]);
+  assert.deepEqual(numbers(all.filter(({ isDrawn }) => isDrawn)).sort(), [0, 1, 2]);
+  assert.ok(all.every(({ isNeeded }) => isNeeded));
+});
+
+test('errors that are small enough are not refined', () => {
+  assert.deepEqual(numbers(wishes(from(0), { pixels: 5 })), [4]);
+  const pixels = (100 * 0.1) / 19; // of node 3
+  assert.deepEqual(numbers(wishes(from(0), { pixels })).sort(), [2, 3, 4]);
+});
+
+test('what exceeds the budget is not requested', () => {
+  assert.deepEqual(numbers(wishes(from(0), { budget: 2999 })).sort(), [2, 3, 4]);
+  assert.deepEqual(numbers(wishes(from(0), { budget: 1499 })), [4]);
+});
+
+test('what is out of view comes last, or not at all', () => {
+  assert.deepEqual(numbers(wishes(from(20))).sort(), [2, 3, 4]); // leaf 2 alone is in view
+  const around = numbers(wishes(from(20), { around: true }));
+  assert.equal(around[0], 4);
+  assert.equal(around[1], 2);
+  assert.deepEqual([...around].sort(), [0, 1, 2, 3, 4]);
 });

@@ -5,7 +5,7 @@ import { test } from 'node:test';
 
 import { CsplatReader } from '../../../codec/js/decoder.mjs';
 import { failures } from '../../../codec/js/test/helpers.mjs';
-import { BLOCK_SPLATS, bitsFor, layoutSlots, packBand, packGeometry, packRows } from '../texels.mjs';
+import { BLOCK_SPLATS, bitsFor, packBand, packGeometry, packRows, pagesOf } from '../texels.mjs';
 
 const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
 const { vectors } = JSON.parse(readFileSync(new URL('manifest.json', VECTORS), 'utf8'));
@@ -156,10 +156,19 @@ test('rows of columns with far offsets are binary32 patterns', () => {
   assert.deepEqual(row(negative, 0, 3), [-(2 ** 34), -1, -(2 ** 33)]);
 });
 
-test('tiles begin at blocks', () => {
-  const { starts, slotCount } = layoutSlots([{ splatCount: 1 }, { splatCount: BLOCK_SPLATS }, { splatCount: 65 }]);
-  assert.deepEqual([starts, slotCount], [[0, 64, 128], 256]);
-  assert.deepEqual(layoutSlots([]), { starts: [], slotCount: 0 });
+test('tiles begin at blocks, and do not cross pages', () => {
+  const sizes = (...counts) => counts.map((splatCount) => ({ splatCount }));
+  assert.deepEqual(pagesOf(sizes(1, BLOCK_SPLATS, 257), Infinity), { pages: [1024], starts: [0, 256, 512] });
+  assert.deepEqual(pagesOf([], Infinity), { pages: [0], starts: [] });
+  const large = sizes(...new Array(9).fill(60_000));
+  const { pages, starts } = pagesOf(large, 540_000);
+  assert.deepEqual([pages, starts[4]], [[240_640, 240_640, 60_160], 240_640]);
+});
+
+test('a scene that is larger than the memory has no fixed places', () => {
+  const tiles = new Array(20).fill({ splatCount: 60_000 });
+  assert.deepEqual(pagesOf(tiles, 1_000_000), { pages: new Array(4).fill(250_112), starts: null });
+  assert.deepEqual(pagesOf(tiles, 100), { pages: [60_160], starts: null }); // the largest tile fits
 });
 
 test('number of bits of integers', () => {

@@ -1,0 +1,277 @@
+// The order in which a file is read, and the events on the way.
+import assert from 'node:assert/strict';
+import { readFileSync } from 'node:fs';
+import { test } from 'node:test';
+
+import { readHeader } from '../../../codec/js/decoder.mjs';
+import { HEADER_SIZE } from '../../../codec/js/spec.mjs';
+import { coarseBounds, fineBounds, weightedQuantile } from '../bounds.mjs';
+import { viewOf } from '../camera_maths.mjs';
+import { TileStream } from '../tile_stream.mjs';
+
+const VECTORS = new URL('../../../conformance/csplat_conformance/vectors/', import.meta.url);
+const bytes = (name) => readFileSync(new URL(`${name}.csplat`, VECTORS));
+const AIMS = { budget: Infinity, pixels: 0, around: true };
+
+/** A camera at z that looks along +z. */
+const viewFrom = (z) => {
+  const viewmat = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, -z, 0, 0, 0, 1];
+  return viewOf({ viewmat, fx: 90, fy: 90, cx: 50, cy: 50 }, 100, 100);
+};
+
+/** A sink that collects events, and resolves `done` when everything is here. */
+function collector() {
+  const events = [];
+  const sink = {
+    events,
+    header: (opened) => events.push({ type: 'header', ...opened }),
+    geometry: (tile, texels, cull, samples) => events.push({ type: 'geometry', tile, layer: 0, texels, cull, samples }),
+    table: (codebook, layer) => events.push({ type: 'table', codebook, layer }),
+    band: (tile, layer, band) => events.push({ type: 'band', tile, layer, band }),
+    evict: (tile) => events.push({ type: 'evict', tile }),
+    progress: (progress) => events.push({ type: 'progress', ...progress }),
+    warn: (error) => events.push({ type: 'warn', error }),
+    complete: () => sink.resolve?.(),
+  };
+  return sink;
+}
+
+/** Resolve when everything that a view requires is here. */
+async function seen(stream, view) {
+  const done = new Promise((resolve) => (stream.sink.resolve = resolve));
+  stream.isComplete = false;
+  stream.setView(view);
+  await Promise.race([done, stream.failed]);
+}
+
+/** Return all events of reading a file for a camera. */
+async function loaded(source, { signal = new AbortController().signal, aims = AIMS, view = viewFrom(-1e4) } = {}) {
+  const sink = collector();
+  const stream = await TileStream.open(source, sink, aims, signal);
+  await seen(stream, view);
+  return sink.events;
+}
+
+test('layer 0 of all tiles comes first, then band after band', async () => {
+  const events = await loaded(new Blob([bytes('valid/rich')]));
+  const { header } = events.find(({ type }) => type === 'header');
+  const layers = events.filter(({ type }) => type === 'geometry' || type === 'band').map(({ layer }) => layer);
+  assert.deepEqual(layers, [...layers].sort());
+  assert.equal(layers.filter((layer) => layer === 0).length, header.tiles.length);
+  assert.equal(layers.length, header.tiles.flatMap((tile) => tile.layers.filter(({ layer }) => layer < 8)).length);
+});
+
+test('a table is passed on once, before the first band that needs it', async () => {
+  const events = await loaded(new Blob([bytes('valid/codebook_sh_1_3')]));
+  const tables = events.filter(({ type }) => type === 'table').map(({ layer }) => layer);
+  assert.deepEqual(tables, [1, 2, 3]);
+  for (const layer of tables) {
+    const table = events.findIndex((event) => event.type === 'table' && event.layer === layer);
+    assert.ok(table < events.findIndex((event) => event.type === 'band' && event.layer === layer));
+  }
+});
+
+test('progress ends at the totals', async () => {
+  for (const source of [new Blob([bytes('valid/rich')]), new Uint8Array(bytes('valid/rich')).buffer]) {
+    const events = await loaded(source);
+    const { received, fileSize, splatsDone, splatCount } = events.at(-1);
+    assert.equal(received, fileSize);
+    assert.equal(splatsDone, splatCount);
+    const amounts = events.filter(({ type }) => type === 'progress').map((one) => one.received);
+    assert.deepEqual(
+      amounts,
+      [...amounts].sort((a, b) => a - b),
+    );
+  }
+});
+
+test('an abort ends the reading', async () => {
+  await assert.rejects(
+    loaded(new Blob([bytes('valid/rich')]), { signal: AbortSignal.abort(new Error('enough')) }),
+    /enough/,
+  );
+});
+
+test('a damaged file is refused with its code', async () => {
+  const damaged = Uint8Array.from(bytes('valid/rich'));
+  damaged[readHeader(damaged).tiles[0].layers[1].offset + 20] ^= 1;
+  await assert.rejects(loaded(damaged.buffer), { code: 'E_CRC' });
+});
+
+test('slots of tiles and of their cull data match', async () => {
+  const events = await loaded(new Blob([bytes('valid/rich')]));
+  const tiles = events.filter(({ type }) => type === 'geometry');
+  let end = 0;
+  for (const { cull, texels } of tiles) {
+    assert.equal(cull.slot % 256, 0);
+    assert.ok(cull.slot >= end);
+    end = cull.slot + cull.count;
+    assert.equal(cull.reaches.length, texels.count);
+    assert.equal(cull.means.length, 3 * texels.count);
+  }
+});
+
+test('bounds come from boxes first, then from samples', async () => {
+  const events = await loaded(new Blob([bytes('valid/rich')]));
+  const { header } = events[events.findIndex(({ type }) => type === 'header')];
+  const coarse = coarseBounds(header);
+  assert.equal(coarse.coarse, true);
+  assert.ok(coarse.radius > 0);
+  const samples = events.filter(({ type }) => type === 'geometry').flatMap((one) => [...one.samples.points]);
+  const fine = fineBounds(header, Float32Array.from(samples), new Float32Array(samples.length / 3).fill(1));
+  assert.equal(samples.length, 3 * header.splatCount);
+  for (let axis = 0; axis < 3; axis++) {
+    const values = samples.filter((_, i) => i % 3 === axis);
+    assert.equal(fine.boxMin[axis], Math.min(...values));
+    assert.equal(fine.boxMax[axis], Math.max(...values));
+    assert.ok(fine.centre[axis] >= fine.boxMin[axis] && fine.centre[axis] <= fine.boxMax[axis]);
+  }
+  assert.deepEqual(fineBounds({ tiles: [] }, new Float32Array(0), new Float32Array(0)).centre, [0, 0, 0]);
+});
+
+test('weighted quantiles', () => {
+  const at = (share) => weightedQuantile(Float64Array.of(3, 1, 2), Float32Array.of(1, 1, 2), share);
+  assert.deepEqual([0, 0.25, 0.5, 0.75, 1].map(at), [1, 1, 2, 2, 3]);
+});
+
+/** A server that sends ranges of a file, of the first request only header and index; `requests` lists them. */
+function served(data, { fails = () => false } = {}) {
+  const { indexSize } = readHeader(data);
+  const requests = [];
+  const fetch = async (_, { headers, signal }) => {
+    const [start, last] = /bytes=(\d+)-(\d+)/.exec(headers.get('Range')).slice(1).map(Number);
+    const end = requests.length === 0 ? HEADER_SIZE + indexSize : last + 1;
+    requests.push({ start, end });
+    await new Promise((resolve) => setTimeout(resolve, 1));
+    signal?.throwIfAborted();
+    if (fails(requests.length)) throw new TypeError('failed to fetch');
+    const body = data.subarray(start, end);
+    const range = `bytes ${start}-${start + body.length - 1}/${data.length}`;
+    return new Response(body, { status: 206, headers: { 'content-range': range } });
+  };
+  return { requests, fetch };
+}
+
+async function until(holds) {
+  while (!holds()) await new Promise((resolve) => setTimeout(resolve, 1));
+}
+
+/** Run with another `fetch`. */
+async function withFetch(fetch, run) {
+  const own = globalThis.fetch;
+  globalThis.fetch = fetch;
+  try {
+    return await run();
+  } finally {
+    globalThis.fetch = own;
+  }
+}
+
+const LEVELS = bytes('valid/levels_of_the_rich_scene');
+const levelOf = new Map(
+  [...readHeader(LEVELS).tiles, ...readHeader(LEVELS).coarseTiles].map((one) => [one.index, one.level]),
+);
+const tilesIn = (events) => events.filter(({ type }) => type === 'geometry').map(({ tile }) => tile);
+
+test('of a file with levels, the coarsest version comes first, and no node before its parent', async () => {
+  const events = await loaded(new Blob([LEVELS]), { view: viewFrom(-300) });
+  const [{ roots }] = events.filter(({ type }) => type === 'header');
+  const order = tilesIn(events);
+  assert.equal(order.length, levelOf.size);
+  const coarsest = Math.max(...levelOf.values());
+  assert.equal(new Set(order.slice(0, roots)).size, [...levelOf.values()].filter((one) => one === coarsest).length);
+  for (const { tile, texels, cull, samples } of events.filter(({ type }) => type === 'geometry')) {
+    assert.equal(cull.index, tile);
+    assert.equal(cull.count, texels.count);
+    assert.equal(samples.weights.length > 0, levelOf.get(tile) === coarsest);
+  }
+  const drawn = events.filter(({ type }) => type === 'band').map(({ tile }) => levelOf.get(tile));
+  assert.ok(drawn.length > 0);
+  assert.ok(drawn.every((level) => level === 0)); // those that are exchanged for finer ones need no bands
+});
+
+test('a view from far away requires the coarsest version alone', async () => {
+  const events = await loaded(new Blob([LEVELS]), { aims: { ...AIMS, pixels: 1 } });
+  const coarsest = Math.max(...levelOf.values());
+  assert.ok(tilesIn(events).length > 0);
+  assert.ok(tilesIn(events).every((tile) => levelOf.get(tile) === coarsest));
+});
+
+test('no part is requested twice, and what is seen later is requested then', async () => {
+  const { fetch } = served(LEVELS);
+  await withFetch(fetch, async () => {
+    const sink = collector();
+    const aims = { ...AIMS, around: false };
+    const stream = await TileStream.open('http://example.test/a', sink, aims, new AbortController().signal);
+    const parts = [];
+    const { prefetch } = stream.reader;
+    stream.reader.prefetch = (wanted, options) => {
+      parts.push(...wanted.map(({ tile, layer }) => `${tile}.${layer}`));
+      prefetch.call(stream.reader, wanted, options);
+    };
+    await seen(stream, viewFrom(1e6)); // behind the camera
+    const before = parts.length;
+    await seen(stream, viewFrom(-300));
+    assert.ok(0 < before && before < parts.length);
+    assert.equal(parts.length, new Set(parts).size);
+  });
+});
+
+test('what is not required any more is cancelled', async () => {
+  const { requests, fetch } = served(LEVELS);
+  await withFetch(fetch, async () => {
+    const aims = { ...AIMS, around: false };
+    const stream = await TileStream.open('http://example.test/a', collector(), aims, new AbortController().signal);
+    await seen(stream, viewFrom(1e6));
+    const before = requests.length;
+    stream.setView(viewFrom(-300));
+    const inFlight = [...stream.pending.values()];
+    stream.setView(viewFrom(1e6));
+    assert.ok(before < requests.length);
+    assert.ok(inFlight.length > 0);
+    assert.ok(inFlight.every(({ signal }) => signal.aborted));
+  });
+});
+
+test('a damaged tile is reported, and the node above it stays', async () => {
+  const damaged = Uint8Array.from(LEVELS);
+  const [{ index, layers }] = readHeader(LEVELS).tiles;
+  damaged[layers[0].offset + layers[0].size - 5] ^= 1;
+  const events = await loaded(new Blob([damaged]), { view: viewFrom(-300) });
+  assert.deepEqual(
+    events.filter(({ type }) => type === 'warn').map(({ error }) => error.code),
+    ['E_CRC'],
+  );
+  assert.deepEqual(new Set(tilesIn(events)), new Set([...levelOf.keys()].filter((tile) => tile !== index)));
+});
+
+test('a damaged root is an error', async () => {
+  const damaged = Uint8Array.from(LEVELS);
+  const { coarseTiles } = readHeader(LEVELS);
+  const { layers } = coarseTiles[coarseTiles.length - 1];
+  damaged[layers[0].offset + layers[0].size - 5] ^= 1;
+  await assert.rejects(loaded(new Blob([damaged])), { code: 'E_CRC' });
+});
+
+test('a lost connection is reported once and tried again', async () => {
+  let isOnline = true;
+  const { fetch } = served(LEVELS, { fails: () => !isOnline });
+  await withFetch(fetch, async () => {
+    const sink = collector();
+    const stream = await TileStream.open('http://example.test/a', sink, AIMS, new AbortController().signal);
+    isOnline = false;
+    const done = seen(stream, viewFrom(-300));
+    await until(() => stream.isLost);
+    stream.retry();
+    await until(() => stream.isLost);
+    isOnline = true;
+    stream.retry(); // as when the browser is online again
+    await done;
+    assert.equal(tilesIn(sink.events).length, levelOf.size);
+    const warnings = sink.events.filter(({ type }) => type === 'warn');
+    assert.deepEqual(
+      warnings.map(({ error }) => error.code),
+      ['E_INPUT'],
+    );
+  });
+});
