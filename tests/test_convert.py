@@ -159,6 +159,18 @@ def test_sog_is_written_to_a_folder(tmp_path, ply):
     assert not (tmp_path / "no").exists()
 
 
+def test_streamed_sog_is_written_to_a_folder_of_its_own(tmp_path, ply):
+    out = tmp_path / "new" / "lod-meta.json"
+    call("convert", ply, out)
+    assert 200 == len(csplat.read(tmp_path / "new"))
+    assert "exists: --force" in call("convert", ply, out, status=1).stderr
+    call("convert", ply, out, "--sh-degree", "0", "--force")
+    assert 0 == csplat.read(tmp_path / "new").sh_degree
+    assert "is in the folder of" in call("convert", ply, ply.parent / "lod-meta.json", status=1).stderr
+    call("convert", ply, tmp_path / "no" / "such" / "lod-meta.json", status=1)
+    assert not (tmp_path / "no").exists()
+
+
 def test_formats_are_listed():
     rows = json.loads(call("formats", "--json").stdout)
     assert {"ply", "csplat"} <= {row["format"] for row in rows}

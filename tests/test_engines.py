@@ -14,7 +14,7 @@ from chromium import absent
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.editing.transform import convert_axes
-from csplat.formats import write
+from csplat.formats import write, write_levels
 from csplat.scene_source import source_from_model
 from csplat_bench.browser import serve
 from csplat_bench.engine_stage import ENGINES, pinhole, served
@@ -151,6 +151,19 @@ def test_disposal_leaves_nothing_on_the_gpu(trial):
     before = trial.memory()[1]
     trial.repeat("scene.csplat", 2)
     assert trial.memory()[1] <= before + 100_000
+
+
+def test_playcanvas_draws_streamed_sog_of_csplat(browser, files):
+    folder, address, model, camera = files
+    coarser = model.select(slice(0, None, 4))
+    write_levels(folder / "streamed" / "lod-meta.json", [source_from_model(one) for one in (model, coarser)])
+    page = browser.new_page(device_scale_factor=1)
+    streamed = Trial(page, address, "playcanvas", pinhole(camera, model)).start()
+    said = streamed.show("streamed/lod-meta.json")
+    assert len(model) == said["count"]
+    ours, quarter = (ENGINES["playcanvas"].render(one, camera, 3) for one in (model, coarser))
+    assert psnr(settled(streamed), ours) > max(30.0, psnr(quarter, ours) + 6.0)
+    page.close()
 
 
 @pytest.mark.usefixtures("packages")

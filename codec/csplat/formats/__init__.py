@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
@@ -43,6 +43,7 @@ __all__ = [
     "read",
     "read_all",
     "write",
+    "write_levels",
     "write_scene",
 ]
 
@@ -198,11 +199,32 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
 
 def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | None = None) -> None:
     """Write a scene block by block; arguments are those of `write`."""
+    write_levels(path, [scene], format)
+
+
+def write_levels(path: str | os.PathLike[str], levels: Sequence[SceneSource], format: str | None = None) -> None:
+    """Write the levels of detail of a scene block by block.
+
+    Args:
+        path: as in `write`. Only streamed SOG, a file lod-meta.json in a folder of its own, has several levels.
+        levels: the scene at each level, finest first.
+        format: as in `write`.
+
+    Raises:
+        InputError: as in `write`, or the format has one level and there are several.
+        OSError: the file cannot be written.
+    """
     target = Path(path)
     found = format_by_suffix(target) if format is None else format_by_name(format)
     if found.write is None:
         raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
-    found.write(target, _with_fewer_bands(scene, found.degree))
+    scenes = [_with_fewer_bands(scene, found.degree) for scene in levels]
+    if found.write_levels is not None and found.takes_levels(target):
+        found.write_levels(target, scenes)
+        return
+    if len(scenes) != 1:
+        raise InputError(f"{target.name} would be {found.title}, which has one level, found {len(scenes)}")
+    found.write(target, scenes[0])
 
 
 def detect_format(path: Path) -> Format:
