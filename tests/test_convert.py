@@ -64,10 +64,10 @@ def test_degree_4_is_converted_and_encoded(tmp_path, ply):
     more = b"".join(b"property float f_rest_%d\n" % index for index in range(24, 72))
     rows = b"".join(body[start : start + width] + bytes(4 * 48) for start in range(0, len(body), width))
     (tmp_path / "4.ply").write_bytes(header + more + b"end_header\n" + rows)
-    for command in ("convert 4.ply a.ply", "encode 4.ply a.csplat", "lint 4.ply --fix b.ply"):
+    for command in ("convert 4.ply a.ply", "encode 4.ply a.csplat"):
         words = [tmp_path / word if "." in word else word for word in command.split()]
         call(*words, "--sh-degree", 3)
-    assert 3 == read_ply(tmp_path / "a.ply").sh_degree == read_ply(tmp_path / "b.ply").sh_degree
+    assert 3 == read_ply(tmp_path / "a.ply").sh_degree
     assert 3 == csplat.decode(tmp_path / "a.csplat").sh_degree
     call("verify", tmp_path / "a.csplat", "--source", tmp_path / "4.ply")
     call("encode", tmp_path / "4.ply", tmp_path / "d.csplat")

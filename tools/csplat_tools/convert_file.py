@@ -237,6 +237,7 @@ def convert_file(
     read_as: str | None = None,
     write_as: str | None = None,
     level: int = 0,
+    max_splats: int | None = None,
     overrides: MetadataOverrides | None = None,
     filters: Filters | None = None,
     no_loss: bool = False,
@@ -252,6 +253,7 @@ def convert_file(
         write_as: name of the target's format; `None`: by the file name ending.
         level: level of detail to read if the source has several; 0 is the finest. Streamed SOG (a target
             lod-meta.json) gets it and all coarser ones.
+        max_splats: as in `open_scene`; streamed SOG gets one level then.
         overrides: overrides of the source's metadata.
         filters: changes of the scene.
         no_loss: refuse if anything would be lost.
@@ -272,10 +274,12 @@ def convert_file(
     with local_path(source) as local, ExitStack() as stack:
 
         def opened(number: int) -> SceneSource:
-            return stack.enter_context(open_scene(local, read_as, level=number, sh_degree=sh_degree))
+            scene = open_scene(local, read_as, level=number, max_splats=max_splats, sh_degree=sh_degree)
+            return stack.enter_context(scene)
 
         reader = opened(level)
-        more = [opened(number) for number in range(level + 1, len(reader.levels))] if writes.takes_levels(path) else []
+        has_levels = writes.takes_levels(path) and max_splats is None
+        more = [opened(number) for number in range(level + 1, len(reader.levels))] if has_levels else []
         if more and changes.drop_floaters:
             raise InputError("floaters cannot be dropped from several levels: coarser ones have too few splats to tell")
         before = (overrides or MetadataOverrides()).apply_to_scene(reader).metadata_model.coordinate_system

@@ -18,7 +18,8 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 # Opening a file raises InputError if it is incomplete or of another format, OSError if it cannot be read. Reading its
 # blocks raises the same errors; it is possible until the context ends.
 OpenScene = Callable[[Path], AbstractContextManager[SceneSource]]
-OpenLevel = Callable[[Path, int], AbstractContextManager[SceneSource]]  # level of detail, 0 is the finest
+# A level of detail, 0 is the finest; or, if it is given, the best version of at most this number of splats.
+OpenLevel = Callable[[Path, int, int | None], AbstractContextManager[SceneSource]]
 OpenBands = Callable[[Path, int], AbstractContextManager[SceneSource]]  # highest SH degree to read
 # Writing raises InputError if the format cannot represent the scene (too many splats, positions out of range), OSError
 # if the file cannot be written. The path appears when the file is complete.

@@ -44,10 +44,7 @@ def convert(
     write_as: Annotated[
         str | None, typer.Option("--to", metavar="FORMAT", hidden=True, help="Format of OUT. Default: by its name.")
     ] = None,
-    level: Annotated[
-        int,
-        typer.Option(min=0, metavar="N", hidden=True, show_default=False, help="Level of streamed SOG. Default: 0."),
-    ] = 0,
+    level: shared.HiddenLevel = None,
     read_as: shared.ReadAs = None,
     force: shared.Force = False,
     report: shared.Report = None,
@@ -74,14 +71,15 @@ def convert(
         raise typer.BadParameter("OUT cannot be standard output: name a file")
     filters, overrides = _filters(to_axes, rotate, scale, translate, crop), shared.parse_overrides(up, axes)
     filters = replace(filters, drop_floaters=drop_floaters, sh_degree=shared.parse_sh_degree(sh_degree))
+    chosen, max_splats = shared.parse_level(level)
     folder = Path(output).parent
     is_new_folder = Path(output).name in FOLDER_NAMES and not folder.exists()
     if not dry_run and not Path(output).is_dir():
         out.check(str(folder) if is_new_folder else output, inputs=(source,))
     with out.bar() as progress, assume_format(read_as):
         made = convert_file(
-            source, output, write_as=write_as, level=level, overrides=overrides, filters=filters, no_loss=no_loss,
-            dry_run=dry_run, progress=progress,
+            source, output, write_as=write_as, level=chosen, max_splats=max_splats, overrides=overrides,
+            filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)
     if made.losses():
