@@ -4,7 +4,7 @@
 import * as pc from 'playcanvas';
 
 import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
-import { openScene } from './scene.mjs';
+import { MAX_SPLATS, openScene } from './scene.mjs';
 import { onceSaid } from './packed_values.mjs';
 
 /**
@@ -264,7 +264,10 @@ export class CsplatParser {
       this.options.onProgress?.(received, size);
       asset?.fire('progress', received, size);
     };
-    const target = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: false, shDegree: BANDS.length };
+    const target = {
+      ...{ name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: false, shDegree: BANDS.length },
+      maxSplats: world?.gsplat?.splatBudget ?? MAX_SPLATS,
+    };
     const scene = await openScene(from, { ...this.options, onProgress }, target);
     const { header } = scene;
     /** @type {import('../decoder.d.ts').PackedTile[]} */
