@@ -9,7 +9,7 @@ import { Matrix, Quaternion } from '@babylonjs/core/Maths/math.vector.js';
 import { GaussianSplattingMesh } from '@babylonjs/core/Meshes/GaussianSplatting/gaussianSplattingMesh.js';
 import { Observable } from '@babylonjs/core/Misc/observable.js';
 
-import { MAX_SPLATS, openScene } from './scene.mjs';
+import { openScene } from './scene.mjs';
 import { alphaOf, displayColour, eachThinnest, places, putBand, putColumns, putQuats } from './packed_values.mjs';
 
 const NAME = 'csplat';
@@ -63,7 +63,7 @@ export class CSPLATFileLoader {
       typeof from === 'string' || from instanceof Blob
         ? from
         : new Blob([/** @type {ArrayBufferView<ArrayBuffer>} */ (from)]);
-    const target = { name: 'csplat for Babylon.js', engine, mirrors: true, shDegree: 4, maxSplats: MAX_SPLATS };
+    const target = { name: 'csplat for Babylon.js', engine, mirrors: true, shDegree: 4 };
     openScene(source, { ...options, onProgress: progress }, target, [controller.signal])
       .then(onSuccess, (error) => onError?.(undefined, error))
       .finally(() => {

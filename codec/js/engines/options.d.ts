@@ -12,8 +12,8 @@ export interface LoadOptions extends Omit<ReaderOptions, 'inflate'> {
   workers?: number;
   /**
    * Of a file with levels of detail, load the version with the smallest errors that has at most this number of splats, or
-   * the coarsest; Infinity: level 0. Other files are loaded whole. Default: 2,500,000; in PlayCanvas
-   * `app.scene.gsplat.splatBudget`.
+   * the coarsest; Infinity: level 0. Other files are loaded whole. Default: 2,500,000, on
+   * phones 1,000,000; in PlayCanvas `app.scene.gsplat.splatBudget`.
    */
   maxSplats?: number;
 }

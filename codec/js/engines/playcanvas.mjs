@@ -4,7 +4,7 @@
 import * as pc from 'playcanvas';
 
 import { bandImagesOf, imagesOf } from './playcanvas-textures.mjs';
-import { MAX_SPLATS, openScene } from './scene.mjs';
+import { openScene } from './scene.mjs';
 import { onceSaid } from './packed_values.mjs';
 
 /**
@@ -266,7 +266,7 @@ export class CsplatParser {
     };
     const target = {
       ...{ name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: false, shDegree: BANDS.length },
-      maxSplats: world?.gsplat?.splatBudget ?? MAX_SPLATS,
+      maxSplats: world?.gsplat?.splatBudget,
     };
     const scene = await openScene(from, { ...this.options, onProgress }, target);
     const { header } = scene;

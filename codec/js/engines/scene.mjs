@@ -14,8 +14,7 @@ import { onceSaid, uprightIn } from './packed_values.mjs';
  * @typedef {{first: number, count: number, sh: Packed}} Band the band of a tile, and the index of its first splat
  */
 
-/** Default of `maxSplats`: what Spark 2.2 and Babylon.js 9.34 draw at most of scenes with levels on desktops. */
-export const MAX_SPLATS = 2_500_000;
+const PHONE = /Android|iPhone|iPad/;
 const WORKERS = 2; // default number of decoding workers
 const DETERMINANT_ROWS = [[1, 2], [2, 0], [0, 1]]; // prettier-ignore
 const SAMPLE = 1024; // splats per tile from which bounds are computed
@@ -26,13 +25,20 @@ const MOST = 0.9; // fraction of the sample within the bounds
  *
  * @param {Parameters<typeof CsplatReader.open>[0]} from
  * @param {LoadOptions} options
- * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean, shDegree: number, maxSplats: number}} target name of the
+ * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean, shDegree: number, maxSplats?: number}} target name of the
  *   adapter; letters of the engine's directions +x, +y, +z; whether the engine can draw with a mirroring matrix; its
- *   highest SH degree; default of the option
+ *   highest SH degree; the engine's own default of the option
  * @param {(AbortSignal | undefined)[]} [signals] further signals that abort the load
  */
 export async function openScene(from, options, target, signals = []) {
-  const { shDegree, progressive, workers, maxSplats = target.maxSplats, signal: given, ...others } = options;
+  const {
+    shDegree,
+    progressive,
+    workers,
+    maxSplats = target.maxSplats ?? usualMaxSplats(),
+    signal: given,
+    ...others
+  } = options;
   const life = new Life([given, ...signals]);
   try {
     const { signal } = life;
@@ -64,6 +70,9 @@ export async function openScene(from, options, target, signals = []) {
     throw error;
   }
 }
+
+/** Return the default of `maxSplats`: what Spark 2.2 and Babylon.js 9.34 draw at most of scenes with levels. */
+const usualMaxSplats = () => (PHONE.test(globalThis.navigator?.userAgent ?? '') ? 1_000_000 : 2_500_000);
 
 /**
  * Return the tiles of the version with the smallest errors that has at most a number of splats; of a file without levels of

@@ -2,7 +2,7 @@
 
 import { ExtSplats, PackedSplats, SplatMesh } from '@sparkjsdev/spark';
 
-import { MAX_SPLATS, openScene } from './scene.mjs';
+import { openScene } from './scene.mjs';
 import { ExtWords, PackedWords, halvesSuffice } from './spark-words.mjs';
 import { onceSaid } from './packed_values.mjs';
 
@@ -21,14 +21,7 @@ const LAYERS = /** @type {const} */ ([1, 2, 3]);
  * @param {SparkOptions} [options]
  */
 export async function loadCsplat(from, { layout, ...options } = {}) {
-  const target = {
-    name: NAME,
-    engine: /** @type {const} */ ('RUB'),
-    mirrors: false,
-    shDegree: 3,
-    maxSplats: MAX_SPLATS,
-  };
-  const scene = await openScene(from, options, target);
+  const scene = await openScene(from, options, { name: NAME, engine: 'RUB', mirrors: false, shDegree: 3 });
   const { header } = scene;
   const make = (layout ?? (halvesSuffice(header) ? 'packed' : 'ext')) === 'packed' ? packed : ext;
   const { splats, words, mesh } = await make(scene);

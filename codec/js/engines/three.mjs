@@ -6,7 +6,7 @@
 
 import { BufferAttribute, BufferGeometry, Loader, Matrix4 } from 'three';
 
-import { MAX_SPLATS, openScene } from './scene.mjs';
+import { openScene } from './scene.mjs';
 import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovariances } from './packed_values.mjs';
 
 /**
@@ -17,7 +17,7 @@ import { alphaOf, displayColour, onceSaid, places, putBand, putColumns, putCovar
  */
 
 const NAME = 'CSPLATLoader';
-const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true, shDegree: 3, maxSplats: MAX_SPLATS };
+const TARGET = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: true, shDegree: 3 };
 const SH_WORDS = [0, 3, 4, 6]; // words per splat in a band, of four coefficients each
 const SH_ZERO = 0x80808080;
 

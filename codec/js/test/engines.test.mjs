@@ -177,7 +177,7 @@ test('scenes are upright in the axes of an engine', () => {
   }
 });
 
-const TARGET = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3, maxSplats: 2_500_000 };
+const TARGET = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3 };
 for (const [name, options] of [
   ['valid/combined_codebooks', {}],
   ['valid/combined_codebooks', { progressive: true }],
