@@ -284,13 +284,13 @@ def convert_file(
             raise InputError("floaters cannot be dropped from several levels: coarser ones have too few splats to tell")
         before = (overrides or MetadataOverrides()).apply_to_scene(reader).metadata_model.coordinate_system
         levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
-        scene = levels[0]
+        scene, counts = levels[0], tuple(one.count for one in levels if one.count)
         lost = writes.losses(scene.metadata_model)
         rounded = tuple(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.metadata_model.sh_degree)
         )
         result = Conversion(
-            reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, tuple(one.count for one in levels),
+            reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, counts or (0,),
             size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded,
             (before, writes.axes or scene.metadata_model.coordinate_system), (),
         )  # fmt: skip

@@ -82,7 +82,7 @@ def compare(
     require_renderer()
     mode, device = shared.parse_backend(backend, out)
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
-    given = b if level is None else load_model(b, level=chosen, max_splats=max_splats)
+    given = b if (chosen, max_splats) == (0, None) else load_model(b, level=chosen, max_splats=max_splats)
     with open_scenes((a, given)) as (source, other), out.bar() as progress:
         if isinstance(source, OpenedScene):
             if mode == "exact":
