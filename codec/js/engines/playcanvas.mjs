@@ -264,9 +264,10 @@ export class CsplatParser {
       this.options.onProgress?.(received, size);
       asset?.fire('progress', received, size);
     };
+    const budget = world?.gsplat?.splatBudget;
     const target = {
       ...{ name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: false, shDegree: BANDS.length },
-      maxSplats: world?.gsplat?.splatBudget,
+      maxSplats: budget === 0 ? Infinity : budget, // the engine draws everything at its finest level then
     };
     const scene = await openScene(from, { ...this.options, onProgress }, target);
     const { header } = scene;
