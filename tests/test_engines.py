@@ -14,7 +14,8 @@ from chromium import absent
 
 from csplat import EncodeOptions, decode, encode, read_ply
 from csplat.editing.transform import convert_axes
-from csplat.formats import write
+from csplat.encoder import EncodePlan, LevelNode, encode_levels
+from csplat.formats import write, write_levels
 from csplat.scene_source import source_from_model
 from csplat_bench.browser import serve
 from csplat_bench.engine_stage import ENGINES, pinhole, served
@@ -151,6 +152,36 @@ def test_disposal_leaves_nothing_on_the_gpu(trial):
     before = trial.memory()[1]
     trial.repeat("scene.csplat", 2)
     assert trial.memory()[1] <= before + 100_000
+
+
+def test_a_budget_selects_the_version_of_a_file_with_levels(trial, files):
+    folder, _, model, camera = files
+    coarser = replace(model.select(slice(0, None, 3)), extra={})
+    groups = np.array_split(np.argsort(model.means[:, 0]), 2)
+    nodes = [LevelNode(0, 2, rows=rows) for rows in groups] + [LevelNode(1, None, splats=coarser, error=1.0)]
+    (folder / "levels.csplat").write_bytes(encode_levels(EncodePlan.of(model, FAST), nodes).write().data)
+    for options, wanted, other in (({"maxSplats": 2000}, coarser, model), ({}, model, coarser)):
+        for more in ({}, {"progressive": True}):
+            said = trial.show("levels.csplat", **options, **more)
+            shown = settled(trial)
+            trial.remove()
+            assert said["count"] - len(wanted) in range(16), said
+            ours, others = (ENGINES[trial.engine].render(one, camera, 3) for one in (wanted, other))
+            assert psnr(shown, ours) > max(30.0, psnr(shown, others) + 3.0)
+
+
+@pytest.mark.parametrize("engine", ["playcanvas", "babylon"])
+def test_engines_draw_streamed_sog_of_csplat(browser, files, engine):
+    folder, address, model, camera = files
+    coarser = model.select(slice(0, None, 4))
+    write_levels(folder / engine / "lod-meta.json", [source_from_model(one) for one in (model, coarser)])
+    page = browser.new_page(device_scale_factor=1)
+    streamed = Trial(page, address, engine, pinhole(camera, model)).start()
+    said = streamed.show(f"{engine}/lod-meta.json")
+    assert "failed" not in said, said
+    ours, quarter = (ENGINES[engine].render(one, camera, 3) for one in (model, coarser))
+    assert psnr(settled(streamed), ours) > max(30.0, psnr(quarter, ours) + 6.0)
+    page.close()
 
 
 @pytest.mark.usefixtures("packages")

@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,14 +12,18 @@ from tables import failures
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import detect_format, open_scene
+from csplat.formats import detect_format, open_scene, write_levels
 from csplat.formats.sog.sog_reader import read_leaf_numbers
+from csplat.scene_source import source_from_model
+from csplat_conformance.manifest import VECTORS
 from csplat_conformance.validator import validate
+from csplat_tools.convert_file import Filters, convert_file
 from csplat_tools.encode_file import encode_file
 
 Image = pytest.importorskip("PIL.Image", reason="SOG is pictures")
 
 COUNT = 5
+RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
 
 
 def webp(pixels, *, lossless=True):
@@ -453,9 +458,153 @@ def test_splats_at_one_point_are_written(tmp_path, make_model):
     np.testing.assert_allclose(csplat.read(tmp_path / "a.sog").means, 2.5, rtol=1e-6)
 
 
-def test_streamed_sog_is_not_written(tmp_path, make_model):
-    with pytest.raises(InputError, match="does not write"):
-        csplat.write(tmp_path / "lod-meta.json", make_model(3, 0))
+SIDE = 64  # positions are integers below, so that a splat is known by its place
+
+
+def places_of(model):
+    return np.rint(model.means).astype(int) @ [1, SIDE, SIDE**2]
+
+
+@pytest.fixture
+def streamed(tmp_path, make_model):
+    """Three levels of a scene, the coarsest without splats in three quarters of space, and their streamed SOG."""
+    cells = np.random.default_rng(8).permutation(SIDE**3)[:40_000]
+    means = np.stack([cells % SIDE, cells // SIDE % SIDE, cells // SIDE**2], axis=1).astype(np.float32)
+    finest = make_model(len(means), 1, means=means, antialiased=True)
+    levels = [finest, finest.select(slice(0, 9_000)), finest.select((means[:, :2] < SIDE / 4).all(axis=1))]
+    path = tmp_path / "scene" / "lod-meta.json"
+    write_levels(path, [source_from_model(one) for one in levels])
+    return path, levels
+
+
+def leaves_of(node):
+    """Return the leaves of a tree; each other node has two children, and its bounds are theirs."""
+    if "lods" in node:
+        return [node]
+    assert 2 == len(node["children"])
+    for side, extreme in (("min", min), ("max", max)):
+        low, high = (one["bound"][side] for one in node["children"])
+        assert node["bound"][side] == [extreme(pair) for pair in zip(low, high, strict=True)]
+    return [leaf for child in node["children"] for leaf in leaves_of(child)]
+
+
+def test_levels_of_streamed_sog_are_those_written_within_a_step(streamed):
+    path, levels = streamed
+    for number, level in enumerate(levels):
+        with open_scene(path.parent, level=number) as scene:
+            back = scene.model()
+        assert (tuple(map(len, levels)), 1, True) == (scene.levels, back.sh_degree, back.antialiased)
+        wanted, found = (one.select(np.argsort(places_of(one))) for one in (level, back))
+        assert np.array_equal(places_of(wanted), places_of(found))
+        assert np.abs(wanted.means - found.means).max() < SIDE * np.log1p(SIDE) / 65535
+        assert np.abs(wanted.opacities - found.opacities).max() <= 0.5 / 255 + 1e-7
+        assert np.abs((wanted.quats * found.quats).sum(axis=1)).min() > 1 - 4e-5
+        for name, most in (("scales", 0.02), ("sh0", 0.02), ("shN", 0.6)):
+            assert np.sqrt(np.mean((getattr(wanted, name) - getattr(found, name)) ** 2)) < most
+
+
+def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
+    path, levels = streamed
+    meta = json.loads(path.read_text())
+    leaves = leaves_of(meta["tree"])
+    counts = list(map(len, levels))
+    assert (1, 3, counts, sum(counts)) == (meta["version"], meta["lodLevels"], meta["counts"], meta["count"])
+    assert {"lod-meta.json", "0_0", "1_0", "2_0"} == {one.name for one in path.parent.iterdir()}
+    assert len(leaves) in (3, 4)
+    assert all(5_000 < leaf["lods"]["0"]["count"] <= 1 << 14 for leaf in leaves)
+    assert 0 in [leaf["lods"]["2"]["count"] for leaf in leaves]
+    for number in range(3):
+        runs = [leaf["lods"][str(number)] for leaf in leaves]
+        assert {number} == {run["file"] for run in runs}
+        assert np.cumsum([0, *(run["count"] for run in runs)]).tolist() == [
+            *(run["offset"] for run in runs),
+            counts[number],
+        ]
+        chunk = csplat.read(path.parent / meta["filenames"][number])
+        for leaf, run in zip(leaves, runs, strict=True):
+            splats = chunk.select(slice(run["offset"], run["offset"] + run["count"]))
+            # At least the centres; a large splat reaches further.
+            assert (splats.means >= np.array(leaf["bound"]["min"]) - 0.01).all()
+            assert (splats.means <= np.array(leaf["bound"]["max"]) + 0.01).all()
+    reach = max(np.exp(level.scales).max() for level in levels)
+    assert -reach <= min(meta["tree"]["bound"]["min"]) < 0
+
+
+def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
+    count = 530_000
+    csplat.write(tmp_path / "a" / "lod-meta.json", make_model(count, 0))
+    meta = json.loads((tmp_path / "a" / "lod-meta.json").read_text())
+    assert ["0_0/meta.json", "0_1/meta.json"] == meta["filenames"]
+    sizes = [0, 0]
+    for leaf in leaves_of(meta["tree"]):
+        assert sizes[leaf["lods"]["0"]["file"]] == leaf["lods"]["0"]["offset"]
+        sizes[leaf["lods"]["0"]["file"]] += leaf["lods"]["0"]["count"]
+    assert count == sum(sizes)
+    assert abs(sizes[0] - sizes[1]) < 2 << 14
+    with open_scene(tmp_path / "a") as scene:
+        assert count == sum(map(len, scene.blocks()))
+
+
+def test_splats_at_one_point_are_one_leaf(tmp_path, make_model):
+    model = make_model(20_000, 0, means=np.full((20_000, 3), 2.5, np.float32))
+    csplat.write(tmp_path / "a" / "lod-meta.json", model)
+    assert "lods" in json.loads((tmp_path / "a" / "lod-meta.json").read_text())["tree"]
+    assert 20_000 == len(csplat.read(tmp_path / "a"))
+
+
+def test_all_levels_of_a_file_are_converted(tmp_path):
+    source, out = RICH, tmp_path / "a" / "lod-meta.json"
+    made = convert_file(str(source), str(out), filters=Filters(scale=2.0))
+    assert len(made.levels) > 1
+    assert () == made.findings
+    for number, count in enumerate(made.levels):
+        with csplat.open(source) as file, open_scene(out, level=number) as scene:
+            cut, back = file.read(tiles=file.cut(level=number)), scene.model()
+        assert count == len(cut) == len(back)
+        np.testing.assert_allclose(np.sort(2 * cut.means, axis=0), np.sort(back.means, axis=0), rtol=1e-3, atol=1e-3)
+    coarser = convert_file(str(source), str(tmp_path / "b" / "lod-meta.json"), level=1)
+    assert made.levels[1:] == coarser.levels
+    with pytest.raises(InputError, match="floaters cannot be dropped from several levels"):
+        convert_file(str(source), str(tmp_path / "c" / "lod-meta.json"), filters=Filters(drop_floaters=True))
+    with pytest.raises(InputError, match="which has one level, found 2"), open_scene(source) as scene:
+        write_levels(tmp_path / "d.ply", [scene, scene])
+    assert {"a", "b"} == {one.name for one in tmp_path.iterdir()}
+
+
+def test_streamed_sog_replaces_only_streamed_sog(tmp_path, make_model):
+    path = tmp_path / "a" / "lod-meta.json"
+    with pytest.raises(InputError, match="no splats"):
+        csplat.write(path, make_model(0, 0))
+    (tmp_path / "a").mkdir()
+    csplat.write(path, make_model(20, 1))  # an empty folder
+    csplat.write(path, make_model(10, 0))
+    assert 10 == len(csplat.read(path))
+    with pytest.raises(InputError, match="is in the folder of"):
+        convert_file(str(path.parent / "0_0"), str(path))
+    (tmp_path / "a" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"a contains notes\.txt, and a new folder replaces it: name another"):
+        csplat.write(path, make_model(10, 0))
+    assert 10 == len(csplat.read(path))
+
+
+def test_a_failed_write_of_streamed_sog_leaves_the_older_one(tmp_path, make_model):
+    path = tmp_path / "a" / "lod-meta.json"
+    csplat.write(path, make_model(10, 0))
+    scene = source_from_model(make_model(20, 0))
+    reads = []
+
+    def blocks():
+        reads.append(1)
+        yield from scene.blocks()
+        if len(reads) == 3:
+            raise InputError("the disk was removed")
+
+    for target in (path, tmp_path / "b" / "lod-meta.json"):
+        reads.clear()
+        with pytest.raises(InputError, match="was removed"):
+            write_levels(target, [replace(scene, blocks=blocks)])
+    assert ["a"] == [one.name for one in tmp_path.iterdir()]
+    assert 10 == len(csplat.read(path))
 
 
 def test_real_files_are_read(data_dir):

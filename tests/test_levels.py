@@ -1,6 +1,7 @@
 """Levels of detail: cuts through the nodes, reading, copying and encoding them, and the first builder."""
 
 import io
+import json
 import math
 import re
 from dataclasses import replace
@@ -8,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 from test_editing import extract
@@ -15,12 +17,14 @@ from test_spec_pseudocode import spec  # noqa: F401 - a fixture
 from typer.testing import CliRunner
 
 import csplat
+import csplat_tools
 from csplat import InputError, LimitError, _spec, decode, read_header
 from csplat.decoder import decode_scene
 from csplat.decoder.container import SceneHeader
 from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
 from csplat.encoder.levels import LevelNode, encode_levels
+from csplat.formats import open_scene
 from csplat.scene_source import join_blocks
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders import all_inputs
@@ -28,10 +32,13 @@ from csplat_conformance.encoders.file_checks import SplatPairs
 from csplat_conformance.encoders.render_checks import check_renders
 from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.validator import validate
+from csplat_render.camera_paths import orbit_cameras
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools import level_builder
 from csplat_tools.cli.app import app
+from csplat_tools.cli.shared_options import parse_level
+from csplat_tools.convert_file import convert_file
 from csplat_tools.level_builder import build_levels, encode_with_levels, kd_groups, measure_errors, merge_neighbours
 from csplat_tools.level_fitting import LevelFitter
 
@@ -238,6 +245,85 @@ def test_levels_of_a_file_are_scenes_to_convert(data, tmp_path):
     result = CliRunner().invoke(app, ["convert", str(path), str(ply), "--level", "3", "--force"])
     assert 1 == result.exit_code
     assert "the level is 3, expected 0 to 2" in result.output
+
+
+def test_a_number_of_splats_selects_a_version(data, tmp_path):
+    path, streamed = tmp_path / "levels.csplat", tmp_path / "streamed" / "lod-meta.json"
+    path.write_bytes(data)
+    convert_file(str(path), str(streamed))
+    with csplat.open(data) as file:
+        counts = [len(file.read(tiles=file.cut(max_splats=most))) for most in (200, 700, 5000)]
+        coarser = [len(file.read(tiles=file.cut(level=level))) for level in range(3)]
+    assert len({*counts}) == 3
+    for most, wanted in zip((200, 700, 5000), counts, strict=True):
+        with open_scene(path, max_splats=most) as scene, open_scene(streamed, max_splats=most) as level:
+            assert (wanted, wanted) == (scene.count, sum(map(len, scene.blocks())))
+            assert max(one for one in coarser if one <= most) == level.count
+    for one in (path, streamed):
+        with pytest.raises(InputError, match=rf"the coarsest version has {coarser[2]} splats, expected at most 9$"):
+            csplat_tools.load_model(one, max_splats=9)
+    csplat.write(tmp_path / "a.ply", csplat.decode(data))
+    with pytest.raises(InputError, match="the scene, which has no other version, has 1,200 splats, expected at most 9"):
+        csplat_tools.load_model(tmp_path / "a.ply", max_splats=9)
+    with pytest.raises(InputError, match="level and max_splats exclude each other"):
+        csplat_tools.load_model(path, level=1, max_splats=900)
+
+
+def test_a_version_of_both_levels_has_no_extra_columns(model):
+    scene = replace(model, extra={"label": np.arange(len(model), dtype=np.uint8)})
+    left, right = kd_groups(model.means, 2)
+    nodes = [
+        LevelNode(0, 2, rows=left),
+        LevelNode(0, None, rows=right),
+        LevelNode(1, None, splats=replace(merge_neighbours(model.select(left)), extra={}), error=1.0),
+    ]
+    data = encode_levels(EncodePlan.of(scene, EncodeOptions(keep_extra=True)), nodes).write().data
+    with open_scene(data, max_splats=len(model) - 1) as opened:
+        blocks = list(opened.blocks())
+    assert opened.count == sum(map(len, blocks)) < len(model)
+    assert all(one.extra == {} for one in blocks)
+
+
+def test_render_and_compare_draw_a_level(data, tmp_path):
+    path, cameras = tmp_path / "levels.csplat", tmp_path / "cameras.json"
+    path.write_bytes(data)
+    with csplat.open(data) as file:
+        tiles = file.cut(level=1)
+        coarse = file.read(tiles=tiles)
+        size = sum(layer.size for index in tiles for layer in file.header.all_tiles[index].layers.values())
+    cameras.write_text(json.dumps([camera.to_json() for camera in orbit_cameras(coarse, 2, 48, 36)]))
+    csplat.write(tmp_path / "coarse.ply", coarse)
+
+    def call(*words):
+        result = CliRunner().invoke(app, [str(word) for word in words])
+        assert 0 == result.exit_code, result.output
+        return result.stdout
+
+    call("render", path, tmp_path / "a", "--cameras", cameras, "--level", "1")
+    call("render", tmp_path / "coarse.ply", tmp_path / "b", "--cameras", cameras)
+    call("render", path, tmp_path / "c", "--cameras", cameras)
+    images = [[one.read_bytes() for one in sorted((tmp_path / name).iterdir())] for name in "abc"]
+    assert images[0] == images[1]
+    assert images[0] != images[2]
+    words = ("compare", tmp_path / "coarse.ply", path, "--cameras", cameras, "--json")
+    same, scene = (json.loads(call(*words, *more)) for more in (("--level", f"{len(coarse)}"), ()))
+    assert 99 == same["psnr"] > scene["psnr"]
+    assert (len(coarse), size) == (same["b"]["splats"], same["b"]["size_bytes"])
+
+
+def test_values_of_the_option_level():
+    wanted = {
+        None: (0, None),
+        "2": (2, None),
+        "255": (255, None),
+        "256": (0, 256),
+        "3k": (0, 3000),
+        "1.5M": (0, 1_500_000),
+    }
+    assert wanted == {text: parse_level(text) for text in wanted}
+    for text in ("-1", "1.5", "k", "all", "5 k", ""):
+        with pytest.raises(typer.BadParameter, match="expected a level, as in 1, or a number of splats, as in 500k"):
+            parse_level(text)
 
 
 def test_info_lists_the_levels(data, tmp_path):

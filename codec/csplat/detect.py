@@ -226,7 +226,7 @@ KINDS: dict[str, FileKind] = {
         FileKind("spz4", "SPZ 4", (".v4.spz",)),
         FileKind("splat", ".splat", (".splat",)),
         FileKind("ksplat", ".ksplat", (".ksplat",), _is_ksplat),
-        FileKind("sog", "SOG", (".sog", "meta.json"), _is_sog),
+        FileKind("sog", "SOG", (".sog", "meta.json", "lod-meta.json"), _is_sog),
         FileKind(
             "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
         ),

@@ -228,6 +228,37 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         raise
 
 
+@contextmanager
+def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Write a folder that appears under its name only when complete, in the place of an older one.
+
+    Args:
+        path: path of the folder. All of an older folder is deleted: the caller checks what it contains.
+
+    Yields:
+        An empty folder next to it, which is renamed on success and removed on any error.
+
+    Raises:
+        OSError: the parent folder does not exist, is full or is not writable.
+    """
+    target = Path(path).resolve()
+    temporary, old = (target.with_name(f".{target.name}.{os.getpid()}.{end}") for end in ("tmp", "old"))
+    try:
+        temporary.mkdir()
+        yield temporary
+        if target.exists():
+            target.rename(old)
+        temporary.rename(target)
+    except BaseException as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        if old.exists() and not target.exists():
+            old.rename(target)
+        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
+            error.filename = os.fspath(path)  # report the caller's name
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
 def _take_name(temporary: Path, target: Path) -> None:
     """Move a complete file to its name.
 

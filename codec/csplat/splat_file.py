@@ -161,8 +161,8 @@ class SplatFile:
 
         Examples:
             >>> import csplat
-            >>> with csplat.open("scene.csplat") as file:
-            ...     coarse = file.read(tiles=file.cut(level=1))  # this file has level 0 alone
+            >>> with csplat.open("scene.csplat") as file:  # at a URL, only the tiles of the cut are fetched
+            ...     coarse = file.read(tiles=file.cut(max_splats=5_000))  # this file has level 0 alone
             >>> len(coarse)
             1000
 

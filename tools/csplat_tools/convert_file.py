@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 from csplat.decoder import Limits, open_tiles
 from csplat.editing.transform import convert_axes, rotate_scene, scale_scene, translate_scene
 from csplat.errors import InputError
-from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, write_scene
+from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, write_levels
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel
@@ -187,6 +188,7 @@ class Conversion:
     Attributes:
         source_format, target_format: names of the formats.
         count, sh_degree: number of splats and SH degree of the target.
+        levels: number of splats of each level of detail of the target, finest first.
         source_bytes, size_bytes: sizes of the files; in a dry run the latter is an estimate, or `None` if unknown.
         lost: contents that the target format does not support.
         rounded: names of the arrays that the target rounds.
@@ -198,6 +200,7 @@ class Conversion:
     target_format: str
     count: int
     sh_degree: int
+    levels: tuple[int, ...]
     source_bytes: int
     size_bytes: int | None
     lost: tuple[str, ...]
@@ -212,6 +215,7 @@ class Conversion:
             "format": self.target_format,
             "splats": self.count,
             "sh_degree": self.sh_degree,
+            "levels": list(self.levels),
             "source_bytes": self.source_bytes,
             "size_bytes": self.size_bytes,
             "lost": list(self.lost),
@@ -233,6 +237,7 @@ def convert_file(
     read_as: str | None = None,
     write_as: str | None = None,
     level: int = 0,
+    max_splats: int | None = None,
     overrides: MetadataOverrides | None = None,
     filters: Filters | None = None,
     no_loss: bool = False,
@@ -246,7 +251,9 @@ def convert_file(
         target: the file or folder to write; it is replaced without a check.
         read_as: name of the source's format, if its content does not identify it.
         write_as: name of the target's format; `None`: by the file name ending.
-        level: level of detail to read if the source has several; 0 is the finest.
+        level: level of detail to read if the source has several; 0 is the finest. Streamed SOG (a target
+            lod-meta.json) gets it and all coarser ones.
+        max_splats: as in `open_scene`; streamed SOG gets one level then.
         overrides: overrides of the source's metadata.
         filters: changes of the scene.
         no_loss: refuse if anything would be lost.
@@ -257,29 +264,46 @@ def convert_file(
         CsplatError: the source is damaged, the target cannot hold it, or `no_loss` is set and something is lost.
         OSError: a file cannot be read or written.
     """
-    writes = format_by_suffix(Path(target)) if write_as is None else format_by_name(write_as)
+    path = Path(target)
+    writes = format_by_suffix(path) if write_as is None else format_by_name(write_as)
     if writes.write is None:
         raise InputError(f"{target} has the name of {writes.title}, which csplat does not write")
-    sh_degree = None if filters is None else filters.sh_degree
-    with local_path(source) as local, open_scene(local, read_as, level=level, sh_degree=sh_degree) as reader:
-        scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
-        before = scene.metadata_model.coordinate_system
-        scene = (filters or Filters()).apply(scene)
+    if writes.takes_levels(path) and path.parent.resolve() in (Path(source).resolve(), *Path(source).resolve().parents):
+        raise InputError(f"{source} is in the folder of {target}, which a new folder replaces: name another")
+    changes, sh_degree = filters or Filters(), None if filters is None else filters.sh_degree
+    with local_path(source) as local, ExitStack() as stack:
+
+        def opened(number: int) -> SceneSource:
+            scene = open_scene(local, read_as, level=number, max_splats=max_splats, sh_degree=sh_degree)
+            return stack.enter_context(scene)
+
+        reader = opened(level)
+        has_levels = writes.takes_levels(path) and max_splats is None
+        more = [opened(number) for number in range(level + 1, len(reader.levels))] if has_levels else []
+        if more and changes.drop_floaters:
+            raise InputError("floaters cannot be dropped from several levels: coarser ones have too few splats to tell")
+        before = (overrides or MetadataOverrides()).apply_to_scene(reader).metadata_model.coordinate_system
+        levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
+        scene, counts = levels[0], tuple(one.count for one in levels if one.count)
         lost = writes.losses(scene.metadata_model)
         rounded = tuple(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.metadata_model.sh_degree)
         )
         result = Conversion(
-            reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, size_on_disk(local),
-            writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded,
+            reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, counts or (0,),
+            size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded,
             (before, writes.axes or scene.metadata_model.coordinate_system), (),
         )  # fmt: skip
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {result.losses()}")
         if not dry_run:
-            write_scene(target, with_progress(scene, "reading", progress), writes.name)
-            result = replace(result, size_bytes=size_on_disk(Path(target)))
-        return replace(result, findings=tuple(reader.findings))
+            reporting = [
+                with_progress(one, f"reading level {level + at}" if more else "reading", progress)
+                for at, one in enumerate(levels)
+            ]
+            write_levels(path, reporting, writes.name)
+            result = replace(result, size_bytes=size_on_disk(path))
+        return replace(result, findings=tuple(one for one in reader.findings if not (more and one.id == "levels")))
 
 
 def decode_file(

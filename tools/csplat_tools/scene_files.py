@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from csplat import formats
+from csplat import formats, splat_file
 from csplat import scene_source as scenes
 from csplat.decoder import DeclaredBounds, Limits, SceneHeader, decode_scene
 from csplat.editing.up_axis import Direction, with_up
@@ -40,7 +40,8 @@ class LoadedModel:
 
     Attributes:
         model: the splats.
-        size_bytes: size of the file; for a model without a file, of its plain PLY.
+        size_bytes: size of the file; of the tiles, for a coarser version in a .csplat file; of its plain PLY, for a
+            model without a file.
         header: header of a .csplat file; `None` for other formats.
         declared_bounds: declared error bounds of a .csplat file, if any.
         name: name of the file.
@@ -150,12 +151,15 @@ def _sizes(count: int, metadata_model: SplatModel, size_bytes: int) -> dict[str,
 SceneLike = SplatModel | LoadedModel | File
 
 
-def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel:
+def load_model(
+    scene: SceneLike, *, level: int = 0, max_splats: int | None = None, sh_degree: int | None = None
+) -> LoadedModel:
     """Read a scene in any format (`csplat formats`), detected by its content.
 
     Args:
         scene: a path, an open binary file, or bytes; the path `-` is standard input. A model or a `LoadedModel` is
             not read again.
+        level, max_splats: as in `csplat.formats.open_scene`. A version other than level 0 has no header and no bounds.
         sh_degree: drop the SH bands above; required to read files of a higher degree than 4. `None`: keep all.
 
     Examples:
@@ -174,7 +178,23 @@ def load_model(scene: SceneLike, *, sh_degree: int | None = None) -> LoadedModel
     if isinstance(scene, SplatModel):
         return LoadedModel(scene, len(scene) * ply_splat_bytes(scene.sh_degree))
     with local_path(scene) as local:
+        if level or max_splats is not None:
+            return _load_version(local, level, max_splats, sh_degree)
         return _loaded(local, sh_degree)
+
+
+def _load_version(local: Path, level: int, max_splats: int | None, sh_degree: int | None) -> LoadedModel:
+    with formats.open_scene(local, level=level, max_splats=max_splats, sh_degree=sh_degree) as scene:
+        wanted, free = scene.count * ply_splat_bytes(scene.metadata_model.sh_degree), available_memory_bytes()
+        if wanted > free:
+            raise LimitError("memory for all splats at once", wanted, free)
+        model = formats.read_all(scene)
+    size_bytes = size_on_disk(local)
+    if is_csplat(local):
+        with splat_file.open(local) as file:
+            tiles = file.cut(level=level) if max_splats is None else file.cut(max_splats=max_splats)
+            size_bytes = sum(layer.size for index in tiles for layer in file.header.all_tiles[index].layers.values())
+    return LoadedModel(model, size_bytes, name=local.name, findings=tuple(scene.findings))
 
 
 def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:

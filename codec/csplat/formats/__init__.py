@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 from csplat.decoder import decode, open_tiles
@@ -43,6 +42,7 @@ __all__ = [
     "read",
     "read_all",
     "write",
+    "write_levels",
     "write_scene",
 ]
 
@@ -128,7 +128,12 @@ def assume_format(format: str | None) -> Iterator[None]:
 
 @contextmanager
 def open_scene(
-    file: File, format: str | None = None, *, level: int = 0, sh_degree: int | None = None
+    file: File,
+    format: str | None = None,
+    *,
+    level: int = 0,
+    max_splats: int | None = None,
+    sh_degree: int | None = None,
 ) -> Iterator[SceneSource]:
     """Open a scene in any format to read it block by block.
 
@@ -136,25 +141,27 @@ def open_scene(
         file: as in `read`.
         format: as in `read`.
         level: level of detail, if the file has several; 0 is the finest.
+        max_splats: open the best version of at most this number of splats instead: of a .csplat file the cut with the
+            smallest errors, of streamed SOG the finest level. `None`: open `level`.
         sh_degree: as in `read`.
 
     Yields:
         The scene; its blocks can be read until the context ends.
 
     Raises:
-        InputError: csplat cannot read the format, or the file is incomplete. Reading a block may raise it, too.
+        InputError: csplat cannot read the format, the file is incomplete, or the coarsest version has more than
+            `max_splats` splats. Reading a block may raise it, too.
         OSError: the file cannot be read.
     """
-    with local_file(file) as path, _open(_readable_format(path, format), path, level, sh_degree) as scene:
+    with local_file(file) as path, _open(_readable_format(path, format), path, level, max_splats, sh_degree) as scene:
         yield scene
 
 
-def lint_file(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
+def lint_file(path: Path) -> list[Finding]:
     """List the defects of a file in any format without refusing it.
 
     Args:
         path: path of the file.
-        sh_degree: as in `read`.
 
     Returns:
         Findings in the order of reading; the last one is an error if `read` would refuse the file.
@@ -165,8 +172,8 @@ def lint_file(path: Path, *, sh_degree: int | None = None) -> list[Finding]:
     """
     found = _readable_format(path, None)
     if found.name == _PLY:
-        return lint_ply(path, sh_degree=sh_degree)
-    with _open(found, path, sh_degree=sh_degree, lenient=True) as scene:
+        return lint_ply(path)
+    with _open(found, path, lenient=True) as scene:
         if all(one.repairable for one in scene.findings):
             try:
                 for _ in scene.blocks():
@@ -198,11 +205,32 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
 
 def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | None = None) -> None:
     """Write a scene block by block; arguments are those of `write`."""
+    write_levels(path, [scene], format)
+
+
+def write_levels(path: str | os.PathLike[str], levels: Sequence[SceneSource], format: str | None = None) -> None:
+    """Write the levels of detail of a scene block by block.
+
+    Args:
+        path: as in `write`. Only streamed SOG, a file lod-meta.json in a folder of its own, has several levels.
+        levels: the scene at each level, finest first.
+        format: as in `write`.
+
+    Raises:
+        InputError: as in `write`, or the format has one level and there are several.
+        OSError: the file cannot be written.
+    """
     target = Path(path)
     found = format_by_suffix(target) if format is None else format_by_name(format)
     if found.write is None:
         raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
-    found.write(target, _with_fewer_bands(scene, found.degree))
+    scenes = [_with_fewer_bands(scene, found.degree) for scene in levels]
+    if found.write_levels is not None and found.takes_levels(target):
+        found.write_levels(target, scenes)
+        return
+    if len(scenes) != 1:
+        raise InputError(f"{target.name} would be {found.title}, which has one level, found {len(scenes)}")
+    found.write(target, scenes[0])
 
 
 def detect_format(path: Path) -> Format:
@@ -259,8 +287,8 @@ def format_by_name(name: str) -> Format:
 
 
 @contextmanager
-def _open_csplat(path: Path, level: int = 0) -> Iterator[SceneSource]:
-    """Open a level of detail (`Format.open`, `Format.open_level`); a file with level 0 alone is read as a whole."""
+def _open_csplat(path: Path, level: int = 0, max_splats: int | None = None) -> Iterator[SceneSource]:
+    """Open a version (`Format.open`, `Format.open_level`); a file with level 0 alone is read as a whole."""
     opened = open_tiles(path)
     header, last = opened.header, max((tile.level for tile in opened.header.coarse_tiles), default=0)
     if level > last:
@@ -271,12 +299,20 @@ def _open_csplat(path: Path, level: int = 0) -> Iterator[SceneSource]:
         return
     cuts = [select_tiles(header, opened.nodes, level=one) for one in range(last + 1)]
     counts = tuple(sum(tile.splat_count for tile in tiles) for tiles in cuts)
-    metadata_model = replace(opened.metadata_model, extra={}) if level else opened.metadata_model
-    blocks = partial(opened.models, [tile.index for tile in cuts[level]] if level else None)
-    findings = [
-        Finding("levels", last, f"{counted(last, 'coarser level')} of detail: level {level} alone is read", "note")
-    ]
-    yield SceneSource(counts[level], metadata_model, blocks, findings, levels=counts)
+    tiles = cuts[level]
+    if max_splats is not None:  # the caller refuses a coarsest version that is too large
+        tiles = select_tiles(header, opened.nodes, max_splats=max(max_splats, counts[last]))
+    is_scene = len(tiles) == len(header.tiles) and all(tile.level == 0 for tile in tiles)
+    count = sum(tile.splat_count for tile in tiles)
+    metadata_model = opened.metadata_model if is_scene else replace(opened.metadata_model, extra={})
+
+    def blocks() -> Iterator[SplatModel]:
+        for model in opened.models(None if is_scene else [tile.index for tile in tiles]):
+            yield model if is_scene or not model.extra else replace(model, extra={})  # coarser tiles have none
+
+    which = f"level {level} alone is read" if max_splats is None else f"a version of {counted(count, 'splat')} is read"
+    findings = [Finding("levels", last, f"{counted(last, 'coarser level')} of detail: {which}", "note")]
+    yield SceneSource(count, metadata_model, blocks, findings, levels=counts)
 
 
 def _write_csplat(path: Path, scene: SceneSource) -> None:
@@ -331,20 +367,31 @@ def _readable_format(path: Path, format: str | None) -> Format:
 
 @contextmanager
 def _open(
-    found: Format, path: Path, level: int = 0, sh_degree: int | None = None, *, lenient: bool = False
+    found: Format,
+    path: Path,
+    level: int = 0,
+    max_splats: int | None = None,
+    sh_degree: int | None = None,
+    *,
+    lenient: bool = False,
 ) -> Iterator[SceneSource]:
     """Open a scene along the default axes; `lenient` accepts findings that are errors."""
     assert found.open is not None
     check_sh_degree(sh_degree)
+    if level and max_splats is not None:
+        raise InputError("level and max_splats exclude each other")
     if level and found.open_level is None:
         raise InputError(f"{path.name} is {found.title}, which has no levels: level {level} cannot be read")
     if found.open_level is not None:
-        opened = found.open_level(path, level)
+        opened = found.open_level(path, level, max_splats)
     elif found.open_bands is not None and sh_degree is not None:
         opened = found.open_bands(path, sh_degree)
     else:
         opened = found.open(path)
     with opened as all_bands:
+        if max_splats is not None and all_bands.count > max_splats:
+            which = "the coarsest version" if all_bands.levels else "the scene, which has no other version,"
+            raise InputError(f"{path.name}: {which} has {all_bands.count:,} splats, expected at most {max_splats:,}")
         refuse([] if lenient else all_bands.findings, strict=False)
         scene = all_bands if sh_degree is None else _with_fewer_bands(all_bands, sh_degree)
         yield replace(convert_axes(scene, DEFAULT_AXES) if found.axes else scene, format=found.name)

@@ -261,8 +261,7 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
 
     Args:
         scene: the scene; its blocks are read twice.
-        folder: folder for an unnamed temporary file of 56 bytes per splat and 12 per SH coefficient. Only a few blocks
-            are in memory at a time.
+        folder: as in `sorted_parts`.
 
     Yields:
         The sorted scene without extra columns; all blocks but the last are full.
@@ -272,39 +271,64 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
         OSError: the folder is full.
     """
     curve = _ZCurve.through(scene)
+    with sorted_parts(scene, folder, curve.codes, curve.splits) as (metadata_model, parts):
+        yield replace(scene, metadata_model=metadata_model, blocks=lambda: _fill_blocks(metadata_model, parts()))
+
+
+@contextmanager
+def sorted_parts(
+    scene: SceneSource, folder: Path, keys: Callable[[F32], I64], splits: I64
+) -> Iterator[tuple[SplatModel, Callable[[], Iterator[Rows]]]]:
+    """Sort a scene by keys of positions, and divide it at some keys; splats with the same key keep their order.
+
+    Args:
+        scene: the scene; its blocks are read once.
+        folder: folder for an unnamed temporary file of 56 bytes per splat and 12 per SH coefficient. Only one block
+            and one part are in memory at a time.
+        keys: returns the key of each position [n, 3].
+        splits: the least key of each part but the first, ascending.
+
+    Yields:
+        The scene without splats and extra columns; and a function that returns the parts one by one, as rows for
+        `scene_of_rows`.
+
+    Raises:
+        InputError: raised by the blocks of the scene.
+        OSError: the folder is full.
+    """
     metadata_model = replace(scene.metadata_model, extra={}, means_double=None)
     dtype = np.dtype([(name, "<f4", getattr(metadata_model, name).shape[1:]) for name in ARRAYS])
     with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(folder)) as spool:
         runs = []  # per block written: the offsets of its parts
         for model in scene.blocks():
-            codes = curve.codes(model.means)
+            codes = keys(model.means)
             order = np.argsort(codes, kind="stable")
             rows = np.empty(len(model), dtype)
             for name in ARRAYS:
                 rows[name] = getattr(model, name)[order]
-            parts = np.searchsorted(codes[order], curve.splits)
+            parts = np.searchsorted(codes[order], splits)
             runs.append(spool.tell() + dtype.itemsize * np.concatenate([[0], parts, [len(model)]]))
             spool.write(rows.tobytes())
-        yield replace(
-            scene,
-            metadata_model=metadata_model,
-            blocks=lambda: _fill_blocks(metadata_model, _merge_runs(spool, runs, dtype, curve)),
-        )
+        yield metadata_model, lambda: _merge_runs(spool, runs, dtype, keys)
 
 
-def _merge_runs(spool: IO[bytes], runs: Sequence[I64], dtype: np.dtype[Any], curve: _ZCurve) -> Iterator[NDArray[Any]]:
-    """Yield the sorted rows between two splits at a time, about one block, collected from all runs."""
-    for part in range(len(curve.splits) + 1):
+def _merge_runs(
+    spool: IO[bytes], runs: Sequence[I64], dtype: np.dtype[Any], keys: Callable[[F32], I64]
+) -> Iterator[Rows]:
+    """Yield the sorted rows of one part at a time, collected from all runs."""
+    for part in range(len(runs[0]) - 1 if runs else 0):
         pieces = []
         for run in runs:
             spool.seek(run[part])
             pieces.append(np.frombuffer(spool.read(run[part + 1] - run[part]), dtype))
-        rows = np.concatenate(pieces) if pieces else np.empty(0, dtype)
-        yield rows[np.argsort(curve.codes(rows["means"]), kind="stable")]
+        rows = np.concatenate(pieces)
+        pieces.clear()  # a part may be large
+        rows = rows[np.argsort(keys(rows["means"]), kind="stable")]
+        yield rows
 
 
-def _fill_blocks(metadata_model: SplatModel, parts: Iterator[NDArray[Any]]) -> Iterator[SplatModel]:
-    left: list[NDArray[Any]] = []
+def _fill_blocks(metadata_model: SplatModel, parts: Iterator[Rows]) -> Iterator[SplatModel]:
+    left: list[Rows] = []
     for rows in parts:
         left = [np.concatenate([*left, rows])]
         while len(left[0]) >= BLOCK_SPLATS:
@@ -314,7 +338,17 @@ def _fill_blocks(metadata_model: SplatModel, parts: Iterator[NDArray[Any]]) -> I
         yield _model_of_rows(metadata_model, left[0])
 
 
-def _model_of_rows(metadata_model: SplatModel, rows: NDArray[Any]) -> SplatModel:
+def scene_of_rows(metadata_model: SplatModel, rows: Rows) -> SceneSource:
+    """Return the scene of rows with the fields of `ARRAYS`; its blocks copy them."""
+
+    def blocks() -> Iterator[SplatModel]:
+        for start in range(0, len(rows), BLOCK_SPLATS):
+            yield _model_of_rows(metadata_model, rows[start : start + BLOCK_SPLATS])
+
+    return SceneSource(len(rows), metadata_model, blocks)
+
+
+def _model_of_rows(metadata_model: SplatModel, rows: Rows) -> SplatModel:
     arrays: dict[str, Any] = {name: np.ascontiguousarray(rows[name]) for name in ARRAYS}
     return replace(metadata_model, **arrays)
 

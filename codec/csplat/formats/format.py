@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,11 +18,13 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 # Opening a file raises InputError if it is incomplete or of another format, OSError if it cannot be read. Reading its
 # blocks raises the same errors; it is possible until the context ends.
 OpenScene = Callable[[Path], AbstractContextManager[SceneSource]]
-OpenLevel = Callable[[Path, int], AbstractContextManager[SceneSource]]  # level of detail, 0 is the finest
+# A level of detail, 0 is the finest; or, if it is given, the best version of at most this number of splats.
+OpenLevel = Callable[[Path, int, int | None], AbstractContextManager[SceneSource]]
 OpenBands = Callable[[Path, int], AbstractContextManager[SceneSource]]  # highest SH degree to read
 # Writing raises InputError if the format cannot represent the scene (too many splats, positions out of range), OSError
 # if the file cannot be written. The path appears when the file is complete.
 WriteScene = Callable[[Path, SceneSource], None]
+WriteLevels = Callable[[Path, Sequence[SceneSource]], None]  # the levels of detail of a scene, finest first
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,8 @@ class Format:
         open_level: opens a level of detail; `None`: scenes have one level.
         open_bands: opens a file without the SH bands above a degree; `None`: `open` reads all bands.
         write: writes a file; `None`: csplat does not write the format.
+        write_levels: writes all levels of detail to a file of the name `levels_name`; `None`: files have one level.
+        levels_name: name of files with levels, in lower case; "" if there are none.
         doubt: for formats identified by the file name alone: returns the reason why the content is unlikely to be of
             this format, "" if it may be.
         degree: highest SH degree that the format stores; the writer gets no higher bands.
@@ -51,6 +55,8 @@ class Format:
     open_level: OpenLevel | None = None
     open_bands: OpenBands | None = None
     write: WriteScene | None = None
+    write_levels: WriteLevels | None = None
+    levels_name: str = ""
     doubt: Callable[[Path], str] = lambda _path: ""
     degree: int = 3
     axes: str = ""
@@ -67,6 +73,10 @@ class Format:
     def suffixes(self) -> tuple[str, ...]:
         """File name suffixes with their dots, in lower case, the usual one first."""
         return KINDS[self.name].suffixes
+
+    def takes_levels(self, path: Path) -> bool:
+        """Return True if a file of this name holds all levels of detail of a scene."""
+        return self.write_levels is not None and path.name.lower() == self.levels_name
 
     def expected_bytes(self, model: SplatModel, count: int) -> int | None:
         """Return the approximate size of a file; `None` if it depends on the scene."""

@@ -10,6 +10,12 @@ export interface LoadOptions extends Omit<ReaderOptions, 'inflate'> {
   progressive?: boolean;
   /** Number of decoding workers. Default: 2. */
   workers?: number;
+  /**
+   * Of a file with levels of detail, load the version with the smallest errors that has at most this number of splats, or
+   * the coarsest; Infinity: level 0. Other files are loaded whole. Default: 2,500,000, on
+   * phones 1,000,000; in PlayCanvas `app.scene.gsplat.splatBudget`.
+   */
+  maxSplats?: number;
 }
 
 /** The source of a scene. */
@@ -17,8 +23,10 @@ export type SceneSource = string | URL | Blob | ArrayBuffer | ByteSource;
 
 /** The property `csplat` of an engine's object. */
 export interface SceneFacts<T = void> {
-  /** `axes`, `antialiased`, `origin` (the position that coordinates are relative to), `unitMetres`, `splatCount`, `shDegree`, … */
+  /** `axes`, `antialiased`, `origin` (the position that coordinates are relative to), `unitMetres`, `shDegree`, …, of the file. */
   header: Header;
+  /** Number of splats of the loaded version. */
+  splatCount: number;
   metadata: Record<string, unknown> | null;
   /** A sphere around most splats of the upright scene, for an initial camera. */
   bounds: { center: number[]; radius: number };

@@ -264,7 +264,11 @@ export class CsplatParser {
       this.options.onProgress?.(received, size);
       asset?.fire('progress', received, size);
     };
-    const target = { name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: false, shDegree: BANDS.length };
+    const budget = world?.gsplat?.splatBudget;
+    const target = {
+      ...{ name: NAME, engine: /** @type {const} */ ('RUB'), mirrors: false, shDegree: BANDS.length },
+      maxSplats: budget === 0 ? Infinity : budget, // the engine draws everything at its finest level then
+    };
     const scene = await openScene(from, { ...this.options, onProgress }, target);
     const { header } = scene;
     /** @type {import('../decoder.d.ts').PackedTile[]} */

@@ -1,6 +1,7 @@
 // A file as the adapters for engines load it: their shared options, and packed tiles as they arrive.
 
 import { CsplatReader } from '../decoder.mjs';
+import { allTiles } from '../tile_records.mjs';
 import { mirroredBand, mirroredGeometry } from './mirror.mjs';
 import { onceSaid, uprightIn } from './packed_values.mjs';
 
@@ -8,10 +9,12 @@ import { onceSaid, uprightIn } from './packed_values.mjs';
  * @typedef {import('../decoder.d.ts').Header} Header
  * @typedef {import('../decoder.d.ts').Packed} Packed
  * @typedef {import('../decoder.d.ts').PackedTile} PackedTile
+ * @typedef {import('../decoder.d.ts').TileRecord} TileRecord
  * @typedef {import('./options.d.ts').LoadOptions} LoadOptions
  * @typedef {{first: number, count: number, sh: Packed}} Band the band of a tile, and the index of its first splat
  */
 
+const PHONE = /Android|iPhone|iPad/;
 const WORKERS = 2; // default number of decoding workers
 const DETERMINANT_ROWS = [[1, 2], [2, 0], [0, 1]]; // prettier-ignore
 const SAMPLE = 1024; // splats per tile from which bounds are computed
@@ -22,12 +25,20 @@ const MOST = 0.9; // fraction of the sample within the bounds
  *
  * @param {Parameters<typeof CsplatReader.open>[0]} from
  * @param {LoadOptions} options
- * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean, shDegree: number}} target name of the adapter; letters of
- *   the engine's directions +x, +y, +z; whether the engine can draw with a mirroring matrix; its highest SH degree
+ * @param {{name: string, engine: 'RUB' | 'RUF', mirrors: boolean, shDegree: number, maxSplats?: number}} target name of the
+ *   adapter; letters of the engine's directions +x, +y, +z; whether the engine can draw with a mirroring matrix; its
+ *   highest SH degree; the engine's own default of the option
  * @param {(AbortSignal | undefined)[]} [signals] further signals that abort the load
  */
 export async function openScene(from, options, target, signals = []) {
-  const { shDegree, progressive, workers, signal: given, ...others } = options;
+  const {
+    shDegree,
+    progressive,
+    workers,
+    maxSplats = target.maxSplats ?? usualMaxSplats(),
+    signal: given,
+    ...others
+  } = options;
   const life = new Life([given, ...signals]);
   try {
     const { signal } = life;
@@ -38,6 +49,7 @@ export async function openScene(from, options, target, signals = []) {
     };
     const reader = await CsplatReader.open(from, { ...others, signal, onProgress });
     const { metadata } = await reader.describe({ signal });
+    const version = await chooseTiles(reader, maxSplats);
     const { extras, shDegree: most } = reader.header;
     const wanted = Math.min(shDegree ?? most, most);
     const degree = Math.min(wanted, target.shDegree);
@@ -47,6 +59,7 @@ export async function openScene(from, options, target, signals = []) {
       onceSaid(target.name, `extra columns are left out: ${extras.map(({ name }) => name).join(', ')}`);
     return new SplatScene(
       reader,
+      version,
       metadata,
       { degree, progressive: progressive === true && degree > 0, workers },
       target,
@@ -56,6 +69,26 @@ export async function openScene(from, options, target, signals = []) {
     life.end();
     throw error;
   }
+}
+
+/** Return the default of `maxSplats`: what Spark 2.2 and Babylon.js 9.34 draw at most of scenes with levels. */
+const usualMaxSplats = () => (PHONE.test(globalThis.navigator?.userAgent ?? '') ? 1_000_000 : 2_500_000);
+
+/**
+ * Return the tiles of the version with the smallest errors that has at most a number of splats; of a file without levels of
+ * detail, all tiles; if there is none, the coarsest version.
+ *
+ * @param {CsplatReader} reader
+ * @param {number} maxSplats
+ */
+async function chooseTiles(reader, maxSplats) {
+  const { header } = reader;
+  if (header.coarseTiles.length === 0 || header.splatCount <= maxSplats) return header.tiles;
+  const nodes = await reader.nodes();
+  const fewest = nodes.reduce((sum, { parent, splatCount }) => sum + (parent === null ? splatCount : 0), 0);
+  const tiles = allTiles(header);
+  const chosen = await reader.cut({ maxSplats: Math.max(maxSplats, fewest) });
+  return chosen.map((index) => tiles[index]);
 }
 
 /** The lifetime of a load. It ends when any of the signals aborts, and removes its listeners when the load is over. */
@@ -78,19 +111,31 @@ class Life {
   }
 }
 
-/** Tiles, bands and metadata of a file. */
+/** Tiles, bands and metadata of one version of a scene. */
 export class SplatScene {
   /**
    * @param {CsplatReader} reader
+   * @param {TileRecord[]} version its tiles
    * @param {Record<string, unknown> | null} metadata
    * @param {{degree: number, progressive: boolean, workers?: number}} wanted
    * @param {{engine: 'RUB' | 'RUF', mirrors: boolean}} target
    * @param {Life} life
    */
-  constructor(reader, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, life) {
+  constructor(reader, version, metadata, { degree, progressive, workers = WORKERS }, { engine, mirrors }, life) {
     /** @type {CsplatReader | null} null once everything has been read, to free the bytes of the file and the decoder */
     this.reader = reader;
-    this.header = reader.header;
+    /** The header of the file. */
+    this.file = reader.header;
+    /** Of each tile of the header below, its index in the file. */
+    this.indices = version.map(({ index }) => index);
+    let splatCount = 0;
+    const tiles = version.map((tile, index) => {
+      const first = splatCount;
+      splatCount += tile.splatCount;
+      return { ...tile, index, first };
+    });
+    /** The header of a file with this version alone. */
+    this.header = { ...reader.header, tiles, splatCount };
     this.metadata = metadata;
     this.degree = degree;
     this.progressive = progressive;
@@ -124,14 +169,16 @@ export class SplatScene {
    * @returns {AsyncGenerator<PackedTile & {index: number, first: number}, void>} tiles in the order of completion
    */
   async *tiles() {
-    const { header, progressive, workers } = this;
+    const { header, indices, progressive, workers } = this;
     const { signal } = this.life;
+    const numbers = new Map(indices.map((index, number) => [index, number]));
     const shDegree = progressive ? 0 : this.degree;
     try {
       const reader = this.reading(Array.from({ length: shDegree + 1 }, (_, layer) => layer));
       if (progressive) this.fetchBandsNext();
-      for await (const tile of reader.readTiles({ form: 'packed', shDegree, workers, signal })) {
+      for await (const read of reader.readTiles({ tiles: indices, form: 'packed', shDegree, workers, signal })) {
         signal.throwIfAborted();
+        const tile = { ...read, index: /** @type {number} */ (numbers.get(read.index)) };
         const { first } = header.tiles[tile.index];
         this.sample.push(...centresOf(tile));
         if (!this.mirrored) yield { ...tile, first };
@@ -151,11 +198,12 @@ export class SplatScene {
 
   /** Fetch SH bands as soon as layer 0 has arrived: no earlier, to not compete with it, and no later, to not idle. */
   fetchBandsNext() {
-    const { life, header, degree } = this;
+    const { life, header, file, indices, degree } = this;
     const end = header.tiles.reduce((most, { layers: [{ offset, size }] }) => Math.max(most, offset + size), 0); // layer 0 comes first
-    // Coarser tiles come before it, but are not fetched.
-    const base = header.coarseTiles.reduce(
-      (sum, { layers: [{ offset, size }] }) => sum - (offset < end ? size : 0),
+    // Tiles of other versions are between these, but are not fetched.
+    const chosen = new Set(indices);
+    const base = allTiles(file).reduce(
+      (sum, { index, layers: [{ offset, size }] }) => sum - (offset < end && !chosen.has(index) ? size : 0),
       end,
     );
     life.onBytes = () => {
@@ -176,7 +224,7 @@ export class SplatScene {
     const { signal } = this.life;
     const reader = this.reading([layer]);
     for (const { index, first } of this.header.tiles) {
-      const band = await reader.readLayer(index, layer, { form: 'packed', signal });
+      const band = await reader.readLayer(this.indices[index], layer, { form: 'packed', signal });
       signal.throwIfAborted();
       if (band) yield { index, first, count: band.count, sh: this.mirrored ? mirroredBand(band.sh, layer) : band.sh };
     }
@@ -191,11 +239,12 @@ export class SplatScene {
    * @returns {import('./options.d.ts').SceneFacts<T>}
    */
   facts(work, done) {
-    const { header, metadata, bounds } = this;
+    const { file: header, metadata, bounds } = this;
+    const { splatCount } = this.header;
     const complete = this.progressive ? work() : Promise.resolve(done);
     // If the caller does not await `complete`, its errors would be lost.
     complete.catch((error) => this.life.signal.aborted || console.error(error)).finally(() => this.release());
-    return { header, metadata, bounds, complete };
+    return { header, splatCount, metadata, bounds, complete };
   }
 
   /** Bounds of most splats of the upright scene: a few far away would make the bounds of all useless. */
@@ -215,12 +264,12 @@ export class SplatScene {
    * @param {number[]} layers
    */
   reading(layers) {
-    const { header, reader } = this;
+    const { indices, reader } = this;
     const { signal } = this.life;
     signal.throwIfAborted();
     if (reader === null) throw new Error('the whole file has already been read');
     reader.prefetch(
-      header.tiles.flatMap(({ index }) => layers.map((layer) => ({ tile: index, layer }))),
+      indices.flatMap((tile) => layers.map((layer) => ({ tile, layer }))),
       { signal },
     );
     return reader;

@@ -136,7 +136,7 @@ declare module 'playcanvas' {
   }
   export interface AppBase {
     graphicsDevice: { maxTextureSize: number };
-    scene?: { gsplatCentersEnabled?: boolean; gsplat?: { antiAlias: boolean } };
+    scene?: { gsplatCentersEnabled?: boolean; gsplat?: { antiAlias: boolean; splatBudget: number } };
   }
   export class Entity {
     gsplat?: { workBufferUpdate: number };

@@ -14,6 +14,7 @@ import {
   putQuats,
   uprightIn,
 } from '../engines/packed_values.mjs';
+import { allTiles } from '../tile_records.mjs';
 import { failures, manifest, vector } from './helpers.mjs';
 
 const same = (value) => value;
@@ -46,7 +47,7 @@ test("unpacked numbers of every vector equal the decoder's", async () => {
   const failed = await failures(valid, async ({ name }) => {
     const reader = await CsplatReader.open(new Blob([vector(name)]));
     const { header } = reader;
-    for (const { index, splatCount: count } of header.tiles) {
+    for (const { index, splatCount: count } of allTiles(header)) {
       const floats = await reader.readTile(index);
       const tile = await reader.readTile(index, { form: 'packed' });
       // A different stride and one splat more than needed, so that no value is at its default position.
@@ -176,11 +177,14 @@ test('scenes are upright in the axes of an engine', () => {
   }
 });
 
+const TARGET = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3 };
 for (const [name, options] of [
   ['valid/combined_codebooks', {}],
   ['valid/combined_codebooks', { progressive: true }],
   ['valid/combined_codebooks', { workers: 0 }],
   ['valid/levels_of_the_rich_scene', { progressive: true }],
+  ['valid/levels_of_the_rich_scene', { maxSplats: 1 }],
+  ['valid/levels_of_the_rich_scene', { maxSplats: 1, progressive: true }],
 ]) {
   test(`${name}: a load requests every byte at most once: ${JSON.stringify(options)}`, async () => {
     const bytes = vector(name);
@@ -195,8 +199,7 @@ for (const [name, options] of [
       };
       return new Response(body, { status: 206, headers: known });
     };
-    const target = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3 };
-    const scene = await openScene('http://example.org/a.csplat', { ...options, fetch, firstBytes: 64 }, target);
+    const scene = await openScene('http://example.org/a.csplat', { ...options, fetch, firstBytes: 64 }, TARGET);
     let count = 0;
     for await (const tile of scene.tiles()) count += tile.count;
     const complete = scene.facts(async () => {
@@ -211,3 +214,38 @@ for (const [name, options] of [
     for (const [i, [first]] of asked.entries()) if (i > 0) assert.ok(first >= asked[i - 1][1], `${asked.join(' ')}`);
   });
 }
+
+test('a budget of splats selects the version of cut, renumbered', async () => {
+  const bytes = vector('valid/levels_of_a_tree');
+  const reader = await CsplatReader.open(new Blob([bytes]));
+  const counts = new Set();
+  const coarsest = await reader.cut({ level: 255 });
+  for (const maxSplats of [...Array(reader.header.splatCount).keys(), Infinity]) {
+    const cut = await reader.cut({ maxSplats }).catch(({ code }) => (assert.equal(code, 'E_LIMIT'), coarsest));
+    for (const progressive of [false, true]) {
+      const scene = await openScene(new Blob([bytes]), { maxSplats, progressive }, TARGET);
+      const tiles = [];
+      for await (const tile of scene.tiles()) tiles[tile.index] = tile;
+      const { header, splatCount, complete } = scene.facts(async () => {});
+      await complete;
+      assert.deepEqual(header, reader.header);
+      assert.equal(tiles.length, cut.length);
+      let first = 0;
+      for (const [number, index] of cut.entries()) {
+        const tile = await reader.readTile(index, { form: 'packed', shDegree: progressive ? 0 : undefined });
+        assert.deepEqual(tiles[number], { ...tile, index: number, first });
+        first += tile.count;
+      }
+      assert.equal(splatCount, first);
+      counts.add(first);
+    }
+  }
+  assert.ok(counts.size > 2, [...counts].join(' '));
+});
+
+test('other files ignore the budget', async () => {
+  const reader = await CsplatReader.open(new Blob([vector('valid/combined_codebooks')]));
+  const scene = await openScene(new Blob([vector('valid/combined_codebooks')]), { maxSplats: 1 }, TARGET);
+  assert.deepEqual(scene.header, reader.header);
+  scene.release();
+});

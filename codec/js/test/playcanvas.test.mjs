@@ -3,6 +3,7 @@ import assert from 'node:assert/strict';
 import { test } from 'node:test';
 
 import { CsplatReader } from '../decoder.mjs';
+import { openScene } from '../engines/scene.mjs';
 import { bandImagesOf, imagesOf } from '../engines/playcanvas-textures.mjs';
 import { failures, manifest, vector } from './helpers.mjs';
 
@@ -50,39 +51,47 @@ function readerOf({ images, parameters }) {
   };
 }
 
-test('textures have the values of every vector', async () => {
-  const failed = await failures(valid, async ({ name }) => {
-    const reader = await CsplatReader.open(new Blob([vector(name)]));
-    const shDegree = Math.min(reader.header.shDegree, 3); // PlayCanvas ends there
-    const header = { ...reader.header, shDegree };
-    const tiles = [];
-    for (const { index } of header.tiles) tiles.push(await reader.readTile(index, { form: 'packed', shDegree }));
-    const made = madeOf(header, tiles, 64); // many rows of few entries
-    const splat = readerOf(made);
-    for (const { index, first, corner, extent, step } of header.tiles) {
-      const floats = await reader.readTile(index, { shDegree });
-      const near = (found, wanted, off, what) =>
-        assert.ok(Math.abs(found - wanted) <= off, `${what}: ${found}, ${wanted}`);
-      for (let i = 0; i < floats.count; i++) {
-        for (let c = 0; c < 3; c++) {
-          const mean = floats.means[3 * i + c];
-          assert.equal(made.centers[3 * (first + i) + c], mean);
-          near(splat.mean(first + i, c), mean, (Math.abs(corner[c]) + extent[c]) * step * 2 ** -22, 'mean');
-          const value = (found, wanted, what) =>
-            near(found, wanted, Math.abs(wanted) * 2 ** -22 + 2 ** -31 * 100, what);
-          value(splat.scale(first + i, c), floats.scales[3 * i + c], 'scale');
-          value(splat.quat(first + i, c), floats.quats[4 * i + 1 + c], 'quat');
-          value(splat.colour(first + i, c), floats.sh0[3 * i + c], 'colour');
-          for (let band = 1, k = 0; band <= header.shDegree; band++) {
-            for (let m = 0; m <= 2 * band; m++, k++) {
-              const terms = (header.shDegree + 1) ** 2 - 1;
-              value(splat.sh(first + i, band, m, c), floats.shN[3 * (terms * i + k) + c], 'sh');
-            }
+/** Check the textures of a version of a file. */
+async function checkVersion(name, maxSplats) {
+  const reader = await CsplatReader.open(new Blob([vector(name)]));
+  const target = { name: 'test', engine: 'RUB', mirrors: true, shDegree: 3, maxSplats }; // PlayCanvas ends at degree 3
+  const scene = await openScene(new Blob([vector(name)]), {}, target);
+  const shDegree = scene.degree;
+  const header = { ...scene.header, shDegree };
+  const tiles = [];
+  for await (const tile of scene.tiles()) tiles[tile.index] = tile;
+  scene.release();
+  const made = madeOf(header, tiles, 64); // many rows of few entries
+  const splat = readerOf(made);
+  for (const { index, first, corner, extent, step } of header.tiles) {
+    const floats = await reader.readTile(scene.indices[index], { shDegree });
+    const near = (found, wanted, off, what) =>
+      assert.ok(Math.abs(found - wanted) <= off, `${what}: ${found}, ${wanted}`);
+    for (let i = 0; i < floats.count; i++) {
+      for (let c = 0; c < 3; c++) {
+        const mean = floats.means[3 * i + c];
+        assert.equal(made.centers[3 * (first + i) + c], mean);
+        near(splat.mean(first + i, c), mean, (Math.abs(corner[c]) + extent[c]) * step * 2 ** -22, 'mean');
+        const value = (found, wanted, what) => near(found, wanted, Math.abs(wanted) * 2 ** -22 + 2 ** -31 * 100, what);
+        value(splat.scale(first + i, c), floats.scales[3 * i + c], 'scale');
+        value(splat.quat(first + i, c), floats.quats[4 * i + 1 + c], 'quat');
+        value(splat.colour(first + i, c), floats.sh0[3 * i + c], 'colour');
+        for (let band = 1, k = 0; band <= header.shDegree; band++) {
+          for (let m = 0; m <= 2 * band; m++, k++) {
+            const terms = (header.shDegree + 1) ** 2 - 1;
+            value(splat.sh(first + i, band, m, c), floats.shN[3 * (terms * i + k) + c], 'sh');
           }
         }
-        near(splat.alpha(first + i), floats.opacities[i], 1e-7, 'alpha');
       }
+      near(splat.alpha(first + i), floats.opacities[i], 1e-7, 'alpha');
     }
+  }
+}
+
+test('textures have the values of every vector', async () => {
+  const failed = await failures(valid, async ({ name }) => {
+    await checkVersion(name, Infinity);
+    await checkVersion(name, 1); // the coarsest version
   });
   assert.deepEqual(failed, {});
 });

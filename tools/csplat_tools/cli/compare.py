@@ -16,7 +16,7 @@ from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.inspect.text_reports import format_comparison
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
-from csplat_tools.scene_files import OpenedScene, open_scenes
+from csplat_tools.scene_files import OpenedScene, load_model, open_scenes
 from csplat_tools.views import Split
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def compare(
     lpips: Annotated[
         str | None, typer.Option(metavar="FILE.npz", help="Weights of LPIPS, or auto. Default: none.")
     ] = None,
+    level: shared.Level = None,
     backend: shared.BackendOption = "cpu",
     test_every: shared.TestEvery = None,
     source_index: Annotated[
@@ -59,13 +60,14 @@ def compare(
     of black, or of the given views; at most 99 dB. Compare only values for
     the same cameras and background. With --data, A and B are also scored
     against the held-out images. Scenes that do not fit in memory are rendered
-    from the disk. --backend gpu computes PSNR on a GPU (extra gpu), which
-    may differ in the third decimal. Requires the render extra.
+    from the disk. --level is that of B. --backend gpu computes PSNR on a GPU
+    (extra gpu), which may differ in the third decimal. Requires the render
+    extra.
 
     Examples:
       csplat compare scene.ply scene.csplat
       csplat compare scene.ply scene.csplat --data capture --lpips auto
-      csplat compare scene.ply scene.csplat --pictures differences
+      csplat compare scene.ply scene.csplat --level 2 --pictures differences
       csplat compare scene.ply other.ply --cameras test.json --json | jq .psnr
     """
     import csplat_tools
@@ -76,10 +78,12 @@ def compare(
     out.check(inputs=(a, b, *views.inputs, source_index, None if lpips == "auto" else lpips))
     if a == b == STANDARD_STREAM:
         raise typer.BadParameter("A and B cannot both be standard input")
+    chosen, max_splats = shared.parse_level(level)
     require_renderer()
     mode, device = shared.parse_backend(backend, out)
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
-    with open_scenes((a, b)) as (source, other), out.bar() as progress:
+    given = b if (chosen, max_splats) == (0, None) else load_model(b, level=chosen, max_splats=max_splats)
+    with open_scenes((a, given)) as (source, other), out.bar() as progress:
         if isinstance(source, OpenedScene):
             if mode == "exact":
                 raise InputError("--backend exact requires both scenes in memory, and they do not fit: use cpu")

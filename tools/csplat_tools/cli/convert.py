@@ -18,6 +18,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes, format_table, note
 from csplat_tools.convert_file import Filters, convert_file, format_rows
 from csplat_tools.file_streams import STANDARD_STREAM
+from csplat_tools.scene_files import FOLDER_NAMES
 
 _COLUMNS = ("format", "endings", "read", "written", "SH degree", "axes", "exact", "has a place for")
 
@@ -43,10 +44,7 @@ def convert(
     write_as: Annotated[
         str | None, typer.Option("--to", metavar="FORMAT", hidden=True, help="Format of OUT. Default: by its name.")
     ] = None,
-    level: Annotated[
-        int,
-        typer.Option(min=0, metavar="N", hidden=True, show_default=False, help="Level of streamed SOG. Default: 0."),
-    ] = 0,
+    level: shared.HiddenLevel = None,
     read_as: shared.ReadAs = None,
     force: shared.Force = False,
     report: shared.Report = None,
@@ -59,27 +57,29 @@ def convert(
     Changes are made in this order: --to-axes (in --help-all), --rotate,
     --scale, --translate, --crop, --drop-floaters, --sh-degree. A line reports
     what the format cannot hold. `csplat formats` lists the formats; for .csplat
-    files, `csplat encode` has presets and targets.
+    files, `csplat encode` has presets and targets. A new folder with a file
+    lod-meta.json gets streamed SOG, with all levels of detail.
 
     Examples:
       csplat convert scene.spz scene.ply
       csplat convert scene.ply scene.sog --drop-floaters
       csplat convert scene.ply small.spz --sh-degree 1 --crop 0,0,0,3
-      csplat convert scene.ply scene.glb --dry-run
+      csplat convert city.csplat city/lod-meta.json
     """
     out = Output(force, report, as_json, quiet)
     if output == STANDARD_STREAM:
         raise typer.BadParameter("OUT cannot be standard output: name a file")
     filters, overrides = _filters(to_axes, rotate, scale, translate, crop), shared.parse_overrides(up, axes)
     filters = replace(filters, drop_floaters=drop_floaters, sh_degree=shared.parse_sh_degree(sh_degree))
+    chosen, max_splats = shared.parse_level(level)
     folder = Path(output).parent
-    is_new_folder = Path(output).name == "meta.json" and not folder.exists()  # SOG as a folder
+    is_new_folder = Path(output).name in FOLDER_NAMES and not folder.exists()
     if not dry_run and not Path(output).is_dir():
         out.check(str(folder) if is_new_folder else output, inputs=(source,))
     with out.bar() as progress, assume_format(read_as):
         made = convert_file(
-            source, output, write_as=write_as, level=level, overrides=overrides, filters=filters, no_loss=no_loss,
-            dry_run=dry_run, progress=progress,
+            source, output, write_as=write_as, level=chosen, max_splats=max_splats, overrides=overrides,
+            filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)
     if made.losses():
@@ -89,8 +89,9 @@ def convert(
         known = f"{before} axes" if before != UNSPECIFIED else f"no axes: {DEFAULT_AXES} is assumed, --axes sets others"
         out.remark(f"turned to {after} axes, as {made.target_format} has them; the source has {known}")
     size = "a size that depends on the scene" if made.size_bytes is None else format_bytes(made.size_bytes)
+    in_levels = f" and {counted(len(made.levels) - 1, 'coarser level')}" if len(made.levels) > 1 else ""
     out.remark(
-        f"{counted(made.count, 'splat')}: {made.source_format}, {format_bytes(made.source_bytes)}"
+        f"{counted(made.count, 'splat')}{in_levels}: {made.source_format}, {format_bytes(made.source_bytes)}"
         f" -> {made.target_format}, {'about ' * (dry_run and made.size_bytes is not None)}{size}"
     )
     out.publish(made.as_json())

@@ -31,7 +31,6 @@ def finetune(
         float | None, typer.Option("--lambda", metavar="COST", help="Loss per bit and splat. Default: 1e-4.")
     ] = None,
     page: shared.Page = None,
-    sh_degree: shared.HiddenShDegree = None,
     cameras: shared.HiddenCameras = None,
     background: shared.HiddenBackground = None,
     source_index: shared.SourceIndexOutput = None,
@@ -77,8 +76,7 @@ def finetune(
     options = shared.checked(FinetuneOptions, iterations=iterations, byte_cost=cost).scaled(
         tuning.LEARNING_FACTOR[itself]
     )
-    degree = shared.parse_sh_degree(sh_degree)
-    encoding = EncodeOptions(preset, sh_degree=degree, shape_codebook_size=tuning.SHAPE_ENTRIES)
+    encoding = EncodeOptions(preset, shape_codebook_size=tuning.SHAPE_ENTRIES)
     replaces = shared.is_same_file(checkpoint, resume)  # a checkpoint may replace the one that the run goes on from
     named = {"--source-index": source_index, "--page": page}
     if replaces:

@@ -21,7 +21,6 @@ def lint(
     source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, another of `csplat formats`, or -.")],
     fix: Annotated[str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY if that is safe.")] = None,
     keep_extra: shared.KeepExtra = False,
-    sh_degree: shared.ShDegree = None,
     force: shared.Force = False,
     report: shared.Report = None,
     as_json: shared.Json = False,
@@ -39,17 +38,17 @@ def lint(
       csplat lint scene.ply --fix clean.ply
       csplat lint scene.ply --json | jq '.findings[].id'
     """
-    out, sh_degree = Output(force, report, as_json, quiet), shared.parse_sh_degree(sh_degree)
+    out = Output(force, report, as_json, quiet)
     out.check(fix, inputs=(source,))
     if fix is not None:
         check_name(fix, ".ply", "--fix", source)
     with source_path(source) as path:
-        findings = formats.lint_file(path, sh_degree=sh_degree)
+        findings = formats.lint_file(path)
         if keep_extra:
             findings = [one for one in findings if one.id != "extra-columns"]
         errors = any(one.kind == "error" for one in findings)
         if fix is not None and not errors:
-            with formats.open_scene(path, sh_degree=sh_degree) as scene:
+            with formats.open_scene(path) as scene:
                 write_model(fix, scene if keep_extra else without_extra_columns(scene), absolute=False)
     clean = all(one.kind == "note" for one in findings)
     table = _table(findings)

@@ -36,6 +36,7 @@ def render(
     orbit: Annotated[
         int | None, typer.Option(metavar="N", min=1, help="N cameras around or along. Default: none.")
     ] = None,
+    level: shared.Level = None,
     backend: shared.BackendOption = "cpu",
     fps: Annotated[
         float, typer.Option(metavar="RATE", show_default=False, help="Frames per second. Default: 25.")
@@ -61,7 +62,7 @@ def render(
 
     Examples:
       csplat render scene.csplat turn.mp4 --orbit 120
-      csplat render room.ply room.webp --orbit 240 --data capture --backend gpu
+      csplat render room.csplat room.webp --orbit 240 --level 500k
       csplat render scene.ply held-out --data capture
       csplat render scene.ply views --cameras test.json --background white
     """
@@ -75,6 +76,7 @@ def render(
         raise typer.BadParameter("--depth and --alpha require a folder, not a video")
     shared.check_range("--fps", fps, 0.1, MAX_FPS)
     shared.require_one({"--up": up}, {"--orbit": orbit})
+    chosen, max_splats = shared.parse_level(level)
     pixels, overrides = None if size is None else shared.parse_size(size), shared.parse_overrides(up)
     out.check(output if is_video else None, inputs=(source, *views.inputs))
     if not is_video:
@@ -84,7 +86,7 @@ def render(
     require_renderer()
     mode, device = shared.parse_backend(backend, out)
     with out.bar() as progress:
-        read = load_model(source)
+        read = load_model(source, level=chosen, max_splats=max_splats)
         out.print_findings(read.findings)
         model, notes = overrides.apply(read.model), list[str]()
         data_set = None if data is None else DataOptions(data, pixels)

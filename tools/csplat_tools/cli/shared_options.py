@@ -31,6 +31,8 @@ T = TypeVar("T")
 N = TypeVar("N", int, float, int | None, float | None)
 
 CHECKPOINT_EVERY = 1_000  # steps from one checkpoint to the next
+_LEVEL = re.compile(r"(\d+(?:\.\d+)?)(k|M)?", re.ASCII)
+_LEVEL_MAX = 255  # largest level that the format has; larger numbers are numbers of splats
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}  # metres
 _NAMED_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
@@ -70,9 +72,12 @@ ReadAs = Annotated[
 _up = typer.Option("--up", metavar="-y|X,Y,Z", help="Up direction. Default: the scene's own.")
 Up = Annotated[str | None, _up]
 HiddenUp = Annotated[str | None, hidden(_up)]
-_sh_degree = typer.Option("--sh-degree", metavar="0..4", help="Drop higher SH bands. Default: keep all.")
-ShDegree = Annotated[int | None, _sh_degree]
-HiddenShDegree = Annotated[int | None, hidden(_sh_degree)]
+ShDegree = Annotated[
+    int | None, typer.Option("--sh-degree", metavar="0..4", help="Drop higher SH bands. Default: keep all.")
+]
+_level = typer.Option("--level", metavar="K|N", help="Level, or most splats: 1, 500k. Default: 0.")
+Level = Annotated[str | None, _level]
+HiddenLevel = Annotated[str | None, hidden(_level)]
 MaxSplats = Annotated[int | None, typer.Option(metavar="N", min=1, help="Refuse larger scenes. Default: no limit.")]
 SourceIndexOutput = Annotated[
     str | None,
@@ -132,6 +137,20 @@ HiddenDryRun = Annotated[bool, hidden(_dry_run)]
 _keep_extra = typer.Option("--keep-extra", help="Keep columns that splats do not have.")
 KeepExtra = Annotated[bool, _keep_extra]
 HiddenKeepExtra = Annotated[bool, hidden(_keep_extra)]
+
+
+def parse_level(text: str | None) -> tuple[int, int | None]:
+    """Return the level of detail and the maximum number of splats, of which only one is set, for a value of `Level`.
+
+    Args:
+        text: a level, 0 to 255; or a number of splats above, or with k or M for thousands or millions.
+    """
+    found = _LEVEL.fullmatch("0" if text is None else text)
+    factor = {None: 1, "k": 1_000, "M": 1_000_000}[found[2]] if found else 0
+    if found is None or (factor == 1 and "." in found[1]):
+        raise typer.BadParameter(f"--level is {text}, expected a level, as in 1, or a number of splats, as in 500k")
+    number = round(float(found[1]) * factor)
+    return (number, None) if factor == 1 and number <= _LEVEL_MAX else (0, number)
 
 
 def parse_backend(name: RendererName, out: Output) -> tuple[Mode, Backend]:

@@ -31,11 +31,11 @@ _Range = tuple[int, int, int]  # file index, first splat, end
 
 
 @contextmanager
-def open_sog(path: Path, level: int = 0) -> Iterator[SceneSource]:
+def open_sog(path: Path, level: int = 0, max_splats: int | None = None) -> Iterator[SceneSource]:
     """Open a file or folder (`Format.open`, `Format.open_level`)."""
     parts, name = find_parts(path)
     with parts.kept_open():
-        yield _open_scene(path, parts, name, level)
+        yield _open_scene(path, parts, name, level, max_splats)
 
 
 def read_leaf_numbers(path: Path, level: int = 0) -> I64:
@@ -62,13 +62,13 @@ def read_leaf_numbers(path: Path, level: int = 0) -> I64:
     return np.concatenate([*numbers, np.full(around, len(leaves), np.int64)])
 
 
-def _open_scene(path: Path, parts: SogParts, name: str, level: int) -> SceneSource:
+def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: int | None) -> SceneSource:
     meta = parts.json(name)
     if isinstance(meta.value, dict) and not any(one in meta for one in _KEYS):
         where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
         parts.refuse(f"{name} is not the one of SOG, which has {', '.join(_KEYS[:4])}; {where}")
     if "lodLevels" in meta or "tree" in meta:
-        scene = _open_streamed(parts, meta, level)
+        scene = _open_streamed(parts, meta, level, max_splats)
         scene.findings.extend(parts.findings)
         return scene
     if level:
@@ -106,19 +106,30 @@ def _list_findings(images: SogImages) -> list[Finding]:
     return [Finding("zero-quats", images.zeros, text, "repair")]
 
 
-def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
-    """Open a level of streamed SOG with its environment; blocks are read one file at a time."""
+def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int | None) -> SceneSource:
+    """Open a level of streamed SOG with its environment; blocks are read one file at a time.
+
+    With `max_splats`, open the finest level of at most this number of splats, else the coarsest.
+    """
     names, leaves = _read_leaves(parts, meta)
     last = max([max(one) for one in leaves], default=0)
     if level > last:
         parts.refuse(f"the level is {level}, expected 0 to {last}")
+    environment = use_slashes(meta["environment"].text()) if "environment" in meta else None
+    around = 0 if environment is None else read_meta(*parts.inner(environment)).count
+    counts = [
+        around + sum(stop - start for _, start, stop in (_range_at(leaf, one) for leaf in leaves))
+        for one in range(last + 1)
+    ]
+    if max_splats is not None:
+        level = next((one for one in range(last) if counts[one] <= max_splats), last)
     findings: list[Finding] = []
     if any("\\" in name for name in names):
         findings.append(Finding("zip-names", 1, "backslashes in filenames, read as slashes", "note"))
         names = [use_slashes(name) for name in names]
     ranges = _collect_ranges(parts, names, [_range_at(one, level) for one in leaves])
-    if "environment" in meta:
-        ranges[use_slashes(meta["environment"].text())] = None
+    if environment is not None:
+        ranges[environment] = None
     metas: list[tuple[SogMeta, list[tuple[int, int]]]] = []
     for name, wanted in ranges.items():
         sog = read_meta(*parts.inner(name))
@@ -151,12 +162,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int) -> SceneSource:
                 if chosen.any():
                     yield model if chosen.all() else model.select(chosen)
 
-    count = sum(stop - start for _, taken in metas for start, stop in taken)
-    inside = [
-        sum(stop - start for _, start, stop in (_range_at(leaf, one) for leaf in leaves)) for one in range(last + 1)
-    ]
-    around = count - inside[level]
-    return SceneSource(count, metadata_model, blocks, findings, levels=tuple(one + around for one in inside))
+    return SceneSource(counts[level], metadata_model, blocks, findings, levels=tuple(counts))
 
 
 def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict[int, _Range]]]:

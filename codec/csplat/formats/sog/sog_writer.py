@@ -45,24 +45,22 @@ def write_sog(path: Path, scene: SceneSource) -> None:
         InputError: the scene has more splats than an image can have pixels; or Pillow is not installed.
         OSError: a file cannot be written.
     """
-    if path.name.lower() == "lod-meta.json":
-        raise InputError(f"{path.name} would be streamed SOG, which csplat does not write: end it in .sog")
     is_folder = path.name.lower().endswith("meta.json")
     if is_folder:
         path.parent.mkdir(exist_ok=True)
     with sorted_along_curve(scene, path.parent) as ordered:
         if is_folder:
-            for name, data in _encode_files(ordered):  # meta.json comes last
+            for name, data in encode_files(ordered):  # meta.json comes last
                 with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
                     stream.write(data)
             return
         with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-            for name, data in _encode_files(ordered):
+            for name, data in encode_files(ordered):
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
 
 
-def _encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
-    """Yield the name and bytes of each file. Takes 17 bytes of memory per splat, 21 with SH."""
+def encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
+    """Yield the name and bytes of each file of a SOG. Takes 17 bytes of memory per splat, 21 with SH."""
     count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
     height = max(1, math.ceil(count / width / 4)) * 4
