@@ -718,12 +718,12 @@ def test_answers_wait_for_the_latency_and_an_open_request_is_not_quiet(folder):
         assert 10 == sum(size for _, size in line.sent)
 
 
-def test_the_first_image_is_not_black_and_the_good_one_has_25_db():
+def test_the_first_image_is_not_black_and_later_ones_are_nearer_to_the_last():
     finished = np.zeros((120, 160, 3), np.uint8)
     finished[30:90, 40:120] = 200
     images = np.stack([np.zeros_like(finished), finished // 2, finished - finished // 20, finished])
     record = Record([1.0, 2.0, 3.0, 4.0], images, [(0.5, 10), (1.5, 20), (2.5, 40), (9.0, 80)], 0.5)
     assert {
-        "first_ms": 1500.0, "first_bytes": 30, "good_ms": 2500.0, "good_bytes": 70, "whole_ms": 3500.0,
-        "whole_bytes": 70, "asked_bytes": 150,
+        "first_ms": 1500.0, "first_bytes": 30, "db25_ms": 2500.0, "db25_bytes": 70, "db30_ms": 2500.0, "db30_bytes": 70,
+        "db38_ms": 3500.0, "db38_bytes": 70, "whole_ms": 3500.0, "whole_bytes": 70, "asked_bytes": 150,
     } == record.values()  # fmt: skip

@@ -553,7 +553,7 @@ def test_software_is_not_chosen_but_draws_correctly(engine):
         """async () => {
           const { WebGpuRenderer } = await import('/tools/viewer/webgpu.mjs');
           const { Device } = await import('/tools/viewer/webgpu_device.mjs');
-          const { isSound } = await import('/tools/viewer/webgpu_check.mjs');
+          const { isSound } = await import('/tools/viewer/trial_scene.mjs');
           const renderer = new WebGpuRenderer(await Device.open(false), 'auto');
           const found = [await isSound(renderer)];
           renderer.projection.setView = () => {}; // a GPU that does not draw

@@ -297,9 +297,11 @@ export class Reader {
     const description = emptyDescription();
     const { version, splatCount } = this.header;
     const scene = { version, splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
-    for (const record of this.header.directory) {
-      const { type } = record;
-      if (type === spec.CHUNK_CODEBOOK || type === spec.CHUNK_TREE || !Object.hasOwn(spec.CHUNK_NAMES, type)) continue;
+    const records = this.header.directory.filter(
+      ({ type }) => type !== spec.CHUNK_CODEBOOK && type !== spec.CHUNK_TREE && Object.hasOwn(spec.CHUNK_NAMES, type),
+    );
+    this.source.prefetch?.(records, signal);
+    for (const record of records) {
       await describe(description, record, this.opened(await this.fetch(record, signal), record), scene);
     }
     return description;

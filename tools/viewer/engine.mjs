@@ -72,8 +72,11 @@ const [SORTED_SPLATS, UNSORTED_SPLATS] = [3e6, 6e6];
 /** Gigabytes of memory below which a device gets half of that, as do users who save data. */
 const SMALL_GB = 4;
 
-/** Error in pixels until which splats are refined, and for users who save data. */
-const [USUAL_PIXELS, SAVING_PIXELS] = [0.25, 1];
+/**
+ * Error in pixels until which splats are refined, and for users who save data. Renders of lego60k, at a quarter of their size, have
+ * 36.8 dB or more in either case, with 81 and 53 % of the splats.
+ */
+const [USUAL_PIXELS, SAVING_PIXELS] = [1, 2];
 
 /**
  * @param {EngineOptions} options

@@ -102,13 +102,20 @@ export class TileStream {
       },
     });
     const { header } = reader;
-    const description = await reader.describe({ signal });
+    const described = reader.describe({ signal });
+    described.catch(() => {}); // it is waited for below
     const nodes = nodesOrTiles(header, header.coarseTiles.length > 0 ? await reader.nodes() : []);
     Object.assign(amounts, { phase: 'layers', fileSize: header.fileSize, splatCount: header.splatCount });
     const isLocal = typeof source !== 'string'; // the decoder then reports no received bytes
     if (isLocal) amounts.received = header.indexSize;
     const stream = new TileStream(reader, nodes, sink, aims, amounts, isLocal, signal);
-    sink.header({ header, description, roots: stream.roots.size, pages: stream.pages });
+    // What is shown first comes together with the description.
+    if (stream.hasLevels)
+      reader.prefetch(
+        Array.from(stream.roots, (tile) => ({ tile, layer: 0 })),
+        { signal },
+      );
+    sink.header({ header, description: await described, roots: stream.roots.size, pages: stream.pages });
     sink.progress(amounts);
     return stream;
   }

@@ -121,8 +121,8 @@ export interface EngineOptions {
    */
   splatBudget?: number;
   /**
-   * Error, in pixels, below which parts of a file with levels of detail are not refined further. Default: 0.25; 1 for users who
-   * save data, and what is out of view is then not loaded.
+   * Error, in pixels, below which parts of a file with levels of detail are not refined further. Default: 1; 2 for users who save
+   * data, and what is out of view is then not loaded.
    */
   pixelError?: number;
   /** Format of WebGL 2. Default: the fastest that can be blended without visible differences. */

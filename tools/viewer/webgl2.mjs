@@ -5,6 +5,7 @@ import { ShaderPrograms } from './shader_programs.mjs';
 import { SceneTextures } from './scene_textures.mjs';
 import { RECORD_COLUMNS, ROW_TEXELS } from './shader_attributes.mjs';
 import { Picture, Quads, pictureFormat } from './framebuffers.mjs';
+import { warmUp } from './trial_scene.mjs';
 import { SOFTWARE } from './webgpu_device.mjs';
 
 /**
@@ -32,7 +33,9 @@ export class WebGl2Renderer {
       stencil: false,
       powerPreference: 'high-performance',
     });
-    return gl && new WebGl2Renderer(gl, format);
+    const renderer = gl && new WebGl2Renderer(gl, format);
+    if (renderer) warmUp(renderer);
+    return renderer;
   }
 
   /**
@@ -62,11 +65,11 @@ export class WebGl2Renderer {
     return { attributes: this.scene.bytes, order: this.scene.order.bytes, work: work + this.scene.records.bytes };
   }
 
-  /** @param {SceneLayout} layout */
+  /** @param {SceneLayout | null} layout null for no scene */
   allocate(layout) {
     this.scene?.dispose();
     this.scene = null;
-    this.scene = new SceneTextures(this.gl, layout, this.capabilities.splatsMax);
+    if (layout) this.scene = new SceneTextures(this.gl, layout, this.capabilities.splatsMax);
   }
 
   /**

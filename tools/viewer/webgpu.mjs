@@ -2,7 +2,7 @@
 // blended by screen tiles or as quads, as options say or a short measurement decides. renderer.mjs documents its methods.
 
 import { E_CONTEXT, E_LIMIT } from './engine_error.mjs';
-import { isSound } from './webgpu_check.mjs';
+import { isSound } from './trial_scene.mjs';
 import { Device } from './webgpu_device.mjs';
 import { Projection } from './webgpu_projection.mjs';
 import { Quads } from './webgpu_quads.mjs';

@@ -5,20 +5,22 @@ A case has a `viewer` (a page of subjects/pages) and a `form` of the file, all f
 renderer are already loaded. A small image of the canvas is recorded after each frame. The last image, when everything
 has arrived and nothing changes, is the finished one, with which the others are compared.
 
-    first       the first image that is not black
-    good        the first with 25 dB against the finished one
-    whole       the finished one
-    asked_bytes bytes sent in all: fewer than the files have if the viewer omits some, more if it requests some twice
+    first                the first image that is not black
+    db25, db30, db38     the first image with so many dB against the finished one
+    whole                the finished one
+    asked_bytes          bytes sent in all: fewer than the files have if the viewer omits some, more if it asks twice
 
 Times count from the first request for the scene; bytes are those sent by then. SwiftShader, a GL on the CPU, draws and
-shares the cores with decoders: with a GPU, a first image takes fewer bytes. The images of each case are written to the
-work folder; look at them. Requires Chromium, playwright and npm.
+shares the cores with decoders: with a GPU, a first image takes fewer bytes. Files, which a later run uses again, and
+the images of each case are written to the work folder; look at them. Requires Chromium, playwright and npm.
 """
 
 from __future__ import annotations
 
 import base64
 import json
+import shutil
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -41,9 +43,10 @@ from csplat_bench.scenes import Scene, find_scene
 from csplat_bench.slow_line import SLOW, Line
 from csplat_bench.suites import Case
 from csplat_render.metrics import psnr
+from csplat_tools.level_builder import encode_with_levels
 from csplat_tools.render_files import write_png
 
-_GOOD = 25.0  # dB
+_STEPS = {"db25": 25.0, "db30": 30.0, "db38": 38.0}  # dB
 _SMALL = (120, 160)  # rows and columns of the images, as pages/arrival.mjs has them
 _BLACK = 8  # largest component of a black image
 _STILL_SECONDS, _FRAMES = 1.5, 5  # seconds and frames without change after which an image is finished
@@ -56,8 +59,8 @@ _BEGIN = """async ([viewer, url, camera]) => {
   arrival.begin(viewer, url, camera);
 }"""
 
-#: Writes a scene into an empty folder and returns the file that viewers open. The function finds splat-transform.
-Writer = Callable[[Scene, Path, Callable[[], Sequence[str]]], Path]
+#: Writes a scene into an empty folder. The function finds splat-transform.
+Writer = Callable[[Scene, Path, Callable[[], Sequence[str]]], None]
 
 
 @dataclass(frozen=True)
@@ -77,19 +80,21 @@ class Record:
     begun: float
 
     @property
-    def shown(self) -> tuple[int, int, int]:
-        """Indices of the first image that is not black, the first near the finished one, and the finished one."""
+    def shown(self) -> dict[str, int]:
+        """Indices of the first image that is not black, the first ones nearer to the finished one, and that one."""
         finished = self.images[-1].astype(np.float32) / 255.0
-        first = int(np.argmax((self.images > _BLACK).any((1, 2, 3))))
-        good = first
-        while psnr(self.images[good].astype(np.float32) / 255.0, finished) < _GOOD:
-            good += 1
-        return first, good, len(self.images) - 1
+        at = int(np.argmax((self.images > _BLACK).any((1, 2, 3))))
+        shown = {"first": at}
+        for name, least in _STEPS.items():
+            while psnr(self.images[at].astype(np.float32) / 255.0, finished) < least:
+                at += 1
+            shown[name] = at
+        return {**shown, "whole": len(self.images) - 1}
 
     def values(self) -> dict[str, float]:
         """Return the times of these images in milliseconds, and the bytes sent by then."""
         values: dict[str, float] = {}
-        for name, index in zip(("first", "good", "whole"), self.shown, strict=True):
+        for name, index in self.shown.items():
             at = self.times[index]
             values[f"{name}_ms"] = 1e3 * (at - self.begun)
             values[f"{name}_bytes"] = sum(size for moment, size in self.sent if moment <= at)
@@ -110,18 +115,30 @@ def measure_arrival(setup: Setup, name: str, cases: Sequence[Case]) -> Iterator[
         def measure(case: Case) -> Mapping[str, Any]:
             form = case["form"]
             axes, writer = FORMS[form]
-            target = folder / SLOW.strip("/") / f"{scene.name}-{form}"
+            kept = setup.work / "arrival" / f"{scene.name}-{form}"
             if form not in files:
-                target.mkdir(parents=True)
-                files[form] = writer(scene, target, lambda: find_splat_transform(setup.peers))
+                if not kept.exists():
+                    with tempfile.TemporaryDirectory(prefix="csplat-arrival-") as name:
+                        writer(scene, Path(name), lambda: find_splat_transform(setup.peers))
+                        shutil.copytree(name, kept)
+                target = folder / SLOW.strip("/") / kept.name
+                target.parent.mkdir(exist_ok=True)
+                target.symlink_to(kept.resolve())
+                files[form] = target / _opened(kept).name
             _, camera = placed_in(format_by_name(axes), model)
             url = f"{address}{files[form].relative_to(folder)}"
             record = _watch(page, line, case["viewer"], url, pinhole(camera, model))
             _keep_images(setup.work / "arrival" / f"{scene.name}-{case.name.replace(' ', '-')}.png", record)
-            size = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
+            size = sum(path.stat().st_size for path in kept.rglob("*") if path.is_file())
             return {"splats": scene.splat_count, "file_bytes": size, **record.values()}
 
         yield measure
+
+
+def _opened(folder: Path) -> Path:
+    """Return the file that viewers open: the metadata of streamed SOG, or the only file."""
+    meta = folder / "lod-meta.json"
+    return meta if meta.exists() else next(folder.iterdir())
 
 
 def _watch(page: Any, line: Line, viewer: str, url: str, camera: dict[str, Any]) -> Record:
@@ -151,36 +168,35 @@ def _watch(page: Any, line: Line, viewer: str, url: str, camera: dict[str, Any])
 
 
 def _keep_images(path: Path, record: Record) -> None:
-    """Write the first, the good and the finished image, from left to right."""
+    """Write the images of all steps, from left to right."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_png(path, np.concatenate([record.images[index] for index in record.shown], axis=1))
+    write_png(path, np.concatenate([record.images[index] for index in record.shown.values()], axis=1))
 
 
 def _as_csplat(preset: PresetName) -> Writer:
-    def write_form(scene: Scene, folder: Path, _: object) -> Path:
-        path = folder / f"{scene.name}.csplat"
-        path.write_bytes(encode(read_ply(scene.path), EncodeOptions(preset=preset)))
-        return path
+    def write_form(scene: Scene, folder: Path, _: object) -> None:
+        (folder / f"{scene.name}.csplat").write_bytes(encode(read_ply(scene.path), EncodeOptions(preset=preset)))
 
     return write_form
 
 
 def _convert(format: str) -> Writer:
-    def write_form(scene: Scene, folder: Path, _: object) -> Path:
-        path = folder / f"{scene.name}.{format}"
-        write(path, read_ply(scene.path), format)
-        return path
+    def write_form(scene: Scene, folder: Path, _: object) -> None:
+        write(folder / f"{scene.name}.{format}", read_ply(scene.path), format)
 
     return write_form
 
 
-def _transform(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> Path:
-    path = folder / f"{scene.name}.spz"
-    run_program([*transform(), "-q", "-w", "--spz-version", "3", scene.path, path])
-    return path
+def _transform(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> None:
+    run_program([*transform(), "-q", "-w", "--spz-version", "3", scene.path, folder / f"{scene.name}.spz"])
 
 
-def _in_levels(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> Path:
+def _with_levels(scene: Scene, folder: Path, _: object) -> None:
+    encoded = encode_with_levels(read_ply(scene.path))
+    (folder / f"{scene.name}.csplat").write_bytes(encoded.data)
+
+
+def _in_levels(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> None:
     """Write streamed SOG of one chunk, laid out as splat-transform does.
 
     `csplat convert` writes each level: splat-transform's own coding of SH takes hours on a CPU.
@@ -207,15 +223,14 @@ def _in_levels(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]
             "lods": {str(i): {"file": i, "offset": 0, "count": count} for i, count in enumerate(counts)},
         },
     }  # fmt: skip
-    path = folder / "lod-meta.json"
-    path.write_text(json.dumps(meta))
-    return path
+    (folder / "lod-meta.json").write_text(json.dumps(meta))
 
 
 #: By name: the format whose axes the files have, and what writes them.
 FORMS: dict[str, tuple[str, Writer]] = {
     "balanced": ("csplat", _as_csplat("balanced")),
     "small": ("csplat", _as_csplat("small")),
+    "levels": ("csplat", _with_levels),
     "spz": ("spz", _convert("spz")),  # SPZ 3 of csplat
     "spz-default": ("ply", _transform),  # SPZ 3 of splat-transform, with fewer bits for SH
     "sog": ("sog", _convert("sog")),

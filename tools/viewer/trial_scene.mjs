@@ -1,4 +1,5 @@
-// Whether a GPU draws what it should, so that WebGPU is chosen only where it works.
+// A small scene: to check whether a GPU draws what it should, so that WebGPU is chosen only where it works, and to compile
+// shaders before a scene arrives.
 
 import { packGeometry, pagesOf } from './texels.mjs';
 
@@ -26,12 +27,48 @@ const PIXELS = [
 ];
 
 /**
+ * Draw the scene once and clear the canvas: a driver compiles shaders when it draws with them first.
+ *
+ * @param {import('./webgl2.mjs').WebGl2Renderer} renderer without a scene
+ */
+export function warmUp(renderer) {
+  const view = putTrialScene(renderer);
+  renderer.setOrder(Uint32Array.of(0, 1), BALLS.length);
+  for (let time = 0; time < 2; time++) {
+    renderer.draw(view, { background: [0, 0, 0], shDegree: 0 });
+    renderer.allocate(null);
+  }
+}
+
+/**
  * Draw a small scene by both methods.
  *
  * @param {import('./webgpu.mjs').WebGpuRenderer} renderer without a scene
  */
 export async function isSound(renderer) {
   const chosen = renderer.method;
+  const view = putTrialScene(renderer);
+  let isRight = true;
+  for (const method of [renderer.tiles, renderer.quads]) {
+    renderer.use(method);
+    const pixels = await renderer.pixelsOf({ view, look: { background: BACKGROUND, shDegree: 0 } });
+    for (const [x, y] of PIXELS) {
+      expectedAt(x, y).forEach((value, c) => {
+        isRight &&= Math.abs(255 * value - pixels[4 * (SIZE * y + x) + c]) <= TOLERANCE;
+      });
+    }
+  }
+  renderer.allocate(null);
+  renderer.use(chosen);
+  return isRight;
+}
+
+/**
+ * Let a renderer hold the scene, and return a view of it.
+ *
+ * @param {import('./renderer.mjs').Renderer} renderer
+ */
+function putTrialScene(renderer) {
   const column = (/** @type {number[]} */ ...columns) => ({
     columns: Uint32Array.from(columns),
     offsets: [0, 0, 0],
@@ -53,20 +90,7 @@ export async function isSound(renderer) {
   renderer.allocate({ ...layout, shDegree: 0, tiles, pages, drawn: BALLS.length });
   renderer.uploadGeometry(0, packGeometry(geometry, { levels: LEVELS }, { levels: LEVELS }), 0);
   const half = SIZE / 2;
-  const view = { viewmat: IDENTITY, fx: FOCAL, fy: FOCAL, cx: half, cy: half, width: SIZE, height: SIZE, near: 0.2 };
-  let isRight = true;
-  for (const method of [renderer.tiles, renderer.quads]) {
-    renderer.use(method);
-    const pixels = await renderer.pixelsOf({ view, look: { background: BACKGROUND, shDegree: 0 } });
-    for (const [x, y] of PIXELS) {
-      expectedAt(x, y).forEach((value, c) => {
-        isRight &&= Math.abs(255 * value - pixels[4 * (SIZE * y + x) + c]) <= TOLERANCE;
-      });
-    }
-  }
-  renderer.allocate(null);
-  renderer.use(chosen);
-  return isRight;
+  return { viewmat: IDENTITY, fx: FOCAL, fy: FOCAL, cx: half, cy: half, width: SIZE, height: SIZE, near: 0.2 };
 }
 
 /**
