@@ -19,22 +19,17 @@ from csplat import EncodeOptions, InputError, decode, encode, encode_with_report
 from csplat.encoder import buckets, encode_plan, encode_tiles
 from csplat.encoder.buckets import BucketCurve, bucket_rows
 from csplat.formats import open_scene
-from csplat.out_of_core import OutOfCoreOptions, disk_encode, encode_scene
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene_source import source_from_model
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import encode_file, estimate_file_cost, may_exceed_memory
 
-WHOLE = 600  # splats per bucket, in place of half a million
+WHOLE = 600  # splats per bucket
 COUNT = 6 * WHOLE
-FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32)
-
-
-@pytest.fixture(autouse=True)
-def small_buckets(monkeypatch):
-    """Make scenes of thousands of splats large."""
-    for module in (buckets, encode_plan, disk_encode):
-        monkeypatch.setattr(module, "BUCKET_SPLATS", WHOLE)
+FAST = EncodeOptions(
+    preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32, bucket_splats=WHOLE
+)  # fmt: skip
 
 
 def encode_large(scene, target, options, *, progress=None, **limits):
@@ -53,10 +48,7 @@ def model(sample_path):
 @pytest.fixture(scope="module")
 def whole(model):
     """The file of the scene, encoded in memory."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(buckets, "BUCKET_SPLATS", WHOLE)
-        patch.setattr(encode_plan, "BUCKET_SPLATS", WHOLE)
-        return encode(model, FAST)
+    return encode(model, FAST)
 
 
 def test_out_of_core_encoding_gives_the_bytes_of_memory(model, whole, tmp_path):
@@ -83,7 +75,7 @@ def test_a_file_of_many_buckets_is_valid_with_declared_errors(model, whole):
 def test_the_sample_of_a_plan_has_refitted_colours(model):
     other = encode_plan.EncodePlan.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
     assert other.sample is not None
-    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT)], other.sample.model.shN)
+    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT, WHOLE)], other.sample.model.shN)
     decoded = decode(encode_tiles(other).write().data)
     assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
 
@@ -96,9 +88,9 @@ def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        EncodeOptions(preset="fast", sh_coding="scalar", keep_extra=True),
-        EncodeOptions(preset="small", sh_degree=0),
-        EncodeOptions(preset="fast", sh_degree=1, adaptive=0.5, tile_splats=300),
+        EncodeOptions(preset="fast", sh_coding="scalar", keep_extra=True, bucket_splats=WHOLE),
+        EncodeOptions(preset="small", sh_degree=0, bucket_splats=WHOLE),
+        EncodeOptions(preset="fast", sh_degree=1, adaptive=0.5, tile_splats=300, bucket_splats=WHOLE),
     ],
 )
 def test_options_give_the_bytes_of_memory(model, options, tmp_path):
@@ -113,7 +105,7 @@ def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
     scales[17], scales[1600], shN[3200] = 95.0, 1e5, 3e8
     means = (doubles - np.array(origin)).astype(np.float32)
     hard = replace(model, means=means, origin=origin, means_double=doubles, scales=scales, shN=shN)
-    options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
+    options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
     encode_large(source_from_model(hard), tmp_path / "out.csplat", options)
     assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
 
@@ -260,7 +252,7 @@ def test_too_little_memory_is_refused(model, tmp_path):
 
 
 def test_buckets_partition_the_splats_by_place(model):
-    rows = bucket_rows(model.means)
+    rows = bucket_rows(model.means, WHOLE)
     assert np.array_equal(np.arange(len(model)), np.sort(np.concatenate(rows)))
     assert max(map(len, rows)) <= WHOLE
     assert all((np.diff(part) > 0).all() for part in rows)
@@ -271,18 +263,18 @@ def test_buckets_partition_the_splats_by_place(model):
 def test_a_large_bucket_is_split_into_equal_parts():
     rng = np.random.default_rng(1)
     means = rng.normal(0, 1, (COUNT, 3)).astype(np.float32)
-    means[buckets.sample_rows(COUNT)] += 100.0  # the sampled rows are far from the others
-    parts = bucket_rows(means)
+    means[buckets.sample_rows(COUNT, WHOLE)] += 100.0  # the sampled rows are far from the others
+    parts = bucket_rows(means, WHOLE)
     assert np.array_equal(np.arange(COUNT), np.sort(np.concatenate(parts)))
     assert max(map(len, parts)) <= WHOLE
-    same = bucket_rows(np.ones((1600, 3), np.float32))
+    same = bucket_rows(np.ones((1600, 3), np.float32), WHOLE)
     assert [533, 533, 534] == [len(part) for part in same]
     assert [0, 533, 1066, 1600] == [part[0] for part in same] + [1600]
     assert all(first[-1] < second[0] for first, second in pairwise(same))
 
 
 def test_a_small_scene_has_one_bucket():
-    assert 1 == BucketCurve.through(np.zeros((10, 3), np.float32), WHOLE).count
+    assert 1 == BucketCurve.through(np.zeros((10, 3), np.float32), WHOLE, WHOLE).count
 
 
 @pytest.mark.slow
@@ -325,7 +317,7 @@ def ply(model, tmp_path):
 
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
-    options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
+    options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
     cost = estimate_file_cost(ply, options, limits)
     assert (COUNT, 1, False) == (cost.splats, cost.sh_degree, cost.in_memory)
     assert 0 < cost.memory_bytes <= 300e6

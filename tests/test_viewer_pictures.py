@@ -21,7 +21,7 @@ from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import load_cameras
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.level_builder import encode_with_levels
+from csplat_tools.level_builder import LevelBuilder
 
 pytestmark = [pytest.mark.slow, pytest.mark.area(name="chromium")]
 
@@ -121,7 +121,7 @@ def test_the_antialiased_flag_is_honoured(engine, part, camera):
 
 
 def test_level_0_of_a_file_with_levels_of_detail_is_drawn(engine, part, camera):
-    data = encode_with_levels(part, leaf_splats=700, root_splats=200).data
+    data = LevelBuilder(leaf_splats=700, root_splats=200).encode(part).write().data
     assert read_header(data).coarse_tiles
     assert engine.open(data) is None
     model = decode(data)
@@ -133,7 +133,7 @@ def test_level_0_of_a_file_with_levels_of_detail_is_drawn(engine, part, camera):
 @pytest.mark.parametrize("backend", ["webgl2", "webgpu-tiles"])
 def test_the_whole_scene_is_shown_coarsely_while_a_file_with_levels_arrives(engine, sample, backend):
     engine.start_again(f"{{ backend: '{backend}' }}")
-    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    data = LevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
     model, (camera,) = decode(data), views(sample, 1, 96)
     engine.look(camera)
     engine.site.bytes_per_second = 20_000
@@ -157,7 +157,7 @@ def test_the_whole_scene_is_shown_coarsely_while_a_file_with_levels_arrives(engi
 @pytest.mark.parametrize("backend", ["webgl2", "webgpu-tiles"])
 def test_what_exceeds_the_budget_of_splats_is_drawn_coarsely(engine, sample, backend):
     engine.start_again(f"{{ backend: '{backend}', splatBudget: 4000 }}")
-    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    data = LevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
     engine.open(data)
     (camera,) = views(sample, 1, 96)
     picture = engine.picture(camera)

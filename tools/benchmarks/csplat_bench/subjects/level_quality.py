@@ -30,7 +30,8 @@ from csplat_render.camera import resized
 from csplat_render.metrics import psnr_of_mse, ssim
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools import level_builder
+from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_fitting import merge_neighbours
 
 _CAMERAS = 8
 _SHARE = 0.25  # splats of a level, as a share of the finer one
@@ -49,14 +50,18 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
 
     @cache
     def build(maker: str) -> tuple[dict[int, SplatModel], float]:
-        usual, start = level_builder.FITTED_SPLATS, time.perf_counter()
-        level_builder.FITTED_SPLATS = len(model) if maker == "fitted" else 0
-        try:
-            nodes = level_builder.build_levels(model)
-        finally:
-            level_builder.FITTED_SPLATS = usual
+        start = time.perf_counter()
+        if maker == "merged":
+            levels, splats = dict[int, SplatModel](), model
+            while len(splats) > LevelBuilder.root_splats:
+                splats = merge_neighbours(splats)
+                levels[len(levels) + 1] = splats
+            return levels, time.perf_counter() - start
+        builder = LevelBuilder()
+        if maker == "buckets":
+            builder = LevelBuilder(whole_splats=0, bucket_splats=len(model) // 4)
         parts: dict[int, list[SplatModel]] = {}
-        for node in nodes:
+        for node in builder.build(model):
             if node.splats is not None:
                 parts.setdefault(node.level, []).append(node.splats)
         levels = {level: join_blocks(some[0], some) for level, some in parts.items()}
@@ -64,7 +69,7 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
 
     def measure(case: Case) -> Mapping[str, Any]:
         maker, level = case["maker"], case["level"]
-        if maker in ("fitted", "merged"):
+        if maker in ("fitted", "buckets", "merged"):
             levels, seconds = build(maker)
             if level not in levels:
                 raise AbsentError(f"{name} has {len(levels)} coarser levels")
