@@ -7,7 +7,7 @@ import os
 import resource
 import shutil
 import signal
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -16,11 +16,12 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat import EncodeOptions, InputError, decode, encode, encode_with_report, read_ply, write_ply
-from csplat.encoder import buckets, encode_plan, encode_tiles
+from csplat import open as csplat_open
+from csplat.encoder import LevelNode, buckets, encode_plan, encode_tiles
 from csplat.encoder.buckets import BucketCurve, bucket_rows
 from csplat.formats import open_scene
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
-from csplat.scene_source import source_from_model
+from csplat.scene_source import join_blocks, source_from_model
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import encode_file, estimate_file_cost, may_exceed_memory
@@ -32,8 +33,39 @@ FAST = EncodeOptions(
 )  # fmt: skip
 
 
-def encode_large(scene, target, options, *, progress=None, **limits):
-    return encode_scene(scene, target, options, OutOfCoreOptions(always=True, **limits), progress=progress)
+def encode_large(scene, target, options, *, progress=None, levels=None, **limits):
+    return encode_scene(
+        scene, target, options, OutOfCoreOptions(always=True, **limits), levels=levels, progress=progress
+    )
+
+
+@dataclass(frozen=True)
+class EveryFourth:
+    """Levels of every fourth splat: a node for each bucket, and one above all of them; errors are the levels."""
+
+    whole_splats: int = WHOLE
+
+    def settings(self):
+        return {"splats": "every fourth"}
+
+    def build_part(self, splats, scene_count, threads):
+        assert (COUNT, 1) == (scene_count, threads)
+        coarse = replace(splats.select(np.arange(0, len(splats), 4)), extra={}, means_double=None)
+        return [LevelNode(0, 1, rows=np.arange(len(splats))), LevelNode(1, None, splats=coarse)]
+
+    def build_top(self, roots, threads, progress):
+        assert threads in (1, 2)
+        parts = list(roots)
+        progress("building levels", 1.0)
+        scene = join_blocks(parts[0], parts)
+        return [0] * len(parts), [LevelNode(2, None, splats=scene.select(np.arange(0, len(scene), 4)))]
+
+    def measure(self, encoded, threads, progress):  # noqa: ARG002 - of the protocol
+        nodes = [replace(node, error=float(node.level), squares=(0.5,)) for node in encoded.nodes]
+        return replace(encoded, nodes=nodes)
+
+    def encode(self, model, options, progress):
+        raise NotImplementedError
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +110,71 @@ def test_the_sample_of_a_plan_has_refitted_colours(model):
     assert np.array_equal(-model.shN[buckets.sample_rows(COUNT, WHOLE)], other.sample.model.shN)
     decoded = decode(encode_tiles(other).write().data)
     assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
+
+
+@pytest.fixture(scope="module")
+def with_levels(model, tmp_path_factory):
+    """The file of the scene with levels of detail."""
+    path = tmp_path_factory.mktemp("levels") / "out.csplat"
+    encode_large(source_from_model(model), path, FAST, levels=EveryFourth())
+    return path.read_bytes()
+
+
+def test_each_bucket_is_a_subtree_of_the_levels(whole, with_levels):
+    assert validate(with_levels).conforms
+    with csplat_open(with_levels) as file:
+        counts = [sum(node.splat_count for node in file.nodes if node.level == level) for level in range(3)]
+        assert COUNT == counts[0]
+        assert COUNT / 4 <= counts[1] < COUNT / 4 + len(file.nodes)
+        assert 1 == sum(node.parent is None for node in file.nodes)
+        assert {0.0, 1.0, 2.0} == {node.error for node in file.nodes}
+    for name in ("means", "opacities", "sh0"):  # level 0 has the same steps
+        assert np.array_equal(getattr(decode(whole), name), getattr(decode(with_levels), name))
+
+
+@pytest.mark.parametrize("memory", [None, 900_000_000])
+def test_levels_do_not_depend_on_processes_or_memory(model, with_levels, tmp_path, memory):
+    target = tmp_path / "out.csplat"
+    encode_large(source_from_model(model), target, replace(FAST, threads=2), levels=EveryFourth(), memory_bytes=memory)
+    assert with_levels == target.read_bytes()
+
+
+@pytest.mark.parametrize(("stage", "after"), [("sorting", 0), ("coding", 3), ("writing", 0)])
+def test_an_interrupted_encoding_with_levels_is_resumed(model, with_levels, tmp_path, stage, after):
+    target, scene = tmp_path / "out.csplat", source_from_model(model)
+    with pytest.raises(KeyboardInterrupt):
+        encode_large(scene, target, FAST, levels=EveryFourth(), progress=Interrupt(stage, after=after))
+    assert not target.exists()
+    with pytest.raises(InputError, match="was started with levels"):
+        encode_large(scene, target, FAST, resume=True)
+    encode_large(scene, target, FAST, levels=EveryFourth(), resume=True)
+    assert with_levels == target.read_bytes()
+    assert [target] == list(tmp_path.iterdir())
+
+
+def test_a_disk_that_fills_up_while_levels_are_written_is_reported(model, with_levels, tmp_path):
+    target, before = tmp_path / "out.csplat", resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(stage, _done):
+        if stage == "coding":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (5_000, before[1]))
+
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            encode_large(source_from_model(model), target, FAST, levels=EveryFourth(), progress=fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not target.exists()
+    assert not list((tmp_path / "out.csplat.work").glob("*.part*"))
+    encode_large(source_from_model(model), target, FAST, levels=EveryFourth(), resume=True)
+    assert with_levels == target.read_bytes()
+
+
+def test_a_scene_built_in_one_piece_requires_its_memory(model, tmp_path):
+    with pytest.raises(InputError, match="300 MB of memory are too little for this scene, which requires 3"):
+        encode_large(
+            source_from_model(model), tmp_path / "out.csplat", FAST, levels=EveryFourth(COUNT), memory_bytes=300_000_000
+        )
 
 
 def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
@@ -279,7 +376,7 @@ def test_a_small_scene_has_one_bucket():
 
 @pytest.mark.slow
 @pytest.mark.area(name="dask")
-def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, tmp_path):
+def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, with_levels, tmp_path):
     distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     target = tmp_path / "out.csplat"
     with distributed.LocalCluster(
@@ -293,8 +390,10 @@ def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, tmp_p
                 victims.clear()
 
         encode_large(source_from_model(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
-    assert not victims
-    assert whole == target.read_bytes()
+        assert not victims
+        assert whole == target.read_bytes()
+        encode_large(source_from_model(model), target, FAST, cluster=cluster.scheduler_address, levels=EveryFourth())
+    assert with_levels == target.read_bytes()
 
 
 @pytest.mark.area(name="dask")

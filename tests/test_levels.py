@@ -23,7 +23,8 @@ from csplat.decoder.container import SceneHeader
 from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
 from csplat.encoder.levels import LevelNode, encode_levels
-from csplat.scene_source import join_blocks
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.scene_source import join_blocks, source_from_model
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders import all_inputs
 from csplat_conformance.encoders.file_checks import SplatPairs
@@ -505,3 +506,25 @@ def test_levels_without_the_renderer_are_an_error_that_names_the_extra(monkeypat
     assert choose_levels(AUTO_LEVEL_SPLATS - 1, EncodeOptions(), "auto") is None
     with pytest.raises(InputError, match=r"1,000,000 splats, .* 'csplat\[render\]', or encode with `--levels none`"):
         choose_levels(AUTO_LEVEL_SPLATS, EncodeOptions(), "auto")
+
+
+# Scenes of several buckets ---------------------------------------------------------------------------
+
+
+def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path):
+    scene, options = model.select(np.arange(400)), EncodeOptions(bucket_splats=300, threads=1)
+    builder = LevelBuilder(2, leaf_splats=300, whole_splats=300, bucket_splats=300)
+    data = builder.encode(scene, options).write({"levels": builder.settings()}).data
+    with csplat.open(data) as file:
+        assert [(0, 2), (1, 2), (2, 1)] == [
+            (level, sum(node.level == level for node in file.nodes)) for level in range(3)
+        ]  # fmt: skip
+        errors = [node.error for node in file.nodes]
+        assert 0.0 == min(errors) < errors[2] <= errors[4]
+    assert () == tuple(validate(data).violations)
+    for name, limits in (("one", OutOfCoreOptions(memory_bytes=2_000_000_000)), ("two", OutOfCoreOptions())):
+        out = tmp_path / f"{name}.csplat"
+        encode_scene(
+            source_from_model(scene), out, replace(options, threads=1 + (name == "two")), limits, levels=builder
+        )
+        assert data == out.read_bytes()

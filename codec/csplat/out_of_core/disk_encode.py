@@ -214,7 +214,7 @@ def encode_scene(
         "options": options.chosen(),
         "splats": scene.count,
         "csplat": __version__,
-        **settings,
+        "levels": settings.get("levels"),
     }
     store = DiskBuckets.of(
         scene, folder, key, bucket_splats=options.bucket_splats, resume=limits.resume, disk_bytes=cost.disk_bytes,
