@@ -35,9 +35,10 @@ from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import AUTO_LEVEL_SPLATS, choose_levels, encode_file
-from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_builder import LevelBuilder, encode_with_levels
 from csplat_tools.level_errors import measure_errors
 from csplat_tools.level_fitting import MEASURED_SPLATS, LevelFitter, kd_groups, merge_neighbours
+from csplat_tools.scene_files import LoadedModel
 
 TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
 RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
@@ -528,3 +529,39 @@ def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tm
             source_from_model(scene), out, replace(options, threads=1 + (name == "two")), limits, levels=builder
         )
         assert data == out.read_bytes()
+
+
+# Targets ---------------------------------------------------------------------------------------------
+
+
+def test_a_size_counts_all_levels(model):
+    """Level 0 is the one that a search for the rest of the size finds."""
+    target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
+    result = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
+    report, whole = result.report.search, decode(result.data)
+    assert 17_000 < len(result.data) == report.size_bytes <= 18_000
+    assert () == tuple(validate(result.data).violations)
+    with csplat.open(result.data) as file:
+        assert (len(model), 300) == (len(whole), len(file.read(tiles=file.cut(level=1))))
+    alone = csplat.encode(model, target=replace(target, size_bytes=int(0.72 * 18_000)))
+    scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
+    assert scorer.psnr(whole) > scorer.psnr(decode(alone)) - 0.3
+
+
+def test_other_targets_and_an_importance_have_levels(model, tmp_path):
+    source = LoadedModel(model, 1)
+    weights, out = tmp_path / "weights.npy", tmp_path / "out.csplat"
+    np.save(weights, np.linspace(0.1, 1.0, len(model), dtype=np.float32))
+    for what in ({"target": csplat.Target(keep=0.5, effort=1)}, {"importance": str(weights)}):
+        kept = 600 if "target" in what else 1200
+        encoded = encode_file(source, str(out), EncodeOptions(), levels=1, **what)
+        assert () == tuple(validate(out.read_bytes()).violations)
+        with csplat.open(out) as file:
+            assert [kept, kept // 4] == [len(file.read(tiles=file.cut(level=level))) for level in (0, 1)]
+        assert encoded.report.options["levels"]["count"] == 1
+    bounded = encode_with_levels(
+        model, EncodeOptions(), LevelBuilder(1), target=csplat.Target(max_error={"means": 0.01})
+    )  # fmt: skip
+    assert bounded.report.search.size_bytes == len(bounded.data)
+    assert 0.005 < bounded.report.errors["means"][0] <= 0.01
+    assert () == tuple(validate(bounded.data).violations)

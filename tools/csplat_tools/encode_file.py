@@ -19,7 +19,7 @@ from csplat.out_of_core import EncodingCost, OutOfCoreOptions, encode_scene, est
 from csplat.ply.column_names import dropped_columns
 from csplat.scene_source import SceneSource
 from csplat.system import default_memory_bytes
-from csplat.types import Progress, null_progress
+from csplat.types import Progress
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
 from csplat_tools.optional_packages import require_renderer
@@ -191,7 +191,8 @@ def encode_file(
     else:
         with source_path(source) as local, ExitStack() as stack:
             opened: SceneSource | None = None
-            if levels and detect_format(local).name == "sog":
+            # A target or an importance may prune splats, whose levels are built anew.
+            if levels and target is None and importance is None and detect_format(local).name == "sog":
                 builder = _levels_of_source(local, options, levels, limits)
             if not in_memory and builder is None and may_exceed_memory(local, limits, levels):
                 if progress is not None:
@@ -211,17 +212,19 @@ def encode_file(
             )  # fmt: skip
     if builder is None:
         builder = choose_levels(len(read.model), options, levels)
-    if builder is not None and target is None and importance is None:
-        encoded = builder.encode(read.model, options, progress or null_progress)
-        result = encoded.write({"levels": builder.settings()})
-    elif importance is None:
-        result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
-    else:
+    if importance is not None:
         from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
 
         result = encode_by_importance(
-            read.model, options, importance, target=target, views=views, prune_unseen=prune_unseen, progress=progress
-        )
+            read.model, options, importance, target=target, views=views, prune_unseen=prune_unseen, levels=builder,
+            progress=progress,
+        )  # fmt: skip
+    elif builder is not None:
+        from csplat_tools.level_builder import encode_with_levels  # imports the renderer
+
+        result = encode_with_levels(read.model, options, builder, target=target, views=views, progress=progress)
+    else:
+        result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
     write_bytes(output, result.data)
     if source_index is not None:
         write_array(source_index, result.source_index)

@@ -10,7 +10,7 @@ taken instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,12 +18,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder import EncodedTiles, EncodeOptions, EncodePlan, LevelNode, encode_levels
+from csplat.encoder import (
+    EncodedTiles,
+    EncodeOptions,
+    EncodePlan,
+    EncodeResult,
+    Importance,
+    LevelNode,
+    Origin,
+    Target,
+    encode_levels,
+    encode_with_report,
+    meet_bounds,
+)
 from csplat.encoder.buckets import bucket_rows
 from csplat.encoder.encode_options import BUCKET_SPLATS
+from csplat.encoder.sh_codebook import FileCodebooks
 from csplat.formats import open_scene
 from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
+from csplat.plugins import load_plugins
 from csplat.scene_source import join_blocks
 from csplat.types import I64, Progress, null_progress
 from csplat_tools.level_errors import measure_errors
@@ -70,10 +84,15 @@ class LevelBuilder:
         Raises:
             InputError: a value fits no lattice, or an option is not allowed for the model.
         """
-        options = options or EncodeOptions()
-        plan = EncodePlan.of(model, options, progress=progress)
-        nodes = self.build(plan.model, options.threads, progress) if self.nodes is None else self.nodes
-        return self.measure(encode_levels(plan, nodes, progress=progress), options.threads, progress)
+        return self.encode_plan(EncodePlan.of(model, options, progress=progress), progress=progress)
+
+    def encode_plan(
+        self, plan: EncodePlan, codebooks: FileCodebooks | None = None, progress: Progress = null_progress
+    ) -> EncodedTiles:
+        """Encode a planned scene with its levels, in memory; arguments as for `csplat.encoder.encode_levels`."""
+        threads = plan.options.threads
+        nodes = self.build(plan.model, threads, progress) if self.nodes is None else self.nodes
+        return self.measure(encode_levels(plan, nodes, codebooks, progress), threads, progress)
 
     def build(
         self, model: SplatModel, threads: int | None = None, progress: Progress = null_progress
@@ -177,6 +196,50 @@ class LevelBuilder:
             places, splats = fitter.fit(splats, places, count, level - first)
             nodes += [LevelNode(level, None, splats=splats.select(rows)) for rows in _rows_by_node(places, node_count)]
         return nodes
+
+
+def encode_with_levels(
+    model: SplatModel,
+    options: EncodeOptions,
+    levels: LevelBuilder | None,
+    *,
+    target: Target | None = None,
+    views: Any = None,
+    importance: NDArray[Any] | Importance | None = None,
+    origin: Origin | None = None,
+    metadata: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> EncodeResult:
+    """Encode a scene in memory, with levels of detail if there is a builder.
+
+    Args:
+        model: the scene.
+        options: options of the encoder.
+        levels: builds levels of detail, whose bytes count for a target; `None`: the file has none.
+        target, views, importance, origin, metadata, progress: as for `csplat.encode_with_report`.
+
+    Raises:
+        InputError, OSError: as for `csplat.encode_with_report`.
+    """
+    if levels is None:
+        return encode_with_report(
+            model, options, target=target, views=views, importance=importance, origin=origin, metadata=metadata,
+            progress=progress,
+        )  # fmt: skip
+    search = None
+    if target is not None:
+        if target.is_rendered:
+            meet_target = load_plugins("csplat.search")["target"]
+            found: EncodeResult = meet_target(
+                model, options, target=target, views=views, importance=importance, levels=levels, progress=progress
+            )
+            return found
+        bounded, options = meet_bounds(model, options, target, importance=importance, progress=progress)
+        search = bounded.report.search
+    plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
+    encoded = levels.encode_plan(plan, progress=progress or null_progress)
+    result = encoded.write({**(metadata or {}), "levels": levels.settings()})
+    return result if search is None else result.with_search(replace(search, size_bytes=result.size_bytes))
 
 
 def join_roots(nodes: Sequence[LevelNode]) -> SplatModel:

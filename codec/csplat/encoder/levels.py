@@ -12,7 +12,7 @@ from csplat.encoder.coding_parameters import SAME_STEPS, StepFactors
 from csplat.encoder.container import FileNode, FileTile, order_nodes
 from csplat.encoder.encode_plan import EncodePlan, clip_scales
 from csplat.encoder.pipeline import EncodedTiles, encode_tile, encode_tiles
-from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats, nearest_entries
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
@@ -117,7 +117,8 @@ def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
 
 
 def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> ShCodingPlan:
-    if codebooks.sh_plan.book is not None and codebooks.rule is None:  # no rule for splats that were not trained on
-        return replace(codebooks.sh_plan, weights=None, book=None, extras=())
-    assigned = assign_splats(codebooks, splats, plan.parameters, plan.options.thread_count)
-    return replace(assigned, extras=())
+    sh_plan, threads = codebooks.sh_plan, plan.options.thread_count
+    if sh_plan.book is not None and codebooks.rule is None:  # of a refit, which has no rule for other splats
+        book = nearest_entries(sh_plan.book, splats, plan.parameters, threads)
+        return replace(sh_plan, weights=None, book=book, extras=())
+    return replace(assign_splats(codebooks, splats, plan.parameters, threads), extras=())
