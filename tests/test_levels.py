@@ -386,7 +386,7 @@ def test_a_built_tree_has_a_quarter_of_the_splats_on_each_level_and_growing_erro
 def test_the_number_of_levels_is_the_one_asked_for(model):
     nodes = LevelBuilder(1, leaf_splats=200).build(model)
     assert {0, 1} == {node.level for node in nodes}
-    assert 2 == sum(node.parent is None for node in nodes)  # of six leaves, four and two have a parent
+    assert 2 == sum(node.parent is None for node in nodes)  # four leaves have one parent, and two have the other
     assert 3 == LevelBuilder(3, leaf_splats=1200).build(model)[-1].level
 
 

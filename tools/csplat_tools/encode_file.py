@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from csplat_tools.level_builder import LevelBuilder
 
 _MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
-_LEVELS_FACTOR = 4  # of the above, if levels of detail may be built: renders, and splats in several forms
+_LEVELS_FACTOR = 4  # memory with levels of detail divided by that without: renders, and splats in several forms
 _SMALL = 4 << 20  # bytes; smaller files of any format always fit in memory
 
 #: Number of splats from which "auto" adds levels of detail. Such a file has 8 MB, which take ten seconds to arrive

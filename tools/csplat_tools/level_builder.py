@@ -158,7 +158,7 @@ class LevelBuilder:
 
     @property
     def _part_levels(self) -> int:
-        """Number of levels above 0 of a bucket: as many as the largest one needs to become one node."""
+        """Number of levels above 0 of a bucket, with which the largest one becomes one node."""
         leaves = max(1, math.ceil(self.bucket_splats / self.leaf_splats))
         levels = math.ceil(math.log(leaves, _CHILDREN) - 1e-9) or 1
         return levels if self.count is None else min(levels, self.count)

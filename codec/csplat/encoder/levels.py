@@ -118,7 +118,7 @@ def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
 
 def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> ShCodingPlan:
     sh_plan, threads = codebooks.sh_plan, plan.options.thread_count
-    if sh_plan.book is not None and codebooks.rule is None:  # of a refit, which has no rule for other splats
+    if sh_plan.book is not None and codebooks.rule is None:  # a refit has no rule for other splats
         book = nearest_entries(sh_plan.book, splats, plan.parameters, threads)
         return replace(sh_plan, weights=None, book=book, extras=())
     return replace(assign_splats(codebooks, splats, plan.parameters, threads), extras=())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from numpy.typing import NDArray
 
@@ -25,7 +25,9 @@ from csplat.model import SplatModel
 from csplat.types import F64, Progress, null_progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
-from csplat_tools.level_builder import LevelBuilder
+
+if TYPE_CHECKING:
+    from csplat_tools.level_builder import LevelBuilder
 
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance

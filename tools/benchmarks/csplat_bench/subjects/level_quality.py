@@ -1,8 +1,9 @@
 """Levels of detail next to the scene: level k at 1/2^k and 1/2^(k - 1) of the size of its cameras.
 
-A case is a `level`, from 1, and its `maker`: `fitted` or `merged`, as `csplat encode --levels` builds small and large
-scenes; `decimate` or `decimate-adaptive` of splat-transform, at the same number of splats. Seconds are those of all
-levels for csplat, of this one for splat-transform. Splats are not quantised. PSNR is pooled over eight cameras.
+A case is a `level`, from 1, and its `maker`: `fitted`, as `csplat encode` builds scenes of up to two million splats;
+`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, at the same number of splats. Seconds are
+those of all levels for csplat, of this one for splat-transform. Splats are not quantised. PSNR is pooled over eight
+cameras.
 """
 
 from __future__ import annotations
@@ -57,11 +58,8 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
                 splats = merge_neighbours(splats)
                 levels[len(levels) + 1] = splats
             return levels, time.perf_counter() - start
-        builder = LevelBuilder()
-        if maker == "buckets":
-            builder = LevelBuilder(whole_splats=0, bucket_splats=len(model) // 4)
         parts: dict[int, list[SplatModel]] = {}
-        for node in builder.build(model):
+        for node in LevelBuilder().build(model):
             if node.splats is not None:
                 parts.setdefault(node.level, []).append(node.splats)
         levels = {level: join_blocks(some[0], some) for level, some in parts.items()}
@@ -69,7 +67,7 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
 
     def measure(case: Case) -> Mapping[str, Any]:
         maker, level = case["maker"], case["level"]
-        if maker in ("fitted", "buckets", "merged"):
+        if maker in ("fitted", "merged"):
             levels, seconds = build(maker)
             if level not in levels:
                 raise AbsentError(f"{name} has {len(levels)} coarser levels")
