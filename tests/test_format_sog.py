@@ -171,7 +171,7 @@ def test_leaves_are_numbered_in_the_order_of_the_splats(tmp_path):
 
 def test_levels_of_streamed_sog_become_nodes_of_a_file(tmp_path):
     path, out = levels(tmp_path), tmp_path / "out.csplat"
-    encode_file(str(path), str(out), csplat.EncodeOptions(), levels=True)
+    encode_file(str(path), str(out), csplat.EncodeOptions(), levels=1)
     assert () == tuple(validate(out.read_bytes()).violations)
     with csplat.open(out) as file, open_scene(path, level=1) as coarse:
         assert [(0, 3, 5), (0, 4, 3), (0, None, 5), (1, None, 3), (1, None, 2)] == [

@@ -7,7 +7,7 @@ import os
 import resource
 import shutil
 import signal
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -16,29 +16,56 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat import EncodeOptions, InputError, decode, encode, encode_with_report, read_ply, write_ply
-from csplat.encoder import buckets, encode_plan, encode_tiles
+from csplat import open as csplat_open
+from csplat.encoder import LevelNode, buckets, encode_plan, encode_tiles
 from csplat.encoder.buckets import BucketCurve, bucket_rows
 from csplat.formats import open_scene
-from csplat.out_of_core import OutOfCoreOptions, disk_encode, encode_scene
-from csplat.scene_source import source_from_model
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.scene_source import join_blocks, source_from_model
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 from csplat_tools.encode_file import encode_file, estimate_file_cost, may_exceed_memory
 
-WHOLE = 600  # splats per bucket, in place of half a million
+WHOLE = 600  # splats per bucket
 COUNT = 6 * WHOLE
-FAST = EncodeOptions(preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32)
+FAST = EncodeOptions(
+    preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32, bucket_splats=WHOLE
+)  # fmt: skip
 
 
-@pytest.fixture(autouse=True)
-def small_buckets(monkeypatch):
-    """Make scenes of thousands of splats large."""
-    for module in (buckets, encode_plan, disk_encode):
-        monkeypatch.setattr(module, "BUCKET_SPLATS", WHOLE)
+def encode_large(scene, target, options, *, progress=None, levels=None, **limits):
+    return encode_scene(
+        scene, target, options, OutOfCoreOptions(always=True, **limits), levels=levels, progress=progress
+    )
 
 
-def encode_large(scene, target, options, *, progress=None, **limits):
-    return encode_scene(scene, target, options, OutOfCoreOptions(always=True, **limits), progress=progress)
+@dataclass(frozen=True)
+class EveryFourth:
+    """Levels of every fourth splat: a node for each bucket, and one above all of them; errors are the levels."""
+
+    whole_splats: int = WHOLE
+
+    def settings(self):
+        return {"splats": "every fourth"}
+
+    def build_part(self, splats, scene_count, threads):
+        assert (COUNT, 1) == (scene_count, threads)
+        coarse = replace(splats.select(np.arange(0, len(splats), 4)), extra={}, means_double=None)
+        return [LevelNode(0, 1, rows=np.arange(len(splats))), LevelNode(1, None, splats=coarse)]
+
+    def build_top(self, roots, threads, progress):
+        assert threads in (1, 2)
+        parts = list(roots)
+        progress("building levels", 1.0)
+        scene = join_blocks(parts[0], parts)
+        return [0] * len(parts), [LevelNode(2, None, splats=scene.select(np.arange(0, len(scene), 4)))]
+
+    def measure(self, encoded, threads, progress):  # noqa: ARG002 - of the protocol
+        nodes = [replace(node, error=float(node.level), squares=(0.5,)) for node in encoded.nodes]
+        return replace(encoded, nodes=nodes)
+
+    def encode(self, model, options, progress):
+        raise NotImplementedError
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +80,7 @@ def model(sample_path):
 @pytest.fixture(scope="module")
 def whole(model):
     """The file of the scene, encoded in memory."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(buckets, "BUCKET_SPLATS", WHOLE)
-        patch.setattr(encode_plan, "BUCKET_SPLATS", WHOLE)
-        return encode(model, FAST)
+    return encode(model, FAST)
 
 
 def test_out_of_core_encoding_gives_the_bytes_of_memory(model, whole, tmp_path):
@@ -83,9 +107,74 @@ def test_a_file_of_many_buckets_is_valid_with_declared_errors(model, whole):
 def test_the_sample_of_a_plan_has_refitted_colours(model):
     other = encode_plan.EncodePlan.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
     assert other.sample is not None
-    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT)], other.sample.model.shN)
+    assert np.array_equal(-model.shN[buckets.sample_rows(COUNT, WHOLE)], other.sample.model.shN)
     decoded = decode(encode_tiles(other).write().data)
     assert abs(decoded.sh0.mean() - model.sh0.mean() - 0.5) < 0.01
+
+
+@pytest.fixture(scope="module")
+def with_levels(model, tmp_path_factory):
+    """The file of the scene with levels of detail."""
+    path = tmp_path_factory.mktemp("levels") / "out.csplat"
+    encode_large(source_from_model(model), path, FAST, levels=EveryFourth())
+    return path.read_bytes()
+
+
+def test_each_bucket_is_a_subtree_of_the_levels(whole, with_levels):
+    assert validate(with_levels).conforms
+    with csplat_open(with_levels) as file:
+        counts = [sum(node.splat_count for node in file.nodes if node.level == level) for level in range(3)]
+        assert COUNT == counts[0]
+        assert COUNT / 4 <= counts[1] < COUNT / 4 + len(file.nodes)
+        assert 1 == sum(node.parent is None for node in file.nodes)
+        assert {0.0, 1.0, 2.0} == {node.error for node in file.nodes}
+    for name in ("means", "opacities", "sh0"):  # level 0 has the same steps
+        assert np.array_equal(getattr(decode(whole), name), getattr(decode(with_levels), name))
+
+
+@pytest.mark.parametrize("memory", [None, 900_000_000])
+def test_levels_do_not_depend_on_processes_or_memory(model, with_levels, tmp_path, memory):
+    target = tmp_path / "out.csplat"
+    encode_large(source_from_model(model), target, replace(FAST, threads=2), levels=EveryFourth(), memory_bytes=memory)
+    assert with_levels == target.read_bytes()
+
+
+@pytest.mark.parametrize(("stage", "after"), [("sorting", 0), ("coding", 3), ("writing", 0)])
+def test_an_interrupted_encoding_with_levels_is_resumed(model, with_levels, tmp_path, stage, after):
+    target, scene = tmp_path / "out.csplat", source_from_model(model)
+    with pytest.raises(KeyboardInterrupt):
+        encode_large(scene, target, FAST, levels=EveryFourth(), progress=Interrupt(stage, after=after))
+    assert not target.exists()
+    with pytest.raises(InputError, match="was started with levels"):
+        encode_large(scene, target, FAST, resume=True)
+    encode_large(scene, target, FAST, levels=EveryFourth(), resume=True)
+    assert with_levels == target.read_bytes()
+    assert [target] == list(tmp_path.iterdir())
+
+
+def test_a_disk_that_fills_up_while_levels_are_written_is_reported(model, with_levels, tmp_path):
+    target, before = tmp_path / "out.csplat", resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(stage, _done):
+        if stage == "coding":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (5_000, before[1]))
+
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            encode_large(source_from_model(model), target, FAST, levels=EveryFourth(), progress=fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not target.exists()
+    assert not list((tmp_path / "out.csplat.work").glob("*.part*"))
+    encode_large(source_from_model(model), target, FAST, levels=EveryFourth(), resume=True)
+    assert with_levels == target.read_bytes()
+
+
+def test_a_scene_built_in_one_piece_requires_its_memory(model, tmp_path):
+    with pytest.raises(InputError, match="300 MB of memory are too little for this scene, which requires 3"):
+        encode_large(
+            source_from_model(model), tmp_path / "out.csplat", FAST, levels=EveryFourth(COUNT), memory_bytes=300_000_000
+        )
 
 
 def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
@@ -96,9 +185,9 @@ def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        EncodeOptions(preset="fast", sh_coding="scalar", keep_extra=True),
-        EncodeOptions(preset="small", sh_degree=0),
-        EncodeOptions(preset="fast", sh_degree=1, adaptive=0.5, tile_splats=300),
+        EncodeOptions(preset="fast", sh_coding="scalar", keep_extra=True, bucket_splats=WHOLE),
+        EncodeOptions(preset="small", sh_degree=0, bucket_splats=WHOLE),
+        EncodeOptions(preset="fast", sh_degree=1, adaptive=0.5, tile_splats=300, bucket_splats=WHOLE),
     ],
 )
 def test_options_give_the_bytes_of_memory(model, options, tmp_path):
@@ -113,7 +202,7 @@ def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
     scales[17], scales[1600], shN[3200] = 95.0, 1e5, 3e8
     means = (doubles - np.array(origin)).astype(np.float32)
     hard = replace(model, means=means, origin=origin, means_double=doubles, scales=scales, shN=shN)
-    options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
+    options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
     encode_large(source_from_model(hard), tmp_path / "out.csplat", options)
     assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
 
@@ -260,7 +349,7 @@ def test_too_little_memory_is_refused(model, tmp_path):
 
 
 def test_buckets_partition_the_splats_by_place(model):
-    rows = bucket_rows(model.means)
+    rows = bucket_rows(model.means, WHOLE)
     assert np.array_equal(np.arange(len(model)), np.sort(np.concatenate(rows)))
     assert max(map(len, rows)) <= WHOLE
     assert all((np.diff(part) > 0).all() for part in rows)
@@ -271,23 +360,23 @@ def test_buckets_partition_the_splats_by_place(model):
 def test_a_large_bucket_is_split_into_equal_parts():
     rng = np.random.default_rng(1)
     means = rng.normal(0, 1, (COUNT, 3)).astype(np.float32)
-    means[buckets.sample_rows(COUNT)] += 100.0  # the sampled rows are far from the others
-    parts = bucket_rows(means)
+    means[buckets.sample_rows(COUNT, WHOLE)] += 100.0  # the sampled rows are far from the others
+    parts = bucket_rows(means, WHOLE)
     assert np.array_equal(np.arange(COUNT), np.sort(np.concatenate(parts)))
     assert max(map(len, parts)) <= WHOLE
-    same = bucket_rows(np.ones((1600, 3), np.float32))
+    same = bucket_rows(np.ones((1600, 3), np.float32), WHOLE)
     assert [533, 533, 534] == [len(part) for part in same]
     assert [0, 533, 1066, 1600] == [part[0] for part in same] + [1600]
     assert all(first[-1] < second[0] for first, second in pairwise(same))
 
 
 def test_a_small_scene_has_one_bucket():
-    assert 1 == BucketCurve.through(np.zeros((10, 3), np.float32), WHOLE).count
+    assert 1 == BucketCurve.through(np.zeros((10, 3), np.float32), WHOLE, WHOLE).count
 
 
 @pytest.mark.slow
 @pytest.mark.area(name="dask")
-def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, tmp_path):
+def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, with_levels, tmp_path):
     distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     target = tmp_path / "out.csplat"
     with distributed.LocalCluster(
@@ -301,8 +390,10 @@ def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, tmp_p
                 victims.clear()
 
         encode_large(source_from_model(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
-    assert not victims
-    assert whole == target.read_bytes()
+        assert not victims
+        assert whole == target.read_bytes()
+        encode_large(source_from_model(model), target, FAST, cluster=cluster.scheduler_address, levels=EveryFourth())
+    assert with_levels == target.read_bytes()
 
 
 @pytest.mark.area(name="dask")
@@ -325,7 +416,7 @@ def ply(model, tmp_path):
 
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
-    options = EncodeOptions(preset="fast", sh_degree=1, threads=1)
+    options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
     cost = estimate_file_cost(ply, options, limits)
     assert (COUNT, 1, False) == (cost.splats, cost.sh_degree, cost.in_memory)
     assert 0 < cost.memory_bytes <= 300e6

@@ -4,6 +4,7 @@ import io
 import json
 import math
 import re
+import sys
 from dataclasses import replace
 from itertools import pairwise
 
@@ -25,7 +26,8 @@ from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
 from csplat.encoder.levels import LevelNode, encode_levels
 from csplat.formats import open_scene
-from csplat.scene_source import join_blocks
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.scene_source import join_blocks, source_from_model
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders import all_inputs
 from csplat_conformance.encoders.file_checks import SplatPairs
@@ -35,12 +37,14 @@ from csplat_conformance.validator import validate
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools import level_builder
 from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_level
 from csplat_tools.convert_file import convert_file
-from csplat_tools.level_builder import build_levels, encode_with_levels, kd_groups, measure_errors, merge_neighbours
-from csplat_tools.level_fitting import LevelFitter
+from csplat_tools.encode_file import AUTO_LEVEL_SPLATS, choose_levels, encode_file
+from csplat_tools.level_builder import LevelBuilder, encode_with_levels
+from csplat_tools.level_errors import measure_errors
+from csplat_tools.level_fitting import MEASURED_SPLATS, LevelFitter, kd_groups, merge_neighbours
+from csplat_tools.scene_files import LoadedModel
 
 TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
 RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
@@ -331,8 +335,6 @@ def test_info_lists_the_levels(data, tmp_path):
     path.write_bytes(data)
     result = CliRunner().invoke(app, ["info", str(path), "--json"])
     assert 0 == result.exit_code, result.output
-    import json
-
     levels = json.loads(result.stdout)["levels"]
     assert [(0, 4), (1, 2), (2, 1)] == [(one["level"], one["nodes"]) for one in levels]
     assert [[0.0, 0.0], [0.25, 0.5], [1.0, 1.0]] == [one["errors"] for one in levels]
@@ -448,38 +450,59 @@ def test_merged_splats_keep_mean_covariance_and_light():
 
 
 def test_a_built_tree_has_a_quarter_of_the_splats_on_each_level_and_growing_errors(model):
-    nodes = build_levels(model, 100, 30)
-    counts = [sum(len(one.splats) for one in nodes if one.level == level) for level in range(1, nodes[-1].level + 1)]
-    for finer, coarser in pairwise([len(model), *counts]):
-        assert finer / 4 <= coarser <= finer / 4 + 4
-    result = encode_with_levels(model, leaf_splats=100, root_splats=30)
-    assert () == tuple(validate(result.data).violations)
-    with csplat.open(result.data) as file:
+    builder = LevelBuilder(leaf_splats=100, root_splats=30)
+    encoded = builder.encode(model)
+    data = encoded.write().data
+    assert () == tuple(validate(data).violations)
+    with csplat.open(data) as file:
+        counts = [
+            sum(one.splat_count for one in file.nodes if one.level == level)
+            for level in range(file.nodes[-1].level + 1)
+        ]  # fmt: skip
+        for finer, coarser in pairwise(counts):
+            assert finer / 4 <= coarser <= finer / 4 + 4
         assert 1 == sum(node.parent is None for node in file.nodes)
         errors = [node.error for node in file.nodes]
         assert errors[-1] == max(errors) > 0.0
         assert len(file.read(tiles=file.cut(level=255))) <= 30
-    assert errors == measure_errors(result.data)
+    assert errors == [node.error for node in encoded.nodes]
 
 
-def test_fitted_levels_look_better_than_merged_ones(model, monkeypatch):
-    cameras = virtual_cameras(model, 3, 96, 72)
-    scorer = Scorer.of_source(model, cameras)
-    scores = []
-    for splats in (level_builder.FITTED_SPLATS, 0):
-        monkeypatch.setattr(level_builder, "FITTED_SPLATS", splats)
-        parts = [one.splats for one in build_levels(model, 400, 400) if one.level == 1]
-        scores.append(scorer.psnr(join_blocks(parts[0], parts)))
-    assert scores[0] > scores[1] + 3.0
+def test_the_number_of_levels_is_the_one_asked_for(model):
+    nodes = LevelBuilder(1, leaf_splats=200).build(model)
+    assert {0, 1} == {node.level for node in nodes}
+    assert 2 == sum(node.parent is None for node in nodes)  # four leaves have one parent, and two have the other
+    assert 3 == LevelBuilder(3, leaf_splats=1200).build(model)[-1].level
 
 
-def test_levels_are_the_same_each_time(model):
-    one, other = (build_levels(model, 400, 100) for _ in range(2))
+def test_fitted_levels_look_better_than_merged_ones(model):
+    """The largest scenes have merged levels, which are adjusted with less work."""
+    scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
+    nodes, count = np.zeros(len(model), np.int64), len(model) // 4
+    merged = merge_neighbours(model)
+    coarse, measured = (
+        LevelFitter(model, size).fit(model, nodes, count, 1)[1] for size in (MEASURED_SPLATS + 1, count)
+    )
+    scores = [scorer.psnr(splats) for splats in (merged, coarse, measured)]
+    assert scores[0] + 1.0 < scores[1] < scores[2] - 1.0
+
+
+def test_levels_are_the_same_each_time_and_at_any_number_of_threads(model):
+    one, other = (LevelBuilder(leaf_splats=400, root_splats=100).build(model, threads) for threads in (1, 2))
     assert len(one) == len(other)
     for first, second in zip(one, other, strict=True):
         assert first.level == second.level
         assert first.parent == second.parent
         assert first.splats is None or same(first.splats, second.splats)
+
+
+def test_a_node_with_many_splats_below_is_compared_with_a_finer_level(model):
+    """The error of that level is added, so that the result is no smaller than if it were compared with level 0."""
+    encoded = encode_levels(EncodePlan.of(model), LevelBuilder(leaf_splats=100, root_splats=30).build(model))
+    exact, bounded = (measure_errors(encoded, reference_splats=count) for count in (len(model), 80))
+    for one, other in zip(exact.nodes, bounded.nodes, strict=True):
+        assert one.error <= other.error * (1.0 if one.level > 1 else 1.0 + 1e-6)
+    assert bounded.nodes[-1].error < 16.0 * exact.nodes[-1].error
 
 
 def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(model):
@@ -502,27 +525,26 @@ def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(model):
     )
     scene = replace(join_blocks(wall, [wall, hidden]), means_double=None)
     nodes = np.repeat([0, 1, 2], [600, 199, 1])
-    rows, splats = LevelFitter(scene).fit(scene, nodes, 200, 1)
-    assert len(rows) == len(splats) <= 202
-    assert {0, 1, 2} == set(nodes[rows])
-    kept = rows[(rows >= 600) & (rows < 799)]
-    assert 25 <= len(kept) <= 75
-    assert scene.opacities[kept].min() >= np.sort(scene.opacities[600:])[-76]
+    kept, splats = LevelFitter(scene, len(scene)).fit(scene, nodes, 200, 1)
+    assert len(kept) == len(splats) <= 202
+    assert {0, 1, 2} == set(kept)
+    assert 25 <= np.count_nonzero(kept == 1) <= 75
+    assert splats.opacities[kept == 1].min() >= np.sort(scene.opacities[600:])[-76]
 
 
 def test_a_node_that_is_its_splats_has_the_smallest_error(model):
     """A parent with the splats of its only child looks like it at every pixel size."""
     rows = np.arange(len(model))
     nodes = [LevelNode(0, 1, rows=rows), LevelNode(1, None, splats=replace(model, extra={}))]
-    data = encode_levels(EncodePlan.of(model), nodes).write().data
-    with csplat.open(data) as file:
+    encoded = encode_levels(EncodePlan.of(model), nodes)
+    with csplat.open(encoded.write().data) as file:
         low, high = file.boxes[0]
     radius = np.linalg.norm(high - low) / 2
-    assert measure_errors(data)[1] == pytest.approx(radius / 256, rel=1e-6)
+    assert measure_errors(encoded).nodes[1].error == pytest.approx(radius / 256, rel=1e-6)
 
 
 def test_a_scene_without_splats_has_no_levels(model):
-    data = encode_with_levels(model.select(slice(0, 0))).data
+    data = LevelBuilder().encode(model.select(slice(0, 0))).write().data
     assert (0, ()) == (read_header(data).splat_count, read_header(data).all_tiles)
 
 
@@ -540,10 +562,91 @@ def test_the_suite_of_encoders_reports_how_levels_look(model, data):
 
 def test_encode_writes_levels(tmp_path, sample_path):
     out = tmp_path / "levels.csplat"
-    words = ["encode", str(sample_path), str(out), "--levels"]
-    result = CliRunner().invoke(app, words)
+    result = CliRunner().invoke(app, ["encode", str(sample_path), str(out), "--levels", "2", "--json"])
     assert 0 == result.exit_code, result.output
-    assert () == tuple(validate(out.read_bytes()).violations)
-    refused = CliRunner().invoke(app, [*words, "--force", "--target-size", "9kB"])
-    assert 2 == refused.exit_code
-    assert "--levels" in refused.output
+    data = out.read_bytes()
+    assert () == tuple(validate(data).violations)
+    assert {0, 1, 2} == {tile.level for tile in read_header(data).all_tiles}
+    recorded = json.loads(result.stdout)["options"]["levels"]
+    assert {"count": 2, "leaf_splats": 1 << 14, "splats": "fitted"} == recorded
+    for word in ("17", "some", "-1"):
+        refused = CliRunner().invoke(app, ["encode", str(sample_path), str(out), "--force", f"--levels={word}"])
+        assert 2 == refused.exit_code
+        assert "expected auto, none or 0 to 16" in " ".join(refused.output.split())
+
+
+def test_small_scenes_have_levels_on_request_only(tmp_path, sample_path):
+    out = tmp_path / "plain.csplat"
+    for levels in ("auto", None, 0):
+        encode_file(str(sample_path), str(out), EncodeOptions(), levels=levels)
+        assert csplat.encode(csplat.read_ply(sample_path)) == out.read_bytes()
+    assert choose_levels(AUTO_LEVEL_SPLATS - 1, EncodeOptions(), "auto") is None
+    assert choose_levels(AUTO_LEVEL_SPLATS, EncodeOptions(), "auto") == LevelBuilder()
+    assert choose_levels(9, EncodeOptions(), 2) == LevelBuilder(2)
+    with pytest.raises(InputError, match="levels is 17, expected 0 to 16, or auto"):
+        choose_levels(9, EncodeOptions(), 17)
+
+
+def test_levels_without_the_renderer_are_an_error_that_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    assert choose_levels(AUTO_LEVEL_SPLATS - 1, EncodeOptions(), "auto") is None
+    with pytest.raises(InputError, match=r"1,000,000 splats, .* 'csplat\[render\]', or encode with `--levels none`"):
+        choose_levels(AUTO_LEVEL_SPLATS, EncodeOptions(), "auto")
+
+
+# Scenes of several buckets ---------------------------------------------------------------------------
+
+
+def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path):
+    scene, options = model.select(np.arange(400)), EncodeOptions(bucket_splats=300, threads=1)
+    builder = LevelBuilder(2, leaf_splats=300, whole_splats=300, bucket_splats=300)
+    data = builder.encode(scene, options).write({"levels": builder.settings()}).data
+    with csplat.open(data) as file:
+        assert [(0, 2), (1, 2), (2, 1)] == [
+            (level, sum(node.level == level for node in file.nodes)) for level in range(3)
+        ]  # fmt: skip
+        errors = [node.error for node in file.nodes]
+        assert 0.0 == min(errors) < errors[2] <= errors[4]
+    assert () == tuple(validate(data).violations)
+    for name, limits in (("one", OutOfCoreOptions(memory_bytes=2_000_000_000)), ("two", OutOfCoreOptions())):
+        out = tmp_path / f"{name}.csplat"
+        encode_scene(
+            source_from_model(scene), out, replace(options, threads=1 + (name == "two")), limits, levels=builder
+        )
+        assert data == out.read_bytes()
+
+
+# Targets ---------------------------------------------------------------------------------------------
+
+
+def test_a_size_counts_all_levels(model):
+    """Level 0 is the one that a search for the rest of the size finds."""
+    target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
+    result = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
+    report, whole = result.report.search, decode(result.data)
+    assert 17_000 < len(result.data) == report.size_bytes <= 18_000
+    assert () == tuple(validate(result.data).violations)
+    with csplat.open(result.data) as file:
+        assert (len(model), 300) == (len(whole), len(file.read(tiles=file.cut(level=1))))
+    alone = csplat.encode(model, target=replace(target, size_bytes=int(0.72 * 18_000)))
+    scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
+    assert scorer.psnr(whole) > scorer.psnr(decode(alone)) - 0.3
+
+
+def test_other_targets_and_an_importance_have_levels(model, tmp_path):
+    source = LoadedModel(model, 1)
+    weights, out = tmp_path / "weights.npy", tmp_path / "out.csplat"
+    np.save(weights, np.linspace(0.1, 1.0, len(model), dtype=np.float32))
+    for what in ({"target": csplat.Target(keep=0.5, effort=1)}, {"importance": str(weights)}):
+        kept = 600 if "target" in what else 1200
+        encoded = encode_file(source, str(out), EncodeOptions(), levels=1, **what)
+        assert () == tuple(validate(out.read_bytes()).violations)
+        with csplat.open(out) as file:
+            assert [kept, kept // 4] == [len(file.read(tiles=file.cut(level=level))) for level in (0, 1)]
+        assert encoded.report.options["levels"]["count"] == 1
+    bounded = encode_with_levels(
+        model, EncodeOptions(), LevelBuilder(1), target=csplat.Target(max_error={"means": 0.01})
+    )  # fmt: skip
+    assert bounded.report.search.size_bytes == len(bounded.data)
+    assert 0.005 < bounded.report.errors["means"][0] <= 0.01
+    assert () == tuple(validate(bounded.data).violations)

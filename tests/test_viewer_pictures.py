@@ -23,7 +23,7 @@ from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import load_cameras
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.level_builder import encode_with_levels
+from csplat_tools.level_builder import LevelBuilder
 
 pytestmark = [pytest.mark.slow, pytest.mark.area(name="chromium")]
 
@@ -131,7 +131,7 @@ def test_the_antialiased_flag_is_honoured(engine, part, camera):
 
 
 def test_level_0_of_a_file_with_levels_of_detail_is_drawn(engine, part, camera):
-    data = encode_with_levels(part, leaf_splats=700, root_splats=200).data
+    data = LevelBuilder(leaf_splats=700, root_splats=200).encode(part).write().data
     header = read_header(data)
     assert header.coarse_tiles
     engine.start_again("{ pixelError: 0 }")
@@ -143,7 +143,7 @@ def test_level_0_of_a_file_with_levels_of_detail_is_drawn(engine, part, camera):
 
 
 def test_what_has_no_visible_error_is_not_loaded(engine, part, camera):
-    data = encode_with_levels(part, leaf_splats=700, root_splats=200).data
+    data = LevelBuilder(leaf_splats=700, root_splats=200).encode(part).write().data
     engine.start_again("{ pixelError: 1e9 }")
     engine.look(camera)
     assert engine.open(data) is None
@@ -158,7 +158,7 @@ def test_what_has_no_visible_error_is_not_loaded(engine, part, camera):
 @pytest.mark.parametrize("backend", ["webgl2", "webgpu-tiles"])
 def test_the_whole_scene_is_shown_coarsely_while_a_file_with_levels_arrives(engine, sample, backend):
     engine.start_again(f"{{ backend: '{backend}', pixelError: 0 }}")
-    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    data = LevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
     model, (camera,) = decode(data), views(sample, 1, 96)
     engine.look(camera)
     engine.site.bytes_per_second = 20_000
@@ -183,7 +183,7 @@ def test_the_whole_scene_is_shown_coarsely_while_a_file_with_levels_arrives(engi
 @pytest.mark.parametrize("backend", ["webgl2", "webgpu-tiles"])
 def test_what_exceeds_the_budget_of_splats_is_drawn_coarsely(engine, sample, backend):
     engine.start_again(f"{{ backend: '{backend}', splatBudget: 4000 }}")
-    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    data = LevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
     engine.open(data)
     (camera,) = views(sample, 1, 96)
     picture = engine.picture(camera)
@@ -199,7 +199,7 @@ def test_the_memory_is_bounded_wherever_the_camera_goes(engine, backend):
     places = np.arange(-120.0, 121.0, 10.0)
     means = np.concatenate([rng.normal((x, 0, 0), 1.5, (400, 3)) for x in places])
     row = make(means, sh0=rng.normal(0, 1, means.shape))
-    data = encode_with_levels(row, leaf_splats=400, root_splats=150).data
+    data = LevelBuilder(leaf_splats=400, root_splats=150).encode(row).write().data
     total = sum(tile.splat_count for tile in read_header(data).all_tiles)
     engine.start_again(f"{{ backend: '{backend}', splatBudget: 5200, pixelError: 0 }}")
     engine.open(data)
@@ -220,7 +220,7 @@ def test_the_memory_is_bounded_wherever_the_camera_goes(engine, backend):
 
 def test_a_damaged_tile_is_reported_and_drawn_coarsely(engine, sample):
     engine.start_again("{ pixelError: 0 }")
-    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    data = LevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
     (camera,) = views(sample, 1, 96)
     tile = read_header(data).tiles[3]
     damaged = bytearray(data)
@@ -237,7 +237,7 @@ def test_a_damaged_tile_is_reported_and_drawn_coarsely(engine, sample):
 
 def test_a_lost_connection_is_reported_once_and_tried_again(engine, sample):
     engine.start_again("{ pixelError: 1 }")
-    data = encode_with_levels(sample, leaf_splats=1200, root_splats=150).data
+    data = LevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
     (camera,) = views(sample, 1, 96)
     engine.look(near(camera, sample, 1000))
     assert engine.open(data) is None

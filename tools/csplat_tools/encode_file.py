@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from csplat._spec import MEASURE_NAMES
 from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target, encode_with_report
@@ -22,6 +22,7 @@ from csplat.system import default_memory_bytes
 from csplat.types import Progress
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
+from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import (
     CHEAP_TO_REOPEN,
     LoadedModel,
@@ -31,8 +32,20 @@ from csplat_tools.scene_files import (
     size_on_disk,
 )
 
+if TYPE_CHECKING:
+    from csplat_tools.level_builder import LevelBuilder
+
 _MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
+_LEVELS_FACTOR = 4  # memory with levels of detail divided by that without: renders, and splats in several forms
 _SMALL = 4 << 20  # bytes; smaller files of any format always fit in memory
+
+#: Number of splats from which "auto" adds levels of detail. Such a file has 8 MB, which take ten seconds to arrive
+#: at 6 Mbit/s; with levels the whole scene is shown after 50 kB. Building them takes ten times as long as encoding.
+AUTO_LEVEL_SPLATS = 1_000_000
+#: Largest number of levels to ask for: 4^16 splats are more than a scene can have.
+LEVELS_MAX = 16
+
+Levels = int | Literal["auto"] | None
 
 
 def read_degree(options: EncodeOptions) -> int | None:
@@ -44,15 +57,43 @@ def read_degree(options: EncodeOptions) -> int | None:
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
 
-def estimate_file_cost(local: Path, options: EncodeOptions, limits: OutOfCoreOptions) -> EncodingCost:
+def estimate_file_cost(
+    local: Path, options: EncodeOptions, limits: OutOfCoreOptions, levels: Levels = None
+) -> EncodingCost:
     """Estimate the cost of encoding a scene file, without reading its splats.
 
+    Args:
+        local: path of the scene.
+        options, limits, levels: as for `encode_file`.
+
     Raises:
-        CsplatError: the scene is not valid, or there is too little memory.
+        CsplatError: the scene is not valid, there is too little memory, or levels require the extra `render`.
         OSError: the scene cannot be read.
     """
     with open_scene(local, sh_degree=read_degree(options)) as reader:
-        return estimate_cost(reader, options, limits)
+        return estimate_cost(reader, options, limits, choose_levels(reader.count, options, levels))
+
+
+def choose_levels(count: int, options: EncodeOptions, levels: Levels) -> LevelBuilder | None:
+    """Return the builder of the levels of detail of a scene of `count` splats; `None`: the file has none.
+
+    Raises:
+        InputError: the number of levels is out of range, or the extra `render` is not installed.
+    """
+    if isinstance(levels, int) and not 0 <= levels <= LEVELS_MAX:
+        raise InputError(f"levels is {levels}, expected 0 to {LEVELS_MAX}, or auto")
+    if not levels or not count or (levels == "auto" and count < AUTO_LEVEL_SPLATS):
+        return None
+    try:
+        require_renderer()
+    except InputError:
+        raise InputError(
+            f"the scene has {count:,} splats, and its levels of detail require numba: pip install 'csplat[render]', or "
+            "encode with `--levels none`"
+        ) from None
+    from csplat_tools.level_builder import LevelBuilder  # imports the renderer
+
+    return LevelBuilder(None if levels == "auto" else levels, bucket_splats=options.bucket_splats)
 
 
 @dataclass(frozen=True)
@@ -107,13 +148,13 @@ def encode_file(
     importance: str | None = None,
     prune_unseen: bool = False,
     source_index: str | None = None,
-    levels: bool = False,
+    levels: Levels = "auto",
     out_of_core: OutOfCoreOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodedFile:
     """Read a scene file, encode it, and write the .csplat file.
 
-    A `target`, `importance`, `source_index` and `levels` require the scene in memory, and exclude `out_of_core`.
+    A `target`, `importance` and `source_index` require the scene in memory, and exclude `out_of_core`.
 
     Args:
         source: a scene in any format, or `-`; or one that `read_source` has read.
@@ -125,7 +166,8 @@ def encode_file(
         importance: a .npy file with one weight per splat of the source, or a file of `csplat sensitivity`.
         prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
-        levels: add levels of detail, those of the source if it is streamed SOG; excludes `target` and `importance`.
+        levels: number of levels of detail above the scene; "auto": until the coarsest has 4,096 splats, for scenes of
+            `AUTO_LEVEL_SPLATS` or more, otherwise none; `None` or 0: none. Streamed SOG has its own, which are taken.
         out_of_core: memory, disk and workers.
         progress: progress callback.
 
@@ -134,38 +176,32 @@ def encode_file(
         CsplatError: the scene or the options are not valid.
         OSError: a file cannot be read or written.
     """
-    in_memory = target is not None or importance is not None or source_index is not None or levels
+    in_memory = target is not None or importance is not None or source_index is not None
     limits = out_of_core or OutOfCoreOptions()
     if prune_unseen and importance is None:
         raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
     if prune_unseen and target is not None:
         raise InputError("prune_unseen and a target are given, expected only one of them")
-    if levels and (target is not None or importance is not None):
-        raise InputError("levels of detail exclude a target and an importance")
     if in_memory and limits != OutOfCoreOptions():
-        raise InputError(
-            "a target, an importance, a source index and levels exclude options for scenes larger than memory"
-        )
+        raise InputError("a target, an importance and a source index exclude options for scenes larger than memory")
     start = time.perf_counter()
-    nodes = None
+    builder = None
     if isinstance(source, LoadedModel):
         read = source
     else:
         with source_path(source) as local, ExitStack() as stack:
             opened: SceneSource | None = None
-            if levels and detect_format(local).name == "sog":
-                from csplat_tools.level_builder import read_streamed_levels
-
-                with open_scene(local) as scene:
-                    has_levels = len(scene.levels) > 1
-                nodes = read_streamed_levels(local) if has_levels else None
-            if not in_memory and may_exceed_memory(local, limits):
+            # A target or an importance may prune splats, whose levels are built anew.
+            if levels and target is None and importance is None and detect_format(local).name == "sog":
+                builder = _levels_of_source(local, options, levels, limits)
+            if not in_memory and builder is None and may_exceed_memory(local, limits, levels):
                 if progress is not None:
                     progress("opening", 0.0)
                 opened = stack.enter_context(open_scene(local, sh_degree=read_degree(options)))
-                if limits.resume or not estimate_cost(opened, options, limits).in_memory:
+                builder = choose_levels(opened.count, options, levels)
+                if limits.resume or not estimate_cost(opened, options, limits, builder).in_memory:
                     return _encode_out_of_core(
-                        opened, local, output, options, limits, start, overrides=overrides, strict=strict,
+                        opened, local, output, options, limits, start, builder, overrides=overrides, strict=strict,
                         progress=progress,
                     )  # fmt: skip
                 if opened.format in CHEAP_TO_REOPEN:
@@ -174,31 +210,58 @@ def encode_file(
                 local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
                 opened=opened, progress=progress,
             )  # fmt: skip
-    if levels:
-        from csplat_tools.level_builder import encode_with_levels  # imports the renderer
-
-        result = encode_with_levels(read.model, options, nodes=nodes, progress=progress)
-    elif importance is None:
-        result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
-    else:
+    if builder is None:
+        builder = choose_levels(len(read.model), options, levels)
+    if importance is not None:
         from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
 
         result = encode_by_importance(
-            read.model, options, importance, target=target, views=views, prune_unseen=prune_unseen, progress=progress
-        )
+            read.model, options, importance, target=target, views=views, prune_unseen=prune_unseen, levels=builder,
+            progress=progress,
+        )  # fmt: skip
+    elif builder is not None:
+        from csplat_tools.level_builder import encode_with_levels  # imports the renderer
+
+        result = encode_with_levels(read.model, options, builder, target=target, views=views, progress=progress)
+    else:
+        result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
     write_bytes(output, result.data)
     if source_index is not None:
         write_array(source_index, result.source_index)
     return EncodedFile(read.model, result.report, result, read.findings, read.size_bytes, time.perf_counter() - start)
 
 
-def may_exceed_memory(path: Path, limits: OutOfCoreOptions) -> bool:
+def _levels_of_source(
+    local: Path, options: EncodeOptions, levels: int | Literal["auto"], limits: OutOfCoreOptions
+) -> LevelBuilder | None:
+    """Return the builder that takes the levels of streamed SOG; `None` if it has one level, or none are to be written.
+
+    Raises:
+        InputError: the scene does not fit in memory; or as in `choose_levels`.
+    """
+    with open_scene(local) as scene:
+        counts = scene.levels
+    builder = choose_levels(counts[0], options, levels) if len(counts) > 1 else None
+    if builder is None:
+        return None
+    if limits != OutOfCoreOptions():
+        raise InputError(
+            "taking the levels of detail of the source requires the scene in memory: use `--levels none`, or encode a "
+            "PLY of its finest level"
+        )
+    from csplat_tools.level_builder import read_streamed_levels
+
+    return replace(builder, nodes=read_streamed_levels(local, builder.count))
+
+
+def may_exceed_memory(path: Path, limits: OutOfCoreOptions, levels: Levels = None) -> bool:
     """Return True if a scene may not fit in memory, which can only be decided after opening it."""
     if limits.cluster is not None or limits.resume or limits.always:
         return True
     bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
     size = size_on_disk(path)
-    return size > _SMALL and (detect_format(path).name != "ply" or size * _MEMORY_FACTOR > bound)
+    factor = _MEMORY_FACTOR * (_LEVELS_FACTOR if levels else 1)
+    return size > _SMALL and (detect_format(path).name != "ply" or size * factor > bound)
 
 
 def _encode_out_of_core(
@@ -208,6 +271,7 @@ def _encode_out_of_core(
     options: EncodeOptions,
     limits: OutOfCoreOptions,
     start: float,
+    levels: LevelBuilder | None,
     *,
     overrides: MetadataOverrides | None,
     strict: bool,
@@ -224,7 +288,7 @@ def _encode_out_of_core(
     size = size_on_disk(local)
     try:
         source = {"name": local.name, "size": size, "changed": local.stat().st_mtime_ns}
-        report = encode_scene(scene, target, options, limits, source=source, progress=progress)
+        report = encode_scene(scene, target, options, limits, levels=levels, source=source, progress=progress)
     except (KeyboardInterrupt, OSError):
         folder = limits.working_folder(target)
         if folder.exists():

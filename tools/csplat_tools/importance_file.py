@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.disk_files import read_array
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, Target, encode_with_report
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.scene_frame import scene_frame
+from csplat_tools.level_builder import LevelBuilder, encode_with_levels
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 _ZIP = b"PK"  # first bytes of a .npz file
@@ -60,6 +61,7 @@ def encode_by_importance(
     target: Target | None = None,
     views: Any = None,
     prune_unseen: bool = False,
+    levels: LevelBuilder | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
     """Encode a scene with the importance of its splats.
@@ -70,6 +72,7 @@ def encode_by_importance(
         path: a file as for `read_importance`.
         target, views: as for `csplat.encode`; not with `prune_unseen`.
         prune_unseen: prune the splats that no view of the sensitivities saw.
+        levels: builds levels of detail; `None`: the file has none.
         progress: progress callback.
 
     Raises:
@@ -83,17 +86,21 @@ def encode_by_importance(
         raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
     weights = encoder_importance(found, model)
     if target is not None:
-        return encode_with_report(model, options, target=target, views=views, importance=weights, progress=progress)
+        return encode_with_levels(
+            model, options, levels, target=target, views=views, importance=weights, progress=progress
+        )
     notes = _class_notes(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
-        return _with_notes(encode_with_report(model, options, importance=weights, progress=progress), *notes)
+        result = encode_with_levels(model, options, levels, importance=weights, progress=progress)
+        return _with_notes(result, *notes)
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
         raise InputError(f"{path}: no view saw any splat, so all would be pruned")
     pruned = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
-    result = encode_with_report(
-        model.select(rows), options, importance=weights.select(rows) if isinstance(weights, Importance) else None,
-        origin=Origin(len(model), rows), metadata={"pruned": pruned}, progress=progress,
+    left = weights.select(rows) if isinstance(weights, Importance) else None
+    result = encode_with_levels(
+        model.select(rows), options, levels, importance=left, origin=Origin(len(model), rows),
+        metadata={"pruned": pruned}, progress=progress,
     )  # fmt: skip
     if stored.missed_share > 0.0:  # NaN if no view was held out
         missed = f"{100 * stored.missed_share:.1f} % of the splats were pruned although held-out views saw them:"

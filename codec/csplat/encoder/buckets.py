@@ -1,8 +1,8 @@
 """Divide a large scene into buckets of neighbours, and survey it.
 
-A scene of up to `BUCKET_SPLATS` splats is one bucket. For a larger scene, a sample of that size is analysed: all
-choices are made on it, and a Morton curve through it divides space into buckets. Each bucket is cut into tiles by
-itself, so that only one has to be in memory, and the file does not depend on the available memory.
+A scene of up to `EncodeOptions.bucket_splats` splats is one bucket. For a larger scene, a sample of that size is
+analysed: all choices are made on it, and a Morton curve through it divides space into buckets. Each bucket is cut into
+tiles by itself, so that only one has to be in memory, and the file does not depend on the available memory.
 """
 
 from __future__ import annotations
@@ -25,9 +25,6 @@ from csplat.types import F32, F64, I64
 Rows = NDArray[np.intp]
 Item = TypeVar("Item")
 
-#: Maximum number of splats in a bucket, and size of the sample of a larger scene.
-BUCKET_SPLATS = 1 << 19
-
 _BUCKET_FILL = 0.8  # fraction of a bucket to fill; the sample predicts bucket sizes within a few per cent
 _CURVE_EDGE = 0.005  # fraction of the splats beyond either side of the curve's cube
 _CURVE_TOP = (1 << 16) - 1  # cells along a side of the cube, minus one
@@ -37,7 +34,7 @@ _CONTRAST_BUCKETS = 16  # buckets in which the contrast is measured
 
 @dataclass(frozen=True, eq=False)
 class SceneSurvey:
-    """The values that choices for a scene of more than `BUCKET_SPLATS` splats depend on.
+    """The values that choices for a scene of several buckets depend on.
 
     Attributes:
         sample: the splats `sample_rows` of the scene.
@@ -51,7 +48,7 @@ class SceneSurvey:
 
 
 class BucketStore(Protocol):
-    """The splats of a scene of more than `BUCKET_SPLATS` splats by bucket, in memory or on disk."""
+    """The splats of a scene of several buckets, in memory or on disk."""
 
     @property
     def model(self) -> SplatModel:
@@ -74,17 +71,19 @@ class MemoryBuckets:
 
     model: SplatModel
     rows: Sequence[Rows]
+    bucket_splats: int
 
     @classmethod
-    def of(cls, model: SplatModel) -> MemoryBuckets:
+    def of(cls, model: SplatModel, bucket_splats: int) -> MemoryBuckets:
         """Sort the splats of a scene into buckets."""
-        return cls(model, bucket_rows(model.means))
+        return cls(model, bucket_rows(model.means, bucket_splats), bucket_splats)
 
     def survey(self) -> SceneSurvey:
         """Survey the scene."""
         plain = replace(self.model, shN=self.model.shN[:, :0], extra={})  # SH has no influence, and takes most memory
         contrast = measure_contrast(plain.select(rows) for rows in contrast_buckets(self.rows))
-        return SceneSurvey(self.model.select(sample_rows(len(self.model))), largest_sh(self.model.shN), contrast)
+        sample = self.model.select(sample_rows(len(self.model), self.bucket_splats))
+        return SceneSurvey(sample, largest_sh(self.model.shN), contrast)
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,21 +101,22 @@ class BucketCurve:
     bounds: I64
 
     @classmethod
-    def through(cls, means: F32, count: int) -> BucketCurve:
+    def through(cls, means: F32, count: int, bucket_splats: int) -> BucketCurve:
         """Divide the curve into buckets of about equal numbers of splats.
 
         Args:
             means: [n, 3] float32, means of the sample.
             count: number of splats in the scene.
+            bucket_splats: maximum number of splats in a bucket.
         """
-        if count <= BUCKET_SPLATS:
+        if count <= bucket_splats:
             return cls(np.zeros(3), 0.0, np.zeros(0, np.int64))
         points = np.sort(means.astype(np.float64), axis=0)
         edge = int(len(points) * _CURVE_EDGE)
         low, high = points[edge], points[len(points) - 1 - edge]
         side = float((high - low).max())
         curve = cls(low, _CURVE_TOP / side if side > 0.0 else 0.0, np.zeros(0, np.int64))
-        buckets = math.ceil(count / (_BUCKET_FILL * BUCKET_SPLATS))
+        buckets = math.ceil(count / (_BUCKET_FILL * bucket_splats))
         codes = np.sort(curve._codes(means))
         starts = np.arange(1, buckets, dtype=np.int64) * len(codes) // buckets
         return cls(curve.corner, curve.scale, np.unique(codes[starts]))
@@ -140,27 +140,27 @@ class BucketCurve:
         return codes
 
 
-def bucket_rows(means: F32) -> Sequence[Rows]:
+def bucket_rows(means: F32, bucket_splats: int) -> Sequence[Rows]:
     """Return the rows of each bucket of a scene in memory, ascending."""
-    if len(means) <= BUCKET_SPLATS:
+    if len(means) <= bucket_splats:
         return [np.arange(len(means), dtype=np.intp)]
-    curve = BucketCurve.through(means[sample_rows(len(means))], len(means))
+    curve = BucketCurve.through(means[sample_rows(len(means), bucket_splats)], len(means), bucket_splats)
     bucket = curve.bucket_of(means)
     order = np.argsort(bucket, kind="stable")
     ends = np.searchsorted(bucket[order], np.arange(curve.count + 1))
     found = [order[start:end] for start, end in pairwise(ends)]
-    return [rows[part] for rows in found for part in bucket_slices(len(rows)) if len(rows)]
+    return [rows[part] for rows in found for part in bucket_slices(len(rows), bucket_splats) if len(rows)]
 
 
-def bucket_slices(count: int) -> list[slice]:
-    """Split a bucket of more than `BUCKET_SPLATS` splats into equal parts, in the scene's order."""
-    parts = max(1, math.ceil(count / BUCKET_SPLATS))
+def bucket_slices(count: int, bucket_splats: int) -> list[slice]:
+    """Split a bucket of more than `bucket_splats` splats into equal parts, in the scene's order."""
+    parts = max(1, math.ceil(count / bucket_splats))
     return [slice(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
 
 
-def sample_rows(count: int) -> I64:
-    """Return the evenly spaced rows of the sample of a scene with more than `BUCKET_SPLATS` splats."""
-    return np.arange(BUCKET_SPLATS, dtype=np.int64) * count // BUCKET_SPLATS
+def sample_rows(count: int, bucket_splats: int) -> I64:
+    """Return the evenly spaced rows of the sample of a scene of several buckets."""
+    return np.arange(bucket_splats, dtype=np.int64) * count // bucket_splats
 
 
 def contrast_buckets(buckets: Sequence[Item]) -> list[Item]:

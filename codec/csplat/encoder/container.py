@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -61,6 +62,12 @@ class FileTile:
     codebook_ids: tuple[int, ...] = ()
     level: int = 0
 
+    def corners(self, step: float) -> tuple[list[float], list[float]]:
+        """Return the corners of the box around the centres (spec 4.3.5), scene units; `step` is the file's."""
+        scaled = math.ldexp(step, self.exponent)
+        low = [corner * scaled for corner in self.corner]
+        return low, [(corner + extent) * scaled for corner, extent in zip(self.corner, self.extent, strict=True)]
+
 
 @dataclass(frozen=True)
 class IndexedCodebook:
@@ -89,11 +96,30 @@ class SceneFields:
 
 @dataclass(frozen=True)
 class FileNode:
-    """A node of the levels of detail: the index of its parent or `None`, its tiles, its error in scene units."""
+    """A node of the levels of detail.
+
+    Attributes:
+        parent: index of the parent, or `None`.
+        tiles: its tiles.
+        error: see spec 5.7, scene units.
+        squares: mean squared errors at the pixel sizes of spec E.5, finest first, from which the error follows; none
+            for a leaf, or if they have not been measured.
+    """
 
     parent: int | None
     tiles: Sequence[FileTile]
     error: float = 0.0
+    squares: tuple[float, ...] = ()
+
+    @property
+    def level(self) -> int:
+        """Level of its tiles."""
+        return self.tiles[0].level
+
+    @property
+    def splat_count(self) -> int:
+        """Number of splats in its tiles."""
+        return sum(tile.splat_count for tile in self.tiles)
 
 
 def tree_chunk(nodes: Sequence[FileNode]) -> FileChunk:
@@ -107,7 +133,7 @@ def tree_chunk(nodes: Sequence[FileNode]) -> FileChunk:
 
 def order_nodes(nodes: Sequence[FileNode]) -> list[FileNode]:
     """Return nodes by ascending level, as the index requires (TIL-12), with renumbered parents."""
-    order = sorted(range(len(nodes)), key=lambda number: nodes[number].tiles[0].level)
+    order = sorted(range(len(nodes)), key=lambda number: nodes[number].level)
     position = {number: place for place, number in enumerate(order)}
     return [
         replace(nodes[number], parent=None if (parent := nodes[number].parent) is None else position[parent])

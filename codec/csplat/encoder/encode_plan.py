@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.encoder.buckets import BUCKET_SPLATS, BucketStore, MemoryBuckets, sample_rows
+from csplat.encoder.buckets import BucketStore, MemoryBuckets, bucket_rows, sample_rows
 from csplat.encoder.coding_parameters import CodingParameters, choose_parameters
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.error_bounds import SCALE_MOST
@@ -82,8 +82,7 @@ class EncodePlan:
         extras: records of the extra columns to write.
         shapes: the shape codebook, if there is one.
         classes: quantisation classes of the splats, if there are several.
-        sample: plan of the sample on which choices are made, for a scene of more than `BUCKET_SPLATS` splats without
-            importance.
+        sample: plan of the sample on which choices are made, for a scene of several buckets without importance.
         buckets: `BucketStore.rows` of such a scene.
         is_sample: the model is such a sample.
     """
@@ -136,13 +135,14 @@ class EncodePlan:
         if len(origin.source_index) != len(model):
             raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
-        if len(model) > BUCKET_SPLATS and importance is None and not options.shape_codebook_size:
-            return cls.of_buckets(MemoryBuckets.of(model), options, origin, progress)
+        if len(model) > options.bucket_splats and importance is None and not options.shape_codebook_size:
+            return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats), options, origin, progress)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
         parameters, classes = choose_classes(model, blocks, parameters, options)
-        tiles = cut_scene(model, parameters, classes)
+        buckets = bucket_rows(model.means, options.bucket_splats) if classes is None else None
+        tiles = cut_scene(model, parameters, classes, buckets)
         shapes = None
         if options.shape_codebook_size and len(model):
             weights = shape_weights(model, importance)
@@ -165,7 +165,7 @@ class EncodePlan:
     def of_buckets(
         cls, store: BucketStore, options: EncodeOptions, origin: Origin, progress: Progress | None = None
     ) -> EncodePlan:
-        """Plan the encoding of a scene of more than `BUCKET_SPLATS` splats on a sample of it.
+        """Plan the encoding of a scene of several buckets on a sample of it.
 
         Args:
             store: the scene, in memory or on disk.
@@ -205,7 +205,7 @@ class EncodePlan:
             InputError: a shape or dtype is wrong, or a value is not finite.
         """
         model = replace(self.model, sh0=sh0, shN=shN)
-        rows = None if self.sample is None else sample_rows(len(model))
+        rows = None if self.sample is None else sample_rows(len(model), self.options.bucket_splats)
         sample = None if self.sample is None else self.sample.with_colours(sh0[rows], shN[rows])
         return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
 

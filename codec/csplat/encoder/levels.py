@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder.coding_parameters import SAME_STEPS, StepFactors
-from csplat.encoder.container import FileNode, order_nodes
+from csplat.encoder.container import FileNode, FileTile, order_nodes
 from csplat.encoder.encode_plan import EncodePlan, clip_scales
-from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tile, encode_tiles
-from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats
+from csplat.encoder.pipeline import EncodedTiles, encode_tile, encode_tiles
+from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splats, nearest_entries
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
@@ -44,14 +44,20 @@ class LevelNode:
     error: float = 0.0
 
 
-def encode_levels(plan: EncodePlan, nodes: Sequence[LevelNode], progress: Progress | None = None) -> EncodedTiles:
+def encode_levels(
+    plan: EncodePlan,
+    nodes: Sequence[LevelNode],
+    codebooks: FileCodebooks | None = None,
+    progress: Progress | None = None,
+) -> EncodedTiles:
     """Encode the tiles of a scene and of its coarser versions.
 
     All choices are made for the scene alone, so that level 0 has the same steps and codebooks as without other levels.
 
     Args:
-        plan: the plan of the scene.
+        plan: the plan of the scene; its tiles are replaced by those of the leaves.
         nodes: the nodes, whose leaves hold each splat once.
+        codebooks: SH codebooks, if the plan's SH coding is chosen; `None`: choose it now.
         progress: see `EncodePlan.of`.
 
     Raises:
@@ -59,7 +65,8 @@ def encode_levels(plan: EncodePlan, nodes: Sequence[LevelNode], progress: Progre
     """
     _check_nodes(nodes, len(plan.model))
     progress = progress or null_progress
-    plan, codebooks = plan.choose_sh_coding(progress)
+    if codebooks is None:
+        plan, codebooks = plan.choose_sh_coding(progress)
     leaves = [number for number, node in enumerate(nodes) if node.level == 0]
     of_leaves = [
         cut_scene(plan.model, plan.parameters, plan.classes, [rows])
@@ -68,16 +75,36 @@ def encode_levels(plan: EncodePlan, nodes: Sequence[LevelNode], progress: Progre
     plan = replace(plan, tiles=[tile for tiles in of_leaves for tile in tiles])
     encoded = encode_tiles(plan, codebooks, progress=progress)
     parts = iter(encoded.tiles)
-    made = {number: [next(parts) for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
-    for done, (number, node) in enumerate((at, node) for at, node in enumerate(nodes) if node.splats is not None):
-        assert node.splats is not None
-        made[number] = _encode_coarse(node.splats, node.level, plan, codebooks)
-        progress("levels", (done + 1) / (len(nodes) - len(leaves)))
-    tree = [
-        FileNode(node.parent, [replace(part.tile, level=node.level) for part in made[number]], node.error)
-        for number, node in enumerate(nodes)
-    ]
+    made = {number: [next(parts).tile for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
+    coarse = [number for number, node in enumerate(nodes) if node.level]
+    for done, number in enumerate(coarse):
+        made[number] = encode_coarse(nodes[number], plan, codebooks)
+        progress("levels", (done + 1) / len(coarse))
+    tree = [FileNode(node.parent, made[number], node.error) for number, node in enumerate(nodes)]
     return replace(encoded, nodes=order_nodes(tree))
+
+
+def encode_coarse(node: LevelNode, plan: EncodePlan, codebooks: FileCodebooks) -> list[FileTile]:
+    """Encode the splats of a node above level 0 with the SH codebooks of the scene, and with coarser steps.
+
+    Args:
+        node: the node.
+        plan: the plan of the scene, whose SH coding is chosen.
+        codebooks: codebooks of the file.
+
+    Raises:
+        InputError: a value fits no lattice.
+    """
+    assert node.splats is not None
+    check_model("the encoder", node.splats)
+    splats, level = clip_scales(node.splats), node.level
+    factors = SAME_STEPS if level == 1 else _COARSE_STEPS
+    sh_plan = _assign_coarse(splats, plan, codebooks)
+    tiles = [
+        replace(tile, exponent=tile.exponent + level, factors=factors)
+        for tile in cut_scene(splats, plan.parameters)
+    ]  # fmt: skip
+    return [replace(encode_tile(splats, tile, plan.parameters, sh_plan).tile, level=level) for tile in tiles]
 
 
 def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
@@ -89,21 +116,9 @@ def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
             raise InputError(f"the parent of a node of level {node.level} has level {nodes[node.parent].level}")
 
 
-def _encode_coarse(splats: SplatModel, level: int, plan: EncodePlan, codebooks: FileCodebooks) -> list[EncodedTile]:
-    """Encode the splats of a coarser node with the SH codebooks of the scene, and with coarser steps."""
-    check_model("the encoder", splats)
-    splats = clip_scales(splats)
-    factors = SAME_STEPS if level == 1 else _COARSE_STEPS
-    tiles = [
-        replace(tile, exponent=tile.exponent + level, factors=factors)
-        for tile in cut_scene(splats, plan.parameters, None, [np.arange(len(splats))])
-    ]
-    sh_plan = _assign_coarse(splats, plan, codebooks)
-    return [encode_tile(splats, tile, plan.parameters, sh_plan) for tile in tiles]
-
-
 def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> ShCodingPlan:
-    if codebooks.sh_plan.book is not None and codebooks.rule is None:  # no rule for splats that were not trained on
-        return replace(codebooks.sh_plan, weights=None, book=None, extras=())
-    assigned = assign_splats(codebooks, splats, plan.parameters, plan.options.thread_count)
-    return replace(assigned, extras=())
+    sh_plan, threads = codebooks.sh_plan, plan.options.thread_count
+    if sh_plan.book is not None and codebooks.rule is None:  # a refit has no rule for other splats
+        book = nearest_entries(sh_plan.book, splats, plan.parameters, threads)
+        return replace(sh_plan, weights=None, book=book, extras=())
+    return replace(assign_splats(codebooks, splats, plan.parameters, threads), extras=())

@@ -174,10 +174,6 @@ class EncodedTiles:
         index: NDArray[np.int64] = self.plan.origin.source_index[rows]
         return index
 
-    def with_node_errors(self, errors: Sequence[float]) -> EncodedTiles:
-        """Return the same tiles with other errors of `nodes`."""
-        return replace(self, nodes=[replace(node, error=e) for node, e in zip(self.nodes, errors, strict=True)])
-
     def against(self, source: SplatModel, decoded: SplatModel) -> EncodedTiles:
         """Return the same tiles with declared errors that refer to another scene than the one encoded.
 
@@ -199,6 +195,18 @@ class EncodedTiles:
         stream = BytesIO()
         report = self.write_to(stream, metadata)
         return EncodeResult(stream.getvalue(), self.source_index, report)
+
+    def part(self, nodes: Sequence[FileNode]) -> bytes:
+        """Return a file of the tiles of some nodes alone, as one level without extra columns, in their order."""
+        tiles = [
+            replace(
+                tile, level=0,
+                layers={layer: payload for layer, payload in tile.layers.items() if layer != _spec.LAYER_EXTRA},
+            )
+            for node in nodes
+            for tile in node.tiles
+        ]  # fmt: skip
+        return b"".join(file_pieces(scene_fields(replace(self.plan, extras=()), self.codebooks, []), tiles))
 
     def write_to(
         self, stream: BinaryIO, metadata: Mapping[str, Any] | None = None, progress: Progress = null_progress
@@ -244,7 +252,7 @@ def encode_tiles(
         plan, codebooks = plan.choose_sh_coding(progress)
     tiles = _encode_all(plan, codebooks.sh_plan, progress)
     errors = errors or ErrorSums.total(part.errors for part in tiles)
-    if plan.shapes is not None:
+    if plan.shapes is not None and not any(one.id == SHAPE_CODEBOOK_ID for one in codebooks.records):
         record, chunk = shape_codebook_chunk(plan.shapes, plan.parameters.deflate)
         codebooks = replace(codebooks, records=[*codebooks.records, record], chunks=[*codebooks.chunks, chunk])
     return EncodedTiles(plan, codebooks, tiles, errors)

@@ -34,6 +34,7 @@ _BLOCK = 1 << 12  # splats per block of temporaries, 0.7 MiB, which fits the sec
 _TRIAL_SPLATS = 1 << 14  # maximum number of splats on which scalar coding is tried
 _CODEBOOK_SPLATS_MIN = 256  # splats; in smaller scenes a codebook costs more bytes than it saves
 _TRAINING_SPLATS, _TRAINING_USERS = 1 << 16, 64  # minimum numbers of splats, and per entry, to train a codebook on
+_NEAR_GROUPS = 8  # see `assign`
 _GROUPED_ENTRIES_MIN = 4096  # entries from which searching near groups is worth the additional distortion
 _FULL_SHARE_SPLATS = 1 << 15  # splats; smaller scenes get the number of entries of this size, within `_USERS_MIN`
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
@@ -239,6 +240,23 @@ def assign_splats(
     return replace(sh_plan, weights=weights, book=ShCodebook(sh_plan.book.entries, index))
 
 
+def nearest_entries(book: ShCodebook, model: SplatModel, parameters: CodingParameters, threads: int) -> ShCodebook:
+    """Return a codebook with the entry that is nearest to each splat of another model, without escapes.
+
+    Args:
+        book: the codebook.
+        model: the splats.
+        parameters: the final parameters.
+        threads: number of threads; no effect on the result.
+    """
+    rgb = lift_colour(book.entries, parameters.chroma_shift).transpose(2, 1, 0)
+    entries = np.ascontiguousarray(rgb, np.int32).reshape(book.size, -1)
+    near_groups = _NEAR_GROUPS if book.size >= _GROUPED_ENTRIES_MIN else 0
+    points = _lattice_points(model.shN, parameters, threads)
+    index = assign(points, entries, near_groups=near_groups, threads=threads)
+    return ShCodebook(book.entries, index.astype(np.int32))
+
+
 def make_codebooks(sh_plan: ShCodingPlan, book: ShCodebook, parameters: CodingParameters) -> FileCodebooks:
     """Return a codebook with its index record and chunks."""
     chunks = []
@@ -382,7 +400,9 @@ def _train(
     """Train a codebook; return it with the entry of each splat [N] and the weighted mean squared error."""
     weights, threads = error_weights.weights, options.thread_count
     points = _lattice_points(shN, parameters, threads)
-    effort = {"near_groups": 8, "iterations": 7, "sample_per_entry": 16} if size >= _GROUPED_ENTRIES_MIN else {}
+    effort = (
+        {"near_groups": _NEAR_GROUPS, "iterations": 7, "sample_per_entry": 16} if size >= _GROUPED_ENTRIES_MIN else {}
+    )
 
     def report_steps(done: int, steps: int) -> None:
         progress("codebook", done / steps)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.encoder.buckets import bucket_rows
 from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, Lattice, StepFactors
 from csplat.encoder.entropy import morton_codes
 from csplat.encoder.quantisation import largest_exact, lattice_values, opacity_levels, opacity_values, quantise_means
@@ -73,16 +72,15 @@ def cut_scene(
         model: the scene.
         parameters: steps and tile size.
         classes: quantisation classes; `None`: all splats have the same steps.
-        buckets: rows of the parts to cut by themselves; default: the whole scene with classes, otherwise `bucket_rows`.
+        buckets: rows of the parts to cut by themselves; default: the whole scene.
     """
     flags = _outlier_flags(model, parameters)
     groups, factors = flags, [SAME_STEPS]
     if classes is not None:
         groups = classes.index if flags is None else classes.index + np.uint8(len(classes.factors)) * flags
         factors = [*classes.factors]
-        buckets = [np.arange(len(model))] if buckets is None else buckets
     tiles: list[TileSplats] = []
-    for rows in bucket_rows(model.means) if buckets is None else buckets:
+    for rows in [np.arange(len(model))] if buckets is None else buckets:
         tiles += _cut_groups(model.means, rows, None if groups is None else groups[rows], factors, parameters)
     return tiles
 

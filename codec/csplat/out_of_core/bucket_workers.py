@@ -1,6 +1,7 @@
 """Encode buckets from splats on disk to tiles on disk: in this process, several processes or on a Dask cluster.
 
-The file of a coded bucket has a head (size and CRC of the records), records of its tiles as JSON, and their payloads.
+The file of a coded bucket has a head (size and CRC of the records), records of its tiles and nodes as JSON, and the
+payloads. With levels of detail, another file has the splats of its coarsest node.
 """
 
 from __future__ import annotations
@@ -8,28 +9,73 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from csplat import _spec
 from csplat.disk_files import atomic_writer
-from csplat.encoder.container import FileTile, LazyPayload, chunk_crc
-from csplat.encoder.encode_plan import EncodePlan, clip_scales
+from csplat.encoder.container import FileNode, FileTile, LazyPayload, chunk_crc
+from csplat.encoder.encode_options import EncodeOptions
+from csplat.encoder.encode_plan import EncodePlan, Origin, clip_scales
 from csplat.encoder.error_bounds import ErrorSums
-from csplat.encoder.pipeline import EncodedTile, encode_tile
+from csplat.encoder.levels import LevelNode, encode_levels
+from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tiles
 from csplat.encoder.sh_codebook import FileCodebooks, assign_splats
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import missing_package
-from csplat.out_of_core.disk_buckets import Bucket, damaged_file, read_bucket
+from csplat.model import SplatModel
+from csplat.out_of_core.disk_buckets import Bucket, damaged_file, read_bucket, write_splats
+from csplat.scene_source import join_blocks
 from csplat.system import map_in_processes
+from csplat.types import Progress, null_progress
 
 _HEAD = struct.Struct("<QI")  # size and CRC-32 of the records
+
+
+class LevelMaker(Protocol):
+    """Builds levels of detail, and measures their errors; picklable. No result depends on `threads`."""
+
+    @property
+    def whole_splats(self) -> int:
+        """Number of splats up to which a scene is built in one piece, in memory."""
+        ...
+
+    def settings(self) -> dict[str, Any]:
+        """Return what the OPTS chunk states, JSON-compatible."""
+        ...
+
+    def encode(self, model: SplatModel, options: EncodeOptions, progress: Progress) -> EncodedTiles:
+        """Encode a scene with its levels, in memory."""
+        ...
+
+    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
+        """Build the nodes of a bucket of a scene of `scene_count` splats."""
+        ...
+
+    def build_top(
+        self, roots: Iterable[SplatModel], threads: int | None, progress: Progress
+    ) -> tuple[list[int | None], list[LevelNode]]:
+        """Build the nodes above all buckets.
+
+        Args:
+            roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
+            threads: number of threads; `None`: all.
+            progress: called with the stage and the completed fraction of it.
+
+        Returns:
+            The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
+        """
+        ...
+
+    def measure(self, encoded: EncodedTiles, threads: int | None, progress: Progress) -> EncodedTiles:
+        """Return the same tiles with errors of the nodes that have none yet."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,16 +86,25 @@ class BucketCoding:
         folder: the working folder.
         plan: the complete plan, without splats.
         codebooks: codebooks trained on the sample, without the assignment of its splats.
+        scene_count: number of splats of the scene.
+        levels: builds levels of detail; `None`: there are none.
     """
 
     folder: Path
     plan: EncodePlan
     codebooks: FileCodebooks
+    scene_count: int
+    levels: LevelMaker | None = None
 
 
 def coded_path(folder: Path, bucket: Bucket) -> Path:
     """Return the path of the file of a coded bucket."""
     return folder / f"tiles-{bucket.index:06}"
+
+
+def roots_path(folder: Path, bucket: Bucket) -> Path:
+    """Return the path of the splats of the coarsest nodes of a coded bucket."""
+    return folder / f"roots-{bucket.index:06}"
 
 
 def code_buckets(
@@ -86,29 +141,49 @@ def code_buckets(
 
 def _code_bucket(coding: BucketCoding, bucket: Bucket) -> None:
     """Code a bucket unless it is already coded."""
-    plan, path = coding.plan, coded_path(coding.folder, bucket)
+    path = coded_path(coding.folder, bucket)
     if path.exists():  # by a worker that Dask lost
         return
-    model = clip_scales(read_bucket(coding.folder, plan.model, bucket))
-    sh_plan = assign_splats(coding.codebooks, model, plan.parameters, threads=1)
+    encoded = _encode_bucket(coding, bucket)
     records, payloads, size = list[dict[str, Any]](), list[bytes](), 0
-    for tile in cut_scene(model, plan.parameters):
-        coded, layers = encode_tile(model, tile, plan.parameters, sh_plan), {}
-        for layer, payload in coded.tile.layers.items():
+    nodes = encoded.nodes or [FileNode(None, [part.tile for part in encoded.tiles])]
+    parts = iter(encoded.tiles)
+    for tile in (tile for node in nodes for tile in node.tiles):
+        layers = {}
+        for layer, payload in tile.layers.items():
             assert isinstance(payload, bytes)
             layers[layer] = size, len(payload), chunk_crc(_spec.CHUNK_TILE, payload)
             payloads.append(payload)
             size += len(payload)
-        fields = {**asdict(replace(coded.tile, layers={})), "layers": layers}
-        records.append({"tile": fields, "errors": asdict(coded.errors), "coarsened": sorted(coded.coarsened)})
-    text = json.dumps(records).encode()
+        record: dict[str, Any] = {"tile": {**asdict(replace(tile, layers={})), "layers": layers}}
+        if tile.level == 0:
+            part = next(parts)
+            record |= {"errors": asdict(part.errors), "coarsened": sorted(part.coarsened)}
+        records.append(record)
+    tree = [[node.parent, len(node.tiles), node.error, node.squares] for node in nodes]
+    text = json.dumps({"tiles": records, "nodes": tree}).encode()
     with atomic_writer(path) as stream:
         stream.write(_HEAD.pack(len(text), zlib.crc32(text)) + text)
         stream.writelines(payloads)
 
 
-def read_tiles(folder: Path, bucket: Bucket) -> Iterator[EncodedTile]:
-    """Yield the tiles of a coded bucket, whose payloads are read when the file is written.
+def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
+    """Encode a bucket, with its levels of detail and their errors if there are any; write its coarsest nodes."""
+    model = clip_scales(read_bucket(coding.folder, coding.plan.model, bucket))
+    threads = coding.plan.options.threads
+    plan = replace(coding.plan, model=model, origin=Origin(len(model), np.arange(len(model))))
+    sh_plan = assign_splats(coding.codebooks, model, plan.parameters, plan.options.thread_count)
+    codebooks = replace(coding.codebooks, sh_plan=sh_plan)
+    if coding.levels is None:
+        return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), codebooks)
+    nodes = coding.levels.build_part(model, coding.scene_count, threads)
+    roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
+    write_splats(roots_path(coding.folder, bucket), join_blocks(roots[0], roots))
+    return coding.levels.measure(encode_levels(plan, nodes, codebooks), threads, null_progress)
+
+
+def read_coded(folder: Path, bucket: Bucket) -> tuple[list[EncodedTile], list[FileNode]]:
+    """Return the tiles of level 0 and the nodes of a coded bucket, whose payloads are read when the file is written.
 
     Raises:
         InputError: the file is damaged.
@@ -120,15 +195,25 @@ def read_tiles(folder: Path, bucket: Bucket) -> Iterator[EncodedTile]:
         text = stream.read(min(size, path.stat().st_size))
     if len(text) != size or zlib.crc32(text) != crc:
         raise damaged_file(path)
-    for record in json.loads(text):
+    content = json.loads(text)
+    leaves, tiles = list[EncodedTile](), list[FileTile]()
+    for record in content["tiles"]:
         fields = record["tile"]
         layers = {
             int(layer): LazyPayload(length, check, partial(_read_payload, path, _HEAD.size + size + at, length, check))
             for layer, (at, length, check) in fields.pop("layers").items()
         }
         fields |= {name: tuple(fields[name]) for name in ("corner", "extent", "codebook_ids")}
-        errors, coarsened = ErrorSums(**record["errors"]), frozenset(record["coarsened"])
-        yield EncodedTile(FileTile(layers=layers, **fields), np.zeros(0, np.intp), errors, coarsened)
+        tiles.append(FileTile(layers=layers, **fields))
+        if "errors" in record:
+            errors, coarsened = ErrorSums(**record["errors"]), frozenset(record["coarsened"])
+            leaves.append(EncodedTile(tiles[-1], np.zeros(0, np.intp), errors, coarsened))
+    rest = iter(tiles)
+    nodes = [
+        FileNode(parent, [next(rest) for _ in range(count)], error, tuple(squares))
+        for parent, count, error, squares in content["nodes"]
+    ]
+    return leaves, nodes
 
 
 def _read_payload(path: Path, offset: int, size: int, crc: int) -> bytes:

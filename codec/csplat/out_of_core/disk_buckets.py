@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,12 +64,14 @@ class DiskBuckets:
     Attributes:
         folder: path of the working folder.
         model: the scene without splats.
+        bucket_splats: maximum number of splats in a bucket.
         counts: number of splats in each section.
         largest_sh, contrast: see `SceneSurvey`.
     """
 
     folder: Path
     model: SplatModel
+    bucket_splats: int
     counts: list[int]
     largest_sh: float
     contrast: float
@@ -81,6 +83,7 @@ class DiskBuckets:
         folder: Path,
         key: dict[str, Any],
         *,
+        bucket_splats: int,
         resume: bool,
         disk_bytes: int,
         progress: Progress,
@@ -91,6 +94,7 @@ class DiskBuckets:
             scene: the scene; its extra columns are kept.
             folder: a new or empty folder.
             key: identity of scene and options, JSON-compatible.
+            bucket_splats: see `EncodeOptions`.
             resume: continue from the content of the folder if it exists.
             disk_bytes: free space that the encoding needs.
             progress: called with the stage and the completed fraction of it.
@@ -103,7 +107,7 @@ class DiskBuckets:
         """
         done = _read_state(folder, key, resume=resume)
         if done is not None:
-            return cls(folder, scene.metadata_model, **done)
+            return cls(folder, scene.metadata_model, bucket_splats, **done)
         for path in folder.glob("section-*"):  # an interrupted sort starts again
             path.unlink()
         check_free_space(
@@ -113,7 +117,7 @@ class DiskBuckets:
         )
         folder.mkdir(exist_ok=True)
         _write_json(folder / _STATE, {"key": key})
-        store = _sort(scene, folder, progress)
+        store = _sort(scene, folder, bucket_splats, progress)
         _write_json(folder / _STATE, {"key": key, **{name: getattr(store, name) for name in _STATE_FIELDS}})
         return store
 
@@ -125,7 +129,11 @@ class DiskBuckets:
     @property
     def buckets(self) -> list[Bucket]:
         """All buckets, in the order of the output file."""
-        parts = [(section, part) for section, count in enumerate(self.counts) if count for part in bucket_slices(count)]
+        parts = [
+            (section, part)
+            for section, count in enumerate(self.counts) if count
+            for part in bucket_slices(count, self.bucket_splats)
+        ]  # fmt: skip
         return [Bucket(index, section, part.start, part.stop) for index, (section, part) in enumerate(parts)]
 
     def survey(self) -> SceneSurvey:
@@ -135,7 +143,7 @@ class DiskBuckets:
             InputError: the file with the sample is damaged.
             OSError: it cannot be read.
         """
-        count = len(sample_rows(sum(self.counts)))
+        count = len(sample_rows(sum(self.counts), self.bucket_splats))
         return SceneSurvey(_read(self.folder / _SAMPLE, self.model, 0, count), self.largest_sh, self.contrast)
 
     def remove_section(self, section: int) -> None:
@@ -161,6 +169,31 @@ def read_bucket(folder: Path, model: SplatModel, bucket: Bucket) -> SplatModel:
         OSError: the file cannot be read.
     """
     return _read(_section_path(folder, bucket.section), model, bucket.start, bucket.stop)
+
+
+def write_splats(path: Path, model: SplatModel) -> None:
+    """Write splats to a file of the working folder, which appears when complete.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with atomic_writer(path) as stream:
+        _write_frames(stream, _records(model, np.arange(len(model)), _record_type(model)))
+
+
+def read_splats(path: Path, model: SplatModel, count: int) -> SplatModel:
+    """Read splats that `write_splats` wrote.
+
+    Args:
+        path: the file.
+        model: a scene of the same attributes, whose metadata is returned.
+        count: number of splats.
+
+    Raises:
+        InputError: the file is damaged.
+        OSError: it cannot be read.
+    """
+    return _read(path, model, 0, count)
 
 
 def splat_bytes(model: SplatModel) -> int:
@@ -203,25 +236,26 @@ def _write_json(path: Path, value: Any) -> None:
         stream.write(json.dumps(value).encode())
 
 
-def _sort(scene: SceneSource, folder: Path, progress: Progress) -> DiskBuckets:
+def _sort(scene: SceneSource, folder: Path, bucket_splats: int, progress: Progress) -> DiskBuckets:
     """Read the scene twice: survey it, then sort its splats into spill files."""
-    curve, largest = _survey(with_progress(scene, "looking", progress), folder)
+    curve, largest = _survey(with_progress(scene, "looking", progress), folder, bucket_splats)
     counts = _spill(with_progress(scene, "sorting", progress), folder, curve)
-    store = DiskBuckets(folder, scene.metadata_model, counts, largest, 0.0)
+    store = DiskBuckets(folder, scene.metadata_model, bucket_splats, counts, largest, 0.0)
     chosen = contrast_buckets(store.buckets)
     return replace(store, contrast=measure_contrast(read_bucket(folder, store.model, bucket) for bucket in chosen))
 
 
-def _survey(scene: SceneSource, folder: Path) -> tuple[BucketCurve, float]:
+def _survey(scene: SceneSource, folder: Path, bucket_splats: int) -> tuple[BucketCurve, float]:
     """Write the sample; return the curve through it and the largest magnitude of all SH coefficients."""
-    rows, largest = sample_rows(scene.count), 0.0
+    rows, largest = sample_rows(scene.count, bucket_splats), 0.0
     sample = np.empty(len(rows), _record_type(scene.metadata_model))
     for where, block in scene.numbered():
         first, last = np.searchsorted(rows, (where.start, where.stop))
         sample[first:last] = _records(block, rows[first:last] - where.start, sample.dtype)
         largest = max(largest, largest_sh(block.shN))
-    _append(folder / _SAMPLE, sample, mode="wb")
-    return BucketCurve.through(np.ascontiguousarray(sample["means"]), scene.count), largest
+    with (folder / _SAMPLE).open("wb") as stream:
+        _write_frames(stream, sample)
+    return BucketCurve.through(np.ascontiguousarray(sample["means"]), scene.count, bucket_splats), largest
 
 
 def _spill(scene: SceneSource, folder: Path, curve: BucketCurve) -> list[int]:
@@ -281,13 +315,17 @@ def _records(model: SplatModel, rows: NDArray[Any], dtype: np.dtype[Any]) -> Rec
     return records
 
 
-def _append(path: Path, records: Records, mode: str = "ab") -> None:
-    """Append frames of at most `_FRAME_SPLATS` splats to a file."""
-    with path.open(mode) as stream:
-        for start in range(0, len(records), _FRAME_SPLATS):
-            data = records[start : start + _FRAME_SPLATS].view(np.uint8).data
-            stream.write(_FRAME.pack(len(data) // records.itemsize, zlib.crc32(data)))
-            stream.write(data)
+def _append(path: Path, records: Records) -> None:
+    with path.open("ab") as stream:
+        _write_frames(stream, records)
+
+
+def _write_frames(stream: BinaryIO, records: Records) -> None:
+    """Write frames of at most `_FRAME_SPLATS` splats."""
+    for start in range(0, len(records), _FRAME_SPLATS):
+        data = records[start : start + _FRAME_SPLATS].view(np.uint8).data
+        stream.write(_FRAME.pack(len(data) // records.itemsize, zlib.crc32(data)))
+        stream.write(data)
 
 
 def _frames(path: Path, dtype: np.dtype[Any]) -> Iterator[Records]:

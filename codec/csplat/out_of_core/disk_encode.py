@@ -14,11 +14,20 @@ import numpy as np
 from csplat import __version__
 from csplat.disk_files import atomic_writer
 from csplat.encoder import EncodedTiles, EncodeOptions, EncodePlan, EncodeReport, Origin, encode_tiles
-from csplat.encoder.buckets import BUCKET_SPLATS
+from csplat.encoder.container import FileNode, order_nodes
 from csplat.encoder.error_bounds import ErrorSums
+from csplat.encoder.levels import encode_coarse
+from csplat.encoder.pipeline import EncodedTile
 from csplat.errors import InputError
-from csplat.out_of_core.bucket_workers import BucketCoding, code_buckets, coded_path, read_tiles
-from csplat.out_of_core.disk_buckets import PENDING_BYTES, DiskBuckets, splat_bytes
+from csplat.out_of_core.bucket_workers import (
+    BucketCoding,
+    LevelMaker,
+    code_buckets,
+    coded_path,
+    read_coded,
+    roots_path,
+)
+from csplat.out_of_core.disk_buckets import PENDING_BYTES, DiskBuckets, read_splats, splat_bytes
 from csplat.scene_source import SceneSource
 from csplat.system import default_memory_bytes
 from csplat.types import Progress, null_progress
@@ -32,6 +41,11 @@ _CODED = 0.3  # maximum size of a file, as a multiple of the size of its arrays
 #: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
 #: 30 M of degree 3. Degree 4 takes 1.13 times the CPU time of degree 3 (300,000 splats in memory).
 _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0), (0.65, 9.0, 22.5))
+# Levels of detail: memory of building those of a bucket, for each process: renders, a multiple of the size of its
+# arrays, and bytes per splat; seconds per splat of one process; size of the file relative to one without.
+_LEVEL_RENDERS, _LEVEL_ROWS, _LEVEL_SPLAT = 200 * _MB, 2.0, 600
+_LEVEL_SECONDS = 6e-5
+_LEVEL_SIZE = 1.35
 #: Bytes per splat of a file, by preset and SH degree 0 to 4.
 _FILE_BYTES = {
     "fast": (9.0, 9.5, 10.0, 11.0, 11.3),
@@ -93,13 +107,19 @@ class EncodingCost:
         return {**asdict(self), "seconds": round(self.seconds, 1)}
 
 
-def estimate_cost(scene: SceneSource, options: EncodeOptions, limits: OutOfCoreOptions | None = None) -> EncodingCost:
+def estimate_cost(
+    scene: SceneSource,
+    options: EncodeOptions,
+    limits: OutOfCoreOptions | None = None,
+    levels: LevelMaker | None = None,
+) -> EncodingCost:
     """Estimate the cost of an encoding, and decide where it takes place.
 
     Args:
         scene: the scene; its blocks are not read.
         options: options of the encoder.
         limits: memory and disk.
+        levels: builds levels of detail; `None`: the file has none.
 
     Raises:
         InputError: there is too little memory.
@@ -109,12 +129,16 @@ def estimate_cost(scene: SceneSource, options: EncodeOptions, limits: OutOfCoreO
     bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
     row = splat_bytes(_with_written_columns(scene, options).metadata_model)
     workers, passes, disk = options.thread_count, 1, int(count * row * _CODED)
-    memory = least = _PROGRAM + int(count * row * _WHOLE_ROW)
-    in_memory = count <= BUCKET_SPLATS or (memory <= bound and not limits.always and limits.cluster is None)
+    per_bucket = min(count, options.bucket_splats)
+    is_one = count <= (options.bucket_splats if levels is None else levels.whole_splats)
+    building = 0 if levels is None else _building_bytes(count if is_one else per_bucket, row)
+    memory = least = _PROGRAM + int(count * row * _WHOLE_ROW) + building
+    # Building levels takes most of the time, and processes share it better than threads.
+    in_memory = is_one or (levels is None and memory <= bound and not limits.always and limits.cluster is None)
     if not in_memory:
         if options.shape_codebook_size:
             raise InputError(f"a codebook of shapes requires the scene in memory, about {memory / _MB:,.0f} MB")
-        worker = _PROGRAM + int(BUCKET_SPLATS * row * _PER_ROW)
+        worker = _PROGRAM + int(per_bucket * row * _PER_ROW) + building
         memory = least = worker + PENDING_BYTES
         workers, passes, disk = max(1, min(workers, (bound - _PROGRAM) // worker)), 4, disk + count * row
         if workers > 1:
@@ -126,7 +150,15 @@ def estimate_cost(scene: SceneSource, options: EncodeOptions, limits: OutOfCoreO
     read, code, book = _SECONDS[min(degree, 1) if options.preset == "fast" else degree]
     seconds = count / 1e6 * (read * passes + code / workers) + book * min(1.0, count / 5e5) / workers
     file_bytes = round(count * _FILE_BYTES[options.preset][degree])
+    if levels is not None:
+        seconds += count * _LEVEL_SECONDS / (1 if in_memory else workers)
+        file_bytes = round(file_bytes * _LEVEL_SIZE)
     return EncodingCost(count, degree, in_memory, workers, memory, disk, seconds, file_bytes)
+
+
+def _building_bytes(count: int, row: int) -> int:
+    """Return the memory for the levels of splats that are built together, in addition to that of their encoding."""
+    return _LEVEL_RENDERS + int(count * (row * _LEVEL_ROWS + _LEVEL_SPLAT))
 
 
 def encode_scene(
@@ -135,6 +167,7 @@ def encode_scene(
     options: EncodeOptions | None = None,
     limits: OutOfCoreOptions | None = None,
     *,
+    levels: LevelMaker | None = None,
     source: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
@@ -149,6 +182,7 @@ def encode_scene(
         target: path of the file, which appears when complete.
         options: options of the encoder.
         limits: memory, disk and workers.
+        levels: builds levels of detail (`csplat_tools.level_builder.LevelBuilder`); `None`: the file has none.
         source: identity of the scene, JSON-compatible; checked when resuming.
         progress: called with the stage and the completed fraction of it, 0 to 1.
 
@@ -165,22 +199,30 @@ def encode_scene(
     folder = limits.working_folder(target)
     if limits.resume and folder.exists():
         limits = replace(limits, always=True)
-    cost = estimate_cost(scene, options, limits)
+    cost = estimate_cost(scene, options, limits, levels)
+    settings = {} if levels is None else {"levels": levels.settings()}
     if cost.in_memory:
-        encoded = encode_tiles(EncodePlan.of(scene.model(), options, progress=progress), progress=progress)
+        if levels is None:
+            encoded = encode_tiles(EncodePlan.of(scene.model(), options, progress=progress), progress=progress)
+        else:
+            encoded = levels.encode(scene.model(), options, progress)
         with atomic_writer(target) as stream:
-            return encoded.write_to(stream, progress=progress)
+            return encoded.write_to(stream, settings, progress=progress)
     scene = _with_written_columns(scene, options)
     key = {
         "source": dict(source or {}),
         "options": options.chosen(),
         "splats": scene.count,
         "csplat": __version__,
+        "levels": settings.get("levels"),
     }
-    store = DiskBuckets.of(scene, folder, key, resume=limits.resume, disk_bytes=cost.disk_bytes, progress=progress)
-    encoded = _encode_buckets(store, options, cost.workers, limits.cluster, progress)
+    store = DiskBuckets.of(
+        scene, folder, key, bucket_splats=options.bucket_splats, resume=limits.resume, disk_bytes=cost.disk_bytes,
+        progress=progress,
+    )  # fmt: skip
+    encoded = _encode_buckets(store, options, cost.workers, limits.cluster, levels, progress)
     with atomic_writer(target) as stream:
-        report = encoded.write_to(stream, progress=progress)
+        report = encoded.write_to(stream, settings, progress=progress)
     store.remove()
     return report
 
@@ -191,9 +233,14 @@ def _with_written_columns(scene: SceneSource, options: EncodeOptions) -> SceneSo
 
 
 def _encode_buckets(
-    store: DiskBuckets, options: EncodeOptions, workers: int, cluster: str | None, progress: Progress
+    store: DiskBuckets,
+    options: EncodeOptions,
+    workers: int,
+    cluster: str | None,
+    levels: LevelMaker | None,
+    progress: Progress,
 ) -> EncodedTiles:
-    """Plan the encoding on the sample, and encode the buckets that are not encoded yet."""
+    """Plan the encoding on the sample, encode the buckets that are not encoded yet, and the levels above them."""
     count, buckets = sum(store.counts), store.buckets
     origin = Origin(count, np.zeros(0, np.int64))
     plan, codebooks = EncodePlan.of_buckets(store, options, origin, progress).choose_sh_coding(progress)
@@ -202,11 +249,40 @@ def _encode_buckets(
     for section in set(range(len(store.counts))) - set(uncoded):
         store.remove_section(section)
     done = count - sum(one.stop - one.start for one in left)
-    for bucket in code_buckets(BucketCoding(store.folder, plan, codebooks), left, workers, cluster):
+    threads = options.threads if workers == 1 and cluster is None else 1
+    coding = BucketCoding(
+        store.folder, replace(plan, options=replace(options, threads=threads)), codebooks, count, levels
+    )
+    for bucket in code_buckets(coding, left, workers, cluster):
         uncoded[bucket.section] -= 1
         if not uncoded[bucket.section]:
             store.remove_section(bucket.section)
         done += bucket.stop - bucket.start
         progress("coding", done / count)
-    tiles = [tile for bucket in buckets for tile in read_tiles(store.folder, bucket)]
-    return EncodedTiles(plan, codebooks, tiles, ErrorSums.total(tile.errors for tile in tiles))
+    tiles, nodes, roots = list[EncodedTile](), list[FileNode](), list[list[int]]()
+    for bucket in buckets:
+        leaves, part = read_coded(store.folder, bucket)
+        tiles += leaves
+        roots.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
+        nodes += [_renumbered(node, len(nodes)) for node in part]
+    encoded = EncodedTiles(plan, codebooks, tiles, ErrorSums.total(tile.errors for tile in tiles))
+    if levels is None:
+        return encoded
+    plain = replace(store.model, extra={}, means_double=None)
+    parts = (
+        read_splats(roots_path(store.folder, bucket), plain, sum(nodes[number].splat_count for number in numbers))
+        for bucket, numbers in zip(buckets, roots, strict=True)
+    )
+    parents, top = levels.build_top(parts, options.threads, progress)
+    for numbers, parent in zip(roots, parents, strict=False):
+        for number in numbers:
+            nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
+    nodes += [
+        _renumbered(FileNode(node.parent, encode_coarse(node, plan, codebooks)), len(nodes)) for node in top
+    ]  # fmt: skip
+    return levels.measure(replace(encoded, nodes=order_nodes(nodes)), options.threads, progress)
+
+
+def _renumbered(node: FileNode, first: int) -> FileNode:
+    """Return a node whose parent is counted from `first`."""
+    return node if node.parent is None else replace(node, parent=node.parent + first)

@@ -19,6 +19,7 @@ from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
+    Levels,
     encode_file,
     estimate_file_cost,
     format_cost,
@@ -34,7 +35,7 @@ from csplat_tools.views import ViewSet
 
 #: Parameters that require the whole scene in memory.
 IN_MEMORY = (
-    "target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index", "levels",
+    "target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index",
 )  # fmt: skip
 
 
@@ -51,7 +52,10 @@ def encode(
     max_error: Annotated[str | None, typer.Option(metavar="NAME=MAX", help="E.g. means=0.001,sh0=0.02.")] = None,
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
     data: shared.Data = None,
-    up: shared.Up = None,
+    levels: Annotated[
+        str, typer.Option(metavar="LEVELS", show_default=False, help="N, none, auto. Default: auto, from 1M on.")
+    ] = "auto",
+    up: shared.HiddenUp = None,
     attribute_psnr: Annotated[
         float | None, typer.Option(metavar="DB", hidden=True, help="PSNR of each attribute. Default: by preset.")
     ] = None,
@@ -63,12 +67,6 @@ def encode(
         str | None, typer.Option(metavar="FILE", hidden=True, help="File of `csplat sensitivity`, or .npy weights.")
     ] = None,
     source_index: shared.SourceIndexOutput = None,
-    levels: Annotated[
-        bool,
-        typer.Option(
-            "--levels", hidden=True, help="Add levels of detail for viewers: a third more splats, and minutes of work."
-        ),
-    ] = False,
     memory: shared.HiddenMemory = None,
     resume: Annotated[bool, typer.Option("--resume", hidden=True, help="Go on from OUT.csplat.work.")] = False,
     dask: shared.HiddenDask = None,
@@ -100,8 +98,9 @@ def encode(
     --target-psnr, --target-size, --max-psnr-drop (with --data) and --keep
     chooses the precision and prunes splats, and requires the render extra;
     --max-error limits errors of means, covariance, opacities, sh0 to sh4. Views
-    are virtual without --data or --cameras. --help-all shows --keep, --cameras
-    and all other options.
+    are virtual without --data or --cameras. --levels adds coarser versions of
+    the scene, which viewers show first: 35 % more bytes, and minutes. --help-all
+    shows --keep, --cameras, --up and all other options.
 
     Examples:
       csplat encode scene.ply scene.csplat
@@ -114,14 +113,13 @@ def encode(
     precision = {"--target-psnr": target_psnr, "--target-size": target_size, "--max-psnr-drop": max_psnr_drop}
     rendered = {**precision, "--keep": keep}
     targets = {**rendered, "--max-error": max_error}
-    whole = {**targets, "--importance": importance, "--source-index": source_index, "--levels": levels}
+    whole = {**targets, "--importance": importance, "--source-index": source_index}
     out_of_core = {"--memory": memory, "--resume": resume, "--dask": dask, "--dry-run": dry_run}
     shared.refuse_together(rendered)
     shared.refuse_together({"--attribute-psnr": attribute_psnr}, precision)
     shared.refuse_together({"--keep": keep}, {"--no-prune": no_prune, "--importance": importance})
     shared.refuse_together({"--effort": effort}, {"--no-prune": no_prune})
     shared.refuse_together(out_of_core, whole)
-    shared.refuse_together({"--levels": levels}, {**targets, "--importance": importance})
     shared.require_one({"--max-psnr-drop": max_psnr_drop}, {"--data": data})
     shared.require_one({"--no-prune": no_prune}, {**precision, "--max-error": max_error})
     shared.require_one({"--effort": effort, "--cameras": cameras, "--data": data}, rendered)
@@ -135,16 +133,15 @@ def encode(
         psnr=target_psnr, size=target_size, max_psnr_drop=max_psnr_drop, keep=keep, max_error=max_error,
         prune=not no_prune, effort=effort,
     )  # fmt: skip
+    level_count = shared.parse_levels(levels)
     overrides = shared.parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased or None, licence=licence)
     limits = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, cluster=dask)
     with out.bar() as progress, assume_format(read_as):
         if dry_run:
-            _publish_estimate(source, options, limits, out)
+            _publish_estimate(source, options, limits, level_count, out)
             return
         out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
         check_name(output, ".csplat", "encode", source)
-        if levels:
-            prepare_renderer(quiet=out.quiet)
         scene: str | LoadedModel = source
         around = None
         if target is not None:
@@ -159,7 +156,7 @@ def encode(
                 around = _find_views(scene.model, options, target, views, out)
         encoded = encode_file(
             scene, output, options, target=target, views=around, overrides=overrides, importance=importance,
-            source_index=source_index, levels=levels, out_of_core=limits, progress=progress,
+            source_index=source_index, levels=level_count, out_of_core=limits, progress=progress,
         )  # fmt: skip
         _publish(encoded, source, output, threads, out, up=up, progress=progress)
 
@@ -193,10 +190,12 @@ def _publish(
     out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
 
 
-def _publish_estimate(source: str, options: EncodeOptions, limits: OutOfCoreOptions, out: Output) -> None:
+def _publish_estimate(
+    source: str, options: EncodeOptions, limits: OutOfCoreOptions, levels: Levels, out: Output
+) -> None:
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local:
-        found = estimate_file_cost(local, options, limits)
+        found = estimate_file_cost(local, options, limits, levels)
     out.publish(found.as_json(), format_cost(found))
 
 

@@ -24,6 +24,7 @@ from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import NUMBER, parse_size_bytes, print_data
+from csplat_tools.encode_file import LEVELS_MAX, Levels
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
@@ -453,6 +454,15 @@ def parse_target(
         Target, decibels[0], size_bytes, decibels[1], keep, bounds, prune,
         Target.effort if effort is None else effort,
     )  # fmt: skip
+
+
+def parse_levels(text: str) -> Levels:
+    """Parse a number of levels of detail, `auto` or `none`."""
+    if text in ("auto", "none"):
+        return "auto" if text == "auto" else None
+    if not text.isdecimal() or int(text) > LEVELS_MAX:
+        raise typer.BadParameter(f"--levels is {text}, expected auto, none or 0 to {LEVELS_MAX}")
+    return int(text)
 
 
 def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:

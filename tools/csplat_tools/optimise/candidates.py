@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from numpy.typing import NDArray
 
@@ -25,6 +25,9 @@ from csplat.model import SplatModel
 from csplat.types import F64, Progress, null_progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
+
+if TYPE_CHECKING:
+    from csplat_tools.level_builder import LevelBuilder
 
 #: Importance of the splats, as for the encoder.
 Weights = NDArray[Any] | Importance
@@ -139,7 +142,7 @@ class Candidate:
         quality: its precision, PSNR of each attribute alone, dB; `None`: that of the options.
         is_draft: the refit through the quantisers was skipped.
         options: options of the encoder.
-        result: the encoder's result.
+        coded, result: the encoder's tiles, and its result.
         error: mean squared error on the validation views, by which candidates are compared.
         goal_error: mean squared error on the views of the goal; `None` until it is measured.
         test_errors: [V] mean squared error by test view; `None` until it is measured.
@@ -151,11 +154,21 @@ class Candidate:
     quality: float | None
     is_draft: bool
     options: EncodeOptions
+    coded: EncodedTiles = field(repr=False)
     result: EncodeResult = field(repr=False)
     error: float
     goal_error: float | None = None
     test_errors: F64 | None = field(default=None, repr=False)
     test_psnr: float | None = None
+
+    def with_levels(self, levels: LevelBuilder, progress: Progress | None) -> Candidate:
+        """Return the same splats in a file with levels of detail, which is not measured in the test views yet."""
+        coded, entries = self.coded, self.subset.metadata(self.validation_psnr) or {}
+        found = levels.encode_plan(coded.plan, coded.codebooks, progress or null_progress)
+        if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
+            found = replace(found, errors=coded.errors)
+        result = found.write({**entries, "levels": levels.settings()})
+        return replace(self, coded=found, result=result, test_errors=None, test_psnr=None)
 
     @property
     def size_bytes(self) -> int:
@@ -234,7 +247,7 @@ class CandidatePool:
         error = self.error(self.validation_scorer, result.data)
         entries = subset.metadata(psnr_of_mse(error))
         result = result if entries is None else coded.write(entries)
-        self.made.append(Candidate(subset, coding, quality, draft, options, result, error))
+        self.made.append(Candidate(subset, coding, quality, draft, options, coded, result, error))
         report(stage, 1.0)
         return self.made[-1]
 

@@ -16,6 +16,7 @@ from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.view_sets import render_seconds
 
 if TYPE_CHECKING:
+    from csplat_tools.level_builder import LevelBuilder
     from csplat_tools.optimise.simplify import SimplifyOptions
 
 
@@ -27,6 +28,7 @@ def meet_target(
     views: ViewSet | None = None,
     importance: Weights | None = None,
     simplifying: SimplifyOptions | None = None,
+    levels: LevelBuilder | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
     """Search for the file that meets a target which requires rendering.
@@ -37,6 +39,7 @@ def meet_target(
         views: training, validation and test views; `None`: virtual ones around the scene.
         simplifying: options of pruning and refitting, instead of the target's effort; the background is that of the
             views.
+        levels: builds levels of detail, whose bytes count; `None`: the file has none.
 
     Returns:
         The file. Its source index refers to the source, and its report contains that of the search.
@@ -60,7 +63,7 @@ def meet_target(
         encodes = bounded.report.search.encodes
     found, report = search_target(
         source, target, views or find_view_set(source), options, importance=importance,
-        options=simplifying or SimplifyOptions(effort=target.effort), progress=progress,
+        options=simplifying or SimplifyOptions(effort=target.effort), levels=levels, progress=progress,
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 3)
     return found.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))

@@ -38,6 +38,7 @@ from csplat.types import Progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
+from csplat_tools.level_builder import LevelBuilder
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, Coding, Subset, Weights, WholeScene
 from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
 from csplat_tools.optimise.rate_distortion import (
@@ -78,6 +79,7 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 
 # What is near, and what is worth another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
+_LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 
 _INSIDE_REMARK = (
@@ -573,6 +575,7 @@ def search_target(
     *,
     importance: Weights | None,
     options: SimplifyOptions,
+    levels: LevelBuilder | None,
     progress: Progress | None,
 ) -> tuple[Candidate, SearchReport]:
     """Search for the file that meets a target, by rendering candidates.
@@ -583,6 +586,7 @@ def search_target(
         views: training, validation and test views.
         encoding, importance, progress: as for `csplat.encode_with_report`.
         options: options of pruning and refitting.
+        levels: builds levels of detail, whose bytes count; `None`: the file has none.
 
     Returns:
         The file, and the report with 0 seconds.
@@ -604,6 +608,7 @@ def search_target(
     sensitivity_views = 0
     if pruner is not None and target.keep is not None:
         found = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
+        found = found if levels is None else found.with_levels(levels, progress)
     else:
         images = None if target.max_psnr_drop is None else views.image_validation_scorer(threads=encoding.threads)
         goal, measured = Goal.of(target, source, test_scorer, images), None
@@ -612,7 +617,8 @@ def search_target(
                 source, views, encoding, importance, inside=inside, progress=progress
             )
         whole = WholeScene(source, importance, measured, progress)
-        found = TargetSearch(goal, pool, whole, pruner, options.work).best()
+        search = TargetSearch(goal, pool, whole, pruner, options.work)
+        found = search.best() if levels is None else _best_with_levels(search, levels, progress)
     report = make_report(
         target, found, pool, test_scorer, splats_before=len(source), views_of=views.name,
         remarks=[_INSIDE_REMARK] * (inside and found.splats < len(source)), encodes=len(pool.made), seconds=0.0,
@@ -622,6 +628,33 @@ def search_target(
         reached={name: found.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
     return found, report
+
+
+def _best_with_levels(search: TargetSearch, levels: LevelBuilder, progress: Progress | None) -> Candidate:
+    """Return the best file with levels of detail, whose bytes count for a size.
+
+    Their bytes are only known once they are built for the splats of a file. So the size that is left for level 0 is
+    predicted, and corrected by that of the file.
+
+    Raises:
+        InputError: no file meets the goal.
+    """
+    size_bytes = search.goal.size_bytes
+    if size_bytes is None:
+        return search.best().with_levels(levels, progress)
+    left, best, smallest = size_bytes * _LEVEL_0, None, math.inf
+    for _ in range(_ROUNDS):
+        goal = replace(search.goal, size_bytes=max(1, int(left)))
+        found = replace(search, goal=goal).best().with_levels(levels, progress)
+        smallest = min(smallest, found.size_bytes)
+        if found.size_bytes <= size_bytes and (best is None or found.error < best.error):
+            best = found
+        if (1.0 - _WORTH) * size_bytes <= found.size_bytes <= size_bytes:
+            break
+        left *= (1.0 - 0.5 * _WORTH) * size_bytes / found.size_bytes
+    if best is None:
+        raise InputError(f"no file with levels of detail has at most {size_bytes} bytes; the smallest has {smallest}")
+    return best
 
 
 def expected_renders(encoding: EncodeOptions, target: Target) -> float:

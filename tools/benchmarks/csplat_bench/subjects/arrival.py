@@ -6,7 +6,7 @@ renderer are already loaded. A small image of the canvas is recorded after each 
 has arrived and nothing changes, is the finished one, with which the others are compared.
 
     first                the first image that is not black
-    db25, db30, db38     the first image with so many dB against the finished one
+    db25, db30, db38     the first image with 25, 30, 38 dB against the finished one
     whole                the finished one
     asked_bytes          bytes sent in all: fewer than the files have if the viewer omits some, more if it asks twice
 
@@ -43,7 +43,7 @@ from csplat_bench.scenes import Scene, find_scene
 from csplat_bench.slow_line import SLOW, Line
 from csplat_bench.suites import Case
 from csplat_render.metrics import psnr
-from csplat_tools.level_builder import encode_with_levels
+from csplat_tools.level_builder import LevelBuilder
 from csplat_tools.render_files import write_png
 
 _STEPS = {"db25": 25.0, "db30": 30.0, "db38": 38.0}  # dB
@@ -192,8 +192,7 @@ def _transform(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]
 
 
 def _with_levels(scene: Scene, folder: Path, _: object) -> None:
-    encoded = encode_with_levels(read_ply(scene.path))
-    (folder / f"{scene.name}.csplat").write_bytes(encoded.data)
+    (folder / f"{scene.name}.csplat").write_bytes(LevelBuilder().encode(read_ply(scene.path)).write().data)
 
 
 def _in_levels(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> None:

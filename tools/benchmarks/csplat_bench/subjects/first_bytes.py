@@ -25,7 +25,7 @@ from csplat_bench.scenes import find_scene
 from csplat_bench.suites import Case
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.level_builder import encode_with_levels
+from csplat_tools.level_builder import LevelBuilder
 from csplat_tools.views import comparison_cameras
 
 
@@ -33,7 +33,7 @@ from csplat_tools.views import comparison_cameras
 def measure_first_bytes(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that draws the beginning of a file."""
     model = csplat.read_ply(find_scene(name, setup.data, setup.work).path)
-    files = {False: csplat.encode(model), True: encode_with_levels(model).data}
+    files = {False: csplat.encode(model), True: LevelBuilder().encode(model).write().data}
     cameras = comparison_cameras(model)
     rasteriser = Rasteriser(gradients=False)
 

@@ -1,8 +1,9 @@
 """Levels of detail next to the scene: level k at 1/2^k and 1/2^(k - 1) of the size of its cameras.
 
-A case is a `level`, from 1, and its `maker`: `fitted` or `merged`, as `csplat encode --levels` builds small and large
-scenes; `decimate` or `decimate-adaptive` of splat-transform, at the same number of splats. Seconds are those of all
-levels for csplat, of this one for splat-transform. Splats are not quantised. PSNR is pooled over eight cameras.
+A case is a `level`, from 1, and its `maker`: `fitted`, as `csplat encode` builds scenes of up to two million splats;
+`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, at the same number of splats. Seconds are
+those of all levels for csplat, of this one for splat-transform. Splats are not quantised. PSNR is pooled over eight
+cameras.
 """
 
 from __future__ import annotations
@@ -30,7 +31,8 @@ from csplat_render.camera import resized
 from csplat_render.metrics import psnr_of_mse, ssim
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools import level_builder
+from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_fitting import merge_neighbours
 
 _CAMERAS = 8
 _SHARE = 0.25  # splats of a level, as a share of the finer one
@@ -49,14 +51,15 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
 
     @cache
     def build(maker: str) -> tuple[dict[int, SplatModel], float]:
-        usual, start = level_builder.FITTED_SPLATS, time.perf_counter()
-        level_builder.FITTED_SPLATS = len(model) if maker == "fitted" else 0
-        try:
-            nodes = level_builder.build_levels(model)
-        finally:
-            level_builder.FITTED_SPLATS = usual
+        start = time.perf_counter()
+        if maker == "merged":
+            levels, splats = dict[int, SplatModel](), model
+            while len(splats) > LevelBuilder.root_splats:
+                splats = merge_neighbours(splats)
+                levels[len(levels) + 1] = splats
+            return levels, time.perf_counter() - start
         parts: dict[int, list[SplatModel]] = {}
-        for node in nodes:
+        for node in LevelBuilder().build(model):
             if node.splats is not None:
                 parts.setdefault(node.level, []).append(node.splats)
         levels = {level: join_blocks(some[0], some) for level, some in parts.items()}

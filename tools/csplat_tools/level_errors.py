@@ -1,0 +1,161 @@
+"""Measure the errors of the nodes of levels of detail with the renderer (spec E.5), on the decoded splats.
+
+A node is compared with the splats of level 0 below it. If these are too many to be rendered at once, a finer level of
+its subtree takes their place, and the error of that level, which has been measured before, is added: root mean squares
+of differences of images add up at most.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from csplat.decoder import decode
+from csplat.encoder import EncodedTiles
+from csplat.encoder.container import FileNode
+from csplat.model import SplatModel
+from csplat.types import F32, F64, Progress, null_progress
+from csplat_render.camera import Camera, look_at
+from csplat_render.rasteriser import Rasteriser
+
+#: Maximum number of splats that a node is compared with: those of a bucket, so that each node of a bucket is compared
+#: with level 0. Six renders of them take 1 s.
+REFERENCE_SPLATS = 1 << 19
+
+# Spec E.5.
+_DISTANCE = 4.0  # radii from the camera to the centre
+_RADIUS_PIXELS = 256
+_IMAGE_PIXELS = 3 * _RADIUS_PIXELS
+_SIZES = _RADIUS_PIXELS.bit_length()  # pixel sizes of 1 to 256 pixels of the images
+_SQUARED_ERROR_MAX = 1e-3  # 30 dB
+_COVERED = 1.0 / 255.0  # alpha
+_DIRECTIONS = [(axis, sign) for axis in range(3) for sign in (1.0, -1.0)]
+
+
+def measure_errors(
+    encoded: EncodedTiles,
+    *,
+    reference_splats: int = REFERENCE_SPLATS,
+    threads: int | None = None,
+    progress: Progress = null_progress,
+) -> EncodedTiles:
+    """Return the same tiles with errors of the nodes that have none yet.
+
+    Args:
+        encoded: the tiles, with nodes by ascending level.
+        reference_splats: maximum number of splats that a node is compared with, if a level of its subtree has as few.
+        threads: number of threads; `None`: all. No error depends on it.
+        progress: called with the fraction of the nodes that are done.
+    """
+    nodes = list(encoded.nodes)
+    children: list[list[int]] = [[] for _ in nodes]
+    for number, node in enumerate(nodes):
+        if node.parent is not None:
+            children[node.parent].append(number)
+    step = encoded.plan.parameters.lattice.step
+    regions = np.empty((len(nodes), 2, 3))
+    rasteriser = Rasteriser(gradients=False, threads=threads)
+    for number, node in enumerate(nodes):  # children come before their parents
+        corners = [corner for tile in node.tiles for corner in tile.corners(step)]
+        corners += [corner for child in children[number] for corner in regions[child]]
+        regions[number] = np.min(corners, axis=0), np.max(corners, axis=0)
+        if node.level == 0 or node.squares:
+            continue
+        cut = _reference(nodes, children, number, reference_splats)
+        coarse, fine = decode(encoded.part([node])), decode(encoded.part([nodes[one] for one in cut]))
+        radius = _radius(regions[number], fine)
+        squares = _squared_errors(rasteriser, coarse, fine, regions[number].mean(axis=0), radius)
+        below = _errors_below([(nodes[one], _radius(regions[one])) for one in cut], radius)
+        squares = (np.sqrt(squares) + np.sqrt(below)) ** 2
+        error = max(_first_alike(squares, radius), *(nodes[child].error for child in children[number]))
+        nodes[number] = replace(node, error=error, squares=tuple(squares.tolist()))
+        progress("measuring levels", (number + 1) / len(nodes))
+    return replace(encoded, nodes=nodes)
+
+
+def _reference(
+    nodes: Sequence[FileNode], children: Sequence[Sequence[int]], number: int, splat_count: int
+) -> list[int]:
+    """Return the finest level of the subtree of a node with at most as many splats, or the coarsest one."""
+    cut: list[int] = []
+    for level in range(nodes[number].level):
+        pending, cut = list(reversed(children[number])), []
+        while pending:
+            one = pending.pop()
+            if nodes[one].level > level:
+                pending += reversed(children[one])
+            else:
+                cut.append(one)
+        if sum(nodes[one].splat_count for one in cut) <= splat_count:
+            break
+    return cut
+
+
+def _radius(region: F64, splats: SplatModel | None = None) -> float:
+    """Return half the diagonal of a region, or, if that is 0, the largest standard deviation of splats."""
+    radius = float(np.linalg.norm(region[1] - region[0])) / 2.0
+    return radius if radius or splats is None else float(np.exp(np.float64(splats.scales.max())))
+
+
+def _errors_below(cut: Sequence[tuple[FileNode, float]], radius: float) -> F64:
+    """Return the squared errors of a level of a subtree at the pixel sizes of a node of this radius.
+
+    They are averages over the nodes, by the areas of their regions; for each, that of the next finer size measured.
+    """
+    total, area = np.zeros(_SIZES), 0.0
+    for node, own in cut:
+        area += own * own
+        if node.squares and own:
+            finer = np.arange(_SIZES) + math.floor(math.log2(radius / own))
+            total += own * own * np.array(node.squares)[np.clip(finer, 0, _SIZES - 1)]
+    return total / area if area else total
+
+
+def _first_alike(squares: F64, radius: float) -> float:
+    """Return the smallest pixel size from which on all have a small squared error, scene units, as float32."""
+    first = _SIZES - int(np.argmin([*(squares <= _SQUARED_ERROR_MAX)[::-1], False]))
+    return float(np.float32(radius * 2.0**first / _RADIUS_PIXELS))
+
+
+def _squared_errors(rasteriser: Rasteriser, coarse: SplatModel, fine: SplatModel, centre: F64, radius: float) -> F64:
+    """Return the mean squared error at each pixel size, finest first."""
+    squares, pixels = np.zeros(_SIZES), np.zeros(_SIZES, np.int64)
+    for camera in _cameras(centre, radius):
+        a, b = (_image(rasteriser, splats, camera) for splats in (coarse, fine))
+        # Averages are linear: those of the difference and of both alphas are all that is needed.
+        images = np.concatenate([a - b, a[3:], b[3:]])
+        for size in range(_SIZES):
+            covered = np.maximum(images[4], images[5]) >= np.float32(_COVERED)
+            error = np.einsum("cyx,cyx->yx", images[:4], images[:4])
+            squares[size] += float(np.sum(error[covered], dtype=np.float64)) / 4.0
+            pixels[size] += int(covered.sum())
+            images = _halved(images)
+    return squares / np.maximum(pixels, 1)
+
+
+def _image(rasteriser: Rasteriser, splats: SplatModel, camera: Camera) -> F32:
+    """Return red, green, blue and alpha, [4, H, W]."""
+    image = rasteriser.forward(splats, camera, antialiased=splats.antialiased)
+    return np.concatenate([np.clip(image.rgb, 0.0, 1.0).transpose(2, 0, 1), image.alpha[None]])
+
+
+def _halved(images: F32) -> F32:
+    """Return the averages of two by two pixels, [C, H // 2, W // 2]."""
+    side = images.shape[1] // 2 * 2
+    rows = images[:, 0:side:2] + images[:, 1:side:2]
+    return (rows[:, :, 0:side:2] + rows[:, :, 1:side:2]) * np.float32(0.25)
+
+
+def _cameras(centre: F64, radius: float) -> list[Camera]:
+    focal, middle = _DISTANCE * _RADIUS_PIXELS, _IMAGE_PIXELS / 2.0
+    K = np.array([[focal, 0.0, middle], [0.0, focal, middle], [0.0, 0.0, 1.0]])
+    cameras = []
+    for axis, sign in _DIRECTIONS:
+        away = np.zeros(3)
+        away[axis] = sign * _DISTANCE * radius
+        up = np.eye(3)[(axis + 1) % 3]
+        cameras.append(look_at(centre + away, centre, up, K, _IMAGE_PIXELS, _IMAGE_PIXELS, near=radius * 1e-3))
+    return cameras
