@@ -43,7 +43,7 @@ from csplat_tools.convert_file import convert_file
 from csplat_tools.encode_file import AUTO_LEVEL_SPLATS, choose_levels, encode_file
 from csplat_tools.level_builder import LevelBuilder, encode_with_levels
 from csplat_tools.level_errors import measure_errors
-from csplat_tools.level_fitting import MEASURED_SPLATS, LevelFitter, kd_groups, merge_neighbours
+from csplat_tools.level_fitting import LevelFitter, kd_groups, merge_neighbours
 from csplat_tools.scene_files import LoadedModel
 
 TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
@@ -476,12 +476,12 @@ def test_the_number_of_levels_is_the_one_asked_for(model):
 
 
 def test_fitted_levels_look_better_than_merged_ones(model):
-    """The largest scenes have merged levels, which are adjusted with less work."""
+    """Buckets of larger scenes have merged levels, which are adjusted with less work."""
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
     nodes, count = np.zeros(len(model), np.int64), len(model) // 4
     merged = merge_neighbours(model)
     coarse, measured = (
-        LevelFitter(model, size).fit(model, nodes, count, 1)[1] for size in (MEASURED_SPLATS + 1, count)
+        LevelFitter(model, size).fit(model, nodes, count, 1)[1] for size in (len(model) + 1, len(model))
     )
     scores = [scorer.psnr(splats) for splats in (merged, coarse, measured)]
     assert scores[0] + 1.0 < scores[1] < scores[2] - 1.0

@@ -56,8 +56,8 @@ class LevelBuilder:
         leaf_splats: maximum number of splats of a leaf; smaller leaves take more bytes, larger ones load later when
             they are seen.
         root_splats: maximum number of splats of the root, the first picture of a scene; 4,096 are about 50 kB.
-        whole_splats: number of splats up to which a scene is built in one piece. In five buckets, garden500k loses 5 dB
-            of 32 at level 1, since renders of a part show what other parts hide.
+        whole_splats: number of splats up to which a scene is built in one piece, with more work. Built like a bucket,
+            level 1 of garden500k has 24.7 instead of 32.0 dB.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
     """

@@ -1,8 +1,8 @@
 """Fit the splats of a level of detail: keep those that matter in renders, and adjust them to renders of the scene.
 
 Views around the scene become smaller from level to level, so that a level is as good as it can be at the pixel size at
-which it is shown. Work on a scene is bounded up to some million splats, and proportional to them beyond. In the largest
-scenes neighbouring splats are merged instead of chosen, since so few views tell too little about each splat.
+which it is shown. Work on a scene is bounded. In buckets of a larger scene, neighbouring splats are merged instead of
+chosen, and adjusted with less work, proportional to the splats.
 """
 
 from __future__ import annotations
@@ -28,14 +28,13 @@ _WIDTHS = (128, 640)  # pixels, the smallest and largest views of level 1
 _LEAST_WIDTH = 64
 # Work is bounded so that a million splats take five minutes. On garden500k, less than half of it costs 2 dB at level 1.
 _VIEWS = (40, 120)
-_SPLATS_TO_MEASURE = 6e7  # views times splats of the finer level of the whole scene
+_SPLATS_TO_MEASURE = 6e7  # views times splats of the finer level
 _STEPS = (100, 800)
-_SPLATS_TO_MOVE = 7.5e7  # steps times splats of the level of the whole scene
+_SPLATS_TO_MOVE = 7.5e7  # steps times splats of the level
 _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
 
-#: Number of splats of a scene above which neighbours are merged. A bucket of an aerial scene takes a quarter of the
-#: time then, and level 1 is at 28.6 instead of 33.9 dB; garden500k with as much work, 24.7 instead of 26.8 dB.
-MEASURED_SPLATS = 20_000_000
+# Buckets of larger scenes: neighbours are merged, since few views of a bucket leave holes where they see nothing. In an
+# aerial scene of 13.6 million splats, chosen in 40 views of each bucket, level 1 had 13 dB. A million take 50 CPU s.
 _MERGED = 4  # splats that become one
 _OPACITY_MAX = 0.99  # alpha that renderers cap at
 _MERGED_VIEWS, _MERGED_STEPS = 16, 60
@@ -47,7 +46,7 @@ class LevelFitter:
 
     Attributes:
         scene: a scene or a part of one, in whose renders levels are measured.
-        scene_count: number of splats of the whole scene, of whose work the part has a share.
+        scene_count: number of splats of the whole scene.
         threads: number of threads; `None`: all. No result depends on it.
         progress: called with the stage and the completed fraction.
     """
@@ -75,7 +74,7 @@ class LevelFitter:
         else:
             rows = self._choose(finer, nodes, count, used)
             nodes, chosen = nodes[rows], finer.select(rows)
-        steps = _MERGED_STEPS if self._merges else _between(_SPLATS_TO_MOVE * self._share / len(chosen), _STEPS)
+        steps = _MERGED_STEPS if self._merges else _between(_SPLATS_TO_MOVE / len(chosen), _STEPS)
         draw = renderer(self.scene, (0.0, 0.0, 0.0), threads=self.threads)
         fitted = refit_splats(
             chosen, used, [draw(camera).rgb for camera in used], steps=steps, moves=True, threads=self.threads,
@@ -86,18 +85,13 @@ class LevelFitter:
 
     @property
     def _merges(self) -> bool:
-        return self.scene_count > MEASURED_SPLATS
-
-    @property
-    def _share(self) -> float:
-        """The fraction of the work on the whole scene."""
-        return len(self.scene) / self.scene_count
+        return self.scene_count > len(self.scene)
 
     def _cameras(self, finer_count: int, level: int) -> tuple[list[Camera], list[Camera]]:
         """Return views for a level, and held-out ones."""
         widest = _between(math.sqrt(_PIXELS_PER_SPLAT * len(self.scene) / 3.0), _WIDTHS)
         width = max(_LEAST_WIDTH, widest >> (level - 1))
-        views = _MERGED_VIEWS if self._merges else _between(_SPLATS_TO_MEASURE * self._share / finer_count, _VIEWS)
+        views = _MERGED_VIEWS if self._merges else _between(_SPLATS_TO_MEASURE / finer_count, _VIEWS)
         checks = min(views // _CHECKS_EVERY, HELD_OUT_COUNT)
         cameras = camera_sequence(self.scene, views + checks, (width, width * 3 // 4))
         return cameras[checks:], cameras[:checks]
