@@ -207,7 +207,7 @@ export class TileStream {
     this.readOn();
   }
 
-  /** @param {boolean} isPaused whether nothing is requested */
+  /** @param {boolean} isPaused whether the scene is not seen: of a file with levels, only the coarsest version is read */
   pause(isPaused) {
     this.isPaused = isPaused;
     this.readOn();
@@ -232,9 +232,9 @@ export class TileStream {
     const places = new Set(parts.map(({ place }) => place));
     const due = new Set([...this.pending].filter(([place]) => places.has(place)).map(([, controller]) => controller));
     for (const controller of this.pending.values()) if (!due.has(controller)) controller.abort();
-    if (this.isPaused || this.isLost) return;
     // The coarsest version is requested alone, then one layer at a time, so that nothing else delays it.
-    const isFirst = this.hasLevels && parts.some(({ tile }) => this.roots.has(tile.index));
+    const isFirst = this.hasLevels && parts.some(({ tile, place }) => place.layer === 0 && this.roots.has(tile.index));
+    if (this.isLost || (this.isPaused && this.hasLevels && !isFirst)) return;
     const layer = parts[0]?.place.layer;
     const left = parts.filter(({ tile, place }) => {
       const isNext = place.layer === layer && (!isFirst || this.roots.has(tile.index));

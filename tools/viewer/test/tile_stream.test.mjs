@@ -1,6 +1,6 @@
 // The order in which a file is read, and the events on the way.
 import assert from 'node:assert/strict';
-import { readFileSync } from 'node:fs';
+import { readFileSync, readdirSync } from 'node:fs';
 import { test } from 'node:test';
 
 import { readHeader } from '../../../codec/js/decoder.mjs';
@@ -274,4 +274,33 @@ test('a lost connection is reported once and tried again', async () => {
       ['E_INPUT'],
     );
   });
+});
+
+test('a hidden page reads the coarsest version alone, and goes on when it is seen', async () => {
+  const sink = collector();
+  const stream = await TileStream.open(new Blob([LEVELS]), sink, AIMS, new AbortController().signal);
+  stream.pause(true);
+  stream.setView(viewFrom(-300));
+  await until(() => tilesIn(sink.events).length > 0);
+  await new Promise((resolve) => setTimeout(resolve, 20));
+  const coarsest = Math.max(...levelOf.values());
+  assert.ok(tilesIn(sink.events).every((tile) => levelOf.get(tile) === coarsest));
+  const done = new Promise((resolve) => (sink.resolve = resolve));
+  stream.pause(false);
+  await done;
+  assert.equal(tilesIn(sink.events).length, levelOf.size);
+});
+
+test('of every file with levels, what a view requires arrives, whatever the view', { timeout: 60_000 }, async () => {
+  const names = readdirSync(new URL('valid/', VECTORS)).filter((name) => name.startsWith('levels'));
+  assert.ok(names.length > 10);
+  for (const name of names) {
+    const data = bytes(`valid/${name.replace('.csplat', '')}`);
+    const aims = { ...AIMS, pixels: 1 };
+    const stream = await TileStream.open(new Blob([data]), collector(), aims, new AbortController().signal);
+    for (const z of [-1e4, -300, -30, -3, 0, 50]) {
+      await seen(stream, viewFrom(z));
+      assert.ok(stream.here.size > 0);
+    }
+  }
 });
