@@ -300,7 +300,7 @@ export class Reader {
     const records = this.header.directory.filter(
       ({ type }) => type !== spec.CHUNK_CODEBOOK && type !== spec.CHUNK_TREE && Object.hasOwn(spec.CHUNK_NAMES, type),
     );
-    this.source.prefetch?.(records, signal);
+    for (const record of records) this.source.prefetch?.([record], signal); // at once, without what is between them
     for (const record of records) {
       await describe(description, record, this.opened(await this.fetch(record, signal), record), scene);
     }
