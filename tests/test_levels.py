@@ -532,6 +532,20 @@ def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(model):
     assert splats.opacities[kept == 1].min() >= np.sort(scene.opacities[600:])[-76]
 
 
+class Crowded(LevelFitter):
+    """A fitter whose scene has too many splats at one place for the renderer."""
+
+    def _fit(self, *_args):
+        raise LimitError("MAX_INTERSECTIONS", 2)
+
+
+def test_what_cannot_be_rendered_is_merged(model):
+    nodes = np.arange(len(model)) // 600
+    kept, splats = Crowded(model, len(model)).fit(model, nodes, 300, 1)
+    assert len(kept) == len(splats) == len(model) // 4
+    assert {*nodes} == {*kept}
+
+
 def test_a_node_that_is_its_splats_has_the_smallest_error(model):
     """A parent with the splats of its only child looks like it at every pixel size."""
     rows = np.arange(len(model))

@@ -16,6 +16,7 @@ import numpy as np
 from csplat.decoder import decode
 from csplat.encoder import EncodedTiles
 from csplat.encoder.container import FileNode
+from csplat.errors import LimitError
 from csplat.model import SplatModel
 from csplat.types import F32, F64, Progress, null_progress
 from csplat_render.camera import Camera, look_at
@@ -67,7 +68,10 @@ def measure_errors(
         cut = _reference(nodes, children, number, reference_splats)
         coarse, fine = decode(encoded.part([node])), decode(encoded.part([nodes[one] for one in cut]))
         radius = _radius(regions[number], fine)
-        squares = _squared_errors(rasteriser, coarse, fine, regions[number].mean(axis=0), radius)
+        try:
+            squares = _squared_errors(rasteriser, coarse, fine, regions[number].mean(axis=0), radius)
+        except LimitError:  # too many splats at one place to be rendered: as different as can be
+            squares = np.ones(_SIZES)
         below = _errors_below([(nodes[one], _radius(regions[one])) for one in cut], radius)
         squares = (np.sqrt(squares) + np.sqrt(below)) ** 2
         error = max(_first_alike(squares, radius), *(nodes[child].error for child in children[number]))

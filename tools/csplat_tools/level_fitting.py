@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import covariance_entries, mean_axes
+from csplat.errors import LimitError
 from csplat.model import SplatModel
 from csplat.scene_source import join_blocks
 from csplat.types import F32, F64, I64, Progress, null_progress
@@ -57,7 +58,7 @@ class LevelFitter:
     progress: Progress = null_progress
 
     def fit(self, finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
-        """Choose or merge splats, and adjust them.
+        """Choose or merge splats, and adjust them; merge them alone if there are too many in a view to be rendered.
 
         Args:
             finer: the next finer level.
@@ -68,6 +69,12 @@ class LevelFitter:
         Returns:
             The node of each splat of the level, and the splats.
         """
+        try:
+            return self._fit(finer, nodes, count, level)
+        except LimitError:
+            return merge_by_node(finer, nodes)
+
+    def _fit(self, finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
         used, check = self._cameras(len(finer), level)
         if self._merges:
             nodes, chosen = merge_by_node(finer, nodes)
