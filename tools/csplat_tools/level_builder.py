@@ -19,21 +19,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.encoder import (
+    BUCKET_SPLATS,
     EncodedTiles,
     EncodeOptions,
     EncodePlan,
     EncodeResult,
+    FileCodebooks,
     Importance,
     LevelNode,
     Origin,
     Target,
+    bucket_rows,
     encode_levels,
     encode_with_report,
     meet_bounds,
 )
-from csplat.encoder.buckets import bucket_rows
-from csplat.encoder.encode_options import BUCKET_SPLATS
-from csplat.encoder.sh_codebook import FileCodebooks
 from csplat.formats import open_scene
 from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel

@@ -14,8 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from csplat.decoder import decode
-from csplat.encoder import EncodedTiles
-from csplat.encoder.container import FileNode
+from csplat.encoder import EncodedTiles, FileNode
 from csplat.errors import LimitError
 from csplat.model import SplatModel
 from csplat.types import F32, F64, Progress, null_progress

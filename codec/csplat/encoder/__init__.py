@@ -7,8 +7,18 @@ callers that tune all values. `encode_levels` adds levels of detail.
 
 from __future__ import annotations
 
+from csplat.encoder.buckets import bucket_rows
+from csplat.encoder.container import FileNode
 from csplat.encoder.encode_api import encode, encode_with_report
-from csplat.encoder.encode_options import PRESETS, Deflate, EncodeOptions, MeansCoding, PresetName, ShCoding
+from csplat.encoder.encode_options import (
+    BUCKET_SPLATS,
+    PRESETS,
+    Deflate,
+    EncodeOptions,
+    MeansCoding,
+    PresetName,
+    ShCoding,
+)
 from csplat.encoder.encode_plan import EncodePlan, Origin
 from csplat.encoder.error_bounds import covariance_entries
 from csplat.encoder.error_targets import meet_bounds
@@ -18,11 +28,13 @@ from csplat.encoder.levels import LevelNode, encode_levels
 from csplat.encoder.pipeline import EncodedTiles, EncodeReport, EncodeResult, encode_tiles
 from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.quantisation_classes import max_class_count
+from csplat.encoder.sh_codebook import FileCodebooks
 from csplat.encoder.shape_codebook import mean_axes
 from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor
 from csplat.encoder.target import SearchReport, Target
 
 __all__ = [
+    "BUCKET_SPLATS",
     "PRESETS",
     "DecodedValues",
     "Deflate",
@@ -31,6 +43,8 @@ __all__ = [
     "EncodeReport",
     "EncodeResult",
     "EncodedTiles",
+    "FileCodebooks",
+    "FileNode",
     "FixedQuantisation",
     "FreeValues",
     "GaussNewtonBlocks",
@@ -43,6 +57,7 @@ __all__ = [
     "ShCoding",
     "Target",
     "apply_weight_floor",
+    "bucket_rows",
     "canonicalise_shape",
     "cluster",
     "covariance_entries",
