@@ -41,9 +41,10 @@ from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_level
 from csplat_tools.convert_file import convert_file
 from csplat_tools.encode_file import AUTO_LEVEL_SPLATS, choose_levels, encode_file
-from csplat_tools.level_builder import LevelBuilder, encode_with_levels
+from csplat_tools.level_builder import LevelBuilder, encode_with_levels, kd_groups
 from csplat_tools.level_errors import measure_errors
-from csplat_tools.level_fitting import LevelFitter, kd_groups, merge_neighbours
+from csplat_tools.level_fitting import LevelFitter
+from csplat_tools.level_merging import merge_neighbours
 from csplat_tools.scene_files import LoadedModel
 
 TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
@@ -61,11 +62,15 @@ def model(sample_path):
 def data(model):
     """A file of four leaves in two levels above, with errors that grow."""
     leaves = kd_groups(model.means, 4)
-    halves = [merge_neighbours(model.select(np.concatenate(leaves[at : at + 2]))) for at in (0, 2)]
+    halves = [quarter(model.select(np.concatenate(leaves[at : at + 2]))) for at in (0, 2)]
     nodes = [LevelNode(0, 4 + number // 2, rows=rows) for number, rows in enumerate(leaves)]
     nodes += [LevelNode(1, 6, splats=half, error=error) for half, error in zip(halves, (0.5, 0.25), strict=True)]
-    nodes.append(LevelNode(2, None, splats=merge_neighbours(halves[0]), error=1.0))
+    nodes.append(LevelNode(2, None, splats=quarter(halves[0]), error=1.0))
     return encode_levels(EncodePlan.of(model), nodes).write().data
+
+
+def quarter(splats):
+    return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4))[1]
 
 
 def same(one, other):
@@ -279,7 +284,7 @@ def test_a_version_of_both_levels_has_no_extra_columns(model):
     nodes = [
         LevelNode(0, 2, rows=left),
         LevelNode(0, None, rows=right),
-        LevelNode(1, None, splats=replace(merge_neighbours(model.select(left)), extra={}), error=1.0),
+        LevelNode(1, None, splats=replace(quarter(model.select(left)), extra={}), error=1.0),
     ]
     data = encode_levels(EncodePlan.of(scene, EncodeOptions(keep_extra=True)), nodes).write().data
     with open_scene(data, max_splats=len(model) - 1) as opened:
@@ -401,7 +406,7 @@ def test_level_0_of_a_file_is_the_scene_with_the_errors_of_a_plain_file(data, mo
 def test_files_with_levels_are_valid_with_any_options(model, options):
     leaves = kd_groups(model.means, 2)
     nodes = [LevelNode(0, 2, rows=rows) for rows in leaves]
-    nodes.append(LevelNode(7, None, splats=merge_neighbours(model), error=2.0))
+    nodes.append(LevelNode(7, None, splats=quarter(model), error=2.0))
     data = encode_levels(EncodePlan.of(model, EncodeOptions(**options)), nodes).write().data
     assert () == tuple(validate(data).violations)
     assert len(model) == len(decode(data))
@@ -430,16 +435,22 @@ def test_groups_hold_each_point_once_and_are_of_equal_size(count, parts):
     assert list(range(count)) == sorted(np.concatenate(groups).tolist())
 
 
+def splats_at(means, opacities, log_sizes, colours):
+    """Return round splats without SH."""
+    quats = np.zeros((len(means), 4), np.float32)
+    quats[:, 0] = 1.0
+    return csplat.SplatModel(
+        means=np.array(means, np.float32), quats=quats, opacities=np.array(opacities, np.float32),
+        scales=np.repeat(np.array(log_sizes, np.float32)[:, None], 3, axis=1), sh0=np.array(colours, np.float32),
+        shN=np.zeros((len(means), 0, 3), np.float32),
+    )  # fmt: skip
+
+
 def test_merged_splats_keep_mean_covariance_and_light():
     """Two equal splats next to each other, on the x axis: variance 1 + 1 along it."""
-    quats = np.zeros((2, 4), np.float32)
-    quats[:, 0] = 1.0
-    two = csplat.SplatModel(
-        means=np.array([[-1, 0, 0], [1, 0, 0]], np.float32), quats=quats, scales=np.zeros((2, 3), np.float32),
-        opacities=np.full(2, 0.25, np.float32), sh0=np.array([[1, 0, 0], [0, 1, 0]], np.float32),
-        shN=np.zeros((2, 0, 3), np.float32),
-    )  # fmt: skip
-    one = merge_neighbours(two)
+    two = splats_at([[-1, 0, 0], [1, 0, 0]], [0.25, 0.25], [0.0, 0.0], [[1, 0, 0], [0, 1, 0]])
+    nodes, one = merge_neighbours(two, np.array([7, 7]), 1)
+    assert [7] == nodes.tolist()
     assert 1 == len(one)
     assert [0.0, 0.0, 0.0] == one.means[0].tolist()
     assert [0.5, 0.5, 0.0] == one.sh0[0].tolist()
@@ -447,6 +458,41 @@ def test_merged_splats_keep_mean_covariance_and_light():
     assert deviations == pytest.approx([1.0, 1.0, math.sqrt(2.0)], rel=1e-6)
     area = (2.0 * math.sqrt(2.0) + 1.0) / 3.0
     assert one.opacities[0] == pytest.approx(2 * 0.25 / area, rel=1e-6)
+
+
+def test_splats_grow_by_half_of_what_no_opacity_can_carry():
+    """Four times the light of an opaque splat at one place: opacity 0.99, twice the area."""
+    four = splats_at([[0, 0, 0]] * 4, [0.99] * 4, [0.0] * 4, [[0, 0, 0]] * 4)
+    one = merge_neighbours(four, np.zeros(4, np.int64), 1)[1]
+    assert np.float32(0.99) == one.opacities[0]
+    assert np.exp(2.0 * one.scales[0]) == pytest.approx([2.0] * 3, rel=1e-5)
+
+
+def test_pairs_that_look_alike_are_merged_first_and_never_across_nodes():
+    """Four in a row: the two red ones, although the blue one is as near, and no red one of another node."""
+    red, blue = [1, 0, 0], [-1, -1, 1]
+    means = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]
+    row = splats_at(means, [0.5] * 4, [-0.5] * 4, [blue, red, red, blue])
+    nodes, merged = merge_neighbours(row, np.zeros(4, np.int64), 3)
+    assert [0.0, 1.5, 3.0] == sorted(merged.means[:, 0].tolist())
+    nodes, merged = merge_neighbours(row, np.array([0, 0, 1, 1]), 1)
+    assert [0, 1] == nodes.tolist()
+    assert [0.5, 2.5] == sorted(merged.means[:, 0].tolist())
+
+
+@given(seed=st.integers(0, 1000), count=st.integers(1, 60), spread=st.sampled_from([0.0, 1e-3, 1.0, 1e5]))
+def test_any_splats_are_merged_to_the_number_asked_for(seed, count, spread):
+    """Also at one place or far apart, without opacity, huge or tiny."""
+    rng = np.random.default_rng(seed)
+    scene = splats_at(
+        rng.normal(size=(60, 3)) * spread, rng.choice([0.0, 0.003, 1.0], 60), rng.uniform(-20, 20, 60),
+        rng.normal(size=(60, 3)) * 3.0,
+    )  # fmt: skip
+    nodes, splats = merge_neighbours(scene, np.zeros(60, np.int64), count)
+    assert count == len(splats) == len(nodes)
+    for name in ("means", "quats", "scales", "opacities", "sh0"):
+        assert np.isfinite(getattr(splats, name)).all()
+    assert splats.opacities.max(initial=0.0) <= 1.0
 
 
 def test_a_built_tree_has_a_quarter_of_the_splats_on_each_level_and_growing_errors(model):
@@ -476,15 +522,12 @@ def test_the_number_of_levels_is_the_one_asked_for(model):
 
 
 def test_fitted_levels_look_better_than_merged_ones(model):
-    """Buckets of larger scenes have merged levels, which are adjusted with less work."""
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
     nodes, count = np.zeros(len(model), np.int64), len(model) // 4
-    merged = merge_neighbours(model)
-    coarse, measured = (
-        LevelFitter(model, size).fit(model, nodes, count, 1)[1] for size in (len(model) + 1, len(model))
-    )
-    scores = [scorer.psnr(splats) for splats in (merged, coarse, measured)]
-    assert scores[0] + 1.0 < scores[1] < scores[2] - 1.0
+    fitters = LevelFitter(model, True), LevelFitter(model)
+    levels = [quarter(model), *(one.fit(model, nodes, count, 1)[1] for one in fitters)]
+    scores = [scorer.psnr(splats) for splats in levels]
+    assert scores[0] + 0.5 < scores[1] < scores[2]
 
 
 def test_levels_are_the_same_each_time_and_at_any_number_of_threads(model):
@@ -525,7 +568,7 @@ def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(model):
     )
     scene = replace(join_blocks(wall, [wall, hidden]), means_double=None)
     nodes = np.repeat([0, 1, 2], [600, 199, 1])
-    kept, splats = LevelFitter(scene, len(scene)).fit(scene, nodes, 200, 1)
+    kept, splats = LevelFitter(scene).fit(scene, nodes, 200, 1)
     assert len(kept) == len(splats) <= 202
     assert {0, 1, 2} == set(kept)
     assert 25 <= np.count_nonzero(kept == 1) <= 75
@@ -539,9 +582,9 @@ class Crowded(LevelFitter):
         raise LimitError("MAX_INTERSECTIONS", 2)
 
 
-def test_what_cannot_be_rendered_is_merged(model):
+def test_what_cannot_be_rendered_is_quarter(model):
     nodes = np.arange(len(model)) // 600
-    kept, splats = Crowded(model, len(model)).fit(model, nodes, 300, 1)
+    kept, splats = Crowded(model).fit(model, nodes, 300, 1)
     assert len(kept) == len(splats) == len(model) // 4
     assert {*nodes} == {*kept}
 

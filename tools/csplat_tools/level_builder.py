@@ -2,9 +2,9 @@
 
 Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent; above the last common one,
 a chain of nodes goes on to a few thousand splats. Each level has a quarter of the splats of the finer one, those that
-matter most, fitted to renders (`level_fitting.py`). Larger scenes are built bucket by bucket, until each is one node;
-these nodes together are the scene whose levels are built next. Levels that a scene has already, in streamed SOG, are
-taken instead.
+matter most, fitted to renders (`level_fitting.py`). Larger scenes are built bucket by bucket, of merged neighbours,
+until each is one node; these nodes together are the scene whose levels are built next. Levels that a scene has already,
+in streamed SOG, are taken instead.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
 from csplat.plugins import load_plugins
 from csplat.scene_source import join_blocks
-from csplat.types import I64, Progress, null_progress
+from csplat.types import F32, I64, Progress, null_progress
 from csplat_tools.level_errors import measure_errors
-from csplat_tools.level_fitting import LevelFitter, kd_groups
+from csplat_tools.level_fitting import PART_WORK, LevelFitter
 
 _KEPT = 4  # splats of a level, divided by those of the coarser one
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
@@ -107,11 +107,11 @@ class LevelBuilder:
         if not len(model):
             return []
         if len(model) <= self.whole_splats:
-            return self._build_leaves(model, LevelFitter(_plain(model), len(model), threads, progress), self.count)
+            return self._build_leaves(model, LevelFitter(_plain(model), threads=threads, progress=progress), self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
         buckets = bucket_rows(model.means, self.bucket_splats)
         for done, rows in enumerate(buckets):
-            part = self.build_part(model.select(rows), len(model), threads)
+            part = self.build_part(model.select(rows), threads)
             numbers.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
             roots.append(join_roots(part))
             nodes += [_moved(node, len(nodes), rows) for node in part]
@@ -122,9 +122,9 @@ class LevelBuilder:
                 nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
         return nodes + [_moved(node, len(nodes)) for node in top]
 
-    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
-        """Build the nodes of a bucket of a scene of `scene_count` splats, up to one node or the last level."""
-        fitter = LevelFitter(_plain(splats), scene_count, threads)
+    def build_part(self, splats: SplatModel, threads: int | None) -> list[LevelNode]:
+        """Build the nodes of a bucket, up to one node or the last level."""
+        fitter = LevelFitter(_plain(splats), True, PART_WORK, threads)
         return self._build_leaves(splats, fitter, self._part_levels)
 
     def build_top(
@@ -146,7 +146,9 @@ class LevelBuilder:
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
-        nodes = self._add_levels(nodes, scene, places, LevelFitter(scene, len(scene), threads, progress), self.count)
+        nodes = self._add_levels(
+            nodes, scene, places, LevelFitter(scene, True, threads=threads, progress=progress), self.count
+        )
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
         return [node.parent for node in nodes[: len(parts)]], nodes[len(parts) :]
 
@@ -246,6 +248,34 @@ def join_roots(nodes: Sequence[LevelNode]) -> SplatModel:
     """Return the splats of the nodes without parents, all above level 0."""
     roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
     return join_blocks(roots[0], roots)
+
+
+def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
+    """Cut points at the medians of the longest sides of their boxes.
+
+    Args:
+        points: [N, 3].
+        count: number of groups, 1 to N.
+
+    Returns:
+        Rows of each group, in spatial order; their numbers differ by 1 at most.
+    """
+    order = np.arange(len(points))
+    sizes = np.array([len(points)], np.int64)  # points in each box
+    counts = np.array([count], np.int64)  # groups in each box
+    while counts.max() > 1:
+        starts = np.cumsum(sizes) - sizes
+        inside = points[order]
+        sides = np.maximum.reduceat(inside, starts) - np.minimum.reduceat(inside, starts)
+        box = np.repeat(np.arange(len(sizes)), sizes)
+        along = inside[np.arange(len(points)), sides.argmax(axis=1)[box]]
+        order = order[np.lexsort((along, box))]
+        near = counts // 2
+        splats = sizes * near // counts
+        sizes = np.stack([splats, sizes - splats], axis=1).reshape(-1)
+        counts = np.stack([near, counts - near], axis=1).reshape(-1)
+        sizes, counts = sizes[counts > 0], counts[counts > 0]
+    return np.split(order, np.cumsum(sizes)[:-1])
 
 
 def _plain(model: SplatModel) -> SplatModel:

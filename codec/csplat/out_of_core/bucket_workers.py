@@ -54,8 +54,8 @@ class LevelMaker(Protocol):
         """Encode a scene with its levels, in memory."""
         ...
 
-    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
-        """Build the nodes of a bucket of a scene of `scene_count` splats."""
+    def build_part(self, splats: SplatModel, threads: int | None) -> list[LevelNode]:
+        """Build the nodes of a bucket."""
         ...
 
     def build_top(
@@ -86,14 +86,12 @@ class BucketCoding:
         folder: the working folder.
         plan: the complete plan, without splats.
         codebooks: codebooks trained on the sample, without the assignment of its splats.
-        scene_count: number of splats of the scene.
         levels: builds levels of detail; `None`: there are none.
     """
 
     folder: Path
     plan: EncodePlan
     codebooks: FileCodebooks
-    scene_count: int
     levels: LevelMaker | None = None
 
 
@@ -176,7 +174,7 @@ def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
     codebooks = replace(coding.codebooks, sh_plan=sh_plan)
     if coding.levels is None:
         return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), codebooks)
-    nodes = coding.levels.build_part(model, coding.scene_count, threads)
+    nodes = coding.levels.build_part(model, threads)
     roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
     write_splats(roots_path(coding.folder, bucket), join_blocks(roots[0], roots))
     return coding.levels.measure(encode_levels(plan, nodes, codebooks), threads, null_progress)

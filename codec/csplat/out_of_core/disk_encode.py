@@ -251,9 +251,7 @@ def _encode_buckets(
         store.remove_section(section)
     done = count - sum(one.stop - one.start for one in left)
     threads = options.threads if workers == 1 and cluster is None else 1
-    coding = BucketCoding(
-        store.folder, replace(plan, options=replace(options, threads=threads)), codebooks, count, levels
-    )
+    coding = BucketCoding(store.folder, replace(plan, options=replace(options, threads=threads)), codebooks, levels)
     for bucket in code_buckets(coding, left, workers, cluster):
         uncoded[bucket.section] -= 1
         if not uncoded[bucket.section]:

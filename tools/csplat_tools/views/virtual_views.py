@@ -59,6 +59,8 @@ _OBJECT_OFFSET = 0.2  # largest offset of a camera's target from the centre, per
 _AROUND_DISTANCE = (0.35, 1.45)  # the same for surrounding scenes
 _AROUND_HEIGHT = (-0.12, 0.7)
 _AROUND_OFFSET = 0.35
+_BODY = (1.0, 99.0)  # percentiles of positions along each axis; cameras outside look at the middle of this box
+_OUTSIDE_DISTANCE = (1.3, 2.5)  # half diagonals of the box
 _OUTWARDS = 5  # every Nth view looks away from the middle of a surrounding scene
 _GOOD_DETAIL = 0.4  # least detail as a fraction of the best view's; views of walls from behind are useless
 _CANDIDATES = 3  # candidates per view
@@ -107,6 +109,20 @@ def camera_sequence(model: SplatModel, count: int, size: tuple[int, int] = VIEW_
     good = np.flatnonzero(details >= _GOOD_DETAIL * best)
     rest = np.setdiff1d(np.argsort(-details, kind="stable"), good, assume_unique=True)
     return [cameras[i] for i in [*good, *rest][:count]]
+
+
+def cameras_outside(model: SplatModel, count: int, size: tuple[int, int] = VIEW_SIZE, *, seed: int = 0) -> list[Camera]:
+    """Place virtual cameras outside of a part of a scene, on all sides; arguments as for `camera_sequence`."""
+    frame, K = scene_frame(model), intrinsics(*size, FIELD_OF_VIEW)
+    low, high = np.percentile(model.means.astype(np.float64), _BODY, axis=0)
+    centre = (low + high) / 2.0
+    radius = float(np.sqrt(np.sum((high - low) ** 2))) / 2.0 or frame.extent
+    cameras = []
+    for point in _sequence(count, seed):
+        along = direction_at(frame.up, 360.0 * point[0], math.degrees(math.asin(2.0 * point[1] - 1.0)))
+        eye = centre + radius * _between(_OUTSIDE_DISTANCE, point[2]) * along
+        cameras.append(look_at(eye, centre, frame.up, K, *size, frame.near))
+    return cameras
 
 
 def shrink_cameras(cameras: Sequence[Camera], size: tuple[int, int] = VIEW_SIZE) -> list[Camera]:

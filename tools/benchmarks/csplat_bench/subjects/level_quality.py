@@ -8,6 +8,7 @@ cameras.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,7 +33,7 @@ from csplat_render.metrics import psnr_of_mse, ssim
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.level_builder import LevelBuilder
-from csplat_tools.level_fitting import merge_neighbours
+from csplat_tools.level_merging import merge_neighbours
 
 _CAMERAS = 8
 _SHARE = 0.25  # splats of a level, as a share of the finer one
@@ -55,7 +56,7 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
         if maker == "merged":
             levels, splats = dict[int, SplatModel](), model
             while len(splats) > LevelBuilder.root_splats:
-                splats = merge_neighbours(splats)
+                splats = merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(_SHARE * len(splats)))[1]
                 levels[len(levels) + 1] = splats
             return levels, time.perf_counter() - start
         parts: dict[int, list[SplatModel]] = {}
