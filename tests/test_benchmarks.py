@@ -609,7 +609,7 @@ def test_levels_are_compared_at_their_size(sample_path, tmp_path):
         with pytest.raises(AbsentError, match="coarser levels"):
             measure({"maker": "merged", "level": 9})
     assert fitted["level_splats"] == pytest.approx(fitted["splats"] / 4, rel=0.01)
-    assert fitted["psnr"] > merged["psnr"] + 3.0
+    assert fitted["psnr"] > merged["psnr"] + 2.0
     assert fitted["ssim"] > merged["ssim"]
     assert fitted["seconds"] > merged["seconds"] > 0.0
 

@@ -44,8 +44,8 @@ _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20
 # Levels of detail: memory of building those of a bucket, for each process: renders, a multiple of the size of its
 # arrays, and bytes per splat; seconds per splat of one process; size of the file relative to one without.
 _LEVEL_RENDERS, _LEVEL_ROWS, _LEVEL_SPLAT = 200 * _MB, 2.0, 600
-_LEVEL_SECONDS = 5e-5
-_LEVEL_WHOLE = 6  # factor for scenes built in one piece, whose levels are fitted with more work
+_LEVEL_SECONDS = 8e-5
+_LEVEL_WHOLE = 4  # factor for scenes built in one piece, whose levels are fitted with more work
 _LEVEL_SIZE = 1.35
 #: Bytes per splat of a file, by preset and SH degree 0 to 4.
 _FILE_BYTES = {
