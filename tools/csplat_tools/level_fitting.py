@@ -30,7 +30,7 @@ _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
 
 @dataclass(frozen=True)
 class Work:
-    """How much is done for each level.
+    """Bounds the work on each level.
 
     Attributes:
         splats_to_measure: number of views times splats of the finer level, within the bounds of views.

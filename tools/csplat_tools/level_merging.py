@@ -22,8 +22,8 @@ from csplat_render.kernels import kernel
 
 _NEIGHBOURS = 8  # with which a splat may be merged; 16 gain 0.1 dB at level 1, and take twice as long
 # Splats that a pass keeps: three passes leave a quarter. Levels 1 and 3 of fox120k: 35.7 and 21.6 dB; with five passes
-# 35.9 and 20.2, since clumps of unmerged splats stay; with two 33.9 and 22.1, since bad pairs are merged, too. Level 1
-# of lego60k: 32.0, 32.3 and 28.2 dB.
+# 35.9 and 20.2, since clumps of unmerged splats stay; with two 33.9 and 22.1, since bad pairs are merged too. For level
+# 1 of lego60k: 32.0, 32.3 and 28.2 dB.
 _KEPT = 0.629
 # A cost is divided by this power of the squared sum of both images. With 0, all small splats are merged before any
 # large one, and with 1, size does not count. Level 1 of fox120k: 34.3 dB (0), 35.4 (0.5), 35.8 (1); of lego60k: 31.9,
@@ -36,9 +36,9 @@ _GROWTH = 0.5
 _OPACITY_MAX = 0.99  # alpha that renderers cap at
 _THINNEST = 1e-3  # least standard deviation, divided by the largest, so that a flat splat has an image from the side
 _SINGULAR = 1e-12  # least determinant of a covariance, divided by the product of its variances
-_TIE = 1e-9  # largest distance by which splats at one place are told apart, divided by the side of their node
+_TIE = 1e-9  # largest distance added between splats at one place, divided by the side of their node
 _BLOCK = 1 << 14  # edges at once, so that temporary arrays stay in the cache
-_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of the entries of a covariance
+_AXES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # row and column of each entry of a covariance
 _VIEWS = (((0, 1), (0, 3, 1)), ((0, 2), (0, 4, 2)), ((1, 2), (1, 5, 2)))  # axes of an image, entries of its covariances
 _TINY = np.finfo(np.float64).tiny
 
@@ -80,6 +80,7 @@ def _pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
 
 @kernel
 def _pair_up(edges: Any, order: Any, most: int, partners: Any) -> None:
+    """Set the partners of splats, in this order of edges, if both have none; at `most` as many pairs."""
     count = 0
     for edge in order:
         if count == most:
@@ -123,6 +124,7 @@ def _costs(splats: SplatModel, edges: I64) -> F64:
 
 
 def _block_costs(means: F32, covariances: F64, amplitudes: F64, light: F64, edges: I64) -> F64:
+    """Return the cost of each edge; amplitudes are red, green, blue and alpha of each splat, [N, 4]."""
     one, other = edges
     a, b = amplitudes[one], amplitudes[other]
     aa, bb, ab = (np.einsum("nc,nc->n", left, right) for left, right in ((a, a), (b, b), (a, b)))
