@@ -17,7 +17,7 @@ from csplat.model import SplatModel
 from csplat.types import I64, Progress, null_progress
 from csplat_render.camera import Camera
 from csplat_render.scorer import Scorer, renderer
-from csplat_tools.level_merging import areas, merge_neighbours
+from csplat_tools.level_merging import light_of, merge_neighbours
 from csplat_tools.views import HELD_OUT_COUNT, camera_sequence, cameras_outside
 from csplat_trainer.pruning import MeasuredViews, PruningOrder, total_error
 from csplat_trainer.splat_refit import refit_splats
@@ -121,7 +121,7 @@ class LevelFitter:
             for part in (cameras[::2], cameras[1::2])
         ]
         # No view tells unseen splats apart: as many of them go, those of the least opacity times area.
-        light = finer.opacities * areas(finer.scales)
+        light = light_of(finer)
         unseen = np.flatnonzero(~total_error(groups).seen)
         unseen = unseen[np.argsort(-light[unseen], kind="stable")]
         left = np.delete(np.arange(len(finer)), unseen[len(unseen) * count // len(finer) :])

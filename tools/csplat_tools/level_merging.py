@@ -116,7 +116,7 @@ def _costs(splats: SplatModel, edges: I64) -> F64:
     covariances = covariance_entries(splats.quats.T, np.exp(2.0 * scales).T)
     colours = np.maximum(SH_C0 * splats.sh0 + 0.5, 0.0)
     amplitudes = splats.opacities[:, None] * np.column_stack([colours, np.ones(len(splats))])
-    light = _light(splats)
+    light = light_of(splats)
     blocks = (edges[:, at : at + _BLOCK] for at in range(0, edges.shape[1], _BLOCK))
     return np.concatenate(
         [np.zeros(0), *(_block_costs(splats.means, covariances, amplitudes, light, block) for block in blocks)]
@@ -138,7 +138,7 @@ def _block_costs(means: F32, covariances: F64, amplitudes: F64, light: F64, edge
             share * one_entry + (1.0 - share) * other_entry + apart * offset
             for one_entry, other_entry, offset in zip(first, second, (x * x, x * y, y * y), strict=True)
         )
-        sizes = [np.sqrt(_determinant(one)) for one in (first, second, both)]
+        sizes = [np.sqrt(_determinant(shape)) for shape in (first, second, both)]
         # The image of the merged splat has the sum of both volumes: of these amplitudes, as multiples of a and b.
         s, t = sizes[0] / sizes[2], sizes[1] / sizes[2]
         with_first = _overlap(first, both, (1.0 - share) * x, (1.0 - share) * y)
@@ -176,7 +176,7 @@ def _determinant(entries: tuple[F64, ...]) -> F64:
 def _merged(splats: SplatModel, pairs: I64) -> SplatModel:
     """Return all splats, of which the first ones of the pairs stand for both."""
     two = [splats.select(rows) for rows in pairs]
-    light = [_light(part) for part in two]
+    light = [light_of(part) for part in two]
     share = light[0] / (light[0] + light[1])
 
     def averaged(one: NDArray[np.floating], other: NDArray[np.floating]) -> F64:
@@ -190,7 +190,7 @@ def _merged(splats: SplatModel, pairs: I64) -> SplatModel:
     trace = np.maximum(covariances[:3].sum(axis=0), _TINY)
     quats, scales = mean_axes(covariances / trace)
     scales = (scales + 0.5 * np.log(trace)[:, None]).astype(np.float32)
-    opacities = (light[0] + light[1]) / areas(scales)
+    opacities = (light[0] + light[1]) / _areas(scales)
     growth = np.maximum(opacities / _OPACITY_MAX, 1.0) ** _GROWTH
     values: dict[str, NDArray[np.floating]] = {
         "means": averaged(two[0].means, two[1].means),
@@ -206,12 +206,12 @@ def _merged(splats: SplatModel, pairs: I64) -> SplatModel:
     return replace(splats, **changed)
 
 
-def _light(splats: SplatModel) -> F64:
-    """Return opacity × area, above 0."""
-    return np.maximum(splats.opacities * areas(splats.scales), _TINY)
+def light_of(splats: SplatModel) -> F64:
+    """Return opacity × area of each splat, above 0."""
+    return np.maximum(splats.opacities * _areas(splats.scales), _TINY)
 
 
-def areas(scales: F32) -> F64:
+def _areas(scales: F32) -> F64:
     """Return the areas of the projections of ellipsoids, averaged over directions, up to a factor (Knud Thomsen)."""
     a, b, c = np.exp(scales.astype(np.float64)).T
     return np.asarray((a * b + a * c + b * c) / 3.0)
