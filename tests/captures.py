@@ -22,13 +22,15 @@ from scipy.spatial.transform import Rotation
 from csplat import EncodeOptions, Target, write_ply
 from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
-from csplat_render.camera import intrinsics, look_at, resized
+from csplat_render.camera import intrinsics, look_at, orbit, resized
+from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import renderer
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.target_encoding import meet_target
 from csplat_tools.training import training_run
 from csplat_tools.training.training_run import tuning_after
 from csplat_tools.views import BLACK, ViewSet, camera_sequence, find_view_set, with_validation_views
+from csplat_trainer.data import DataSet
 from csplat_trainer.posed_images import PosedImage
 
 W, H = 48, 40
@@ -42,6 +44,22 @@ def cameras(count):
 def views_of(seen_from, photographs=()):
     """Return training views and every eighth as a validation view, without test views."""
     return with_validation_views(ViewSet("cameras", BLACK, seen_from, (), (), photographs))
+
+
+def training_images(make_model, *, alpha: bool = True) -> DataSet:
+    """Return twelve images of thirty splats, nine of them for training."""
+    scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))
+    rasteriser = Rasteriser(gradients=False)
+    shots = []
+    for elevation in (10.0, 45.0):
+        seen_from = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(32, 32, 50.0), 32, 32, elevation=elevation)
+        for camera in seen_from:
+            seen = rasteriser.forward(scene, camera)
+            cover = np.maximum(seen.alpha, 1e-6)[..., None]
+            colour = np.clip(seen.rgb / cover, 0, 1)
+            pixels = np.concatenate([colour, seen.alpha[..., None]], axis=2) if alpha else np.clip(seen.rgb, 0, 1)
+            shots.append(PosedImage(camera, np.rint(pixels * 255).astype(np.uint8)))
+    return DataSet("made", shots[:9], shots[9:])
 
 
 def shell(coefficients):

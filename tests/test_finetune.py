@@ -40,7 +40,8 @@ from csplat_trainer.tuned_scene import (
     RateTerm,
     TunedScene,
     colour_integers_of,
-    cost_slopes,
+    count_integers,
+    slopes_of,
     sum_by_entry,
     sum_by_entry_twin,
 )
@@ -258,7 +259,7 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
 # The cost of bytes.
 def test_costs_are_the_entropy_with_slopes_away_from_common_values():
     columns = np.repeat([0, 1, -1, 2], [800, 100, 90, 10])[:, None]
-    slopes, bits = cost_slopes([columns[:700], columns[700:]])
+    slopes, bits = slopes_of(count_integers([columns[:700], columns[700:]]))
     shares = np.array([800, 100, 90, 10]) / 1000
     assert bits == pytest.approx(-1000 * (shares * np.log2(shares)).sum())
     assert slopes[0, 128 + 1] > 0.5  # towards 2 the cost rises

@@ -12,6 +12,7 @@ import pytest
 
 pytest.importorskip("numba", reason="requires the extra [render]")
 
+from captures import training_images
 from command_line import call
 from PIL import Image
 from posed_sets import to_opengl
@@ -21,7 +22,7 @@ from csplat.encoder import EncodeOptions, EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.training_record import TrainingRecord
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to
-from csplat_render.rasteriser import Rasteriser
+from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.training.training_run import plan_training, tuning_after
 from csplat_trainer.data import DataSet
 from csplat_trainer.engine import CpuEngine
@@ -48,21 +49,6 @@ from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, tune
 
 SIZE = 32
 QUICK = {"max_splats": 80, "sh_degree": 1, "iterations": 60, "refine_start": 20, "refine_every": 10, "log_every": 20}
-
-
-def training_images(make_model, *, alpha: bool = True) -> DataSet:
-    scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))
-    rasteriser = Rasteriser(gradients=False)
-    shots = []
-    for elevation in (10.0, 45.0):
-        cameras = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(SIZE, SIZE, 50.0), SIZE, SIZE, elevation=elevation)
-        for camera in cameras:
-            seen = rasteriser.forward(scene, camera)
-            cover = np.maximum(seen.alpha, 1e-6)[..., None]
-            colour = np.clip(seen.rgb / cover, 0, 1)
-            pixels = np.concatenate([colour, seen.alpha[..., None]], axis=2) if alpha else np.clip(seen.rgb, 0, 1)
-            shots.append(PosedImage(camera, np.rint(pixels * 255).astype(np.uint8)))
-    return DataSet("made", shots[:9], shots[9:])
 
 
 @pytest.fixture
@@ -694,12 +680,15 @@ def test_prunings_are_spread_and_end_early():
 
 def test_splats_with_the_least_effect_are_pruned(make_model):
     cameras = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(40, 40, 50.0), 40, 40)
-    pictures = [PosedImage(camera, np.zeros((40, 40, 3), np.uint8)) for camera in cameras]
     values = from_model(make_model(40, 1, seed=3, scales=np.full((40, 3), -1.2, np.float32)), 1)
     values["logits"][5:15] = -7.0
     parameters = Parameters.starting_at(values)
     parameters.second["means"][:] = np.arange(40, dtype=np.float32)[:, None]
-    prune_least_needed(parameters, pictures, np.ones(3, np.float32), 30, antialiased=False)
+
+    def measure(views):
+        return measure_pruning_error(to_model(parameters.values), views, background=np.ones(3, np.float32))
+
+    prune_least_needed(parameters, cameras, measure, 30)
     wanted = [*range(5), *range(15, 40)]
     assert wanted == parameters.second["means"][:, 0].tolist()
 

@@ -1,5 +1,5 @@
 # ruff: noqa: E402 -- the tests are skipped before the imports of the trainer if torch is absent
-"""The torch rasteriser, the GPU engine and the perceptual loss, against their counterparts on the CPU."""
+"""The torch rasteriser and the perceptual loss, against their counterparts on the CPU."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,8 @@ torch = pytest.importorskip("torch", reason="the torch wrapper requires torch (t
 from csplat.errors import InputError
 from csplat_render import lpips
 from csplat_render.camera import Camera
-from csplat_trainer import gsplat_engine, torch_rasteriser
-from csplat_trainer.engine import CpuEngine
+from csplat_trainer import torch_rasteriser
 from csplat_trainer.losses import PerceptualLoss
-from csplat_trainer.parameters import GROUPS, Parameters, from_model
-from csplat_trainer.posed_images import PosedImage
-from csplat_trainer.training_options import TrainOptions
 
 pytestmark = pytest.mark.area(name="torch")
 
@@ -78,46 +74,6 @@ def test_mixed_types_are_refused(make_model, camera):
     inputs[1] = inputs[1].double()
     with pytest.raises(InputError, match="all float32 or all float64"):
         torch_rasteriser.render(*inputs, camera)
-
-
-def rasterization(
-    means, quats, scales, opacities, colors, viewmats, Ks, width, height, near_plane, sh_degree, backgrounds, **rest
-):
-    """Render with the CPU rasteriser, with the arguments of gsplat's function of this name."""
-    camera = Camera(Ks[0].double().numpy(), viewmats[0].double().numpy(), width, height, near_plane)
-    picture = torch_rasteriser.render(
-        means, quats, scales.log(), opacities, colors[:, 0], colors[:, 1:], camera,
-        background=tuple(backgrounds[0].tolist()), antialiased=rest["rasterize_mode"] == "antialiased",
-        sh_degree=sh_degree,
-    )  # fmt: skip
-    return picture[None], None, {}
-
-
-@pytest.mark.parametrize("loss", ["inria", "study"])
-def test_the_gpu_engine_takes_the_same_steps(make_model, camera, loss):
-    options = TrainOptions(strategy="fixed", loss=loss, noise=0.0, max_splats=12)
-    pixels = np.random.default_rng(0).integers(0, 255, (20, 24, 4)).astype(np.uint8)
-    starts = [Parameters.starting_at(from_model(make_model(12, 1), 1)) for _ in range(2)]
-    gpu = gsplat_engine.GsplatEngine(starts[1], options, rasterization, "cpu")
-    engines, figures = [CpuEngine(starts[0], options), gpu], []
-    for engine in engines:
-        rng = np.random.default_rng(0)
-        for step in range(1, 6):
-            rates = options.learning_rates(step, 1.0)
-            value = engine.step(PosedImage(camera, pixels), np.ones(3, np.float32), 1, rates, rng)
-        figures.append(value)
-    assert figures[0].loss == pytest.approx(figures[1].loss, rel=1e-4)
-    for name in GROUPS:
-        assert np.allclose(engines[0].parameters.values[name], engines[1].parameters.values[name], atol=2e-3)
-    pictures = [engine.render(camera, np.zeros(3, np.float32), 1) for engine in engines]
-    assert np.abs(pictures[0] - pictures[1]).mean() < 1e-3
-
-
-def test_a_missing_gpu_is_refused():
-    if torch.cuda.is_available():
-        pytest.skip("this machine has a GPU")
-    with pytest.raises(InputError, match="finds no GPU"):
-        gsplat_engine.gsplat_rasterization()
 
 
 def test_the_perceptual_loss_agrees_with_lpips_and_finite_differences():

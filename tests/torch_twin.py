@@ -48,7 +48,7 @@ def autograd_gradients(
 def render_torch(
     splats: dict[str, Tensor], view: Camera, background: tuple[float, float, float], antialiased: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return colours, alpha and depth."""
+    """Return colours, alpha and depth; `scales` may be covariances [N, 3, 3] instead."""
     centre, covariance, opacity, colour, depth = _project(splats, view, antialiased)
     ys, xs = torch.meshgrid(torch.arange(view.H) + 0.5, torch.arange(view.W) + 0.5, indexing="ij")
     offset = torch.stack([xs, ys], -1).double() - centre[:, None, None]  # splat, row, column, xy
@@ -78,8 +78,11 @@ def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tupl
     jacobian = torch.stack(
         [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], 1
     )
-    axes = jacobian @ R @ _rotation(quats) @ torch.diag_embed(torch.exp(scales))
-    bare = axes @ axes.mT
+    if scales.dim() == 2:
+        spans = _rotation(quats) @ torch.diag_embed(torch.exp(scales))
+        scales = spans @ spans.mT
+    plane = jacobian @ R
+    bare = plane @ scales @ plane.mT
     covariance = bare + DILATION * torch.eye(2).double()
     if antialiased:
         ratio = torch.linalg.det(bare) / torch.linalg.det(covariance)

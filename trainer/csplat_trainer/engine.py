@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -11,10 +12,11 @@ from csplat.types import F32
 from csplat_render.camera import Camera
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.kernels import lane_range, parallel_kernel
+from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.image_gains import ImageGain
-from csplat_trainer.losses import LossValue, PerceptualLoss, SizedLosses
-from csplat_trainer.parameters import Parameters, adam_step
+from csplat_trainer.losses import LossValue, PendingLoss, PerceptualLoss, SizedLosses
+from csplat_trainer.parameters import Parameters, adam_step, to_model
 from csplat_trainer.posed_images import PosedImage, compose
 from csplat_trainer.strategies import ScreenGradients, add_noise
 from csplat_trainer.training_options import TrainOptions
@@ -25,16 +27,14 @@ _MAX_LOG_SCALE = 40.0  # largest log scale whose gradient Adam can square in flo
 class Engine(Protocol):
     """A training engine, with numba kernels on the CPU or gsplat on a GPU."""
 
-    screen: ScreenGradients | None
-
     @property
     def parameters(self) -> Parameters:
-        """The state of the optimisation, in CPU memory."""
+        """The state of the optimisation, which strategies change."""
         ...
 
-    @parameters.setter
-    def parameters(self, parameters: Parameters) -> None:
-        """Continue from another state."""
+    @property
+    def screen(self) -> ScreenGradients | None:
+        """Gradients on screen since the last densification, if the strategy uses them."""
         ...
 
     def step(
@@ -45,12 +45,16 @@ class Engine(Protocol):
         rates: dict[str, float],
         rng: Generator,
         gain: ImageGain | None = None,
-    ) -> LossValue:
+    ) -> PendingLoss:
         """Make a training step on an image."""
         ...
 
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
         """Render the current state, [H, W, 3]."""
+        ...
+
+    def measure_pruning(self, cameras: Sequence[Camera], background: F32) -> PruningError:
+        """Measure the pruning errors of the splats in some views."""
         ...
 
 
@@ -142,6 +146,11 @@ class CpuEngine:
     def render(self, camera: Camera, background: F32, degree: int) -> F32:
         """Render the current state, [H, W, 3], into a buffer that the next render overwrites."""
         return self._forward(camera, background, degree)
+
+    def measure_pruning(self, cameras: Sequence[Camera], background: F32) -> PruningError:
+        """Measure the pruning errors of the splats in some views; arguments as for `measure_pruning_error`."""
+        model = to_model(self.parameters.values, antialiased=self._options.antialiased)
+        return measure_pruning_error(model, cameras, background=background)
 
     def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
         v = self.parameters.values

@@ -15,11 +15,12 @@ from csplat.types import F32
 from csplat_render.metrics import psnr_of_mse
 from csplat_trainer.fit_checkpoint import FitCheckpoint, Kind, save_checkpoint
 from csplat_trainer.image_gains import ImageGain, ImageGains
-from csplat_trainer.losses import LossValue
+from csplat_trainer.losses import LossValue, PendingLoss
 from csplat_trainer.parameters import Parameters
 from csplat_trainer.tuned_scene import RateTerm
 
 COUNT_EVERY = 50  # steps between counts of the file's integers for the rate term
+_MOST_PENDING = 20  # losses to be read at once; reading one lets a GPU wait for the next step
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class FitStep:
 class Fit(Protocol):
     """The values that a `Fitter` fits, and their loss."""
 
-    def step(self, view: int) -> LossValue:
+    def step(self, view: int) -> PendingLoss:
         """Move the values against the gradient of a view's loss, and return the loss before."""
         ...
 
@@ -86,6 +87,7 @@ class Fitter:
         self.rate: RateTerm | None = None
         self.log: dict[str, Any] = {"losses": [], "seconds": 0.0}
         self._window: list[LossValue] = []
+        self._pending: list[PendingLoss] = []
         self._begin, self._first, self._spent = time.perf_counter(), 0, 0.0  # the last two: before a resume
 
     def resume(self, checkpoint: FitCheckpoint) -> None:
@@ -114,6 +116,7 @@ class Fitter:
         arrays: dict[str, F32] | None = None,
     ) -> None:
         """Write a checkpoint; arguments as in `FitCheckpoint`."""
+        self._read_losses()
         self.log["seconds"] = self.seconds
         gains = self.gains.as_json() if self.gains.values.any() else []
         save_checkpoint(
@@ -130,6 +133,7 @@ class Fitter:
             self.iteration += 1
             self.step(fit)
             fit.after_step()
+        self._read_losses()
         self.log["seconds"] = self.seconds
 
     def step(self, fit: Fit) -> None:
@@ -137,13 +141,20 @@ class Fitter:
         if not self.queue:
             self.queue = self.rng.permutation(len(self.gains.values)).tolist()
         value = fit.step(self.queue.pop())
-        self._window.append(value)
-        self.log["losses"].append(float(f"{value.loss:.6g}"))
+        self._pending.append(value)
+        if isinstance(value, LossValue) or len(self._pending) == _MOST_PENDING:
+            self._read_losses()
 
-    def check(self, value: LossValue) -> None:
-        """Raise an `InputError` if a loss is not finite."""
-        if not math.isfinite(value.loss):
-            raise InputError(f"the loss is not finite at step {self.iteration}: try smaller learning rates")
+    def _read_losses(self) -> None:
+        """Read the losses of the last steps, and raise an `InputError` if one is not finite."""
+        first = self.iteration - len(self._pending) + 1
+        for step, pending in enumerate(self._pending, first):
+            value = pending.read()
+            if not math.isfinite(value.loss):
+                raise InputError(f"the loss is not finite at step {step}: try smaller learning rates")
+            self._window.append(value)
+            self.log["losses"].append(float(f"{value.loss:.6g}"))
+        self._pending.clear()
 
     def gain(self, view: int, rate: float) -> ImageGain | None:
         """Return the correction of an image, to be trained at a learning rate; `None` if that is 0."""
@@ -162,6 +173,7 @@ class Fitter:
         self, splat_count: int, sh_degree: int, *, seconds_left: float | None = None, size_bytes: int | None = None
     ) -> FitStep:
         """Return the progress since the last report; arguments as in `FitStep`, `None`: estimate the time left."""
+        self._read_losses()
         window, self._window = self._window, []
         loss, mse = (sum(values) / len(window) for values in zip(*((one.loss, one.mse) for one in window), strict=True))
         return FitStep(

@@ -74,9 +74,19 @@ class ImageGain:
     number: int
     rate: float
 
+    @property
+    def values(self) -> F64:
+        """The logarithm of the gain, and the bias, by channel, [2, 3]."""
+        own: F64 = self.gains.values[self.number]
+        return own
+
+    def update(self, slope: F64) -> None:
+        """Make a step against the gradient of the loss, [2, 3]."""
+        self.gains.step(self.number, slope, self.rate)
+
     def apply(self, render: F32) -> F32:
         """Apply the correction to a render, [H, W, 3]."""
-        gain, bias = self.gains.values[self.number]
+        gain, bias = self.values
         corrected: F32 = render * np.exp(gain).astype(np.float32) + bias.astype(np.float32)
         return corrected
 
@@ -90,9 +100,9 @@ class ImageGain:
         Returns:
             The gradient by the render, in the memory of `slope`.
         """
-        gain = np.exp(self.gains.values[self.number, 0])
+        gain = np.exp(self.values[0])
         by_bias = slope.sum(axis=(0, 1), dtype=np.float64)
         by_gain = gain * np.einsum("hwc,hwc->c", slope, render, dtype=np.float64)
-        self.gains.step(self.number, np.stack([by_gain, by_bias]), self.rate)
+        self.update(np.stack([by_gain, by_bias]))
         slope *= gain.astype(np.float32)
         return slope

@@ -18,7 +18,7 @@ LPIPS runs in torch, since the renderer's metric has no gradient; torch is impor
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,18 @@ class LossValue:
     l1: float
     ssim: float
     mse: float
+
+    def read(self) -> LossValue:
+        """Return itself."""
+        return self
+
+
+class PendingLoss(Protocol):
+    """A loss that may not be computed yet: a GPU works while the CPU goes on."""
+
+    def read(self) -> LossValue:
+        """Wait for the loss, and return it."""
+        ...
 
 
 class PhotometricLoss:

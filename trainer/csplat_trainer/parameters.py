@@ -58,6 +58,23 @@ class Parameters:
         """Opacities, [N]."""
         return sigmoid(self.values["logits"])
 
+    def on_cpu(self) -> Parameters:
+        """Return the state in arrays of NumPy: itself."""
+        return self
+
+    def read(self, name: str, rows: NDArray[np.int64]) -> F32:
+        """Return a group's values of some splats."""
+        return self.values[name][rows]
+
+    def write(self, name: str, rows: NDArray[np.int64], values: F32) -> None:
+        """Replace a group's values of some splats."""
+        self.values[name][rows] = values
+
+    def copy_rows(self, sources: NDArray[np.int64], targets: NDArray[np.int64]) -> None:
+        """Copy the values of some splats to others."""
+        for name in GROUPS:
+            self.values[name][targets] = self.values[name][sources]
+
     def forget(self, rows: NDArray[np.int64]) -> None:
         """Reset Adam's moments of some splats."""
         for name in GROUPS:
@@ -70,12 +87,13 @@ class Parameters:
             for name in GROUPS:
                 part[name] = np.ascontiguousarray(part[name][rows])
 
-    def append(self, values: ParameterArrays) -> None:
-        """Add splats with zero moments."""
+    def append_copies(self, sources: NDArray[np.int64]) -> None:
+        """Add copies of some splats, with zero moments."""
         for name in GROUPS:
-            self.values[name] = np.concatenate([self.values[name], values[name]])
+            copies = self.values[name][sources]
+            self.values[name] = np.concatenate([self.values[name], copies])
             for memory in (self.first, self.second):
-                memory[name] = np.concatenate([memory[name], np.zeros_like(values[name])])
+                memory[name] = np.concatenate([memory[name], np.zeros_like(copies)])
 
 
 def from_model(model: SplatModel, sh_degree: int) -> ParameterArrays:

@@ -21,7 +21,7 @@ from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 
-_ROUND_FRACTION = 0.72  # fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB
+ROUND_FRACTION = 0.72  # fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB
 _LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
 
 
@@ -110,7 +110,7 @@ class PruningOrder:
         """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`."""
         least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
         while len(self._left) > least and float(self.errors.sum()) <= error * self.value_count:
-            if not self._prune(max(least, int(len(self._left) * _ROUND_FRACTION))):
+            if not self._prune(max(least, int(len(self._left) * ROUND_FRACTION))):
                 break
 
     def _prune(self, count: int) -> bool:

@@ -14,7 +14,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,15 +22,16 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from csplat.types import F32, F64, I64
+from csplat_render.camera import Camera
 from csplat_render.kernels import lane_range, parallel_kernel
-from csplat_trainer.parameters import GROUPS, Parameters, to_model
-from csplat_trainer.posed_images import PosedImage
-from csplat_trainer.pruning import MeasuredViews, PruningOrder
+from csplat_render.pruning_error import PruningError
+from csplat_trainer.parameters import Parameters
+from csplat_trainer.pruning import ROUND_FRACTION, pruning_keys
 
 _MAX_SHARE = 51  # largest number of splats in one place, as in the paper's code
 _BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])
-_GATE_SLOPE, _GATE_CENTRE = 100.0, 0.995  # the paper's gate, which limits noise to nearly transparent splats
-_MAX_NOISE = 1.0  # standard deviations per step; the paper's noise moves large splats out of small scenes
+GATE_SLOPE, GATE_CENTRE = 100.0, 0.995  # the paper's gate, which limits noise to nearly transparent splats
+MAX_NOISE = 1.0  # standard deviations per step; the paper's noise moves large splats out of small scenes
 _GATE_OFF = 0.1  # opacity above which the gate is below 1e-4
 
 
@@ -52,8 +53,7 @@ def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int
         return 0
     sources = _draw_by_opacity(alphas, alive, len(dead), rng)
     _share_among(parameters, sources, alphas, dead_opacity)
-    for name in GROUPS:
-        parameters.values[name][dead] = parameters.values[name][sources]
+    parameters.copy_rows(sources, dead)
     parameters.forget(dead)
     return len(dead)
 
@@ -78,7 +78,7 @@ def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, r
     alphas = parameters.alphas
     sources = _draw_by_opacity(alphas, np.arange(count), added, rng)
     _share_among(parameters, sources, alphas, dead_opacity)
-    parameters.append({name: parameters.values[name][sources] for name in GROUPS})
+    parameters.append_copies(sources)
     return added
 
 
@@ -113,9 +113,13 @@ def _share_among(parameters: Parameters, sources: I64, alphas: F32, least: float
     old = np.clip(alphas[places].astype(np.float64), 1e-7, 1.0 - 1e-7)
     shared, factor = share_opacity(old, np.minimum(counts + 1, _MAX_SHARE))
     shared = np.clip(shared, max(least, 1e-6), 1.0 - 1e-6)
-    parameters.values["logits"][places] = np.log(shared / (1.0 - shared))
-    parameters.values["scales"][places] += np.log(factor)[:, None].astype(np.float32)
+    parameters.write("logits", places, np.log(shared / (1.0 - shared)).astype(np.float32))
+    _add(parameters, "scales", places, np.log(factor)[:, None].astype(np.float32))
     parameters.forget(places)
+
+
+def _add(parameters: Parameters, name: str, rows: I64, summand: F32 | np.float32) -> None:
+    parameters.write(name, rows, parameters.read(name, rows) + summand)
 
 
 def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
@@ -142,16 +146,16 @@ def _noise(
         if logits[i] > highest:
             continue
         alpha = 1.0 / (1.0 + math.exp(-logits[i]))
-        gate = strength / (1.0 + math.exp(-_GATE_SLOPE * (1.0 - alpha - _GATE_CENTRE)))
+        gate = strength / (1.0 + math.exp(-GATE_SLOPE * (1.0 - alpha - GATE_CENTRE)))
         w, x, y, z = quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3]
         r00, r01, r02 = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
         r10, r11, r12 = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
         r20, r21, r22 = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
         n0, n1, n2 = normals[i, 0], normals[i, 1], normals[i, 2]
         s0, s1, s2 = math.exp(scales[i, 0]), math.exp(scales[i, 1]), math.exp(scales[i, 2])
-        l0 = (r00 * n0 + r10 * n1 + r20 * n2) * min(gate * s0, _MAX_NOISE) * s0
-        l1 = (r01 * n0 + r11 * n1 + r21 * n2) * min(gate * s1, _MAX_NOISE) * s1
-        l2 = (r02 * n0 + r12 * n1 + r22 * n2) * min(gate * s2, _MAX_NOISE) * s2
+        l0 = (r00 * n0 + r10 * n1 + r20 * n2) * min(gate * s0, MAX_NOISE) * s0
+        l1 = (r01 * n0 + r11 * n1 + r21 * n2) * min(gate * s1, MAX_NOISE) * s1
+        l2 = (r02 * n0 + r12 * n1 + r22 * n2) * min(gate * s2, MAX_NOISE) * s2
         m0 = np.float32(means[i, 0] + (r00 * l0 + r01 * l1 + r02 * l2))
         m1 = np.float32(means[i, 1] + (r10 * l0 + r11 * l1 + r12 * l2))
         m2 = np.float32(means[i, 2] + (r20 * l0 + r21 * l1 + r22 * l2))
@@ -181,6 +185,10 @@ class ScreenGradients:
     def none(cls, splats: int) -> ScreenGradients:
         """Return sums of no renders."""
         return cls(np.zeros(splats), np.zeros(splats, np.int64))
+
+    def clear(self, splats: int) -> None:
+        """Start anew, for another number of splats."""
+        self.total, self.count = np.zeros(splats), np.zeros(splats, np.int64)
 
     def add(self, norms: F32, drawn: NDArray[np.bool_]) -> None:
         """Add the norms of a render, for the splats that it shows."""
@@ -224,26 +232,24 @@ def densify(
     free = max(0, cap - int(alive.sum()))
     strongest = np.argsort(-strength, kind="stable")[:free]
     chosen = np.sort(strongest[strength[strongest] > threshold])
-    values = parameters.values
-    large = values["scales"][chosen].max(axis=1) > np.log(_SPLIT_SIZE * extent)
-    split = chosen[large]
-    new = {name: values[name][chosen].copy() for name in GROUPS}
+    parameters.append_copies(chosen)
+    large = parameters.read("scales", chosen).max(axis=1) > np.log(_SPLIT_SIZE * extent)
+    split, copies = chosen[large], before + np.flatnonzero(large)
     if len(split):
-        first, second = _split_offsets(values["quats"][split], values["scales"][split], rng)
-        new["means"][large] += second
-        new["scales"][large] -= np.float32(np.log(_SPLIT_SHRINK))
-        values["means"][split] += first
-        values["scales"][split] -= np.float32(np.log(_SPLIT_SHRINK))
+        offsets = _split_offsets(parameters.read("quats", split), parameters.read("scales", split), rng)
+        for rows, offset in zip((split, copies), offsets, strict=True):
+            _add(parameters, "means", rows, offset)
+            _add(parameters, "scales", rows, -np.float32(np.log(_SPLIT_SHRINK)))
         parameters.forget(split)
-    parameters.keep(np.flatnonzero(alive))
-    parameters.append(new)
+    parameters.keep(np.concatenate([np.flatnonzero(alive), np.arange(before, len(parameters))]))
     return len(parameters) - before
 
 
 def reset_opacities(parameters: Parameters) -> None:
     """Make every splat nearly transparent; training restores those that the images need."""
+    rows = np.arange(len(parameters))
     logit = np.float32(np.log(_RESET_ALPHA / (1.0 - _RESET_ALPHA)))
-    np.minimum(parameters.values["logits"], logit, out=parameters.values["logits"])
+    parameters.write("logits", rows, np.minimum(parameters.read("logits", rows), logit))
     for memory in (parameters.first, parameters.second):
         memory["logits"][:] = 0.0
 
@@ -269,23 +275,18 @@ _PRUNING_VIEWS = 32  # largest number of views in which the pruning error is mea
 
 
 def prune_least_needed(
-    parameters: Parameters,
-    images: Sequence[PosedImage],
-    background: NDArray[np.float32],
-    count: int,
-    *,
-    antialiased: bool,
+    parameters: Parameters, cameras: Sequence[Camera], measure: Callable[[Sequence[Camera]], PruningError], count: int
 ) -> None:
-    """Prune the splats with the least pruning error.
+    """Prune the splats with the least pruning error, in rounds of a `PruningOrder`; unseen ones are the first.
 
     Args:
         parameters: changed in place.
-        images: the training images.
-        background: [3], background colour.
+        cameras: those of the training images.
+        measure: measures the pruning errors of the splats in some views.
         count: number of splats to keep.
-        antialiased: apply the mip-splatting filter.
     """
-    views = images[:: -(-len(images) // _PRUNING_VIEWS)]
-    model = to_model(parameters.values, antialiased=antialiased)
-    measured = MeasuredViews.of(model, [one.camera for one in views], background)
-    parameters.keep(PruningOrder(model, [measured], background, keep_unseen=False).kept(count))
+    views = cameras[:: -(-len(cameras) // _PRUNING_VIEWS)]
+    while (left := len(parameters)) > count:
+        keys = pruning_keys(parameters.alphas, measure(views), keep_unseen=False)
+        kept_count = max(count, int(left * ROUND_FRACTION))
+        parameters.keep(np.sort(np.argsort(keys, kind="stable")[left - kept_count :]))

@@ -27,11 +27,11 @@ from csplat_trainer.engine import CpuEngine, Engine
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
 from csplat_trainer.fitter import FitStep, Fitter
 from csplat_trainer.initial_splats import SceneExtent, measure_extent, place_splats
-from csplat_trainer.losses import LossValue, PerceptualLoss
+from csplat_trainer.losses import PendingLoss, PerceptualLoss
 from csplat_trainer.parameters import ParameterArrays, Parameters, to_model
 from csplat_trainer.posed_images import PosedImage, compose, evaluate, halve
-from csplat_trainer.strategies import ScreenGradients, densify, grow, prune_least_needed, relocate, reset_opacities
-from csplat_trainer.training_options import Outputs, TrainOptions, TrainResult
+from csplat_trainer.strategies import densify, grow, prune_least_needed, relocate, reset_opacities
+from csplat_trainer.training_options import MISSING_TORCH, Outputs, TrainOptions, TrainResult
 from csplat_trainer.training_report import peak_memory, save_image, side_by_side
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -121,16 +121,14 @@ class _Training:
         metrics = self._evaluate(options.eval_views) if self._data.test else None
         return TrainResult(self._model(), self._full_log(metrics), metrics)
 
-    def step(self, view: int) -> LossValue:
+    def step(self, view: int) -> PendingLoss:
         fitter = self._fitter
         background = self._background
         if self._options.background == "random":
             background = fitter.rng.random(3, dtype=np.float32)
         rates = self._options.learning_rates(fitter.iteration, self._scene.extent)
         gain = fitter.gain(view, rates["exposure"])
-        value = self._engine.step(self._image(view), background, self._degree, rates, fitter.rng, gain)
-        fitter.check(value)
-        return value
+        return self._engine.step(self._image(view), background, self._degree, rates, fitter.rng, gain)
 
     def after_step(self) -> None:
         fitter, options, outputs = self._fitter, self._options, self._outputs
@@ -208,12 +206,11 @@ class _Training:
             )
             if self._fitter.is_due(_RESET_EVERY) and self._fitter.iteration + _RESET_EVERY / 2 < options.iterations:
                 reset_opacities(parameters)
-            self._engine.screen = ScreenGradients.none(len(parameters))
+            self._engine.screen.clear(len(parameters))
         else:
             relocate(parameters, options.dead_opacity, self._fitter.rng)
             if options.strategy == "mcmc":
                 grow(parameters, self._log["growth"], options.max_splats, options.dead_opacity, self._fitter.rng)
-        self._engine.parameters = parameters
 
     def _prune(self, times: int) -> None:
         """Make the first of a number of equal prunings towards the final fraction."""
@@ -223,10 +220,14 @@ class _Training:
         kept_count = max(1, round(count))
         if kept_count >= len(parameters):
             return
-        prune_least_needed(parameters, self._data.train, self._background, kept_count, antialiased=options.antialiased)
-        self._engine.parameters = parameters
+        prune_least_needed(
+            parameters,
+            [image.camera for image in self._data.train],
+            lambda cameras: self._engine.measure_pruning(cameras, self._background),
+            kept_count,
+        )
         if self._engine.screen is not None:
-            self._engine.screen = ScreenGradients.none(len(parameters))
+            self._engine.screen.clear(len(parameters))
 
     def _prune_late(self) -> None:
         """Prune splats after the last step of a resumed run, each time followed by steps at the last learning rates."""
@@ -273,12 +274,12 @@ class _Training:
     def _save(self) -> None:
         assert self._outputs.checkpoint is not None
         self._fitter.save(
-            self._outputs.checkpoint, "train", asdict(self._options), self._engine.parameters,
+            self._outputs.checkpoint, "train", asdict(self._options), self._engine.parameters.on_cpu(),
             own={"origin": self._data.origin},
         )  # fmt: skip
 
     def _model(self) -> SplatModel:
-        model = to_model(self._engine.parameters.values, antialiased=self._options.antialiased)
+        model = to_model(self._engine.parameters.on_cpu().values, antialiased=self._options.antialiased)
         metadata = {TRAINING: self._data.trained_on(self._colour).as_json()}
         if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
             metadata[VIEW] = _first_view([image.camera for image in self._data.train])
@@ -375,10 +376,8 @@ def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None) 
         return CpuEngine(parameters, options, perceptual)
     if options.lpips_weight > 0.0:
         raise InputError("the perceptual loss requires --device cpu: omit --lpips-weight on other devices")
-    if options.lr_exposure > 0.0:
-        raise InputError("gains of images require --device cpu: omit lr_exposure on other devices")
     try:
         from csplat_trainer.gsplat_engine import GsplatEngine
     except ImportError:
-        raise InputError("device cuda: torch is not installed (pip install 'csplat[train]')") from None
+        raise InputError(MISSING_TORCH) from None
     return GsplatEngine(parameters, options)

@@ -25,6 +25,9 @@ BACKGROUNDS: tuple[Background, ...] = get_args(Background)
 DEVICES: tuple[Device, ...] = get_args(Device)
 
 
+MISSING_TORCH = "device cuda: torch is not installed (pip install 'csplat[train]')"
+
+
 @dataclass(frozen=True)
 class TrainOptions:
     """Options of training. The defaults suit thousands to a hundred thousand splats on a CPU.

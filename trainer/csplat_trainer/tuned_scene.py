@@ -40,7 +40,7 @@ class TunedScene:
 
     def __init__(self, fixed: FixedQuantisation, parameters: Parameters | None = None) -> None:
         self.fixed = fixed
-        self.parameters = parameters or Parameters.starting_at(_values(fixed.start()))
+        self.parameters = parameters or initial_parameters(fixed)
         values, book, shapes = self.parameters.values, fixed.book, fixed.shapes
         self._users = None if book is None else _users(book.index, book.size)
         self._escaped = np.zeros(0, np.int64) if book is None else book.escaped
@@ -123,16 +123,20 @@ class TunedScene:
         return quats, scales, gradients.scales.sum(axis=1)
 
 
-def _values(start: FreeValues) -> ParameterArrays:
-    return {
-        "means": start.means,
-        "quats": start.quats,
-        "scales": start.scales,
-        "logits": logits_of(start.opacities),
-        "sh0": start.sh0,
-        "shN": start.sh,
-        "sizes": start.sizes,
-    }
+def initial_parameters(fixed: FixedQuantisation) -> Parameters:
+    """Return the state of `TunedScene` before the first step."""
+    start = fixed.start()
+    return Parameters.starting_at(
+        {
+            "means": start.means,
+            "quats": start.quats,
+            "scales": start.scales,
+            "logits": logits_of(start.opacities),
+            "sh0": start.sh0,
+            "shN": start.sh,
+            "sizes": start.sizes,
+        }
+    )
 
 
 def _users(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
@@ -173,7 +177,7 @@ def sum_by_entry_twin(values: F32, order: I64, starts: I64, out: F32) -> None:
         out[entry] = values[order[starts[entry] : starts[entry + 1]]].sum(axis=0)
 
 
-_MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this
+MAX_INTEGER = 128  # integers beyond ± this cost the same as ± this
 _ROWS = 1 << 15  # rows of SH to count at a time; their integers take several times the memory of the values
 _MAX_SLOPE = 4.0  # bits per step; frequencies of rare integers are too uncertain for larger slopes
 _ROOT2 = np.sqrt(2.0)
@@ -237,7 +241,7 @@ class RateTerm:
         return costs
 
     def _count(self, name: str, parts: Iterable[NDArray[Any]]) -> None:
-        self.tables[name], bits = cost_slopes(parts)
+        self.tables[name], bits = slopes_of(count_integers(parts))
         self.bits += bits
 
     @property
@@ -263,10 +267,10 @@ class RateTerm:
             _add_plain(stored.scales[rows], grade.scale_step, 0, scales, per_bit, steps["scales"][rows])
             _add_plain(stored.quats[rows], grade.quat_step, 1, quats, per_bit, steps["quats"][rows])
             roots = np.sqrt(stored.opacities[rows])
-            levels = np.minimum(np.rint(roots * np.float32(grade.levels)), _MAX_INTEGER).astype(np.int64)
+            levels = np.minimum(np.rint(roots * np.float32(grade.levels)), MAX_INTEGER).astype(np.int64)
             # The level is M √alpha, whose derivative by the logit is M √alpha (1 − alpha) / 2.
             chain = np.float32(0.5 * grade.levels) * roots * (np.float32(1.0) - stored.opacities[rows])
-            steps["logits"][rows] += per_bit * chain * opacities[0][_MAX_INTEGER + levels]
+            steps["logits"][rows] += per_bit * chain * opacities[0][MAX_INTEGER + levels]
             _add_colour(stored.sh0[rows, None], grade.sh0_step, shift, sh0, per_bit, steps["sh0"][rows, None])
         _add_plain(stored.sizes[:, None], plan.scale_step, 0, tables["sizes"], per_bit, steps["sizes"][:, None])
         if stored.sh.shape[1]:
@@ -309,22 +313,32 @@ def _table_name(name: str, number: int) -> str:
     return f"{name} {number}" if number else name
 
 
-def cost_slopes(parts: Iterable[NDArray[Any]]) -> tuple[F32, float]:
-    """Return the slope of the cost of integers in bits per step, and the cost of all of them.
+def count_integers(parts: Iterable[NDArray[Any]]) -> I64:
+    """Count the integers −128 to 128 of each column, [C, 257]; those beyond count as these.
 
     Args:
         parts: at least one part of [n, C] integers: rows of the same C columns.
-
-    Returns:
-        [C, 257] float32, for the integers −128 to 128, and bits.
     """
-    size = 2 * _MAX_INTEGER + 1
+    size = 2 * MAX_INTEGER + 1
     counts: NDArray[Any] = np.zeros((0, size), np.int64)
     for columns in parts:
         width = columns.shape[1]
-        places = np.clip(columns, -_MAX_INTEGER, _MAX_INTEGER) + (_MAX_INTEGER + size * np.arange(width))
+        places = np.clip(columns, -MAX_INTEGER, MAX_INTEGER) + (MAX_INTEGER + size * np.arange(width))
         found = np.bincount(places.reshape(-1), minlength=width * size).reshape(width, size)
         counts = counts + found if len(counts) else found
+    return counts
+
+
+def slopes_of(counts: I64) -> tuple[F32, float]:
+    """Return the slope of the cost of integers in bits per step, and the cost of all of them.
+
+    Args:
+        counts: result of `count_integers`.
+
+    Returns:
+        [C, 257] float32, and bits.
+    """
+    size = counts.shape[1]
     count = int(counts.sum(axis=1).max(initial=0))
     # Counts + 1, slightly blurred: an integer that happens not to occur counts as rare.
     padded = np.pad(counts + 1.0, ((0, 0), (1, 1)), mode="edge")

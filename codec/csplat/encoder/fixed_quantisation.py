@@ -227,6 +227,12 @@ class FixedQuantisation:
         scales = np.concatenate([lattice_values(shapes.entries[:3], parameters.scale_step).T, decoded.scales[own]])
         return quats, scales, lattice_values(shapes.summand, parameters.scale_step)
 
+    def sh_coarseness(self) -> I32 | None:
+        """Return the exponents of `colour_integers` of the rows of `FreeValues.sh` after the entries; `None`: all 0."""
+        if self.book is not None:
+            return np.full(len(self.book.escaped), self.parameters.escape_coarse, np.int32)
+        return sh_coarseness(np.arange(len(self.encode_plan.model)), self.parameters, self.sh_plan)
+
     def _dequantise_shapes(self, values: FreeValues) -> tuple[F32, F32]:
         shapes, quats, scales = self._shape_values(values)
         return dequantise_shapes(quats, scales, self.encode_plan.tiles, self.parameters, shapes)

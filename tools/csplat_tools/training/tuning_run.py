@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, Importance, Origin, Target
+from csplat.encoder import EncodeOptions, EncodePlan, Importance, Origin, Target, encode_tiles
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import I64, Progress
+from csplat.types import F32, I64, Progress
 from csplat_render import Camera
 from csplat_render.kernels import thread_count
 from csplat_render.metrics import Distance
-from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scorer import Scorer
 from csplat_tools.console import progress_bar, step_progress
 from csplat_tools.file_streams import write_array, write_bytes
@@ -28,7 +27,6 @@ from csplat_tools.importance_file import read_importance
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, WholeScene
 from csplat_tools.optimise.pruning import PrunedSubset, Pruner
 from csplat_tools.optimise.rate_distortion import error_of_psnr
-from csplat_tools.optimise.scene_sensitivity import measure_views
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.optimise.target_search import Goal, TargetSearch, check_target
 from csplat_tools.optional_packages import prepare_renderer
@@ -40,8 +38,10 @@ from csplat_tools.training.tuning_report import (
     write_training_page,
 )
 from csplat_tools.views import VIEW_COUNT, ViewSet, shrink_cameras, with_validation_views
+from csplat_trainer.device_measurements import measure_importance, measure_pruning
 from csplat_trainer.fitter import FitStep
 from csplat_trainer.posed_images import PosedImage, image_scorer
+from csplat_trainer.pruning import ROUND_FRACTION, pruning_keys
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning import (
@@ -75,6 +75,7 @@ _AIM = 0.05  # dB above a PSNR that tuned files aim at
 _WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
 _FINER = 0.1  # least factor of the error of the goal from one tuning to the next
 _TUNINGS = 4  # largest number of tunings for a target
+_PRECISIONS, _PRECISION_STEPS = (30.0, 56.0), 5  # dB, and bisections, when a GPU tunes to a size
 
 _VALIDATION_EVERY = 8  # every Nth virtual view is a validation view
 _MOST_VALIDATION = 16  # validation views, at most
@@ -239,8 +240,8 @@ class Tuner:
         """
         if not self.prune_unseen:
             return np.arange(len(self.source))
-        found = measure_pruning_error(
-            self.source, [*self.views.training, *self.views.validation], background=self.views.background,
+        found = measure_pruning(
+            self.source, [*self.views.training, *self.views.validation], self._background, self.options.device,
             threads=self.encoding.threads, progress=self.progress,
         )  # fmt: skip
         if not found.seen.any():
@@ -285,15 +286,9 @@ class Tuner:
             is_pruned: splats may have been pruned that a view shows.
         """
         with self._timer.stage("choosing"):
-            views, given = self.tuning_views, self.importance
-            if given is None:
-                measured = measure_views(
-                    model, self._measuring, self.views.background, matrices=True, magnitudes=False,
-                    threads=encoding.threads, progress=self.progress,
-                )  # fmt: skip
-                weights: NDArray[Any] | Importance = StoredSensitivity.of(model, measured).importance()
-            else:
-                weights = given.select(rows) if isinstance(given, Importance) else given[rows]
+            views, weights = self.tuning_views, self._importance_of(model, rows)
+            if self.options.device != "cpu" and size_bytes is not None:
+                encoding = self._precise(model, weights, size_bytes)
         pruning = {"unseen": len(self.source) - len(self.rows)}
         if is_pruned:
             pruning["simplified_from"] = len(self.rows)
@@ -306,6 +301,55 @@ class Tuner:
         for stage, seconds in made.seconds.items():
             self._timer.add(stage, seconds)
         return TunedSubset(made, pruning, self._timer.seconds)
+
+    def _importance_of(self, model: SplatModel, rows: I64) -> NDArray[Any] | Importance:
+        """Return the importance of some splats, `rows` of the source."""
+        given = self.importance
+        if given is not None:
+            return given.select(rows) if isinstance(given, Importance) else given[rows]
+        return measure_importance(
+            model, self._measuring, self._background, self.options.device, threads=self.encoding.threads,
+            progress=self.progress,
+        )  # fmt: skip
+
+    @property
+    def _background(self) -> F32:
+        return np.array(self.views.background, np.float32)
+
+    def _precise(self, model: SplatModel, weights: NDArray[Any] | Importance, size_bytes: int) -> EncodeOptions:
+        """Return the options with the precision at which the untuned file has about the size."""
+        if self.encoding.attribute_psnr is not None:
+            return self.encoding
+        low, high = _PRECISIONS
+        for _ in range(_PRECISION_STEPS):
+            options = replace(self.encoding, attribute_psnr=0.5 * (low + high))
+            plan = EncodePlan.of(model, options, importance=weights, allow_classes=False, progress=self.progress)
+            if len(encode_tiles(plan).write().data) > size_bytes:
+                high = 0.5 * (low + high)
+            else:
+                low = 0.5 * (low + high)
+        return replace(self.encoding, attribute_psnr=low)
+
+    def tune_to_size(self, size_bytes: int) -> TunedSubset:
+        """Tune a file of a size without drafts, which a GPU does not make.
+
+        One splat is kept for `SPLAT_BYTES`, and the untuned file gets the precision that leads to the size.
+
+        Raises:
+            InputError: the file is larger, at the largest lambda.
+        """
+        kept_count = min(max(1, size_bytes // SPLAT_BYTES), len(self.rows))
+        with self._timer.stage("choosing"):
+            rows = self.rows
+            while len(rows) > kept_count:
+                model = self.source.select(rows)
+                found = measure_pruning(model, self._measuring, self._background, self.options.device)
+                keys, left = pruning_keys(model.opacities, found), max(kept_count, int(len(rows) * ROUND_FRACTION))
+                rows = rows[np.sort(np.argsort(keys, kind="stable")[len(rows) - left :])]
+        made = self._tune(self.source.select(rows), rows, self.encoding, size_bytes)
+        if made.size_bytes > size_bytes:
+            raise InputError(f"the smallest file has {made.size_bytes:,} bytes, more than {size_bytes:,}")
+        return made
 
     def tune_to(self, target: Target) -> TunedSubset:
         """Tune the best file of a size, or the smallest one of a PSNR on the validation views.
@@ -409,6 +453,8 @@ def choose_and_finetune(
     )  # fmt: skip
     if target is None:
         return tuner.tune_kept(None)
+    if options.device != "cpu" and target.size_bytes is not None:
+        return tuner.tune_to_size(target.size_bytes)
     return tuner.tune_kept(target.count(len(source))) if target.keep is not None else tuner.tune_to(target)
 
 

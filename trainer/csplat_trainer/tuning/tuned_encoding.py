@@ -19,9 +19,8 @@ from csplat.training_record import TrainingRecord
 from csplat.types import I64
 from csplat_render.camera import relative_to
 from csplat_trainer.data import DataSet
+from csplat_trainer.device_measurements import measure_importance
 from csplat_trainer.fitter import FitStep
-from csplat_trainer.sensitivity import measure_sensitivity
-from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning.tuning_loop import tune
 from csplat_trainer.tuning.tuning_options import FinetuneOptions
@@ -120,7 +119,10 @@ def finetune(
     if isinstance(views, DataSet):
         views = _views_of(views, model)
     if importance is None:
-        importance = _measure(model, views, encoding, progress)
+        importance = measure_importance(
+            model, [one.camera for one in views.train], views.background, options.device, threads=encoding.threads,
+            progress=progress,
+        )  # fmt: skip
     with timer.stage("encoding"):
         draft = EncodePlan.of(
             model, encoding, importance=importance, origin=origin, allow_classes=False, progress=progress
@@ -162,18 +164,6 @@ def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
     shift = np.subtract(model.origin, data.origin)
     training = [TuningView(relative_to(shift, one.camera), one) for one in data.train]
     return split_views(training, np.array(background, np.float32))
-
-
-def _measure(
-    model: SplatModel, views: TuningViews, encoding: EncodeOptions, progress: Callable[[str, float], None] | None
-) -> Importance:
-    """Measure the importance of each splat in the training views."""
-    cameras = [one.camera for one in views.train]
-    found = measure_sensitivity(
-        model, cameras, background=views.background, metric=True, magnitudes=False, threads=encoding.threads,
-        progress=progress,
-    )  # fmt: skip
-    return StoredSensitivity.of(model, found).importance()
 
 
 def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:

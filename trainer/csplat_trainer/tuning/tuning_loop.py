@@ -14,20 +14,20 @@ from typing import Any
 
 import numpy as np
 
-from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
+from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.errors import InputError
-from csplat.types import F32
 from csplat_render.metrics import psnr_of_mse
-from csplat_render.rasteriser import Rasteriser
 from csplat_trainer.fit_checkpoint import check_arrays, load_checkpoint
 from csplat_trainer.fitter import COUNT_EVERY, FitStep, Fitter
 from csplat_trainer.image_gains import ImageGain
-from csplat_trainer.losses import LossValue, SizedLosses
-from csplat_trainer.training_options import Outputs
+from csplat_trainer.losses import PendingLoss
+from csplat_trainer.parameters import Parameters
+from csplat_trainer.training_options import MISSING_TORCH, Outputs
 from csplat_trainer.training_report import peak_memory
-from csplat_trainer.tuned_scene import RateTerm, TunedScene
+from csplat_trainer.tuned_scene import RateTerm
+from csplat_trainer.tuning.tuning_engine import CpuTuning, TuningEngine
 from csplat_trainer.tuning.tuning_options import FinetuneOptions
-from csplat_trainer.tuning.tuning_views import TuningView, TuningViews
+from csplat_trainer.tuning.tuning_views import TuningViews
 
 _MIN_GAIN = 2e-4  # smallest relative difference of the score that counts as a gain
 
@@ -103,14 +103,12 @@ class _Tuning:
         size_bytes: int | None,
     ) -> None:
         self._views, self._options, self._outputs, self._show = views, options, outputs, show
-        self._scene = TunedScene(fixed)
-        self._rasteriser = Rasteriser(threads=threads)
-        self._antialiased = fixed.encode_plan.model.antialiased
+        self._fixed, self._threads = fixed, threads
+        self._engine = self._make_engine(None)
         self._extent = float(np.exp(np.clip(np.median(np.median(fixed.encode_plan.model.scales, axis=1)), -80.0, 80.0)))
         self._fitter = Fitter(len(views.train), options.iterations, options.seed)
         self._log = self._fitter.log
         self._log |= {"validations": [], "views": views.digest}
-        self._losses = SizedLosses(options.loss)
         self._numbers = {id(view): number for number, view in enumerate(views.train)}
         self._best: _BestValues | None = None
         self._controller = None if size_bytes is None else RateController(size_bytes, options.byte_cost)
@@ -121,7 +119,7 @@ class _Tuning:
         Raises:
             InputError: the file is damaged, or of a run with another scene, views or options.
         """
-        fixed, start = self._scene.fixed, self._scene.fixed.start()
+        fixed, start = self._fixed, self._fixed.start()
         found = load_checkpoint(path, "finetune")
         own, arrays = found.own, found.arrays
         if own.get("fixed") != fingerprint(fixed):
@@ -132,13 +130,13 @@ class _Tuning:
         if (controller and controller.size_bytes) != (self._controller and self._controller.size_bytes):
             raise InputError("the checkpoint is of a run with another target")
         for name, value in asdict(self._options).items():
-            if name != "iterations" and found.options.get(name) != value:
+            if name not in ("iterations", "device") and found.options.get(name) != value:
                 raise InputError(f"the checkpoint is of a run with another {name}: {found.options.get(name)}")
-        values = self._scene.parameters.values
-        check_arrays(path, found.parameters.values, {name: array.shape for name, array in values.items()})
+        values = self._engine.parameters.values
+        check_arrays(path, found.parameters.values, {name: tuple(array.shape) for name, array in values.items()})
         check_arrays(path, arrays, {f"best_{name}": getattr(start, name).shape for name in _FREE_VALUES})
         self._fitter.resume(found)
-        self._scene = TunedScene(fixed, found.parameters)
+        self._engine = self._make_engine(found.parameters)
         tables = {name.removeprefix("rate_"): array for name, array in arrays.items() if name.startswith("rate_")}
         try:
             self._best = _BestValues(FreeValues(*(arrays[f"best_{name}"] for name in _FREE_VALUES)), **own["best"])
@@ -157,24 +155,16 @@ class _Tuning:
         assert self._best is not None
         return TuningResult(self._best.values, self._full_log())
 
-    def step(self, view: int) -> LossValue:
-        fitter, options, shown_view = self._fitter, self._options, self._views.train[view]
-        seen, alphas = self._scene.dequantise()
+    def step(self, view: int) -> PendingLoss:
+        fitter, options = self._fitter, self._options
         if self._byte_cost > 0.0 and (fitter.rate is None or fitter.is_due(COUNT_EVERY)):
-            fitter.rate = self._scene.count(seen, self._byte_cost)
+            fitter.rate = self._engine.count(self._byte_cost)
             if self._controller is not None:
                 self._controller.update(fitter.rate.bits, (fitter.iteration - 1) / fitter.iterations, options.byte_cost)
-        rendered = self._render(seen, shown_view)
-        loss, buffer = self._losses.of(shown_view.camera)
         gain = fitter.gain(view, options.lr_exposure * options.learning_rate_factor(fitter.iteration))
-        shown = rendered if gain is None else gain.apply(rendered)
-        value, slope = loss(shown, shown_view.image(self._views.background, buffer), shown_view.mask)
-        if fitter.iteration == 1 and not math.isfinite(value.loss):  # values are still the initial ones
+        value = self._engine.step(self._views.train[view], gain, self._rates(), fitter.rate)
+        if fitter.iteration == 1 and not math.isfinite(value.read().loss):  # that of the initial values
             raise InputError("renders of the scene overflow float32: its colours are too large for tuning")
-        fitter.check(value)
-        if gain is not None:
-            slope = gain.backward(rendered, slope)
-        self._scene.step(self._rasteriser.backward(slope), seen, alphas, self._rates(), fitter.rate)
         return value
 
     def after_step(self) -> None:
@@ -182,7 +172,7 @@ class _Tuning:
         if fitter.is_due(options.validate_every) or fitter.is_last:
             self._validate()
         if self._show is not None and (fitter.is_due(options.log_every) or fitter.is_last):
-            model = self._scene.fixed.encode_plan.model
+            model = self._fixed.encode_plan.model
             size_bytes = self._log["validations"][-1]["size_bytes"]
             self._show(fitter.report(len(model), model.sh_degree, size_bytes=size_bytes))
         if outputs.checkpoint is not None and fitter.is_due(outputs.checkpoint_every):
@@ -203,31 +193,36 @@ class _Tuning:
             "sizes": options.lr_scales * factor,
             "logits": options.lr_opacities * factor,
             "sh0": options.lr_sh0 * factor,
-            "shN": (options.lr_shN if self._scene.fixed.book is None else options.lr_entries) * factor,
+            "shN": (options.lr_shN if self._fixed.book is None else options.lr_entries) * factor,
         }
 
-    def _render(self, seen: DecodedValues, view: TuningView) -> F32:
-        return self._rasteriser.forward(
-            seen, view.camera, background=self._views.background, antialiased=self._antialiased
-        ).rgb
+    def _make_engine(self, parameters: Parameters | None) -> TuningEngine:
+        fixed, options, background = self._fixed, self._options, self._views.background
+        if options.device == "cpu":
+            return CpuTuning(fixed, options, background, parameters, self._threads)
+        try:
+            from csplat_trainer.tuning.gsplat_tuning import GsplatTuning
+        except ImportError:
+            raise InputError(MISSING_TORCH) from None
+        return GsplatTuning(fixed, options, background, parameters)
 
     def _validate(self) -> None:
         """Score on the validation views, and keep the values with the least sum of loss and rate term."""
-        if not all(np.isfinite(values).all() for values in self._scene.parameters.values.values()):
+        values = self._engine.free_values()
+        if not all(np.isfinite(array).all() for array in vars(values).values()):
             raise InputError(f"a value is not finite at step {self._fitter.iteration}: try smaller learning rates")
-        seen, _ = self._scene.dequantise()
         total, error, count = 0.0, 0.0, 0
         for view in self._views.validation:
-            (loss, buffer), rendered = self._losses.of(view.camera), self._render(seen, view)
+            gain = None
             if self._options.lr_exposure and id(view) in self._numbers:  # also a training view
-                rendered = ImageGain(self._fitter.gains, self._numbers[id(view)], 0.0).apply(rendered)
-            reference = view.image(self._views.background, buffer)
-            total += loss(rendered, reference, view.mask)[0].loss / len(self._views.validation)
-            error += float(np.square(np.clip(rendered, 0, 1) - np.clip(reference, 0, 1)).sum(dtype=np.float64))
-            count += rendered.size if view.mask is None else 3 * int(view.mask.sum())
-        costs = self._scene.count(seen, self._options.byte_cost)
+                gain = ImageGain(self._fitter.gains, self._numbers[id(view)], 0.0)
+            value, squares = self._engine.score(view, gain)
+            total += value.loss / len(self._views.validation)
+            error += squares
+            count += 3 * (view.camera.W * view.camera.H if view.mask is None else int(view.mask.sum()))
+        costs = self._engine.count(self._options.byte_cost)
         psnr = psnr_of_mse(error / count)
-        size_bytes = len(self._scene.fixed.encode(self._scene.free_values).write().data)
+        size_bytes = len(self._fixed.encode(values).write().data)
         shrinks = False
         if self._controller is None:
             score = total + costs.loss
@@ -239,7 +234,7 @@ class _Tuning:
             {"iteration": self._fitter.iteration, "loss": total, "psnr": psnr, "size_bytes": size_bytes}
         )
         if self._best is None or score < self._best.score * (1.0 - _MIN_GAIN):
-            self._best = _BestValues(self._scene.free_values.copy(), score, psnr, self._fitter.iteration)
+            self._best = _BestValues(values, score, psnr, self._fitter.iteration)
         elif self._options.has_calmed(self._fitter.iteration) and not shrinks:
             self._best.since += 1
             self._fitter.has_ended = 0 < self._options.patience <= self._best.since
@@ -252,12 +247,14 @@ class _Tuning:
             arrays |= {f"rate_{name}": table for name, table in rate.tables.items()}
         del best["values"]
         own = {
-            "fixed": fingerprint(self._scene.fixed),
+            "fixed": fingerprint(self._fixed),
             "best": best,
             "rate": None if rate is None else {"weight": rate.weight, "bits": rate.bits},
             "controller": self._controller and asdict(self._controller),
         }
-        self._fitter.save(path, "finetune", asdict(self._options), self._scene.parameters, own=own, arrays=arrays)
+        self._fitter.save(
+            path, "finetune", asdict(self._options), self._engine.parameters.on_cpu(), own=own, arrays=arrays
+        )
 
     def _full_log(self) -> dict[str, Any]:
         assert self._best is not None

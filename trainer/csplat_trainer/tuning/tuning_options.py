@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 from csplat.errors import InputError
-from csplat_trainer.training_options import LOSSES, Loss
+from csplat_trainer.training_options import DEVICES, LOSSES, Device, Loss
 
 
 @dataclass(frozen=True)
@@ -16,6 +16,7 @@ class FinetuneOptions:
     Attributes:
         iterations: steps at most, one image each.
         seed: seed of the order of the images.
+        device: `cpu` (numba) or `cuda` (the gsplat package).
         loss: `inria`, `study` or `l1`, as in `TrainOptions`.
         lr_means: learning rate of the means, as a fraction of the median of the splats' middle standard deviation.
         lr_quats: learning rate of the rotations.
@@ -39,6 +40,7 @@ class FinetuneOptions:
 
     iterations: int = 1_000
     seed: int = 0
+    device: Device = "cpu"
     loss: Loss = "inria"
     lr_means: float = 0.1
     lr_quats: float = 8e-3
@@ -58,6 +60,8 @@ class FinetuneOptions:
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
             raise InputError(f"loss is {self.loss!r}, expected one of {', '.join(LOSSES)}")
+        if self.device not in DEVICES:
+            raise InputError(f"device is {self.device!r}, expected one of {', '.join(DEVICES)}")
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and low <= value <= high):

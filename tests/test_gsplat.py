@@ -1,0 +1,305 @@
+# ruff: noqa: E402 -- the tests are skipped before the imports of the trainer if torch is absent
+"""Training, tuning and measuring through gsplat's interface, against the same on the CPU.
+
+`gsplat_twin` stands in for gsplat; the tests marked `gpu` repeat the comparison with gsplat itself.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="the GPU engine requires torch (the train extra)")
+
+from captures import cameras, shell, training_images
+from gsplat_twin import rasterization
+
+from csplat import EncodeOptions
+from csplat.encoder import EncodePlan, fix_quantisation
+from csplat.errors import InputError
+from csplat_render.camera import Camera
+from csplat_render.pruning_error import measure_pruning_error
+from csplat_trainer import gsplat_rasteriser, training_loop
+from csplat_trainer.engine import CpuEngine
+from csplat_trainer.fitter import Fitter
+from csplat_trainer.gsplat_derivatives import estimate_pruning, estimate_sensitivity
+from csplat_trainer.gsplat_engine import GsplatEngine
+from csplat_trainer.gsplat_rasteriser import DeviceParameters, GsplatRasteriser, SplatTensors
+from csplat_trainer.image_gains import ImageGain, ImageGains
+from csplat_trainer.losses import LOSS_WEIGHTS, LossValue, photometric_loss_twin
+from csplat_trainer.parameters import GROUPS, Parameters, from_model
+from csplat_trainer.posed_images import PosedImage
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.strategies import ScreenGradients, densify, grow, relocate, reset_opacities
+from csplat_trainer.torch_losses import DeviceImages, TorchLoss
+from csplat_trainer.training_options import Outputs, TrainOptions
+from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
+from csplat_trainer.tuning.gsplat_tuning import GsplatTuning
+from csplat_trainer.tuning.tuning_engine import CpuTuning
+
+pytestmark = pytest.mark.area(name="torch")
+
+CPU, BLACK = torch.device("cpu"), np.zeros(3, np.float32)
+
+
+@pytest.fixture
+def camera() -> Camera:
+    viewmat = np.eye(4)
+    viewmat[2, 3] = 6.0
+    return Camera(np.array([[30.0, 0, 12], [0, 30.0, 10], [0, 0, 1]]), viewmat, 24, 20)
+
+
+@pytest.fixture
+def image(camera) -> PosedImage:
+    return PosedImage(camera, np.random.default_rng(0).integers(0, 255, (20, 24, 4)).astype(np.uint8))
+
+
+# The loss.
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 21)])
+@pytest.mark.parametrize("name", LOSS_WEIGHTS)
+def test_the_loss_equals_its_twin(size, name):
+    rng = np.random.default_rng(0)
+    x, y = (rng.random((*size, 3), dtype=np.float32) for _ in range(2))
+    value, slope = TorchLoss(name, CPU)(torch.from_numpy(x), torch.from_numpy(y))
+    expected, wanted = photometric_loss_twin(x, y, *LOSS_WEIGHTS[name])
+    assert value.read().loss == pytest.approx(expected.loss, rel=1e-5)
+    assert value.read().mse == pytest.approx(expected.mse, rel=1e-5)
+    assert np.abs(slope.numpy() - wanted).max() <= 1e-5 * np.abs(wanted).max()
+
+
+def test_masked_pixels_do_not_count():
+    rng = np.random.default_rng(0)
+    x, y = (torch.from_numpy(rng.random((9, 9, 3), dtype=np.float32)) for _ in range(2))
+    mask = torch.ones((9, 9), dtype=torch.bool)
+    mask[3:5] = False
+    losses = []
+    for value in (0.0, 1.0):
+        y[3:5] = value
+        found, slope = TorchLoss("inria", CPU)(x, y, mask)
+        losses.append(found.read())
+        assert not slope[3:5].any()
+    assert losses[0] == losses[1]
+
+
+def test_images_are_kept_on_the_device_as_far_as_they_fit(image):
+    images = DeviceImages(CPU)
+    images._left = 2000.0
+    shown = images.reference(image, torch.ones(3))
+    assert torch.equal(shown, images.reference(image, torch.ones(3)))
+    assert 1 == len(images._kept)
+    images.reference(replace(image), torch.ones(3))
+    assert 1 == len(images._kept)
+
+
+# Training.
+@pytest.mark.parametrize("gains", [False, True])
+@pytest.mark.parametrize("loss", ["inria", "study"])
+def test_the_engine_takes_the_same_steps(make_model, image, loss, gains):
+    options = TrainOptions(strategy="fixed", loss=loss, noise=0.0, max_splats=12)
+    starts = [Parameters.starting_at(from_model(make_model(12, 1), 1)) for _ in range(2)]
+    gpu = GsplatEngine(starts[1], options, rasterization, "cpu")
+    figures, corrections = [], []
+    for engine in (CpuEngine(starts[0], options), gpu):
+        rng, of_all = np.random.default_rng(0), ImageGains(2)
+        for step in range(1, 6):
+            gain = ImageGain(of_all, 0, 1e-2) if gains else None
+            rates = options.learning_rates(step, 1.0)
+            value = engine.step(image, np.ones(3, np.float32), 1, rates, rng, gain)
+        figures.append(value.read())
+        corrections.append(of_all.values)
+    assert figures[0].loss == pytest.approx(figures[1].loss, rel=1e-4)
+    assert np.allclose(*corrections, atol=1e-4)
+    for name in GROUPS:
+        assert np.allclose(starts[0].values[name], gpu.parameters.on_cpu().values[name], atol=2e-3)
+    pictures = [engine.render(image.camera, BLACK, 1) for engine in (CpuEngine(starts[0], options), gpu)]
+    assert np.abs(pictures[0] - pictures[1]).mean() < 1e-3
+
+
+def strategies(parameters):
+    """Let every strategy act once."""
+    rng = np.random.default_rng(0)
+    parameters.write("logits", np.arange(4), np.full(4, -9.0, np.float32))
+    relocate(parameters, 0.005, rng)
+    grow(parameters, 1.5, 60, 0.005, rng)
+    screen = ScreenGradients(np.linspace(0.0, 1.0, len(parameters)), np.ones(len(parameters), np.int64))
+    parameters.write("logits", np.arange(3), np.full(3, -9.0, np.float32))
+    parameters.write("scales", np.arange(30, 40), np.full((10, 3), -1.0, np.float32))
+    densify(parameters, screen, 1.0, 0.5, 80, 0.005, rng)
+    reset_opacities(parameters)
+    return parameters
+
+
+def test_strategies_act_alike_on_a_device(make_model):
+    starts = [Parameters.starting_at(from_model(make_model(40, 1), 1)) for _ in range(2)]
+    for start in starts:
+        start.first["means"][:] = start.second["shN"][:] = 1.0
+    found = strategies(DeviceParameters(starts[1], CPU)).on_cpu()
+    expected = strategies(starts[0])
+    for part in ("values", "first", "second"):
+        for name in GROUPS:
+            assert np.allclose(getattr(expected, part)[name], getattr(found, part)[name], atol=1e-6)
+
+
+@pytest.fixture
+def stand_in(monkeypatch):
+    """Let device cuda be the CPU."""
+
+    def start(self, *, antialiased, rasterization=None, **_):
+        return original(self, antialiased=antialiased, rasterization=rasterization or twin, device="cpu")
+
+    original, twin = GsplatRasteriser.__init__, rasterization
+    monkeypatch.setattr(GsplatRasteriser, "__init__", start)
+
+
+@pytest.mark.usefixtures("stand_in")
+@pytest.mark.parametrize("first", ["cpu", "cuda"])
+def test_either_engine_resumes_a_training_of_the_other(make_model, tmp_path, first):
+    data = training_images(make_model)
+    second = {"cpu": "cuda", "cuda": "cpu"}[first]
+    options = TrainOptions(max_splats=60, sh_degree=1, iterations=8, refine_start=2, refine_every=2, device=first)
+    start = training_loop.train(data, options, outputs=Outputs(checkpoint=tmp_path / "run.npz"))
+    longer = replace(options, iterations=16, device=second, final_share=0.5)
+    found = training_loop.train(data, longer, outputs=Outputs(resume=tmp_path / "run.npz"))
+    assert len(start.log["losses"]) < len(found.log["losses"])
+    assert found.log["losses"][-1] < found.log["losses"][0]
+    assert len(found.model) == 30
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_densification_trains_on_a_device(make_model):
+    options = TrainOptions(
+        max_splats=60, sh_degree=0, iterations=8, refine_start=2, refine_every=2, device="cuda", strategy="gradient"
+    )
+    assert np.isfinite(training_loop.train(training_images(make_model), options).log["losses"]).all()
+
+
+def test_a_loss_that_is_not_finite_is_reported_with_its_step():
+    class Fit:
+        def step(self, view):
+            count.append(view)
+            return Late(np.nan if len(count) == 3 else 1.0)
+
+        def after_step(self):
+            pass
+
+    class Late:
+        def __init__(self, loss):
+            self.loss = loss
+
+        def read(self):
+            return LossValue(self.loss, 0.0, 0.0, 0.0)
+
+    count = []
+    with pytest.raises(InputError, match="not finite at step 3"):
+        Fitter(4, 50, 0).run(Fit())
+
+
+def test_a_missing_gpu_is_refused():
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    with pytest.raises(InputError, match="finds no GPU"):
+        gsplat_rasteriser.gsplat_rasterization()
+
+
+def test_a_full_gpu_is_reported_with_the_options():
+    with pytest.raises(InputError, match=r"--max-splats.*--size"), gsplat_rasteriser.memory_errors():
+        raise torch.OutOfMemoryError("2 GiB")
+
+
+# Tuning.
+ENCODINGS = {
+    "codebook": EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16),
+    "shapes": EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32),
+    "scalar": EncodeOptions(attribute_psnr=28.0, sh_coding="scalar", tile_splats=80),
+    "no SH": EncodeOptions(attribute_psnr=28.0, sh_coding="none"),
+}
+
+
+@pytest.fixture(scope="module", params=ENCODINGS)
+def fixed(request):
+    return fix_quantisation(EncodePlan.of(shell(8), ENCODINGS[request.param], importance=np.linspace(1, 99, 300)))
+
+
+@pytest.fixture(scope="module")
+def views():
+    return split_views(renders_of(shell(8), cameras(6), BLACK, None), BLACK, validation_count=2)
+
+
+def test_the_loss_sees_what_a_decoder_returns(fixed, views):
+    options = FinetuneOptions(iterations=9)
+    gpu = GsplatTuning(fixed, options, BLACK, rasterization=rasterization, device="cpu")
+    rates = dict.fromkeys(gpu.parameters.values, 0.02)
+    for view in views.train:
+        gpu.step(view, None, rates, gpu.count(1e-3))
+        gpu.free_values()  # which compares the quantisers with the encoder's
+
+
+def test_tuning_takes_the_same_steps(fixed, views):
+    options = FinetuneOptions(iterations=9)
+    engines = CpuTuning(fixed, options, BLACK), GsplatTuning(fixed, options, BLACK, None, rasterization, "cpu")
+    found, figures = [], []
+    for engine in engines:
+        rates = dict.fromkeys(engine.parameters.values, 1e-3)
+        costs = engine.count(1e-4)
+        losses = [engine.step(view, None, rates, costs).read().loss for view in views.train]
+        figures.append([costs.bits, *losses, engine.score(views.validation[0], None)[1]])
+        found.append(engine.free_values())
+    assert np.allclose(*figures, rtol=2e-3)
+    for name, array in vars(found[0]).items():
+        assert np.count_nonzero(np.abs(array - getattr(found[1], name)) > 1e-5) <= 0.02 * array.size, name
+
+
+def test_values_that_the_encoder_quantises_differently_are_refused(fixed):
+    gpu = GsplatTuning(fixed, FinetuneOptions(), BLACK, None, rasterization, "cpu")
+    gpu.parameters.tensors["sh0"][0] = 1e9
+    with pytest.raises(InputError, match="sh0 are too large"):
+        gpu.free_values()
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_either_engine_resumes_a_tuning_of_the_other(fixed, views, tmp_path):
+    path = tmp_path / "run.npz"
+    options = FinetuneOptions(iterations=6, validate_every=3, warm_up=1, device="cuda")
+    tune(fixed, views, options, outputs=Outputs(checkpoint=path))
+    longer = replace(options, iterations=9, device="cpu")
+    found = tune(fixed, views, longer, outputs=Outputs(checkpoint=path, resume=path))
+    again = tune(fixed, views, replace(options, iterations=12), outputs=Outputs(resume=path))
+    assert [9, 12] == [len(one.log["losses"]) for one in (found, again)]
+    assert again.log["best_psnr"] == pytest.approx(found.log["start_psnr"], abs=0.2)
+
+
+@pytest.mark.usefixtures("stand_in")
+def test_tuning_approaches_a_size_alike(views):
+    fixed = fix_quantisation(EncodePlan.of(shell(8), ENCODINGS["codebook"]))
+    size = int(0.9 * len(fixed.encode(fixed.start()).write().data))
+    options = FinetuneOptions(iterations=30, validate_every=10, warm_up=5, byte_cost=1e-3)
+    runs = [tune(fixed, views, replace(options, device=device), size_bytes=size) for device in ("cpu", "cuda")]
+    sizes = [len(fixed.encode(one.best_values).write().data) for one in runs]
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.02)
+    assert runs[0].log["best_psnr"] == pytest.approx(runs[1].log["best_psnr"], abs=0.2)
+
+
+# Estimates.
+def test_estimates_agree_with_the_measured_derivatives(make_model, camera):
+    model = make_model(8, 1, seed=5, scales=np.full((8, 3), -1.0, np.float32), opacities=np.full(8, 0.4, np.float32))
+    rasteriser = GsplatRasteriser(antialiased=False, rasterization=rasterization, device="cpu")
+    expected = measure_sensitivity(model, [camera], metric=True, magnitudes=False, dtype=np.float64)
+    found = estimate_sensitivity(rasteriser, model, [camera] * 150, BLACK)
+    for name in ("colour_squares", "opacity_squares", "shape_squares", "means_squares"):
+        exact = getattr(expected, name)
+        assert np.allclose(getattr(found, name), exact, rtol=0.5, atol=0.1 * exact.max()), name
+        assert getattr(found, name).sum() == pytest.approx(exact.sum(), rel=0.2), name
+    for name in ("shape_metric", "metric"):
+        exact = getattr(expected, name)
+        assert np.abs(getattr(found, name) - exact).max() < 0.3 * np.abs(exact).max()
+
+
+def test_pruning_errors_agree_with_the_measured_ones(make_model, camera):
+    model = make_model(8, 1, seed=5, scales=np.full((8, 3), -1.0, np.float32))
+    exact = measure_pruning_error(model, [camera])
+    values = {name: torch.from_numpy(array) for name, array in from_model(model, 1).items()}
+    splats = SplatTensors.of(values, torch.from_numpy(model.opacities))
+    rasteriser = GsplatRasteriser(antialiased=False, rasterization=rasterization, device="cpu")
+    found = estimate_pruning(rasteriser, splats, [camera] * 150, BLACK)
+    assert np.array_equal(exact.seen, found.seen)
+    assert np.allclose(found.error / 150, exact.error, rtol=0.5, atol=0.1 * exact.error.max())

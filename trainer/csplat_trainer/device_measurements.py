@@ -1,0 +1,81 @@
+"""Measure importance and pruning errors of a scene, exactly on the CPU or by estimates on a GPU."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from csplat.encoder import Importance
+from csplat.errors import InputError
+from csplat.model import SplatModel
+from csplat.types import F32, Progress
+from csplat_render.camera import Camera
+from csplat_render.pruning_error import PruningError, measure_pruning_error
+from csplat_trainer.sensitivity import measure_sensitivity
+from csplat_trainer.sensitivity_file import StoredSensitivity
+from csplat_trainer.training_options import MISSING_TORCH, Device
+
+if TYPE_CHECKING:
+    from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
+
+
+def measure_importance(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    background: F32,
+    device: Device,
+    *,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> Importance:
+    """Measure the importance of each splat.
+
+    Args:
+        model: the scene.
+        cameras: the views, at least one; relative to the scene's origin.
+        background: [3].
+        device: `cpu` or `cuda`.
+        threads: number of threads on the CPU; `None` for all.
+        progress: progress callback.
+
+    Raises:
+        InputError: no view shows any splat, or the device is not usable.
+    """
+    if device == "cpu":
+        found = measure_sensitivity(
+            model, cameras, background=background, metric=True, magnitudes=False, threads=threads, progress=progress
+        )
+    else:
+        rasteriser = _rasteriser(model)
+        from csplat_trainer.gsplat_derivatives import estimate_sensitivity
+
+        found = estimate_sensitivity(rasteriser, model, cameras, background, progress)
+    if not found.seen.any():
+        raise InputError("no view shows any splat: check that the cameras belong to the scene")
+    return StoredSensitivity.of(model, found).importance()
+
+
+def measure_pruning(
+    model: SplatModel,
+    cameras: Sequence[Camera],
+    background: F32,
+    device: Device,
+    *,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> PruningError:
+    """Measure the pruning error of each splat; arguments and errors as for `measure_importance`."""
+    if device == "cpu":
+        return measure_pruning_error(model, cameras, background=background, threads=threads, progress=progress)
+    rasteriser = _rasteriser(model)
+    from csplat_trainer.gsplat_derivatives import estimate_pruning, splats_of
+
+    return estimate_pruning(rasteriser, splats_of(rasteriser, model), cameras, background)
+
+
+def _rasteriser(model: SplatModel) -> GsplatRasteriser:
+    try:
+        from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
+    except ImportError:
+        raise InputError(MISSING_TORCH) from None
+    return GsplatRasteriser(antialiased=model.antialiased)
