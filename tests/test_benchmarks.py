@@ -25,6 +25,7 @@ from chromium import absent
 from posed_sets import write_blender
 
 import csplat
+import gpu_machine
 from csplat import encode, write_ply
 from csplat.errors import InputError
 from csplat.ply import read_ply
@@ -345,7 +346,7 @@ def test_a_mean_requires_a_value_of_every_scene():
 
 def test_published_figures_of_scenes_give_the_published_means():
     """A slip of a digit shows: papers print figures by scene and their means."""
-    tables = tomllib.loads((results.PUBLISHED / "data_sets.toml").read_text())
+    tables = tomllib.loads((results.PUBLISHED / "captures.toml").read_text())
     for protocol in data_set_folders.PROTOCOLS:
         scenes = [tables[f"{protocol.slug}-{scene}"][0] for scene in protocol.factors]
         printed, tolerances = tables[protocol.slug][0], {"psnr_mean": 0.01, "ssim": 0.0006, "lpips_vgg": 0.0006}
@@ -359,7 +360,7 @@ def test_published_rows_follow_the_scenes_and_sets_that_were_measured(tmp_path):
     file = Results(tmp_path / "r.json", suite, "c")
     file.add("synthetic-lego200", suite.cases[0], {"set": "synthetic"})
     for _ in range(2):
-        file.set_published("data_sets")
+        file.set_published("captures")
     assert [
         ("synthetic-lego200", "PLY"), ("synthetic-lego200", "3DGS, published"), ("all of synthetic", "3DGS, published"),
         ("all of synthetic", "c3dgs, published"),
@@ -568,20 +569,22 @@ def test_scenes_of_the_papers_come_first_and_others_are_named(disk, capsys):
 
 def test_a_data_set_is_trained_scored_and_encoded_once(tmp_path):
     write_blender(tmp_path / "data" / "lego")
-    text = 'title = "t"\nsubject = "data_sets"\nscenes = ["*"]\n[options]\npublished = "data_sets"\n'
+    text = 'title = "t"\nsubject = "captures"\nscenes = ["*"]\n[options]\npublished = "captures"\n'
     text += 'train = { iterations = 20, max_splats = 60, sh_degree = 1 }\n[[cases]]\nname = "PLY"\n'
-    (tmp_path / "s.toml").write_text(text + '[[cases]]\nname = "fast"\npreset = "fast"\n')
+    text += '[[cases]]\nname = "fast"\npreset = "fast"\n[[cases]]\nname = "tuned"\nmegabytes = 0.004\n'
+    (tmp_path / "s.toml").write_text(text)
     status, found = run(tmp_path / "s.toml", tmp_path, "--data", tmp_path / "data")
     assert 0 == status
-    ply, fast, published, *_ = found["rows"]
+    ply, fast, tuned, published, *_ = found["rows"]
     assert ("synthetic-lego", "PLY", 20) == (ply["scene"], ply["case"], ply["steps"])
     assert "20 steps, the papers' 30000" in ply["remarks"]
     assert (
-        fast["size_bytes"]
-        < ply["size_bytes"]
-        == (tmp_path / "work" / "data_sets" / "synthetic-lego.ply").stat().st_size
+        fast["size_bytes"] < ply["size_bytes"] == (tmp_path / "work" / "captures" / "synthetic-lego.ply").stat().st_size
     )
     assert abs(fast["psnr_mean"] - ply["psnr_mean"]) < 3.0
+    assert tuned["size_bytes"] <= 4000
+    assert abs(tuned["psnr_mean"] - ply["psnr_mean"]) < 3.0
+    assert {"pruning", "choosing", "encoding", "tuning"} <= tuned["seconds"].keys()
     assert 35.78 == published["psnr_mean"]
     (tmp_path / "s.toml").write_text((tmp_path / "s.toml").read_text().replace("= 20", "= 25"))
     with pytest.raises(InputError, match="was trained with other options"):
@@ -591,8 +594,23 @@ def test_a_data_set_is_trained_scored_and_encoded_once(tmp_path):
 def run_suite_file(tmp_path):
     suite = load_suite(str(tmp_path / "s.toml"), list(SUBJECTS))
     setup = replace(setup_of(tmp_path / "work"), data=tmp_path / "data", options=suite.options)
-    with SUBJECTS["data_sets"](setup, "synthetic-lego", suite.cases):
-        pass
+    with SUBJECTS["captures"](setup, "synthetic-lego", suite.cases) as measure:
+        measure(suite.cases[0])
+
+
+def test_a_scene_reaches_another_machine_in_pieces(tmp_path):
+    write_blender(tmp_path / "lego")
+    sizes = {path: path.stat().st_size for path in (tmp_path / "lego").rglob("*") if path.is_file()}
+    count = gpu_machine.pack_pieces(tmp_path / "lego", tmp_path / "pieces", max(sizes.values()), tmp_path / "none")
+    for number in range(1, count + 1):
+        piece = [path for path in (tmp_path / "pieces" / str(number)).rglob("*") if path.is_file()]
+        assert sum(path.stat().st_size for path in piece) <= max(sizes.values())
+        assert 0 == gpu_machine.main(["unpack", str(tmp_path / "pieces" / str(number)), str(tmp_path / "there")])
+    for path in sizes:
+        copy = tmp_path / "there" / "data" / "lego" / path.relative_to(tmp_path / "lego")
+        assert path.read_bytes() == copy.read_bytes()
+    assert count > 1
+    assert 3 == gpu_machine.run_suite(tmp_path / "there", "captures_cpu", [], 0.1)
 
 
 def test_the_renderer_is_measured(sample_path, tmp_path):

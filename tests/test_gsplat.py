@@ -1,7 +1,7 @@
 # ruff: noqa: E402 -- the tests are skipped before the imports of the trainer if torch is absent
 """Training, tuning and measuring through gsplat's interface, against the same on the CPU.
 
-`gsplat_twin` stands in for gsplat; the tests marked `gpu` repeat the comparison with gsplat itself.
+`gsplat_twin` renders instead of gsplat, on the CPU.
 """
 
 from dataclasses import replace
@@ -14,17 +14,20 @@ torch = pytest.importorskip("torch", reason="the GPU engine requires torch (the 
 from captures import cameras, shell, training_images
 from gsplat_twin import rasterization
 
-from csplat import EncodeOptions
+from csplat import EncodeOptions, Target
 from csplat.encoder import EncodePlan, fix_quantisation
 from csplat.errors import InputError
+from csplat_render import render
 from csplat_render.camera import Camera
 from csplat_render.pruning_error import measure_pruning_error
+from csplat_tools.training.tuning_run import choose_and_finetune
+from csplat_tools.views import ViewSet
 from csplat_trainer import gsplat_rasteriser, training_loop
 from csplat_trainer.engine import CpuEngine
 from csplat_trainer.fitter import Fitter
-from csplat_trainer.gsplat_derivatives import estimate_pruning, estimate_sensitivity
+from csplat_trainer.gsplat_derivatives import estimate_pruning, estimate_sensitivity, splats_of
 from csplat_trainer.gsplat_engine import GsplatEngine
-from csplat_trainer.gsplat_rasteriser import DeviceParameters, GsplatRasteriser, SplatTensors
+from csplat_trainer.gsplat_rasteriser import DeviceParameters, GsplatRasteriser
 from csplat_trainer.image_gains import ImageGain, ImageGains
 from csplat_trainer.losses import LOSS_WEIGHTS, LossValue, photometric_loss_twin
 from csplat_trainer.parameters import GROUPS, Parameters, from_model
@@ -265,7 +268,7 @@ def test_either_engine_resumes_a_tuning_of_the_other(fixed, views, tmp_path):
     found = tune(fixed, views, longer, outputs=Outputs(checkpoint=path, resume=path))
     again = tune(fixed, views, replace(options, iterations=12), outputs=Outputs(resume=path))
     assert [9, 12] == [len(one.log["losses"]) for one in (found, again)]
-    assert again.log["best_psnr"] == pytest.approx(found.log["start_psnr"], abs=0.2)
+    assert again.log["best_psnr"] > found.log["start_psnr"] - 0.2
 
 
 @pytest.mark.usefixtures("stand_in")
@@ -279,12 +282,24 @@ def test_tuning_approaches_a_size_alike(views):
     assert runs[0].log["best_psnr"] == pytest.approx(runs[1].log["best_psnr"], abs=0.2)
 
 
+@pytest.mark.usefixtures("stand_in")
+def test_a_scene_is_pruned_and_tuned_to_a_size(views):
+    model = shell(8)
+    around = ViewSet("cameras", (0.0, 0.0, 0.0), [one.camera for one in views.train[:2]], (), ())
+    options = FinetuneOptions(iterations=8, validate_every=4, warm_up=2, device="cuda", byte_cost=1e-3)
+    tuned = choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size_bytes=2900))
+    assert 2400 < tuned.size_bytes <= 2900
+    assert 290 == len(tuned.made.decoded)
+    with pytest.raises(InputError, match="more than 300"):
+        choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size_bytes=300))
+
+
 # Estimates.
 def test_estimates_agree_with_the_measured_derivatives(make_model, camera):
     model = make_model(8, 1, seed=5, scales=np.full((8, 3), -1.0, np.float32), opacities=np.full(8, 0.4, np.float32))
     rasteriser = GsplatRasteriser(antialiased=False, rasterization=rasterization, device="cpu")
     expected = measure_sensitivity(model, [camera], metric=True, magnitudes=False, dtype=np.float64)
-    found = estimate_sensitivity(rasteriser, model, [camera] * 150, BLACK)
+    found = estimate_sensitivity(rasteriser, model, [camera] * 60, BLACK)
     for name in ("colour_squares", "opacity_squares", "shape_squares", "means_squares"):
         exact = getattr(expected, name)
         assert np.allclose(getattr(found, name), exact, rtol=0.5, atol=0.1 * exact.max()), name
@@ -297,9 +312,31 @@ def test_estimates_agree_with_the_measured_derivatives(make_model, camera):
 def test_pruning_errors_agree_with_the_measured_ones(make_model, camera):
     model = make_model(8, 1, seed=5, scales=np.full((8, 3), -1.0, np.float32))
     exact = measure_pruning_error(model, [camera])
-    values = {name: torch.from_numpy(array) for name, array in from_model(model, 1).items()}
-    splats = SplatTensors.of(values, torch.from_numpy(model.opacities))
     rasteriser = GsplatRasteriser(antialiased=False, rasterization=rasterization, device="cpu")
-    found = estimate_pruning(rasteriser, splats, [camera] * 150, BLACK)
+    found = estimate_pruning(rasteriser, splats_of(rasteriser, model), [camera] * 60, BLACK)
     assert np.array_equal(exact.seen, found.seen)
-    assert np.allclose(found.error / 150, exact.error, rtol=0.5, atol=0.1 * exact.error.max())
+    assert np.allclose(found.error / 60, exact.error, rtol=0.5, atol=0.1 * exact.error.max())
+
+
+# On a GPU.
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a GPU")
+
+
+@pytest.mark.gpu
+@needs_gpu
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_gsplat_renders_as_the_cpu_does(make_model, camera, antialiased):
+    model = make_model(40, 3, seed=1)
+    rasteriser = GsplatRasteriser(antialiased=antialiased)
+    found, _ = rasteriser.render(splats_of(rasteriser, model), camera, rasteriser.upload(BLACK), 3)
+    expected = render(replace(model, antialiased=antialiased), camera).rgb
+    assert np.abs(found.detach().cpu().numpy() - expected).mean() < 2e-3
+
+
+@pytest.mark.gpu
+@needs_gpu
+def test_a_gpu_quantises_as_the_encoder(fixed, views):
+    gpu = GsplatTuning(fixed, FinetuneOptions(), BLACK)
+    for view in views.train:
+        gpu.step(view, None, dict.fromkeys(gpu.parameters.values, 0.02), gpu.count(1e-3))
+        gpu.free_values()

@@ -157,7 +157,7 @@ class _Derivatives:
     def _add(self, means: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, basis: Tensor) -> Tensor:
         """Add the products of derivatives, and return which splats are drawn."""
         self.opacity += opacities.square() / _DRAWS
-        squares = colours.square().mean(dim=1) / _DRAWS  # of each channel, with other signs
+        squares = colours.square().mean(dim=1) / _DRAWS  # each channel has its own signs
         if self._matrices:
             self.colour += squares
             self.means += means.square().sum(dim=1) / _DRAWS

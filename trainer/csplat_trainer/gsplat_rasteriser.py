@@ -39,7 +39,7 @@ def gsplat_rasterization() -> Callable[..., Any]:
         from gsplat import rasterization
         from gsplat.cuda._backend import _C
     except ImportError:
-        raise InputError("device cuda: the gsplat package is not installed (pip install gsplat==1.5.3)") from None
+        raise InputError("device cuda: the gsplat package is not installed (pip install 'csplat[cuda]')") from None
     except (OSError, RuntimeError) as error:  # from the compiler
         raise InputError(f"device cuda: gsplat cannot be compiled: {_last_line(error)}") from None
     if _C is None:

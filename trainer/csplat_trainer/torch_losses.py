@@ -116,7 +116,7 @@ class DeviceImages:
         found = self._kept.get(id(key))
         if found is not None:
             return found[1]
-        tensor = torch.from_numpy(np.ascontiguousarray(array)).to(self._device)
+        tensor = torch.from_numpy(np.require(array, requirements=["C", "W"])).to(self._device)
         if array.nbytes <= self._left:
             self._left -= array.nbytes
             self._kept[id(key)] = (key, tensor)

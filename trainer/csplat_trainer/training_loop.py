@@ -38,7 +38,7 @@ _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 _COLOURS = {"black": _BLACK, "white": _WHITE, "random": _WHITE}  # background colours of evaluations
 _RESET_EVERY = 3000  # steps between resets of the opacities, gradient strategy
 _KEPT_AT_ONCE = 0.85  # fraction of the splats kept by a late pruning
-_STEPS_BETWEEN = 100  # steps after each late pruning
+_STEPS_BETWEEN = 100  # steps after each late pruning, or 1 % of the iterations
 _LARGE_EXTENT = 50.0  # scene units; in larger scenes the weight of the mean standard deviation is reduced
 _FIRST_FRACTION = 0.5  # initial number of splats of mcmc without points, as a fraction of the cap
 
@@ -238,7 +238,7 @@ class _Training:
         times, begin = math.ceil(math.log(final / count) / math.log(_KEPT_AT_ONCE)), fitter.seconds
         for left in range(times, 0, -1):
             self._prune(left)
-            for _ in range(_STEPS_BETWEEN):
+            for _ in range(max(_STEPS_BETWEEN, self._options.iterations // 100)):
                 fitter.step(self)
             self._report((fitter.seconds - begin) / (times - left + 1) * (left - 1))
 

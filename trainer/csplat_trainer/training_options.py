@@ -25,7 +25,7 @@ BACKGROUNDS: tuple[Background, ...] = get_args(Background)
 DEVICES: tuple[Device, ...] = get_args(Device)
 
 
-MISSING_TORCH = "device cuda: torch is not installed (pip install 'csplat[train]')"
+MISSING_TORCH = "device cuda: torch is not installed (pip install 'csplat[cuda]')"
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,7 @@ def train(
     ] = None,
     target_size: shared.TargetSize = None,
     target_psnr: shared.TargetPsnr = None,
-    device: Annotated[
-        str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, or cuda: a GPU. Default: cpu.")
-    ] = "cpu",
+    device: shared.Device = "cpu",
     page: shared.Page = None,
     up: shared.HiddenUp = None,
     size: Annotated[

@@ -17,7 +17,7 @@ from csplat_tools.file_streams import write_model
 from csplat_tools.optional_packages import prepare_renderer
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.training.tuning_report import describe_step, show_views, write_training_page
-from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, run_finetuning
+from csplat_tools.training.tuning_run import RATE_WEIGHT, SPLAT_BYTES, paced, run_finetuning
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.data import DataSet, load
 from csplat_trainer.fit_checkpoint import load_checkpoint
@@ -28,7 +28,6 @@ from csplat_trainer.tuning import FinetuneOptions
 
 _TUNING = 1 / 6  # steps of the tuning that follows a training, as a fraction of the training's steps
 _KEEP = 0.8  # default fraction of the trained splats that a file keeps: some of them are hardly seen
-_VALIDATIONS = 8  # validations of a tuning on a GPU
 _BRIEF = 4_000  # training steps up to which the tuning uses full learning rates; later they gain nothing
 
 
@@ -175,9 +174,7 @@ def tuning_after(training: TrainOptions, byte_cost: float | None = None) -> Fine
     usual = FinetuneOptions(seed=training.seed, byte_cost=RATE_WEIGHT[False] if byte_cost is None else byte_cost)
     tuning = usual.scaled(min(1.0, _BRIEF / training.iterations))
     steps = max(usual.iterations, round(_TUNING * training.iterations))
-    if training.device != "cpu":  # the CPU writes the file of each validation, which takes as long as many steps
-        tuning = replace(tuning, validate_every=max(tuning.validate_every, steps // _VALIDATIONS))
-    return replace(tuning, iterations=steps, lr_exposure=training.lr_exposure, device=training.device)
+    return paced(replace(tuning, iterations=steps, lr_exposure=training.lr_exposure, device=training.device))
 
 
 def tuning_checkpoint(path: str | Path) -> Path:

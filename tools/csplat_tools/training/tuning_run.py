@@ -75,7 +75,9 @@ _AIM = 0.05  # dB above a PSNR that tuned files aim at
 _WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
 _FINER = 0.1  # least factor of the error of the goal from one tuning to the next
 _TUNINGS = 4  # largest number of tunings for a target
-_PRECISIONS, _PRECISION_STEPS = (30.0, 56.0), 5  # dB, and bisections, when a GPU tunes to a size
+_PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.75  # dB: range and accuracy of the precision that is found for a size
+_VALIDATIONS = 8  # validations of a tuning on a GPU
+_SAMPLE = 1 << 15  # splats by which it is judged
 
 _VALIDATION_EVERY = 8  # every Nth virtual view is a validation view
 _MOST_VALIDATION = 16  # validation views, at most
@@ -93,6 +95,13 @@ def default_validation_count(count: int, *, cameras: str | None, data: object | 
     if data is not None:
         return 0
     return min(_MOST_VALIDATION, count // _VALIDATION_EVERY) if cameras is None else None
+
+
+def paced(options: FinetuneOptions) -> FinetuneOptions:
+    """Return the options with fewer validations on a GPU: their files, which the CPU writes, take longer than steps."""
+    if options.device == "cpu":
+        return options
+    return replace(options, validate_every=max(options.validate_every, options.iterations // _VALIDATIONS))
 
 
 def run_finetuning(
@@ -274,7 +283,14 @@ class Tuner:
         return self._tune(model, rows, self.encoding, None, is_pruned=kept_count is not None)
 
     def _tune(
-        self, model: SplatModel, rows: I64, encoding: EncodeOptions, size_bytes: int | None, *, is_pruned: bool = True
+        self,
+        model: SplatModel,
+        rows: I64,
+        encoding: EncodeOptions,
+        size_bytes: int | None,
+        *,
+        is_pruned: bool = True,
+        finds_precision: bool = False,
     ) -> TunedSubset:
         """Tune a file.
 
@@ -284,10 +300,11 @@ class Tuner:
             encoding: options of the encoder.
             size_bytes: largest size, to which the tuning adjusts lambda; `None`: none.
             is_pruned: splats may have been pruned that a view shows.
+            finds_precision: choose the precision by the size.
         """
         with self._timer.stage("choosing"):
             views, weights = self.tuning_views, self._importance_of(model, rows)
-            if self.options.device != "cpu" and size_bytes is not None:
+            if finds_precision and size_bytes is not None:
                 encoding = self._precise(model, weights, size_bytes)
         pruning = {"unseen": len(self.source) - len(self.rows)}
         if is_pruned:
@@ -317,21 +334,30 @@ class Tuner:
         return np.array(self.views.background, np.float32)
 
     def _precise(self, model: SplatModel, weights: NDArray[Any] | Importance, size_bytes: int) -> EncodeOptions:
-        """Return the options with the precision at which the untuned file has about the size."""
-        if self.encoding.attribute_psnr is not None:
-            return self.encoding
+        """Return the options with the precision at which the untuned file has about the size, judged by a sample.
+
+        In a sample, centres take more bits, and indices of its smaller codebooks fewer, by about the same.
+        """
+        encoding = self.encoding
+        if encoding.attribute_psnr is not None:
+            return encoding
+        if model.sh_degree and encoding.sh_coding == "auto":  # the choice may differ between precisions
+            encoding = replace(encoding, sh_coding="codebook")
+        count = min(len(model), _SAMPLE)
+        rows = np.sort(np.random.default_rng(encoding.seed).choice(len(model), count, replace=False))
+        sample = model.select(rows)
+        weights = weights.select(rows) if isinstance(weights, Importance) else weights[rows]
         low, high = _PRECISIONS
-        for _ in range(_PRECISION_STEPS):
-            options = replace(self.encoding, attribute_psnr=0.5 * (low + high))
-            plan = EncodePlan.of(model, options, importance=weights, allow_classes=False, progress=self.progress)
-            if len(encode_tiles(plan).write().data) > size_bytes:
-                high = 0.5 * (low + high)
-            else:
-                low = 0.5 * (low + high)
-        return replace(self.encoding, attribute_psnr=low)
+        while high - low > _PRECISION_STEP:
+            middle = 0.5 * (low + high)
+            options = replace(encoding, attribute_psnr=middle)
+            plan = EncodePlan.of(sample, options, importance=weights, allow_classes=False)
+            is_larger = len(encode_tiles(plan).write().data) * len(model) > size_bytes * count
+            low, high = (low, middle) if is_larger else (middle, high)
+        return replace(encoding, attribute_psnr=low)
 
     def tune_to_size(self, size_bytes: int) -> TunedSubset:
-        """Tune a file of a size without drafts, which a GPU does not make.
+        """Tune a file of a size without drafts: for trainings, which prune themselves, and on a GPU.
 
         One splat is kept for `SPLAT_BYTES`, and the untuned file gets the precision that leads to the size.
 
@@ -346,7 +372,7 @@ class Tuner:
                 found = measure_pruning(model, self._measuring, self._background, self.options.device)
                 keys, left = pruning_keys(model.opacities, found), max(kept_count, int(len(rows) * ROUND_FRACTION))
                 rows = rows[np.sort(np.argsort(keys, kind="stable")[len(rows) - left :])]
-        made = self._tune(self.source.select(rows), rows, self.encoding, size_bytes)
+        made = self._tune(self.source.select(rows), rows, self.encoding, size_bytes, finds_precision=True)
         if made.size_bytes > size_bytes:
             raise InputError(f"the smallest file has {made.size_bytes:,} bytes, more than {size_bytes:,}")
         return made
@@ -453,7 +479,8 @@ def choose_and_finetune(
     )  # fmt: skip
     if target is None:
         return tuner.tune_kept(None)
-    if options.device != "cpu" and target.size_bytes is not None:
+    most = 0 if target.size_bytes is None else target.size_bytes // SPLAT_BYTES
+    if target.size_bytes is not None and (options.device != "cpu" or len(source) <= most):
         return tuner.tune_to_size(target.size_bytes)
     return tuner.tune_kept(target.count(len(source))) if target.keep is not None else tuner.tune_to(target)
 

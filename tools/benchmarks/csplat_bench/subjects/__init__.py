@@ -8,7 +8,7 @@ from csplat_bench.protocol import Setup, Subject
 from csplat_bench.subjects.arrival import measure_arrival
 from csplat_bench.subjects.batch_runs import measure_batches
 from csplat_bench.subjects.browsers import measure_browsers
-from csplat_bench.subjects.data_sets import measure_data_set, scene_keys
+from csplat_bench.subjects.captures import measure_capture, scene_keys
 from csplat_bench.subjects.decoder_agreement import compare_decoders
 from csplat_bench.subjects.decoders import measure_decoders
 from csplat_bench.subjects.encoder_inputs import input_names, measure_input
@@ -29,7 +29,7 @@ SUBJECTS: dict[str, Subject] = {
     "arrival": measure_arrival,
     "batch_runs": measure_batches,
     "browsers": measure_browsers,
-    "data_sets": measure_data_set,
+    "captures": measure_capture,
     "decoder_agreement": compare_decoders,
     "decoders": measure_decoders,
     "encoder_inputs": measure_input,
@@ -49,6 +49,6 @@ SUBJECTS: dict[str, Subject] = {
 
 #: Subjects that find their scenes by patterns.
 SCENE_FINDERS: dict[str, Callable[[Setup, Sequence[str]], list[str]]] = {
-    "data_sets": scene_keys,
+    "captures": scene_keys,
     "encoder_inputs": input_names,
 }
