@@ -48,8 +48,11 @@ class EveryFourth:
     def settings(self):
         return {"splats": "every fourth"}
 
-    def build_part(self, splats, threads):
-        assert threads == 1
+    def seconds(self, count):
+        return 1e-5 * count
+
+    def build_part(self, splats, scene_count, threads):
+        assert (COUNT, 1) == (scene_count, threads)
         coarse = replace(splats.select(np.arange(0, len(splats), 4)), extra={}, means_double=None)
         return [LevelNode(0, 1, rows=np.arange(len(splats))), LevelNode(1, None, splats=coarse)]
 

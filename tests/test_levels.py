@@ -530,6 +530,14 @@ def test_fitted_levels_look_better_than_merged_ones(model):
     assert scores[0] + 0.5 < scores[1] < scores[2]
 
 
+def test_parts_of_a_very_large_scene_are_merged_alone(model):
+    builder = LevelBuilder(1, leaf_splats=1200, whole_splats=1200, fitted_splats=5000)
+    fitted, merged = (builder.build_part(model, count, 1)[1].splats for count in (5000, 5001))
+    assert same(quarter(model), merged)
+    assert not same(quarter(model), fitted)
+    assert builder.seconds(5001) < builder.seconds(5000)
+
+
 def test_levels_are_the_same_each_time_and_at_any_number_of_threads(model):
     one, other = (LevelBuilder(leaf_splats=400, root_splats=100).build(model, threads) for threads in (1, 2))
     assert len(one) == len(other)
@@ -654,9 +662,10 @@ def test_levels_without_the_renderer_are_an_error_that_names_the_extra(monkeypat
 # Scenes of several buckets ---------------------------------------------------------------------------
 
 
-def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path):
+@pytest.mark.parametrize("fitted_splats", [400, 399])
+def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path, fitted_splats):
     scene, options = model.select(np.arange(400)), EncodeOptions(bucket_splats=300, threads=1)
-    builder = LevelBuilder(2, leaf_splats=300, whole_splats=300, bucket_splats=300)
+    builder = LevelBuilder(2, leaf_splats=300, whole_splats=300, fitted_splats=fitted_splats, bucket_splats=300)
     data = builder.encode(scene, options).write({"levels": builder.settings()}).data
     with csplat.open(data) as file:
         assert [(0, 2), (1, 2), (2, 1)] == [

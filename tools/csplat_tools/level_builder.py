@@ -10,7 +10,7 @@ in streamed SOG, are taken instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -42,9 +42,15 @@ from csplat.scene_source import join_blocks
 from csplat.types import F32, I64, Progress, null_progress
 from csplat_tools.level_errors import measure_errors
 from csplat_tools.level_fitting import PART_WORK, LevelFitter
+from csplat_tools.level_merging import merge_neighbours
 
 _KEPT = 4  # splats of a level, divided by those of the coarser one
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
+# Seconds per splat for levels, with the measurement of errors: of scenes in one piece, and of buckets.
+_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 3e-5
+
+#: Makes the splats of a level, and the node of each; arguments as for `LevelFitter.fit`.
+_Fit = Callable[[SplatModel, I64, int, int], tuple[I64, SplatModel]]
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,9 @@ class LevelBuilder:
         root_splats: maximum number of splats of the root, the first picture of a scene; 4,096 are about 50 kB.
         whole_splats: number of splats up to which a scene is built in one piece, with more work. Built like a bucket,
             level 1 of garden500k has 27.5 instead of 32.0 dB.
+        fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger ones,
+            neighbours are merged alone: 411,296 splats of SH degree 0 take 14 CPU s instead of 35. On two cores, 100
+            million would take 75 to 90 minutes with the fit, and 40 million take 30 to 35.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
     """
@@ -66,6 +75,7 @@ class LevelBuilder:
     leaf_splats: int = 1 << 14
     root_splats: int = 1 << 12
     whole_splats: int = 2_000_000
+    fitted_splats: int = 40_000_000
     bucket_splats: int = BUCKET_SPLATS
     nodes: Sequence[LevelNode] | None = None
 
@@ -75,6 +85,12 @@ class LevelBuilder:
             return {"splats": "of the source"}
         size = {"root_splats": self.root_splats} if self.count is None else {"count": self.count}
         return {"splats": "fitted", "leaf_splats": self.leaf_splats, **size}
+
+    def seconds(self, count: int) -> float:
+        """Return the approximate time for the levels of a scene of `count` splats, by one process."""
+        if count <= self.whole_splats:
+            return count * _SECONDS_WHOLE
+        return count * (_SECONDS_FITTED if count <= self.fitted_splats else _SECONDS_MERGED)
 
     def encode(
         self, model: SplatModel, options: EncodeOptions | None = None, progress: Progress = null_progress
@@ -107,11 +123,13 @@ class LevelBuilder:
         if not len(model):
             return []
         if len(model) <= self.whole_splats:
-            return self._build_leaves(model, LevelFitter(_plain(model), threads=threads, progress=progress), self.count)
+            return self._build_leaves(
+                model, LevelFitter(_plain(model), threads=threads, progress=progress).fit, self.count
+            )
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
         buckets = bucket_rows(model.means, self.bucket_splats)
         for done, rows in enumerate(buckets):
-            part = self.build_part(model.select(rows), threads)
+            part = self.build_part(model.select(rows), len(model), threads)
             numbers.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
             roots.append(join_roots(part))
             nodes += [_moved(node, len(nodes), rows) for node in part]
@@ -122,10 +140,18 @@ class LevelBuilder:
                 nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
         return nodes + [_moved(node, len(nodes)) for node in top]
 
-    def build_part(self, splats: SplatModel, threads: int | None) -> list[LevelNode]:
-        """Build the nodes of a bucket, up to one node or the last level."""
+    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
+        """Build the nodes of a bucket, up to one node or the last level.
+
+        Args:
+            splats: the bucket.
+            scene_count: number of splats of the scene.
+            threads: number of threads; `None`: all. No node depends on it.
+        """
         fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, threads=threads)
-        return self._build_leaves(splats, fitter, self._part_levels)
+        return self._build_leaves(
+            splats, fitter.fit if scene_count <= self.fitted_splats else _merge, self._part_levels
+        )
 
     def build_top(
         self, roots: Iterable[SplatModel], threads: int | None = None, progress: Progress = null_progress
@@ -146,9 +172,8 @@ class LevelBuilder:
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
-        nodes = self._add_levels(
-            nodes, scene, places, LevelFitter(scene, is_part=True, threads=threads, progress=progress), self.count
-        )
+        fitter = LevelFitter(scene, is_part=True, threads=threads, progress=progress)
+        nodes = self._add_levels(nodes, scene, places, fitter.fit, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
         return [node.parent for node in nodes[: len(parts)]], nodes[len(parts) :]
 
@@ -165,16 +190,16 @@ class LevelBuilder:
         levels = math.ceil(math.log(leaves, _CHILDREN) - 1e-9) or 1
         return levels if self.count is None else min(levels, self.count)
 
-    def _build_leaves(self, splats: SplatModel, fitter: LevelFitter, last: int | None) -> list[LevelNode]:
+    def _build_leaves(self, splats: SplatModel, fit: _Fit, last: int | None) -> list[LevelNode]:
         groups = kd_groups(splats.means, math.ceil(len(splats) / self.leaf_splats))
         places = np.empty(len(splats), np.int64)
         for place, rows in enumerate(groups):
             places[rows] = place
         nodes = [LevelNode(0, None, rows=rows) for rows in groups]
-        return self._add_levels(nodes, fitter.scene, places, fitter, last)
+        return self._add_levels(nodes, _plain(splats), places, fit, last)
 
     def _add_levels(
-        self, nodes: list[LevelNode], splats: SplatModel, places: I64, fitter: LevelFitter, last: int | None
+        self, nodes: list[LevelNode], splats: SplatModel, places: I64, fit: _Fit, last: int | None
     ) -> list[LevelNode]:
         """Return nodes of one level with those of coarser levels.
 
@@ -182,7 +207,7 @@ class LevelBuilder:
             nodes: the nodes.
             splats: their splats.
             places: [N], the node of each splat.
-            fitter: fits levels to the renders of these splats.
+            fit: makes the splats of a level of those of the finer one, as `LevelFitter.fit`.
             last: the coarsest level; `None`: that of a root of `root_splats`.
         """
         nodes, first, node_count = list(nodes), nodes[0].level, len(nodes)
@@ -195,7 +220,7 @@ class LevelBuilder:
                 nodes[at] = replace(nodes[at], parent=start + child // _CHILDREN)
             node_count, places = math.ceil(node_count / _CHILDREN), places // _CHILDREN
             count = max(node_count, math.ceil(len(splats) / _KEPT))
-            places, splats = fitter.fit(splats, places, count, level - first)
+            places, splats = fit(splats, places, count, level - first)
             nodes += [LevelNode(level, None, splats=splats.select(rows)) for rows in _rows_by_node(places, node_count)]
         return nodes
 
@@ -276,6 +301,10 @@ def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
         counts = np.stack([near, counts - near], axis=1).reshape(-1)
         sizes, counts = sizes[counts > 0], counts[counts > 0]
     return np.split(order, np.cumsum(sizes)[:-1])
+
+
+def _merge(finer: SplatModel, nodes: I64, count: int, _level: int) -> tuple[I64, SplatModel]:
+    return merge_neighbours(finer, nodes, count)
 
 
 def _plain(model: SplatModel) -> SplatModel:

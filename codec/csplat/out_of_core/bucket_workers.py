@@ -50,12 +50,16 @@ class LevelMaker(Protocol):
         """Return what the OPTS chunk states, JSON-compatible."""
         ...
 
+    def seconds(self, count: int) -> float:
+        """Return the approximate time for the levels of a scene of `count` splats, by one process."""
+        ...
+
     def encode(self, model: SplatModel, options: EncodeOptions, progress: Progress) -> EncodedTiles:
         """Encode a scene with its levels, in memory."""
         ...
 
-    def build_part(self, splats: SplatModel, threads: int | None) -> list[LevelNode]:
-        """Build the nodes of a bucket."""
+    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
+        """Build the nodes of a bucket of a scene of `scene_count` splats."""
         ...
 
     def build_top(
@@ -174,7 +178,7 @@ def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
     codebooks = replace(coding.codebooks, sh_plan=sh_plan)
     if coding.levels is None:
         return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), codebooks)
-    nodes = coding.levels.build_part(model, threads)
+    nodes = coding.levels.build_part(model, coding.plan.origin.source_count, threads)
     roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
     write_splats(roots_path(coding.folder, bucket), join_blocks(roots[0], roots))
     return coding.levels.measure(encode_levels(plan, nodes, codebooks), threads, null_progress)

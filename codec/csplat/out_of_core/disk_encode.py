@@ -42,10 +42,8 @@ _CODED = 0.3  # maximum size of a file, as a multiple of the size of its arrays
 #: 30 M of degree 3. Degree 4 takes 1.13 times the CPU time of degree 3 (300,000 splats in memory).
 _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0), (0.65, 9.0, 22.5))
 # Levels of detail: memory of building those of a bucket, for each process: renders, a multiple of the size of its
-# arrays, and bytes per splat; seconds per splat of one process; size of the file relative to one without.
+# arrays, and bytes per splat; size of the file relative to one without.
 _LEVEL_RENDERS, _LEVEL_ROWS, _LEVEL_SPLAT = 200 * _MB, 2.0, 600
-_LEVEL_SECONDS = 8e-5
-_LEVEL_WHOLE = 4  # factor for scenes built in one piece, whose levels are fitted with more work
 _LEVEL_SIZE = 1.35
 #: Bytes per splat of a file, by preset and SH degree 0 to 4.
 _FILE_BYTES = {
@@ -152,7 +150,7 @@ def estimate_cost(
     seconds = count / 1e6 * (read * passes + code / workers) + book * min(1.0, count / 5e5) / workers
     file_bytes = round(count * _FILE_BYTES[options.preset][degree])
     if levels is not None:
-        seconds += count * _LEVEL_SECONDS * (_LEVEL_WHOLE if is_one else 1.0 / workers)
+        seconds += levels.seconds(count) / (1 if is_one else workers)
         file_bytes = round(file_bytes * _LEVEL_SIZE)
     return EncodingCost(count, degree, in_memory, workers, memory, disk, seconds, file_bytes)
 
