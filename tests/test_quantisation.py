@@ -39,7 +39,7 @@ from csplat.model import normalise_quats
 from csplat_conformance.adapter import answer
 from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
 from csplat_selftest.fuzzing.decoder_targets import compared
-from csplat_trainer.tuned_scene import TunedScene, cost_slopes
+from csplat_trainer.tuned_scene import TunedScene, count_integers, slopes_of
 
 
 @pytest.mark.parametrize("square", [False, True])
@@ -523,7 +523,7 @@ def test_costs_count_the_encoded_integers_of_each_class(make_model):
             np.ascontiguousarray(values.sh0[rows].T), plan.sh0_step, plan.chroma_shift, factors.sh0
         )[0]
         for columns in (shape.scales, shape.quats // factors.quats, alpha[None] // factors.opacities, colour):
-            bits += cost_slopes([columns.T])[1]
+            bits += slopes_of(count_integers([columns.T]))[1]
     assert scene.count(scene.dequantise()[0], 1.0).bits == pytest.approx(bits, rel=1e-3)
 
 

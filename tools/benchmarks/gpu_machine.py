@@ -46,6 +46,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run.add_argument("--only", action="append", default=[], help="pattern of case names, e.g. '4 MB'")
     given = parser.parse_args(arguments)
     if given.command == "pack":
+        if not given.data.is_dir():
+            parser.error(f"{given.data} is not a folder")
+        if given.pieces.exists() and any(given.pieces.iterdir()):
+            parser.error(f"{given.pieces} is not empty")
         wheels = given.pieces / "wheels"
         if not given.no_wheels:
             _download(wheels, given.python)
@@ -53,6 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{count} pieces in {given.pieces}")
         return 0
     if given.command == "unpack":
+        if not given.piece.is_dir():
+            parser.error(f"{given.piece} is not a folder")
         return unpack_piece(given.piece, given.work)
     return run_suite(given.work, given.suite, given.only, given.seconds)
 
@@ -65,9 +71,9 @@ def pack_pieces(data: Path, pieces: Path, size: int, wheels: Path) -> int:
     """
     files = [(path, Path("wheels") / path.name) for path in sorted(wheels.glob("*.whl"))]
     files += [
-        (path, Path("data") / data.resolve().name / path.relative_to(data))
-        for path in sorted(data.rglob("*"))
-        if path.is_file()
+        (path, Path("data") / data.absolute().name / path.relative_to(data))
+        for folder, _, names in sorted(os.walk(data, followlinks=True))
+        for path in (Path(folder) / name for name in sorted(names))
     ]
     number, left = 0, 0
     for path, place in files:
