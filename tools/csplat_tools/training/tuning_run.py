@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import csplat_trainer
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, EncodePlan, Importance, Origin, Target, encode_tiles
+from csplat.encoder import EncodeOptions, EncodePlan, Importance, Origin, ShCoding, Target, encode_tiles
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, I64, Progress
@@ -77,6 +77,7 @@ _FINER = 0.1  # least factor of the error of the goal from one tuning to the nex
 _TUNINGS = 4  # largest number of tunings for a target
 _PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.75  # dB: range and accuracy of the precision that is found for a size
 _VALIDATIONS = 8  # validations of a tuning on a GPU
+_SH_CODINGS: tuple[ShCoding, ...] = ("codebook", "scalar")
 _SAMPLE = 1 << 15  # splats by which it is judged
 
 _VALIDATION_EVERY = 8  # every Nth virtual view is a validation view
@@ -290,7 +291,7 @@ class Tuner:
         size_bytes: int | None,
         *,
         is_pruned: bool = True,
-        finds_precision: bool = False,
+        weights: NDArray[Any] | Importance | None = None,
     ) -> TunedSubset:
         """Tune a file.
 
@@ -300,12 +301,11 @@ class Tuner:
             encoding: options of the encoder.
             size_bytes: largest size, to which the tuning adjusts lambda; `None`: none.
             is_pruned: splats may have been pruned that a view shows.
-            finds_precision: choose the precision by the size.
+            weights: importance of the splats, if it is known.
         """
         with self._timer.stage("choosing"):
-            views, weights = self.tuning_views, self._importance_of(model, rows)
-            if finds_precision and size_bytes is not None:
-                encoding = self._precise(model, weights, size_bytes)
+            views = self.tuning_views
+            weights = self._importance_of(model, rows) if weights is None else weights
         pruning = {"unseen": len(self.source) - len(self.rows)}
         if is_pruned:
             pruning["simplified_from"] = len(self.rows)
@@ -338,23 +338,27 @@ class Tuner:
 
         In a sample, centres take more bits, and indices of its smaller codebooks fewer, by about the same.
         """
-        encoding = self.encoding
-        if encoding.attribute_psnr is not None:
-            return encoding
-        if model.sh_degree and encoding.sh_coding == "auto":  # the choice may differ between precisions
-            encoding = replace(encoding, sh_coding="codebook")
+        if self.encoding.attribute_psnr is not None:
+            return self.encoding
         count = min(len(model), _SAMPLE)
-        rows = np.sort(np.random.default_rng(encoding.seed).choice(len(model), count, replace=False))
+        rows = np.sort(np.random.default_rng(self.encoding.seed).choice(len(model), count, replace=False))
         sample = model.select(rows)
         weights = weights.select(rows) if isinstance(weights, Importance) else weights[rows]
-        low, high = _PRECISIONS
-        while high - low > _PRECISION_STEP:
-            middle = 0.5 * (low + high)
-            options = replace(encoding, attribute_psnr=middle)
+
+        def sample_bytes(options: EncodeOptions) -> int:
             plan = EncodePlan.of(sample, options, importance=weights, allow_classes=False)
-            is_larger = len(encode_tiles(plan).write().data) * len(model) > size_bytes * count
-            low, high = (low, middle) if is_larger else (middle, high)
-        return replace(encoding, attribute_psnr=low)
+            return len(encode_tiles(plan).write().data)
+
+        low, high = _PRECISIONS
+        found = [replace(self.encoding, attribute_psnr=0.5 * (low + high))]
+        if model.sh_degree and self.encoding.sh_coding == "auto":  # its choice differs between precisions
+            found = [replace(found[0], sh_coding=coding) for coding in _SH_CODINGS]
+        options = min(found, key=sample_bytes)
+        while high - low > _PRECISION_STEP:
+            options = replace(options, attribute_psnr=0.5 * (low + high))
+            is_larger = sample_bytes(options) * len(model) > size_bytes * count
+            low, high = (low, 0.5 * (low + high)) if is_larger else (0.5 * (low + high), high)
+        return replace(options, attribute_psnr=low)
 
     def tune_to_size(self, size_bytes: int) -> TunedSubset:
         """Tune a file of a size without drafts: for trainings, which prune themselves, and on a GPU.
@@ -372,10 +376,18 @@ class Tuner:
                 found = measure_pruning(model, self._measuring, self._background, self.options.device)
                 keys, left = pruning_keys(model.opacities, found), max(kept_count, int(len(rows) * ROUND_FRACTION))
                 rows = rows[np.sort(np.argsort(keys, kind="stable")[len(rows) - left :])]
-        made = self._tune(self.source.select(rows), rows, self.encoding, size_bytes, finds_precision=True)
-        if made.size_bytes > size_bytes:
-            raise InputError(f"the smallest file has {made.size_bytes:,} bytes, more than {size_bytes:,}")
-        return made
+            model = self.source.select(rows)
+            weights = self._importance_of(model, rows)
+        untuned_bytes, smallest = size_bytes, math.inf
+        for _ in range(_TUNINGS):
+            with self._timer.stage("choosing"):
+                encoding = self._precise(model, weights, untuned_bytes)
+            made = self._tune(model, rows, encoding, size_bytes, weights=weights)
+            if made.size_bytes <= size_bytes:
+                return made
+            smallest = min(smallest, made.size_bytes)
+            untuned_bytes = int(untuned_bytes * (size_bytes / made.size_bytes) * (1.0 - _WORTH))
+        raise InputError(f"the smallest file has {smallest:,} bytes, more than {size_bytes:,}")
 
     def tune_to(self, target: Target) -> TunedSubset:
         """Tune the best file of a size, or the smallest one of a PSNR on the validation views.
