@@ -362,7 +362,8 @@ def test_published_rows_follow_the_scenes_and_sets_that_were_measured(tmp_path):
     for _ in range(2):
         file.set_published("captures")
     assert [
-        ("synthetic-lego200", "PLY"), ("synthetic-lego200", "3DGS, published"), ("all of synthetic", "3DGS, published"),
+        ("synthetic-lego200", "PLY"), ("synthetic-lego200", "3DGS, published"),
+        *2 * [("synthetic-lego200", "HEMGS, published")], ("all of synthetic", "3DGS, published"),
         ("all of synthetic", "c3dgs, published"),
     ] == [(row["scene"], row["case"]) for row in file.rows]  # fmt: skip
 

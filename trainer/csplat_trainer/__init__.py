@@ -1,9 +1,9 @@
-"""Training of Gaussian splats on the CPU: data sets, losses, optimisation, and a torch wrapper of the renderer.
+"""Training of Gaussian splats on a CPU or a GPU: data sets, losses, optimisation, and a torch wrapper of the renderer.
 
     >>> import csplat_trainer
     >>> found = csplat_trainer.train("capture")  # doctest: +SKIP
 
-The names load their modules on first use. `train` and `finetune` require numba. `torch_rasteriser`, `gsplat_engine`,
+The names load their modules on first use. `train` and `finetune` require numba, and gsplat on a GPU. `torch_rasteriser`,
 the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads checkpoints of gsplat and splatfacto,
 require torch.
 """
