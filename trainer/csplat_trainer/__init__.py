@@ -3,9 +3,9 @@
     >>> import csplat_trainer
     >>> found = csplat_trainer.train("capture")  # doctest: +SKIP
 
-The names load their modules on first use. `train` and `finetune` require numba, and gsplat on a GPU. `torch_rasteriser`,
-the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads checkpoints of gsplat and splatfacto,
-require torch.
+The names load their modules on first use. `train` and `finetune` require numba, and gsplat on a GPU.
+`torch_rasteriser`, the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads checkpoints of gsplat
+and splatfacto, require torch.
 """
 
 from __future__ import annotations
