@@ -78,7 +78,8 @@ def measure_capture(setup: Setup, key: str, _: Sequence[Case]) -> Iterator[Measu
     def measure(case: Case) -> Mapping[str, Any]:
         if "megabytes" in case.settings:
             file, record = _tuned(ply, images, options, case["megabytes"])
-            model, values, training = decode(file), {"size_bytes": len(file), **record}, record.pop("training")
+            training = record.pop("training")
+            model, values = decode(file), {"size_bytes": len(file), **record}
         else:
             training = _train(ply, images, options)
             model, values = read_ply(ply), {"size_bytes": ply.stat().st_size}
