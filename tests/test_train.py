@@ -814,11 +814,6 @@ def test_a_resumed_run_keeps_its_gains(uneven, tmp_path):
         train(DataSet("fewer", uneven.train[:8], uneven.test), options, outputs=Outputs(resume=stopped))
 
 
-def test_gains_are_refused_on_a_gpu(uneven):
-    with pytest.raises(InputError, match="--device cpu"):
-        train(uneven, TrainOptions(**QUICK, lr_exposure=0.02, device="cuda"))
-
-
 @pytest.mark.slow
 def test_tuning_corrects_gains(make_model, uneven):
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # the scene of the images

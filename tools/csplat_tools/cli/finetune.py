@@ -30,7 +30,6 @@ def finetune(
     byte_cost: Annotated[
         float | None, typer.Option("--lambda", metavar="COST", help="Loss per bit and splat. Default: 1e-4.")
     ] = None,
-    device: shared.Device = "cpu",
     page: shared.Page = None,
     cameras: shared.HiddenCameras = None,
     background: shared.HiddenBackground = None,
@@ -74,8 +73,9 @@ def finetune(
     from csplat_trainer.tuning.tuning_options import FinetuneOptions
 
     cost = tuning.RATE_WEIGHT[itself] if byte_cost is None else byte_cost
-    options = shared.checked(FinetuneOptions, iterations=iterations, byte_cost=cost, device=device)
-    options = tuning.paced(options.scaled(tuning.LEARNING_FACTOR[itself]))
+    options = shared.checked(FinetuneOptions, iterations=iterations, byte_cost=cost).scaled(
+        tuning.LEARNING_FACTOR[itself]
+    )
     encoding = EncodeOptions(preset, shape_codebook_size=tuning.SHAPE_ENTRIES)
     replaces = shared.is_same_file(checkpoint, resume)  # a checkpoint may replace the one that the run goes on from
     named = {"--source-index": source_index, "--page": page}
