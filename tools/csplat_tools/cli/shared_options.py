@@ -96,7 +96,6 @@ HiddenCameras = Annotated[str | None, hidden(_cameras)]
 Data = Annotated[str | None, typer.Option(metavar="DATA", help="Data set of the training. Default: none.")]
 Background = Annotated[str | None, _background]
 HiddenBackground = Annotated[str | None, hidden(_background)]
-Device = Annotated[str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, or cuda: a GPU. Default: cpu.")]
 TestEvery = Annotated[int | None, typer.Option(metavar="N", hidden=True, help="Hold out every Nth image. Default: 8.")]
 RendererName = Literal["cpu", "exact", "fast", "gpu", "auto", "software"]
 BackendOption = Annotated[

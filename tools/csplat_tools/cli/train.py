@@ -37,7 +37,9 @@ def train(
     ] = None,
     target_size: shared.TargetSize = None,
     target_psnr: shared.TargetPsnr = None,
-    device: shared.Device = "cpu",
+    device: Annotated[
+        str, typer.Option(metavar="DEVICE", show_default=False, help="cpu, or cuda: a GPU. Default: cpu.")
+    ] = "cpu",
     page: shared.Page = None,
     up: shared.HiddenUp = None,
     size: Annotated[
