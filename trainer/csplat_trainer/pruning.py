@@ -21,7 +21,7 @@ from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 
-ROUND_FRACTION = 0.72  # fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB
+_ROUND_FRACTION = 0.72  # fraction of the splats that a round keeps; with more rounds PSNR rises by less than 0.1 dB
 _LEAST_FRACTION = 0.01  # fraction of the splats at which an order ends unless fewer are requested
 
 
@@ -57,14 +57,13 @@ class MeasuredViews:
 
 @dataclass(eq=False)
 class PruningOrder:
-    """The splats of a scene in the order of pruning; longer on demand.
+    """The splats of a scene in the order of pruning, without those that no view shows; longer on demand.
 
     Attributes:
         model: the scene.
         groups: views with the pruning errors of the scene. Each round measures the next group, and adds the last
             measurements of the others: two groups give twice the views at the cost of one.
         background: background colour of the views.
-        keep_unseen: splats that no view shows are never pruned; else they are pruned first.
         threads: number of threads; `None` for all. The order does not depend on it.
         progress: progress callback.
         rows: [G] int64, indices of splats in the order of pruning.
@@ -76,7 +75,6 @@ class PruningOrder:
     model: SplatModel
     groups: list[MeasuredViews]
     background: ArrayLike = (0.0, 0.0, 0.0)
-    keep_unseen: bool = True
     threads: int | None = None
     progress: Progress | None = None
     rows: I64 = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
@@ -110,7 +108,7 @@ class PruningOrder:
         """Prune until `kept_count` splats are left, or the mean squared error exceeds `error`."""
         least = max(1, round(len(self.model) * _LEAST_FRACTION)) if kept_count is None else kept_count
         while len(self._left) > least and float(self.errors.sum()) <= error * self.value_count:
-            if not self._prune(max(least, int(len(self._left) * ROUND_FRACTION))):
+            if not self._prune(max(least, int(len(self._left) * _ROUND_FRACTION))):
                 break
 
     def _prune(self, count: int) -> bool:
@@ -121,7 +119,7 @@ class PruningOrder:
             self.groups[turn] = MeasuredViews.of(
                 left, cameras, self.background, threads=self.threads, progress=self.progress
             )
-        keys = pruning_keys(self.model.opacities[self._left], total_error(self.groups), keep_unseen=self.keep_unseen)
+        keys = pruning_keys(self.model.opacities[self._left], total_error(self.groups))
         order = np.argsort(keys, kind="stable")[: len(self._left) - count]
         order = order[np.isfinite(keys[order])]
         if not len(order):
@@ -155,3 +153,15 @@ def pruning_keys(opacities: NDArray[np.float32], pruning_error: PruningError, *,
     keys = np.where(pruning_error.seen, pruning_error.error, np.inf if keep_unseen else -0.5)
     keys[opacities < ALPHA_MIN] = -1.0
     return keys
+
+
+def kept_in_round(opacities: NDArray[np.float32], pruning_error: PruningError, count: int) -> I64:
+    """Return the ascending indices of the splats that a round keeps, at least `count`; unseen ones are pruned first.
+
+    Args:
+        opacities, pruning_error: as for `pruning_keys`.
+        count: number of splats to keep in the last round.
+    """
+    keys = pruning_keys(opacities, pruning_error, keep_unseen=False)
+    kept_count = max(count, int(len(keys) * _ROUND_FRACTION))
+    return np.sort(np.argsort(keys, kind="stable")[len(keys) - kept_count :])

@@ -26,7 +26,7 @@ from csplat_render.camera import Camera
 from csplat_render.kernels import lane_range, parallel_kernel
 from csplat_render.pruning_error import PruningError
 from csplat_trainer.parameters import Parameters
-from csplat_trainer.pruning import ROUND_FRACTION, pruning_keys
+from csplat_trainer.pruning import kept_in_round
 
 _MAX_SHARE = 51  # largest number of splats in one place, as in the paper's code
 _BINOMIAL = np.array([[float(math.comb(n, k)) for k in range(_MAX_SHARE + 1)] for n in range(_MAX_SHARE + 1)])
@@ -277,7 +277,7 @@ _PRUNING_VIEWS = 32  # largest number of views in which the pruning error is mea
 def prune_least_needed(
     parameters: Parameters, cameras: Sequence[Camera], measure: Callable[[Sequence[Camera]], PruningError], count: int
 ) -> None:
-    """Prune the splats with the least pruning error, in rounds of a `PruningOrder`; unseen ones are the first.
+    """Prune the splats with the least pruning error in rounds; unseen ones are the first.
 
     Args:
         parameters: changed in place.
@@ -286,7 +286,5 @@ def prune_least_needed(
         count: number of splats to keep.
     """
     views = cameras[:: -(-len(cameras) // _PRUNING_VIEWS)]
-    while (left := len(parameters)) > count:
-        keys = pruning_keys(parameters.alphas, measure(views), keep_unseen=False)
-        kept_count = max(count, int(left * ROUND_FRACTION))
-        parameters.keep(np.sort(np.argsort(keys, kind="stable")[left - kept_count :]))
+    while len(parameters) > count:
+        parameters.keep(kept_in_round(parameters.alphas, measure(views), count))

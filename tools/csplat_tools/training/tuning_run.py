@@ -41,7 +41,7 @@ from csplat_tools.views import VIEW_COUNT, ViewSet, shrink_cameras, with_validat
 from csplat_trainer.device_measurements import measure_importance, measure_pruning
 from csplat_trainer.fitter import FitStep
 from csplat_trainer.posed_images import PosedImage, image_scorer
-from csplat_trainer.pruning import ROUND_FRACTION, pruning_keys
+from csplat_trainer.pruning import kept_in_round
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_options import Outputs
 from csplat_trainer.tuning import (
@@ -373,9 +373,11 @@ class Tuner:
             rows = self.rows
             while len(rows) > kept_count:
                 model = self.source.select(rows)
-                found = measure_pruning(model, self._measuring, self._background, self.options.device)
-                keys, left = pruning_keys(model.opacities, found), max(kept_count, int(len(rows) * ROUND_FRACTION))
-                rows = rows[np.sort(np.argsort(keys, kind="stable")[len(rows) - left :])]
+                found = measure_pruning(
+                    model, self._measuring, self._background, self.options.device,
+                    threads=self.encoding.threads, progress=self.progress,
+                )  # fmt: skip
+                rows = rows[kept_in_round(model.opacities, found, kept_count)]
             model = self.source.select(rows)
             weights = self._importance_of(model, rows)
         untuned_bytes, smallest = size_bytes, math.inf

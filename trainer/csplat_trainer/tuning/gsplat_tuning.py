@@ -87,7 +87,8 @@ class GsplatTuning:
         self, view: TuningView, gain: ImageGain | None, rates: dict[str, float], costs: RateTerm | None
     ) -> PendingLoss:
         """Make a step on a view, see `CpuTuning.step`."""
-        found, v = self._quantised(), self.parameters.tensors
+        v, alphas = self.parameters.tensors, self.parameters.device_alphas
+        found = self._quantisers.quantise(v, alphas)
         splats = SplatTensors.of(found.decoded, found.alphas)
         rendered, _ = self._rasteriser.render(splats, view.camera, self._background, _degree(found))
         shown = rendered.detach()
@@ -95,7 +96,6 @@ class GsplatTuning:
         value, slope = self._loss(corrected(gain, shown), reference, self._images.mask(view.mask))
         rendered.backward(through_gain(gain, shown, slope))  # type: ignore[no-untyped-call]  # untyped in torch
         gradients = splats.gradients()
-        alphas = self.parameters.device_alphas
         gradients["logits"] = gradients.pop("opacities") * (alphas * (1.0 - alphas))
         gradients["sizes"] = torch.zeros_like(v["sizes"])
         if self._quantisers.shape_rows is not None:
@@ -142,8 +142,7 @@ class GsplatTuning:
         return values
 
     def _quantised(self) -> QuantisedValues:
-        found: QuantisedValues = self._quantisers.quantise(self.parameters.tensors, self.parameters.device_alphas)
-        return found
+        return self._quantisers.quantise(self.parameters.tensors, self.parameters.device_alphas)
 
     @torch.no_grad()
     def _add_costs(self, gradients: dict[str, Tensor], found: QuantisedValues, costs: RateTerm) -> None:
