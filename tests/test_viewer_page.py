@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from chromium import ViewerPage
 
-from csplat import EncodeOptions, decode, encode, read_ply
+from csplat import EncodeOptions, decode, encode, read_header, read_ply
 from csplat_conformance.validator import validate
+from csplat_tools.level_builder import LevelBuilder
 
 pytestmark = pytest.mark.slow
 
@@ -97,6 +98,21 @@ def test_a_broken_file_is_explained(viewer, sample):
         assert code not in title
         viewer.page.keyboard.press("Escape")
         assert viewer.error() is None
+
+
+def test_a_damaged_part_is_reported_beside_the_scene(viewer, model):
+    data = bytearray(LevelBuilder(leaf_splats=400, root_splats=100).encode(model, FAST).write().data)
+    layer = read_header(bytes(data)).tiles[0].layers[0]
+    data[layer.offset + layer.size // 2] ^= 1
+    viewer.show(bytes(data))
+    viewer.page.wait_for_selector("#error:not([hidden])")
+    assert "E_CRC" == viewer.error()
+    viewer.page.set_viewport_size({"width": 800, "height": 600})
+    centre = "document.elementFromPoint(innerWidth / 2, innerHeight / 2).tagName"
+    assert "CANVAS" == viewer.page.evaluate(centre)
+    assert f"{len(model):,} splats" in viewer.text("#summary")
+    viewer.page.keyboard.press("Escape")
+    assert viewer.error() is None
 
 
 def test_an_absent_file_is_explained(viewer):

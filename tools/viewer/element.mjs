@@ -3,7 +3,7 @@
 // Attributes: src, alt, and these parameters of main.mjs: camera, view, up, axes, background.
 // Events: progress, load (detail: the engine's Stats), error (detail: ErrorReport). Property `engine`: null until it loads.
 
-import { E_CONTEXT, E_INPUT } from './engine_error.mjs';
+import { E_CONTEXT } from './engine_error.mjs';
 import { explain } from './messages.mjs';
 import { nameOf, readWishes } from './page.mjs';
 import { loadedShare } from './statistics.mjs';
@@ -237,7 +237,8 @@ export class CsplatView extends HTMLElement {
   #failed(report) {
     // Browsers take contexts away from pages with many. An element out of view loads again when it comes near.
     if (report.code === E_CONTEXT && !this.#isNear) return this.#stop();
-    if (report.code === E_INPUT && !report.fatal) return this.#tell('error', report); // the connection is tried again
+    // The scene stays usable: the connection is tried again, and damaged parts are drawn coarsely.
+    if (report.code !== E_CONTEXT && !report.fatal) return this.#tell('error', report);
     this.#hasFailed = report.fatal;
     this.#progress.hidden = true;
     const { title, advice, facts } = explain(report, nameOf(this.src));

@@ -4,7 +4,7 @@
 // &backend=webgl2
 // `window.csplatViewer` lets programs control the page; its `ready` resolves when the scene has been drawn completely.
 
-import { E_INPUT } from './engine_error.mjs';
+import { E_CONTEXT, E_INPUT } from './engine_error.mjs';
 import { MeasureCard, measure } from './measure.mjs';
 import { SaveUpOffer, upWord } from './save_up.mjs';
 import { Overlay, element } from './overlay.mjs';
@@ -44,8 +44,10 @@ const showing = new SceneViewer(canvas, wishes, {
     overlay.done();
   },
   failed: (report) => {
-    if (report.code === E_INPUT && !report.fatal) overlay.toast('The connection is lost. It is tried again.');
-    else overlay.error(report, showing.engine !== null && report.code !== 'E_CONTEXT');
+    const isScene = report.code !== E_CONTEXT;
+    if (report.fatal || !isScene) overlay.error(report, showing.engine !== null && isScene);
+    else if (report.code === E_INPUT) overlay.toast('The connection is lost. It is tried again.');
+    else overlay.warn(report);
   },
 });
 const { view } = showing;

@@ -164,16 +164,36 @@ export class Overlay {
    * @param {boolean} scene whether the error belongs to a scene, not to the page
    */
   error(problem, scene = true) {
-    const { title, advice, facts } = explain(problem, this.name);
     this.failed = true;
     html('progress').hidden = true;
     html('welcome').hidden = true;
     html('summary').textContent = 'Not shown, or only in part';
+    this.#explain(problem, false);
+    html('error-open').hidden = !scene;
+  }
+
+  /**
+   * Report an error that leaves the scene usable, beside the scene.
+   *
+   * @param {import('./messages.mjs').Problem} problem
+   */
+  warn(problem) {
+    if (this.failed) return;
+    this.#explain(problem, true);
+    html('error-open').hidden = true;
+  }
+
+  /**
+   * @param {import('./messages.mjs').Problem} problem
+   * @param {boolean} isAside whether the card leaves the middle free
+   */
+  #explain(problem, isAside) {
+    const { title, advice, facts } = explain(problem, this.name);
     html('error-title').textContent = title;
     html('error-advice').textContent = advice;
     html('error-facts').textContent = facts;
-    html('error-open').hidden = !scene;
     const card = html('error');
+    card.classList.toggle('aside', isAside);
     card.dataset.code = problem.code;
     card.hidden = false;
   }
