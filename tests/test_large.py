@@ -45,8 +45,8 @@ class EveryFourth:
 
     whole_splats: int = WHOLE
 
-    def settings(self):
-        return {"splats": "every fourth"}
+    def settings(self, count):
+        return {"splats": f"every fourth of {count}"}
 
     def seconds(self, count):
         return 1e-5 * count

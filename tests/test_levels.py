@@ -666,7 +666,8 @@ def test_levels_without_the_renderer_are_an_error_that_names_the_extra(monkeypat
 def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path, fitted_splats):
     scene, options = model.select(np.arange(400)), EncodeOptions(bucket_splats=300, threads=1)
     builder = LevelBuilder(2, leaf_splats=300, whole_splats=300, fitted_splats=fitted_splats, bucket_splats=300)
-    data = builder.encode(scene, options).write({"levels": builder.settings()}).data
+    assert ("fitted" if fitted_splats == 400 else "merged") == builder.settings(len(scene))["splats"]
+    data = builder.encode(scene, options).write({"levels": builder.settings(len(scene))}).data
     with csplat.open(data) as file:
         assert [(0, 2), (1, 2), (2, 1)] == [
             (level, sum(node.level == level for node in file.nodes)) for level in range(3)

@@ -47,7 +47,7 @@ from csplat_tools.level_merging import merge_neighbours
 _KEPT = 4  # splats of a level, divided by those of the coarser one
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
 # Seconds per splat for levels, with the measurement of errors: of scenes in one piece, and of buckets.
-_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 3e-5
+_SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 4e-5
 
 #: Makes the splats of a level, and the node of each; arguments as for `LevelFitter.fit`.
 _Fit = Callable[[SplatModel, I64, int, int], tuple[I64, SplatModel]]
@@ -79,12 +79,13 @@ class LevelBuilder:
     bucket_splats: int = BUCKET_SPLATS
     nodes: Sequence[LevelNode] | None = None
 
-    def settings(self) -> dict[str, Any]:
-        """Return what the OPTS chunk states."""
+    def settings(self, count: int) -> dict[str, Any]:
+        """Return what the OPTS chunk of a scene of `count` splats states."""
         if self.nodes is not None:
             return {"splats": "of the source"}
         size = {"root_splats": self.root_splats} if self.count is None else {"count": self.count}
-        return {"splats": "fitted", "leaf_splats": self.leaf_splats, **size}
+        made = "fitted" if count <= max(self.whole_splats, self.fitted_splats) else "merged"
+        return {"splats": made, "leaf_splats": self.leaf_splats, **size}
 
     def seconds(self, count: int) -> float:
         """Return the approximate time for the levels of a scene of `count` splats, by one process."""
@@ -265,7 +266,7 @@ def encode_with_levels(
         search = bounded.report.search
     plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
     encoded = levels.encode_plan(plan, progress=progress or null_progress)
-    result = encoded.write({**(metadata or {}), "levels": levels.settings()})
+    result = encoded.write({**(metadata or {}), "levels": levels.settings(len(model))})
     return result if search is None else result.with_search(replace(search, size_bytes=result.size_bytes))
 
 

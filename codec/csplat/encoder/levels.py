@@ -117,8 +117,12 @@ def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
 
 
 def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> ShCodingPlan:
+    """Return the SH coding of coarse splats, without escapes, which large splats often are.
+
+    On lego60k, escapes would take 12 % of the bytes of level 1 and 25 % of level 2, and gain 0.2 and 0.0 dB.
+    """
     sh_plan, threads = codebooks.sh_plan, plan.options.thread_count
-    if sh_plan.book is not None and codebooks.rule is None:  # a refit has no rule for other splats
-        book = nearest_entries(sh_plan.book, splats, plan.parameters, threads)
-        return replace(sh_plan, weights=None, book=book, extras=())
-    return replace(assign_splats(codebooks, splats, plan.parameters, threads), extras=())
+    if sh_plan.book is None:
+        return replace(assign_splats(codebooks, splats, plan.parameters, threads), extras=())
+    book = nearest_entries(sh_plan.book, splats, plan.parameters, threads)
+    return replace(sh_plan, weights=None, book=book, extras=())

@@ -46,8 +46,8 @@ class LevelMaker(Protocol):
         """Number of splats up to which a scene is built in one piece, in memory."""
         ...
 
-    def settings(self) -> dict[str, Any]:
-        """Return what the OPTS chunk states, JSON-compatible."""
+    def settings(self, count: int) -> dict[str, Any]:
+        """Return what the OPTS chunk of a scene of `count` splats states, JSON-compatible."""
         ...
 
     def seconds(self, count: int) -> float:

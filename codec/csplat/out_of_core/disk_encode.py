@@ -199,7 +199,7 @@ def encode_scene(
     if limits.resume and folder.exists():
         limits = replace(limits, always=True)
     cost = estimate_cost(scene, options, limits, levels)
-    settings = {} if levels is None else {"levels": levels.settings()}
+    settings = {} if levels is None else {"levels": levels.settings(scene.count)}
     if cost.in_memory:
         if levels is None:
             encoded = encode_tiles(EncodePlan.of(scene.model(), options, progress=progress), progress=progress)

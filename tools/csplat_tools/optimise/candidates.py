@@ -167,7 +167,7 @@ class Candidate:
         found = levels.encode_plan(coded.plan, coded.codebooks, progress or null_progress)
         if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
             found = replace(found, errors=coded.errors)
-        result = found.write({**entries, "levels": levels.settings()})
+        result = found.write({**entries, "levels": levels.settings(len(coded.plan.model))})
         return replace(self, coded=found, result=result, test_errors=None, test_psnr=None)
 
     @property
