@@ -627,6 +627,8 @@ def test_levels_are_compared_at_their_size(sample_path, tmp_path):
         fitted, merged = (measure({"maker": maker, "level": 1}) for maker in ("fitted", "merged"))
         with pytest.raises(AbsentError, match="coarser levels"):
             measure({"maker": "merged", "level": 9})
+        with pytest.raises(AbsentError, match="clone https"):
+            measure({"maker": "nanogs", "level": 1})
     assert fitted["level_splats"] == pytest.approx(fitted["splats"] / 4, rel=0.01)
     assert fitted["psnr"] > merged["psnr"] + 2.0
     assert fitted["ssim"] > merged["ssim"]

@@ -63,6 +63,18 @@ def read_peer(path: Path, folder: Path) -> SplatModel:
     return model
 
 
+def find_nanogs(folder: Path) -> Path:
+    """Return the program of NanoGS in a folder; its licence forbids commercial use, so it is not fetched.
+
+    Raises:
+        AbsentError: it is not there.
+    """
+    script = folder / "NanoGS" / "simplification.py"
+    if not script.exists():
+        raise AbsentError(f"clone https://github.com/saliteta/NanoGS into {folder}, and install tqdm")
+    return script
+
+
 def find_splat_transform(folder: Path) -> list[str]:
     """Install splat-transform, and a Node.js that is new enough, into a folder if they are missing.
 

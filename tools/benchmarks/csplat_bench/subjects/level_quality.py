@@ -1,14 +1,15 @@
 """Levels of detail next to the scene: level k at 1/2^k and 1/2^(k - 1) of the size of its cameras.
 
 A case is a `level`, from 1, and its `maker`: `fitted`, as `csplat encode` builds scenes of up to two million splats;
-`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, at the same number of splats. Seconds are
-those of all levels for csplat, of this one for splat-transform. Splats are not quantised. PSNR is pooled over eight
-cameras.
+`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, or `nanogs`, at the same number of splats.
+Seconds are those of all levels for csplat, of this one for the others. Splats are not quantised. PSNR is pooled over
+eight cameras.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,7 +24,7 @@ from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import join_blocks
 from csplat_bench.measuring import run_program
-from csplat_bench.peers import CAP_SECONDS, find_splat_transform
+from csplat_bench.peers import CAP_SECONDS, find_nanogs, find_splat_transform
 from csplat_bench.protocol import AbsentError, Measure, Setup
 from csplat_bench.scenes import find_scene
 from csplat_bench.suites import Case
@@ -74,7 +75,7 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
                 raise AbsentError(f"{name} has {len(levels)} coarser levels")
             coarse = levels[level]
         else:
-            coarse, seconds = _decimated(setup, source, maker, round(len(model) * _SHARE**level))
+            coarse, seconds = _simplified(setup, source, maker, len(model), level)
         scores: dict[str, float] = {}
         for suffix, factor in (("", 0.5**level), ("_finer", 0.5 ** (level - 1))):
             views = [resized(one, max(1, round(one.W * factor)), max(1, round(one.H * factor))) for one in cameras]
@@ -99,9 +100,16 @@ def _scene(setup: Setup, name: str) -> tuple[SplatModel, list[Camera]]:
     return model, list(scene.cameras[::every][:_CAMERAS] or virtual_cameras(model, _CAMERAS))
 
 
-def _decimated(setup: Setup, source: Path, option: str, count: int) -> tuple[SplatModel, float]:
-    output = setup.work / f"{source.stem}-{option}-{count}.ply"
+def _simplified(setup: Setup, source: Path, maker: str, count: int, level: int) -> tuple[SplatModel, float]:
+    """Return a level by a program of others, and its seconds."""
+    share = _SHARE**level
+    output = setup.work / f"{source.stem}-{maker}-{level}.ply"
+    words: list[object]
+    if maker == "nanogs":
+        words = [sys.executable, find_nanogs(setup.peers), "--ply", source, "-o", output, "-r", share]
+    else:
+        transform = find_splat_transform(setup.peers)
+        words = [*transform, "-g", "cpu", "-q", "-w", source, f"--{maker}", round(count * share), output]
     start = time.perf_counter()
-    words = [*find_splat_transform(setup.peers), "-g", "cpu", "-q", "-w", source, f"--{option}", count, output]
     run_program([str(word) for word in words], CAP_SECONDS)
     return read_ply(output), time.perf_counter() - start
