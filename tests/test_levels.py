@@ -320,6 +320,18 @@ def test_render_and_compare_draw_a_level(data, tmp_path):
     assert (len(coarse), size) == (same["b"]["splats"], same["b"]["size_bytes"])
 
 
+@pytest.mark.parametrize("framed_splats", [100, 10**6])
+def test_an_orbit_is_the_same_for_all_levels(data, tmp_path, monkeypatch, framed_splats):
+    monkeypatch.setattr("csplat_tools.scene_files.FRAMED_SPLATS", framed_splats)
+    path, seen = tmp_path / "levels.csplat", []
+    path.write_bytes(data)
+    monkeypatch.setattr("csplat_tools.cli.render.render_folder", lambda _, shots, *__, **___: seen.append(shots))
+    for level in ("0", "1", "256"):
+        CliRunner().invoke(app, ["render", str(path), str(tmp_path / level), "--orbit", "2", "--level", level])
+    first, *others = ([camera.to_json() for camera in shots] for shots in seen)
+    assert [first, first] == others
+
+
 def test_values_of_the_option_level():
     wanted = {
         None: (0, None),

@@ -32,6 +32,8 @@ CHEAP_TO_REOPEN = ("ply", "csplat")
 _SMALL = 1 << 20  # bytes; smaller files of any format always fit in memory
 #: Bytes of memory of a comparison in addition to the scenes' arrays: for the program, and per splat.
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
+#: Largest number of splats, about, by which cameras are placed in a .csplat file with levels.
+FRAMED_SPLATS = 2_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +48,7 @@ class LoadedModel:
         declared_bounds: declared error bounds of a .csplat file, if any.
         name: name of the file.
         findings: lint findings.
+        to_frame: splats by which cameras are placed, the same for all levels of a .csplat file; `None`: the model's.
     """
 
     model: SplatModel
@@ -54,6 +57,7 @@ class LoadedModel:
     declared_bounds: DeclaredBounds | None = None
     name: str = "scene"
     findings: tuple[Finding, ...] = ()
+    to_frame: SplatModel | None = None
 
     def _repr_html_(self) -> str | None:
         """Return the HTML that a notebook shows, see `SplatModel`."""
@@ -189,12 +193,19 @@ def _load_version(local: Path, level: int, max_splats: int | None, sh_degree: in
         if wanted > free:
             raise LimitError("memory for all splats at once", wanted, free)
         model = formats.read_all(scene)
-    size_bytes = size_on_disk(local)
+    size_bytes, to_frame = size_on_disk(local), None
     if is_csplat(local):
         with splat_file.open(local) as file:
             tiles = file.cut(level=level) if max_splats is None else file.cut(max_splats=max_splats)
             size_bytes = sum(layer.size for index in tiles for layer in file.header.all_tiles[index].layers.values())
-    return LoadedModel(model, size_bytes, name=local.name, findings=tuple(scene.findings))
+            to_frame = file.read(tiles=_tiles_to_frame(file.header), sh_degree=0)
+    return LoadedModel(model, size_bytes, name=local.name, findings=tuple(scene.findings), to_frame=to_frame)
+
+
+def _tiles_to_frame(header: SceneHeader) -> list[int]:
+    """Return every Nth tile of level 0."""
+    tiles = [number for number, tile in enumerate(header.all_tiles) if tile.level == 0]
+    return tiles[:: max(1, -(-header.splat_count // FRAMED_SPLATS))]
 
 
 def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
@@ -207,7 +218,11 @@ def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
         return LoadedModel(model, size_bytes, name=name, findings=tuple(findings))
     with mapped_csplat(str(local)) as data:
         decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)), sh_degree=sh_degree)
-    return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.declared_bounds, name)
+    to_frame, header = None, decoded.header
+    if any(tile.level for tile in header.all_tiles) and header.splat_count > FRAMED_SPLATS:
+        with splat_file.open(local) as file:
+            to_frame = file.read(tiles=_tiles_to_frame(header), sh_degree=0)
+    return LoadedModel(decoded.model, size_bytes, header, decoded.declared_bounds, name, to_frame=to_frame)
 
 
 def read_source(

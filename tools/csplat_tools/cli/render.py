@@ -89,11 +89,12 @@ def render(
         read = load_model(source, level=chosen, max_splats=max_splats)
         out.print_findings(read.findings)
         model, notes = overrides.apply(read.model), list[str]()
+        to_frame = model if read.to_frame is None else overrides.apply(read.to_frame)
         data_set = None if data is None else DataOptions(data, pixels)
-        shots = find_cameras(model, cameras, orbit, data_set, pixels, report=notes)
+        shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
         if orbit is not None:
-            shared.take_estimated_up(estimate_up(model), out, given=up)
+            shared.take_estimated_up(estimate_up(to_frame), out, given=up)
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, backend=device, force=out.force,

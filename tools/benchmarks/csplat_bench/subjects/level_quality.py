@@ -1,9 +1,9 @@
 """Levels of detail next to the scene: level k at 1/2^k and 1/2^(k - 1) of the size of its cameras.
 
 A case is a `level`, from 1, and its `maker`: `fitted`, as `csplat encode` builds scenes of up to two million splats;
-`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, or `nanogs`, at the same number of splats.
-Seconds are those of all levels for csplat, of this one for the others. Splats are not quantised. PSNR is pooled over
-eight cameras.
+`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, or `nanogs`, at as many splats. Seconds
+are those of all levels for csplat, of this one for the others. Splats are not quantised. PSNR is pooled over eight
+cameras.
 """
 
 from __future__ import annotations
