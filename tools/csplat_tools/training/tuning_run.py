@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -75,7 +76,7 @@ _AIM = 0.05  # dB above a PSNR that tuned files aim at
 _WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
 _FINER = 0.1  # least factor of the error of the goal from one tuning to the next
 _TUNINGS = 4  # largest number of tunings for a target
-_PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.75  # dB: range and accuracy of the precision that is found for a size
+_PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.375  # dB: range and accuracy of the precision that is found for a size
 _VALIDATIONS = 8  # validations of a tuning on a GPU
 _SH_CODINGS: tuple[ShCoding, ...] = ("codebook", "scalar")
 _SAMPLE = 1 << 15  # splats by which it is judged
@@ -334,31 +335,43 @@ class Tuner:
         return np.array(self.views.background, np.float32)
 
     def _precise(self, model: SplatModel, weights: NDArray[Any] | Importance, size_bytes: int) -> EncodeOptions:
-        """Return the options with the precision at which the untuned file has about the size, judged by a sample.
+        """Return the options with the precision at which the untuned file has about the size.
 
-        In a sample, centres take more bits, and indices of its smaller codebooks fewer, by about the same.
+        It is found in a sample, whose splats take more bytes for centres, and fewer for indices of its smaller
+        codebooks. How much all splats take is learnt without importance and shapes, which cost most of the time: of
+        130,000 splats of Lego, 0.94 of the sample's bytes per splat instead of 0.92.
         """
         if self.encoding.attribute_psnr is not None:
             return self.encoding
         count = min(len(model), _SAMPLE)
         rows = np.sort(np.random.default_rng(self.encoding.seed).choice(len(model), count, replace=False))
         sample = model.select(rows)
-        weights = weights.select(rows) if isinstance(weights, Importance) else weights[rows]
+        sample_weights = weights.select(rows) if isinstance(weights, Importance) else weights[rows]
 
-        def sample_bytes(options: EncodeOptions) -> int:
-            plan = EncodePlan.of(sample, options, importance=weights, allow_classes=False)
+        def encoded_bytes(
+            splats: SplatModel, its_weights: NDArray[Any] | Importance | None, options: EncodeOptions
+        ) -> int:
+            plan = EncodePlan.of(splats, options, importance=its_weights, allow_classes=False)
             return len(encode_tiles(plan).write().data)
 
-        low, high = _PRECISIONS
-        found = [replace(self.encoding, attribute_psnr=0.5 * (low + high))]
+        sample_bytes = functools.cache(functools.partial(encoded_bytes, sample, sample_weights))
+
+        def search(most: float, options: EncodeOptions) -> EncodeOptions:
+            low, high = _PRECISIONS
+            while high - low > _PRECISION_STEP:
+                middle = 0.5 * (low + high)
+                is_larger = sample_bytes(replace(options, attribute_psnr=middle)) > most
+                low, high = (low, middle) if is_larger else (middle, high)
+            return replace(options, attribute_psnr=low)
+
+        found = [replace(self.encoding, attribute_psnr=sum(_PRECISIONS) / 2.0)]
         if model.sh_degree and self.encoding.sh_coding == "auto":  # its choice differs between precisions
             found = [replace(found[0], sh_coding=coding) for coding in _SH_CODINGS]
-        options = min(found, key=sample_bytes)
-        while high - low > _PRECISION_STEP:
-            options = replace(options, attribute_psnr=0.5 * (low + high))
-            is_larger = sample_bytes(options) * len(model) > size_bytes * count
-            low, high = (low, 0.5 * (low + high)) if is_larger else (0.5 * (low + high), high)
-        return replace(options, attribute_psnr=low)
+        options = search(size_bytes * count / len(model), min(found, key=sample_bytes))
+        if count == len(model):
+            return options
+        plain = replace(options, shape_codebook_size=0)
+        return search(size_bytes * encoded_bytes(sample, None, plain) / encoded_bytes(model, None, plain), options)
 
     def tune_to_size(self, size_bytes: int) -> TunedSubset:
         """Tune a file of a size without drafts: for trainings, which prune themselves, and on a GPU.
