@@ -48,7 +48,6 @@ class LoadedModel:
         declared_bounds: declared error bounds of a .csplat file, if any.
         name: name of the file.
         findings: lint findings.
-        to_frame: splats by which cameras are placed, the same for all levels of a .csplat file; `None`: the model's.
     """
 
     model: SplatModel
@@ -57,7 +56,6 @@ class LoadedModel:
     declared_bounds: DeclaredBounds | None = None
     name: str = "scene"
     findings: tuple[Finding, ...] = ()
-    to_frame: SplatModel | None = None
 
     def _repr_html_(self) -> str | None:
         """Return the HTML that a notebook shows, see `SplatModel`."""
@@ -193,19 +191,33 @@ def _load_version(local: Path, level: int, max_splats: int | None, sh_degree: in
         if wanted > free:
             raise LimitError("memory for all splats at once", wanted, free)
         model = formats.read_all(scene)
-    size_bytes, to_frame = size_on_disk(local), None
+    size_bytes = size_on_disk(local)
     if is_csplat(local):
         with splat_file.open(local) as file:
             tiles = file.cut(level=level) if max_splats is None else file.cut(max_splats=max_splats)
             size_bytes = sum(layer.size for index in tiles for layer in file.header.all_tiles[index].layers.values())
-            to_frame = file.read(tiles=_tiles_to_frame(file.header), sh_degree=0)
-    return LoadedModel(model, size_bytes, name=local.name, findings=tuple(scene.findings), to_frame=to_frame)
+    return LoadedModel(model, size_bytes, name=local.name, findings=tuple(scene.findings))
 
 
-def _tiles_to_frame(header: SceneHeader) -> list[int]:
-    """Return every Nth tile of level 0."""
-    tiles = [number for number, tile in enumerate(header.all_tiles) if tile.level == 0]
-    return tiles[:: max(1, -(-header.splat_count // FRAMED_SPLATS))]
+def splats_to_frame(path: str, model: SplatModel) -> SplatModel:
+    """Return the splats by which cameras are placed: some of level 0, so that all levels have the same cameras.
+
+    Args:
+        path: path of the scene; standard input and pipes cannot be read again.
+        model: the splats that were read, which are returned unless they are of a .csplat file with levels.
+
+    Raises:
+        CsplatError, OSError: as for `load_model`.
+    """
+    if not Path(path).is_file() or not is_csplat(Path(path)):
+        return model
+    with splat_file.open(path) as file:
+        header = file.header
+        tiles = [number for number, tile in enumerate(header.all_tiles) if tile.level == 0]
+        every = max(1, -(-header.splat_count // FRAMED_SPLATS))
+        if len(tiles) == len(header.all_tiles) or len(model) == header.splat_count <= FRAMED_SPLATS:
+            return model
+        return file.read(tiles=tiles[::every], sh_degree=0)
 
 
 def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
@@ -218,11 +230,7 @@ def _loaded(local: Path, sh_degree: int | None = None) -> LoadedModel:
         return LoadedModel(model, size_bytes, name=name, findings=tuple(findings))
     with mapped_csplat(str(local)) as data:
         decoded = decode_scene(data, limits=Limits(bytes=min(Limits().bytes, free)), sh_degree=sh_degree)
-    to_frame, header = None, decoded.header
-    if any(tile.level for tile in header.all_tiles) and header.splat_count > FRAMED_SPLATS:
-        with splat_file.open(local) as file:
-            to_frame = file.read(tiles=_tiles_to_frame(header), sh_degree=0)
-    return LoadedModel(decoded.model, size_bytes, header, decoded.declared_bounds, name, to_frame=to_frame)
+    return LoadedModel(decoded.model, size_bytes, decoded.header, decoded.declared_bounds, name)
 
 
 def read_source(

@@ -17,7 +17,7 @@ from csplat_tools.file_streams import STANDARD_STREAM, check_name
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.present.scene_renders import find_cameras, render_film, render_folder
 from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
-from csplat_tools.scene_files import load_model
+from csplat_tools.scene_files import load_model, splats_to_frame
 from csplat_tools.views import DataOptions
 
 _OTHER_VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
@@ -89,7 +89,7 @@ def render(
         read = load_model(source, level=chosen, max_splats=max_splats)
         out.print_findings(read.findings)
         model, notes = overrides.apply(read.model), list[str]()
-        to_frame = model if read.to_frame is None else overrides.apply(read.to_frame)
+        to_frame = model if orbit is None else overrides.apply(splats_to_frame(source, read.model))
         data_set = None if data is None else DataOptions(data, pixels)
         shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
