@@ -776,6 +776,34 @@ def test_a_tuned_file_that_is_too_large_is_tuned_from_a_smaller_draft(stub_tuner
     assert [10_000, 8_016] == [goal.size_bytes for goal in stub_tuner.goals]
 
 
+class GrowingTuner(tuning_run.Tuner):
+    """Tunes without rendering; files grow by a tenth, so that values of the first steps alone may fit."""
+
+    def _precise(self, _, __, size_bytes):
+        self.untuned = [*getattr(self, "untuned", []), size_bytes]
+        return self.encoding
+
+    def _tune(self, _, __, ___, size_bytes, **____):
+        last = round(1.1 * self.untuned[-1])
+        fits = last <= size_bytes
+        log = {"best_iteration": 10 if fits else 0, "steps": 10, "validations": [{"size_bytes": last}]}
+        log["best_psnr"] = 30.0 if fits else 29.0
+        data = bytes(last if fits else self.untuned[-1])
+        return tuning_run.TunedSubset(SimpleNamespace(data=data, log=log), {}, {})
+
+
+def test_a_tuning_that_outgrows_its_size_begins_smaller(source):
+    training = cameras(14)
+    views = ViewSet("virtual", (0.0, 0.0, 0.0), training[:10], training[10:], (), virtual=True)
+    weights = np.ones(len(source))
+    tuner = GrowingTuner(
+        source, views, EncodeOptions(), FEW, Outputs(), prune_unseen=False, effort=1, importance=weights
+    )
+    made = tuner.tune_to_size(10_000)
+    assert 9_500 <= made.size_bytes <= 10_000
+    assert (30.0, 2) == (made.psnr, len(tuner.untuned))
+
+
 def test_importance_is_per_source_splat(capture, tmp_path, monkeypatch):
     words = ("finetune", capture / "scene.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
     weighted = partial(tuning_run.run_finetuning, importance=str(tmp_path / "w.npy"))

@@ -386,23 +386,29 @@ class Tuner:
             rows = self.rows
             while len(rows) > kept_count:
                 model = self.source.select(rows)
-                found = measure_pruning(
+                errors = measure_pruning(
                     model, self._measuring, self._background, self.options.device,
                     threads=self.encoding.threads, progress=self.progress,
                 )  # fmt: skip
-                rows = rows[kept_in_round(model.opacities, found, kept_count)]
+                rows = rows[kept_in_round(model.opacities, errors, kept_count)]
             model = self.source.select(rows)
             weights = self._importance_of(model, rows)
-        untuned_bytes, smallest = size_bytes, math.inf
+        untuned_bytes, made = size_bytes, list[TunedSubset]()
         for _ in range(_TUNINGS):
             with self._timer.stage("choosing"):
                 encoding = self._precise(model, weights, untuned_bytes)
-            made = self._tune(model, rows, encoding, size_bytes, weights=weights)
-            if made.size_bytes <= size_bytes:
-                return made
-            smallest = min(smallest, made.size_bytes)
-            untuned_bytes = int(untuned_bytes * (size_bytes / made.size_bytes) * (1.0 - _WORTH))
-        raise InputError(f"the smallest file has {smallest:,} bytes, more than {size_bytes:,}")
+            made.append(self._tune(model, rows, encoding, size_bytes, weights=weights))
+            log = made[-1].made.log
+            last_bytes, is_early = log["validations"][-1]["size_bytes"], 2 * log["best_iteration"] < log["steps"]
+            if made[-1].size_bytes <= size_bytes and not (is_early and last_bytes > size_bytes):
+                break
+            # Too large; or the tuning has outgrown the size, and only values of its first steps fit.
+            untuned_bytes = int(untuned_bytes * (size_bytes / last_bytes) * (1.0 - _WORTH))
+        found = [one for one in made if one.size_bytes <= size_bytes]
+        if not found:
+            smallest = min(one.size_bytes for one in made)
+            raise InputError(f"the smallest file has {smallest:,} bytes, more than {size_bytes:,}")
+        return max(found, key=lambda one: one.psnr)
 
     def tune_to(self, target: Target) -> TunedSubset:
         """Tune the best file of a size, or the smallest one of a PSNR on the validation views.
