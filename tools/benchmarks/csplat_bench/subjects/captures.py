@@ -50,7 +50,7 @@ from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import Outputs, TrainOptions
 
 _NOTES = 5  # lines of progress of a training
-_CHECKPOINTS = 5000  # steps between checkpoints
+_CHECKPOINTS = 5  # checkpoints of a training
 
 
 def scene_keys(setup: Setup, names: Sequence[str]) -> list[str]:
@@ -114,7 +114,8 @@ def _train(ply: Path, data: DataSet, options: TrainOptions) -> dict[str, Any]:
 
     checkpoint = ply.with_suffix(".npz")
     checkpoint.parent.mkdir(parents=True, exist_ok=True)
-    outputs = Outputs(checkpoint, _CHECKPOINTS, resume=checkpoint if checkpoint.exists() else None)
+    every_steps = max(1, options.iterations // _CHECKPOINTS)
+    outputs = Outputs(checkpoint, every_steps, resume=checkpoint if checkpoint.exists() else None)
     result = train(replace(data, test=[]), options, outputs=outputs, on_step=show)
     # The record first: a PLY without one counts as that of another trainer.
     write_json(record, {"options": asdict(options), "seconds": result.log["seconds"]})
