@@ -142,7 +142,8 @@ class GsplatTuning:
         return values
 
     def _quantised(self) -> QuantisedValues:
-        return self._quantisers.quantise(self.parameters.tensors, self.parameters.device_alphas)
+        found: QuantisedValues = self._quantisers.quantise(self.parameters.tensors, self.parameters.device_alphas)
+        return found
 
     @torch.no_grad()
     def _add_costs(self, gradients: dict[str, Tensor], found: QuantisedValues, costs: RateTerm) -> None:
