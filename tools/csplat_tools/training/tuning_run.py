@@ -77,9 +77,9 @@ _WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have t
 _FINER = 0.1  # least factor of the error of the goal from one tuning to the next
 _TUNINGS = 4  # largest number of tunings for a target
 _PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.375  # dB: range and accuracy of the precision that is found for a size
-_VALIDATIONS = 8  # validations of a tuning on a GPU
+_SAMPLE = 1 << 15  # splats of the sample in which it is found
 _SH_CODINGS: tuple[ShCoding, ...] = ("codebook", "scalar")
-_SAMPLE = 1 << 15  # splats by which it is judged
+_VALIDATIONS = 8  # validations of a tuning on a GPU
 
 _VALIDATION_EVERY = 8  # every Nth virtual view is a validation view
 _MOST_VALIDATION = 16  # validation views, at most
