@@ -23,7 +23,9 @@ from csplat_trainer.pruning import MeasuredViews, PruningOrder, total_error
 from csplat_trainer.splat_refit import refit_splats
 
 _PIXELS_PER_SPLAT = 8.0  # pixels of a view per splat of level 1; views of each coarser level are half as wide
-_WIDTHS = (128, 640)  # pixels, the smallest and largest views of level 1
+#: Pixels, the smallest and largest views of level 1. With 640 instead of 400, level 1 of garden500k loses 1.2 dB at its
+#: pixel size, gains 0.5 at half of it, and takes 1.7 times as long; that of fox120k gains 0.0 and 0.2 dB.
+_WIDTHS = (128, 448)
 _LEAST_WIDTH = 64  # pixels, of the views of the coarsest levels
 _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
 
@@ -45,8 +47,9 @@ class Work:
     steps: tuple[int, int]
 
 
-#: A million splats take five minutes. On garden500k, less than half of it costs 2 dB at level 1.
-SCENE_WORK = Work(6e7, (40, 120), 7.5e7, (100, 800))
+#: A million splats take five minutes. On garden500k, less than half of it costs 2 dB at level 1. Half as many steps at
+#: most cost level 1 of fox120k 1.1 dB, and level 2 of lego60k 0.5.
+SCENE_WORK = Work(6e7, (40, 120), 7.5e7, (100, 1600))
 #: A million splats of a bucket take 70 CPU s. In four buckets of an aerial scene, the fit gains 2.5, 3.5 and 3.7 dB at
 #: levels 1 to 3. Twice as many views gain 0.1 dB; steps as few as at level 1 cost levels 2 and 3 half a dB.
 PART_WORK = Work(0.0, (16, 16), 6e6, (60, 240))

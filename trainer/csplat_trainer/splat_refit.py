@@ -195,19 +195,21 @@ class _FloatRefit(_Refit):
         moves: bool,
     ) -> None:
         super().__init__(views, steps, seed, progress)
-        self._start, self._moves = model.means, moves
+        self._start, self._moves = model, moves
         values = _values_to_fit(model)
-        if moves:  # in units of the size of each splat
-            values["offsets"] = np.zeros_like(model.means)
+        if moves:
+            del values["shN"]
+            values["offsets"] = np.zeros_like(model.means)  # in units of the size of each splat
             self._sizes = np.exp(np.clip(model.scales.mean(axis=1, keepdims=True), -_SIZE_LIMIT, _SIZE_LIMIT))
         self._parameters = Parameters.starting_at(values)
         self._parameters.beta2 = _BETA2
 
     def splats(self) -> UncheckedSplats:
         """Return the splats to render."""
-        v = self._parameters.values
-        means = self._start + self._sizes * v["offsets"] if self._moves else self._start
-        return UncheckedSplats(means, v["quats"], v["scales"], self._parameters.alphas, v["sh0"], v["shN"])
+        v, start = self._parameters.values, self._start
+        means = start.means + self._sizes * v["offsets"] if self._moves else start.means
+        shN = start.shN if self._moves else v["shN"]
+        return UncheckedSplats(means, v["quats"], v["scales"], self._parameters.alphas, v["sh0"], shN)
 
     def _move(self, view: int, rates: dict[str, float]) -> float:
         splats = self.splats()
@@ -216,7 +218,6 @@ class _FloatRefit(_Refit):
         slopes["logits"] = gradients.opacities * splats.opacities * (np.float32(1.0) - splats.opacities)
         if self._moves:
             slopes["offsets"] = gradients.means * self._sizes
-            rates = {**rates, "shN": 0.0}
         adam_step(self._parameters, slopes, rates)
         return error
 
@@ -228,7 +229,7 @@ class _FloatRefit(_Refit):
         self._parameters.first, self._parameters.second = {}, {}  # each as large as the scene
         values, alphas, start = self._parameters.values, self._parameters.alphas, _values_to_fit(before)
         moved = np.zeros(len(before), bool)
-        for name in ("logits", "scales", "sh0", "shN"):
+        for name in values.keys() & {"logits", "scales", "sh0", "shN"}:
             moved |= (values[name] != start[name]).reshape(len(before), -1).any(axis=1)
         means = self.splats().means
         moved &= np.isfinite(means).all(axis=1)
@@ -237,13 +238,14 @@ class _FloatRefit(_Refit):
         rows = moved[:, None]
         if self._moves:
             before = replace(before, means=np.where(rows, means, before.means), means_double=None)
+        else:
+            before = replace(before, shN=np.where(rows[:, :, None], values["shN"], before.shN))
         return replace(
             before,
             opacities=np.where(moved, alphas, before.opacities),
             quats=np.where(rows, values["quats"], before.quats),
             scales=np.where(rows, values["scales"], before.scales),
             sh0=np.where(rows, values["sh0"], before.sh0),
-            shN=np.where(rows[:, :, None], values["shN"], before.shN),
         )
 
 

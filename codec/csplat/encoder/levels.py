@@ -20,7 +20,7 @@ from csplat.types import Progress, null_progress
 
 Rows = NDArray[np.intp]
 
-#: Steps of levels above 1: on lego60k they save a fifth of the bytes of geometry, and cost 0.5 dB of 30.
+#: Steps of levels above 1: on lego60k they save a tenth of their bytes, and cost 0.4 dB of 30.
 _COARSE_STEPS = StepFactors(opacities=2, scales=1, quats=2, sh0=1)
 
 
@@ -85,7 +85,10 @@ def encode_levels(
 
 
 def encode_coarse(node: LevelNode, plan: EncodePlan, codebooks: FileCodebooks) -> list[FileTile]:
-    """Encode the splats of a node above level 0 with the SH codebooks of the scene, and with coarser steps.
+    """Encode the splats of a node above level 0 with the SH codebooks of the scene, above level 1 with coarser steps.
+
+    The step of the means doubles from level to level, from level 2 on. If it did from level 1 on, level 1 of lego60k,
+    fox120k and garden500k would have 3 to 4 % fewer bytes, and 0.3 to 0.8 dB less.
 
     Args:
         node: the node.
@@ -101,7 +104,7 @@ def encode_coarse(node: LevelNode, plan: EncodePlan, codebooks: FileCodebooks) -
     factors = SAME_STEPS if level == 1 else _COARSE_STEPS
     sh_plan = _assign_coarse(splats, plan, codebooks)
     tiles = [
-        replace(tile, exponent=tile.exponent + level, factors=factors)
+        replace(tile, exponent=tile.exponent + level - 1, factors=factors)
         for tile in cut_scene(splats, plan.parameters)
     ]  # fmt: skip
     return [replace(encode_tile(splats, tile, plan.parameters, sh_plan).tile, level=level) for tile in tiles]

@@ -1,9 +1,10 @@
 """Levels of detail next to the scene: level k at 1/2^k and 1/2^(k - 1) of the size of its cameras.
 
 A case is a `level`, from 1, and its `maker`: `fitted`, as `csplat encode` builds scenes of up to two million splats;
-`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, or `nanogs`, at as many splats. Seconds
-are those of all levels for csplat, of this one for the others. Splats are not quantised. PSNR is pooled over eight
-cameras.
+`merged`, without a fit; `decimate` or `decimate-adaptive` of splat-transform, or `nanogs`, at as many splats. Fitted
+levels are decoded from a file, and compared with its level 0; the others are not quantised, and compared with the
+scene. Seconds are those of all levels for csplat, with the encoding of the file, and of this one for the others. PSNR
+is pooled over eight cameras.
 """
 
 from __future__ import annotations
@@ -22,7 +23,6 @@ import numpy as np
 from csplat.decoder import decode
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
-from csplat.scene_source import join_blocks
 from csplat_bench.measuring import run_program
 from csplat_bench.peers import CAP_SECONDS, find_nanogs, find_splat_transform
 from csplat_bench.protocol import AbsentError, Measure, Setup
@@ -53,33 +53,33 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
 
     @cache
     def build(maker: str) -> tuple[dict[int, SplatModel], float]:
+        """Return levels by number, 0 being the scene, and seconds."""
         start = time.perf_counter()
         if maker == "merged":
-            levels, splats = dict[int, SplatModel](), model
+            levels, splats = {0: model}, model
             while len(splats) > LevelBuilder.root_splats:
                 splats = merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(_SHARE * len(splats)))[1]
-                levels[len(levels) + 1] = splats
+                levels[len(levels)] = splats
             return levels, time.perf_counter() - start
-        parts: dict[int, list[SplatModel]] = {}
-        for node in LevelBuilder().build(model):
-            if node.splats is not None:
-                parts.setdefault(node.level, []).append(node.splats)
-        levels = {level: join_blocks(some[0], some) for level, some in parts.items()}
-        return levels, time.perf_counter() - start
+        encoded = LevelBuilder().encode(model)
+        seconds, nodes = time.perf_counter() - start, encoded.nodes
+        numbers = sorted({node.level for node in nodes})
+        return {n: decode(encoded.part([node for node in nodes if node.level == n])) for n in numbers}, seconds
 
     def measure(case: Case) -> Mapping[str, Any]:
         maker, level = case["maker"], case["level"]
         if maker in ("fitted", "merged"):
             levels, seconds = build(maker)
             if level not in levels:
-                raise AbsentError(f"{name} has {len(levels)} coarser levels")
-            coarse = levels[level]
+                raise AbsentError(f"{name} has {len(levels) - 1} coarser levels")
+            fine, coarse = levels[0], levels[level]
         else:
+            fine = model
             coarse, seconds = _simplified(setup, source, maker, len(model), level)
         scores: dict[str, float] = {}
         for suffix, factor in (("", 0.5**level), ("_finer", 0.5 ** (level - 1))):
             views = [resized(one, max(1, round(one.W * factor)), max(1, round(one.H * factor))) for one in cameras]
-            pairs = [(render(model, view), render(coarse, view)) for view in views]
+            pairs = [(render(fine, view), render(coarse, view)) for view in views]
             errors = [np.mean((a - b) ** 2, dtype=np.float64) for a, b in pairs]
             scores[f"psnr{suffix}"] = psnr_of_mse(float(np.mean(errors)))
             scores[f"ssim{suffix}"] = float(np.mean([ssim(a, b) for a, b in pairs]))
