@@ -6,6 +6,7 @@ import math
 import re
 import sys
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -43,7 +44,7 @@ from csplat_tools.convert_file import convert_file
 from csplat_tools.encode_file import AUTO_LEVEL_SPLATS, choose_levels, encode_file
 from csplat_tools.level_builder import LevelBuilder, encode_with_levels, kd_groups
 from csplat_tools.level_errors import measure_errors
-from csplat_tools.level_fitting import LevelFitter
+from csplat_tools.level_fitting import SCENE_WORK, LevelFitter
 from csplat_tools.level_merging import merge_neighbours
 from csplat_tools.scene_files import LoadedModel
 
@@ -51,6 +52,13 @@ TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
 RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
 NOTHING = next(VECTORS / one.file for one in load() if one.expect and one.expect["header"]["tile_count"] == 0)
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@pytest.fixture(autouse=True)
+def few_steps(monkeypatch):
+    """Fit the small scenes of these tests in fewer steps."""
+    work = replace(SCENE_WORK, steps=(100, 200))
+    monkeypatch.setattr("csplat_tools.level_builder.LevelFitter", partial(LevelFitter, work=work))
 
 
 @pytest.fixture(scope="module")
