@@ -367,7 +367,7 @@ def test_one_training_gives_several_files(file_runs):
     assert usual["size_bytes"] < made("larger.csplat", "--target-size", f"{bound}B")["size_bytes"] <= bound
     wanted = usual["validation"]["psnr"] - 0.1  # 0.05 is out of reach on some processors
     good = made("good.csplat", "--target-psnr", wanted, final_share=1.0)
-    assert wanted <= good["validation"]["psnr"] <= wanted + 0.4  # twenty splats are coarse
+    assert wanted <= good["validation"]["psnr"] <= usual["validation"]["psnr"] + 0.05
     assert trained == file_runs.checkpoint.read_bytes()
 
 
