@@ -857,6 +857,35 @@ def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="sends SIGINT")
+def test_an_interrupt_while_the_program_loads_is_no_traceback(tmp_path):
+    def interrupted(module, script):
+        """Run a script that imports a module in whose import the interrupt becomes another error."""
+        folder = tmp_path / module
+        folder.mkdir()
+        (folder / f"{module}.py").write_text(
+            "import sys, time\n"
+            "print('loading', flush=True)\n"
+            "try:\n    time.sleep(20)\n"
+            "except KeyboardInterrupt as error:\n    raise ImportError('half of it') from error\n"
+        )
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
+        with subprocess.Popen(
+            [sys.executable, "-c", script, "formats"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
+        ) as running:  # fmt: skip
+            assert running.stdout is not None
+            assert running.stdout.readline() == b"loading\n"
+            running.send_signal(signal.SIGINT)
+            _, errors = running.communicate(timeout=20)
+            return running.returncode, errors
+
+    run = "from csplat_program import main; main()"
+    assert (-signal.SIGINT, b"") == interrupted("contextlib", f"import sys; sys.modules.pop('contextlib', None); {run}")
+    assert (130, b"interrupted\n") == interrupted("typer", run)
+
+
 def test_a_scene_keeps_its_extremes(tmp_path):
     count = 4
     model = SplatModel(

@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import numba as typed_numba
@@ -92,7 +93,7 @@ class _UserCacheLocator(caching.UserWideCacheLocator):  # type: ignore[misc]  # 
         Raises:
             OSError: it cannot be created, or there is no home.
         """
-        if not os.path.isabs(self.get_cache_path()):
+        if not Path(self.get_cache_path()).is_absolute():
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.get_cache_path())
         super().ensure_cache_path()
 
