@@ -23,6 +23,7 @@ def main() -> None:
         with suppress(OSError):  # the code below reports a full disk
             os.write(sys.stdout.fileno(), f"{VERSIONS}\n".encode())
             return
+    _open_closed_streams()
     interrupts: list[int] = []
 
     def interrupt(number: int, _frame: FrameType | None) -> None:
@@ -43,6 +44,19 @@ def main() -> None:
         pass
     sys.stderr.write("interrupted\n")
     sys.exit(_INTERRUPTED)
+
+
+def _open_closed_streams() -> None:
+    """Open standard streams that the caller has closed, so that reading or writing one is an error of its own.
+
+    Otherwise the next file that is opened would get its number, and what is printed.
+    """
+    for number, name, mode, flags in ((0, "stdin", "r", os.O_WRONLY), (1, "stdout", "w", os.O_RDONLY)):
+        if getattr(sys, name) is None:
+            os.open(os.devnull, flags)  # gets the lowest free number
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115  # stays open
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115  # stays open
 
 
 def _silence_libraries() -> None:

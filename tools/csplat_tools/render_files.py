@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import temporary_folder
 from csplat.errors import InputError
 from csplat.types import F32, U8
 from csplat_tools.file_streams import write_bytes
@@ -212,8 +212,8 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
 
     height, width = (side - side % 2 for side in frames[0].shape[:2])  # even, since chroma has half the resolution
     rate = Fraction(fps).limit_denominator(1001)
-    with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
-        path = Path(folder) / "video.mp4"  # a file, since PyAV rewrites it to put the index first
+    with temporary_folder() as folder:
+        path = folder / "video.mp4"  # a file, since PyAV rewrites it to put the index first
         options = {"movflags": "+faststart", "fflags": "+bitexact"}
         with av.open(path, "w", format="mp4", options=options) as container:
             try:

@@ -16,13 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any
 from urllib.parse import unquote
 
 from csplat import __version__
+from csplat.disk_files import temporary_file, temporary_folder
 from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, InputError, StoreError, counted, missing_package
+from csplat.file_source import open_binary, read_bytes
 from csplat.formats import detect_format
 from csplat.out_of_core import OutOfCoreOptions
 from csplat.remote_store import is_url, open_store
@@ -269,9 +270,9 @@ def _local_source(source: str) -> Iterator[Path]:
     if not is_url(source):
         yield Path(source)
         return
-    with TemporaryDirectory(prefix="csplat-") as folder:
-        local = Path(folder) / (PurePosixPath(source.partition("?")[0]).name or "scene")
-        with closing(open_store(source)) as store, local.open("wb") as copy:
+    with temporary_folder() as folder:
+        local = folder / (PurePosixPath(source.partition("?")[0]).name or "scene")
+        with closing(open_store(source)) as store, open_binary(local, "w") as copy:
             for start in range(0, store.size, _PART_BYTES):
                 copy.writelines(store.read([(start, min(start + _PART_BYTES, store.size))]))
         yield local
@@ -283,8 +284,8 @@ def _local_output(job: SceneJob) -> Iterator[Path]:
     if not is_url(job.task.output):
         yield Path(job.folder) / job.task.output
         return
-    with TemporaryDirectory(prefix="csplat-") as folder:
-        local = Path(folder) / PurePosixPath(job.task.output).name
+    with temporary_folder() as folder:
+        local = folder / PurePosixPath(job.task.output).name
         yield local
         if local.exists():
             _upload(local, job.task.output)
@@ -411,7 +412,7 @@ def _files(path: Path) -> list[Path]:
 def _buffer_files(path: Path) -> Iterator[Path]:
     """Yield the buffer files that a glTF names and that exist in its folder; none if the JSON is invalid."""
     try:
-        buffers = json.loads(path.read_bytes()).get("buffers", [])
+        buffers = json.loads(read_bytes(path)).get("buffers", [])
         names = [unquote(one["uri"]) for one in buffers if not one.get("uri", "data:").startswith("data:")]
     except (ValueError, TypeError, AttributeError):
         return
@@ -421,7 +422,7 @@ def _buffer_files(path: Path) -> Iterator[Path]:
 
 
 def _hashed(path: Path) -> str:
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -446,7 +447,7 @@ class Worker:
 
     def __init__(self) -> None:
         self._process: Process | None = None
-        self._stderr = TemporaryFile()  # noqa: SIM115  # lives as long as this object
+        self._stderr = temporary_file()
         self._lock = threading.Lock()
         self._closed = False
 

@@ -26,6 +26,7 @@ from csplat.decoder import SceneHeader, decode, read_header
 from csplat.editing.up_axis import Direction
 from csplat.encoder import EncodeOptions, PresetName, encode_with_report
 from csplat.errors import CsplatError, FormatError, InputError
+from csplat.file_source import open_binary, read_bytes
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
 from csplat.types import Progress
@@ -96,7 +97,7 @@ class ViewerScene:
 
     def read(self) -> bytes:
         """Return the bytes of the file."""
-        return self.content if isinstance(self.content, bytes) else self.content.read_bytes()
+        return self.content if isinstance(self.content, bytes) else read_bytes(self.content)
 
 
 class SceneServer(ThreadingHTTPServer):
@@ -356,7 +357,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 def _file(path: Path, ending: str = "") -> _Resource:
     def open_file() -> tuple[BinaryIO, int]:
-        stream = path.open("rb")
+        stream = open_binary(path)
         return stream, os.fstat(stream.fileno()).st_size
 
     def tag(stream: BinaryIO) -> str:
