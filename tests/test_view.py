@@ -187,7 +187,8 @@ def test_another_name_for_this_machine_is_misdirected(scene_path):
 LOOPBACK = ["127.0.0.1", "127.0.0.2", "127.1", "LOCALHOST", "localhost", "::1", "0:0:0:0:0:0:0:1", "::ffff:127.0.0.1"]
 ANYWHERE = "0.0.0.0"  # noqa: S104  # the documented value of --host
 GOOD = [
-    "localhost", "LOCALHOST:80", "localhost.", "localhost:", "127.0.0.1:9", "127.0.0.2", "[::1]", "[::1]:80", "192.0.2.1",
+    "localhost", "LOCALHOST:80", "localhost.", "localhost:", "127.0.0.1:9", "127.0.0.2", "[::1]", "[::1]:80",
+    "192.0.2.1",
 ]  # fmt: skip
 BAD = [
     "evil.example", "EVIL.example:80", "127.0.0.1.evil.example", "localhost.evil.example", "evil.example.", "[evil]",

@@ -13,6 +13,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from mmap import mmap
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -28,7 +29,7 @@ from csplat.file_source import File, describe_substitute, named_errors, open_bin
 _PART_SIZE = 1 << 20  # bytes copied at a time
 _NAME_PART = 20  # characters of a file's name in that of its temporary file, which must not be longer than 255 bytes
 _TEMPORARY = "csplat-"  # beginning of the names of files in the system's folder for temporary files
-_numbers = itertools.count()  # of the temporary files of this process
+_numbers = itertools.count()  # tells the temporary files of this process apart
 _MB = 1e6  # bytes
 
 
@@ -291,6 +292,18 @@ def resolve_links(path: str | os.PathLike[str]) -> Path:
 def _temporary_name(target: Path) -> Path:
     """Return an unused name in the same folder, which is not longer than 255 bytes, with the number of the process."""
     return target.with_name(f".{target.name[:_NAME_PART]}.{os.getpid()}.{next(_numbers)}.tmp")
+
+
+def remove_unfinished(path: str | os.PathLike[str], pid: int) -> None:
+    """Remove the temporary files of a process that was killed while it wrote a file by `atomic_writer`.
+
+    Args:
+        path: path of the file.
+        pid: number of the process.
+    """
+    target = Path(path)
+    for file in target.parent.glob(f".{escape(target.name[:_NAME_PART])}.{pid}.*.tmp"):
+        file.unlink(missing_ok=True)
 
 
 def _report_as(path: str | os.PathLike[str], temporary: Path, error: BaseException) -> None:

@@ -146,6 +146,16 @@ def read_bytes(path: str | os.PathLike[str]) -> bytes:
         return stream.read()
 
 
+def write_file(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file whose name need not be kept for complete content, as in a temporary folder.
+
+    Raises:
+        OSError: the file cannot be written; it has its name.
+    """
+    with open_binary(path, "w") as stream:
+        stream.write(data)
+
+
 def describe_substitute(head: bytes) -> str:
     """Describe a placeholder that was delivered instead of a file, such as an error page; return "" if there is none.
 

@@ -6,6 +6,7 @@ replaced only with `force`.
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -90,7 +91,9 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
         raise InputError(f"{path} is a folder, expected the name of a file")
     _free.discard(resolved)
     if not target.exists():
-        resolved.parent.stat()  # raises an OSError that names the folder
+        target.parent.stat()  # raises an OSError that names the folder
+        if not resolved.parent.exists():  # of a link to a file that is to be made
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
         if not force:
             _free.add(resolved)
         return

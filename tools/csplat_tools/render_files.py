@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.disk_files import temporary_folder
+from csplat.disk_files import resolve_links, temporary_folder
 from csplat.errors import InputError
 from csplat.types import F32, U8
 from csplat_tools.file_streams import write_bytes
@@ -51,6 +51,7 @@ def make_output_folder(folder: str, names: Sequence[str], *, force: bool) -> Pat
         OSError: the folder cannot be made.
     """
     path = Path(folder)
+    resolve_links(path)  # refuses a loop of links, which `exists` takes for nothing
     if path.exists() and not path.is_dir():
         raise InputError(f"{folder} is not a folder")
     if len(set(names)) < len(names):

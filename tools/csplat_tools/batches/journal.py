@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from csplat.errors import InputError
-from csplat.file_source import open_binary
+from csplat.file_source import named_errors, open_binary
 from csplat.system import locked_folder
 from csplat_tools.file_streams import write_bytes
 
@@ -108,9 +108,10 @@ class Journal:
 
     def _write_line(self, line: bytes) -> None:
         rest = memoryview(line + b"\n")
-        while rest:  # on a full disk, a write may be partial before one raises
-            rest = rest[self._file.write(rest) :]
-        os.fsync(self._file.fileno())  # so that after a power cut no output exists without its line
+        with named_errors(self._path):
+            while rest:  # on a full disk, a write may be partial before one raises
+                rest = rest[self._file.write(rest) :]
+            os.fsync(self._file.fileno())  # so that after a power cut no output exists without its line
 
 
 @contextmanager

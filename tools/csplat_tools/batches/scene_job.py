@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from csplat import __version__
-from csplat.disk_files import temporary_file, temporary_folder
+from csplat.disk_files import remove_unfinished, temporary_file, temporary_folder
 from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, InputError, StoreError, counted, missing_package
 from csplat.file_source import open_binary, read_bytes
@@ -174,9 +174,10 @@ def run_job(job: SceneJob, worker: Worker, gate: Gate | None = None) -> tuple[Re
     except CsplatError as error:
         return replace(record, code=error.code, error=" ".join(str(error).split())), True
     except OSError as error:
-        return replace(
-            record, code=errno.errorcode.get(error.errno or 0, "E_OS"), error=" ".join(str(error).split())
-        ), True
+        reason = error.strerror or str(error)
+        message = reason if error.filename is None else f"{error.filename}: {reason}"
+        code = errno.errorcode.get(error.errno or 0, "E_OS")
+        return replace(record, code=code, error=" ".join(message.split())), True
 
 
 class CommandLineError(InputError):
@@ -199,7 +200,7 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
     if output.exists() and not is_url(job.task.output) and not job.force and not _is_ours(job, output):
         raise SceneError(f"{job.task.output} exists, and is not from this batch: --force replaces it", "E_INPUT")
     threads = () if job.threads is None or "--threads" in job.words else ("--threads", str(job.threads))
-    resume = ("--resume",) if job.resumes and output.with_name(f"{output.name}.work").is_dir() else ()
+    resume = ("--resume",) if job.resumes and Path(f"{output}.work").is_dir() else ()  # the name may be too long
     words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options, *resume)
     thumbnail = str(Path(job.folder) / THUMBNAILS / f"{job.task.output}.jpg")
     try:
@@ -525,10 +526,3 @@ def _end(process: Process | None) -> None:
         if pipe is not None:
             with suppress(OSError):  # unsent data
                 pipe.close()
-
-
-def remove_unfinished(output: Path, pid: int) -> None:
-    """Remove the temporary files of a lost process for an output; see `atomic_writer`."""
-    for file in output.parent.glob(f".*.{pid}.*.tmp"):
-        if file.name.startswith(f".{output.name}."):
-            file.unlink(missing_ok=True)

@@ -58,9 +58,9 @@ _HEADERS = {
 }
 _BLOCK_BYTES = 1 << 20
 _SECONDS_IDLE = 60.0
-_DRAINED_BYTES = 1 << 20  # bytes of a body that are read before a connection is closed, and the seconds that may take
-_DRAIN_SECONDS = 1.0
-_DIGITS_MAX = 18  # of a position in a file; larger ones lie after the end of any file
+_DRAINED_BYTES = 1 << 20  # bytes; the part of a request's body that is read before the connection is closed
+_DRAIN_SECONDS = 1.0  # seconds; the time that this may take
+_DIGITS_MAX = 18  # decimal digits; a longer position lies after the end of any file
 
 
 @dataclass(frozen=True)
