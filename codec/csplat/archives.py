@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, open_binary
 
 #: Exceptions that NumPy and zipfile raise for damaged files: RuntimeError for passwords and unknown compression,
 #: MemoryError for impossible sizes, OSError for offsets outside the file and broken bz2.
@@ -123,7 +123,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
         OSError: the file cannot be read.
     """
     nothing = Archive(path, kind, {})
-    with Path(path).open("rb") as stream:  # np.load would leave a damaged file open
+    with open_binary(path) as stream:  # np.load would leave a damaged file open
         if instead := describe_substitute(stream.read(64)):
             raise InputError(f"{path} is {instead}")
         if not zipfile.is_zipfile(stream):  # np.load would report a pickle instead

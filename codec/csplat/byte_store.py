@@ -12,7 +12,7 @@ import numpy as np
 
 from csplat.decoder.container import view_of
 from csplat.errors import CsplatError, FormatError, LimitError, StoreError
-from csplat.file_source import File
+from csplat.file_source import File, named_errors, open_binary
 from csplat.system import Pages, read_at
 
 
@@ -123,12 +123,13 @@ class DiskStore(Store):
     """A file on disk. It is not mapped: truncating a mapped file would kill the process that reads it."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("rb")
+        self._file = open_binary(path)
         self._stat = os.fstat(self._file.fileno())
         super().__init__(str(path), self._stat.st_size)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        return [read_at(self._file.fileno(), stop - start, start) for start, stop in ranges]
+        with named_errors(self.name):
+            return [read_at(self._file.fileno(), stop - start, start) for start, stop in ranges]
 
     def _is_other(self) -> bool:
         now = os.fstat(self._file.fileno())

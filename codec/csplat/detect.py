@@ -17,7 +17,7 @@ from pathlib import Path
 from csplat._spec import MAGIC
 from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import InputError
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, open_binary
 
 #: Size of the beginning of a file that identifies it, bytes.
 HEAD_SIZE = 512
@@ -88,7 +88,7 @@ def read_head(path: Path) -> bytes:
     """
     if path.is_dir():
         return b""
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         return stream.read(HEAD_SIZE)
 
 
@@ -142,7 +142,7 @@ def _is_compressed_ply(path: Path, head: bytes) -> bool:
     if not is_ply(head):
         return False
     if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
-        with path.open("rb") as stream:
+        with open_binary(path) as stream:
             head = stream.read(_PLY_HEADER_SIZE)
     return b"packed_position" in head.partition(b"end_header")[0]
 

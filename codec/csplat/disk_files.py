@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import codecs
+import itertools
 import json
 import math
 import os
 import shutil
-import threading
+import stat
+import sys
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from mmap import mmap
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,9 +24,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.file_source import File, describe_substitute
+from csplat.file_source import File, describe_substitute, named_errors, open_binary, read_bytes
 
 _PART_SIZE = 1 << 20  # bytes copied at a time
+_NAME_PART = 20  # characters of a file's name in that of its temporary file, which must not be longer than 255 bytes
+_TEMPORARY = "csplat-"  # beginning of the names of files in the system's folder for temporary files
+_numbers = itertools.count()  # tells the temporary files of this process apart
 _MB = 1e6  # bytes
 
 
@@ -57,7 +64,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
         InputError: the file cannot be read, has another encoding, or is not text.
     """
     try:
-        data = Path(path).read_bytes()
+        data = read_bytes(path)
     except OSError as error:
         raise InputError(f"{os.fspath(path)}: {error.strerror or error}") from error
     instead = describe_substitute(data[:64])
@@ -129,42 +136,83 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
         if not path.is_fifo():
             yield path
             return
-        with path.open("rb") as pipe, local_file(pipe) as copied:
+        with open_binary(path) as pipe, local_file(pipe) as copied:
             yield copied
             return
-    with TemporaryDirectory(
-        prefix="csplat-", ignore_cleanup_errors=True
-    ) as folder:  # Windows: the copy may still be mapped
-        own = getattr(file, "name", None)
-        spool = Path(folder) / (name or (Path(own).name if isinstance(own, str) else "") or "data")
-        with _name_errors(spool), spool.open("wb") as stream:
-            for part in _parts(file):
+    own = getattr(file, "name", None)
+    own = own if isinstance(own, str) else ""
+    with temporary_folder() as folder:
+        spool = folder / (name or Path(own).name or "data")
+        with open_binary(spool, "x") as stream:
+            for part in _parts(file, own or name or "the input"):
                 stream.write(part)
         yield spool
 
 
-def _parts(file: Any) -> Iterator[memoryview]:
-    """Yield the bytes of a binary file or buffer in pieces."""
+def _parts(file: Any, name: str) -> Iterator[memoryview]:
+    """Yield the bytes of a binary file or buffer in pieces; errors of reading get its name."""
     try:
         if isinstance(file, mmap) or not hasattr(file, "read"):
             yield memoryview(file).cast("B")
             return
-        while data := file.read(_PART_SIZE):
+        while data := _read_part(file, name):
             yield memoryview(data)
     except (TypeError, ValueError) as error:  # ValueError: text that does not decode
-        name = type(file).__name__
-        raise InputError(f"file is a {name}, expected a path, a binary file or bytes: {error}") from None
+        kind = type(file).__name__
+        raise InputError(f"file is a {kind}, expected a path, a binary file or bytes: {error}") from None
+
+
+def _read_part(file: Any, name: str) -> Any:
+    with named_errors(name):
+        return file.read(_PART_SIZE)
+
+
+def temporary_root() -> str:
+    """Return the folder for temporary files, which the environment variable TMPDIR sets.
+
+    Raises:
+        InputError: there is none that can be written.
+    """
+    try:
+        return tempfile.gettempdir()
+    except FileNotFoundError as error:
+        raise InputError(f"{error.strerror}: set TMPDIR to a folder that can be written") from None
 
 
 @contextmanager
-def _name_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Add the name of the file to errors that lack one."""
-    try:
-        yield
-    except OSError as error:
-        if error.filename is None:
-            error.filename = os.fspath(path)
-        raise
+def temporary_folder() -> Iterator[Path]:
+    """Yield a new folder for temporary files, which is deleted afterwards.
+
+    Raises:
+        InputError: no folder for temporary files can be written.
+        OSError: the disk is full.
+    """
+    with TemporaryDirectory(
+        prefix=_TEMPORARY, dir=temporary_root(), ignore_cleanup_errors=True
+    ) as folder:  # Windows: files in it may still be mapped
+        yield Path(folder)
+
+
+def temporary_file() -> BinaryIO:
+    """Open a temporary file for writing and reading, which vanishes when it is closed.
+
+    Raises:
+        InputError: no folder for temporary files can be written.
+    """
+    path = Path(temporary_root(), f"{_TEMPORARY}{os.urandom(8).hex()}")
+    vanishes = getattr(os, "O_TEMPORARY", 0)  # on Windows
+    stream = open_binary(path, "x+", permissions=0o600, flags=vanishes)
+    if not vanishes:
+        path.unlink()
+    return stream
+
+
+def is_temporary(path: str) -> bool:
+    """Return True for the path of a file of `temporary_folder` or `temporary_file`, which users do not know."""
+    if tempfile.tempdir is None:  # none has been needed
+        return False
+    parts, root = Path(path).parts, Path(tempfile.tempdir).parts
+    return parts[: len(root)] == root and parts[len(root) :] != () and parts[len(root)].startswith(_TEMPORARY)
 
 
 @contextmanager
@@ -189,7 +237,8 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
     """Write a file that appears under its name only when complete.
 
     Bytes go to a temporary file in the same folder, which is renamed on success and removed on any error. The target
-    of a symbolic link is replaced, not the link. Devices and pipes are written directly.
+    of a symbolic link is replaced, not the link. A file that is replaced keeps its permissions, and if possible its
+    owner and group; other hard links keep the older content. Devices and pipes are written directly.
 
     Args:
         path: path of the file to write.
@@ -202,30 +251,86 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         FileExistsError: the file exists and `replace` is False.
         OSError: the folder does not exist, is full or is not writable.
     """
-    if Path(path).exists() and not Path(path).is_file():
-        with (
-            _name_errors(path),
-            Path(path).open("wb") as stream,
-        ):  # not resolved: /dev/stdout may point to an unnamed pipe
+    if Path(path).exists() and not Path(path).is_file():  # not resolved: /dev/stdout may point to an unnamed pipe
+        with open_binary(path, "w") as stream:
             yield stream
         return
-    target = Path(path).resolve()
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.{threading.get_ident()}.tmp")
+    target = resolve_links(path)
+    old = target.stat() if target.exists() else None
+    temporary = _temporary_name(target)
     try:
-        with temporary.open("xb") as stream:
+        permissions = 0o666 if old is None else 0o600  # until it has those of the old file
+        with open_binary(temporary, "x", name=path, permissions=permissions) as stream:
+            if old is not None:
+                _take_permissions(stream.fileno(), old)
             yield stream
             stream.flush()
-            os.fsync(stream.fileno())  # the bytes must reach the disk before the name
+            with named_errors(path):
+                os.fsync(stream.fileno())  # the bytes must reach the disk before the name
         if replace:
             temporary.replace(target)
         else:
             _take_name(temporary, target)
     except BaseException as error:
-        with suppress(FileNotFoundError):
+        with suppress(OSError):
             temporary.unlink()
-        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            error.filename = os.fspath(path)  # report the caller's name
+        _report_as(path, temporary, error)
         raise
+
+
+def resolve_links(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path of a file that may not exist yet, without symbolic links.
+
+    Raises:
+        OSError: the path cannot name a file: its links form a loop, a name is too long, or a parent is a file.
+    """
+    with suppress(FileNotFoundError):
+        Path(path).stat()  # `exists` hides loops of links, for which `resolve` raises a RuntimeError, or nothing
+    return Path(path).resolve()
+
+
+def _temporary_name(target: Path) -> Path:
+    """Return an unused name in the same folder, which is not longer than 255 bytes, with the number of the process."""
+    return target.with_name(f".{target.name[:_NAME_PART]}.{os.getpid()}.{next(_numbers)}.tmp")
+
+
+def remove_unfinished(path: str | os.PathLike[str], pid: int) -> None:
+    """Remove the temporary files of a process that was killed while it wrote a file by `atomic_writer`.
+
+    Args:
+        path: path of the file.
+        pid: number of the process.
+    """
+    target = Path(path)
+    for file in target.parent.glob(f".{escape(target.name[:_NAME_PART])}.{pid}.*.tmp"):
+        file.unlink(missing_ok=True)
+
+
+def _report_as(path: str | os.PathLike[str], temporary: Path, error: BaseException) -> None:
+    """Replace the name of a temporary file or folder in an error by the name that the caller knows."""
+    if isinstance(error, OSError) and isinstance(error.filename, str):
+        failed = Path(error.filename)
+        if failed.is_relative_to(temporary):
+            error.filename = str(Path(path, failed.relative_to(temporary)))
+
+
+def _take_permissions(descriptor: int, old: os.stat_result) -> None:
+    """Give a file the permissions, and if possible owner and group, of the file that it replaces.
+
+    In another group it gives the group the rights of all others: the group may be one that had no more.
+    """
+    if sys.platform == "win32":
+        return
+    for owner, group in ((-1, old.st_gid), (old.st_uid, -1)):
+        with suppress(OSError):
+            os.fchown(descriptor, owner, group)
+    new, mode = os.fstat(descriptor), stat.S_IMODE(old.st_mode)
+    if new.st_gid != old.st_gid:
+        mode = mode & ~stat.S_IRWXG | (mode & stat.S_IRWXO) << 3
+    if (new.st_uid, new.st_gid) != (old.st_uid, old.st_gid):
+        mode &= ~(stat.S_ISUID | stat.S_ISGID)
+    with suppress(OSError):  # a file system without permissions
+        os.fchmod(descriptor, mode)
 
 
 @contextmanager
@@ -241,10 +346,12 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         OSError: the parent folder does not exist, is full or is not writable.
     """
-    target = Path(path).resolve()
-    temporary, old = (target.with_name(f".{target.name}.{os.getpid()}.{end}") for end in ("tmp", "old"))
+    target = resolve_links(path)
+    temporary, old = _temporary_name(target), _temporary_name(target)
     try:
         temporary.mkdir()
+        if target.exists():
+            shutil.copymode(target, temporary)
         yield temporary
         if target.exists():
             target.rename(old)
@@ -253,8 +360,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         if old.exists() and not target.exists():
             old.rename(target)
-        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            error.filename = os.fspath(path)  # report the caller's name
+        _report_as(path, temporary, error)
         raise
     shutil.rmtree(old, ignore_errors=True)
 
@@ -292,7 +398,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
     try:
         if most_bytes is not None and Path(path).stat().st_size > most_bytes:
             return np.lib.format.open_memmap(path, mode="r")
-        with Path(path).open("rb") as stream:
+        with open_binary(path) as stream:
             if instead := describe_substitute(stream.read(64)):
                 raise InputError(f"{path} is {instead}")
             stream.seek(0)

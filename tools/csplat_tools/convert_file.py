@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import Limits, open_tiles
+from csplat.disk_files import resolve_links
 from csplat.editing.transform import convert_axes, rotate_scene, scale_scene, translate_scene
 from csplat.errors import InputError
 from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, write_levels
@@ -268,7 +269,10 @@ def convert_file(
     writes = format_by_suffix(path) if write_as is None else format_by_name(write_as)
     if writes.write is None:
         raise InputError(f"{target} has the name of {writes.title}, which csplat does not write")
-    if writes.takes_levels(path) and path.parent.resolve() in (Path(source).resolve(), *Path(source).resolve().parents):
+    if writes.takes_levels(path) and resolve_links(path.parent) in (
+        place := resolve_links(source),
+        *place.parents,
+    ):
         raise InputError(f"{source} is in the folder of {target}, which a new folder replaces: name another")
     changes, sh_degree = filters or Filters(), None if filters is None else filters.sh_degree
     with local_path(source) as local, ExitStack() as stack:

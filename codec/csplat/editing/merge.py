@@ -12,8 +12,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
 from typing import IO, Any
 
 import numpy as np
@@ -23,7 +21,7 @@ from csplat.byte_store import FileWindow
 from csplat.decoder import read_header
 from csplat.decoder.container import SceneHeader, Tile
 from csplat.decoder.tiles import codebook_references
-from csplat.disk_files import BinaryWriter, open_writer
+from csplat.disk_files import BinaryWriter, open_writer, temporary_file, temporary_folder
 from csplat.encoder import EncodeOptions
 from csplat.encoder.container import (
     FileChunk,
@@ -40,7 +38,7 @@ from csplat.encoder.container import (
 )
 from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
-from csplat.file_source import File
+from csplat.file_source import File, open_binary
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene_source import SceneSource
@@ -124,7 +122,7 @@ def merge(
         windows = [scene.window() for scene in scenes]
         fields = [scene_fields(one, scene.header, (), ()) for one, scene in zip(windows, scenes, strict=True)]
         why, ids = _difference(fields, names), []
-        spool = PayloadSpool(stack.enter_context(TemporaryFile()))
+        spool = PayloadSpool(stack.enter_context(temporary_file()))
         books = MergedCodebooks(spool)
         if not why:
             ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
@@ -217,10 +215,10 @@ def _encode_again(
     metadata_model = _metadata_model(scenes)
     whole = SceneSource(sum(map(len, scenes)), metadata_model, partial(_blocks, scenes, metadata_model))
     dropped = {column.name for scene in scenes for column in scene.header.extras} - metadata_model.extra.keys()
-    with TemporaryDirectory(prefix="csplat-") as folder:
-        path = Path(folder) / "merged.csplat"
-        encode_scene(whole, path, options, OutOfCoreOptions(folder=Path(folder) / "work"))
-        with path.open("rb") as coded, open_writer(output) as stream:
+    with temporary_folder() as folder:
+        path = folder / "merged.csplat"
+        encode_scene(whole, path, options, OutOfCoreOptions(folder=folder / "work"))
+        with open_binary(path) as coded, open_writer(output) as stream:
             shutil.copyfileobj(coded, stream)
         return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
 

@@ -319,7 +319,7 @@ def _write_csplat(path: Path, scene: SceneSource) -> None:
     from csplat.encoder import EncodeOptions  # imported lazily: reading does not load the encoder
     from csplat.out_of_core import OutOfCoreOptions, encode_scene
 
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(prefix=".csplat-", dir=path.parent) as folder:
         encode_scene(scene, path, EncodeOptions(keep_extra=True), OutOfCoreOptions(folder=Path(folder) / "work"))
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from csplat.encoder.entropy import morton_codes
 from csplat.errors import InputError, counted
+from csplat.file_source import named_errors
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel, normalise_quats
@@ -308,7 +309,8 @@ def sorted_parts(
                 rows[name] = getattr(model, name)[order]
             parts = np.searchsorted(codes[order], splits)
             runs.append(spool.tell() + dtype.itemsize * np.concatenate([[0], parts, [len(model)]]))
-            spool.write(rows.tobytes())
+            with named_errors(folder):
+                spool.write(rows.tobytes())
         yield metadata_model, lambda: _merge_runs(spool, runs, dtype, keys)
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from csplat.disk_files import atomic_writer
 from csplat.errors import InputError, counted
+from csplat.file_source import open_binary
 from csplat.formats.common import crossed_bounds, decode_smallest_three, encode_smallest_three, sorted_along_curve
 from csplat.formats.format import Format
 from csplat.lint import Finding, trailing_bytes
@@ -50,7 +51,7 @@ class _Element:
     dtype: np.dtype[Any]
 
     def read(self, path: Path, start: int, stop: int) -> NDArray[Any]:
-        with path.open("rb") as stream:
+        with open_binary(path) as stream:
             stream.seek(self.offset + start * self.dtype.itemsize)
             rows = np.fromfile(stream, self.dtype, stop - start)
         if len(rows) != stop - start:

@@ -32,6 +32,7 @@ from numpy.typing import NDArray
 from csplat.disk_files import atomic_writer
 from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
+from csplat.file_source import open_binary
 from csplat.formats.common import decode_smallest_three, encode_smallest_three, round_to_bytes
 from csplat.formats.format import Format
 from csplat.lint import Finding, trailing_bytes
@@ -236,7 +237,7 @@ _SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
 
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         packed = read_spz_file(file, path.name, path.stat().st_size)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
 

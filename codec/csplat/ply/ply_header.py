@@ -15,6 +15,7 @@ from pathlib import Path
 
 from csplat.detect import KINDS, detect_content, is_ply, read_head, refusal
 from csplat.errors import InputError, counted
+from csplat.file_source import open_binary
 from csplat.lint import Finding
 
 #: The element of the splats.
@@ -84,7 +85,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         raise InputError(f"{path.name} is a PLY in UTF-16, expected ASCII: save it as UTF-8")
     if detect_content(path, head) not in (KINDS["ply"], KINDS[kind]):
         raise refusal(path, head, wanted=kind)
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         start = len(_MARK) if head.startswith(_MARK) else 0
         stream.seek(start)
         data = stream.read(_MAX_SIZE)

@@ -21,7 +21,7 @@ import plyfile
 
 from csplat.disk_files import local_file
 from csplat.errors import InputError, counted
-from csplat.file_source import File
+from csplat.file_source import File, open_binary
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_sh_degree
 from csplat.ply.column_names import ColumnMap, find_columns
@@ -355,7 +355,7 @@ def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: A
     if not header.is_text or error.message == _EARLY_END:
         findings.append(truncated_finding(error.element.name, error.element.count, error.row or 0))
         return None
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         stream.seek(header.end)
         rows, more = parse_text_rows(stream.read(), header.elements)
     findings += more
@@ -413,7 +413,7 @@ def _trailing_findings(path: Path, header: PlyHeader, end: int | None, row_count
             )
             return [Finding("malformed", count, text, "error")]
     else:
-        with path.open("rb") as stream:
+        with open_binary(path) as stream:
             stream.seek(header.end)
             lines = stream.read().splitlines(keepends=True)
         count = len(b"".join(lines[row_count:]).strip())
@@ -434,7 +434,7 @@ def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
     if not header.text.endswith(b"\r\n"):
         return False
     feeds, last = 0, b"\n"
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         stream.seek(header.end)
         while block := stream.read(_BLOCK_SIZE):
             found = block.count(b"\n")
@@ -470,7 +470,7 @@ def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator
     if not isinstance(rows, np.memmap):
         yield from (rows[start : start + step] for start in range(0, len(rows), step))
         return
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         stream.seek(rows.offset)
         for start in range(0, len(rows), step):
             count = min(step, len(rows) - start)

@@ -11,11 +11,11 @@ import re
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
+from csplat.disk_files import resolve_links
 from csplat.editing.up_axis import Direction, unit_up
 from csplat.encoder import PresetName, Target
 from csplat.errors import InputError
@@ -412,7 +412,7 @@ def check_range(option: str, value: N, low: float, high: float) -> N:
 
 def is_same_file(a: str | None, b: str | None) -> bool:
     """Return True if two paths are given and lead to the same place."""
-    return a is not None and b is not None and Path(a).resolve() == Path(b).resolve()
+    return a is not None and b is not None and resolve_links(a) == resolve_links(b)
 
 
 def parse_decibels(text: str | None, option: str) -> float | None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import csplat_trainer
+from csplat.disk_files import resolve_links
 from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError, counted
 from csplat.training_record import TrainingRecord
@@ -192,7 +193,7 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
     outputs = Outputs(checkpoint, files.checkpoint_every)
     if files.resume is None or checkpoint is None or not checkpoint.exists():
         return outputs
-    is_same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
+    is_same = resolve_links(str(files.checkpoint)) == resolve_links(files.resume)
     has_ended = load_checkpoint(files.resume).iteration >= options.iterations
     return replace(outputs, resume=checkpoint) if is_same and has_ended else outputs
 

@@ -16,12 +16,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import resolve_links
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.training_record import TrainingRecord
@@ -440,7 +440,7 @@ def _choose_background(
 
 def _set_name(path: str) -> str:
     """Return the name of a file or folder, changed if it equals that of virtual views."""
-    name = Path(path).resolve().name
+    name = resolve_links(path).name
     return f"./{name}" if name == VIRTUAL else name
 
 

@@ -20,7 +20,7 @@ import numpy as np
 
 from csplat.disk_files import read_text
 from csplat.errors import InputError, counted
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, read_bytes
 from csplat.types import F32, F64
 from csplat_trainer.data.dataset import (
     Shot,
@@ -378,7 +378,7 @@ class _BinaryFile:
 
     def __init__(self, path: Path) -> None:
         try:
-            self._data = path.read_bytes()
+            self._data = read_bytes(path)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from error
         instead = describe_substitute(self._data[:64])

@@ -23,7 +23,7 @@ import numpy as np
 from PIL import ExifTags, Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
 
 from csplat.errors import InputError
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, open_binary
 from csplat.types import F64, U8
 
 #: Least value of a mask for pixels that count.
@@ -269,7 +269,7 @@ def _grey_mask(image: Image.Image, path: Path) -> U8:
 def _refuse_by_name(path: Path) -> None:
     """Refuse a file that pillow does not open; name its format if its first bytes identify it."""
     try:
-        with path.open("rb") as file:
+        with open_binary(path) as file:
             head = file.read(_HEAD_SIZE)
     except OSError:
         return

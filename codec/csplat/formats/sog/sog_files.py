@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from csplat.archives import DAMAGED, scenes_of
 from csplat.errors import InputError, missing_package
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, open_binary
 from csplat.lint import Finding
 
 _LARGEST_JSON = 1 << 25  # bytes
@@ -140,7 +140,7 @@ class SogParts:
         if self.folder is not None:
             data = self._unzip(str(self.folder / self._inside(name)), most)
         else:
-            with self.file(name).open("rb") as stream:
+            with open_binary(self.file(name)) as stream:
                 data = stream.read(most + 1)
             if len(data) > most:
                 self.refuse(f"{name[:80]} has more than {most:,} bytes")
@@ -256,7 +256,7 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
         if not found:
             SogParts(path, title).refuse(f"a folder without {_ONE}, not a SOG")
         return SogParts(path, title), str(_only_scene(SogParts(path, title), found))
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         zipped = stream.read(2) == b"PK"
     if not zipped:
         return SogParts(path.parent, title), path.name

@@ -19,10 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from csplat.disk_files import atomic_folder, read_json
+from csplat.disk_files import atomic_folder, read_json, resolve_links
 from csplat.encoder import covariance_entries
 from csplat.encoder.entropy import morton_codes
 from csplat.errors import InputError
+from csplat.file_source import write_file
 from csplat.formats.common import scene_of_rows, sorted_parts
 from csplat.formats.sog.sog_writer import encode_files
 from csplat.model import SplatModel
@@ -87,7 +88,7 @@ def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> None:
         InputError: there are no splats, the folder contains other files, or Pillow is not installed.
         OSError: a file cannot be written.
     """
-    folder = path.parent.resolve()
+    folder = resolve_links(path.parent)
     _check_folder(folder)
     levels = list(takewhile(lambda level: level.count, levels))
     if not levels:
@@ -96,7 +97,7 @@ def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> None:
     found = [_survey(level, tree, leaf_count) for level in levels]
     filenames: list[str] = []
     leaves: list[dict[str, dict[str, int]]] = [{} for _ in range(leaf_count)]
-    with atomic_folder(folder) as temporary:
+    with atomic_folder(path.parent) as temporary:
         for number, (level, statistics) in enumerate(zip(levels, found, strict=True)):
             _list_runs(leaves, number, statistics, len(filenames))
             names = [f"{number}_{chunk}" for chunk in range(int(statistics.chunks[-1]) + 1)]
@@ -110,7 +111,7 @@ def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> None:
             "lodLevels": len(levels), "lodErrors": False, "filenames": filenames,
             "tree": _describe_node(tree, bounds, leaves)[0],
         }  # fmt: skip
-        (temporary / LEVELS_NAME).write_text(json.dumps(meta, separators=(",", ":")), encoding="ascii")
+        write_file(temporary / LEVELS_NAME, json.dumps(meta, separators=(",", ":")).encode("ascii"))
 
 
 def _check_folder(folder: Path) -> None:
@@ -220,7 +221,7 @@ def _write_chunks(folders: Sequence[Path], scene: SceneSource, tree: _Cut | int,
         for folder, rows in zip(folders, parts(), strict=True):
             folder.mkdir()
             for name, data in encode_files(scene_of_rows(metadata_model, rows)):
-                (folder / name).write_bytes(data)
+                write_file(folder / name, data)
 
 
 def _describe_node(
