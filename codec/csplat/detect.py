@@ -25,6 +25,7 @@ HEAD_SIZE = 512
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _NOT_READ = "which csplat does not read: convert it to PLY first, with"
 _NO_SPLATS = "not a scene of splats"
+_PROJECT = "not a scene: export the splats as PLY in that program"
 _PLY_HEADER_SIZE = 1 << 16  # bytes within which a compressed PLY declares its packed columns
 _KSPLAT_HEAD = 44  # used bytes of .ksplat's header; the rest are 0
 _SPLAT_ROW_SIZE = 32  # bytes of one splat in a .splat file
@@ -233,6 +234,17 @@ KINDS: dict[str, FileKind] = {
         FileKind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
         FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _zip_with("/data.pkl")),
         FileKind("spx", ".spx", (".spx",), _starts_with(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
+        FileKind("parquet", "Parquet", (".parquet",), _starts_with(b"PAR1"), f"{_NOT_READ} the program that wrote it"),
+        FileKind(
+            "splatv",
+            ".splatv of splaTV",
+            (".splatv",),
+            _starts_with(b"\x4b\x67\0\0"),
+            "splats that move, which csplat does not read",
+        ),
+        FileKind("psht", "a project of Postshot", (".psht",), remedy=_PROJECT),
+        FileKind("licht", "a project of LichtFeld Studio", (".licht",), remedy=_PROJECT),
+        FileKind("blend", "a file of Blender", (".blend",), _starts_with(b"BLENDER"), _PROJECT),
         FileKind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
         FileKind(
             "rad",
