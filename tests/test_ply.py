@@ -463,7 +463,7 @@ def test_a_ply_with_codebooks_is_named(tmp_path):
     columns = "\nproperty uchar opacity\nproperty uchar scaling\n"
     text = f"ply\nformat binary_little_endian 1.0\nelement vertex_0 1{columns}element codebook_centers 1{columns}"
     (tmp_path / "a.ply").write_bytes(f"{text}end_header\n".encode() + bytes(4))
-    with pytest.raises(InputError, match=r"a PLY with codebooks, .*: save it there without quantisation"):
+    with pytest.raises(InputError, match=r"is a PLY with codebooks .*: save it there without quantisation"):
         read_ply(tmp_path / "a.ply")
 
 

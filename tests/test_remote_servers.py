@@ -35,6 +35,7 @@ def box(data):
 @pytest.fixture
 def web(data, monkeypatch):
     monkeypatch.setattr(RemoteStore, "sizes", RequestSizes(waits=(0.01, 0.01, 0.01)))
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
     server = Web({"/scene.csplat": data})
     with server.serve() as address:
         server.url = f"{address}/scene.csplat"
@@ -136,6 +137,14 @@ def test_a_file_that_is_stored_compressed_is_refused(web):
     for web.coding in ("gzip", "br"):  # aiohttp unpacks br only with another package
         with pytest.raises(StoreError, match=rf"compressed \(Content-Encoding(: {web.coding})?\), so no parts"):
             csplat.open(web.url)
+
+
+def test_a_proxy_of_the_environment_is_used(web, data, monkeypatch):
+    web.files["http://far.example/scene.csplat"] = data
+    monkeypatch.setenv("http_proxy", web.url.removesuffix("/scene.csplat"))
+    monkeypatch.setenv("no_proxy", "")
+    with csplat.open("http://far.example/scene.csplat") as file:
+        assert_same(decode(data, sh_degree=0), file.read(sh_degree=0))
 
 
 def test_a_weak_etag_is_the_same_version(web, data):

@@ -139,13 +139,18 @@ def is_ply(head: bytes) -> bool:
     return head[:3].lower() == b"ply" and head[3:].lstrip(b" \t")[:1] in (b"\n", b"\r")
 
 
-def _is_compressed_ply(path: Path, head: bytes) -> bool:
-    if not is_ply(head):
-        return False
-    if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
-        with path.open("rb") as stream:
-            head = stream.read(_PLY_HEADER_SIZE)
-    return b"packed_position" in head.partition(b"end_header")[0]
+def _declares(word: bytes) -> Callable[[Path, bytes], bool]:
+    """Return a test for PLYs with a word in their headers."""
+
+    def matches(path: Path, head: bytes) -> bool:
+        if not is_ply(head):
+            return False
+        if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
+            with path.open("rb") as stream:
+                head = stream.read(_PLY_HEADER_SIZE)
+        return word in head.partition(b"end_header")[0]
+
+    return matches
 
 
 def _is_spz(_path: Path, head: bytes) -> bool:
@@ -220,7 +225,14 @@ def _is_usd(path: Path, head: bytes) -> bool:
 KINDS: dict[str, FileKind] = {
     kind.name: kind
     for kind in (
-        FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _is_compressed_ply),
+        FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _declares(b"packed_position")),
+        FileKind(
+            "codebook-ply",
+            "a PLY with codebooks (Reducing the Memory Footprint of 3D Gaussian Splatting)",
+            (),
+            _declares(b"element codebook_centers"),
+            "which csplat does not read: save it there without quantisation",
+        ),
         FileKind(_PLY, "PLY", (".ply",), lambda _path, head: is_ply(head)),
         FileKind(_CSPLAT, "csplat", (".csplat",), _starts_with(MAGIC)),
         FileKind("spz", "SPZ", (".spz",), _is_spz),

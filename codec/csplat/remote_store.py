@@ -197,9 +197,7 @@ class RemoteStore(Store):
             return OSError(number, text, self._shown)  # creates the subclass for the number
         if isinstance(error, TimeoutError):
             text = "the server sends nothing"
-        elif "content-encoding" in getattr(
-            error, "message", ""
-        ):  # one that aiohttp cannot unpack, with a status of 400
+        elif "content-encoding" in getattr(error, "message", ""):  # one that aiohttp cannot unpack
             text = _COMPRESSED.format("")
         else:
             text = f"HTTP status {status}" if status else _message(error) or type(error).__name__
@@ -286,6 +284,7 @@ def _web_options(options: Mapping[str, Any]) -> dict[str, Any]:
     client: dict[str, Any] = {
         "timeout": aiohttp.ClientTimeout(total=None, sock_connect=_SILENCE, sock_read=_SILENCE),
         "raise_for_status": _check_answer,
+        "trust_env": True,  # proxies in HTTP_PROXY, HTTPS_PROXY and NO_PROXY
         **options.get("client_kwargs", {}),
     }
     # Ranges must refer to the file, not to compressed data.

@@ -46,7 +46,6 @@ _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_s
 _COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time; they fit in the cache
 _EARLY_END = "early end-of-file"  # message of plyfile
-_CODEBOOKS = "codebook_centers"  # element of INRIA's PLY with 8-bit indices into codebooks
 _SHOWN = 40  # maximum number of characters of a word in a message
 
 
@@ -191,10 +190,6 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     if parsed is None:
         return None
     if SPLAT_ELEMENT not in parsed:
-        named = [element.name for element in parsed]
-        if _CODEBOOKS in named:
-            what = "a PLY with codebooks, of Reducing the Memory Footprint of 3D Gaussian Splatting"
-            raise InputError(f"{path.name} is {what}, which csplat does not read: save it there without quantisation")
         raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
     others = [element for element in parsed if element.name != SPLAT_ELEMENT]
     findings += _other_findings(others)
