@@ -83,7 +83,8 @@ def test_degree_4_is_converted_and_encoded(tmp_path, ply):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("a.xyz",), "no format has that ending"), (("-",), "standard output"),
+        (("a.xyz",), "no format has that ending"), (("a.html",), "`csplat export-html` writes pages"),
+        ((".",), ".: a folder, not the name of a file"), (("-",), "standard output"),
         (("a.ply", "--to", "zzz"), "expected one of "), (("a.ply", "--rotate", "1,2"), "expected 3 numbers"),
         (("a.ply", "--crop", "0,0,0,-1"), "radius"), (("a.ply", "--crop", "0,0,0,1,2"), "expected 6 or 4 numbers"),
         (("a.ply", "--crop-sphere", "0,0,0,1"), "--crop-sphere is part of --crop now"),
@@ -155,6 +156,8 @@ def test_sog_is_written_to_a_folder(tmp_path, ply):
     call("convert", ply, tmp_path / "new" / "meta.json")
     assert 200 == len(csplat.read(tmp_path / "new"))
     assert "exists: --force" in call("convert", ply, tmp_path / "new" / "meta.json", status=1).stderr
+    (tmp_path / "new" / "other.bin").write_bytes(bytes(9_999_999))
+    assert " MB" not in call("convert", ply, tmp_path / "new" / "meta.json", "--force").stderr
     call("convert", ply, tmp_path / "no" / "such" / "meta.json", status=1)
     assert not (tmp_path / "no").exists()
 

@@ -55,6 +55,14 @@ def test_old_files_without_bounds_of_colours_are_read(tmp_path):
     np.testing.assert_allclose(csplat.read(tmp_path / "a.ply").sh0[0] * 0.28209479 + 0.5, [1, 0, 1], atol=1e-6)
 
 
+def test_an_element_without_sh_coefficients_is_degree_0(tmp_path):
+    data = built([ROW], [WORD], [()], rest=0)  # as gsplat writes it
+    assert b"element sh 1\nend_header\n" in data
+    (tmp_path / "a.ply").write_bytes(data)
+    model = csplat.read(tmp_path / "a.ply")
+    assert (1, 0) == (len(model), model.sh_degree)
+
+
 def test_written_files_read_back_within_a_step(tmp_path, make_model):
     model = make_model(700, 3, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
     csplat.write(tmp_path / "a.compressed.ply", model)

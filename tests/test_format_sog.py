@@ -393,6 +393,15 @@ def test_zip_bombs_are_not_unpacked(tmp_path):
         csplat.read(zipped(tmp_path / "a.sog", files, how=zipfile.ZIP_DEFLATED))
 
 
+def test_a_cut_zip_is_named_as_such(tmp_path, make_model):
+    csplat.write(tmp_path / "a.sog", make_model(5, 0))
+    data = (tmp_path / "a.sog").read_bytes()
+    for size in (len(data) // 2, len(data) - 5):
+        (tmp_path / "a.sog").write_bytes(data[:size])
+        with pytest.raises(InputError, match=r"a\.sog: a damaged zip: its end is missing, .*: copy or download it aga"):
+            csplat.read(tmp_path / "a.sog")
+
+
 def test_damage_is_refused_or_read(tmp_path):
     whole = zipped(tmp_path / "a.sog", files_of(*splats(1, sh=False))).read_bytes()
     damaged = [whole[:size] for size in range(0, len(whole), 61)] + [*flipped(whole, range(0, len(whole), 11))]

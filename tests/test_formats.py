@@ -123,6 +123,11 @@ def test_each_format_has_a_name_of_its_own():
     ("a.xz", b"\xfd7zXZ\0\0", "is xz, unpack it first, with unxz"),
     ("a.ply", b"BZh91AY&SY", "is bzip2, unpack it first"),
     ("a.csplat", b"\x1f\x8b\x08\0hello", "is gzip, unpack it first, with gunzip"),
+    ("a.ply", b"PAR1\0\0\0\0PAR1", "is Parquet, which csplat does not read: convert it to PLY first"),
+    ("a.splat", b"\x4b\x67\0\0\x64\0\0\0[{}]".ljust(64), "is .splatv of splaTV, splats that move"),
+    ("a.psht", b"hello", "is a project of Postshot, not a scene: export the splats as PLY"),
+    ("a.licht", b"hello", "is a project of LichtFeld Studio, not a scene: export the splats as PLY"),
+    ("a.ply", b"BLENDER-v300", "is a file of Blender, not a scene: export the splats as PLY"),
 ])  # fmt: skip
 def test_other_files_are_refused_with_their_type(tmp_path, name, data, message):
     (tmp_path / name).write_bytes(data)

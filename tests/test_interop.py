@@ -148,6 +148,11 @@ def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
         ({"splats": {**splats, "means": "many"}}, "means is not a tensor"),
         ({"splats": {**splats, "means": tensor(np.full((5, 3), np.inf))}}, "NaN or infinite"),
         ({"splats": {"means": splats["means"]}}, "no quats"),
+        (
+            {f"m.{name}": splats[name] for name in ("means", "quats", "scales", "opacities")}
+            | {"m.appearance_features": splats["sh0"]},
+            "no sh0, .*; it was trained with appearance features",
+        ),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
     ):
         with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{expected}"):
@@ -167,6 +172,16 @@ def of_inria(splats):
     return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
 
 
+LIGHTNING = ("means", "rotations", "scales", "opacities", "shs_dc", "shs_rest")  # of Gaussian Splatting Lightning
+INRIA_STATE = ("_xyz", "_rotation", "_scaling", "_opacity", "_features_dc", "_features_rest")
+
+
+def other_names(splats, prefix, names):
+    """Return tensors under the names of another program, in the order means, quats, scales, opacities, sh0, shN."""
+    order = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    return {prefix + name: splats[own] for own, name in zip(order, names, strict=True)}
+
+
 def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(read_holding, make_model):
     splats = made_splats(make_model, 3)
     expected = read_holding({"splats": splats})
@@ -177,6 +192,8 @@ def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(read_hol
         renamed(splats, "_model."),
         splats,
         of_inria(splats),
+        {"state_dict": other_names(splats, "gaussian_model.gaussians.", LIGHTNING)},
+        other_names(splats, "", INRIA_STATE),
     ):
         read = read_holding(said)
         assert all(np.array_equal(getattr(expected, name), getattr(read, name)) for name in ARRAYS)

@@ -242,15 +242,6 @@ def test_an_incomplete_answer_of_a_store_is_a_typed_error(store):
             file.read(sh_degree=0)
 
 
-def test_a_web_server_without_parts_is_refused(store):
-    store.protocol, store.ranges = ("http", "https"), False
-    with (
-        csplat.open("https://example.org/scene.csplat") as file,
-        pytest.raises(StoreError, match=r"/scene\.csplat: the server sends only whole files"),
-    ):
-        file.read(sh_degree=0)
-
-
 def test_a_web_server_with_parts_is_used(store, data):
     store.protocol = ("http", "https")
     with csplat.open("https://example.org/scene.csplat") as file:

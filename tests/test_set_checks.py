@@ -94,7 +94,8 @@ def test_lens_models_agree_with_the_documentation_of_colmap(tmp_path):
     def check(case):
         model, parameters = case
         if parameters is None:
-            with pytest.raises(InputError, match=f"the lens is {model}, expected one of .*colmap image_undistorter"):
+            remedy = "split panoramas" if model == "EQUIRECTANGULAR" else "use `colmap image_undistorter"
+            with pytest.raises(InputError, match=f"the lens is {model}, expected one of .*: {remedy}"):
                 read_lens(tmp_path, model, [1.0] * 4)
             return
         lens = read_lens(tmp_path, model, parameters)

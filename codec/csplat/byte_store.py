@@ -26,6 +26,7 @@ class RequestSizes:
         gap: largest gap between two ranges that one request reads through, bytes; a second request takes longer.
         request: maximum size of one request, bytes.
         at_once: maximum number of concurrent requests.
+        waits: breaks before a failed request to a web server is repeated, seconds: one for each repetition.
     """
 
     first: int = 1 << 16
@@ -33,6 +34,7 @@ class RequestSizes:
     gap: int = 1 << 16
     request: int = 1 << 23
     at_once: int = 8
+    waits: tuple[float, ...] = (0.25, 1.0, 4.0)
 
 
 class Store:

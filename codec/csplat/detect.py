@@ -25,6 +25,7 @@ HEAD_SIZE = 512
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _NOT_READ = "which csplat does not read: convert it to PLY first, with"
 _NO_SPLATS = "not a scene of splats"
+_PROJECT = "not a scene: export the splats as PLY in that program"
 _PLY_HEADER_SIZE = 1 << 16  # bytes within which a compressed PLY declares its packed columns
 _KSPLAT_HEAD = 44  # used bytes of .ksplat's header; the rest are 0
 _SPLAT_ROW_SIZE = 32  # bytes of one splat in a .splat file
@@ -138,13 +139,18 @@ def is_ply(head: bytes) -> bool:
     return head[:3].lower() == b"ply" and head[3:].lstrip(b" \t")[:1] in (b"\n", b"\r")
 
 
-def _is_compressed_ply(path: Path, head: bytes) -> bool:
-    if not is_ply(head):
-        return False
-    if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
-        with open_binary(path) as stream:
-            head = stream.read(_PLY_HEADER_SIZE)
-    return b"packed_position" in head.partition(b"end_header")[0]
+def _declares(word: bytes) -> Callable[[Path, bytes], bool]:
+    """Return a test for PLYs with a word in their headers."""
+
+    def matches(path: Path, head: bytes) -> bool:
+        if not is_ply(head):
+            return False
+        if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
+            with open_binary(path) as stream:
+                head = stream.read(_PLY_HEADER_SIZE)
+        return word in head.partition(b"end_header")[0]
+
+    return matches
 
 
 def _is_spz(_path: Path, head: bytes) -> bool:
@@ -219,7 +225,14 @@ def _is_usd(path: Path, head: bytes) -> bool:
 KINDS: dict[str, FileKind] = {
     kind.name: kind
     for kind in (
-        FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _is_compressed_ply),
+        FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _declares(b"packed_position")),
+        FileKind(
+            "codebook-ply",
+            "a PLY with codebooks (Reducing the Memory Footprint of 3D Gaussian Splatting)",
+            (),
+            _declares(b"element codebook_centers"),
+            "which csplat does not read: save it there without quantisation",
+        ),
         FileKind(_PLY, "PLY", (".ply",), lambda _path, head: is_ply(head)),
         FileKind(_CSPLAT, "csplat", (".csplat",), _starts_with(MAGIC)),
         FileKind("spz", "SPZ", (".spz",), _is_spz),
@@ -233,6 +246,17 @@ KINDS: dict[str, FileKind] = {
         FileKind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
         FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _zip_with("/data.pkl")),
         FileKind("spx", ".spx", (".spx",), _starts_with(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
+        FileKind("parquet", "Parquet", (".parquet",), _starts_with(b"PAR1"), f"{_NOT_READ} the program that wrote it"),
+        FileKind(
+            "splatv",
+            ".splatv of splaTV",
+            (".splatv",),
+            _starts_with(b"\x4b\x67\0\0"),
+            "splats that move, which csplat does not read",
+        ),
+        FileKind("psht", "a project of Postshot", (".psht",), remedy=_PROJECT),
+        FileKind("licht", "a project of LichtFeld Studio", (".licht",), remedy=_PROJECT),
+        FileKind("blend", "a file of Blender", (".blend",), _starts_with(b"BLENDER"), _PROJECT),
         FileKind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
         FileKind(
             "rad",

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Form = Literal["parameters", "activated"]
 
 _REQUIRED = ("means", "quats", "scales", "opacities", "sh0")
+_APPEARANCE = ("features", "appearance_features")  # of gsplat's simple_trainer with app_opt, and of splatfacto-w
 _SPLATS = "splats"  # key of the splats in gsplat's checkpoints
 
 
@@ -67,7 +68,8 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
         splats = splats[_SPLATS]
     missing = [name for name in _REQUIRED if name not in splats]
     if missing:
-        hint = "; it was trained with appearance features, which are not SH" if "features" in splats else ""
+        learnt = any(name in splats for name in _APPEARANCE)
+        hint = "; it was trained with appearance features, which are not SH" if learnt else ""
         raise InputError(f"the splats have no {', '.join(missing)}, expected gsplat's names{hint}")
     means, quats, scales, opacities, sh0 = (_array(name, splats[name]) for name in _REQUIRED)
     count = len(means) if means.ndim else 0

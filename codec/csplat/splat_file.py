@@ -307,8 +307,8 @@ def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any]
     Raises:
         FormatError, UnsupportedError: as in `read_header`, or the file is shorter or longer than its header specifies.
         InputError: `file` has another type; storage options without a URL; the extra is not installed.
-        StoreError: the server does not answer, does not support ranges (HTTP Range), or closes the connection; or the
-            file has changed since it was opened.
+        StoreError: the server does not answer, does not support ranges (HTTP Range), or closes the connection, also
+            when requests are repeated; or the file has changed since it was opened.
         OSError: the file does not exist or cannot be read.
     """
     store = open_store(file, storage)

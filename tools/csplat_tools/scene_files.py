@@ -351,8 +351,9 @@ def _together_bytes(found: Sequence[OpenedScene]) -> float:
 
 def size_on_disk(path: Path) -> int:
     """Return the size in bytes of a file, or of all files of a folder."""
-    if path.name.lower() in FOLDER_NAMES:
-        path = path.parent
+    if path.name.lower() in FOLDER_NAMES:  # the folder may have other files
+        inside = path.parent.rglob("*") if path.name.lower() == FOLDER_NAMES[1] else path.parent.iterdir()
+        return sum(one.stat().st_size for one in inside if one.name.lower().endswith((".webp", *FOLDER_NAMES)))
     if not path.is_dir():
         return path.stat().st_size
     return sum(one.stat().st_size for one in path.rglob("*") if one.is_file())

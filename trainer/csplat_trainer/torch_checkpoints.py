@@ -1,6 +1,6 @@
 # torch may be absent:
 # pyright: reportMissingImports=false
-"""Checkpoints of gsplat's simple_trainer, of nerfstudio's splatfacto and of INRIA's trainer, read as scenes.
+"""Checkpoints of gsplat's simple_trainer, nerfstudio's splatfacto, INRIA's trainer and others, read as scenes.
 
 All are pickles of torch. No code in them is run: `weights_only` admits only tensors, containers and plain numbers. Some
 facts, such as antialiased training, are not in the checkpoint, but in other files of the trainer.
@@ -40,6 +40,8 @@ _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto'
 #: gsplat writes a file per GPU with a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
 _FILTER = "filter_3D"
+#: gsplat's names of tensors, by those of gsplat and splatfacto, of Gaussian Splatting Lightning, and of attributes in
+#: INRIA's `GaussianModel`, which trainers derived from it save as a state.
 _NAMES = {
     "means": "means",
     "quats": "quats",
@@ -47,6 +49,15 @@ _NAMES = {
     "opacities": "opacities",
     "features_dc": "sh0",
     "features_rest": "shN",
+    "rotations": "quats",
+    "shs_dc": "sh0",
+    "shs_rest": "shN",
+    "_xyz": "means",
+    "_rotation": "quats",
+    "_scaling": "scales",
+    "_opacity": "opacities",
+    "_features_dc": "sh0",
+    "_features_rest": "shN",
 }
 
 
@@ -164,12 +175,13 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
     named = {str(name): value for name, value in holder.items()}
     models = _models_in(named)
     if len(models) > 1:
-        shown = ", ".join(f"{prefix}* ({_count(named[prefix + 'means'])})" for prefix in models[:_NAMED])
+        shown = ", ".join(f"{prefix}* ({_count(means)})" for prefix, means in list(models.items())[:_NAMED])
         raise InputError(f"it holds {len(models)} models of splats, expected one: {shown}; save only one of them")
     if not models:
         names = ", ".join(map(str, list(content)[:_NAMED]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
-    found = {name.removeprefix(models[0]): value for name, value in named.items() if name.startswith(models[0])}
+    (prefix,) = models
+    found = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
     part = _checked_part({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
     if part.model.sh_degree or "features_rest" not in found:
         return part
@@ -186,13 +198,18 @@ def _inria_tensors(content: object) -> dict[str, Any] | None:
     return dict(zip(_INRIA, captured[1:], strict=False))
 
 
-def _models_in(named: Mapping[str, Any]) -> list[str]:
-    """Return the name prefix of the tensors of each model of splats.
+def _models_in(named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the means of each model of splats, by the prefix of the names of its tensors.
 
-    It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, and empty in a bare state_dict.
+    It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, `gaussian_model.gaussians.` in Gaussian
+    Splatting Lightning, and empty in a bare state_dict.
     """
-    prefixes = [name.removesuffix("means") for name in named if name == "means" or name.endswith(".means")]
-    return [one for one in prefixes if f"{one}scales" in named or f"{one}quats" in named]
+    found: dict[str, dict[str, Any]] = {}
+    for name, value in named.items():
+        prefix, dot, last = name.rpartition(".")
+        if last in _NAMES:
+            found.setdefault(prefix + dot, {})[_NAMES[last]] = value
+    return {prefix: one["means"] for prefix, one in found.items() if "means" in one and {"scales", "quats"} & set(one)}
 
 
 def _count(means: Any) -> str:

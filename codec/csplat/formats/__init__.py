@@ -270,7 +270,9 @@ def format_by_suffix(path: Path) -> Format:
     found = None if kind is None else _find(kind.name)
     if found is None:
         endings = ", ".join(one.suffixes[0] for one in formats() if one.write is not None)
-        raise InputError(f"{path.name}: no format has that ending, expected one of {endings}")
+        what = "a folder, not the name of a file" if path.is_dir() else "no format has that ending"
+        page = "; `csplat export-html` writes pages" if path.suffix.lower() in {".html", ".htm"} else ""
+        raise InputError(f"{path.name or path}: {what}, expected one of {endings}{page}")
     return found
 
 

@@ -75,6 +75,8 @@ def _open(path: Path) -> Iterator[SceneSource]:
             f" expected one per {_CHUNK}"
         )
     kept = 0  # coefficients per channel
+    if sh is not None and not sh.dtype.names:  # gsplat writes the element without SH, too
+        sh = None
     if sh is not None:
         rest = len(sh.dtype.names or ())
         if sh.count != vertex.count or rest not in _BANDS:

@@ -32,7 +32,7 @@ from csplat_trainer.data.dataset import (
     split_listed,
 )
 from csplat_trainer.data.image_files import abbreviate, describe_masks_among, describe_missing, find_images, find_masks
-from csplat_trainer.data.lens import UNDISTORTER, Lens
+from csplat_trainer.data.lens import SPLIT_PANORAMAS, UNDISTORTER, Lens, is_panorama
 
 #: Folders with models in numbered subfolders, or with a model; the last one only if there is no other.
 _MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))
@@ -506,7 +506,8 @@ def _integer(word: str, where: str) -> int:
 def _lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:
     layout = _LAYOUTS.get(model, "").split()
     if not layout:
-        raise InputError(f"{where}: the lens is {model}, expected one of {', '.join(_LAYOUTS)}: use {UNDISTORTER}")
+        remedy = SPLIT_PANORAMAS if is_panorama(model) else f"use {UNDISTORTER}"
+        raise InputError(f"{where}: the lens is {model}, expected one of {', '.join(_LAYOUTS)}: {remedy}")
     if len(values) != len(layout):
         raise InputError(f"{where}: the lens {model} has {len(values)} parameters, expected {' '.join(layout)}")
     named = dict(zip(layout, values, strict=True))

@@ -103,7 +103,7 @@ def load(
         report.append(
             f"{counted(both, 'test image')} used for training, too: scores do not show the quality of new views"
         )
-    if found.points is None and not any(image.has_alpha for image in train):
+    if (found.points is None or not len(found.points)) and not any(image.has_alpha for image in train):
         report.append("there are no points: splats start anywhere in view")
     colours = found.points_rgb
     if colours is not None and len(colours) and (colours == colours[0]).all():

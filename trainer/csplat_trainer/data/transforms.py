@@ -41,9 +41,9 @@ from csplat_trainer.data.image_files import (
     normalise_name,
 )
 from csplat_trainer.data.image_pixels import image_size, read_image_header
-from csplat_trainer.data.lens import UNDISTORTER, Lens
+from csplat_trainer.data.lens import SPLIT_PANORAMAS, UNDISTORTER, Lens, is_panorama
 
-_POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
+_POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
 _RATIONAL = "FULL_OPENCV"
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
@@ -310,9 +310,10 @@ def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
     model = str(values.get("camera_model") or "").strip()
     fisheye = model.upper() in _FISHEYES or bool(values.get("is_fisheye"))
     if not fisheye and model.upper() not in PERSPECTIVES:
+        remedy = f"use {UNDISTORTER}, or undistort images in the program that computed the poses"
         raise InputError(
             f"{where}: camera_model is {model}, expected one of {', '.join(PERSPECTIVES[1:] + _FISHEYES)}: "
-            f"use {UNDISTORTER}, or undistort images in the program that computed the poses"
+            f"{SPLIT_PANORAMAS if is_panorama(model) else remedy}"
         )
     if "w" in values and "h" in values:
         width, height = finite_number(values, "w", where), finite_number(values, "h", where)

@@ -79,7 +79,9 @@ class _ZipDirectory:
             return zipfile.ZipFile(self._path)
         except DAMAGED as error:
             reason = " ".join(str(error).split())[:120] or type(error).__name__
-            raise InputError(f"{self._title}: a damaged zip: {reason}") from None
+            if "not a zip file" in reason:  # it begins like one
+                reason = "its end is missing, where its list of files is"
+            raise InputError(f"{self._title}: a damaged zip: {reason}: copy or download it again") from None
 
 
 def use_slashes(name: str) -> str:
