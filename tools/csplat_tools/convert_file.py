@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from csplat.decoder import Limits, open_tiles
 from csplat.editing.transform import convert_axes, rotate_scene, scale_scene, translate_scene
 from csplat.errors import InputError
-from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, write_levels
+from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, survey_losses, write_levels
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import SplatModel
@@ -192,6 +192,8 @@ class Conversion:
         source_bytes, size_bytes: sizes of the files; in a dry run the latter is an estimate, or `None` if unknown.
         lost: contents that the target format does not support.
         rounded: names of the arrays that the target rounds.
+        losses: findings about values that the target does not hold: clamped, or moved visibly; a dry run does not find
+            the latter.
         axes: axes before and after.
         findings: lint findings in the source.
     """
@@ -205,6 +207,7 @@ class Conversion:
     size_bytes: int | None
     lost: tuple[str, ...]
     rounded: tuple[str, ...]
+    losses: tuple[Finding, ...]
     axes: tuple[str, str]
     findings: tuple[Finding, ...]
 
@@ -220,14 +223,18 @@ class Conversion:
             "size_bytes": self.size_bytes,
             "lost": list(self.lost),
             "rounded": list(self.rounded),
+            "losses": findings_as_json(self.losses),
             "axes": list(self.axes),
             "defects": findings_as_json(self.findings),
         }
 
-    def losses(self) -> str:
-        """Describe in one line the contents and precision that are lost; empty if there are none."""
-        words = [*self.lost, *([f"precision of {', '.join(self.rounded)}"] if self.rounded else [])]
-        return "; ".join(words)
+    def lost_words(self) -> str:
+        """Describe in one line the contents and precision that are lost; empty if there are none.
+
+        Attributes with a finding in `losses` are left out: more than their precision is lost.
+        """
+        rounded = [name for name in self.rounded if name not in {one.attribute for one in self.losses}]
+        return "; ".join([*self.lost, *([f"precision of {', '.join(rounded)}"] if rounded else [])])
 
 
 def convert_file(
@@ -291,18 +298,21 @@ def convert_file(
         )
         result = Conversion(
             reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, counts or (0,),
-            size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded,
+            size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded, (),
             (before, writes.axes or scene.metadata_model.coordinate_system), (),
         )  # fmt: skip
         if no_loss and (lost or rounded):
-            raise InputError(f"{writes.title} does not keep all of {source}: {result.losses()}")
-        if not dry_run:
-            reporting = [
-                with_progress(one, f"reading level {level + at}" if more else "reading", progress)
-                for at, one in enumerate(levels)
-            ]
-            write_levels(path, reporting, writes.name)
+            raise InputError(f"{writes.title} does not keep all of {source}: {result.lost_words()}")
+        reporting = [
+            with_progress(one, f"reading level {level + at}" if more else "reading", progress)
+            for at, one in enumerate(levels)
+        ]
+        if dry_run:
+            losses = survey_losses(reporting, writes.name)
+        else:
+            losses = write_levels(path, reporting, writes.name)
             result = replace(result, size_bytes=size_on_disk(path))
+        result = replace(result, losses=tuple(one for one in losses if one.id != "lost-contents"))
         return replace(result, findings=tuple(one for one in reader.findings if not (more and one.id == "levels")))
 
 

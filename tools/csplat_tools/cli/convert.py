@@ -82,8 +82,9 @@ def convert(
             filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)
-    if made.losses():
-        note(f"lost on the way: {made.losses()}")
+    if made.lost_words():
+        note(f"lost on the way: {made.lost_words()}")
+    out.print_findings(made.losses)
     before, after = made.axes
     if before != after:
         known = f"{before} axes" if before != UNSPECIFIED else f"no axes: {DEFAULT_AXES} is assumed, --axes sets others"
