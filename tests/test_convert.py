@@ -21,7 +21,7 @@ from csplat.ply import read_ply, write_ply
 from csplat.scene_source import source_from_model
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
 from csplat_tools.encode_file import encode_file
-from csplat_tools.scene_files import open_scenes
+from csplat_tools.scene_files import MetadataOverrides, open_scenes, read_source
 
 
 @pytest.fixture
@@ -207,6 +207,65 @@ def test_filters_are_applied_in_the_documented_order(tmp_path, ply):
     assert np.allclose(wanted[inside], found.means, atol=1e-5)
     assert np.allclose(source.scales[inside] + np.log(2.0), found.scales, atol=1e-5)
     assert 1 == found.sh_degree
+
+
+def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_model):
+    model = replace(make_model(30, 1), coordinate_system="RDF")
+    turned = {"glb": "LUF", "spz": "RUB", "ply": "RDF"}
+
+    def own(path, suffix):
+        return convert_axes(source_from_model(csplat.read(path)), turned[suffix]).model()
+
+    def check(case):
+        suffix, words, change = case
+        source, target = tmp_path / f"in.{suffix}", tmp_path / f"out.{suffix}"
+        csplat.write(source, model)
+        said = call("convert", source, target, "--force", *words).stderr
+        before, after = own(source, suffix), own(target, suffix)
+        option = next(word for word in words if word in ("--translate", "--rotate", "--crop"))
+        assert f"{option}: along the axes" in said
+        assert ("= RDF of --to-axes" if "--to-axes" in words else f"x, y, z = {turned[suffix]}; --to-axes") in said
+        wanted = change(before.means)
+        assert len(wanted) == len(after)
+        np.testing.assert_allclose(after.means, wanted, atol=1e-3)
+
+    def tilted(means):
+        c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
+        return np.stack([means[:, 0], c * means[:, 1] - s * means[:, 2], s * means[:, 1] + c * means[:, 2]], axis=1)
+
+    cases, upwards = {}, np.array([0, 1, 0])
+    for suffix in turned:
+        flips = np.array([1, -1, 1]) if suffix != "ply" else np.ones(3)
+        cases |= {
+            f"{suffix} translate": (suffix, ("--translate", "0,1,0"), lambda means: means + upwards),
+            f"{suffix} tilt": (suffix, ("--rotate", "30,0,0"), tilted),
+            f"{suffix} box": (suffix, ("--crop", "-9,0,-9,9,9,9"), lambda means: means[means[:, 1] >= 0]),
+            f"{suffix} sphere": (
+                suffix, ("--crop", "0,1,0,1.5"), lambda means: means[np.linalg.norm(means - [0, 1, 0], axis=1) <= 1.5]
+            ),
+            f"{suffix} chosen": (
+                suffix, ("--translate", "0,1,0", "--to-axes", "RDF"), lambda means, y=flips[1]: means + y * upwards
+            ),
+        }  # fmt: skip
+    assert not failures(cases, check)
+
+
+@pytest.mark.parametrize("suffix", ["spz", "glb"])
+def test_named_axes_are_those_of_the_coordinates_in_the_file(tmp_path, make_model, suffix):
+    model = replace(make_model(30, 0), coordinate_system="RUB" if suffix == "spz" else "LUF")
+    csplat.write(tmp_path / f"a.{suffix}", model)  # its coordinates are those of the model
+    call("convert", tmp_path / f"a.{suffix}", tmp_path / "a.ply", "--axes", "RDF")
+    encoded = read_source(tmp_path / f"a.{suffix}", MetadataOverrides("RDF")).model
+    for found in (csplat.read(tmp_path / "a.ply"), encoded):
+        assert "RDF" == found.coordinate_system
+        error = np.abs(found.means[:, None] - model.means).max(axis=2).min(axis=1)
+        assert error.max() < 2e-3
+
+
+def test_info_names_the_axes_of_the_file(tmp_path, make_model):
+    csplat.write(tmp_path / "a.glb", make_model(5, 0))
+    assert "axes         LUF, read as RDF" in call("info", tmp_path / "a.glb").stdout
+    assert "LUF" == json.loads(call("info", tmp_path / "a.glb", "--json").stdout)["file_axes"]
 
 
 def test_a_crop_sphere_is_in_world_coordinates(make_model):

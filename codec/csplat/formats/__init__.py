@@ -448,7 +448,9 @@ def _open(
             raise InputError(f"{path.name}: {which} has {all_bands.count:,} splats, expected at most {max_splats:,}")
         refuse([] if lenient else all_bands.findings, strict=False)
         scene = all_bands if sh_degree is None else _with_fewer_bands(all_bands, sh_degree)
-        yield replace(convert_axes(scene, DEFAULT_AXES) if found.axes else scene, format=found.name)
+        if found.axes:
+            scene = replace(convert_axes(scene, DEFAULT_AXES), file_axes=all_bands.metadata_model.coordinate_system)
+        yield replace(scene, format=found.name)
 
 
 def _with_fewer_bands(scene: SceneSource, sh_degree: int) -> SceneSource:
