@@ -21,7 +21,7 @@ from csplat.ply import read_ply, write_ply
 from csplat.scene_source import source_from_model
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
 from csplat_tools.encode_file import encode_file
-from csplat_tools.scene_files import MetadataOverrides, open_scenes, read_source
+from csplat_tools.scene_files import open_scenes
 
 
 @pytest.fixture
@@ -248,18 +248,6 @@ def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_mod
             ),
         }  # fmt: skip
     assert not failures(cases, check)
-
-
-@pytest.mark.parametrize("suffix", ["spz", "glb"])
-def test_named_axes_are_those_of_the_coordinates_in_the_file(tmp_path, make_model, suffix):
-    model = replace(make_model(30, 0), coordinate_system="RUB" if suffix == "spz" else "LUF")
-    csplat.write(tmp_path / f"a.{suffix}", model)  # its coordinates are those of the model
-    call("convert", tmp_path / f"a.{suffix}", tmp_path / "a.ply", "--axes", "RDF")
-    encoded = read_source(tmp_path / f"a.{suffix}", MetadataOverrides("RDF")).model
-    for found in (csplat.read(tmp_path / "a.ply"), encoded):
-        assert "RDF" == found.coordinate_system
-        error = np.abs(found.means[:, None] - model.means).max(axis=2).min(axis=1)
-        assert error.max() < 2e-3
 
 
 def test_info_names_the_axes_of_the_file(tmp_path, make_model):

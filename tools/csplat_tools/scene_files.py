@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ import numpy as np
 from csplat import formats, splat_file
 from csplat import scene_source as scenes
 from csplat.decoder import DeclaredBounds, Limits, SceneHeader, decode_scene
-from csplat.editing.transform import convert_axes
 from csplat.editing.up_axis import Direction, with_up
 from csplat.errors import LimitError
 from csplat.file_source import File
@@ -260,20 +259,16 @@ def read_source(
         OSError: the scene cannot be read.
     """
     findings: list[Finding] = []
-    overrides, report = overrides or MetadataOverrides(), progress or null_progress
+    report = progress or null_progress
     report("reading", 0.0)
     with source_path(file) as local:
-        if opened is None and overrides.coordinate_system is None:
+        if opened is None:
             model = formats.read(local, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
-            model = overrides.apply(model)
         else:
-            opening = formats.open_scene(local, sh_degree=sh_degree) if opened is None else nullcontext(opened)
-            with opening as scene:
-                changed = overrides.apply_to_scene(scene)
-                model = formats.read_all(changed, strict=strict, keep_extra=keep_extra, report=findings)
+            model = formats.read_all(opened, strict=strict, keep_extra=keep_extra, report=findings)
         size_bytes, name = size_on_disk(local), local.name
     report("reading", 1.0)
-    return LoadedModel(model, size_bytes, name=name, findings=tuple(findings))
+    return LoadedModel((overrides or MetadataOverrides()).apply(model), size_bytes, name=name, findings=tuple(findings))
 
 
 @contextmanager
@@ -406,8 +401,7 @@ class MetadataOverrides:
     """Overrides of a scene's metadata; `None` keeps that of the file.
 
     Attributes:
-        coordinate_system, unit_metres, antialiased: as in `SplatModel`; `apply` names the axes of a model,
-            `apply_to_scene` those of the coordinates in a file.
+        coordinate_system, unit_metres, antialiased: as in `SplatModel`.
         licence: text for the metadata.
         up: the up direction, see `with_up`.
     """
@@ -429,9 +423,7 @@ class MetadataOverrides:
         return with_up(model, self.up, self.coordinate_system)
 
     def apply_to_scene(self, scene: SceneSource) -> SceneSource:
-        """Return the scene with these overrides; given axes are those of the coordinates in the file."""
-        if self.coordinate_system is not None and scene.file_axes:
-            scene = replace(convert_axes(scene, scene.file_axes), format=scene.format, levels=scene.levels)
+        """Return the scene with these overrides."""
         return replace(
             scene, metadata_model=self.apply(scene.metadata_model), blocks=lambda: map(self.apply, scene.blocks())
         )
