@@ -22,6 +22,9 @@ part of the scene.
 | `zero-quats` | rotations of length 0: replaced by the identity | repair |
 | `unnormalised-quats` | rotations that are not of unit length: normalised, as in every renderer | note |
 | `infinite-logits` | opacities of exactly 0 or 1 | note |
+| `zero-scales` | log scales of -infinity, which are sizes of 0: read as flat | note |
+| `one-scale` | one scale instead of three: spheres, which may have no rotations | note |
+| `packed-colours` | three bytes of colour in a row, of which the header declares one (nerfstudio) | note |
 | `flat-scales` | two scales instead of three: discs (2DGS) | note |
 | `nonzero-normals` | normals, which splats do not use: dropped | note |
 | `huge-values` | log scales beyond ± 88, colours beyond ± 1e6 | note |

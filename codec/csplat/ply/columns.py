@@ -81,6 +81,7 @@ class RowStatistics:
     unnormalised: int = 0
     quat_lengths: tuple[float, float] = (math.inf, 0.0)  # shortest and longest, except 0
     infinite_logits: int = 0
+    zero_scales: int = 0
     normals: int = 0
     huge: int = 0
     filtered: int = 0
@@ -299,6 +300,10 @@ def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:
     _copy_group(rows, columns.means, part.means)
     _copy_group(rows, columns.quats, part.quats)
     _copy_group(rows, columns.scales, part.scales[:, : len(columns.scales)])
+    if len(columns.scales) == 1:
+        part.scales[:, 1:] = part.scales[:, :1]
+        if not columns.quats:
+            part.quats[:] = (1.0, 0.0, 0.0, 0.0)
     part.opacities[:] = rows[columns.opacity]
     _copy_group(rows, columns.sh0, part.sh0)
     coefficients = part.shN.shape[1]
@@ -354,12 +359,14 @@ def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics
     checked += [] if widths is None else [widths]
     sums = [float(array.sum()) for array in (*checked, part.opacities)]
     if not np.isfinite(sum(sums)):  # NaN, infinity, or a sum of large values that overflows
+        zero = flatten_scales(part.scales)
         good = ~np.isnan(part.opacities)
         for array in checked:
             finite = np.isfinite(array.astype(np.float32))  # means may be float64
             good &= finite.reshape(len(good), -1).all(axis=1) if finite.size else True
         kept = int(np.count_nonzero(good))
         statistics.nonfinite += len(good) - kept
+        statistics.zero_scales += int(np.count_nonzero(zero & good))
         for array in (*vars(part).values(), *part.extra.values()):
             if isinstance(array, np.ndarray):
                 array[:kept] = array[good]
@@ -382,6 +389,18 @@ def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics
     _repair_quats(part.quats, statistics)
     statistics.huge += count_huge_rows(part.scales[:, :scale_count], part.sh0, part.shN)
     return len(part.opacities)
+
+
+def flatten_scales(scales: F32) -> NDArray[np.bool_]:
+    """Replace logarithms of standard deviations of 0, which are -infinity, in place; return a mask of their rows.
+
+    Args:
+        scales: [N, C], natural logarithms.
+    """
+    zero = np.isneginf(scales)
+    scales[zero] = LOG_OF_0
+    flat: NDArray[np.bool_] = zero.any(axis=1)
+    return flat
 
 
 def _extend_range(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
@@ -450,6 +469,7 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
     usual = _USUAL_LENGTHS[0] <= shortest and longest <= _USUAL_LENGTHS[1]
     zero = f"{counted(s.zero_quats, 'rotation')} of length 0: set to the identity"
     logits = f"{counted(s.infinite_logits, 'infinite logit')} of opacity: alpha 0 or 1"
+    flat = f"{counted(s.zero_scales, 'splat')} with a log scale of -infinity, a size of 0: read as flat"
     normals = f"{counted(s.normals, 'splat')} with normals, which are not splat attributes: dropped"
     fused = f"the 3D filter of Mip-Splatting: fused into scales and opacities of {counted(s.filtered, 'splat')}"
     huge = f"log scales beyond ± {HUGE_LOG:g} or colours beyond ± {_HUGE_COLOUR:g}"
@@ -460,6 +480,7 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
         Finding("zero-quats", s.zero_quats, zero, "repair"),
         Finding("unnormalised-quats", s.unnormalised, quats, "note", usual=usual),
         Finding("infinite-logits", s.infinite_logits, logits, "note"),
+        Finding("zero-scales", s.zero_scales, flat, "note"),
         Finding("nonzero-normals", s.normals, normals, "note"),
         Finding("filter-3d", s.filtered, fused, "note"),
         Finding("huge-values", s.huge, f"{counted(s.huge, 'splat')} with {huge}", "note"),
