@@ -13,6 +13,7 @@ import csplat
 from csplat import formats
 from csplat.editing.transform import convert_axes
 from csplat.encoder import EncodeOptions
+from csplat.errors import InputError
 from csplat.formats import spz
 from csplat.model import SplatModel, normalise_quats
 from csplat.out_of_core import OutOfCoreOptions
@@ -47,6 +48,98 @@ def test_losses_are_reported_refused_and_predicted(tmp_path, ply):
     assert "lost" not in call("convert", ply, tmp_path / "out.ply", "--no-loss").stderr
     expected = json.loads(call("convert", ply, tmp_path / "x.ply", "--dry-run", "--json").stdout)["size_bytes"]
     assert expected == pytest.approx((tmp_path / "out.ply").stat().st_size, rel=0.05)
+
+
+def calm(model):
+    """Return the model with values that every format holds."""
+    return replace(
+        model, scales=model.scales.clip(-5.9, -2), sh0=model.sh0.clip(-1, 1), shN=model.shN.clip(-0.9, 0.9)
+    )  # fmt: skip
+
+
+def with_values(model, name, rows, value):
+    """Return the model with values that every format holds, and another value of an attribute in the first rows."""
+    model = calm(model)
+    values = getattr(model, name).copy()
+    values[:rows] = value
+    return replace(model, **{name: values})
+
+
+CLAMPED = [
+    # attribute, value in three splats, suffix, largest error
+    ("scales", 7.0, "spz", 1.0625), ("scales", -20.0, "v4.spz", 10.0), ("scales", -30.0, "compressed.ply", 10.0),
+    ("scales", 95.0, "splat", 7.0), ("scales", 95.0, "glb", 95 - np.log(np.finfo("f4").max)),
+    ("scales", -95.0, "csplat", 7.0),
+    ("sh0", 5.0, "spz", 5 - 0.5 / 0.15), ("sh0", -5.0, "splat", 5 - 0.5 / 0.28209479),
+    ("shN", 1.5, "spz", 1.5 - 127 / 128), ("shN", -4.5, "compressed.ply", 0.5),
+]  # fmt: skip
+
+
+def test_clamped_values_are_counted_by_attribute_with_the_largest_error(tmp_path, make_model):
+    def check(case):
+        name, value, suffix, error = case
+        model = with_values(make_model(40, 1, seed=1), name, 3, np.float32(value))
+        found = [one for one in csplat.write(tmp_path / f"a.{suffix}", model) if one.id == "clamped-values"]
+        assert [("loss", name, 3)] == [(one.kind, one.attribute, one.count) for one in found]
+        assert error == pytest.approx(found[0].largest_error, abs=1e-4)
+        decoded = getattr(csplat.read(tmp_path / f"a.{suffix}"), name)
+        within = np.abs(value) - error
+        assert np.abs(decoded).max() == pytest.approx(within, abs=0.02) or suffix == "csplat"
+        assert not [one for one in csplat.write(tmp_path / f"b.{suffix}", calm(make_model(40, 1))) if one.attribute]
+
+    assert not failures({f"{name} {value} {suffix}": one for one in CLAMPED for name, value, suffix, _ in [one]}, check)
+
+
+def test_a_conversion_reports_clamped_values_apart_from_rounding(tmp_path, make_model):
+    write_ply(tmp_path / "a.ply", with_values(make_model(40, 1), "sh0", 5, np.float32(5.0)))
+    for more in ((), ("--dry-run",), ("--force", "--quiet")):
+        said = call("convert", tmp_path / "a.ply", tmp_path / "a.spz", *more).stderr
+        assert "lost on the way: precision of means, quats, scales, opacities, shN" in said
+        assert "loss: clamped-values: 15 values of sh0 in 5 splats outside -3.333 to 3.333, the range of SPZ" in said
+        assert "by up to 1.67; compressed-ply, ply, csplat, sog and gltf hold them" in said
+    result = json.loads(call("convert", tmp_path / "a.ply", tmp_path / "b.splat", "--json").stdout)
+    assert [("clamped-values", "sh0", 5)] == [(one["id"], one["attribute"], one["count"]) for one in result["losses"]]
+    assert 5 - 0.5 / 0.28209479 == pytest.approx(result["losses"][0]["largest_error"])
+
+
+def test_values_that_are_rounded_to_the_end_of_a_range_are_not_clamped(tmp_path, make_model):
+    model = with_values(make_model(40, 1), "shN", 40, np.float32(1.0))  # the largest of SPZ is 127/128
+    assert not [one for one in csplat.write(tmp_path / "a.spz", model) if one.attribute]
+
+
+def far_scene(make_model, count, far):
+    """Return a scene with some splats far from the others."""
+    model = make_model(count, 1)
+    means = model.means.copy()
+    means[: len(far)] = far
+    return replace(calm(model), means=means, scales=np.full((count, 3), np.float32(-3.0)))
+
+
+def test_splats_that_rounding_moves_visibly_are_counted(tmp_path, make_model):
+    model = far_scene(make_model, 200, [[5e5, 0, 0]])
+    (found,) = csplat.write(tmp_path / "a.spz", model)
+    error = np.abs(csplat.read(tmp_path / "a.spz").means - model.means).max(axis=1)
+    assert ("moved-splats", np.count_nonzero(error > np.exp(-3.0) / 8)) == (found.id, found.count)
+    assert error.max() == pytest.approx(found.largest_error, rel=1e-4)
+    assert "--drop-floaters" in found.text
+    assert not csplat.write(tmp_path / "b.spz", model.select(slice(1, None)))
+    with pytest.raises(InputError, match="SPZ stores up to 8,388,607: --drop-floaters drops"):
+        csplat.write(tmp_path / "c.spz", far_scene(make_model, 20, [[9e6, 0, 0]]))
+
+
+def test_sog_reports_what_its_codes_do_not_reach(tmp_path, make_model):
+    rng = np.random.default_rng(0)
+    colours = rng.normal(0, 1, (3000, 3)).astype("f4")
+    model = replace(calm(make_model(3000, 0)), sh0=colours, opacities=np.ones(3000, "f4"))
+    assert not csplat.write(tmp_path / "a.sog", model)
+    colours[:2, 0] = 500, 1000
+    found = csplat.write(tmp_path / "b.sog", replace(model, opacities=np.full(3000, 1e-3, "f4"), sh0=colours))
+    error = np.abs(np.sort(csplat.read(tmp_path / "b.sog").sh0[:, 0])[-1] - 1000)
+    assert bool(found) == (error > 125)
+    flat = replace(model, antialiased=True, flat=True)
+    assert ["SOG cannot hold that splats are discs and antialiased"] == [
+        one.text for one in csplat.write(tmp_path / "c.sog", flat)
+    ]
 
 
 def test_dropped_columns_are_reported_by_every_command(tmp_path, make_model):
@@ -115,6 +208,53 @@ def test_filters_are_applied_in_the_documented_order(tmp_path, ply):
     assert np.allclose(wanted[inside], found.means, atol=1e-5)
     assert np.allclose(source.scales[inside] + np.log(2.0), found.scales, atol=1e-5)
     assert 1 == found.sh_degree
+
+
+def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_model):
+    model = replace(make_model(30, 1), coordinate_system="RDF")
+    turned = {"glb": "LUF", "spz": "RUB", "ply": "RDF"}
+
+    def own(path, suffix):
+        return convert_axes(source_from_model(csplat.read(path)), turned[suffix]).model()
+
+    def check(case):
+        suffix, words, change = case
+        source, target = tmp_path / f"in.{suffix}", tmp_path / f"out.{suffix}"
+        csplat.write(source, model)
+        said = call("convert", source, target, "--force", *words).stderr
+        before, after = own(source, suffix), own(target, suffix)
+        option = next(word for word in words if word in ("--translate", "--rotate", "--crop"))
+        assert f"{option}: along the axes" in said
+        assert ("= RDF of --to-axes" if "--to-axes" in words else f"x, y, z = {turned[suffix]}; --to-axes") in said
+        wanted = change(before.means)
+        assert len(wanted) == len(after)
+        np.testing.assert_allclose(after.means, wanted, atol=1e-3)
+
+    def tilted(means):
+        c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
+        return np.stack([means[:, 0], c * means[:, 1] - s * means[:, 2], s * means[:, 1] + c * means[:, 2]], axis=1)
+
+    cases, upwards = {}, np.array([0, 1, 0])
+    for suffix in turned:
+        flips = np.array([1, -1, 1]) if suffix != "ply" else np.ones(3)
+        cases |= {
+            f"{suffix} translate": (suffix, ("--translate", "0,1,0"), lambda means: means + upwards),
+            f"{suffix} tilt": (suffix, ("--rotate", "30,0,0"), tilted),
+            f"{suffix} box": (suffix, ("--crop", "-9,0,-9,9,9,9"), lambda means: means[means[:, 1] >= 0]),
+            f"{suffix} sphere": (
+                suffix, ("--crop", "0,1,0,1.5"), lambda means: means[np.linalg.norm(means - [0, 1, 0], axis=1) <= 1.5]
+            ),
+            f"{suffix} chosen": (
+                suffix, ("--translate", "0,1,0", "--to-axes", "RDF"), lambda means, y=flips[1]: means + y * upwards
+            ),
+        }  # fmt: skip
+    assert not failures(cases, check)
+
+
+def test_info_names_the_axes_of_the_file(tmp_path, make_model):
+    csplat.write(tmp_path / "a.glb", make_model(5, 0))
+    assert "axes         LUF, read as RDF" in call("info", tmp_path / "a.glb").stdout
+    assert "LUF" == json.loads(call("info", tmp_path / "a.glb", "--json").stdout)["file_axes"]
 
 
 def test_a_crop_sphere_is_in_world_coordinates(make_model):

@@ -245,12 +245,17 @@ def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
     options = EncodeOptions(preset="fast", **STEPS)
     models = [make_model(40, 1), make_model(50, 1, coordinate_system="RDF", unit_metres=2.0)]
     models[0] = replace(models[0], metadata={"licence": "CC0-1.0", "only": 1, "up": [0, -1, 0]})
-    models[1] = replace(models[1], metadata={"licence": "CC0-1.0", "up": [0, 1, 0]})
+    models[1] = replace(models[1], metadata={"licence": "CC0-1.0", "up": [0, -0.8, 0.6]}, cameras=[])
     done, data = merge(*(encode(model, options) for model in models))
     assert not done.why
     header = read_header(data)
     assert ("RDF", 2.0) == (header.coordinate_system, header.unit_metres)
     assert {"licence": "CC0-1.0"} == read_metadata(data)
+    assert (
+        "file 1 without axes: RDF is assumed, as the other files have",
+        "file 1 without a unit: 2 m is assumed, as the other files have",
+        "metadata left out, because not all files have the same: only, up",
+    ) == tuple(one.removesuffix(", cameras") for one in done.notes)
 
 
 def test_merging_checks_the_bytes_that_it_copies(halves):
@@ -290,6 +295,10 @@ def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, de
 
 @pytest.mark.parametrize(("fields", "message"), [
     (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be merged: RDF in .*a, RUB in .*b"),
+    (({}, {"coordinate_system": "RUB"}), "none, for which RDF is assumed, in .*a, RUB in .*b: turn one with"),
+    (({"coordinate_system": "LUF"}, {}), "axes cannot be merged: LUF in .*a, none, for which RDF is assumed, in .*b"),
+    (({"metadata": {"up": [0, 0, 1]}}, {"metadata": {"up": [0, 1, 0]}}), "up direct.*: 0,0,1 in .*a, 0,1,0 in .*b"),
+    (({"coordinate_system": "RDF"}, {"metadata": {"up": [0, 1, 0]}}), "up directions cannot be merged: 0,-1,0 in .*a"),
     (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
     (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
     (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),
@@ -299,6 +308,8 @@ def test_scenes_that_contradict_each_other_are_refused(make_model, tmp_path, fie
         (tmp_path / name).write_bytes(encode(make_model(20, 0, **its), EncodeOptions(preset="fast", **STEPS)))
     with pytest.raises(InputError, match=message):
         csplat.merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out.csplat")
+    with pytest.raises(InputError, match="cannot be merged"):
+        csplat.merge([tmp_path / "b", tmp_path / "b", tmp_path / "a"], tmp_path / "out.csplat")
     assert not (tmp_path / "out.csplat").exists()
 
 

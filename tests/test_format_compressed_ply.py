@@ -1,6 +1,7 @@
 """PlayCanvas' compressed PLY: files built word by word, and round trips."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -48,6 +49,23 @@ def test_packed_words_are_read(tmp_path):
     assert [-4, 4, 0.5 / 32] == model.shN[0, :, 0].tolist()
     assert [(index + 0.5) / 32 - 4 for index in (3, 6)] == model.shN[0, 0, 1:].tolist()
     assert {"comments": ["made by hand"]} == model.metadata
+
+
+def test_splats_far_away_do_not_make_others_coarse(tmp_path, make_model):
+    near = make_model(300, 0)
+    for far in ([[5e5, 0, 0]], [[300, 0, 0], [0, -3e4, 0], [0, 0, 1e30]], np.full((60, 3), 4000) * [[1, -1, 1]]):
+        means = np.concatenate([near.means, np.asarray(far, np.float32)])
+        model = near.select(np.arange(len(means)) % 300)
+        model = replace(model, means=means, scales=np.full_like(means, -3.0), opacities=np.ones(len(means), "f4"))
+        found = {one.id: one for one in csplat.write(tmp_path / "a.compressed.ply", model)}["filling-splats"]
+        read = csplat.read(tmp_path / "a.compressed.ply")
+        visible = read.select(read.opacities > 0)
+        assert (len(model), found.count) == (len(visible), len(read) - len(model))
+        order = np.abs(visible.means[:, None] - means).max(axis=2).argmin(axis=1)
+        error = np.abs(visible.means - means[order]) / np.maximum(np.abs(means[order]).max(axis=1, keepdims=True), 4)
+        assert error.max() < 2e-3
+        assert len(np.unique(order)) >= 300
+        assert [] == [one for one in csplat.write(tmp_path / "b.compressed.ply", read) if one.id == "filling-splats"]
 
 
 def test_old_files_without_bounds_of_colours_are_read(tmp_path):

@@ -248,6 +248,22 @@ def test_values_are_checked_like_those_of_a_ply(read_holding):
     assert [1, 0, 0, 0] == model.quats[3].tolist()
 
 
+def test_one_scale_is_the_size_of_all_axes(read_holding, make_model):
+    splats = made_splats(make_model, 0)
+    for one in (splats["scales"][:, :1], splats["scales"][:, 0]):
+        model, found = read_splats(read_holding, {**splats, "scales": one})
+        assert "one-scale" in found
+        assert np.array_equal(np.repeat(splats["scales"][:, :1], 3, axis=1), model.scales)
+
+
+def test_log_scales_of_minus_infinity_in_a_checkpoint_are_sizes_of_0(read_holding, make_model):
+    splats = made_splats(make_model, 0)
+    splats["scales"][1:, 2] = -np.inf
+    model, found = read_splats(read_holding, splats)
+    assert "zero-scales" in found
+    assert (np.exp(model.scales[1:, 2].astype(float)) < 1e-37).all()
+
+
 def test_two_scales_are_discs(read_holding, make_model):
     splats = made_splats(make_model, 0)
     model, found = read_splats(read_holding, {**splats, "scales": splats["scales"][:, :2]})

@@ -23,7 +23,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model, normalise_quats
-from csplat.ply.columns import alpha_of_logits, logits_of_alpha
+from csplat.ply.columns import alpha_of_logits, flatten_scales, logits_of_alpha
 from csplat.types import F32
 
 if TYPE_CHECKING:
@@ -81,10 +81,12 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
     opacities = _reshape("opacities", opacities, (count,), (count, 1))
     if form == "parameters":
         opacities = alpha_of_logits(opacities)
-    elif (scales > 0.0).all():
-        scales = np.log(scales.astype(np.float64)).astype(np.float32)
+    elif (scales >= 0.0).all():
+        with np.errstate(divide="ignore"):
+            scales = np.log(scales.astype(np.float64)).astype(np.float32)
     else:
-        raise InputError('scales are not all above 0: use form="parameters" for logarithms')
+        raise InputError('scales are not all at least 0: use form="parameters" for logarithms')
+    flatten_scales(scales.reshape(-1, 1))  # a view
     sh0 = _reshape("sh0", sh0, (count, 3), (count, 1, 3))
     return SplatModel(means, normalise_quats(quats), scales, opacities, sh0, shN)
 

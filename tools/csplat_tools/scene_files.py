@@ -361,7 +361,11 @@ def size_on_disk(path: Path) -> int:
 
 def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict[str, Any]]:
     """Return findings as JSON-compatible values."""
-    return [{"id": one.id, "kind": one.kind, "count": one.count, "text": one.text} for one in findings]
+    return [
+        {"id": one.id, "kind": one.kind, "count": one.count, "text": one.text}
+        | ({"attribute": one.attribute, "largest_error": one.largest_error} if one.attribute else {})
+        for one in findings
+    ]
 
 
 def ply_splat_bytes(sh_degree: int) -> int:

@@ -233,6 +233,10 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
     findings = []
     splats = {name: _array(value) if name in _NAMES.values() else value for name, value in splats.items()}
     scales = splats.get("scales")
+    if scales is not None and scales.ndim in (1, 2) and scales.size == len(scales):
+        splats["scales"] = scales = np.repeat(scales.reshape(-1, 1), 3, axis=1)
+        text = "splats have one scale: all axes of a splat have this size"
+        findings.append(Finding("one-scale", 1, text, "note"))
     is_flat = scales is not None and scales.ndim == 2 and scales.shape[1] == 2
     if scales is not None and is_flat:
         third = np.full((len(scales), 1), choose_thickness(scales) if len(scales) else 0.0, np.float32)

@@ -46,6 +46,7 @@ _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_s
 _COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time; they fit in the cache
 _EARLY_END = "early end-of-file"  # message of plyfile
+_PACKED_COLOURS = ("colors", "color", "rgb")
 _SHOWN = 40  # maximum number of characters of a word in a message
 
 
@@ -177,12 +178,15 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     # NumPy warns about text numbers beyond their type, which become infinite and are dropped later, and about empty
     # tables, which plyfile refuses.
     quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
+    packed = None
     with _open_for_plyfile(path, header) as stream, np.errstate(over="ignore"), quiet:
         try:
             try:
                 parsed = plyfile.PlyData.read(stream)
                 end = None if parsed.text else stream.tell()
-                findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
+                packed = _with_packed_colours(path, header, parsed, findings)
+                if packed is None:
+                    findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
             except plyfile.PlyElementParseError as error:
                 parsed = _read_again(path, header, findings, error)
         except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
@@ -193,7 +197,7 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
         raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
     others = [element for element in parsed if element.name != SPLAT_ELEMENT]
     findings += _other_findings(others)
-    rows, lists = _scalar_columns(parsed[SPLAT_ELEMENT].data)
+    rows, lists = _scalar_columns(parsed[SPLAT_ELEMENT].data if packed is None else packed)
     if lists:
         text = f"list properties {', '.join(lists)}: dropped"
         findings.append(Finding("list-columns", len(lists), text, "repair"))
@@ -201,6 +205,27 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     for element in parsed:
         comments += element.comments
     return PlyContent(rows, comments, [element.name for element in others])
+
+
+def _with_packed_colours(path: Path, header: PlyHeader, parsed: Any, findings: list[Finding]) -> Rows | None:
+    """Return the rows of a file that declares one byte of colour and has three; `None` if it is not such a file.
+
+    nerfstudio's exporter declares `uchar colors` with the option `rgb` (exporter.py, up to 1.1.5).
+    """
+    if parsed.text or [element.name for element in parsed] != [SPLAT_ELEMENT]:
+        return None
+    data = parsed[SPLAT_ELEMENT].data
+    names = data.dtype.names or ()
+    name = next((one for one in names if one in _PACKED_COLOURS and data.dtype[one] == np.uint8), "")
+    surplus = path.stat().st_size - header.end - data.nbytes
+    if not name or not len(data) or surplus != 2 * len(data) or {"red", "green", "blue", "f_dc_0"} & {*names}:
+        return None
+    fields: list[Any] = []
+    for one in names:
+        fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")] if one == name else [(one, data.dtype[one])]
+    text = f"one uchar {name} is declared, three are in each row: read as red, green and blue"
+    findings.append(Finding("packed-colours", 1, text, "note"))
+    return np.memmap(path, fields, "r", header.end, (len(data),))
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,14 +110,14 @@ class Output:
             note(f"this takes about {format_estimate(seconds)} here; {faster}")
 
     def print_findings(self, findings: Sequence[Finding], name: str = "") -> None:
-        """Print unusual findings in a file, unless `--quiet` is given; repairs are printed in any case.
+        """Print unusual findings in a file, unless `--quiet` is given; repairs and losses are printed in any case.
 
         Args:
             findings: findings in the file.
             name: name of the file, if a command reads several.
         """
         for one in findings:
-            if one.kind == "repair" or not (self.quiet or one.usual):
+            if one.kind in ("repair", "loss") or not (self.quiet or one.usual):
                 note(f"{name}: {one}" if name else str(one))
 
     def bar(self) -> AbstractContextManager[Progress | None]:

@@ -259,6 +259,7 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
             "levels": list(scene.levels),
             "sh_degree": metadata_model.sh_degree,
             "coordinate_system": metadata_model.coordinate_system,
+            "file_axes": scene.file_axes or metadata_model.coordinate_system,
             "origin": list(metadata_model.origin),
             "unit_metres": metadata_model.unit_metres,
             "antialiased": metadata_model.antialiased,
@@ -269,6 +270,8 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
         }
         average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
         words = describe_placement(metadata_model, count, metadata_model.metadata)
+        if scene.file_axes:
+            words["axes"] = f"{scene.file_axes}, read as {metadata_model.coordinate_system}"
         if scene.levels:
             words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
         if metadata_model.extra:
