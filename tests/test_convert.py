@@ -298,6 +298,7 @@ def test_sog_is_written_to_a_folder(tmp_path, ply):
     assert "exists: --force" in call("convert", ply, tmp_path / "new" / "meta.json", status=1).stderr
     (tmp_path / "new" / "other.bin").write_bytes(bytes(9_999_999))
     assert " MB" not in call("convert", ply, tmp_path / "new" / "meta.json", "--force").stderr
+    assert " MB" not in call("info", tmp_path / "new").stdout
     call("convert", ply, tmp_path / "no" / "such" / "meta.json", status=1)
     assert not (tmp_path / "no").exists()
 

@@ -172,7 +172,7 @@ def of_inria(splats):
     return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
 
 
-LIGHTNING = ("means", "rotations", "scales", "opacities", "shs_dc", "shs_rest")  # of Gaussian Splatting Lightning
+LIGHTNING = ("means", "rotations", "scales", "opacities", "shs_dc", "shs_rest")  # names in Gaussian Splatting Lightning
 INRIA_STATE = ("_xyz", "_rotation", "_scaling", "_opacity", "_features_dc", "_features_rest")
 
 

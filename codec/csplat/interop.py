@@ -33,7 +33,8 @@ if TYPE_CHECKING:
 Form = Literal["parameters", "activated"]
 
 _REQUIRED = ("means", "quats", "scales", "opacities", "sh0")
-_APPEARANCE = ("features", "appearance_features")  # of gsplat's simple_trainer with app_opt, and of splatfacto-w
+#: Names in checkpoints of gsplat's simple_trainer with `app_opt`, and of splatfacto-w.
+_APPEARANCE = ("features", "appearance_features")
 _SPLATS = "splats"  # key of the splats in gsplat's checkpoints
 
 

@@ -238,7 +238,7 @@ async def _check_answer(answer: Any) -> None:
         text = _describe_fault(answer)
         fault = StoreError(text) if text else None
     if fault is not None:
-        answer.close()  # of a connection whose body may be long
+        answer.close()  # the rest of the body may be long
         raise fault
 
 

@@ -20,7 +20,7 @@ from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.scene_files import load_model, splats_to_frame
 from csplat_tools.views import DataOptions
 
-_OTHER_VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
+_NOT_WRITTEN = (".avi", ".bmp", ".exr", ".hdr", ".m4v", ".mkv", ".mov", ".mpg", ".tif", ".tiff", ".webm")
 
 
 def render(
@@ -70,7 +70,7 @@ def render(
     is_video, views = is_film(output), shared.ViewOptions(cameras, data, background)
     if cameras is None and orbit is None and data is None:
         raise typer.BadParameter("expected cameras: --orbit 120 for a path around the scene, or --cameras, or --data")
-    if output == STANDARD_STREAM or Path(output).suffix.lower() in _OTHER_VIDEOS:
+    if output == STANDARD_STREAM or Path(output).suffix.lower() in _NOT_WRITTEN:
         raise typer.BadParameter(f"OUT is {output}, expected a folder, or a video: NAME.mp4, .webp, .gif or .png")
     if is_video and (depth or alpha):
         raise typer.BadParameter("--depth and --alpha require a folder, not a video")
