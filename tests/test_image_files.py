@@ -349,7 +349,6 @@ READ = {
     "16-bit grey TIFF": ("a.tif", saved(UINT16), GREY, 0),
     "16-bit grey, bytes swapped": ("a.tif", lambda p: Image.frombytes("I;16B", (W, H), SWAPPED).save(p), GREY, 0),
     "16-bit grey, white is 0": ("a.tif", lambda p: tiff(p, 65535 - UINT16, 16, 1, photometric=0), GREY, 0),
-    "16-bit grey PGM": ("a.pgm", lambda p: p.write_bytes(f"P5 {W} {H} 65535 ".encode() + SWAPPED), GREY, 0),
     "16-bit RGB": ("a.tif", lambda p: tiff(p, RGB.astype(np.uint16) * 257, 16, 1, channels=3, photometric=2), RGB, 0),
     "16-bit RGB PNG": ("a.png", lambda p: png_16(p, np.ascontiguousarray(RGB.astype(">u2") * 257, ">u2")), RGB, 0),
     "float TIFF": ("a.tif", saved(RAMP.astype(np.float32)), GREY, 0),

@@ -186,7 +186,7 @@ def _open(stream: BinaryIO, kind: ImageFormat, name: str) -> ImageFile:
     except ModuleNotFoundError as error:
         raise missing_package(error, "Pillow") from None
     with _converted_errors(kind, name):
-        image: ImageFile = opener(stream)
+        image: ImageFile = opener(stream, name)
         tags = getattr(image, "tag_v2", {})
         if _DNG_VERSION in tags or tags.get(_SUBFILE, 0) & 1:
             raise _raw_refusal(name)
@@ -208,14 +208,16 @@ def _converted_errors(kind: ImageFormat, name: str) -> Iterator[None]:
         hint = "a TIFF that is damaged, or not of 8 or 16 bits or of floats in one channel: convert it to PNG or JPEG"
         if kind == "TIFF" and isinstance(error, SyntaxError):
             raise InputError(f"{name} is {hint}") from error
-        reason = " ".join(str(error).split())[:_REASON_MAX] or type(error).__name__
-        if isinstance(error, struct.error | IndexError | KeyError | TypeError | AttributeError | EOFError):
-            reason = "its parts contradict each other, or it is truncated"
         if isinstance(error, MemoryError):
             raise InputError(f"{name} does not fit into the memory: scale it") from error
+        reason = " ".join(str(error).split())[:_REASON_MAX]
         if "MAX_TEXT" in reason:
-            reason = "its texts or its colour profile unpack to more than they may: save it without them"
-        raise InputError(f"{name} is a damaged {kind}: {reason}") from error
+            raise InputError(f"{name} has texts or a colour profile of too many bytes: save it without them") from error
+        if "truncated" in reason.lower() or isinstance(error, EOFError):
+            raise InputError(f"{name} is a {kind} that is truncated: copy or export it again") from error
+        if isinstance(error, struct.error | LookupError | TypeError | AttributeError) or not reason:
+            reason = "its parts contradict each other"
+        raise InputError(f"{name} is a {kind} that is damaged ({reason}): copy or export it again") from error
 
 
 def _check_budget(size: tuple[int, int], size_bytes: int, name: str) -> None:

@@ -506,7 +506,7 @@ def _is_keypoints(words: list[str]) -> bool:
     if len(words) % 3:
         return False
     try:
-        return all(_number(word) is not None for word in words)
+        return all(_parse_number(word) is not None for word in words)
     except ValueError:
         return False
 
@@ -517,17 +517,17 @@ def _is_pose(line: str) -> bool:
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
-    """Parse numbers, as `_number` does."""
+    """Parse numbers, as `_parse_number` does."""
     values = []
     for word in words:
         try:
-            values.append(_number(word))
+            values.append(_parse_number(word))
         except ValueError:
             raise InputError(f"{where}: {printable(word[:40])!r} is not a number") from None
     return values
 
 
-def _number(word: str) -> float:
+def _parse_number(word: str) -> float:
     """Parse a number with a point or comma, or NaN, which C++ programs on Windows write as `-nan(ind)` and `1.#IND`."""
     if "_" in word:  # Python's separator of digits
         raise ValueError
@@ -555,7 +555,7 @@ def _check_commas(path: Path, rows: Iterable[tuple[list[str], str]], report: lis
             "points, and no separators of thousands"
         )
     if comma and report is not None:
-        report.append(f"{path.name}: decimal commas are read as points: {comma[0]} is {_number(comma[0]):g}, …")
+        report.append(f"{path.name}: decimal commas are read as points: {comma[0]} is {_parse_number(comma[0]):g}, …")
 
 
 def _integer(word: str, where: str) -> int:

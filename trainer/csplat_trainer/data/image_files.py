@@ -304,7 +304,10 @@ def _translations() -> Iterator[tuple[Callable[[str], str | None], str]]:
 
 def printable(name: str) -> str:
     """Return a name with bytes that are not UTF-8 (lone surrogates) as escapes."""
-    return name.encode("utf-8", "backslashreplace").decode("utf-8")
+    try:
+        return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # surrogates that are no bytes, from JSON
+        return name.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:

@@ -18,6 +18,7 @@ from csplat_render.camera import MAX_IMAGE_SIZE, camera_outliers, nearest_point
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import DataSet, Shot, UnreadDataSet, near_plane, open_shot
 from csplat_trainer.data.dataset_checks import check_shots, describe_images, describe_lenses, describe_poses
+from csplat_trainer.data.foreign_sets import describe_foreign
 from csplat_trainer.data.image_files import IMAGE_ENDINGS, abbreviate
 from csplat_trainer.data.image_pixels import opaque_images, read_image_header
 from csplat_trainer.data.set_folder import SetFolder
@@ -191,6 +192,8 @@ def _settle(found: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
 def _read(
     place: SetFolder, path: Path, size: tuple[int, int] | None, images: str | None, test_every: int
 ) -> UnreadDataSet:
+    if path.is_file() and (foreign := describe_foreign(path)):
+        raise InputError(foreign)
     if path.is_file() and path.suffix.lower() == ".json":
         if path.name == "transforms_train.json":
             return read_blender(place, images)
@@ -207,6 +210,8 @@ def _read(
     elif model is not None:
         found = read_colmap(place, model[0], size, images, test_every)
         return replace(found, report=[*model[1], *found.report])
+    elif foreign := describe_foreign(path):
+        raise InputError(foreign)
     else:
         raise InputError(
             f"{path} is not a data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
