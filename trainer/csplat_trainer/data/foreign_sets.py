@@ -21,7 +21,7 @@ class ForeignSet:
         title: the program and its files, in prose.
         patterns: paths in the folder of the set, one of which exists; the last part is also the name of a file that
             users pass as the set. Case does not matter.
-        remedy: advice that follows "<path> is <title>, which is not read: ".
+        remedy: advice that follows "<path> is <title>, which is not read: "; for folders "<path> holds <file>, …".
         mark: bytes near the beginning of such a file, in lower case; b"": the name suffices.
     """
 
@@ -85,8 +85,8 @@ FOREIGN_SETS = (
     ForeignSet("a set of LLFF", ("poses_bounds.npy",), "convert it with llff2nerf.py of torch-ngp"),
     ForeignSet("a set of NeuS", ("cameras_sphere.npz", "cameras*.npz"), "convert it to transforms.json"),
     ForeignSet("a set of MVSNet", ("cams/*_cam.txt", "pair.txt"), f"convert it to transforms.json, or {_COMPUTE}"),
-    ForeignSet("a set of Nerfies", ("camera-paths", "camera/*.json"), "convert it to transforms.json"),
-    ForeignSet("a set of NSVF", ("pose/*.txt", "bbox.txt"), "convert it to transforms.json"),
+    ForeignSet("a set of Nerfies", ("camera-paths",), "convert it to transforms.json"),
+    ForeignSet("a set of NSVF", ("bbox.txt",), "convert it to transforms.json"),
     ForeignSet(
         "a trained scene of 3DGS", ("cfg_args",), "name the data set that it was trained on (source_path in cfg_args)"
     ),
@@ -108,8 +108,10 @@ def describe_foreign(path: Path) -> str:
         else:
             names = {pattern.rpartition("/")[2] for pattern in one.patterns}
             found = [path] if any(path.match(_any_case(name)) for name in names) else []
-        if any(_has_mark(file, one.mark) for file in found):
-            return f"{path} is {one.title}, which is not read: {one.remedy}"
+        file = next((file for file in found if _has_mark(file, one.mark)), None)
+        if file is not None:
+            subject = f"{path} holds {file.relative_to(path).as_posix()}," if path.is_dir() else f"{path} is"
+            return f"{subject} {one.title}, which is not read: {one.remedy}"
     return ""
 
 

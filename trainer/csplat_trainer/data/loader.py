@@ -210,12 +210,12 @@ def _read(
     elif model is not None:
         found = read_colmap(place, model[0], size, images, test_every)
         return replace(found, report=[*model[1], *found.report])
-    elif foreign := describe_foreign(path):
+    elif not (place_hint := _suggest_place(path)) and (foreign := describe_foreign(path)):
         raise InputError(foreign)
     else:
         raise InputError(
             f"{path} is not a data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
-            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{_suggest_place(path)}"
+            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{place_hint}"
         )
     if model is not None:
         found = replace(found, report=[*found.report, "there is also a COLMAP model, which is ignored"])
