@@ -48,7 +48,7 @@ _MAGICS: tuple[tuple[bytes, ImageFormat], ...] = (
 
 _RAW = "a camera's raw file"
 _RAW_SUFFIXES = (".3fr", ".arw", ".cr2", ".cr3", ".dng", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw")
-_DNG_VERSION, _SUBFILE = 50706, 254  # tags of a TIFF; bit 0 of the second: a reduced image, such as the preview of a raw
+_DNG_VERSION, _SUBFILE = 50706, 254  # tags of a TIFF; bit 0 of the second marks the preview of a raw file
 #: Other formats: offset and value of their first bytes, and their names.
 _OTHERS = (
     (0, b"%!PS", "PostScript (EPS)"),
@@ -156,12 +156,13 @@ _SILENT = logging.NullHandler()  # Pillow's log is the application's business; w
 def _identify(head: bytes, name: str, formats: Sequence[ImageFormat]) -> ImageFormat:
     """Return the format of a file by its first bytes; refuse others by name."""
     expected = ", ".join(formats[:-1]) + " or " * (len(formats) > 1) + formats[-1]
-    kind = "WebP" if head[:4] == b"RIFF" and head[8:12] == b"WEBP" else None
-    kind = kind or next((kind for magic, kind in _MAGICS if head.startswith(magic)), None)
+    kind: ImageFormat | None = next((kind for magic, kind in _MAGICS if head.startswith(magic)), None)
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        kind = "WebP"
     suffix = Path(name).suffix.lower()
     if suffix in _RAW_SUFFIXES or (kind == "TIFF" and head[8:10] == b"CR"):
         raise _raw_refusal(name)
-    if kind in formats:
+    if kind is not None and kind in formats:
         return kind
     if kind is not None:
         raise InputError(f"{name} is a {kind}, expected {expected}")

@@ -82,17 +82,16 @@ def read_colmap(
     cameras_path, images_path = _file(model, "cameras"), _file(model, "images")
     assert cameras_path is not None
     assert images_path is not None
-    for path in (cameras_path, images_path):
+    same, other = images_path.with_suffix(".txt"), cameras_path.with_suffix(".txt")
+    for path in (cameras_path, images_path, same, other):
         place.checked(path)
     registered, report = read_images(images_path)
     used = {image.camera for image in registered}
     cameras = read_cameras(cameras_path, used, report)
-    same = images_path.with_suffix(".txt")
-    if same != images_path and same.is_file() and place.checked(same) and (there := count_images(same)) != len(registered):
+    if same != images_path and same.is_file() and (there := count_images(same)) != len(registered):
         what = f"{same.name} has {counted(there, 'image')}, {images_path.name} {len(registered)}"
         report.append(f"{what}: {images_path.name} is read")
-    other = cameras_path.with_suffix(".txt")
-    if other != cameras_path and other.is_file() and place.checked(other) and not _agree(cameras, read_cameras(other, used)):
+    if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other, used)):
         report.append(f"{other.name} has other cameras than {cameras_path.name}, which is read")
     if not registered:
         raise InputError(f"{images_path} has no images")
@@ -107,7 +106,13 @@ def read_colmap(
     report += describe_missing([name for name in names if name not in found.files], len(names), images_path.name)
     masks = _masks(place, found.files, report)
     shots = [
-        Shot(_shown_name(image.name, found), found.files[image.name], cameras[image.camera], image.viewmat, masks.get(image.name))
+        Shot(
+            _shown_name(image.name, found),
+            found.files[image.name],
+            cameras[image.camera],
+            image.viewmat,
+            masks.get(image.name),
+        )
         for image in registered
         if image.name in found.files
     ]
@@ -290,9 +295,7 @@ class ColmapImage:
     viewmat: F64
 
 
-def read_cameras(
-    path: Path, used: Collection[int] | None = None, report: list[str] | None = None
-) -> dict[int, Lens]:
+def read_cameras(path: Path, used: Collection[int] | None = None, report: list[str] | None = None) -> dict[int, Lens]:
     """Read cameras.bin or cameras.txt.
 
     Args:

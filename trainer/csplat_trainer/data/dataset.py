@@ -274,7 +274,8 @@ def split_listed(
         unread = next((name for name in missing if name != printable(name)), None)
         if unread is not None:
             raise InputError(
-                f"{where} is not a text file in UTF-8 ({printable(unread)} is no image in any code page): save it as UTF-8"
+                f"{where} is not a text file in UTF-8 ({printable(unread)} is no image in any code page): save it as "
+                "UTF-8"
             )
         line = f"{where} names {counted(len(names), f'{word} image')}"
         report.append(f"{line}, found {len(found)}; missing: {abbreviate(missing)}" if missing else line)

@@ -65,7 +65,9 @@ FOREIGN_SETS = (
         ("sfm_data*.json", "sfm_data*.bin", "*/sfm_data*.json", "*/sfm_data*.bin"),
         "convert it with openMVG_main_openMVG2Colmap",
     ),
-    ForeignSet("a scene of Meshroom", ("*.sfm", "cameras.abc", "sfm.abc", "*/*.sfm", "*/sfm.abc", "MeshroomCache"), _EXPORT),
+    ForeignSet(
+        "a scene of Meshroom", ("*.sfm", "cameras.abc", "sfm.abc", "*/*.sfm", "*/sfm.abc", "MeshroomCache"), _EXPORT
+    ),
     ForeignSet(
         "a reconstruction of OpenDroneMap or OpenSfM",
         ("opensfm/reconstruction.json", "reconstruction.json", "odm_report"),
@@ -74,14 +76,19 @@ FOREIGN_SETS = (
     ForeignSet("a file of Bundler", ("bundle*.out", "*/bundle*.out"), f"convert it to COLMAP, or {_COMPUTE}"),
     ForeignSet("a file of VisualSFM", ("*.nvm", "*/*.nvm"), f"convert it to COLMAP, or {_COMPUTE}"),
     ForeignSet(
-        "a project of Pix4D", ("*.p4d", "*_calibrated_camera_parameters.txt", "*/params/*_calibrated_camera_parameters.txt"),
+        "a project of Pix4D",
+        ("*.p4d", "*_calibrated_camera_parameters.txt", "*/params/*_calibrated_camera_parameters.txt"),
         f"{_EXPORT}, or {_COMPUTE}",
-    ),  # fmt: skip
+    ),
     ForeignSet("a project of Postshot", ("*.psht",), "name the folder of its images and poses"),
     ForeignSet(
         "a capture of Stray Scanner", ("odometry.csv", "*/odometry.csv"), f"take frames of its video, and {_COMPUTE}"
     ),
-    ForeignSet("an ARKit capture", ("*.traj", "ARPoses.txt", "SyncedPoses.txt"), f"convert it to transforms.json, or {_COMPUTE}"),
+    ForeignSet(
+        "an ARKit capture",
+        ("*.traj", "ARPoses.txt", "SyncedPoses.txt"),
+        f"convert it to transforms.json, or {_COMPUTE}",
+    ),
     ForeignSet("a set of LLFF", ("poses_bounds.npy",), "convert it with llff2nerf.py of torch-ngp"),
     ForeignSet("a set of NeuS", ("cameras_sphere.npz", "cameras*.npz"), "convert it to transforms.json"),
     ForeignSet("a set of MVSNet", ("cams/*_cam.txt", "pair.txt"), f"convert it to transforms.json, or {_COMPUTE}"),

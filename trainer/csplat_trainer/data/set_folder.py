@@ -28,7 +28,7 @@ class SetFolder:
 
     @cached_property
     def _as_written(self) -> list[str]:
-        return [os.path.abspath(root) for root in (self.path, self.images) if root is not None]
+        return [_absolute(root) for root in (self.path, self.images) if root is not None]
 
     @cached_property
     def _real(self) -> list[str]:
@@ -42,7 +42,7 @@ class SetFolder:
         """
         if self.trusted:
             return True
-        plain = os.path.abspath(path)
+        plain = _absolute(path)
         return any(_is_below(plain, root) for root in (*self._as_written, *self._real))
 
     def checked(self, path: Path, where: str = "") -> Path:
@@ -83,6 +83,10 @@ class SetFolder:
         return InputError(
             f"{subject} {fault} {self.path}, the folder of the data set: move it there, or allow it with --trust-paths"
         )
+
+
+def _absolute(path: Path) -> str:
+    return os.path.abspath(path)  # noqa: PTH100  # resolve would ask the disk, or a server
 
 
 def _is_below(path: str, root: str) -> bool:
