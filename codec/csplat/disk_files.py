@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import sys
@@ -26,6 +27,8 @@ from numpy.typing import NDArray
 from csplat.errors import InputError
 from csplat.file_source import File, describe_substitute, named_errors, open_binary, read_bytes
 
+_DECIMAL_COMMA = re.compile(r'":\s*([+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*[,}\n]')  # of a member of an object
+_TRAILING_BYTE = re.compile(r"([\udc81-\udcfe])\\(?!\\)")  # a backslash that ends a character of Shift-JIS, GBK or Big5
 _PART_SIZE = 1 << 20  # bytes copied at a time
 _NAME_PART = 20  # characters of a file's name in that of its temporary file, which must not be longer than 255 bytes
 _TEMPORARY = "csplat-"  # beginning of the names of files in the system's folder for temporary files
@@ -51,11 +54,13 @@ _MARKS = (
 )
 
 
-def read_text(path: str | os.PathLike[str]) -> str:
+def read_text(path: str | os.PathLike[str], *, any_bytes: bool = False) -> str:
     """Read a text file in UTF-8, or in the encoding of its byte order mark.
 
     Args:
         path: path of the file.
+        any_bytes: keep bytes that are not UTF-8 as lone surrogates, as `os.fsdecode` does, for file names in the code
+            page of another system; False: refuse them.
 
     Returns:
         The text without the mark, with line feeds as line ends.
@@ -72,7 +77,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
         raise InputError(f"{os.fspath(path)} is {instead}")
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "utf-8")
     try:
-        text = data.decode(encoding)
+        text = data.decode(encoding, "surrogateescape" if any_bytes and encoding.startswith("utf-8") else "strict")
     except UnicodeDecodeError as error:
         found = f"byte {error.start} is 0x{data[error.start]:02x}, which is not {encoding.removesuffix('-sig').upper()}"
         raise InputError(f"{os.fspath(path)} is not a text file in UTF-8 ({found}): save it as UTF-8") from None
@@ -83,16 +88,24 @@ def read_text(path: str | os.PathLike[str]) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
+def read_json(path: str | os.PathLike[str], *, any_bytes: bool = False) -> Any:
     """Read a JSON file, in the encodings of `read_text`.
+
+    Args:
+        path: path of the file.
+        any_bytes: as in `read_text`.
 
     Raises:
         InputError: the file cannot be read or is not JSON.
     """
+    text = ""
     try:
-        return json.loads(read_text(path))
+        text = read_text(path, any_bytes=any_bytes)
+        return json.loads(_TRAILING_BYTE.sub(r"\1\\\\", text) if any_bytes else text)
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}") from error
+        comma = _DECIMAL_COMMA.search(text)
+        hint = f"; it has a decimal comma, {comma[1]}, expected a point" if comma else ""
+        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}{hint}") from error
 
 
 def finite_or_none(value: float | None) -> float | None:

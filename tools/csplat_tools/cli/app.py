@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from csplat_tools import VERSIONS
+from csplat_tools.cli.command_output import TRUSTS_PATHS
 from csplat_tools.cli.error_lines import UsageError, refuse_command_line, report_errors
 from csplat_tools.console import print_data
 
@@ -28,6 +29,9 @@ _PANELS = {
     "View": {"view": "view", "render": "render", "export-html": "view", "export-element": "view"},
     "Test an implementation": {"conformance": "conformance"},
 }  # fmt: skip
+#: Commands that read data sets, and take `--trust-paths` anywhere among their words.
+_OF_DATA_SETS = {"train", "finetune", "encode", "compare", "tradeoff", "sensitivity", "simplify", "render"}
+_TRUST_PATHS = "--trust-paths"
 _PANEL_OF = {name: panel for panel, commands in _PANELS.items() for name in commands}
 
 
@@ -43,6 +47,12 @@ class _Commands(TyperGroup):
             if name not in self.commands:
                 self.commands[name] = _imported(name)
         return self.commands.get(cmd_name)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Move `--trust-paths` from the words of a command to the front, where options of the program are."""
+        if args and args[0] in _OF_DATA_SETS and _TRUST_PATHS in args:
+            args = [_TRUST_PATHS, *(word for word in args if word != _TRUST_PATHS)]
+        return super().parse_args(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:
         with report_errors():
@@ -102,6 +112,9 @@ def _version(requested: bool) -> None:
 
 @app.callback()
 def root(
+    trust_paths: Annotated[
+        bool, typer.Option(_TRUST_PATHS, help="Let data sets read files outside of their folders.")
+    ] = False,
     _version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the versions.")
     ] = False,
@@ -116,3 +129,4 @@ def root(
       csplat info scene.csplat
       csplat decode scene.csplat scene.ply
     """
+    TRUSTS_PATHS.set(trust_paths)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from csplat.lint import Finding
 from csplat.types import Progress
 from csplat_tools.console import LONG_WORK_SECONDS, format_estimate, note, print_data, print_json, progress_bar
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, check_outputs, write_json
+
+#: True if data sets may read files outside of their folders; set by the program for each command line.
+TRUSTS_PATHS = ContextVar("TRUSTS_PATHS", default=False)
 
 #: File name endings of the outputs of options.
 _ENDINGS = {

@@ -18,7 +18,6 @@ from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.present.scene_renders import find_cameras, render_film, render_folder
 from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.scene_files import load_model, splats_to_frame
-from csplat_tools.views import DataOptions
 
 _NOT_WRITTEN = (".avi", ".bmp", ".exr", ".hdr", ".m4v", ".mkv", ".mov", ".mpg", ".tif", ".tiff", ".webm")
 
@@ -90,7 +89,7 @@ def render(
         out.print_findings(read.findings)
         model, notes = overrides.apply(read.model), list[str]()
         to_frame = model if orbit is None else overrides.apply(splats_to_frame(source, read.model))
-        data_set = None if data is None else DataOptions(data, pixels)
+        data_set = None if data is None else shared.open_data(data, size=pixels)
         shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
         if orbit is not None:

@@ -22,7 +22,7 @@ from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel, check_axes
 from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
-from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import NUMBER, parse_size_bytes, print_data
 from csplat_tools.encode_file import LEVELS_MAX, Levels
 from csplat_tools.scene_files import MetadataOverrides
@@ -237,6 +237,11 @@ def take_estimated_up(
     return axis
 
 
+def open_data(path: str, **options: Any) -> DataOptions:
+    """Return the options of a data set, with those of the program."""
+    return DataOptions(path, trust_paths=TRUSTS_PATHS.get(), **options)
+
+
 @dataclass(frozen=True)
 class ViewOptions:
     """Views of a camera file or a data set; without either, virtual ones.
@@ -273,7 +278,7 @@ class ViewOptions:
     @property
     def data_options(self) -> DataOptions | None:
         """The options of the data set; `None` without one."""
-        return None if self.data is None else DataOptions(self.data, test_every=self.test_every)
+        return None if self.data is None else open_data(self.data, test_every=self.test_every)
 
     def find(
         self,

@@ -221,7 +221,9 @@ def _load(data: DataOptions, options: TrainOptions, files: Outputs) -> DataSet:
     """Check the other inputs, and open the data set."""
     _check_inputs(options, files)
     every = 8 if data.test_every is None else data.test_every
-    return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
+    return load(
+        data.path, data.size, images=data.images, test_every=every, near=data.near, trust_paths=data.trust_paths
+    )
 
 
 def _check_inputs(options: TrainOptions, files: Outputs) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import math
 import zipfile
@@ -16,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.archives import DAMAGED, scenes_of
-from csplat.errors import InputError, missing_package
+from csplat.errors import InputError
 from csplat.file_source import describe_substitute, open_binary
+from csplat.image_opener import open_image
 from csplat.lint import Finding
 
 _LARGEST_JSON = 1 << 25  # bytes
@@ -155,6 +155,8 @@ class SogParts:
         path = self.path / self._inside(name)
         if self.folder is not None or not path.is_file():
             self.refuse(f"there is no {name[:80]}")
+        if not path.resolve().is_relative_to(self.path.resolve()):
+            self.refuse(f"the part {name[:80]} is a link that leads out of its folder")
         return path
 
     def _inside(self, name: str) -> PurePosixPath:
@@ -333,22 +335,14 @@ def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[n
     Raises:
         InputError: the image is damaged, lossy or of another size; or Pillow is not installed.
     """
-    try:
-        from PIL.Image import DecompressionBombError
-        from PIL.WebPImagePlugin import WebPImageFile  # Image.open would load the plugins of all formats
-    except ModuleNotFoundError as error:
-        raise missing_package(error, "Pillow") from None
     if _is_lossy(data):
         parts.refuse(
             f"{name} is a lossy WebP, expected a lossless one: its codes are changed; use the file as exported"
         )
-    try:
-        with WebPImageFile(io.BytesIO(data)) as image:
-            if not fits(*image.size):
-                parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which does not match the metadata")
-            return np.asarray(image.convert("RGBA"))
-    except (*DAMAGED, DecompressionBombError) as error:
-        parts.refuse(f"{name} is not a complete WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")
+    with open_image(data, f"{parts.title}: {name}", formats=("WebP",), budget=False) as image:
+        if not fits(*image.size):
+            parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which does not match the metadata")
+        return np.asarray(image.convert("RGBA"))
 
 
 def _is_lossy(data: bytes) -> bool:
