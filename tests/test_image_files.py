@@ -433,7 +433,7 @@ def test_a_set_reports_how_its_pixels_are_read(tmp_path):
     for path in files:
         frames[0].save(path, save_all=True, append_images=frames[1:])
     data = load(tmp_path)
-    assert "10 files with several images: the first of each is read (0001.png has 2)" in data.report
+    assert "10 files with several images: the first of each is read (such as 0001.png)" in data.report
     assert (data.train[0].pixels == (255, 0, 0)).all()
 
 

@@ -71,6 +71,8 @@ _OTHERS = (
     (0, b"DDS ", "a DDS texture"),
     (1, b"KTX ", "a KTX texture"),
     (0, b"\0\0\1\0", "an icon (ICO)"),
+    (0, b"\0\0\2\0\0\0", "a TGA"),
+    (0, b"\0\0\n\0\0\0", "a TGA"),
     (0, b"\0\0\2\0", "a cursor (CUR)"),
     (0, b"icns", "an icon (ICNS)"),
     (0, b"\xd0\xcf\x11\xe0", "an OLE file (FlashPix, MIC or a document)"),
@@ -89,6 +91,7 @@ _OTHERS = (
     *((0, b"P%d" % kind, "a Netpbm file (PBM, PGM, PPM)") for kind in range(1, 8)),
 )
 _HEAD_SIZE = 1024  # bytes that identify a format; an SVG may begin with comments
+_STDERR = 2  # descriptor of standard error
 _FILE_MAX = 1 << 32  # bytes; Pillow reads some formats whole, and no camera writes larger files
 _REASON_MAX = 120  # characters of Pillow's reason in a message
 
@@ -131,7 +134,7 @@ def open_image(
         kind = _identify(head, name, formats)
         if size_bytes > _FILE_MAX:
             raise InputError(f"{name} has {size_bytes:,} bytes, expected at most {_FILE_MAX:,}")
-        with _pillow, warnings.catch_warnings():
+        with _pillow, warnings.catch_warnings(), _silent_libtiff(kind):
             warnings.simplefilter("ignore")
             logging.getLogger("PIL").addHandler(_SILENT)
             image = _open(stream, kind, name)
@@ -151,6 +154,25 @@ def _stream(source: str | os.PathLike[str] | bytes, name: str) -> BinaryIO:
 
 
 _SILENT = logging.NullHandler()  # Pillow's log is the application's business; without a handler it is printed
+
+
+@contextmanager
+def _silent_libtiff(kind: ImageFormat) -> Iterator[None]:
+    """Discard what libtiff writes to standard error, past Python; Pillow reports the same error."""
+    try:
+        saved = os.dup(_STDERR) if kind == "TIFF" else -1
+    except OSError:  # it is closed
+        saved = -1
+    if saved < 0:
+        yield
+        return
+    try:
+        with Path(os.devnull).open("wb") as nothing:
+            os.dup2(nothing.fileno(), _STDERR)
+        yield
+    finally:
+        os.dup2(saved, _STDERR)
+        os.close(saved)
 
 
 def _identify(head: bytes, name: str, formats: Sequence[ImageFormat]) -> ImageFormat:

@@ -76,10 +76,10 @@ def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) ->
         line = f"{counted(len(files), 'image')} of {stored_as}: 0 to {white:g} is read as black to white"
         line += f"; the first, {files[0].name}, has {low:g} to {high:g}"
         notes.append(line + (": scale them if that is too dark" if high < _SMALL_RANGE * white else ""))
-    several = [head for head in heads.values() if head.frame_count > 1]
+    several = [head for head in heads.values() if head.has_others]
     if several:
         what = f"{counted(len(several), 'file')} with several images: the first of each is read"
-        notes.append(f"{what} ({several[0].path.name} has {several[0].frame_count})")
+        notes.append(f"{what} (such as {several[0].path.name})")
     sizes = {shot.path: shown_size(shot.path, heads[shot.path].size, shot.lens) for shot in shots}
     misfits = [shot for shot in shots if _aspect_mismatch(sizes[shot.path], (shot.lens.width, shot.lens.height)) > 0.0]
     if misfits:

@@ -49,7 +49,8 @@ class ImageHeader:
         stored_as: pixel format if its meaning is ambiguous: `16-bit grey`, `16-bit colours`, `floats`; else "".
         has_alpha: True if there is transparency.
         orientation: EXIF orientation, 1 to 8; 1 is upright. Always 1 for a TIFF, which pillow turns.
-        frame_count: number of images in the file; the first is read.
+        has_others: True if the file has several images, of which the first is read; False for a JPEG, to which phones
+            append images of depth or brightness.
     """
 
     path: Path
@@ -57,7 +58,7 @@ class ImageHeader:
     stored_as: str
     has_alpha: bool
     orientation: int
-    frame_count: int
+    has_others: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +86,7 @@ def read_image_header(path: Path) -> ImageHeader:
         orientation = 1
         if image.format != "TIFF":
             orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
-        frame_count = int(getattr(image, "n_frames", 1))  # 1 for a JPEG, of which phones append others for depth
-        return ImageHeader(path, image.size, stored_as, has_alpha, orientation, frame_count)
+        return ImageHeader(path, image.size, stored_as, has_alpha, orientation, _has_others(image))
 
 
 def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
@@ -178,6 +178,16 @@ def value_range(path: Path) -> tuple[float, float, float]:
         white = 1.0 if image.mode == _FLOAT else 255.0 if image.mode in _CONVERTED else 65535.0
         stored = np.asarray(image)
         return float(stored.min()), float(stored.max()), white
+
+
+def _has_others(image: ImageFile.ImageFile) -> bool:
+    if image.format != "TIFF":
+        return int(getattr(image, "n_frames", 1)) > 1
+    try:
+        image.seek(1)  # to count the images of a TIFF takes a time that is quadratic in their number
+    except EOFError:
+        return False
+    return True
 
 
 def _has_alpha(image: Image.Image) -> bool:
