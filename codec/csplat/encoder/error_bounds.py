@@ -48,7 +48,7 @@ class ErrorSums:
             if not (math.isfinite(largest) and math.isfinite(rms)):
                 raise InputError(f"the error of {name} is too large to declare: the step is too coarse for the values")
             floor = _ROUNDING if name == "covariance" else 0.0  # a ratio: its rounding does not shrink with its value
-            result[name] = (largest * (1.0 + _ROUNDING) + floor, rms * (1.0 + _ROUNDING) + floor)
+            result[name] = (with_margin(largest) + floor, with_margin(rms) + floor)
         return result
 
     @staticmethod
@@ -61,6 +61,11 @@ class ErrorSums:
                 largest[name] = max(largest.get(name, 0.0), part.largest[name])
                 squares[name] = squares.get(name, 0.0) + part.squares[name]
         return ErrorSums(count, largest, squares)
+
+
+def with_margin(error: float) -> float:
+    """Return an error with a margin for verifiers that round in another order."""
+    return error * (1.0 + _ROUNDING)
 
 
 def take_precise_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
