@@ -26,8 +26,8 @@ def box_of(data, place):
     """Return the box around a tile of a file."""
     header = read_header(data)
     tile, step = header.tiles[place], header.attributes[3].step
-    low = [corner * step * 2.0**tile.exponent for corner in tile.corner]
-    return (*low, *(a + b * step * 2.0**tile.exponent for a, b in zip(low, tile.extent, strict=True)))
+    corners = np.array([tile.corner, np.add(tile.corner, tile.extent)])
+    return tuple(np.float32(corners * (step * 2.0**tile.exponent)).ravel().tolist())
 
 
 class FileSystem:

@@ -102,7 +102,7 @@ export interface TileRecord {
   step: number;
   corner: number[];
   extent: number[];
-  /** Bounding box of the centres. */
+  /** Bounding box of the centres, numbers of binary32 as these are. */
   min: number[];
   max: number[];
   /** Natural logarithm of the largest standard deviation. */
@@ -169,9 +169,9 @@ export interface CutOptions {
   /** Maximum number of splats of the version. Nodes with the largest errors are replaced first by their children. */
   maxSplats?: number;
   /**
-   * Select a part of the version: x, y, z of the smallest corner of a box and of the largest, relative to the header's
-   * origin. Of level 0, these are the tiles whose box touches it. Of a coarser node, they are all of its tiles if its
-   * region, from `min` to `max`, does.
+   * Select a part of the version: two corners of a box, x, y, z each, in any order, possibly infinite, relative to the
+   * header's origin. Of level 0, these are the tiles whose box touches it, or shares a point with it. Of a coarser node,
+   * they are all of its tiles if its region, from `min` to `max`, does.
    */
   box?: ArrayLike<number>;
 }

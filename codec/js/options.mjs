@@ -117,10 +117,11 @@ function checkAmount(name, value) {
 function checkedBox(box) {
   if (box === undefined) return undefined;
   const corners = Array.from(box ?? []);
-  const isBox = corners.length === 6 && corners.every((value) => typeof value === 'number');
-  if (!isBox || !corners.slice(0, 3).every((low, axis) => low <= corners[axis + 3]))
-    throw new InputError(`box is ${corners}, expected x, y, z of its smallest and of its largest corner`);
-  return corners;
+  if (corners.length !== 6 || !corners.every((value) => typeof value === 'number' && !Number.isNaN(value)))
+    throw new InputError(`box is ${corners}, expected six numbers other than NaN: two corners, x, y, z each`);
+  const [one, other] = [corners.slice(0, 3), corners.slice(3)];
+  const ends = (/** @type {'min' | 'max'} */ end) => one.map((value, axis) => Math[end](value, other[axis]));
+  return [...ends('min'), ...ends('max')];
 }
 
 /**

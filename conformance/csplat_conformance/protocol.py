@@ -8,9 +8,9 @@ Or it exits with status 1, its last line on standard output is JSON, `{"code": "
 
     my-cuts INPUT CUTS
 
-CUTS is a text file with a cut per line, `level 1`, `pixel_size 0.5` or `splats 100`. The program exits with status 0
-and prints a line for each: the numbers of its tiles, or an error code. If it refuses the file, it exits with status 1
-and a line of JSON as above.
+CUTS is a text file with a cut per line, `level 1`, `pixel_size 0.5` or `splats 100`, perhaps in a box, `level 0 box 0
+0 0 1 1 1`. The program exits with status 0 and prints a line for each: the numbers of its tiles, or an error code. If
+it refuses the file, it exits with status 1 and a line of JSON as above.
 
 `run_program` runs any program with a time limit:
 

@@ -49,15 +49,9 @@ class ErrorSums:
         result = {}
         for name, (largest, rms) in self.bounds().items():
             floor = _ROUNDING if name == "covariance" else 0.0  # a ratio: its rounding does not shrink with its value
-            try:
-                result[name] = (
-                    _rounded_up(largest * (1.0 + _ROUNDING) + floor),
-                    _rounded_up(rms * (1.0 + _ROUNDING) + floor),
-                )
-            except (OverflowError, ValueError):  # infinite or not a number, here or after rounding
-                raise InputError(
-                    f"the error of {name} is too large to declare: the step is too coarse for the values"
-                ) from None
+            result[name] = (with_margin(largest + floor), with_margin(rms + floor))
+            if not (math.isfinite(result[name][0]) and math.isfinite(result[name][1])):
+                raise InputError(f"the error of {name} is too large to declare: the step is too coarse for the values")
         return result
 
     @staticmethod
@@ -72,9 +66,16 @@ class ErrorSums:
         return ErrorSums(count, largest, squares)
 
 
-def _rounded_up(value: float) -> float:
-    fraction, exponent = math.frexp(value)
-    return math.ldexp(math.ceil(math.ldexp(fraction, _DECLARED_BITS)), exponent - _DECLARED_BITS)
+def with_margin(error: float) -> float:
+    """Return an error with a margin for verifiers that round in another order, rounded up to `_DECLARED_BITS`.
+
+    Infinity and NaN, and errors that leave float64 by it, become infinity.
+    """
+    fraction, exponent = math.frexp(error * (1.0 + _ROUNDING))
+    try:
+        return math.ldexp(math.ceil(math.ldexp(fraction, _DECLARED_BITS)), exponent - _DECLARED_BITS)
+    except (OverflowError, ValueError):
+        return math.inf
 
 
 def take_precise_means(model: SplatModel, rows: NDArray[Any]) -> Floats:
