@@ -996,7 +996,7 @@ def test_a_full_folder_of_temporary_files_is_named(tmp_path, ply, csplat_file, m
         result = invoke("encode", "-", "-", input=ply.read_bytes())
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert "No usable temporary directory" in result.stderr
+    assert result.stderr.startswith("error: No usable temporary directory")
     assert "set TMPDIR to a folder that can be written (E_INPUT)" in result.stderr
 
 
