@@ -114,7 +114,7 @@ def run(folder: Path, words: list[str]) -> tuple[int, str]:
         **os.environ, "ROOT": str(ROOT), "PREFIX": sys.prefix, "BASE": sys.base_prefix, "WORK": str(folder),
         "NOBODY": NOBODY,
     }  # fmt: skip
-    program = ["timeout", "-s", "INT", "5" if words[0] == "view" else str(SECONDS), "csplat", *words]
+    program = ["timeout", "-s", "INT", "20" if words[0] == "view" else str(SECONDS), "csplat", *words]
     if "fifo" in words:
         program = ["sh", "-c", '(cat scene.ply > fifo &) ; exec "$@"', "sh", *program]
     with (folder / "scene.ply").open("rb") as scene, tempfile.TemporaryFile() as errors:

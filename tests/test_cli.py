@@ -991,9 +991,12 @@ def test_a_full_folder_of_temporary_files_is_named(tmp_path, ply, csplat_file, m
     assert "TMPDIR names another folder (EFBIG)" in results[0].stderr
     assert not (tmp_path / "new.csplat").exists()
     monkeypatch.setattr(tempfile, "tempdir", None)
-    monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "absent")])
-    result = invoke("encode", "-", "-", input=ply.read_bytes())
-    assert "No usable temporary directory" in result.stderr
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))  # no folder passes the test of the module
+    try:
+        result = invoke("encode", "-", "-", input=ply.read_bytes())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert result.stderr.startswith("error: No usable temporary directory")
     assert "set TMPDIR to a folder that can be written (E_INPUT)" in result.stderr
 
 

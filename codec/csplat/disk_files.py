@@ -189,7 +189,9 @@ def temporary_root() -> str:
     try:
         return tempfile.gettempdir()
     except FileNotFoundError as error:
-        raise InputError(f"{error.strerror}: set TMPDIR to a folder that can be written") from None
+        refused = InputError(f"{error.strerror}: set TMPDIR to a folder that can be written")
+        refused.path = "TMPDIR"  # not the file that was to be copied
+        raise refused from None
 
 
 @contextmanager

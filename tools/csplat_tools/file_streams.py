@@ -92,7 +92,7 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
     _free.discard(resolved)
     if not target.exists():
         target.parent.stat()  # raises an OSError that names the folder
-        if not resolved.parent.exists():  # of a link to a file that is to be made
+        if not resolved.parent.exists():  # a link to a file in a folder that is absent
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
         if not force:
             _free.add(resolved)
