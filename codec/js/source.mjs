@@ -4,7 +4,7 @@ import { readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { toBytes } from './options.mjs';
 import { HEADER_SIZE } from './spec.mjs';
-import { Transport, unlessAborted } from './transport.mjs';
+import { Transport, onAbort, unlessAborted } from './transport.mjs';
 import { BlobSource, MemorySource, WholeSource, cutShort, shortData } from './whole_sources.mjs';
 
 const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
@@ -201,7 +201,7 @@ export class HttpSource {
       const entry = { ...range, signal, bytes: this.fetch(range.start, range.end, signal) };
       const drop = () => (this.fetched = this.fetched.filter((one) => one !== entry)); // allows another try
       entry.bytes.catch(drop);
-      signal?.addEventListener('abort', drop, { once: true });
+      if (signal) onAbort(signal, drop);
       this.fetched.push(entry);
     }
   }

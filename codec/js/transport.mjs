@@ -8,6 +8,7 @@ const RETRY_MS = 500; // until the first retry; doubled each time
 const RETRY_MS_MAX = 30_000; // also of Retry-After: who waits longer has left
 const TIMEOUT_MS = 8_000; // without a byte; phones that change networks stall, slow servers need seconds to begin
 const TIMER_MS_MAX = 2 ** 31 - 1; // of setTimeout
+const PROBE_FAILURES = 2; // in a row without an answer, until a request is made without Range
 const PROGRESS_BYTES = 1024; // bytes between two failures after which they are not in a row
 
 /**
@@ -90,6 +91,28 @@ export function pause(ms, signal, wakes) {
   });
 }
 
+/** What to do when a signal aborts. @type {WeakMap<AbortSignal, Set<() => void>>} */
+const aborted = new WeakMap();
+
+/**
+ * Call a function when a signal aborts. One listener serves all: Node warns of a leak if there are more than ten.
+ *
+ * @param {AbortSignal} signal
+ * @param {() => void} work
+ * @returns {() => void} takes it back
+ */
+export function onAbort(signal, work) {
+  let all = aborted.get(signal);
+  if (all === undefined) {
+    all = new Set();
+    aborted.set(signal, all);
+    const each = all;
+    signal.addEventListener('abort', () => each.forEach((one) => one()), { once: true });
+  }
+  all.add(work);
+  return () => all.delete(work);
+}
+
 /**
  * Reject as soon as a signal aborts, with its reason, whatever the work does.
  *
@@ -103,8 +126,8 @@ export function abortable(work, signal) {
   return new Promise((resolve, reject) => {
     const abort = () => reject(signal.reason);
     if (signal.aborted) abort();
-    signal.addEventListener('abort', abort, { once: true });
-    work.then(resolve, reject).finally(() => signal.removeEventListener('abort', abort));
+    const forget = onAbort(signal, abort);
+    work.then(resolve, reject).finally(forget);
   });
 }
 
@@ -118,7 +141,8 @@ class Attempt {
   constructor(signals, timeoutMs = Infinity, stalled = () => {}) {
     this.controller = new AbortController();
     this.signal = this.controller.signal;
-    this.over = new AbortController();
+    /** @type {(() => void)[]} */
+    this.links = [];
     this.timeoutMs = timeoutMs;
     this.stalled = stalled;
     /** @type {ReturnType<typeof setTimeout> | undefined} */
@@ -128,12 +152,12 @@ class Attempt {
 
   /** @param {(AbortSignal | null | undefined)[]} signals in place of earlier ones */
   link(signals) {
-    this.over.abort();
-    this.over = new AbortController();
-    for (const signal of signals) {
-      if (signal?.aborted) this.controller.abort(signal.reason);
-      signal?.addEventListener('abort', () => this.controller.abort(signal.reason), { signal: this.over.signal });
-    }
+    for (const unlink of this.links) unlink();
+    this.links = signals.flatMap((signal) => {
+      if (!signal) return [];
+      if (signal.aborted) this.controller.abort(signal.reason);
+      return [onAbort(signal, () => this.controller.abort(signal.reason))];
+    });
   }
 
   /**
@@ -161,7 +185,7 @@ class Attempt {
 
   end() {
     clearTimeout(this.timer);
-    this.over.abort();
+    this.link([]);
   }
 }
 
@@ -379,7 +403,7 @@ class Tries {
   async ask(asked, extra = {}) {
     const { transport } = this;
     // Chromium fails without an answer if one to a request with Range is coded. Without Range it decodes.
-    const isProbe = asked !== null && this.unanswered > (transport.hasParts ? 1 : 0);
+    const isProbe = asked !== null && this.unanswered >= PROBE_FAILURES + Number(transport.hasParts);
     const { response, address, attempt } = await this.#send(isProbe ? null : asked, extra);
     const body = new Body(response, attempt, transport.lifetime);
     try {
@@ -388,7 +412,7 @@ class Tries {
       if (isProbe && !isCoded(response.headers) && !this.hasProbed) {
         // The coding may be hidden across origins, or the connection was lost. If Range fails once more, it is the coding.
         this.hasProbed = true;
-        this.unanswered = transport.hasParts ? 1 : 0;
+        this.unanswered--;
         body.drop();
         return this.ask(asked, extra);
       }
@@ -426,7 +450,7 @@ class Tries {
       return { response, address, attempt };
     } catch (error) {
       attempt.end();
-      if (asked && !hasStalled) this.unanswered++;
+      if (asked && !hasStalled && !codeOf(error)) this.unanswered++;
       throw error;
     }
   }
@@ -465,12 +489,21 @@ export function asInputError(error, url) {
     return new InputError(prefix + detailOf(error), { ...{ cause: error, reason, status, isTransient, retryAfterMs } });
   }
   if (error instanceof CsplatError || (error instanceof Error && error.name === 'AbortError')) return error;
-  // Node names what its own checks refuse, such as an endless redirect, without the code that errors of sockets have.
   const cause = error instanceof Error ? error.cause : undefined;
-  const isTransient = !(cause instanceof Error) || ('code' in cause && cause.code !== 'ERR_INVALID_URL');
-  const why = cause instanceof Error ? ` (${cause.message || /** @type {any} */ (cause).code})` : '';
+  const code = codeOf(error);
+  // Node names what its own checks refuse, such as an endless redirect, without the code that errors of sockets have.
+  const isTransient = !(cause instanceof Error) || (code !== '' && code !== 'ERR_INVALID_URL');
+  const why = cause instanceof Error ? ` (${cause.message || code})` : '';
   return new InputError(`${prefix}${error}${why}`, { cause: error, reason: 'connection', isTransient });
 }
+
+/**
+ * Return the code that Node gives to errors of sockets; '' in browsers.
+ *
+ * @param {any} error
+ * @returns {string}
+ */
+const codeOf = (error) => error?.cause?.code ?? '';
 
 /** The message of an error without its code. @param {Error} error */
 const detailOf = ({ message }) => message.replace(/^E_[A-Z0-9]+: /, '');

@@ -106,7 +106,7 @@ export class WholeSource {
       const before = this.filled;
       try {
         if (sent === null) {
-          asked = transport.isPlain || before === 0 ? null : { start: before, end: Infinity };
+          asked = transport.isPlain ? null : { start: before, end: Infinity };
           sent = await tries.ask(asked);
         }
         const { take } = sent;
