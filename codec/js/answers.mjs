@@ -45,6 +45,8 @@ export function judge({ status, type, headers }, asked, { url, size }) {
     fail('the browser hides the answer of the server, because of the mode or redirect of `request`');
   }
   if (status === 200) return { take: 'whole', total: null };
+  // The range and size of a coded body count other bytes than those of the file.
+  if (status === 206 && asked !== null && isCoded(headers)) return { take: 'plain', total: null };
   const range = headers.get('content-range');
   const place = rangeOf(range);
   if ((status === 206 || status === 416) && place && size !== null && place.total !== null && place.total !== size) {
@@ -53,7 +55,6 @@ export function judge({ status, type, headers }, asked, { url, size }) {
   if (status === 206) {
     const media = headers.get('content-type') ?? '';
     if (/^multipart\/byteranges/i.test(media)) fail('the server answers one range with multipart/byteranges');
-    if (isCoded(headers) && asked !== null) return { take: 'plain', total: null };
     if (range !== null && place?.end === undefined) fail(`the server sent the invalid Content-Range “${range}”`);
     if (asked === null) {
       if (!place || place.start !== 0) fail('the server answers a request without Range with status 206');

@@ -7,6 +7,7 @@ const RETRIES = 4; // in a row; with the waits below, 7.5 s until the error
 const RETRY_MS = 500; // until the first retry; doubled each time
 const RETRY_MS_MAX = 30_000; // also of Retry-After: who waits longer has left
 const TIMEOUT_MS = 8_000; // without a byte; phones that change networks stall, slow servers need seconds to begin
+const GRACE_MS = 100; // from the end of that time until the request is given up
 const TIMER_MS_MAX = 2 ** 31 - 1; // of setTimeout
 const PROBE_FAILURES = 2; // in a row without an answer, until a request is made without Range
 const PROGRESS_BYTES = 1024; // bytes between two failures after which they are not in a row
@@ -167,7 +168,11 @@ class Attempt {
    * @param {Promise<T>} work
    */
   async during(work) {
-    if (this.timeoutMs <= TIMER_MS_MAX) this.timer = setTimeout(() => this.#stall(), this.timeoutMs);
+    const late = () => {
+      // If this thread was busy, what has arrived is still to be delivered.
+      this.timer = setTimeout(() => this.#stall(), Math.min(this.timeoutMs, GRACE_MS));
+    };
+    if (this.timeoutMs <= TIMER_MS_MAX) this.timer = setTimeout(late, this.timeoutMs);
     try {
       return await abortable(work, this.signal);
     } finally {
