@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import codecs
+import io
 import json
 import math
 import os
+import re
 import shutil
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from mmap import mmap
@@ -24,6 +27,11 @@ from csplat.file_source import File, describe_substitute
 
 _PART_SIZE = 1 << 20  # bytes copied at a time
 _MB = 1e6  # bytes
+#: Exceptions that NumPy raises for damaged headers of arrays.
+_NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
+_INTEGER_DIGITS = 300  # longer integers exceed float64; beyond 4,300 digits Python refuses them
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # an escape in JSON
+_HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class BinaryWriter(Protocol):
@@ -77,15 +85,46 @@ def read_text(path: str | os.PathLike[str]) -> str:
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:
-    """Read a JSON file, in the encodings of `read_text`.
+    """Read a JSON file, in the encodings of `read_text`; otherwise as `parse_json`.
 
     Raises:
         InputError: the file cannot be read or is not JSON.
     """
+    text = read_text(path)
     try:
-        return json.loads(read_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}") from error
+        return parse_json(text)
+    except InputError as error:
+        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}") from None
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse a JSON text of another program; NaN and infinities are accepted.
+
+    Args:
+        text: the text, or its bytes in UTF-8, UTF-16 or UTF-32.
+
+    Returns:
+        The value; integers of more than 300 digits are floats: infinite.
+
+    Raises:
+        InputError: it is not JSON, nested too deep, or has a string that is no text (half of a surrogate pair).
+    """
+    try:
+        text = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
+        value = json.loads(text, parse_int=_parse_integer)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise InputError("a string has half of a surrogate pair, expected Unicode text") from None
+    except RecursionError:
+        raise InputError("its brackets are nested too deep") from None
+    except ValueError as error:
+        raise InputError(" ".join(str(error).split())[:120]) from None
+    return value
+
+
+def _parse_integer(digits: str) -> int | float:
+    return int(digits) if len(digits) <= _INTEGER_DIGITS else float(digits)
 
 
 def finite_or_none(value: float | None) -> float | None:
@@ -289,15 +328,50 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
     """
     if Path(path).exists() and not Path(path).is_file():
         raise InputError(f"{path} is not a file")
+    size = Path(path).stat().st_size
+    with Path(path).open("rb") as stream:
+        if instead := describe_substitute(stream.read(64)):
+            raise InputError(f"{path} is {instead}")
+        stream.seek(0)
+        try:
+            if most_bytes is not None and size > most_bytes:
+                return np.lib.format.open_memmap(path, mode="r")
+            return parse_array(stream, size)
+        except (InputError, *_NOT_AN_ARRAY) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
+
+
+def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
+    """Read an array in NumPy's format; its size is compared with that of the file before memory is allocated.
+
+    Args:
+        stream: the file from its beginning.
+        size: its size in bytes.
+
+    Raises:
+        InputError: it is not an array, contains Python objects, or has more or fewer bytes than its shape requires.
+    """
     try:
-        if most_bytes is not None and Path(path).stat().st_size > most_bytes:
-            return np.lib.format.open_memmap(path, mode="r")
-        with Path(path).open("rb") as stream:
-            if instead := describe_substitute(stream.read(64)):
-                raise InputError(f"{path} is {instead}")
-            stream.seek(0)
-            array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
-    except (ValueError, EOFError, SyntaxError, TokenError, TypeError, MemoryError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
-    return array
+        with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
+            version = np.lib.format.read_magic(stream)
+            if version not in _HEADER_READERS:
+                raise InputError(f"it is an array file of version {version[0]}.{version[1]}, expected 1.0 or 2.0")
+            shape, is_transposed, dtype = _HEADER_READERS[version](stream)
+    except _NOT_AN_ARRAY as error:
+        raise InputError(" ".join(str(error).split())) from None
+    if dtype.hasobject or dtype.itemsize == 0:
+        raise InputError(f"its values are of type {dtype}, expected numbers or text: pickled objects are not read")
+    count = math.prod(shape)
+    rest = size - stream.tell()
+    if min(shape, default=0) < 0 or count * dtype.itemsize != rest:
+        text = f"its shape is {', '.join(str(side)[:20] for side in shape[:4])}" if shape else "it is a single value"
+        raise InputError(f"{text} of type {dtype}, which does not fit its {rest:,} bytes of values")
+    data = np.empty(rest, np.uint8)
+    for start in range(0, rest, _PART_SIZE):
+        part = memoryview(data)[start : start + _PART_SIZE]
+        if stream.readinto(part) != len(part):
+            raise InputError("it is truncated")
+    stream.read(1)  # at the end, zipfile compares the checksum
+    array = data.view(dtype)
+    return array.reshape(shape[::-1]).T if is_transposed else array.reshape(shape)
