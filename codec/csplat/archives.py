@@ -12,7 +12,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, cast
 
-import numpy as np
 from numpy.typing import NDArray
 
 from csplat.disk_files import parse_array, parse_json

@@ -1,8 +1,6 @@
-"""Rewrite headers and text rows that plyfile does not accept although their meaning is clear.
+"""Read the headers of PLY files.
 
-Headers may have byte order marks, blank lines, keywords in capitals and spaces after `end_header`. Text rows may share
-a line or span several lines, and may have decimal commas and NaN or infinity as other languages write them. Ambiguous
-text is an error that names the number or row.
+Headers may have byte order marks, blank lines, keywords in capitals and spaces after `end_header`.
 """
 
 from __future__ import annotations
@@ -10,8 +8,10 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from csplat.detect import KINDS, detect_content, is_ply, read_head, refusal
 from csplat.errors import InputError, counted
@@ -21,11 +21,35 @@ from csplat.lint import Finding
 SPLAT_ELEMENT = "vertex"
 
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", re.IGNORECASE)
-_MAX_SIZE = 1 << 20
+_MAX_SIZE = 1 << 20  # bytes of a header; programs write up to a few kilobytes
+_MAX_DECLARED = 4096  # elements and properties; SH of degree 4 takes 87, and each takes memory in every block of rows
 _MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _LINE_END = re.compile(rb"\r\n|\r|\n")
 _FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text
+_SHOWN = 80  # maximum number of characters of a line in a message
+_DIGITS = 18  # of a count; longer ones exceed every file
+_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
+_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float32": "f4", "float64": "f8", **{kind: kind for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")},
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class PlyProperty:
+    """A property as a header declares it.
+
+    Attributes:
+        name: name of the property.
+        kind: type of the values, `f4`.
+        length_kind: type of the length of a list; `None`: a single value.
+    """
+
+    name: str
+    kind: str
+    length_kind: str | None = None
 
 
 @dataclass
@@ -34,37 +58,46 @@ class PlyElement:
 
     Attributes:
         name: name of the element.
-        count: number of rows; 0 if the header specifies no number.
-        properties: names of the properties.
-        has_lists: True if a property is a list.
+        count: number of rows.
+        properties: its properties.
     """
 
     name: str
     count: int
-    properties: list[str] = field(default_factory=list)
-    has_lists: bool = False
+    properties: list[PlyProperty] = field(default_factory=list)
+
+    @property
+    def has_lists(self) -> bool:
+        """True if a property is a list."""
+        return any(one.length_kind is not None for one in self.properties)
+
+    def dtype(self, order: str) -> np.dtype[Any]:
+        """Return the type of a row without its lists, in this byte order."""
+        return np.dtype([(one.name, order + one.kind) for one in self.properties if one.length_kind is None])
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A header that plyfile can parse.
+    """A parsed header.
 
     Attributes:
-        start: offset of the header in the file.
-        text: the header up to and including the line `end_header`, with the same length as in the file; ASCII.
-        is_text: True if the rows are numbers in ASCII.
+        end: offset of the rows in the file.
+        order: byte order of the rows as NumPy writes it; `=` if the rows are numbers in ASCII.
         elements: the declared elements.
+        comments: comments, then other information about the file, then comments on elements.
+        line_end: the characters that end its last line.
     """
 
-    start: int
-    text: bytes
-    is_text: bool
+    end: int
+    order: str
     elements: list[PlyElement]
+    comments: list[str]
+    line_end: bytes
 
     @property
-    def end(self) -> int:
-        """Offset of the rows in the file."""
-        return self.start + len(self.text)
+    def is_text(self) -> bool:
+        """True if the rows are numbers in ASCII."""
+        return self.order == _ORDERS["ascii"]
 
 
 def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> PlyHeader:
@@ -76,7 +109,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         kind: name of the expected kind of PLY, a key of `csplat.detect.KINDS`.
 
     Raises:
-        InputError: the file is not a PLY of this kind, or its header has no end.
+        InputError: the file is not a PLY of this kind, or its header has no end, is invalid or beyond the limits.
         OSError: the file cannot be read.
     """
     head = read_head(path)
@@ -90,11 +123,12 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         data = stream.read(_MAX_SIZE)
     end = _END_OF_HEADER.search(data)
     if end is None:
-        raise InputError(f"{path.name}: the PLY header has no line end_header")
+        where = f" in its first {_MAX_SIZE:,} bytes" if len(data) == _MAX_SIZE else ""
+        raise InputError(f"{path.name}: the PLY header has no line end_header{where}")
     raw = data[: end.end()]
     if raw[3:5] not in (b"\r\n", b"\r") and raw[3:4] == b"\r" and raw.endswith(b"\r\n"):
         raw = raw[:-1]  # the lines end with CR, so the LF is the first byte of a row
-    text, oddities = _rewrite_header(raw)
+    lines, oddities = _normalise_lines(raw)
     if start:
         oddities.insert(0, "a byte order mark")
     if oddities:
@@ -103,39 +137,29 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         count = sum(byte > 127 for byte in raw)
         note = f"{counted(count, 'byte')} of the header are not ASCII: read as question marks"
         findings.append(Finding("non-ascii-header", count, note, "note"))
-    text = bytes(byte if byte < 128 else ord("?") for byte in text)
-    lines = [line.split() for line in text.splitlines()]
-    findings += _count_findings(lines, path.stat().st_size)
-    return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _parse_elements(lines))
+    texts = [line.decode("ascii", "replace").replace("\ufffd", "?") for line in lines]
+    try:
+        order, elements, comments = _parse_lines(texts, findings, path.stat().st_size)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error}") from None
+    return PlyHeader(start + len(raw), order, elements, comments, _LINE_END.findall(raw[-2:])[-1])
 
 
-def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
-    """Rewrite a header for plyfile with the same length, and list its oddities."""
-    first_end = _LINE_END.search(raw)
-    assert first_end is not None, "the line end_header has an end"
-    end = first_end[0]
-    lines = raw.split(end)[:-1]
-    normalised = [_normalise_line(line) for line in lines]
-    if lines[-1] == b"end_header" and all(lines) and lines == normalised and (end == b"\n" or not _has_line_end(lines)):
-        return raw, []
+def _normalise_lines(raw: bytes) -> tuple[list[bytes], list[str]]:
+    """Split a header into lines without blank ones, with keywords in lower case, and list its oddities."""
     lines = _LINE_END.split(raw)[:-1]
     normalised = [_normalise_line(line) for line in lines]
-    changed = [old for old, new in zip(lines, normalised, strict=True) if old.split() != new.split()]
+    changed = [old for old, new in zip(lines, normalised, strict=True) if old is not new and old.split() != new.split()]
     words = dict.fromkeys(word for line in changed for word in line.split() if word != word.lower())
     blank = sum(not line.strip() for line in lines)
-    kinds = {one[0] for one in _LINE_END.finditer(raw)}
     oddities = [f"{blank} blank lines" if blank > 1 else "a blank line"] if blank else []
     oddities += [f"capitals in {' '.join(word.decode('ascii', 'replace') for word in [*words][:3])}"] if words else []
     oddities += ["spaces next to end_header"] if lines[-1].lower() != b"end_header" else []
-    oddities += ["line ends of two kinds"] if len(kinds) > 1 else []
-    kept = [line for line in normalised if line.strip()]
-    text = b"\n".join([*kept, b""])
-    kept[1] += b" " * (len(raw) - len(text))  # keeps the offset of the rows
-    return b"\n".join([*kept, b""]), oddities
-
-
-def _has_line_end(lines: list[bytes]) -> bool:
-    return any(_LINE_END.search(line) for line in lines)
+    first = _LINE_END.search(raw)
+    assert first is not None, "the line end_header has an end"
+    if sum(map(raw.count, (b"\r", b"\n"))) != len(lines) * len(first[0]) or raw.count(first[0]) != len(lines):
+        oddities.append("line ends of two kinds")
+    return [line for line in normalised if line.strip()], oddities
 
 
 def _normalise_line(line: bytes) -> bytes:
@@ -156,146 +180,74 @@ def _normalise_line(line: bytes) -> bytes:
     return line if words == normalised and keyword not in (b"ply", b"end_header") else b" ".join(normalised)
 
 
-def _parse_elements(lines: list[list[bytes]]) -> list[PlyElement]:
-    found: list[PlyElement] = []
-    for words in lines:
-        if words[:1] == [b"element"] and len(words) == 3:
-            found.append(PlyElement(words[1].decode(), int(words[2]) if words[2].isdigit() else 0))
-        elif words[:1] == [b"property"] and len(words) > 2 and found:
-            found[-1].properties.append(words[-1].decode())
-            found[-1].has_lists |= words[1] == b"list"
-    return found
-
-
-def _count_findings(lines: list[list[bytes]], size: int) -> list[Finding]:
-    findings = []
-    for words in lines:
-        if words[:1] != [b"element"] or len(words) != 3:
-            continue
-        if words[2].startswith(b"-"):
-            text = f"{words[2].decode('ascii', 'replace')} rows are declared"
-            findings.append(Finding("malformed", 1, text, "error"))
-        elif words[2].isdigit():
-            count = int(words[2])
-            if count > size:  # a row has at least one byte; refuse before anything is allocated
-                text = f"{count} rows are declared, the file has {size} bytes"
-                findings.append(Finding("truncated", count, text, "error"))
-    return findings
-
-
-TextRows = list[list[str]]
-
-_TEXT_LINE_END = re.compile(r"\r\n|\r|\n")
-_NAN = re.compile(r"(?<!\S)[+-]?(?:nan\([a-z]*\)|1\.#(?:ind|[qs]nan)0*)(?!\S)", re.IGNORECASE)
-_INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf0*(?!\S)", re.IGNORECASE)
-_EXPONENT = re.compile(r"(?<!\S)([+-]?(?:\d+\.?\d*|\.\d+))d([+-]?\d+)(?!\S)", re.IGNORECASE)
-#: Numbers as other languages write them: description for messages, pattern, Python's spelling.
-_SPELLINGS = {
-    "NaN as Microsoft's C writes it": (_NAN, "nan"),
-    "infinity as Microsoft's C writes it": (_INFINITY, r"\1inf"),
-    "an exponent as Fortran writes it": (_EXPONENT, r"\1e\2"),
-}
-_DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
-_NO_THOUSANDS = re.compile(r"\d,(?!\d{3}(?!\d))\d")  # not followed by three digits exactly
-
-
-class _RowError(ValueError):
-    """Text that does not form the declared rows, with a finding about the reason."""
-
-    def __init__(self, finding: Finding) -> None:
-        super().__init__(finding.text)
-        self.finding = finding
-
-
-def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[TextRows | None, list[Finding]]:
-    """Split text of any layout into the rows of all elements.
+def _parse_lines(lines: Sequence[str], findings: list[Finding], size: int) -> tuple[str, list[PlyElement], list[str]]:
+    """Return the byte order, the elements and the comments.
 
     Args:
-        body: the file after its header.
-        elements: the declared elements.
+        lines: normalised lines without blank ones.
+        findings: findings about the counts are appended to this list.
+        size: size of the file in bytes.
 
-    Returns:
-        The words of each row, and findings. The rows are `None` if rows are missing or a row has another number of
-        values than declared.
+    Raises:
+        InputError: a line is invalid, or too many elements and properties are declared.
     """
-    text = body.decode("ascii", "replace")
-    oddities = []
-    for name, (pattern, spelling) in _SPELLINGS.items():
-        text, count = pattern.subn(spelling, text)
-        oddities += [f"{name} ({counted(count, 'number')})"] if count else []
-    first: _RowError | None = None
-    for separated, separators in _separations(text):
-        lines = [line.split() for line in _TEXT_LINE_END.split(separated)]
-        try:
-            rows, layout, rest = _split_rows(lines, elements)
-        except _RowError as error:
-            first = first or error
+    order, elements, declared = "", [], 0
+    comments: list[str] = []
+    remarks: tuple[list[str], list[str]] = [], []  # other information, comments on elements
+    for line in lines[1:-1]:
+        keyword, *words = line.split(None, 1)
+        if keyword in ("comment", "obj_info"):
+            into = remarks[0] if keyword == "obj_info" else remarks[1] if elements else comments
+            into.append(line.strip()[len(keyword) + 1 :])
             continue
-        oddities += [separators] * bool(separators) + layout
-        note = f"the rows have {', '.join(oddities)}"
-        findings = [Finding("unusual-rows", len(oddities), note, "note")] if oddities else []
-        size = len(" ".join(rest))
-        if size:
-            findings.append(Finding("trailing-bytes", size, f"{size} bytes after the last row: ignored", "repair"))
-        return rows, findings
-    assert first is not None, "_separations returns at least one reading"
-    return None, [first.finding]
+        declared += keyword in ("element", "property")
+        if declared > _MAX_DECLARED:
+            raise InputError(f"the header declares more than {_MAX_DECLARED:,} elements and properties")
+        words = words[0].split() if words else []
+        if keyword == "format" and not order and not elements and len(words) == 2 and words[1] == "1.0":
+            order = _ORDERS.get(words[0], "")
+        elif keyword == "element" and order and len(words) == 2:
+            elements.append(PlyElement(words[0], _parse_count(words[1], findings, size)))
+            if any(one.name == words[0] for one in elements[:-1]):
+                raise InputError(f"the header declares two elements with the same name {words[0][:_SHOWN]}")
+            names: set[str] = set()
+        elif keyword == "property" and elements and (found := _parse_property(words)):
+            elements[-1].properties.append(found)
+            if found.name in names:
+                raise InputError(f"the header declares two properties with the same name {found.name[:_SHOWN]}")
+            names.add(found.name)
+        else:
+            raise InputError(f"the header line {line[:_SHOWN]!r} is not valid in a PLY")
+        if not order:
+            raise InputError(
+                f"the header line {line[:_SHOWN]!r} is not valid, expected format {' or '.join(_ORDERS)} 1.0"
+            )
+    if not order:
+        raise InputError("the header has no line format")
+    return order, elements, [*comments, *remarks[0], *remarks[1]]
 
 
-def _separations(text: str) -> list[tuple[str, str]]:
-    """Return the text with only spaces between numbers, for each possible meaning of its commas."""
-    if "," not in text and ";" not in text:
-        return [(text, "")]
-    found = []
-    if "." not in text and _NO_THOUSANDS.search(text):
-        found.append((_DECIMAL_COMMA.sub(".", text.replace(";", " ")), "decimal commas"))
-    return [*found, (re.sub("[,;]", " ", text), "commas or semicolons between numbers"), (text, "")]
+def _parse_property(words: Sequence[str]) -> PlyProperty | None:
+    """Return a property; `None` if its line is invalid."""
+    if len(words) == 2 and words[0] in _TYPES:
+        return PlyProperty(words[1], _TYPES[words[0]])
+    if len(words) != 4 or words[0] != "list" or not {words[1], words[2]} <= set(_TYPES):
+        return None
+    length = _TYPES[words[1]]
+    return None if length[0] == "f" else PlyProperty(words[3], _TYPES[words[2]], length)
 
 
-def _split_rows(lines: TextRows, elements: Sequence[PlyElement]) -> tuple[TextRows, list[str], list[str]]:
-    """Return the rows, the oddities of their lines, and the words after the last row.
-
-    Rows may share a line or continue on the next one, provided that every line end is a row end or every row end is a
-    line end. So a missing value never shifts the values after it.
-    """
-    blank = next((at for at in range(len(lines) - 1, -1, -1) if lines[at]), -1) + 1 - sum(map(bool, lines))
-    oddities = ["blank lines"] if blank else []
-    lines = [line for line in lines if line]
-    rows: TextRows = []
-    at = 0
-    for element in elements:
-        width = len(element.properties)
-        if not width:
-            raise _RowError(Finding("malformed", 1, f"the element {element.name} has no properties", "error"))
-        if element.has_lists or all(len(line) == width for line in lines[at : at + element.count]):
-            taken = lines[at : at + element.count]
-            if len(taken) < element.count:
-                raise _RowError(truncated_finding(element.name, element.count, len(taken)))
-            rows += taken
-            at += element.count
-            continue
-        ends = list(accumulate(map(len, lines[at:])))
-        count = next((number for number, end in enumerate(ends, 1) if end >= width * element.count), len(ends))
-        ends = ends[:count]
-        row_ends = set(range(width, width * element.count + 1, width))
-        if not ends or ends[-1] != width * element.count or not (row_ends <= set(ends) or set(ends) <= row_ends):
-            row, line = next((pair for pair in enumerate(lines[at:]) if len(pair[1]) != width), (0, []))
-            text = f"row {row} of {element.name} has {len(line)} values, expected {width}"
-            raise _RowError(Finding("malformed", 1, text, "error"))
-        words = [word for line in lines[at : at + count] for word in line]
-        rows += [words[first : first + width] for first in range(0, len(words), width)]
-        oddities.append(
-            f"{element.count} of {element.name} in {count} lines" if count > 1 else "all values in one line"
-        )
-        at += count
-    rest = [word for line in lines[at:] for word in line]
-    if rest and len(rows) != at:
-        text = f"found {counted(len(rest), 'value')} after rows that are not on separate lines"
-        raise _RowError(Finding("malformed", len(rest), text, "error"))
-    return rows, oddities, rest
-
-
-def truncated_finding(name: str, declared: int, present: int) -> Finding:
-    """Report missing rows of an element."""
-    text = f"{declared} rows of {name} are declared, {present} are present: copy or download it again"
-    return Finding("truncated", declared - present, text, "error")
+def _parse_count(word: str, findings: list[Finding], size: int) -> int:
+    """Return the number of rows of an element, after adding a finding if it is negative or exceeds the file."""
+    digits = word.removeprefix("-")
+    if not digits.isdecimal() or not digits.isascii():
+        raise InputError(f"the count {word[:_SHOWN]!r} is not a whole number")
+    shown = word if len(word) <= _DIGITS + 2 else f"{word[:_DIGITS]}... ({len(word):,} digits)"
+    if digits != word:
+        findings.append(Finding("malformed", 1, f"{shown} rows are declared", "error"))
+        return 0
+    count = int(word) if len(word) <= _DIGITS else 10**_DIGITS
+    if count > size:  # a row has at least one byte; refuse before anything is allocated
+        text = f"{shown} rows are declared, the file has {size} bytes: copy or download it again"
+        findings.append(Finding("truncated", count, text, "error"))
+    return count

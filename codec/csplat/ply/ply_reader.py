@@ -1,26 +1,20 @@
-"""Read PLY files of 3D Gaussian splats.
-
-This is the only module that imports plyfile, which is GPL-3.0-or-later, so programs that embed the decoder and never
-read a PLY do not load it.
-"""
+"""Read PLY files of 3D Gaussian splats."""
 
 from __future__ import annotations
 
-import io
 import math
-import warnings
+import textwrap
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import plyfile
 
 from csplat.disk_files import local_file
-from csplat.errors import InputError, counted
+from csplat.errors import InputError
 from csplat.file_source import File
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_sh_degree
@@ -35,7 +29,8 @@ from csplat.ply.columns import (
     with_half_floats,
 )
 from csplat.ply.comments import CommentMetadata, parse_comments, split_origin
-from csplat.ply.ply_header import SPLAT_ELEMENT, PlyHeader, parse_text_rows, read_ply_header, truncated_finding
+from csplat.ply.ply_header import SPLAT_ELEMENT, read_ply_header
+from csplat.ply.ply_rows import RowError, read_rows
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
@@ -45,8 +40,7 @@ _FRAME = "delta_vertex_"  # prefix of Brush's elements with the differences of l
 _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
 _COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time; they fit in the cache
-_EARLY_END = "early end-of-file"  # message of plyfile
-_SHOWN = 40  # maximum number of characters of a word in a message
+_SHOWN = 200  # maximum number of characters of names in a message
 
 
 def read_ply(
@@ -158,7 +152,7 @@ class PlyContent(NamedTuple):
 
 
 def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
-    """Parse a file with plyfile.
+    """Parse the header of a file, and read the rows of its splats.
 
     Args:
         path: path of the file.
@@ -174,33 +168,22 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     header = read_ply_header(path, findings)
     if any(not one.repairable for one in findings):
         return None
-    # NumPy warns about text numbers beyond their type, which become infinite and are dropped later, and about empty
-    # tables, which plyfile refuses.
-    quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
-    with _open_for_plyfile(path, header) as stream, np.errstate(over="ignore"), quiet:
-        try:
-            try:
-                parsed = plyfile.PlyData.read(stream)
-                end = None if parsed.text else stream.tell()
-                findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
-            except plyfile.PlyElementParseError as error:
-                parsed = _read_again(path, header, findings, error)
-        except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
-            raise InputError(f"{path.name}: {error or type(error).__name__}") from None
-    if parsed is None:
-        return None
-    if SPLAT_ELEMENT not in parsed:
+    names = [element.name for element in header.elements]
+    if SPLAT_ELEMENT not in names:
         raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
-    others = [element for element in parsed if element.name != SPLAT_ELEMENT]
-    findings += _other_findings(others)
-    rows, lists = _scalar_columns(parsed[SPLAT_ELEMENT].data)
+    try:
+        rows = read_rows(path, header, (SPLAT_ELEMENT, _COLOUR_SPACE), findings)
+    except RowError as error:
+        findings.append(error.finding)
+        return None
+    names.remove(SPLAT_ELEMENT)
+    findings += _other_findings(names, rows.get(_COLOUR_SPACE))
+    lists = [one.name for element in header.elements if element.name == SPLAT_ELEMENT
+             for one in element.properties if one.length_kind is not None]  # fmt: skip
     if lists:
         text = f"list properties {', '.join(lists)}: dropped"
         findings.append(Finding("list-columns", len(lists), text, "repair"))
-    comments = [*parsed.comments, *parsed.obj_info]
-    for element in parsed:
-        comments += element.comments
-    return PlyContent(rows, comments, [element.name for element in others])
+    return PlyContent(rows[SPLAT_ELEMENT], header.comments, names)
 
 
 @dataclass(frozen=True, eq=False)
@@ -343,119 +326,28 @@ def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) 
     )
 
 
-def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: Any) -> Any:
-    """Read a file that plyfile refused; return `None` and append a finding if that is not possible.
+def _other_findings(names: list[str], colour_space: Rows | None) -> list[Finding]:
+    """Report elements that contain no splats.
 
     Args:
-        path: path of the file.
-        header: its header.
-        findings: findings are appended to this list.
-        error: the error that plyfile raised.
+        names: their names.
+        colour_space: rows of the element with the colour space; `None` if there is none.
     """
-    if not header.is_text or error.message == _EARLY_END:
-        findings.append(truncated_finding(error.element.name, error.element.count, error.row or 0))
-        return None
-    with path.open("rb") as stream:
-        stream.seek(header.end)
-        rows, more = parse_text_rows(stream.read(), header.elements)
-    findings += more
-    if rows is None:
-        return None
-    text = "\n".join([*header.text.decode("ascii").splitlines(), *map(" ".join, rows), ""])
-    try:
-        return plyfile.PlyData.read(io.StringIO(text))
-    except plyfile.PlyElementParseError as second:
-        findings.append(_row_finding(second, rows, header))
-        return None
-
-
-def _row_finding(error: Any, rows: list[list[str]], header: PlyHeader) -> Finding:
-    """Report the invalid value of a text row."""
-    name, row, text = error.element.name, error.row or 0, error.message
-    at = [element.name for element in header.elements].index(name)
-    element, before = header.elements[at], sum(one.count for one in header.elements[:at])
-    if error.prop is not None and not element.has_lists:
-        word = rows[before + row][element.properties.index(error.prop.name)]
-        kind = np.dtype(error.prop.val_dtype)
-        expected = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
-        text = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {expected}"
-    return Finding("malformed", 1, f"row {row} of {name}: {text}", "error")
-
-
-def _other_findings(others: list[Any]) -> list[Finding]:
-    """Report elements that contain no splats."""
-    if not others:
+    if not names:
         return []
-    names = [element.name for element in others]
-    text = f"elements besides {SPLAT_ELEMENT}: {', '.join(names)}: dropped"
+    shown = textwrap.shorten(", ".join(names), _SHOWN)
+    text = f"elements besides {SPLAT_ELEMENT}: {shown}: dropped"
     if not set(names) <= _SHARP:
         if any(name.startswith(_FRAME) for name in names):
             text += "; they move the splats, of which the first frame is kept"
-        return [Finding("other-elements", len(others), text, "repair")]
-    findings = [Finding("sharp-elements", len(others), f"{text}; they are the camera of ml-sharp", "note")]
-    for element in others:
-        values = element.data[_COLOUR_SPACE] if element.name == _COLOUR_SPACE == element.properties[0].name else ()
-        linear = [value for value in values if value != _SRGB]
-        if linear:
+        return [Finding("other-elements", len(names), text, "repair")]
+    findings = [Finding("sharp-elements", len(names), f"{text}; they are the camera of ml-sharp", "note")]
+    if colour_space is not None and (colour_space.dtype.names or ())[:1] == (_COLOUR_SPACE,):
+        linear = colour_space[_COLOUR_SPACE][colour_space[_COLOUR_SPACE] != _SRGB]
+        if len(linear):
             text = f"{_COLOUR_SPACE} is {linear[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
             findings.append(Finding("colour-space", 1, text, "error"))
     return findings
-
-
-def _trailing_findings(path: Path, header: PlyHeader, end: int | None, row_count: int) -> list[Finding]:
-    """Report bytes after the last row, which ends at `end`; in ASCII files (`None`) each row is a line."""
-    if end is not None:
-        count = path.stat().st_size - end
-        if count and _is_changed_as_text(path, header, count):
-            text = (
-                f"{counted(count, 'byte')} after the last row, and a carriage return before each line feed of the rows:"
-                " corrupted by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
-            )
-            return [Finding("malformed", count, text, "error")]
-    else:
-        with path.open("rb") as stream:
-            stream.seek(header.end)
-            lines = stream.read().splitlines(keepends=True)
-        count = len(b"".join(lines[row_count:]).strip())
-    if count == 0:
-        return []
-    text = f"{counted(count, 'byte')} after the last row: ignored"
-    return [Finding("trailing-bytes", count, text, "repair")]
-
-
-def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
-    """Return True if a carriage return was inserted before each line feed of binary rows.
-
-    Args:
-        path: path of the file.
-        header: its header.
-        surplus: number of bytes after the last row.
-    """
-    if not header.text.endswith(b"\r\n"):
-        return False
-    feeds, last = 0, b"\n"
-    with path.open("rb") as stream:
-        stream.seek(header.end)
-        while block := stream.read(_BLOCK_SIZE):
-            found = block.count(b"\n")
-            feeds += found
-            if found != (last[-1:] + block).count(b"\r\n"):
-                return False
-            last = block
-    return surplus <= feeds
-
-
-def _scalar_columns(data: Rows) -> tuple[Rows, list[str]]:
-    """Drop list properties; return contiguous rows and the names of the dropped properties."""
-    names = data.dtype.names or ()
-    lists = [name for name in names if data.dtype[name].hasobject]
-    if not lists:
-        return data, []
-    kept = [(name, data.dtype[name]) for name in names if name not in lists]
-    rows = np.empty(len(data), kept)
-    for name, _ in kept:
-        rows[name] = data[name]
-    return rows, lists
 
 
 def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator[Rows]:
@@ -478,31 +370,3 @@ def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator
             if len(block) != count:
                 raise InputError(f"{path.name} became shorter while it was read")
             yield block
-
-
-def _open_for_plyfile(path: Path, header: PlyHeader) -> IO[Any]:
-    """Open a PLY after its byte order mark, with the rewritten header; ASCII files are opened as text."""
-    stream = _StreamWithHeader(path, header)
-    return io.TextIOWrapper(stream, encoding="ascii", errors="replace") if header.is_text else stream
-
-
-class _StreamWithHeader(io.BufferedReader):
-    """A file whose header is replaced by another one of the same length."""
-
-    def __init__(self, path: Path, header: PlyHeader) -> None:
-        super().__init__(io.FileIO(path))
-        self.seek(header.start)
-        self._header, self._at = header.text, 0
-
-    def read(self, size: int | None = -1, /) -> bytes:
-        return self._with_header(super().read(size))
-
-    def read1(self, size: int = -1, /) -> bytes:
-        return self._with_header(super().read1(size))
-
-    def _with_header(self, data: bytes) -> bytes:
-        if self._at >= len(self._header):
-            return data
-        begin = self._header[self._at : self._at + len(data)]  # plyfile reads byte by byte: do not copy the rest
-        self._at += len(begin)
-        return begin + data[len(begin) :]
