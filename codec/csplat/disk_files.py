@@ -29,7 +29,7 @@ _PART_SIZE = 1 << 20  # bytes copied at a time
 _MB = 1e6  # bytes
 #: Exceptions that NumPy raises for damaged headers of arrays.
 _NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
-_INTEGER_DIGITS = 300  # longer integers exceed float64; beyond 4,300 digits Python refuses them
+_INTEGER_DIGITS = 300  # of an integer in JSON; longer ones exceed float64
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # an escape in JSON
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -104,10 +104,11 @@ def parse_json(text: str | bytes) -> Any:
         text: the text, or its bytes in UTF-8, UTF-16 or UTF-32.
 
     Returns:
-        The value; integers of more than 300 digits are floats: infinite.
+        The value.
 
     Raises:
-        InputError: it is not JSON, nested too deep, or has a string that is no text (half of a surrogate pair).
+        InputError: it is not JSON, nested too deep, or has an integer of more than 300 digits, or a string that is no
+            text (half of a surrogate pair).
     """
     try:
         text = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
@@ -123,8 +124,10 @@ def parse_json(text: str | bytes) -> Any:
     return value
 
 
-def _parse_integer(digits: str) -> int | float:
-    return int(digits) if len(digits) <= _INTEGER_DIGITS else float(digits)
+def _parse_integer(digits: str) -> int:
+    if len(digits) > _INTEGER_DIGITS:
+        raise ValueError(f"an integer has {len(digits):,} digits, expected at most {_INTEGER_DIGITS}")
+    return int(digits)
 
 
 def finite_or_none(value: float | None) -> float | None:
@@ -313,6 +316,22 @@ def _take_name(temporary: Path, target: Path) -> None:
         temporary.replace(target)
     else:
         temporary.unlink()
+
+
+def path_inside(folder: Path, name: str) -> Path | None:
+    """Return the path of a file that another file names, with links resolved; `None` if it is outside the folder.
+
+    Args:
+        folder: folder of the file that names it.
+        name: its name relative to the folder; not trusted.
+
+    Raises:
+        ValueError: the name contains a null character or half of a surrogate pair.
+        OSError: a folder in the name cannot be read; before Python 3.13 `RuntimeError` for a loop of links.
+    """
+    folder = folder.resolve()
+    target = (folder / name).resolve()
+    return target if target.is_relative_to(folder) else None
 
 
 def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -> NDArray[Any]:

@@ -186,7 +186,6 @@ _SPELLINGS = {
     "infinity as Microsoft's C writes it": ((b"#",), _INFINITY, rb"\1inf"),
     "an exponent as Fortran writes it": ((b"d", b"D"), _EXPONENT, rb"\1e\2"),
 }
-_DECIMAL_COMMA = re.compile(rb"(?<=\d),(?=\d)")
 _NO_THOUSANDS = re.compile(rb"\d,(?!\d{3}(?!\d))\d")  # not followed by three digits exactly
 _SPACES = np.isin(np.arange(256), list(b" \t\n\v\f\r"))
 
@@ -248,9 +247,20 @@ def _separations(text: bytes) -> Iterator[tuple[bytes, str]]:
         yield text, ""
         return
     if b"." not in text and _NO_THOUSANDS.search(text):
-        yield _DECIMAL_COMMA.sub(b".", text.replace(b";", b" ")), "decimal commas"
+        yield _with_points(text.replace(b";", b" ")), "decimal commas"
     yield text.translate(bytes.maketrans(b",;", b"  ")), "commas or semicolons between numbers"
     yield text, ""
+
+
+def _with_points(text: bytes) -> bytes:
+    """Replace the commas between two digits by points."""
+    characters = np.frombuffer(text, np.uint8).copy()
+    is_digit = (ord("0") <= characters) & (characters <= ord("9"))
+    commas = characters == ord(",")
+    commas[1:] &= is_digit[:-1]
+    commas[:-1] &= is_digit[1:]
+    characters[commas] = ord(".")
+    return characters.tobytes()
 
 
 def _index_lines(body: bytes) -> _Lines:

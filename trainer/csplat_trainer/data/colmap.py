@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import re
 import struct
+import textwrap
+from array import array
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -252,6 +254,8 @@ _LAYOUTS = {
 }
 
 
+_ID_DIGITS = 20  # of an id or a size; COLMAP counts in 64 bits
+_SHOWN = 80  # maximum number of characters of a word in a message
 _NO_NUMBER = re.compile(r"^[+-]?(nan\(.*\)|1\.#(ind|qnan|snan|inf)0*)$", re.IGNORECASE)
 
 
@@ -442,34 +446,39 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     Returns:
         The lines of poses, each with its place in the file; and a line for the report if a second line is missing.
     """
-    written = [
-        (line, f"{path}, line {number}")
-        for number, line in enumerate(read_text(path).split("\n"), 1)
-        if not line.lstrip().startswith("#")
-    ]
-    while written and not written[0][0].strip():
-        written.pop(0)
-    if all(_is_pose(line) for line, _ in written[::2] if line.strip()) and all(
-        _is_keypoints(line.split()) for line, _ in written[1::2]
+    lines = read_text(path).split("\n")
+    first = next((number for number, line in enumerate(lines) if line.strip() and not _is_comment(line)), len(lines))
+    numbers = array("q", (number for number in range(first, len(lines)) if not _is_comment(lines[number])))
+
+    def pair(number: int) -> tuple[str, str]:
+        return lines[number], f"{path}, line {number + 1}"
+
+    if all(_is_pose(lines[one]) for one in numbers[::2] if lines[one].strip()) and all(
+        _is_keypoints(lines[one].split()) for one in numbers[1::2]
     ):
-        return [pair for pair in written[::2] if pair[0].strip()], []
+        return [pair(one) for one in numbers[::2] if lines[one].strip()], []
     poses: list[tuple[str, str]] = []
     single = 0
     expected = False  # a line of keypoints may follow
-    for line, where in written:
+    for number in numbers:
+        line = lines[number]
         if not _is_keypoints(line.split()):
             single += expected
-            poses.append((line, where))
+            poses.append(pair(number))
             expected = True
         elif line.strip() and not expected:
             raise InputError(
-                f"{where}: these are keypoints, expected an image: id, rotation, translation, camera, name"
+                f"{pair(number)[1]}: these are keypoints, expected an image: id, rotation, translation, camera, name"
             )
         else:
             expected = False
     if not single:
         return poses, []
     return poses, [f"{path.name}: {counted(single, 'image')} without a line of keypoints, which is optional"]
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
 
 
 def _is_keypoints(words: list[str]) -> bool:
@@ -493,14 +502,13 @@ def _numbers(words: list[str], where: str) -> list[float]:
     try:
         return [float(word) for word in words]
     except ValueError as error:
-        raise InputError(f"{where}: {error}") from None
+        raise InputError(f"{where}: {textwrap.shorten(str(error), _SHOWN)}") from None
 
 
 def _integer(word: str, where: str) -> int:
-    try:
-        return int(word)
-    except ValueError:
-        raise InputError(f"{where}: {word!r} is not an id") from None
+    if len(word) > _ID_DIGITS or not re.fullmatch("-?[0-9]+", word):
+        raise InputError(f"{where}: {word[:_SHOWN]!r} is not an id")
+    return int(word)
 
 
 def _lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:
