@@ -31,6 +31,11 @@ _CHUNK = 256  # splats that share bounds
 _LARGEST_LOG = 20.0  # log scales are clipped to ± this: a larger one would use up the precision of its chunk
 _LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
 _BANDS = (9, 24, 45, 72)  # number of SH columns by degree, 1 to 4
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
 _BOUNDS = [f"{end}_{kind}{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 _COLOUR_BOUNDS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 _PACKED_COLUMNS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
@@ -116,19 +121,34 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
     """Return the elements, the comments and findings, after checking that the file has all rows."""
     findings: list[Finding] = []
     header = read_ply_header(path, findings, "compressed-ply")
-    wrong = next((one.text for one in findings if not one.repairable), None)
-    if wrong or header.order != "<":
-        raise InputError(f"{path.name}: {wrong or 'the rows are in another format, expected binary_little_endian'}")
+    findings = [one for one in findings if one.repairable]  # row counts are checked below
+    lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
+    found: list[tuple[str, int, list[tuple[str, str]]]] = []
+    comments, form = [], ""
+    for line in lines[1:]:
+        words = line.split()
+        if words[:1] == ["comment"]:
+            comments.append(line[len("comment ") :])
+        elif words[:1] == ["format"]:
+            form = " ".join(words[1:])
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
+            found.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and found:
+            found[-1][2].append((words[2], _TYPES[words[1]]))
+        elif words and words[0] != "obj_info":
+            raise InputError(f"{path.name}: the header line {line[:80]!r} is not valid in a compressed PLY")
+    if form != "binary_little_endian 1.0":
+        raise InputError(f"{path.name}: the format is {form[:40]!r}, expected binary_little_endian 1.0")
     elements: dict[str, _Element] = {}
     offset, size = header.end, path.stat().st_size
-    for one in header.elements:
-        if one.has_lists:
-            raise InputError(f"{path.name}: the element {one.name[:80]} has lists, which a compressed PLY has not")
-        elements[one.name] = _Element(offset, one.count, one.dtype(header.order))
-        offset += one.count * elements[one.name].dtype.itemsize
+    for name, count, columns in found:
+        if len({column for column, _ in columns}) != len(columns) or name in elements:
+            raise InputError(f"{path.name}: the header declares {name} or one of its columns twice")
+        elements[name] = _Element(offset, count, np.dtype(columns))
+        offset += count * elements[name].dtype.itemsize
     if offset > size:
         raise InputError(f"{path.name} has {size:,} bytes, its header declares {offset:,}: copy or download it again")
-    return elements, header.comments, findings + trailing_bytes(size - offset)
+    return elements, comments, findings + trailing_bytes(size - offset)
 
 
 def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], kind: str) -> None:
