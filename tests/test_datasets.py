@@ -407,10 +407,10 @@ def test_numbers_beyond_float64_are_refused(ngp):
     frames = frames_of(ngp)
     frames[3]["transform_matrix"][0][3] = 10**400
     change_transforms(ngp, frames=frames)
-    with pytest.raises(InputError, match="frame 3: transform_matrix is not a matrix of numbers"):
+    with pytest.raises(InputError, match="an integer has 401 digits, expected at most 300"):
         load(ngp)
     change_transforms(ngp, frames=frames[:3], fl_x=10**400)
-    with pytest.raises(InputError, match=r"fl_x is 1000.*, expected a number"):
+    with pytest.raises(InputError, match="an integer has 401 digits"):
         load(ngp)
 
 

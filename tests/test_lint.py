@@ -1,6 +1,7 @@
 """Defects of PLY files: their name in lint, the result of reading, and the error of strict reading."""
 
 import re
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -785,16 +786,141 @@ def test_real_defects_are_found(data_dir):
         assert findings == {one.id: one.count for one in lint_ply(data_dir / "ply" / f"{name}.ply")}
 
 
-def test_an_integer_beyond_its_type_is_refused(tmp_path):
-    columns = "".join(f"property uchar {name}\n" for name in ("label", "other"))
-    (tmp_path / "a.ply").write_text(
-        f"ply\nformat ascii 1.0\nelement vertex 2\n{columns}end_header\n\n1 2\n{10**30} 2\n"
+def test_an_integer_beyond_its_type_is_refused(path):
+    columns = ["label", "other", *NAMES]
+    properties = "".join(f"property {'uchar' if name in columns[:2] else 'float'} {name}\n" for name in columns)
+    zeros = " 0" * len(NAMES)
+    path.write_text(
+        f"ply\nformat ascii 1.0\nelement vertex 2\n{properties}end_header\n\n1 2{zeros}\n{10**30} 2{zeros}\n"
     )
-    with pytest.raises(InputError, match=r"a\.ply"):
-        read_ply(tmp_path / "a.ply")
+    with pytest.raises(InputError, match=path.name):
+        read_ply(path)
 
 
 def test_an_element_without_properties_is_refused(tmp_path):
-    (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nend_header\n1\n")
+    (tmp_path / "a.ply").write_text(
+        "ply\nformat ascii 1.0\nelement face 1\nelement vertex 0\n"
+        + "".join(f"property float {name}\n" for name in NAMES)
+        + "end_header\n1\n"
+    )
     with pytest.raises(InputError, match="face"):
         read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    (b"vertex 5", b"vertex " + b"5" * 5000, r"555\.\.\. \(5,000 digits\) rows are declared, the file has"),
+    (b"vertex 5", b"vertex -" + b"5" * 5000, r"-555.* rows are declared"),
+    (b"vertex 5", b"vertex 1_0", "the count '1_0' of an element is not a whole number"),
+    (b"vertex 5", b"vertex 5.0", "the count '5.0' of an element is not a whole number"),
+    (b"end_header", b"element a 0\n" * 5000 + b"end_header", "more than 4,096 elements and properties"),
+    (b"end_header", b"property int a\n" * 5000 + b"end_header", "more than 4,096 elements and properties"),
+    (b"end_header", b"comment a\n" * 10**6 + b"end_header", "no line end_header in its first 1,048,576 bytes"),
+    (b"end_header", b"element a 5" + b"5" * 1000 + b"\nend_header", r"555\.\.\. \(1,001 digits\) rows are declared"),
+])  # fmt: skip
+def test_headers_that_declare_too_much_are_refused(path, old, new, message):
+    path.write_bytes(header(good_rows()).replace(old, new) + good_rows().tobytes())
+    with pytest.raises(InputError, match=message) as caught:
+        read_ply(path)
+    assert len(str(caught.value)) < 300
+
+
+_LISTS = 12_000
+_HEADER_PEAK = 1_100_000  # bytes; up to 1 MiB of the file is searched for the end of the header
+_EMPTY_LISTS = [f"element tags {_LISTS}", "property list uchar int a"]
+_UNUSED = {  # other elements, their rows in binary, and their lines in ASCII
+    "empty lists": (_EMPTY_LISTS, bytes(_LISTS), "0\n" * _LISTS),
+    "lists of two kinds": (
+        ["element tags 2", "property list ushort short a", "property int b", "property list char double c"],
+        bytes.fromhex("0200 0000 0000 00000000 01 0000000000000000 0000 00000000 00"), "2 0 0 7 1 0.5\n0 7 0\n",
+    ),
+    "fixed rows": (["element tags 3", "property int a", "property uchar b"], bytes(15), "1 2\n" * 3),
+    "rows that share a line": (["element tags 3", "property int a", "property uchar b"], bytes(15), "1 2 1 2 1 2\n"),
+    "a blank line": (["element tags 2", "property list uchar int a"], bytes(2), "0\n\n0\n"),
+}  # fmt: skip
+
+
+def with_element(kind, lines, rows, *, comes_first):
+    """Return a file with another element next to that of the splats."""
+    text = header(ROWS, kind=kind)
+    splats = "".join(f"{line}\n" for line in lines_of(ROWS)).encode() if kind == "ascii" else ROWS.tobytes()
+    added = "".join(f"{line}\n" for line in lines).encode()
+    where = b"element vertex" if comes_first else b"end_header"
+    text = text.replace(where, added + where)
+    return text + (rows + splats if comes_first else splats + rows)
+
+
+def peak_of(read, path):
+    """Return what `read` returns, and the most bytes of Python objects at a time."""
+    tracemalloc.start()
+    try:
+        return read(path), tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("comes_first", [True, False])
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_other_elements_are_skipped_without_an_object_per_row(path, kind, comes_first):
+    for name, (lines, binary, text) in _UNUSED.items():
+        rows = text.encode() if kind == "ascii" else binary
+        data = with_element(kind, lines, rows, comes_first=comes_first)
+        if kind.endswith("big_endian"):
+            swapped = rows if name != "lists of two kinds" else rows.replace(b"\2\0", b"\0\2")
+            data = data.replace(ROWS.tobytes(), ROWS.byteswap().tobytes()).replace(rows, swapped)
+        path.write_bytes(data)
+        model, peak = peak_of(read_ply, path)
+        assert np.array_equal(model.means[:, 0], ROWS["x"]), name
+        assert np.array_equal(model.scales[:, 2], ROWS["scale_2"]), name
+        assert peak < 8 * len(data) + _HEADER_PEAK, name  # a kept object per row takes 60 to 140 bytes
+
+
+@pytest.mark.parametrize(("lines", "rows", "message"), [
+    (["element tags 1", "property list uint int a"], b"\xff" * 4, "1 rows of tags are declared, 0 are present"),
+    (["element tags 3", "property list uchar int a"], b"\0\0\2", "3 rows of tags are declared, 2 are present"),
+    (["element tags 2", "property list char int a"], b"\0\xff", "row 1 of tags: the list a has a length of -1"),
+    (["element tags 1", "property list float int a"], bytes(4), "the list a of tags has lengths of type float32"),
+    (["element tags 2", "property double a"], bytes(9), "2 rows of tags are declared, 1 are present"),
+    (["element tags 1000000000000"], b"", "1000000000000 rows are declared, the file has"),
+])  # fmt: skip
+def test_other_elements_that_the_file_does_not_have_are_refused(path, lines, rows, message):
+    path.write_bytes(with_element("binary_little_endian", lines, rows, comes_first=False))
+    with pytest.raises(InputError, match=message):
+        read_ply(path)
+
+
+@pytest.mark.parametrize(("rows", "message"), [
+    ("1 2\n1\n", "row 1 of tags has 1 values, expected 2"),
+    ("1 2\n1 2 3\n", "row 1 of tags has 3 values, expected 2"),
+    ("1 2\n", "2 rows of tags are declared, 1 are present"),
+])  # fmt: skip
+def test_other_elements_of_text_are_counted(path, rows, message):
+    lines = ["element tags 2", "property int a", "property int b"]
+    path.write_bytes(with_element("ascii", lines, rows.encode(), comes_first=False))
+    with pytest.raises(InputError, match=message):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_a_file_without_columns_of_splats_is_refused_from_its_header(path, kind):
+    data = header(good_rows(names=["x", "y", "z"]), kind=kind, after=["property list uchar int a"])
+    path.write_bytes(data)  # without rows
+    assert ["list-columns", "missing-columns"] == list(found(path))
+
+
+def test_lists_of_splats_are_dropped_without_an_object_per_list(path):
+    rows, names = good_rows(130), [f"property list uchar int a{index}" for index in range(100)]
+    path.write_bytes(header(rows, after=names) + b"".join(row.tobytes() + bytes(100) for row in rows))
+    model, peak = peak_of(read_ply, path)
+    assert np.array_equal(model.means[:, 0], rows["x"])
+    assert peak < 8 * path.stat().st_size + _HEADER_PEAK
+
+
+def test_lists_of_splats_in_text_are_dropped(path):
+    lines = [f"{line} {'2 1 1' if row % 2 else '0'}" for row, line in enumerate(lines_of(ROWS))]
+    for text in ("\n".join(lines), "\n\n".join(lines)):
+        put_text(path, text, after=["property list uchar int a"])
+        assert 1 == found(path)["list-columns"].count
+        assert np.array_equal(read_ply(path).scales[:, 2], ROWS["scale_2"])
+    put_text(path, "\n".join(lines).replace("2 1 1", "2 1"), after=["property list uchar int a"])
+    with pytest.raises(InputError, match="row 1 of vertex has 28 values, which its properties do not match"):
+        read_ply(path)

@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
-import json
-import lzma
+import io
 import re
 import struct
 import textwrap
-import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, BinaryIO, NoReturn, cast
 
-import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import parse_array, parse_json
 from csplat.errors import InputError
 from csplat.file_source import describe_substitute, open_binary
 
-#: Exceptions that NumPy and zipfile raise for damaged files: RuntimeError for passwords and unknown compression,
-#: MemoryError for impossible sizes, OSError for offsets outside the file and broken bz2.
+#: Exceptions that zipfile and Pillow raise for damaged files: RuntimeError for passwords and unknown compression,
+#: MemoryError for impossible sizes, OSError for offsets outside the file.
 DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
-            SyntaxError, OSError, struct.error, tokenize.TokenError, lzma.LZMAError, zlib.error,
-            zipfile.BadZipFile)  # fmt: skip
+            SyntaxError, OSError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
+
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the others expand further, LZMA with 4 GiB of memory
+_OTHER_COMPRESSIONS = {9: "deflate64", 12: "bzip2", 14: "LZMA", 93: "Zstandard", 95: "XZ"}  # by number in a zip
+_FREE = 1 << 26  # bytes of an archive of arrays that are accepted regardless of its expansion
+_EXPANSION = 64  # largest expansion of a larger one; trained values hardly compress
+_MAX_ARRAYS = 4096  # an array of an archive takes 60 bytes of the file if they overlap, and 60 microseconds
 
 
 #: File name suffixes of scenes.
@@ -97,8 +100,8 @@ class Archive(dict[str, NDArray[Any]]):
             InputError: the array is missing, or is not a JSON object.
         """
         try:
-            found = json.loads(self["facts"].tobytes())
-        except (ValueError, RecursionError) as error:
+            found = parse_json(self["facts"].tobytes())
+        except InputError as error:
             self.refuse(error)
         if not isinstance(found, dict):
             self.refuse(f"its facts are a {type(found).__name__}, expected an object")
@@ -111,6 +114,23 @@ class Archive(dict[str, NDArray[Any]]):
                 self.refuse(f"its {name} is not of type {kind.__name__}")
 
 
+def member_refusal(info: zipfile.ZipInfo, max_bytes: int) -> str:
+    """Return why a member of a zip is refused before it is unpacked; "" if it is not.
+
+    Unpacking stops at the declared size, so a member with more data is refused by its checksum.
+
+    Args:
+        info: the member.
+        max_bytes: maximum declared size.
+    """
+    if info.compress_type not in _COMPRESSIONS:
+        method = _OTHER_COMPRESSIONS.get(info.compress_type, "an unknown method")
+        return f"is compressed with {method}, expected deflate: zip it again"
+    if info.file_size > max_bytes:
+        return f"of {info.compress_size:,} bytes declares an unpacked size of {info.file_size:,}, allowed {max_bytes:,}"
+    return ""
+
+
 def read_archive(path: str | Path, kind: str) -> Archive:
     """Read all arrays of a .npz file, without pickle.
 
@@ -119,22 +139,38 @@ def read_archive(path: str | Path, kind: str) -> Archive:
         kind: as in `Archive`.
 
     Raises:
-        InputError: the file is damaged or not a .npz file.
+        InputError: the file is damaged, not a .npz file, or larger than 64 MiB unpacked and than 64 times its size.
         OSError: the file cannot be read.
     """
-    nothing = Archive(path, kind, {})
-    with open_binary(path) as stream:  # np.load would leave a damaged file open
+    with open_binary(path) as stream:
         if instead := describe_substitute(stream.read(64)):
             raise InputError(f"{path} is {instead}")
-        if not zipfile.is_zipfile(stream):  # np.load would report a pickle instead
-            nothing.refuse("it is not a .npz file")
-        stream.seek(0)
         try:
-            with np.load(stream, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-        except DAMAGED as error:
-            nothing.refuse(error)
-    for name, array in arrays.items():
-        if not isinstance(array, np.ndarray):  # NumPy returns other members as bytes
-            nothing.refuse(f"its {name} is not an array")
-    return Archive(path, kind, arrays)
+            return Archive(path, kind, _read_arrays(stream))
+        except (InputError, *DAMAGED) as error:
+            Archive(path, kind, {}).refuse(error)
+
+
+def _read_arrays(stream: BinaryIO) -> dict[str, NDArray[Any]]:
+    """Read the members of a .npz; raises one of `DAMAGED` or an `InputError` with the reason alone."""
+    if not zipfile.is_zipfile(stream):
+        raise InputError("it is not a .npz file")
+    arrays: dict[str, NDArray[Any]] = {}
+    left = max(_FREE, _EXPANSION * stream.seek(0, 2))
+    with zipfile.ZipFile(stream) as archive:
+        members = archive.infolist()
+        if len(members) > _MAX_ARRAYS:
+            raise InputError(f"it has {len(members):,} members, expected at most {_MAX_ARRAYS:,}")
+        for info in members:
+            name = info.filename.removesuffix(".npy")
+            if name in arrays:
+                raise InputError(f"it has two arrays {name[:80]}")
+            if reason := member_refusal(info, left):
+                raise InputError(f"its {name[:80]} {reason}")
+            left -= info.file_size
+            with archive.open(info) as member:
+                try:
+                    arrays[name] = parse_array(cast(io.BufferedIOBase, member), info.file_size)
+                except InputError as error:
+                    raise InputError(f"its {name[:80]} is not an array: {error}") from None
+    return arrays

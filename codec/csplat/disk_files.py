@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import codecs
+import io
 import itertools
 import json
 import math
 import os
 import re
 import shutil
-import stat
-import sys
 import tempfile
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
@@ -26,14 +26,20 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.file_source import File, describe_substitute, named_errors, open_binary, read_bytes
+from csplat.system import take_permissions
 
-_DECIMAL_COMMA = re.compile(r'":\s*([+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*[,}\n]')  # of a member of an object
+_DECIMAL_COMMA = re.compile(r'":\s*([+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*[,}\n]')  # the value of a member of an object
 _TRAILING_BYTE = re.compile(r"([\udc81-\udcfe])\\(?!\\)")  # a backslash that ends a character of Shift-JIS, GBK or Big5
 _PART_SIZE = 1 << 20  # bytes copied at a time
 _NAME_PART = 20  # characters of a file's name in that of its temporary file, which must not be longer than 255 bytes
 _TEMPORARY = "csplat-"  # beginning of the names of files in the system's folder for temporary files
 _numbers = itertools.count()  # tells the temporary files of this process apart
 _MB = 1e6  # bytes
+#: Exceptions that NumPy raises for damaged headers of arrays.
+_NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
+_INTEGER_DIGITS = 300  # digits of the longest integer in JSON; longer ones exceed float64
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # an escape in JSON
+_HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
 class BinaryWriter(Protocol):
@@ -89,7 +95,7 @@ def read_text(path: str | os.PathLike[str], *, any_bytes: bool = False) -> str:
 
 
 def read_json(path: str | os.PathLike[str], *, any_bytes: bool = False) -> Any:
-    """Read a JSON file, in the encodings of `read_text`.
+    """Read a JSON file, in the encodings of `read_text`; otherwise as `parse_json`.
 
     Args:
         path: path of the file.
@@ -98,14 +104,46 @@ def read_json(path: str | os.PathLike[str], *, any_bytes: bool = False) -> Any:
     Raises:
         InputError: the file cannot be read or is not JSON.
     """
-    text = ""
+    text = read_text(path, any_bytes=any_bytes)
     try:
-        text = read_text(path, any_bytes=any_bytes)
-        return json.loads(_TRAILING_BYTE.sub(r"\1\\\\", text) if any_bytes else text)
-    except (ValueError, RecursionError) as error:
+        return parse_json(_TRAILING_BYTE.sub(r"\1\\\\", text) if any_bytes else text)
+    except InputError as error:
         comma = _DECIMAL_COMMA.search(text)
         hint = f"; it has a decimal comma, {comma[1]}, expected a point" if comma else ""
-        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}{hint}") from error
+        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}{hint}") from None
+
+
+def parse_json(text: str | bytes) -> Any:
+    """Parse a JSON text of another program; NaN and infinities are accepted.
+
+    Args:
+        text: the text, or its bytes in UTF-8, UTF-16 or UTF-32.
+
+    Returns:
+        The value.
+
+    Raises:
+        InputError: it is not JSON, nested too deep, or has an integer of more than 300 digits, or a string that is no
+            text (half of a surrogate pair).
+    """
+    try:
+        text = text if isinstance(text, str) else text.decode(json.detect_encoding(text))
+        value = json.loads(text, parse_int=_parse_integer)
+        if _SURROGATE.search(text):
+            json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise InputError("a string has half of a surrogate pair, expected Unicode text") from None
+    except RecursionError:
+        raise InputError("its brackets are nested too deep") from None
+    except ValueError as error:
+        raise InputError(" ".join(str(error).split())[:120]) from None
+    return value
+
+
+def _parse_integer(digits: str) -> int:
+    if len(digits) > _INTEGER_DIGITS:
+        raise ValueError(f"an integer has {len(digits):,} digits, expected at most {_INTEGER_DIGITS}")
+    return int(digits)
 
 
 def finite_or_none(value: float | None) -> float | None:
@@ -277,7 +315,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         permissions = 0o666 if old is None else 0o600  # until it has those of the old file
         with open_binary(temporary, "x", name=path, permissions=permissions) as stream:
             if old is not None:
-                _take_permissions(stream.fileno(), old)
+                take_permissions(stream.fileno(), old)
             yield stream
             stream.flush()
             with named_errors(path):
@@ -329,25 +367,6 @@ def _report_as(path: str | os.PathLike[str], temporary: Path, error: BaseExcepti
             error.filename = str(Path(path, failed.relative_to(temporary)))
 
 
-def _take_permissions(descriptor: int, old: os.stat_result) -> None:
-    """Give a file the permissions, and if possible owner and group, of the file that it replaces.
-
-    In another group it gives the group the rights of all others: the group may be one that had no more.
-    """
-    if sys.platform == "win32":
-        return
-    for owner, group in ((-1, old.st_gid), (old.st_uid, -1)):
-        with suppress(OSError):
-            os.fchown(descriptor, owner, group)
-    new, mode = os.fstat(descriptor), stat.S_IMODE(old.st_mode)
-    if new.st_gid != old.st_gid:
-        mode = mode & ~stat.S_IRWXG | (mode & stat.S_IRWXO) << 3
-    if (new.st_uid, new.st_gid) != (old.st_uid, old.st_gid):
-        mode &= ~(stat.S_ISUID | stat.S_ISGID)
-    with suppress(OSError):  # a file system without permissions
-        os.fchmod(descriptor, mode)
-
-
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a folder that appears under its name only when complete, in the place of an older one.
@@ -397,6 +416,22 @@ def _take_name(temporary: Path, target: Path) -> None:
         temporary.unlink()
 
 
+def path_inside(folder: Path, name: str) -> Path | None:
+    """Return the path of a file that another file names, with links resolved; `None` if it is outside the folder.
+
+    Args:
+        folder: folder of the file that names it.
+        name: its name relative to the folder; not trusted.
+
+    Raises:
+        ValueError: the name contains a null character or half of a surrogate pair.
+        OSError: a folder in the name cannot be read; before Python 3.13 `RuntimeError` for a loop of links.
+    """
+    folder = folder.resolve()
+    target = (folder / name).resolve()
+    return target if target.is_relative_to(folder) else None
+
+
 def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -> NDArray[Any]:
     """Read an array from a .npy file.
 
@@ -410,15 +445,50 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
     """
     if Path(path).exists() and not Path(path).is_file():
         raise InputError(f"{path} is not a file")
+    size = Path(path).stat().st_size
+    with Path(path).open("rb") as stream:
+        if instead := describe_substitute(stream.read(64)):
+            raise InputError(f"{path} is {instead}")
+        stream.seek(0)
+        try:
+            if most_bytes is not None and size > most_bytes:
+                return np.lib.format.open_memmap(path, mode="r")
+            return parse_array(stream, size)
+        except (InputError, *_NOT_AN_ARRAY) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
+
+
+def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
+    """Read an array in NumPy's format; its size is compared with that of the file before memory is allocated.
+
+    Args:
+        stream: the file from its beginning.
+        size: its size in bytes.
+
+    Raises:
+        InputError: it is not an array, contains Python objects, or has more or fewer bytes than its shape requires.
+    """
     try:
-        if most_bytes is not None and Path(path).stat().st_size > most_bytes:
-            return np.lib.format.open_memmap(path, mode="r")
-        with open_binary(path) as stream:
-            if instead := describe_substitute(stream.read(64)):
-                raise InputError(f"{path} is {instead}")
-            stream.seek(0)
-            array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
-    except (ValueError, EOFError, SyntaxError, TokenError, TypeError, MemoryError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path} is not a NumPy array file (.npy): {reason}") from None
-    return array
+        with warnings.catch_warnings(action="ignore"):  # Python 2 wrote headers that NumPy warns of
+            version = np.lib.format.read_magic(stream)
+            if version not in _HEADER_READERS:
+                raise InputError(f"it is an array file of version {version[0]}.{version[1]}, expected 1.0 or 2.0")
+            shape, is_transposed, dtype = _HEADER_READERS[version](stream)
+    except _NOT_AN_ARRAY as error:
+        raise InputError(" ".join(str(error).split())) from None
+    if dtype.hasobject or dtype.itemsize == 0:
+        raise InputError(f"its values are of type {dtype}, expected numbers or text: pickled objects are not read")
+    count = math.prod(shape)
+    rest = size - stream.tell()
+    if min(shape, default=0) < 0 or count * dtype.itemsize != rest:
+        text = f"its shape is {', '.join(str(side)[:20] for side in shape[:4])}" if shape else "it is a single value"
+        raise InputError(f"{text} of type {dtype}, which does not fit its {rest:,} bytes of values")
+    data: NDArray[Any] = np.empty(rest, np.uint8)
+    for start in range(0, rest, _PART_SIZE):
+        part = data[start : start + _PART_SIZE]
+        if stream.readinto(part.data) != len(part):
+            raise InputError("it is truncated")
+    stream.read(1)  # at the end, zipfile compares the checksum
+    array = data.view(dtype)
+    return array.reshape(shape[::-1]).T if is_transposed else array.reshape(shape)

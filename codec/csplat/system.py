@@ -67,6 +67,25 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
         raise
 
 
+def take_permissions(descriptor: int, old: os.stat_result) -> None:
+    """Give a file the permissions, and if possible owner and group, of the file that it replaces.
+
+    In another group it gives the group the rights of all others: the group may be one that had no more.
+    """
+    if sys.platform == "win32" or not hasattr(os, "fchown"):
+        return
+    for owner, group in ((-1, old.st_gid), (old.st_uid, -1)):
+        with suppress(OSError):
+            os.fchown(descriptor, owner, group)
+    new, mode = os.fstat(descriptor), stat.S_IMODE(old.st_mode)
+    if new.st_gid != old.st_gid:
+        mode = mode & ~stat.S_IRWXG | (mode & stat.S_IRWXO) << 3
+    if (new.st_uid, new.st_gid) != (old.st_uid, old.st_gid):
+        mode &= ~(stat.S_ISUID | stat.S_ISGID)
+    with suppress(OSError):  # a file system without permissions
+        os.fchmod(descriptor, mode)
+
+
 def read_at(descriptor: int, size: int, offset: int) -> bytes:
     """Read from an offset of a file, fewer bytes at its end. Thread-safe.
 

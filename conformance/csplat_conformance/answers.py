@@ -201,8 +201,8 @@ def _severity(status: Status) -> int:
 
 def whole_number(text: str) -> float:
     """Convert a JSON integer; beyond 2^53 to a float, since JavaScript writes 2^65 as an integer."""
-    value = int(text)
-    return value if abs(value) <= 2**53 else float(value)
+    value = float(text)
+    return int(text) if abs(value) <= 2**53 else value
 
 
 def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[Status, str]:

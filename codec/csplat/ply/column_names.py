@@ -18,11 +18,12 @@ _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
 _SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
-_SCALE = "scale"  # of spheres, in place of `_SCALES`
+_SCALE = "scale"  # the one scale of spheres, in place of `_SCALES`
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _OPACITY = "opacity"
 _FILTER = "filter_3D"
 _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
+_REST_DIGITS = 9  # digits of its number that are compared; a longer one is in no valid file
 _ZEROS = re.compile(r"\Af_rest_0+(?=[0-9])")
 
 #: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the additional one of 3dgsconverter, which prepares files
@@ -283,7 +284,7 @@ def _meaning(names: Sequence[str]) -> str | None:
 
 def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...], tuple[str, ...], Finding | None]:
     """Return the columns of all bands, the columns of the bands to read, and the finding about them."""
-    numbers = sorted(int(match[1]) for name in names.plain if (match := _REST.fullmatch(name)))
+    numbers = sorted(int(match[1][:_REST_DIGITS]) for name in names.plain if (match := _REST.fullmatch(name)))
     count = len(numbers)
     if numbers != list(range(count)):
         text = f"the {count} f_rest columns are not numbered from 0 to {count - 1}"

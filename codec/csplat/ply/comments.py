@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import parse_json
 from csplat.editing.up_axis import UP, unit_up, up_of
 from csplat.errors import InputError
 from csplat.lint import Finding
@@ -249,11 +250,9 @@ def _is_json(value: object) -> bool:
 def _json(comment: str) -> object:
     """Parse the JSON after the first two words of a comment."""
     try:
-        return json.loads("".join(comment.split(None, 2)[2:]))
-    except RecursionError:
-        raise _comment_error(comment, "too many brackets") from None
-    except ValueError:
-        raise _comment_error(comment, "not JSON") from None
+        return parse_json("".join(comment.split(None, 2)[2:]))
+    except InputError as error:
+        raise _comment_error(comment, f"not JSON: {error}") from None
 
 
 def _comment_error(comment: str, reason: str) -> InputError:
@@ -267,7 +266,7 @@ def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
         numbers = []
     if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
         line = " ".join((_PREFIX, key, *values))
-        raise InputError(f"the header comment {line!r} does not contain {count} finite numbers")
+        raise InputError(f"the header comment {line[:_SHOWN]!r} does not contain {count} finite numbers")
     return numbers
 
 

@@ -8,10 +8,11 @@ text is an error that names the number or row.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate
 from pathlib import Path
+
+import numpy as np
 
 from csplat.detect import KINDS, detect_content, is_ply, read_head, refusal
 from csplat.errors import InputError, counted
@@ -22,10 +23,14 @@ from csplat.lint import Finding
 SPLAT_ELEMENT = "vertex"
 
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", re.IGNORECASE)
-_MAX_SIZE = 1 << 20
+_MAX_SIZE = 1 << 20  # bytes of a header; programs write up to a few kilobytes
+_MAX_DECLARED = 4096  # elements and properties; SH of degree 4 takes 87, and each takes memory in every block of rows
+_MAX_DIGITS = 18  # digits of a count; longer ones exceed every file, and Python converts no more than 4300
+_SHOWN = 80  # maximum number of characters of a word in a message
 _MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _LINE_END = re.compile(rb"\r\n|\r|\n")
+_ASCII = bytes(byte if byte < 128 and byte not in range(0x1C, 0x20) else ord("?") for byte in range(256))
 _FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text
 
 
@@ -67,6 +72,11 @@ class PlyHeader:
         """Offset of the rows in the file."""
         return self.start + len(self.text)
 
+    def without_rows(self) -> bytes:
+        """Return the header with counts of 0, for a parser that shall read no rows."""
+        lines = (b"element %s 0" % line.split()[1] if _is_element(line.split()) else line for line in _split(self.text))
+        return b"\n".join([*lines, b""])
+
 
 def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> PlyHeader:
     """Read the header of a PLY.
@@ -77,7 +87,8 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         kind: name of the expected kind of PLY, a key of `csplat.detect.KINDS`.
 
     Raises:
-        InputError: the file is not a PLY of this kind, or its header has no end.
+        InputError: the file is not a PLY of this kind, or its header has no end, declares too much, or has a count
+            that is no whole number.
         OSError: the file cannot be read.
     """
     head = read_head(path)
@@ -91,7 +102,8 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         data = stream.read(_MAX_SIZE)
     end = _END_OF_HEADER.search(data)
     if end is None:
-        raise InputError(f"{path.name}: the PLY header has no line end_header")
+        where = f" in its first {_MAX_SIZE:,} bytes" if len(data) == _MAX_SIZE else ""
+        raise InputError(f"{path.name}: the PLY header has no line end_header{where}")
     raw = data[: end.end()]
     if raw[3:5] not in (b"\r\n", b"\r") and raw[3:4] == b"\r" and raw.endswith(b"\r\n"):
         raw = raw[:-1]  # the lines end with CR, so the LF is the first byte of a row
@@ -104,10 +116,28 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         count = sum(byte > 127 for byte in raw)
         note = f"{counted(count, 'byte')} of the header are not ASCII: read as question marks"
         findings.append(Finding("non-ascii-header", count, note, "note"))
-    text = bytes(byte if byte < 128 else ord("?") for byte in text)
-    lines = [line.split() for line in text.splitlines()]
+    text = text.translate(_ASCII)
+    lines = [line.split() for line in _split(text)]
+    if sum(words[:1] in ([b"element"], [b"property"]) for words in lines) > _MAX_DECLARED:
+        raise InputError(f"{path.name}: the header declares more than {_MAX_DECLARED:,} elements and properties")
+    wrong = next(
+        (words[2] for words in lines if _is_element(words) and not words[2].removeprefix(b"-").isdigit()), None
+    )
+    if wrong is not None:
+        raise InputError(f"{path.name}: the count {wrong[:_SHOWN].decode()!r} of an element is not a whole number")
     findings += _count_findings(lines, path.stat().st_size)
     return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _parse_elements(lines))
+
+
+def _split(text: bytes) -> list[bytes]:
+    """Return the lines of a rewritten header, which end as its first one does."""
+    end = _LINE_END.search(text)
+    assert end is not None, "the line end_header has an end"
+    return text.split(end[0])[:-1]
+
+
+def _is_element(words: Sequence[bytes]) -> bool:
+    return words[:1] == [b"element"] and len(words) == 3
 
 
 def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
@@ -160,31 +190,33 @@ def _normalise_line(line: bytes) -> bytes:
 def _parse_elements(lines: list[list[bytes]]) -> list[PlyElement]:
     found: list[PlyElement] = []
     for words in lines:
-        if words[:1] == [b"element"] and len(words) == 3:
-            found.append(PlyElement(words[1].decode(), int(words[2]) if words[2].isdigit() else 0))
+        if _is_element(words):
+            found.append(PlyElement(words[1].decode(), _parse_count(words[2])))
         elif words[:1] == [b"property"] and len(words) > 2 and found:
             found[-1].properties.append(words[-1].decode())
             found[-1].has_lists |= words[1] == b"list"
     return found
 
 
+def _parse_count(word: bytes) -> int:
+    """Return a count; 0 if it is negative, and a number beyond every file if it is longer than `_MAX_DIGITS`."""
+    if word.startswith(b"-"):
+        return 0
+    return int(word) if len(word) <= _MAX_DIGITS else 10**_MAX_DIGITS
+
+
 def _count_findings(lines: list[list[bytes]], size: int) -> list[Finding]:
     findings = []
-    for words in lines:
-        if words[:1] != [b"element"] or len(words) != 3:
-            continue
-        if words[2].startswith(b"-"):
-            text = f"{words[2].decode('ascii', 'replace')} rows are declared"
-            findings.append(Finding("malformed", 1, text, "error"))
-        elif words[2].isdigit():
-            count = int(words[2])
-            if count > size:  # a row has at least one byte; refuse before anything is allocated
-                text = f"{count} rows are declared, the file has {size} bytes"
-                findings.append(Finding("truncated", count, text, "error"))
+    for words in filter(_is_element, lines):
+        word, count = words[2].decode(), _parse_count(words[2])
+        shown = word if len(word) <= _SHOWN else f"{word[:_MAX_DIGITS]}... ({len(word):,} digits)"
+        if word.startswith("-"):
+            findings.append(Finding("malformed", 1, f"{shown} rows are declared", "error"))
+        elif count > size:  # a row has at least one byte; refuse before anything is allocated
+            text = f"{shown} rows are declared, the file has {size} bytes"
+            findings.append(Finding("truncated", count, text, "error"))
     return findings
 
-
-TextRows = list[list[str]]
 
 _TEXT_LINE_END = re.compile(r"\r\n|\r|\n")
 _NAN = re.compile(r"(?<!\S)[+-]?(?:nan\([a-z]*\)|1\.#(?:ind|[qs]nan)0*)(?!\S)", re.IGNORECASE)
@@ -200,100 +232,105 @@ _DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
 _NO_THOUSANDS = re.compile(r"\d,(?!\d{3}(?!\d))\d")  # not followed by three digits exactly
 
 
-class _RowError(ValueError):
-    """Text that does not form the declared rows, with a finding about the reason."""
+class RowError(ValueError):
+    """Bytes that do not form the declared rows, with a finding about the reason."""
 
     def __init__(self, finding: Finding) -> None:
         super().__init__(finding.text)
         self.finding = finding
 
 
-def parse_text_rows(body: bytes, elements: Sequence[PlyElement]) -> tuple[TextRows | None, list[Finding]]:
-    """Split text of any layout into the rows of all elements.
+def parse_text_rows(
+    body: bytes, elements: Sequence[PlyElement], wanted: Sequence[str]
+) -> tuple[dict[str, list[str]], list[Finding]]:
+    """Split text of any layout into rows.
 
     Args:
         body: the file after its header.
         elements: the declared elements.
+        wanted: names of the elements whose rows are returned.
 
     Returns:
-        The words of each row, and findings. The rows are `None` if rows are missing or a row has another number of
-        values than declared.
+        The rows of each wanted element, as lines of words; and findings.
+
+    Raises:
+        RowError: rows are missing, or a row has another number of values than declared.
     """
     text = body.decode("ascii", "replace")
     oddities = []
     for name, (pattern, spelling) in _SPELLINGS.items():
         text, count = pattern.subn(spelling, text)
         oddities += [f"{name} ({counted(count, 'number')})"] if count else []
-    first: _RowError | None = None
+    first: RowError | None = None
     for separated, separators in _separations(text):
-        lines = [line.split() for line in _TEXT_LINE_END.split(separated)]
         try:
-            rows, layout, rest = _split_rows(lines, elements)
-        except _RowError as error:
+            rows, layout, rest = _split_rows(_TEXT_LINE_END.split(separated), elements, wanted)
+        except RowError as error:
             first = first or error
             continue
         oddities += [separators] * bool(separators) + layout
         note = f"the rows have {', '.join(oddities)}"
         findings = [Finding("unusual-rows", len(oddities), note, "note")] if oddities else []
-        size = len(" ".join(rest))
-        if size:
-            findings.append(Finding("trailing-bytes", size, f"{size} bytes after the last row: ignored", "repair"))
+        if rest:
+            findings.append(Finding("trailing-bytes", rest, f"{rest} bytes after the last row: ignored", "repair"))
         return rows, findings
     assert first is not None, "_separations returns at least one reading"
-    return None, [first.finding]
+    raise first
 
 
-def _separations(text: str) -> list[tuple[str, str]]:
-    """Return the text with only spaces between numbers, for each possible meaning of its commas."""
-    if "," not in text and ";" not in text:
-        return [(text, "")]
-    found = []
-    if "." not in text and _NO_THOUSANDS.search(text):
-        found.append((_DECIMAL_COMMA.sub(".", text.replace(";", " ")), "decimal commas"))
-    return [*found, (re.sub("[,;]", " ", text), "commas or semicolons between numbers"), (text, "")]
+def _separations(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the text with only spaces between numbers, for each possible meaning of its commas."""
+    if "," in text or ";" in text:
+        if "." not in text and _NO_THOUSANDS.search(text):
+            yield _DECIMAL_COMMA.sub(".", text.replace(";", " ")), "decimal commas"
+        yield text.replace(",", " ").replace(";", " "), "commas or semicolons between numbers"
+    yield text, ""
 
 
-def _split_rows(lines: TextRows, elements: Sequence[PlyElement]) -> tuple[TextRows, list[str], list[str]]:
-    """Return the rows, the oddities of their lines, and the words after the last row.
+def _split_rows(
+    lines: list[str], elements: Sequence[PlyElement], wanted: Sequence[str]
+) -> tuple[dict[str, list[str]], list[str], int]:
+    """Return the rows of the wanted elements, the oddities of the lines, and the number of bytes after the last row.
 
     Rows may share a line or continue on the next one, provided that every line end is a row end or every row end is a
-    line end. So a missing value never shifts the values after it.
+    line end. So a missing value never shifts the values after it. No object is made per word, except of a wanted
+    element whose rows are not on lines of their own.
     """
-    blank = next((at for at in range(len(lines) - 1, -1, -1) if lines[at]), -1) + 1 - sum(map(bool, lines))
-    oddities = ["blank lines"] if blank else []
-    lines = [line for line in lines if line]
-    rows: TextRows = []
+    counts = np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
+    filled = np.flatnonzero(counts)
+    oddities = ["blank lines"] if len(filled) and filled[-1] >= len(filled) else []
+    lines, counts = [line for line in lines if line.strip()], counts[filled]
+    rows: dict[str, list[str]] = {}
     at = 0
     for element in elements:
-        width = len(element.properties)
+        width, count = len(element.properties), element.count
         if not width:
-            raise _RowError(Finding("malformed", 1, f"the element {element.name} has no properties", "error"))
-        if element.has_lists or all(len(line) == width for line in lines[at : at + element.count]):
-            taken = lines[at : at + element.count]
-            if len(taken) < element.count:
-                raise _RowError(truncated_finding(element.name, element.count, len(taken)))
-            rows += taken
-            at += element.count
+            raise RowError(Finding("malformed", 1, f"the element {element.name} has no properties", "error"))
+        stop = at + count
+        if element.has_lists or (counts[at:stop] == width).all():
+            if len(lines) < stop:
+                raise RowError(truncated_finding(element.name, count, len(lines) - at))
+            if element.name in wanted:
+                rows[element.name] = lines[at:stop]
+            at = stop
             continue
-        ends = list(accumulate(map(len, lines[at:])))
-        count = next((number for number, end in enumerate(ends, 1) if end >= width * element.count), len(ends))
-        ends = ends[:count]
-        row_ends = set(range(width, width * element.count + 1, width))
-        if not ends or ends[-1] != width * element.count or not (row_ends <= set(ends) or set(ends) <= row_ends):
-            row, line = next((pair for pair in enumerate(lines[at:]) if len(pair[1]) != width), (0, []))
-            text = f"row {row} of {element.name} has {len(line)} values, expected {width}"
-            raise _RowError(Finding("malformed", 1, text, "error"))
-        words = [word for line in lines[at : at + count] for word in line]
-        rows += [words[first : first + width] for first in range(0, len(words), width)]
-        oddities.append(
-            f"{element.count} of {element.name} in {count} lines" if count > 1 else "all values in one line"
-        )
-        at += count
-    rest = [word for line in lines[at:] for word in line]
-    if rest and len(rows) != at:
-        text = f"found {counted(len(rest), 'value')} after rows that are not on separate lines"
-        raise _RowError(Finding("malformed", len(rest), text, "error"))
-    return rows, oddities, rest
+        ends = np.cumsum(counts[at : at + width * count])
+        used = int(np.searchsorted(ends, width * count)) + 1  # lines
+        whole = np.count_nonzero(ends[:used] % width == 0)  # rows that end with a line
+        if used > len(ends) or ends[used - 1] != width * count or whole not in (count, used):
+            row = int((counts[at:] != width).argmax())
+            text = f"row {row} of {element.name} has {counts[at + row]} values, expected {width}"
+            raise RowError(Finding("malformed", 1, text, "error"))
+        if element.name in wanted:
+            words = [word for line in lines[at : at + used] for word in line.split()]
+            rows[element.name] = [" ".join(words[first : first + width]) for first in range(0, len(words), width)]
+        oddities.append(f"{count} of {element.name} in {used} lines" if used > 1 else "all values in one line")
+        at += used
+    rest = int(counts[at:].sum())
+    if rest and at != sum(element.count for element in elements):
+        text = f"found {counted(rest, 'value')} after rows that are not on separate lines"
+        raise RowError(Finding("malformed", rest, text, "error"))
+    return rows, oddities, len(" ".join(" ".join(lines[at:]).split()))
 
 
 def truncated_finding(name: str, declared: int, present: int) -> Finding:

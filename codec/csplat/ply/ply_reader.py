@@ -8,20 +8,25 @@ from __future__ import annotations
 
 import io
 import math
+import re
+import textwrap
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from tempfile import TemporaryFile
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import plyfile
 
 from csplat.disk_files import local_file
 from csplat.errors import InputError, counted
-from csplat.file_source import File, open_binary
+from csplat.file_source import File, map_file, open_binary
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_sh_degree
 from csplat.ply.column_names import ColumnMap, find_columns
@@ -35,7 +40,15 @@ from csplat.ply.columns import (
     with_half_floats,
 )
 from csplat.ply.comments import CommentMetadata, parse_comments, split_origin
-from csplat.ply.ply_header import SPLAT_ELEMENT, PlyHeader, parse_text_rows, read_ply_header, truncated_finding
+from csplat.ply.ply_header import (
+    SPLAT_ELEMENT,
+    PlyHeader,
+    RowError,
+    parse_text_rows,
+    read_ply_header,
+    truncated_finding,
+)
+from csplat.ply.ply_rows import is_list, lines_without_lists, row_type, skip_lists
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
@@ -45,9 +58,11 @@ _FRAME = "delta_vertex_"  # prefix of Brush's elements with the differences of l
 _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
 _COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time; they fit in the cache
-_EARLY_END = "early end-of-file"  # message of plyfile
 _PACKED_COLOURS = ("colors", "color", "rgb")
+_FORMATS = {"=": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}  # by plyfile's byte order
 _SHOWN = 40  # maximum number of characters of a word in a message
+_SHOWN_NAMES = 200  # characters of names in a message, which may be a MiB long
+_DAMAGED = (plyfile.PlyParseError, ValueError, OverflowError, MemoryError)  # what plyfile and NumPy raise
 
 
 def read_ply(
@@ -158,12 +173,16 @@ class PlyContent(NamedTuple):
     elements: list[str]
 
 
-def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
+def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False) -> PlyContent | None:
     """Parse a file with plyfile.
+
+    It is shown the header without counts, and then the elements that are needed one by one, without their lists: it
+    makes an object for each list.
 
     Args:
         path: path of the file.
         findings: findings are appended to this list.
+        only_splats: refuse a file that lacks columns of splats before its rows are read.
 
     Returns:
         The content; `None` if the findings contain an error.
@@ -175,57 +194,61 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     header = read_ply_header(path, findings)
     if any(not one.repairable for one in findings):
         return None
-    # NumPy warns about text numbers beyond their type, which become infinite and are dropped later, and about empty
-    # tables, which plyfile refuses.
-    quiet = warnings.catch_warnings(action="ignore", category=UserWarning)
-    packed = None
-    with _open_for_plyfile(path, header) as stream, np.errstate(over="ignore"), quiet:
-        try:
-            try:
-                parsed = plyfile.PlyData.read(stream)
-                end = None if parsed.text else stream.tell()
-                packed = _with_packed_colours(path, header, parsed, findings)
-                if packed is None:
-                    findings += _trailing_findings(path, header, end, sum(element.count for element in parsed))
-            except plyfile.PlyElementParseError as error:
-                parsed = _read_again(path, header, findings, error)
-        except (plyfile.PlyParseError, ValueError, OverflowError, MemoryError) as error:
-            raise InputError(f"{path.name}: {error or type(error).__name__}") from None
-    if parsed is None:
-        return None
-    if SPLAT_ELEMENT not in parsed:
+    try:
+        declared = plyfile.PlyData.read(io.BytesIO(header.without_rows()))
+        if packed := _packed_colours(path, header, declared, findings):
+            declared = plyfile.PlyData.read(io.BytesIO(packed))
+    except _DAMAGED as error:
+        raise _input_error(path, error) from None
+    if SPLAT_ELEMENT not in declared:
         raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
-    others = [element for element in parsed if element.name != SPLAT_ELEMENT]
-    findings += _other_findings(others)
-    rows, lists = _scalar_columns(parsed[SPLAT_ELEMENT].data if packed is None else packed)
-    if lists:
-        text = f"list properties {', '.join(lists)}: dropped"
-        findings.append(Finding("list-columns", len(lists), text, "repair"))
-    comments = [*parsed.comments, *parsed.obj_info]
-    for element in parsed:
+    others = [element.name for element in declared if element.name != SPLAT_ELEMENT]
+    properties = declared[SPLAT_ELEMENT].properties
+    list_findings = _list_findings([one.name for one in properties if is_list(one)])
+    if only_splats:
+        _, more = find_columns(row_type(properties), elements=others)
+        if any(one.id == "missing-columns" for one in more):
+            findings += [*_other_findings(others), *list_findings, *more]
+            return None
+    try:
+        rows = _read_rows(path, header, declared, findings)
+    except RowError as error:
+        findings.append(error.finding)
+        return None
+    except _DAMAGED as error:
+        raise _input_error(path, error) from None
+    findings += [*_other_findings(others, rows.get(_COLOUR_SPACE)), *list_findings]
+    comments = [*declared.comments, *declared.obj_info]
+    for element in declared:
         comments += element.comments
-    return PlyContent(rows, comments, [element.name for element in others])
+    return PlyContent(rows.get(SPLAT_ELEMENT, np.empty(0, [])), comments, others)
 
 
-def _with_packed_colours(path: Path, header: PlyHeader, parsed: Any, findings: list[Finding]) -> Rows | None:
-    """Return the rows of a file that declares one byte of colour and has three; `None` if it is not such a file.
+def _input_error(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path.name}: {str(error)[:_SHOWN_NAMES] or type(error).__name__}")
+
+
+def _packed_colours(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> bytes:
+    """Return the header without counts of a file that declares one byte of colour and has three; b"" for other files.
 
     nerfstudio's exporter declares `uchar colors` with the option `rgb` (exporter.py, up to 1.1.5).
     """
-    if parsed.text or [element.name for element in parsed] != [SPLAT_ELEMENT]:
-        return None
-    data = parsed[SPLAT_ELEMENT].data
-    names = data.dtype.names or ()
-    name = next((one for one in names if one in _PACKED_COLOURS and data.dtype[one] == np.uint8), "")
-    surplus = path.stat().st_size - header.end - data.nbytes
-    if not name or not len(data) or surplus != 2 * len(data) or {"red", "green", "blue", "f_dc_0"} & {*names}:
-        return None
-    fields: list[Any] = []
-    for one in names:
-        fields += [("red", "u1"), ("green", "u1"), ("blue", "u1")] if one == name else [(one, data.dtype[one])]
-    text = f"one uchar {name} is declared, three are in each row: read as red, green and blue"
+    if header.is_text or [element.name for element in declared] != [SPLAT_ELEMENT]:
+        return b""
+    properties, count = declared[SPLAT_ELEMENT].properties, header.elements[0].count
+    names = {one.name for one in properties}
+    single = [one for one in properties if not is_list(one)]
+    packed = next((one for one in single if one.name in _PACKED_COLOURS and one.val_dtype == "u1"), None)
+    surplus = path.stat().st_size - header.end - count * row_type(properties).itemsize
+    if packed is None or len(single) < len(properties) or count == 0 or surplus != 2 * count:
+        return b""
+    if names & {"red", "green", "blue", "f_dc_0"}:
+        return b""
+    text = f"one uchar {packed.name} is declared, three are in each row: read as red, green and blue"
     findings.append(Finding("packed-colours", 1, text, "note"))
-    return np.memmap(path, fields, "r", header.end, (len(data),))
+    three = b"\n".join(b"property uchar %s" % name for name in (b"red", b"green", b"blue"))
+    line = rb"(?m)^property[ \t]+\S+[ \t]+%s[ \t]*$" % re.escape(packed.name).encode()
+    return re.sub(line, three, header.without_rows(), count=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,7 +269,7 @@ def _open(
 ) -> _OpenPly | None:
     """Parse everything except the values of the rows; return `None` if the findings contain an error."""
     check_sh_degree(sh_degree)
-    content = parse_ply(path, findings)
+    content = parse_ply(path, findings, only_splats=True)
     if content is None:
         return None
     rows = with_half_floats(content.rows, findings)
@@ -368,84 +391,176 @@ def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) 
     )
 
 
-def _read_again(path: Path, header: PlyHeader, findings: list[Finding], error: Any) -> Any:
-    """Read a file that plyfile refused; return `None` and append a finding if that is not possible.
+def _read_rows(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    """Read the single values of the elements that are needed, by name of the element; all others are skipped.
 
     Args:
         path: path of the file.
         header: its header.
-        findings: findings are appended to this list.
-        error: the error that plyfile raised.
+        declared: the header as plyfile parses it, without counts.
+        findings: findings about the layout of text, and bytes after the last row, are appended to this list.
+
+    Raises:
+        RowError: rows are missing or invalid.
+        plyfile.PlyParseError, ValueError, OverflowError, MemoryError: plyfile cannot read them.
+        OSError: the file cannot be read.
     """
-    if not header.is_text or error.message == _EARLY_END:
-        findings.append(truncated_finding(error.element.name, error.element.count, error.row or 0))
-        return None
+    if not header.is_text:
+        return _read_binary(path, header, declared, findings)
+    # NumPy warns about text numbers beyond their type, which become infinite and are dropped later.
+    with np.errstate(over="ignore"), warnings.catch_warnings(action="ignore", category=UserWarning):
+        with suppress(plyfile.PlyElementParseError, RowError):
+            return _read_lines(path, header, declared, findings)
+        return _read_layout(path, header, declared, findings)
+
+
+def _is_needed(element: Any) -> bool:
+    if element.name == _COLOUR_SPACE:
+        return [one.name for one in element.properties if not is_list(one)][:1] == [_COLOUR_SPACE]
+    return element.name == SPLAT_ELEMENT and not all(map(is_list, element.properties))
+
+
+def _read_binary(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    rows: dict[str, Rows] = {}
+    at, size, order = header.end, path.stat().st_size, declared.byte_order
+    for element, count in zip(declared, (one.count for one in header.elements), strict=True):
+        name, properties = element.name, element.properties
+        if any(map(is_list, properties)):
+            data = memoryview(map_file(path))
+            if not _is_needed(element):
+                at = skip_lists(data, at, name, count, properties, order, None)
+                continue
+            with TemporaryFile() as copy:
+                copy.write(_element_header(declared, element, count))
+                at = skip_lists(data, at, name, count, properties, order, copy)
+                copy.seek(0)
+                rows[name] = np.array(plyfile.PlyData.read(copy)[name].data)
+            continue
+        width = row_type(properties).itemsize
+        if width and (size - at) // width < count:
+            raise RowError(truncated_finding(name, count, (size - at) // width))
+        if _is_needed(element):
+            with _StreamWithHeader(path, _element_header(declared, element, count), at) as stream:
+                rows[name] = plyfile.PlyData.read(stream)[name].data
+        at += count * width
+    findings += _trailing_findings(path, header, at)
+    return rows
+
+
+def _read_lines(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    """Read text with a row in each line; raise an error if it has another layout."""
+    rows: dict[str, Rows] = {}
+    with open_binary(path) as file:
+        left = file.seek(0, io.SEEK_END) - header.end
+        file.seek(header.end)
+        stream = io.TextIOWrapper(file, encoding="ascii", errors="replace", newline="")
+        for element, one in zip(declared, header.elements, strict=True):
+            absent = RowError(truncated_finding(one.name, one.count, 0))
+            if one.count * 2 * len(one.properties) > left + 1:  # before memory for the rows is allocated
+                raise absent
+            if _is_needed(element):
+                rows[one.name] = _parse_lines(declared, element, one.count, stream)
+            elif one.count != sum(1 for _ in islice(_scalar_lines(element, stream), one.count)):
+                raise absent
+        rest = len(stream.read().strip())
+    findings += _rest_findings(rest)
+    return rows
+
+
+def _read_layout(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    """Read text of any layout."""
     with open_binary(path) as stream:
         stream.seek(header.end)
-        rows, more = parse_text_rows(stream.read(), header.elements)
+        needed = [element.name for element in declared if _is_needed(element)]
+        lines, more = parse_text_rows(stream.read(), header.elements, needed)
     findings += more
-    if rows is None:
-        return None
-    text = "\n".join([*header.text.decode("ascii").splitlines(), *map(" ".join, rows), ""])
-    try:
-        return plyfile.PlyData.read(io.StringIO(text))
-    except plyfile.PlyElementParseError as second:
-        findings.append(_row_finding(second, rows, header))
-        return None
+    rows: dict[str, Rows] = {}
+    for name, found in lines.items():
+        try:
+            rows[name] = _parse_lines(declared, declared[name], len(found), found)
+        except plyfile.PlyElementParseError as error:
+            row = next(islice(_scalar_lines(declared[name], found), error.row or 0, None)).split()
+            raise RowError(_row_finding(error, row)) from None
+    return rows
 
 
-def _row_finding(error: Any, rows: list[list[str]], header: PlyHeader) -> Finding:
+def _scalar_lines(element: Any, lines: Iterable[str]) -> Iterator[str]:
+    return lines_without_lists(lines, element.name, element.properties)
+
+
+def _parse_lines(declared: Any, element: Any, count: int, lines: Iterable[str]) -> Rows:
+    """Parse rows of text, one in each line."""
+    if any(map(is_list, element.properties)):
+        lines = _scalar_lines(element, lines)
+    header = io.StringIO(_element_header(declared, element, count).decode())
+    stream = SimpleNamespace(read=header.read, readline=partial(next, iter(lines), ""))
+    rows: Rows = plyfile.PlyData.read(stream)[element.name].data
+    return rows
+
+
+def _element_header(declared: Any, element: Any, count: int) -> bytes:
+    """Return the header of a file that has only this element, without its lists."""
+    single = (one for one in element.properties if not is_list(one))
+    lines = [f"format {_FORMATS[declared.byte_order]} 1.0", f"element {element.name} {count}", *map(str, single)]
+    return "\n".join(["ply", *lines, "end_header", ""]).encode("ascii")
+
+
+def _row_finding(error: Any, words: list[str]) -> Finding:
     """Report the invalid value of a text row."""
     name, row, text = error.element.name, error.row or 0, error.message
-    at = [element.name for element in header.elements].index(name)
-    element, before = header.elements[at], sum(one.count for one in header.elements[:at])
-    if error.prop is not None and not element.has_lists:
-        word = rows[before + row][element.properties.index(error.prop.name)]
+    if error.prop is not None:
+        word = words[[one.name for one in error.element.properties].index(error.prop.name)]
         kind = np.dtype(error.prop.val_dtype)
         expected = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
         text = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {expected}"
     return Finding("malformed", 1, f"row {row} of {name}: {text}", "error")
 
 
-def _other_findings(others: list[Any]) -> list[Finding]:
-    """Report elements that contain no splats."""
-    if not others:
+def _list_findings(names: list[str]) -> list[Finding]:
+    """Report lists of splats."""
+    text = f"list properties {textwrap.shorten(', '.join(names), _SHOWN_NAMES)}: dropped"
+    return [Finding("list-columns", len(names), text, "repair")] if names else []
+
+
+def _other_findings(names: list[str], colour_space: Rows | None = None) -> list[Finding]:
+    """Report elements that contain no splats.
+
+    Args:
+        names: their names.
+        colour_space: rows of the element with the colour space, if any.
+    """
+    if not names:
         return []
-    names = [element.name for element in others]
-    text = f"elements besides {SPLAT_ELEMENT}: {', '.join(names)}: dropped"
+    text = f"elements besides {SPLAT_ELEMENT}: {textwrap.shorten(', '.join(names), _SHOWN_NAMES)}: dropped"
     if not set(names) <= _SHARP:
         if any(name.startswith(_FRAME) for name in names):
             text += "; they move the splats, of which the first frame is kept"
-        return [Finding("other-elements", len(others), text, "repair")]
-    findings = [Finding("sharp-elements", len(others), f"{text}; they are the camera of ml-sharp", "note")]
-    for element in others:
-        values = element.data[_COLOUR_SPACE] if element.name == _COLOUR_SPACE == element.properties[0].name else ()
-        linear = [value for value in values if value != _SRGB]
-        if linear:
-            text = f"{_COLOUR_SPACE} is {linear[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
-            findings.append(Finding("colour-space", 1, text, "error"))
+        return [Finding("other-elements", len(names), text, "repair")]
+    findings = [Finding("sharp-elements", len(names), f"{text}; they are the camera of ml-sharp", "note")]
+    if colour_space is None:
+        return findings
+    linear = colour_space[_COLOUR_SPACE][colour_space[_COLOUR_SPACE] != _SRGB]
+    if len(linear):
+        text = f"{_COLOUR_SPACE} is {linear[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
+        findings.append(Finding("colour-space", 1, text, "error"))
     return findings
 
 
-def _trailing_findings(path: Path, header: PlyHeader, end: int | None, row_count: int) -> list[Finding]:
-    """Report bytes after the last row, which ends at `end`; in ASCII files (`None`) each row is a line."""
-    if end is not None:
-        count = path.stat().st_size - end
-        if count and _is_changed_as_text(path, header, count):
-            text = (
-                f"{counted(count, 'byte')} after the last row, and a carriage return before each line feed of the rows:"
-                " corrupted by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
-            )
-            return [Finding("malformed", count, text, "error")]
-    else:
-        with open_binary(path) as stream:
-            stream.seek(header.end)
-            lines = stream.read().splitlines(keepends=True)
-        count = len(b"".join(lines[row_count:]).strip())
-    if count == 0:
-        return []
+def _trailing_findings(path: Path, header: PlyHeader, end: int) -> list[Finding]:
+    """Report bytes after the last binary row, which ends at `end`."""
+    count = path.stat().st_size - end
+    if count and _is_changed_as_text(path, header, count):
+        text = (
+            f"{counted(count, 'byte')} after the last row, and a carriage return before each line feed of the rows:"
+            " corrupted by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
+        )
+        return [Finding("malformed", count, text, "error")]
+    return _rest_findings(count)
+
+
+def _rest_findings(count: int) -> list[Finding]:
     text = f"{counted(count, 'byte')} after the last row: ignored"
-    return [Finding("trailing-bytes", count, text, "repair")]
+    return [Finding("trailing-bytes", count, text, "repair")] if count else []
 
 
 def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
@@ -470,19 +585,6 @@ def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
     return surplus <= feeds
 
 
-def _scalar_columns(data: Rows) -> tuple[Rows, list[str]]:
-    """Drop list properties; return contiguous rows and the names of the dropped properties."""
-    names = data.dtype.names or ()
-    lists = [name for name in names if data.dtype[name].hasobject]
-    if not lists:
-        return data, []
-    kept = [(name, data.dtype[name]) for name in names if name not in lists]
-    rows = np.empty(len(data), kept)
-    for name, _ in kept:
-        rows[name] = data[name]
-    return rows, lists
-
-
 def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator[Rows]:
     """Yield rows in blocks; memory-mapped rows are read from the file, which aligns them and saves memory.
 
@@ -505,29 +607,13 @@ def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator
             yield block
 
 
-def _open_for_plyfile(path: Path, header: PlyHeader) -> IO[Any]:
-    """Open a PLY after its byte order mark, with the rewritten header; ASCII files are opened as text."""
-    stream = _StreamWithHeader(path, header)
-    return io.TextIOWrapper(stream, encoding="ascii", errors="replace") if header.is_text else stream
-
-
 class _StreamWithHeader(io.BufferedReader):
-    """A file whose header is replaced by another one of the same length."""
+    """A file at an offset, whose bytes follow a header that is not in the file."""
 
-    def __init__(self, path: Path, header: PlyHeader) -> None:
+    def __init__(self, path: Path, header: bytes, offset: int) -> None:
         super().__init__(io.FileIO(path))
-        self.seek(header.start)
-        self._header, self._at = header.text, 0
+        self.seek(offset)
+        self._header = io.BytesIO(header)
 
     def read(self, size: int | None = -1, /) -> bytes:
-        return self._with_header(super().read(size))
-
-    def read1(self, size: int = -1, /) -> bytes:
-        return self._with_header(super().read1(size))
-
-    def _with_header(self, data: bytes) -> bytes:
-        if self._at >= len(self._header):
-            return data
-        begin = self._header[self._at : self._at + len(data)]  # plyfile reads byte by byte: do not copy the rest
-        self._at += len(begin)
-        return begin + data[len(begin) :]
+        return self._header.read(size) or super().read(size)

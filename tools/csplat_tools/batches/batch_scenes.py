@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import os
 import re
 from collections import Counter
@@ -13,7 +12,7 @@ from fnmatch import fnmatch
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from csplat.disk_files import read_text, resolve_links
+from csplat.disk_files import parse_json, read_text, resolve_links
 from csplat.errors import InputError
 from csplat.formats import formats
 from csplat.remote_store import is_url
@@ -156,8 +155,8 @@ def _json_lines(manifest: Path, text: str) -> Iterator[tuple[int, dict[str, Any]
         if not line.strip():
             continue
         try:
-            fields = json.loads(line)
-        except ValueError:
+            fields = parse_json(line)
+        except InputError:
             fields = None
         if not isinstance(fields, dict):
             raise InputError(f"{manifest.name}, line {number}: expected a JSON object with a path")

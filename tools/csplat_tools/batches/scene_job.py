@@ -20,7 +20,7 @@ from typing import Any
 from urllib.parse import unquote
 
 from csplat import __version__
-from csplat.disk_files import remove_unfinished, temporary_file, temporary_folder
+from csplat.disk_files import parse_json, path_inside, remove_unfinished, temporary_file, temporary_folder
 from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, InputError, StoreError, counted, missing_package
 from csplat.file_source import open_binary, read_bytes
@@ -413,13 +413,14 @@ def _files(path: Path) -> list[Path]:
 def _buffer_files(path: Path) -> Iterator[Path]:
     """Yield the buffer files that a glTF names and that exist in its folder; none if the JSON is invalid."""
     try:
-        buffers = json.loads(read_bytes(path)).get("buffers", [])
+        buffers = parse_json(read_bytes(path)).get("buffers", [])
         names = [unquote(one["uri"]) for one in buffers if not one.get("uri", "data:").startswith("data:")]
-    except (ValueError, TypeError, AttributeError):
+    except (InputError, TypeError, AttributeError):
         return
     for name in names:
-        if (path.parent / name).is_file() and (path.parent / name).resolve().is_relative_to(path.parent.resolve()):
-            yield path.parent / name
+        with suppress(ValueError, OSError, RuntimeError):  # not the name of a file, a loop of links
+            if (inside := path_inside(path.parent, name)) and inside.is_file():
+                yield path.parent / name
 
 
 def _hashed(path: Path) -> str:

@@ -32,7 +32,7 @@ T = TypeVar("T")
 N = TypeVar("N", int, float, int | None, float | None)
 
 CHECKPOINT_EVERY = 1_000  # steps from one checkpoint to the next
-_LEVEL = re.compile(r"(\d+(?:\.\d+)?)(k|M)?", re.ASCII)
+_LEVEL = re.compile(r"(\d{1,15}(?:\.\d{1,15})?)(k|M)?", re.ASCII)
 _LEVEL_MAX = 255  # largest level that the format has; larger numbers are numbers of splats
 _LENGTHS = {"um": 1e-6, "µm": 1e-6, "mm": 1e-3, "cm": 1e-2, "m": 1.0, "km": 1e3}  # metres
 _NAMED_COLOURS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -465,7 +465,7 @@ def parse_levels(text: str) -> Levels:
     """Parse a number of levels of detail, `auto` or `none`."""
     if text in ("auto", "none"):
         return "auto" if text == "auto" else None
-    if not text.isdecimal() or int(text) > LEVELS_MAX:
+    if not re.fullmatch(r"[0-9]{1,9}", text) or int(text) > LEVELS_MAX:
         raise typer.BadParameter(f"--levels is {text}, expected auto, none or 0 to {LEVELS_MAX}")
     return int(text)
 

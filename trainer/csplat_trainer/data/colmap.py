@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import re
 import struct
+from array import array
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -277,6 +278,8 @@ _LAYOUTS = {
 
 
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?$")
+_ID_DIGITS = 20  # digits of the longest id or size; COLMAP counts in 64 bits
+_SHOWN = 80  # maximum number of characters of a word in a message
 _NO_NUMBER = re.compile(r"^[+-]?(nan\(.*\)|1\.#(ind|qnan|snan|inf)0*)$", re.IGNORECASE)
 
 
@@ -474,34 +477,39 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     Returns:
         The lines of poses, each with its place in the file; and a line for the report if a second line is missing.
     """
-    written = [
-        (line, f"{path}, line {number}")
-        for number, line in enumerate(read_text(path, any_bytes=True).split("\n"), 1)
-        if not line.lstrip().startswith("#")
-    ]
-    while written and not written[0][0].strip():
-        written.pop(0)
-    if all(_is_pose(line) for line, _ in written[::2] if line.strip()) and all(
-        _is_keypoints(line.split()) for line, _ in written[1::2]
+    lines = read_text(path, any_bytes=True).split("\n")
+    first = next((number for number, line in enumerate(lines) if line.strip() and not _is_comment(line)), len(lines))
+    numbers = array("q", (number for number in range(first, len(lines)) if not _is_comment(lines[number])))
+
+    def pair(number: int) -> tuple[str, str]:
+        return lines[number], f"{path}, line {number + 1}"
+
+    if all(_is_pose(lines[one]) for one in numbers[::2] if lines[one].strip()) and all(
+        _is_keypoints(lines[one].split()) for one in numbers[1::2]
     ):
-        return [pair for pair in written[::2] if pair[0].strip()], []
+        return [pair(one) for one in numbers[::2] if lines[one].strip()], []
     poses: list[tuple[str, str]] = []
     single = 0
     expected = False  # a line of keypoints may follow
-    for line, where in written:
+    for number in numbers:
+        line = lines[number]
         if not _is_keypoints(line.split()):
             single += expected
-            poses.append((line, where))
+            poses.append(pair(number))
             expected = True
         elif line.strip() and not expected:
             raise InputError(
-                f"{where}: these are keypoints, expected an image: id, rotation, translation, camera, name"
+                f"{pair(number)[1]}: these are keypoints, expected an image: id, rotation, translation, camera, name"
             )
         else:
             expected = False
     if not single:
         return poses, []
     return poses, [f"{path.name}: {counted(single, 'image')} without a line of keypoints, which is optional"]
+
+
+def _is_comment(line: str) -> bool:
+    return line.lstrip().startswith("#")
 
 
 def _is_keypoints(words: list[str]) -> bool:
@@ -526,7 +534,7 @@ def _numbers(words: list[str], where: str) -> list[float]:
         try:
             values.append(_parse_number(word))
         except ValueError:
-            raise InputError(f"{where}: {printable(word[:40])!r} is not a number") from None
+            raise InputError(f"{where}: {printable(word[:_SHOWN])!r} is not a number") from None
     return values
 
 
@@ -548,7 +556,8 @@ def _check_commas(path: Path, rows: Iterable[tuple[list[str], str]], report: lis
         for word in words:
             if "," in word:
                 if not _DECIMAL_COMMA.match(word):
-                    raise InputError(f"{where}: {printable(word[:40])!r} has a comma, expected a number such as 0.5")
+                    shown = printable(word[:_SHOWN])
+                    raise InputError(f"{where}: {shown!r} has a comma, expected a number such as 0.5")
                 comma = comma or (word, where)
             elif "." in word and not _NO_NUMBER.match(word):
                 point = point or (word, where)
@@ -562,10 +571,9 @@ def _check_commas(path: Path, rows: Iterable[tuple[list[str], str]], report: lis
 
 
 def _integer(word: str, where: str) -> int:
-    try:
-        return int(word)
-    except ValueError:
-        raise InputError(f"{where}: {word!r} is not an id") from None
+    if len(word) > _ID_DIGITS or not re.fullmatch("-?[0-9]+", word):
+        raise InputError(f"{where}: {word[:_SHOWN]!r} is not an id")
+    return int(word)
 
 
 def _lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:

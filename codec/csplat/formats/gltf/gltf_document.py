@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import binascii
-import json
 import math
 import struct
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import parse_json, path_inside
 from csplat.errors import InputError, counted
 from csplat.file_source import describe_substitute, map_file
 from csplat.types import F32, F64
@@ -34,6 +34,7 @@ _VERSION = 2
 
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # properties of a node
 _MAX_PRIMITIVES = 1 << 14  # primitives shown by all nodes: a small file could reference one mesh very often
 _NO_TRANSLATION = (0.0, 0.0, 0.0)
 _INSTANCING = "EXT_mesh_gpu_instancing"
@@ -218,9 +219,9 @@ class GltfDocument:
         if not name.isprintable() or ":" in name or "\\" in name:
             raise self.error(json_path, f"found {_shorten(uri)}, expected a file in the same folder")
         try:
-            target = (folder / name).resolve()
-            if not target.is_relative_to(folder):  # refuses .., absolute paths and links that lead out
-                raise self.error(json_path, f"{_shorten(uri)} is outside the folder of {self.path.name}")
+            target = path_inside(folder, name)
+            if target is None:  # refuses .., absolute paths and links that lead out
+                raise self.error(json_path, f"{_shorten(uri)} leads outside the folder of {self.path.name}")
             if not target.is_file():
                 same = [path.name for path in folder.iterdir() if path.name.casefold() == target.name.casefold()]
                 hint = f", but {_shorten(same[0])}: rename it" if same else ""
@@ -261,8 +262,10 @@ class GltfDocument:
             if index in seen:
                 raise self.error(json_path, "it has more than one parent")
             seen.add(index)
-            with np.errstate(all="ignore"):
-                matrix = above @ self._transform(node, json_path)
+            matrix = above
+            if not _TRANSFORM.isdisjoint(node):
+                with np.errstate(all="ignore"):
+                    matrix = above @ self._transform(node, json_path)
             stack += [(child, matrix) for child in reversed(self._list(node, json_path, "children"))]
             if "mesh" in node:
                 mesh = self.item("meshes", node["mesh"])
@@ -349,8 +352,8 @@ def open_document(path: Path) -> GltfDocument:
     data = memoryview(map_file(path))
     text, binary, tail = _split_chunks(path, data) if data[:4] == MAGIC else (data, None, 0)
     try:
-        root = json.loads(bytes(text))  # detects UTF-8 with or without a byte order mark, and UTF-16
-    except (ValueError, RecursionError) as error:
+        root = parse_json(bytes(text))
+    except InputError as error:
         raise InputError(f"{path.name}: its JSON cannot be read: {error}") from None
     if not isinstance(root, dict) or not isinstance(root.get("asset"), dict):
         raise InputError(f"{path.name} is not glTF: its JSON has no asset")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -14,7 +13,8 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.archives import DAMAGED, scenes_of
+from csplat.archives import DAMAGED, member_refusal, scenes_of
+from csplat.disk_files import parse_json, path_inside
 from csplat.errors import InputError
 from csplat.file_source import describe_substitute, open_binary
 from csplat.image_opener import open_image
@@ -152,11 +152,15 @@ class SogParts:
 
     def file(self, name: str) -> Path:
         """Return the path of a part in a folder; raises the errors of `read`."""
-        path = self.path / self._inside(name)
-        if self.folder is not None or not path.is_file():
-            self.refuse(f"there is no {name[:80]}")
-        if not path.resolve().is_relative_to(self.path.resolve()):
-            self.refuse(f"the part {name[:80]} is a link that leads out of its folder")
+        inside = self._inside(name)
+        try:
+            path = path_inside(self.path, str(inside))
+            if path is not None and (self.folder is not None or not path.is_file()):
+                self.refuse(f"there is no {name[:80]}")
+        except (ValueError, OSError, RuntimeError) as error:  # RuntimeError: circular links
+            self.refuse(f"{name[:80]!r} cannot be read: {error}")
+        if path is None:
+            self.refuse(f"the part {name[:80]!r} is a link that leads out of it: copy the file there")
         return path
 
     def _inside(self, name: str) -> PurePosixPath:
@@ -173,8 +177,8 @@ class SogParts:
         if len({info.filename for info in found}) > 1:
             self.refuse(f"{' and '.join(info.filename[:80] for info in found[:2])} would both be {name[:80]}")
         info = found[-1]
-        if info.file_size > min(most, _FREE + _EXPANSION * info.compress_size):
-            self.refuse(f"{name} of {info.compress_size:,} bytes declares an unpacked size of {info.file_size:,}")
+        if reason := member_refusal(info, min(most, _FREE + _EXPANSION * info.compress_size)):
+            self.refuse(f"{name[:80]} {reason}")
         try:
             return self.zip.read(info)
         except DAMAGED as error:
@@ -184,10 +188,9 @@ class SogParts:
         """Read and parse a JSON part."""
         data = self.read(name, _LARGEST_JSON)
         try:
-            value = json.loads(data)
-        except (ValueError, RecursionError) as error:
-            reason = "too many brackets" if isinstance(error, RecursionError) else " ".join(str(error).split())[:80]
-            self.refuse(f"{name[:80]} is not JSON: {reason}")
+            value = parse_json(data)
+        except InputError as error:
+            self.refuse(f"{name[:80]} is not JSON: {error}")
         return JsonValue(self, name, value)
 
     def refuse(self, reason: str) -> NoReturn:

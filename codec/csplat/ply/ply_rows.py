@@ -1,0 +1,118 @@
+"""Skip rows of PLY files, and the lists in rows, without keeping an object per row.
+
+Properties are those of plyfile: `name` and `val_dtype`, and `len_dtype` of lists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, BinaryIO, Literal
+
+import numpy as np
+
+from csplat.lint import Finding
+from csplat.ply.ply_header import RowError, truncated_finding
+
+_SHOWN = 40  # maximum number of characters of a name in a message
+_MAX_DIGITS = 18  # digits of the length of a list in text; longer ones exceed every file
+
+
+def is_list(one: Any) -> bool:
+    """Return True if a property is a list."""
+    return hasattr(one, "len_dtype")
+
+
+def row_type(properties: Sequence[Any], order: str = "=") -> np.dtype[Any]:
+    """Return the type of a row without its lists, in this byte order."""
+    return np.dtype([(one.name, order + one.val_dtype) for one in properties if not is_list(one)])
+
+
+def skip_lists(
+    data: memoryview, at: int, name: str, count: int, properties: Sequence[Any], order: str, copy: BinaryIO | None
+) -> int:
+    """Walk binary rows that have lists, because the length of a row is in its lists.
+
+    Args:
+        data: the file.
+        at: offset of the first row.
+        name: name of the element.
+        count: number of rows.
+        properties: properties of the element.
+        order: byte order, `<` or `>`.
+        copy: the rows without their lists are written to this file; `None`: to none.
+
+    Returns:
+        Offset of the end of the last row.
+
+    Raises:
+        RowError: rows are missing, or the length of a list is no count.
+    """
+    byteorder: Literal["little", "big"] = "big" if order == ">" else "little"
+    end, gap = len(data), 0  # gap: bytes of single values before a list, or after the last one
+    lists = []
+    for one in properties:
+        if not is_list(one):
+            gap += np.dtype(one.val_dtype).itemsize
+            continue
+        kind = np.dtype(one.len_dtype)
+        if kind.kind == "f":
+            text = f"the list {one.name[:_SHOWN]} of {name} has lengths of type {kind.name}, expected integers"
+            raise RowError(Finding("malformed", 1, text, "error"))
+        width = np.dtype(one.val_dtype).itemsize
+        lists.append((gap, kind.itemsize, kind == np.uint8, kind.kind == "i", width, one.name))
+        gap = 0
+    for row in range(count):
+        for before, size, is_byte, is_signed, width, listed in lists:
+            start = at + before
+            stop = start + size
+            if stop > end:
+                raise RowError(truncated_finding(name, count, row))
+            if copy is not None:
+                copy.write(data[at:start])
+            if is_byte:
+                length = data[start]
+            else:
+                length = int.from_bytes(data[start:stop], byteorder, signed=is_signed)
+            if length < 0:
+                text = f"row {row} of {name}: the list {listed[:_SHOWN]} has a length of {length}"
+                raise RowError(Finding("malformed", 1, text, "error"))
+            at = stop + length * width
+        if at + gap > end:
+            raise RowError(truncated_finding(name, count, row))
+        if copy is not None:
+            copy.write(data[at : at + gap])
+        at += gap
+    return at
+
+
+def lines_without_lists(lines: Iterable[str], name: str, properties: Sequence[Any]) -> Iterator[str]:
+    """Yield rows of text without their lists.
+
+    Args:
+        lines: one row each.
+        name: name of the element.
+        properties: properties of the element.
+
+    Raises:
+        RowError: a row has another number of values than declared, or the length of a list is no count.
+    """
+    are_lists = [is_list(one) for one in properties]
+    for row, line in enumerate(lines):
+        words = line.split()
+        kept, at = words, len(are_lists)
+        if any(are_lists):
+            kept, at = [], 0
+            for listed in are_lists:
+                word = words[at] if at < len(words) else ""
+                at += 1
+                if not listed:
+                    kept.append(word)
+                elif word.isdecimal() and len(word) <= _MAX_DIGITS:
+                    at += int(word)
+                else:
+                    at = -1
+                    break
+        if at != len(words):
+            text = f"row {row} of {name} has {len(words)} values, which its properties do not match"
+            raise RowError(Finding("malformed", 1, text, "error"))
+        yield " ".join(kept)
