@@ -707,7 +707,7 @@ def test_an_integer_beyond_its_type_is_refused(tmp_path):
     (tmp_path / "a.ply").write_text(
         f"ply\nformat ascii 1.0\nelement vertex 2\n{columns}end_header\n\n1 2\n{10**30} 2\n"
     )
-    with pytest.raises(InputError, match="row 1 of vertex: label is .1000.*, expected an integer of type uint8"):
+    with pytest.raises(InputError, match=r"row 1 of vertex: label is .1000.*, expected an integer of type uint8"):
         read_ply(tmp_path / "a.ply")
 
 

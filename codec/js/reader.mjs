@@ -11,7 +11,7 @@ import { WasmDecoder } from './wasm_decoder.mjs';
 import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
 import { readIndex } from './file_index.mjs';
-import { platformInflate } from './inflate.mjs';
+import { checkedInflate, platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed_layers.mjs';
 import { Payload } from './payload.mjs';
@@ -78,7 +78,7 @@ export class Reader {
     const index = await source.read(spec.HEADER_SIZE, file.indexSize, signal);
     const header = readIndex(index, file, limits);
     const compiled = options.inflate ? null : await WasmDecoder.open(file.fileSize, head, index);
-    const inflate = options.inflate ?? (await platformInflate());
+    const inflate = options.inflate ? checkedInflate(options.inflate) : await platformInflate();
     const reader = new this(source, header, limits, inflate, compiled);
     reader.inflates = options.inflate !== undefined;
     reader.opening = new Map([

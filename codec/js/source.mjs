@@ -1,7 +1,15 @@
 // Sources of a file that is not in memory: HTTP with Range, or one of those in `whole_sources.mjs`.
 
 import { InputError } from './errors.mjs';
-import { BlobSource, MemorySource, WholeSource, asInputError, bodyParts, shortData } from './whole_sources.mjs';
+import {
+  BlobSource,
+  CallerSource,
+  MemorySource,
+  WholeSource,
+  asInputError,
+  bodyParts,
+  shortData,
+} from './whole_sources.mjs';
 
 const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
 const REQUEST_BYTES = 1 << 23; // bytes; joined ranges do not exceed this
@@ -24,7 +32,7 @@ export async function openSource(from, way) {
   if (typeof from === 'string' || from instanceof URL) return openUrl(from, way);
   if (from instanceof Blob) return new BlobSource(from);
   if (from instanceof ArrayBuffer) return new MemorySource(new Uint8Array(from));
-  if (typeof from?.read === 'function') return from;
+  if (typeof from?.read === 'function') return new CallerSource(from);
   throw new InputError('the source is not a URL, a Blob, an ArrayBuffer or an object with a method read');
 }
 
