@@ -341,6 +341,8 @@ def test_a_file_beyond_the_budget_of_splats_is_not_read():
 
 def test_a_text_beyond_the_budget_is_not_read():
     assert "STR-8" in clauses_of(RICH.data, json_bytes_max=3)
+    assert "STR-8" in clauses_of(RICH.data, json_bytes_max=255)
+    assert set() == clauses_of(RICH.data, json_bytes_max=256)
 
 
 # JSON ----------------------------------------------------------------------------------------------

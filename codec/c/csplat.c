@@ -53,7 +53,9 @@
 #define SPEC_ANCILLARY_CHUNK_FLAGS 65280
 #define SPEC_BUDGET_BYTES INT64_C(8589934592)
 #define SPEC_BUDGET_BYTES_JS INT64_C(2147483648)
-#define SPEC_BUDGET_JSON_BYTES 67108864
+#define SPEC_BUDGET_JSON_BYTES 134217728
+#define SPEC_JSON_BYTE_COST 8
+#define SPEC_JSON_VALUE_COST 64
 #define SPEC_PROFILE_BASE 0
 #define SPEC_PROFILE_ARCHIVE 1
 #define SPEC_CHUNK_FLAG_CRITICAL 1
@@ -2733,25 +2735,31 @@ static int json_value(json *j, int array_of_objects)
 static int read_text(csplat *d, csplat_text which)
 {
     const chunk *k = d->texts[which];
-    uint64_t count;
+    uint64_t count, cost, at_count;
     uint8_t *text;
     cursor c;
     stream s;
     json j = {0};
     TRY(load(d, k, &d->chunk_bytes, CSPLAT_E_STREAM, "JSN-2", &c));
     count = c.size < SPEC_STREAM_HEAD_SIZE ? 0 : get_u32(c.data + SPEC_STREAM_HEAD_AT_COUNT);
-    if (count > d->options.json_bytes_max)
-        return fail(d, CSPLAT_E_LIMIT, "STR-8", c.offset + SPEC_STREAM_HEAD_AT_COUNT, "a text of %llu bytes",
-                    (unsigned long long)count);
+    at_count = c.offset + SPEC_STREAM_HEAD_AT_COUNT;
+    cost = SPEC_JSON_BYTE_COST * count; /* count < 2^32 */
+    if (cost > d->options.json_bytes_max)
+        return fail(d, CSPLAT_E_LIMIT, "STR-8", at_count, "a text of %llu bytes", (unsigned long long)count);
     TRY(read_stream(d, &c, count, 1, &s));
     TRY(at_end(d, &c));
     TRY(reserve(d, &d->text, count + 1, 1));
     TRY(reserve(d, &d->integers, count, sizeof(uint32_t)));
     undo_unsigned(&s, d->integers.data);
     text = d->text.data;
-    for (uint64_t i = 0; i < count; i++)
+    for (uint64_t i = 0; i < count; i++) {
         text[i] = (uint8_t)((const uint32_t *)d->integers.data)[i];
+        if (text[i] == ',' || text[i] == ':' || text[i] == '[' || text[i] == '{')
+            cost += SPEC_JSON_VALUE_COST;
+    }
     text[count] = '\0';
+    if (cost > d->options.json_bytes_max)
+        return fail(d, CSPLAT_E_LIMIT, "STR-8", at_count, "a text whose values take %llu bytes", (unsigned long long)cost);
     j.d = d;
     j.text = text;
     j.size = (size_t)count;

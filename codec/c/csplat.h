@@ -78,7 +78,7 @@ typedef struct csplat_source {
 typedef struct csplat_options {
     uint64_t splats_max;     /* limit of csplat_decode; default: none */
     uint64_t bytes_max;      /* limit of the arrays of csplat_decode and of codebooks; default: 8 GiB */
-    uint64_t json_bytes_max; /* limit of a text of csplat_read_text; default: 64 MiB */
+    uint64_t json_bytes_max; /* memory that a parsed text of csplat_read_text may take (STR-8); default: 128 MiB */
     /* Replace malloc and free. Set both or neither. */
     void *(*allocate)(void *user, size_t size);
     void (*release)(void *user, void *memory);

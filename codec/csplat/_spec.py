@@ -35,7 +35,9 @@ ANCILLARY_SCENE_FLAGS: Final = 240  # bits 4 to 7 of the scene flags, which may 
 ANCILLARY_CHUNK_FLAGS: Final = 65280  # bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 BUDGET_BYTES: Final = 8589934592  # default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
 BUDGET_BYTES_JS: Final = 2147483648  # default budget in JavaScript, 2 GiB
-BUDGET_JSON_BYTES: Final = 67108864  # default budget: bytes of one JSON chunk after inflation, 64 MiB
+BUDGET_JSON_BYTES: Final = 134217728  # default budget: memory of one JSON text (STR-8), 128 MiB
+JSON_BYTE_COST: Final = 8  # memory that STR-8 counts for a byte of a JSON text
+JSON_VALUE_COST: Final = 64  # memory that STR-8 counts for each comma, colon, and opening bracket or brace of a JSON text
 
 # Profiles
 PROFILE_BASE: Final = 0

@@ -6,11 +6,14 @@ export interface Limits {
   splats?: number;
   /** Bytes of decoded arrays and tables, and of a file that a server sends without ranges. Default: 2 GiB. */
   bytes?: number;
-  /** Bytes of one JSON chunk. Default: 64 MiB. */
+  /** Memory of one JSON text, estimated from its bytes and values (STR-8). Default: 128 MiB. */
   jsonBytes?: number;
 }
 
-/** Inflates raw DEFLATE to exactly `size` bytes. Throws if the stream ends early or late, or if bytes follow it. */
+/**
+ * Inflates raw DEFLATE to exactly `size` bytes. Throws if the stream ends early or late, or if bytes follow it; the decoder
+ * reports whatever it throws as E_CODER, with it as `cause.cause`.
+ */
 export type Inflate = (coded: Uint8Array<ArrayBuffer>, size: number) => Uint8Array | Promise<Uint8Array>;
 
 export type Form = 'floats' | 'integers';

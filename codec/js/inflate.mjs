@@ -2,13 +2,15 @@
 // the last byte and gives exactly the declared size, and no more output than that is ever produced. zlib, and thus every
 // platform, checks COD-5 to COD-8.
 
-import { UnsupportedError } from './errors.mjs';
+import { InputError, UnsupportedError } from './errors.mjs';
 import { ERROR_UNSUPPORTED } from './spec.mjs';
 
 /** @typedef {(coded: Uint8Array<ArrayBuffer>, size: number) => Uint8Array | Promise<Uint8Array>} Inflate */
 
 const CHUNK_BYTES = 1 << 20; // maximum output of one step of zlib
 const FEED_BYTES = 1 << 14; // input of one step of a DecompressionStream, which inflates to at most 16 MiB
+
+const MESSAGE_MAX = 200; // characters of an error of the platform or of the caller
 
 /** The clause of each zlib error, by the last word of its message; COD-2 otherwise. Browsers use the same words. */
 const CLAUSES = new Map([
@@ -34,11 +36,38 @@ export class InflateError extends Error {
   }
 }
 
-/** @param {unknown} error error from the platform */
+/** @param {unknown} error error from the platform, or whatever a caller's inflate throws */
 function refused(error) {
-  const message = error instanceof Error ? error.message : String(error);
-  const [last] = /[\w-]*(?=\W*$)/.exec(message) ?? [''];
-  return new InflateError(message, 0, CLAUSES.get(last));
+  const { message } = /** @type {{message?: unknown}} */ (error ?? {});
+  const text = typeof message === 'string' ? message : typeof error === 'string' ? error : `it threw ${typeof error}`;
+  const [last] = /[\w-]*(?=\W*$)/.exec(text) ?? [''];
+  const refusal = new InflateError(text.replace(/\s+/g, ' ').slice(0, MESSAGE_MAX), 0, CLAUSES.get(last));
+  refusal.cause = error;
+  return refusal;
+}
+
+/**
+ * Wrap an inflate of the caller: what it throws means a damaged stream, and what it returns is checked.
+ *
+ * @param {Inflate} inflate
+ * @returns {Inflate}
+ */
+export function checkedInflate(inflate) {
+  if (typeof inflate !== 'function') throw new InputError('options.inflate is not a function');
+  return async (coded, size) => {
+    let bytes;
+    try {
+      bytes = await inflate(coded, size);
+    } catch (error) {
+      throw refused(error);
+    }
+    // Not instanceof: the caller's bytes may come from another realm, such as a frame or a test environment.
+    if (Object.prototype.toString.call(bytes) !== '[object Uint8Array]')
+      throw new InputError('options.inflate returned no Uint8Array');
+    if (bytes.length !== size)
+      throw new InputError(`options.inflate returned ${bytes.length} bytes instead of ${size}`);
+    return bytes;
+  };
 }
 
 /** @type {Promise<Inflate> | null} */

@@ -13,7 +13,7 @@ import { WasmDecoder } from './wasm_decoder.mjs';
 import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
 import { FormatError, InputError } from './errors.mjs';
 import { readIndex } from './file_index.mjs';
-import { platformInflate } from './inflate.mjs';
+import { checkedInflate, platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
 import { packLayer } from './packed_layers.mjs';
 import { Payload } from './payload.mjs';
@@ -108,7 +108,7 @@ export class Reader {
       const header = readIndex(index, file, limits);
       opening.set(spec.HEADER_SIZE, index);
       const compiled = options.inflate ? null : await WasmDecoder.open(file.fileSize, head, index);
-      const inflate = options.inflate ?? (await platformInflate());
+      const inflate = options.inflate ? checkedInflate(options.inflate) : await platformInflate();
       return new this(source, header, limits, inflate, compiled);
     };
     try {

@@ -5,7 +5,7 @@ import { InputError } from './errors.mjs';
 import { toBytes } from './options.mjs';
 import { HEADER_SIZE } from './spec.mjs';
 import { Transport, onAbort, unlessAborted } from './transport.mjs';
-import { BlobSource, MemorySource, WholeSource, cutShort, shortData } from './whole_sources.mjs';
+import { BlobSource, CallerSource, MemorySource, WholeSource, cutShort, shortData } from './whole_sources.mjs';
 
 const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
 const REQUEST_BYTES = 1 << 23; // bytes; joined ranges do not exceed this
@@ -28,7 +28,7 @@ export async function openSource(from, way) {
   if (typeof from === 'string' || from instanceof URL) return openUrl(absolute(from, way), way);
   if (from instanceof Blob) return new BlobSource(from);
   if (from instanceof ArrayBuffer || ArrayBuffer.isView(from)) return new MemorySource(toBytes(from));
-  if (typeof from?.read === 'function') return from;
+  if (typeof from?.read === 'function') return new CallerSource(from);
   throw new InputError(
     'the source is not a URL, a Blob, an ArrayBuffer, a view of one or an object with a method read',
   );

@@ -27,7 +27,9 @@ export const ANCILLARY_SCENE_FLAGS = 240; // bits 4 to 7 of the scene flags, whi
 export const ANCILLARY_CHUNK_FLAGS = 65280; // bits 8 to 15 of the chunk flags, which may be skipped (ANC-1)
 export const BUDGET_BYTES = 8589934592; // default budget: bytes of the decoded arrays and tables that lie in memory together, 8 GiB
 export const BUDGET_BYTES_JS = 2147483648; // default budget in JavaScript, 2 GiB
-export const BUDGET_JSON_BYTES = 67108864; // default budget: bytes of one JSON chunk after inflation, 64 MiB
+export const BUDGET_JSON_BYTES = 134217728; // default budget: memory of one JSON text (STR-8), 128 MiB
+export const JSON_BYTE_COST = 8; // memory that STR-8 counts for a byte of a JSON text
+export const JSON_VALUE_COST = 64; // memory that STR-8 counts for each comma, colon, and opening bracket or brace of a JSON text
 
 // Profiles
 export const PROFILE_BASE = 0;

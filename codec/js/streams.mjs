@@ -1,6 +1,6 @@
 // Streams: head and coder (spec sections 6.1 and 6.2).
 
-import { InputError, fault } from './errors.mjs';
+import { fault } from './errors.mjs';
 import { InflateError } from './inflate.mjs';
 import { parseJson } from './json.mjs';
 import * as spec from './spec.mjs';
@@ -37,25 +37,39 @@ export async function readStream(payload, count, widthMax, inflate) {
  * Read and parse the stream of a JSON chunk (spec 5.4).
  *
  * @param {Payload} payload
- * @param {number} limit maximum bytes of the text
+ * @param {number} limit maximum memory of the text (STR-8), in bytes
  * @param {Inflate} inflate
  * @returns {Promise<{value: unknown, offset: number}>} with the offset of the head
  */
 export async function readJson(payload, limit, inflate) {
   const { head, offset } = readHead(payload, 1, (found, at) => {
     if (found === 0) throw fault(spec.ERROR_STREAM, at, 'STR-1', 'no elements');
-    if (found > limit) throw fault(spec.ERROR_LIMIT, at, 'STR-8', `${found} bytes of JSON, the budget is ${limit}`);
+    checkMemory(spec.JSON_BYTE_COST * found, limit, at);
   });
   const text = (await unpack(payload, head, offset, inflate)).slice();
   const transforms = [...head.transforms];
   if (transforms.includes(TRANSFORM_ZIGZAG)) undoZigzag(text, 1);
   if (transforms.includes(TRANSFORM_DELTA)) undoDelta(text, 1);
   payload.finish();
+  let values = 0;
+  for (const byte of text) if (byte === 0x2c || byte === 0x3a || byte === 0x5b || byte === 0x7b) values++;
+  const memory = spec.JSON_BYTE_COST * text.length + spec.JSON_VALUE_COST * values;
+  checkMemory(memory, limit, offset + spec.STREAM_HEAD_OFFSETS.count);
   try {
     return { value: parseJson(text), offset };
   } catch (error) {
     throw fault(spec.ERROR_JSON, offset, 'JSN-1', error instanceof Error ? error.message : String(error), error);
   }
+}
+
+/**
+ * @param {number} memory of a JSON text, in bytes
+ * @param {number} limit
+ * @param {number} at offset of the count in the file
+ */
+function checkMemory(memory, limit, at) {
+  if (memory <= limit) return;
+  throw fault(spec.ERROR_LIMIT, at, 'STR-8', `JSON that takes ${memory} bytes of memory, the budget is ${limit}`);
 }
 
 /**
@@ -162,8 +176,6 @@ async function unpack(payload, head, offset, inflate) {
       throw fault(spec.ERROR_CODER, start + error.at, error.clause, error.message, error);
     }
   }
-  if (packed.length !== size)
-    throw new InputError(`options.inflate returned ${packed.length} bytes instead of ${size}`);
   if (!head.transforms.includes(TRANSFORM_RUN_LENGTH)) return packed;
   return undoRunLength(packed, head.count * head.width, start);
 }

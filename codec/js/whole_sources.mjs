@@ -3,10 +3,13 @@
 import { replaced } from './answers.mjs';
 import { readFileHeader } from './container.mjs';
 import { InputError, LimitError, allocate, fault } from './errors.mjs';
+import { toBytes } from './options.mjs';
 import { ERROR_LIMIT, ERROR_TRAILING, ERROR_TRUNCATED, HEADER_SIZE, MAGIC } from './spec.mjs';
-import { abortable } from './transport.mjs';
+import { abortable, asInputError } from './transport.mjs';
 
 /**
+ * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
+ * @typedef {import('./decoder.d.ts').ByteRange} ByteRange
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
  * @typedef {import('./answers.mjs').Asked} Asked
  * @typedef {import('./transport.mjs').Transport} Transport
@@ -227,6 +230,56 @@ export class MemorySource {
   async read(offset, size) {
     if (offset + size > this.size) throw shortData(this.size, size);
     return this.bytes.subarray(offset, offset + size);
+  }
+}
+
+/** A source of the caller, whose results are checked. */
+export class CallerSource {
+  /** @param {ByteSource} source */
+  constructor(source) {
+    this.source = source;
+    const { size } = source;
+    if (size !== undefined && size !== null && !(Number.isSafeInteger(size) && size >= 0))
+      throw new InputError('the size of the source is not a whole number of bytes');
+  }
+
+  get size() {
+    return this.source.size;
+  }
+
+  get isSequential() {
+    return this.source.isSequential ?? false;
+  }
+
+  /**
+   * @param {number} offset
+   * @param {number} size
+   * @param {AbortSignal} [signal]
+   * @returns {Promise<Bytes>}
+   */
+  async read(offset, size, signal) {
+    /** @type {Bytes} */
+    let bytes;
+    try {
+      bytes = toBytes(await this.source.read(offset, size, signal));
+    } catch (error) {
+      throw signal?.aborted ? error : asInputError(error, 'the source');
+    }
+    if (bytes.length < size) throw shortData(offset + bytes.length, size);
+    if (bytes.length > size) throw new InputError(`the source returned ${bytes.length} bytes instead of ${size}`);
+    return bytes;
+  }
+
+  /**
+   * @param {ByteRange[]} ranges
+   * @param {AbortSignal} [signal]
+   */
+  prefetch(ranges, signal) {
+    try {
+      this.source.prefetch?.(ranges, signal);
+    } catch (error) {
+      throw asInputError(error, 'the source');
+    }
   }
 }
 

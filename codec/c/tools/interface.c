@@ -163,7 +163,7 @@ static void budgets_hold(const unsigned char *data, size_t size)
     csplat_close(d);
     options.splats_max = 0;
     options.bytes_max = 50;
-    options.json_bytes_max = length - 1;
+    options.json_bytes_max = 8 * (uint64_t)length; /* none is left for its values */
     HOLDS(!csplat_open_memory(&d, data, size, &options, NULL) && csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene) == CSPLAT_E_LIMIT);
     HOLDS(csplat_read_text(d, CSPLAT_METADATA, &text, &length) == CSPLAT_E_LIMIT && !text);
     HOLDS(csplat_get_info(d)->codebook_count == 0 || csplat_check(d) == CSPLAT_E_LIMIT);

@@ -29,7 +29,7 @@ _ZLIB_CLAUSES = {
 
 
 def read_stream(
-    cursor: Cursor, count: int | None, width_max: int, *, signed: bool = False, count_max: int | None = None
+    cursor: Cursor, count: int | None, width_max: int, *, signed: bool = False, json_bytes: int | None = None
 ) -> Ints:
     """Read a stream and step over it.
 
@@ -38,7 +38,7 @@ def read_stream(
         count: required number of elements; `None`: any number (JSON).
         width_max: maximum bytes per element.
         signed: read elements as two's complement of `width` bytes.
-        count_max: the caller's limit if `count` is `None`.
+        json_bytes: the caller's limit if `count` is `None`.
 
     Returns:
         [count] little-endian integers of 1, 2, 4 or 8 bytes, the smallest size that holds `width` bytes. The array may
@@ -47,8 +47,9 @@ def read_stream(
     at = cursor.take(_spec.STREAM_HEAD_SIZE)
     head = _spec.unpack_stream_head(cursor.view, at)
     _check_head(head, at, count, width_max)
-    if count_max is not None and head.count > count_max:
-        raise LimitError("json_bytes", head.count, count_max, offset=at + _OFFSETS["count"], clause="STR-8")
+    if json_bytes is not None and _spec.JSON_BYTE_COST * head.count > json_bytes:
+        cost = _spec.JSON_BYTE_COST * head.count
+        raise LimitError("json_bytes", cost, json_bytes, offset=at + _OFFSETS["count"], clause="STR-8")
     if head.coded_size > cursor.end - cursor.at:
         _refuse(at, "coded_size", "STR-6", head.coded_size, f"at most {cursor.end - cursor.at}")
     start = cursor.take(head.coded_size)

@@ -21,7 +21,7 @@ class Limits:
     Attributes:
         splats: maximum number of splats decoded; default: no limit.
         bytes: maximum size of the returned arrays and the codebooks.
-        json_bytes: maximum size of a JSON text.
+        json_bytes: maximum memory of a JSON text, estimated from its bytes and values (spec STR-8).
     """
 
     splats: int = sys.maxsize

@@ -12,13 +12,14 @@ from csplat.decoder.container import SceneHeader, check_reserved, open_chunk, re
 from csplat.decoder.entropy import read_stream
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits
-from csplat.errors import FormatError
+from csplat.errors import FormatError, LimitError
 
 if TYPE_CHECKING:
     from csplat.file_source import File
 
 
 _BOM = b"\xef\xbb\xbf"
+_VALUE_MARKS = (b",", b":", b"[", b"{")  # STR-8: one of them precedes or follows every value
 _INT_DIGITS = 300  # digits; longer integers are read as binary64
 
 #: Components of each measure, for SER-2.
@@ -98,15 +99,19 @@ def json_chunk(view: memoryview, header: SceneHeader, kind: bytes, json_bytes: i
 
     Raises:
         FormatError: E_JSON, or the stream breaks a clause.
-        LimitError: the text is longer than `json_bytes`.
+        LimitError: the text would take more memory than `json_bytes`.
     """
     record = header.chunk(kind)
     if record is None:
         return None
     cursor = open_chunk(view, record, record.type, record.flags, "JSN-2")
     at = cursor.at
-    text = read_stream(cursor, None, 1, count_max=json_bytes).tobytes()
+    text = read_stream(cursor, None, 1, json_bytes=json_bytes).tobytes()
     cursor.finish()
+    cost = _spec.JSON_BYTE_COST * len(text) + _spec.JSON_VALUE_COST * sum(map(text.count, _VALUE_MARKS))
+    if cost > json_bytes:
+        offset = at + _spec.STREAM_HEAD_OFFSETS["count"]
+        raise LimitError("json_bytes", cost, json_bytes, offset=offset, clause="STR-8")
     return parse_json(text, list if kind == _spec.CHUNK_CAMERAS else dict, at)
 
 

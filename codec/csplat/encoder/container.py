@@ -13,6 +13,7 @@ import numpy as np
 
 from csplat import _spec
 from csplat.encoder.entropy import DeflateSettings, unsigned_stream
+from csplat.errors import InputError
 
 #: Chunks that no renderer needs, which are last in a file with levels of detail.
 _LAST = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
@@ -147,9 +148,19 @@ def order_nodes(nodes: Sequence[FileNode]) -> list[FileNode]:
 
 
 def json_payload(value: Any, deflate: DeflateSettings) -> bytes:
-    """Return the payload of a JSON chunk (spec 5.4), keys sorted."""
-    text = json.dumps(value, ensure_ascii=False, sort_keys=True, allow_nan=False, separators=(",", ":"))
-    return unsigned_stream(np.frombuffer(text.encode(), np.uint8), deflate)
+    """Return the payload of a JSON chunk (spec 5.4), keys sorted.
+
+    Raises:
+        InputError: decoders would refuse the text with their default budget (STR-8).
+    """
+    text = json.dumps(value, ensure_ascii=False, sort_keys=True, allow_nan=False, separators=(",", ":")).encode()
+    values = np.isin(np.frombuffer(text, np.uint8), list(b",:[{")).sum()
+    cost = _spec.JSON_BYTE_COST * len(text) + _spec.JSON_VALUE_COST * int(values)
+    if cost > _spec.BUDGET_JSON_BYTES:
+        what = "the cameras" if isinstance(value, list) else "the metadata"
+        text_size = f"{len(text):,} bytes of JSON with {values:,} values"
+        raise InputError(f"{what} are {text_size}, more than decoders accept by default: store fewer, or none")
+    return unsigned_stream(np.frombuffer(text, np.uint8), deflate)
 
 
 def tile_payload(layer: int, blocks: Sequence[bytes]) -> bytes:

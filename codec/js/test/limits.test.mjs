@@ -41,10 +41,11 @@ test('a budget of bytes counts four for each entry and column of a codebook', ()
   assert.deepEqual([...kinds].sort(), [...Object.keys(columns), 'sh'].sort());
 });
 
-test('a budget of JSON counts the text', async () => {
-  const file = vector('valid/worked_example'); // {"title":"two"}
-  assert.deepEqual((await decode(file, { limits: { jsonBytes: 15 } })).metadata, { title: 'two' });
-  assert.equal((await refusal(() => decode(file, { limits: { jsonBytes: 14 } }))).clause, 'STR-8');
+test('a budget of JSON counts the bytes and the values of the text', async () => {
+  const file = vector('valid/worked_example'); // {"title":"two"}: 15 bytes and 2 values
+  assert.deepEqual((await decode(file, { limits: { jsonBytes: 248 } })).metadata, { title: 'two' });
+  for (const jsonBytes of [247, 120, 119])
+    assert.equal((await refusal(() => decode(file, { limits: { jsonBytes } }))).clause, 'STR-8', `${jsonBytes}`);
 });
 
 test('an index beyond the budget is refused before its records are read', async () => {

@@ -82,10 +82,19 @@ def _misplaced_chunks() -> list[Recipe]:
 def _bombs() -> list[Recipe]:
     zeros = Stream(coder="deflate", coded=deflate_fixed(bytes(200_000)))
     bomb = scene(tiles=[tile(changes={OPACITIES: levels([7, 8], zeros)})])
-    runs = 1024  # runs of 65,536 spaces: they exceed the default budget, but take 3 kB in the file
+    runs = _spec.BUDGET_JSON_BYTES // _spec.JSON_BYTE_COST // _spec.RUN_MAX  # of spaces: 3 bytes each in the file
     values = b"{}" + b" " * runs
     packed = values + b"\0\0" + b"\xff" * runs + b"\0\0" + b"\xff" * runs
     text = scene(chunks=(Chunk(_spec.CHUNK_METADATA, b"{}", Stream(1, _RUNS, "deflate_fixed", packed=packed)),))
+    # Without any one of the four bytes that count as values, the text is within the budget.
+    each = _spec.BUDGET_JSON_BYTES // _spec.JSON_VALUE_COST // len(b",:[{") // _spec.RUN_MAX  # runs
+    head, tail = b'{"a":"', b'"}'
+    marks = b"".join(mark * each for mark in (b",", b":", b"[", b"{"))
+    lengths = bytes(len(head)) + b"\xff" * len(marks) + bytes(len(tail))
+    packed = head + marks + tail + lengths + lengths
+    coding = Stream(1, _RUNS, "deflate_fixed", packed=packed)
+    valued = replace(text, chunks=(replace(text.chunks[0], stream_coding=coding),))
+    valued_count = len(head) + len(marks) * _spec.RUN_MAX + len(tail)
     full, band = full_band_4(), sh_attribute(4)
     (one,) = full.tiles
     longer = Stream(1, _RUNS, packed=bytes(range(28)) + (b"\xff" * 27 + b"\0") * 2)
@@ -109,11 +118,20 @@ def _bombs() -> list[Recipe]:
         ),
         invalid_recipe(
             "json_beyond_budget",
-            "a sound text of 64 MiB and two bytes, beyond the default budget",
+            "a sound text of 16 MiB and two bytes, beyond the default budget",
             "STR-8 LIM-1",
             "E_LIMIT",
             text,
             {"META/stream.count": 2 + runs * _spec.RUN_MAX},
+        ),
+        invalid_recipe(
+            "json_values_beyond_budget",
+            "a sound text of 2 MiB, whose bytes that count as values exceed the default budget",
+            "STR-8",
+            "E_LIMIT",
+            valued,
+            {"META/stream.count": valued_count},
+            at="META/stream.count",
         ),
     ]
 

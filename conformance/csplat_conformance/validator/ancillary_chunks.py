@@ -52,13 +52,18 @@ def parse_json(data: bytes) -> Any:
 
 def check_text(payload: Payload, kind: bytes, bytes_max: int) -> None:
     """Check META, CAMS or OPTS: STR, JSN-1, JSN-2. Missing keys of cameras are remarks."""
-    stream = read_stream(payload, "stream", None, _TEXT_WIDTH, count_max=bytes_max)
+    stream = read_stream(payload, "stream", None, _TEXT_WIDTH, count_max=bytes_max // _spec.JSON_BYTE_COST)
     payload.finish()
     if stream.elements is None:
         return
     log = payload.log
+    text = np.asarray(stream.elements, np.uint8)
+    memory = _spec.JSON_BYTE_COST * len(text) + _spec.JSON_VALUE_COST * int(np.isin(text, list(b",:[{")).sum())
+    if memory > bytes_max:
+        log.add_field("STR-8", stream.head, "count", f"{memory} bytes of memory, expected at most {bytes_max} (budget)")
+        return
     try:
-        value = parse_json(np.asarray(stream.elements, np.uint8).tobytes())
+        value = parse_json(text.tobytes())
     except JsonError as error:
         log.add("JSN-1", stream.head.offset, f"{payload.name}/stream", str(error))
         return

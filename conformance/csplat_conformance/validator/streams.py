@@ -62,7 +62,7 @@ def read_stream(
     sound &= _check_transforms(log, head)
     sound &= _check_packed(log, head, sound)
     if count is None and head.record.count > count_max:
-        log.add_field("STR-8", head, "count", f"{head.record.count}, expected at most {count_max} (budget)")
+        log.add_field("STR-8", head, "count", f"{head.record.count}, expected at most {count_max} by the budget")
         sound = False
     coder_known = _check_coder(log, head)
     size = head.record.coded_size

@@ -61,7 +61,7 @@ def validate(
 
     Args:
         data: the file, complete or truncated.
-        json_bytes_max: budget for one JSON text (STR-8), in bytes.
+        json_bytes_max: budget for the memory of one JSON text (STR-8), in bytes.
         splats_max: budget of splats of level 0 (LIM-1), above which the tiles are not read. Default: none, because only
             one tile is in memory at a time.
         progress: called with the fraction of the tiles that were checked.
