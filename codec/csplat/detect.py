@@ -92,13 +92,14 @@ def read_head(path: Path) -> bytes:
         return stream.read(HEAD_SIZE)
 
 
-def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
+def refusal(path: Path, head: bytes, *, wanted: str = "", shown: str = "") -> InputError:
     """Return the error for a file of the wrong kind; it names the kind and a remedy.
 
     Args:
         path: path of the file.
         head: as in `detect_content`.
         wanted: name of the only kind that the caller reads; "" if it reads all formats of csplat.
+        shown: name of the file, if it is a copy; "": `path`.
     """
     if path.is_dir() and wanted and not detect_content(path, head):
         return InputError(f"{path.name} is a folder, expected a {KINDS[wanted].title}")
@@ -123,7 +124,7 @@ def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
         return InputError(f"{path.name} is {state}: {begin}" + ("; expected Gaussian splats" if wanted else ""))
     if wanted == _CSPLAT:
         title = f"a {kind.title}" if kind.name == _PLY else kind.title
-        return InputError(f"{path} is {title}, expected a .csplat file: convert it with `csplat encode`")
+        return InputError(f"{shown or path} is {title}, expected a .csplat file: convert it with `csplat encode`")
     tool = "`csplat decode`" if kind.name == _CSPLAT else "`csplat convert`, or use csplat.read, which reads it"
     return InputError(f"{path.name} is {kind.title}, not a plain PLY: convert it to PLY first, with {tool}")
 

@@ -12,9 +12,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from mmap import mmap
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, TemporaryFile, gettempdir
 from tokenize import TokenError
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +129,7 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
         if not path.is_fifo():
             yield path
             return
-        with path.open("rb") as pipe, local_file(pipe) as copied:
+        with path.open("rb") as pipe, local_file(pipe, path.name if path.suffix else "pipe") as copied:
             yield copied
             return
     with TemporaryDirectory(
@@ -185,14 +185,15 @@ def open_writer(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryW
 
 
 @contextmanager
-def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[BinaryIO]:
+def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekable: bool = False) -> Iterator[BinaryIO]:
     """Write a file that appears under its name only when complete.
 
     Bytes go to a temporary file in the same folder, which is renamed on success and removed on any error. The target
-    of a symbolic link is replaced, not the link. Devices and pipes are written directly.
+    of a symbolic link is replaced, not the link. Devices and pipes are written directly, if possible.
 
     Args:
         path: path of the file to write.
+        seekable: the caller seeks; what a pipe gets is complete before.
         replace: replace an existing file; False also keeps a file that another process creates in the meantime.
 
     Yields:
@@ -207,7 +208,13 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
             _name_errors(path),
             Path(path).open("wb") as stream,
         ):  # not resolved: /dev/stdout may point to an unnamed pipe
-            yield stream
+            if not seekable or stream.seekable():
+                yield stream
+                return
+            with TemporaryFile() as spool:
+                yield cast(BinaryIO, spool)  # on Windows a wrapper of a file
+                spool.seek(0)
+                shutil.copyfileobj(spool, stream, _PART_SIZE)
         return
     target = Path(path).resolve()
     temporary = target.with_name(f".{target.name}.{os.getpid()}.{threading.get_ident()}.tmp")
@@ -226,6 +233,12 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             error.filename = os.fspath(path)  # report the caller's name
         raise
+
+
+def work_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the folder for temporary files of an output: its own, or for a device or pipe that of the system."""
+    target = Path(path)
+    return Path(gettempdir()) if target.exists() and not target.is_file() else target.parent
 
 
 @contextmanager

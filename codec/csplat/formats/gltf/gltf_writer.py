@@ -57,7 +57,7 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
             f"{path.name} would have {start + offsets[-1]:,} bytes, a .glb has at most {_LARGEST_FILE:,}:"
             f" write fewer splats or fewer SH bands"
         )
-    with atomic_writer(path) as stream:
+    with atomic_writer(path, seekable=True) as stream:
         stream.write(GLB_HEAD.pack(MAGIC, 2, start + offsets[-1]) + struct.pack("<I4s", len(text), JSON) + text)
         stream.write(struct.pack("<I4s", offsets[-1], BIN))
         done = 0
