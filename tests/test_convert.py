@@ -318,6 +318,18 @@ def test_every_format_is_written_to_a_pipe_and_to_a_device(tmp_path, ply, name):
     assert Path(os.devnull).is_char_device()
 
 
+def test_a_crop_that_keeps_nothing_is_a_warning(tmp_path, ply):
+    for suffix in ("ply", "csplat", "spz", "splat", "compressed.ply", "sog"):
+        said = call("convert", ply, tmp_path / f"a.{suffix}", "--crop", "90,90,90,1", "--quiet").stderr
+        assert f"warning: --crop keeps none of 200 splats: {tmp_path / f'a.{suffix}'} has no splats" in said
+        result = json.loads(
+            call("convert", ply, tmp_path / f"a.{suffix}", "--crop", "9,9,9,10,10,10", "--json", "--force").stdout
+        )
+        assert (200, 0) == (result["source_splats"], result["splats"])
+    assert "no splats are left" in call("convert", ply, tmp_path / "a.glb", "--crop", "90,90,90,1", status=1).stderr
+    assert "warning" not in call("convert", ply, tmp_path / "b.ply", "--crop", "0,0,0,1").stderr
+
+
 def test_info_names_the_axes_of_the_file(tmp_path, make_model):
     csplat.write(tmp_path / "a.glb", make_model(5, 0))
     assert "axes         LUF, read as RDF" in call("info", tmp_path / "a.glb").stdout

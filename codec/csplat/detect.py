@@ -29,6 +29,7 @@ _PLY_HEADER_SIZE = 1 << 16  # bytes within which a compressed PLY declares its p
 _KSPLAT_HEAD = 44  # used bytes of .ksplat's header; the rest are 0
 _SPLAT_ROW_SIZE = 32  # bytes of one splat in a .splat file
 _SAFETENSORS_HEAD = 100_000_000  # maximum size of the JSON header of safetensors, bytes
+_LCC_PARTS = {"data.bin", "index.bin", "shcoef.bin", "environment.bin", "attrs.lcp"}  # files next to an LCC's index
 _MANIFESTS = {"meta.json", "lod-meta.json"}  # manifests in a SOG file
 _PLY, _CSPLAT = "ply", "csplat"
 
@@ -103,7 +104,7 @@ def refusal(path: Path, head: bytes, *, wanted: str = "", shown: str = "") -> In
     """
     if path.is_dir() and wanted and not detect_content(path, head):
         return InputError(f"{path.name} is a folder, expected a {KINDS[wanted].title}")
-    if path.is_dir() and not wanted:
+    if path.is_dir() and not wanted and not detect_content(path, head):
         return InputError(folder_refusal(path))
     if not (head or path.is_dir()):
         return InputError(f"{path.name} is empty" + (f", expected a {KINDS[wanted].title}" if wanted else ""))
@@ -208,6 +209,28 @@ def _is_json(_path: Path, head: bytes) -> bool:
     return begins and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
 
 
+def _is_lcc(path: Path, head: bytes) -> bool:
+    """Return True for the index of an LCC scene, its folder, or another file of it."""
+    if path.is_dir():
+        return _holds(path, ".lcc")
+    if path.name.lower() in _LCC_PARTS:
+        return _holds(path.parent, ".lcc")
+    return _is_json(path, head) and (path.suffix.lower() == ".lcc" or b'"cellLengthX"' in head)
+
+
+def _is_lcc2(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return _holds(path, ".lcc2")
+    return _is_json(path, head) and (path.suffix.lower() == ".lcc2" or b'"splatType"' in head)
+
+
+def _holds(folder: Path, suffix: str) -> bool:
+    try:
+        return any(one.suffix.lower() == suffix for one in folder.iterdir())
+    except OSError:
+        return False
+
+
 def _is_safetensors(_path: Path, head: bytes) -> bool:
     return head[8:10] == b'{"' and 0 < int.from_bytes(head[:8], "little") < _SAFETENSORS_HEAD
 
@@ -227,6 +250,14 @@ KINDS: dict[str, FileKind] = {
         FileKind("spz4", "SPZ 4", (".v4.spz",)),
         FileKind("splat", ".splat", (".splat",)),
         FileKind("ksplat", ".ksplat", (".ksplat",), _is_ksplat),
+        FileKind("lcc", "LCC", (".lcc",), _is_lcc, f"{_NOT_READ} {_SPLAT_TRANSFORM}, which takes the .lcc file"),
+        FileKind(
+            "lcc2",
+            "LCC2",
+            (".lcc2",),
+            _is_lcc2,
+            "which csplat does not read: its splats are .sog or .spz files in data/3dgs, which csplat reads one by one",
+        ),
         FileKind("sog", "SOG", (".sog", "meta.json", "lod-meta.json"), _is_sog),
         FileKind(
             "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
@@ -234,7 +265,8 @@ KINDS: dict[str, FileKind] = {
         FileKind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
         FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _zip_with("/data.pkl")),
         FileKind("spx", ".spx", (".spx",), _starts_with(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
-        FileKind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
+        FileKind("splatv", "dynamic splats", (".splatv",), remedy="which csplat does not read: export a frame"),
+        FileKind("draco", "Draco", (".drc",), _starts_with(b"DRACO"), f"a mesh or point cloud, {_NO_SPLATS}"),
         FileKind(
             "rad",
             "RAD of Spark",

@@ -32,7 +32,7 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
     if path.suffix.lower() == ".gltf":
         raise InputError(f"{path.name}: glTF is written as a single file, name it {path.with_suffix('.glb').name}")
     if not scene.count:
-        raise InputError(f"{path.name}: the scene has no splats, and glTF has no empty meshes")
+        raise InputError(f"{path.name}: no splats are left to write, and glTF has no empty meshes")
     unit = scene.metadata_model.unit_metres
     if unit not in (None, 1.0):
         before, metres = scene, float(unit)
