@@ -1,13 +1,20 @@
 """`csplat convert` and `csplat formats`: conversion between all formats, filters, reports of losses."""
 
 import json
+import os
+import sys
+import tempfile
+import threading
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from checked import cloud
 from command_line import call, invoke
 from tables import failures
+from typer.testing import CliRunner
 
 import csplat
 from csplat import formats
@@ -19,6 +26,7 @@ from csplat.model import SplatModel, normalise_quats
 from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import source_from_model
+from csplat_tools.cli.app import app
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
 from csplat_tools.encode_file import encode_file
 from csplat_tools.scene_files import open_scenes
@@ -249,6 +257,78 @@ def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_mod
             ),
         }  # fmt: skip
     assert not failures(cases, check)
+
+
+@contextmanager
+def piped(path):
+    """Yield the name of a pipe with the contents of a file; it can be read once."""
+    pipe = path.with_name("pipe")
+    os.mkfifo(pipe)
+    threading.Thread(target=lambda: pipe.write_bytes(path.read_bytes()), daemon=True).start()
+    yield pipe
+    pipe.unlink()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
+def test_commands_read_pipes(tmp_path, make_model):
+    def check(case):
+        command, suffix, status, words = case
+        path = tmp_path / f"a.{suffix}"
+        csplat.write(path, calm(make_model(20, 0)))
+        command = [tmp_path / word if "." in word else word for word in command.split()]
+        with piped(path) as pipe:
+            result = call(*[pipe if word == "IN" else word for word in command], status=status)
+        assert words in result.stdout + result.stderr
+        assert str(tempfile.gettempdir()) not in (result.stdout + result.stderr).replace(str(tmp_path), "")
+        result = run(*command, stdin=path.read_bytes())
+        assert status == result[0]
+        assert words in result[1]
+
+    def run(*command, stdin):
+        result = CliRunner().invoke(app, [str("-" if word == "IN" else word) for word in command], input=stdin)
+        return result.exit_code, result.stdout + result.stderr
+
+    cases = [
+        *(("info IN", suffix, 0, "20") for suffix in ("ply", "csplat", "spz", "glb", "sog", "compressed.ply")),
+        *(("lint IN", suffix, 0, "nothing found") for suffix in ("spz", "sog")),
+        *(
+            (f"{command} IN", "sog", 1, "is SOG, expected a .csplat file")
+            for command in ("verify", "merge a.csplat -o b.csplat")
+        ),
+        ("convert IN b.ply --force", "glb", 0, "20 splats: gltf"),
+        ("convert IN b.ply --force --from splat", "splat", 0, "20 splats: splat"),
+        ("info IN", "splat", 1, "--from splat reads it"),
+    ]
+    assert not failures({f"{one[0]}, {one[1]}": one for one in cases}, check)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
+@pytest.mark.parametrize("name", ["ply", "csplat", "compressed-ply", "spz", "splat", "gltf", "sog"])
+def test_every_format_is_written_to_a_pipe_and_to_a_device(tmp_path, ply, name):
+    os.mkfifo(tmp_path / "pipe")
+    read = []
+    reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_bytes()), daemon=True)
+    reader.start()
+    call("convert", ply, tmp_path / "pipe", "--to", name)
+    reader.join(10)
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "copy").write_bytes(read[0])
+    with formats.open_scene(tmp_path / "copy", name) as scene:
+        assert 200 == scene.count
+    call("convert", ply, os.devnull, "--to", name)
+    assert Path(os.devnull).is_char_device()
+
+
+def test_a_crop_that_keeps_nothing_is_a_warning(tmp_path, ply):
+    for suffix in ("ply", "csplat", "spz", "splat", "compressed.ply", "sog"):
+        said = call("convert", ply, tmp_path / f"a.{suffix}", "--crop", "90,90,90,1", "--quiet").stderr
+        assert f"warning: --crop keeps none of 200 splats: {tmp_path / f'a.{suffix}'} has no splats" in said
+        result = json.loads(
+            call("convert", ply, tmp_path / f"a.{suffix}", "--crop", "9,9,9,10,10,10", "--json", "--force").stdout
+        )
+        assert (200, 0) == (result["source_splats"], result["splats"])
+    assert "no splats are left" in call("convert", ply, tmp_path / "a.glb", "--crop", "90,90,90,1", status=1).stderr
+    assert "warning" not in call("convert", ply, tmp_path / "b.ply", "--crop", "0,0,0,1").stderr
 
 
 def test_info_names_the_axes_of_the_file(tmp_path, make_model):

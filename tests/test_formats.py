@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import os
 import re
 import subprocess
@@ -13,12 +14,13 @@ import zipfile
 
 import numpy as np
 import pytest
+from tables import failures
 
 import csplat
 import csplat_tools
 from csplat.archives import read_archive
 from csplat.errors import InputError
-from csplat.formats import assume_format, formats, open_scene, write_scene
+from csplat.formats import assume_format, detect_format, formats, open_scene, write_scene
 from csplat.formats import lint_file as formats_lint
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import BLOCK_SPLATS, SceneSource, source_from_model
@@ -160,6 +162,36 @@ def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, 
     (tmp_path / "sog" / "quats.webp").write_bytes(LFS)
     with pytest.raises(InputError, match=r"quats\.webp is a pointer of Git LFS"):
         csplat.read(tmp_path / "sog")
+
+
+def test_scenes_of_other_programs_are_named_with_the_way_out(tmp_path, make_model):
+    png = {"shape": [50, 3], "dtype": "float32", "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
+    meta = json.dumps({"means": png, "scales": png, "opacities": {**png, "mins": 0}, "sh0": png})
+    for folder, name, text in (
+        ("png", "meta.json", meta), ("lcc", "scene.lcc", '{"version": "1", "cellLengthX": 30, "fileType": "Quality"}'),
+        ("lcc", "data.bin", "\1" * 64), ("lcc2", "scene.lcc2", '{"version": "2.0", "splatType": "sog", "root": {}}'),
+        ("bare", "renamed.json", '{"version": "1.1", "cellLengthX": 30}'), ("bare", "a.drc", "DRACO\2\2"),
+        ("bare", "a.splatv", "Kg\0\0\1\2\3"),
+    ):  # fmt: skip
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / name).write_text(text)
+    with zipfile.ZipFile(tmp_path / "png.zip", "w") as archive:
+        archive.writestr("compression/meta.json", meta)
+    wanted = {
+        "png": "PNG compression, .*PngCompr", "png/meta.json": "PNG compression", "png.zip": "PNG compression",
+        "lcc": "is LCC, .*splat-transform", "lcc/scene.lcc": "is LCC, ", "lcc/data.bin": ".* takes the .lcc file",
+        "lcc2": "is LCC2, .* in data/3dgs", "lcc2/scene.lcc2": "is LCC2, ", "bare/renamed.json": "is LCC, ",
+        "bare/a.drc": "is Draco, a mesh", "bare/a.splatv": "dynamic splats",
+    }  # fmt: skip
+
+    def check(case):
+        name, message = case
+        with pytest.raises(InputError, match=message):
+            csplat.read(tmp_path / name)
+
+    assert not failures({one[0]: one for one in wanted.items()}, check)
+    csplat.write(tmp_path / "sog" / "meta.json", make_model(5, 0))
+    assert "sog" == detect_format(tmp_path / "sog").name
 
 
 def test_a_zip_is_recognised_by_its_contents(tmp_path):

@@ -187,7 +187,7 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
         if not path.is_fifo():
             yield path
             return
-        with open_binary(path) as pipe, local_file(pipe) as copied:
+        with open_binary(path) as pipe, local_file(pipe, path.name if path.suffix else "pipe") as copied:
             yield copied
             return
     own = getattr(file, "name", None)
@@ -286,15 +286,16 @@ def open_writer(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryW
 
 
 @contextmanager
-def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[BinaryIO]:
+def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekable: bool = False) -> Iterator[BinaryIO]:
     """Write a file that appears under its name only when complete.
 
     Bytes go to a temporary file in the same folder, which is renamed on success and removed on any error. The target
     of a symbolic link is replaced, not the link. A file that is replaced keeps its permissions, and if possible its
-    owner and group; other hard links keep the older content. Devices and pipes are written directly.
+    owner and group; other hard links keep the older content. Devices and pipes are written directly, if possible.
 
     Args:
         path: path of the file to write.
+        seekable: the caller seeks; what a pipe gets is complete before.
         replace: replace an existing file; False also keeps a file that another process creates in the meantime.
 
     Yields:
@@ -306,7 +307,13 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
     """
     if Path(path).exists() and not Path(path).is_file():  # not resolved: /dev/stdout may point to an unnamed pipe
         with open_binary(path, "w") as stream:
-            yield stream
+            if not seekable or stream.seekable():
+                yield stream
+                return
+            with temporary_file() as spool:
+                yield spool
+                spool.seek(0)
+                shutil.copyfileobj(spool, stream, _PART_SIZE)
         return
     target = resolve_links(path)
     old = target.stat() if target.exists() else None
@@ -365,6 +372,12 @@ def _report_as(path: str | os.PathLike[str], temporary: Path, error: BaseExcepti
         failed = Path(error.filename)
         if failed.is_relative_to(temporary):
             error.filename = str(Path(path, failed.relative_to(temporary)))
+
+
+def work_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the folder for temporary files of an output: its own, or for a device or pipe that of the system."""
+    target = Path(path)
+    return Path(temporary_root()) if target.exists() and not target.is_file() else target.parent
 
 
 @contextmanager

@@ -203,6 +203,7 @@ class Conversion:
 
     Attributes:
         source_format, target_format: names of the formats.
+        source_count: number of splats of the source.
         count, sh_degree: number of splats and SH degree of the target.
         levels: number of splats of each level of detail of the target, finest first.
         source_bytes, size_bytes: sizes of the files; in a dry run the latter is an estimate, or `None` if unknown.
@@ -217,6 +218,7 @@ class Conversion:
 
     source_format: str
     target_format: str
+    source_count: int
     count: int
     sh_degree: int
     levels: tuple[int, ...]
@@ -234,6 +236,7 @@ class Conversion:
         return {
             "source_format": self.source_format,
             "format": self.target_format,
+            "source_splats": self.source_count,
             "splats": self.count,
             "sh_degree": self.sh_degree,
             "levels": list(self.levels),
@@ -323,7 +326,7 @@ def convert_file(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.metadata_model.sh_degree)
         )
         result = Conversion(
-            reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, counts or (0,),
+            reader.format, writes.name, reader.count, scene.count, scene.metadata_model.sh_degree, counts or (0,),
             size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded, (),
             (before, writes.axes or scene.metadata_model.coordinate_system), filter_axes, (),
         )  # fmt: skip

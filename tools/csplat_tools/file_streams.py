@@ -22,10 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
-from csplat.detect import HEAD_SIZE, detect_content, detect_name, read_head, refusal
+from csplat.detect import detect_content, detect_name, read_head, refusal
 from csplat.disk_files import atomic_writer, local_file, resolve_links, temporary_file
 from csplat.errors import CsplatError, InputError
-from csplat.file_source import File, map_file, named_errors, open_binary
+from csplat.file_source import File, map_file, named_errors, open_binary, read_bytes
 from csplat.formats import formats
 from csplat.model import SplatModel
 from csplat.ply import write_ply, write_scene_ply
@@ -51,8 +51,12 @@ _MAKERS = {
 _NO_SCENES = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
 
 
-class _StandardInput(io.BytesIO):
-    name = STANDARD_INPUT
+class _Spooled(io.BytesIO):
+    """The contents of standard input or of a pipe."""
+
+    def __init__(self, data: bytes, name: str) -> None:
+        super().__init__(data)
+        self.name = name
 
 
 class _StandardOutput:
@@ -199,7 +203,7 @@ def source_path(file: File) -> Iterator[Path]:
     """
     with local_path(file) as local:
         if is_csplat(local):
-            _refuse_others(local.name, read_head(local))
+            _refuse_others(local)
             raise InputError(
                 f"{local.name} is a .csplat file already: `csplat decode` converts it to a PLY,"
                 " `csplat info` describes it"
@@ -223,22 +227,25 @@ def is_csplat(path: Path) -> bool:
 
 
 @contextmanager
-def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
+def mapped_csplat(path: str, shown: str | None = None) -> Iterator[bytes | mmap]:
     """Yield the bytes of a .csplat file, memory-mapped if possible; they are not validated.
+
+    Args:
+        path: a path, which may be that of a pipe, or `-`.
+        shown: name for messages; `None`: `path`.
 
     Raises:
         InputError: the file is in another format.
         OSError: the file cannot be read.
     """
-    is_path = path != STANDARD_STREAM
-    data = map_file(path) if is_path else _read_stdin()
-    try:
-        with naming(path):
-            _refuse_others(path if is_path else STANDARD_INPUT, data[:HEAD_SIZE])
+    with naming(path if shown is None else shown), kept_path(path) as local:
+        data = map_file(local)
+        try:
+            _refuse_others(local, path if shown is None else shown)
             yield data
-    finally:
-        if isinstance(data, mmap):
-            _close(data)
+        finally:
+            if isinstance(data, mmap):
+                _close(data)
 
 
 def csplat_file(path: str) -> File:
@@ -248,19 +255,13 @@ def csplat_file(path: str) -> File:
         InputError: the file is in another format.
         OSError: the file cannot be read.
     """
-    if path == STANDARD_STREAM:
-        data = _read_stdin()
-        _refuse_others(_StandardInput.name, data[:HEAD_SIZE])
-        return _StandardInput(data)
+    if path == STANDARD_STREAM or (not is_url(path) and Path(path).is_fifo()):
+        with naming(path), kept_path(path) as local:
+            _refuse_others(local, path)
+            return _Spooled(read_bytes(local), STANDARD_INPUT if path == STANDARD_STREAM else path)
     if not is_url(path) and Path(path).is_file():
-        with open_binary(path) as stream:
-            _refuse_others(path, stream.read(HEAD_SIZE))
+        _refuse_others(Path(path))
     return path
-
-
-def _read_stdin() -> bytes:
-    with named_errors(STANDARD_INPUT):
-        return sys.stdin.buffer.read()
 
 
 def write_array(path: str, array: NDArray[Any]) -> None:
@@ -337,11 +338,11 @@ def is_one_way(path: str) -> bool:
     return path == STANDARD_STREAM or (Path(path).exists() and not Path(path).is_file())
 
 
-def _refuse_others(name: str, data: bytes) -> None:
-    head = data[:HEAD_SIZE]
-    kind = detect_content(Path(name), head) or detect_name(Path(name))
+def _refuse_others(path: Path, shown: str = "") -> None:
+    head = read_head(path)
+    kind = detect_content(path, head) or detect_name(path)
     if kind is not None and kind.name != "csplat":
-        raise refusal(Path(name), head, wanted="csplat")
+        raise refusal(path, head, wanted="csplat", shown=STANDARD_INPUT if shown == STANDARD_STREAM else shown)
 
 
 def _close(data: mmap) -> None:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from csplat.decoder import decode, open_tiles
 from csplat.decoder.tree import select_tiles
 from csplat.detect import detect_content, detect_name, read_head, refusal
-from csplat.disk_files import local_file
+from csplat.disk_files import local_file, work_folder
 from csplat.editing.transform import DEFAULT_AXES, convert_axes
 from csplat.errors import InputError, counted
 from csplat.file_source import File
@@ -374,7 +374,7 @@ def _write_csplat(path: Path, scene: SceneSource) -> None:
     from csplat.encoder import EncodeOptions  # imported lazily: reading does not load the encoder
     from csplat.out_of_core import OutOfCoreOptions, encode_scene
 
-    with tempfile.TemporaryDirectory(prefix=".csplat-", dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(prefix=".csplat-", dir=work_folder(path)) as folder:
         encode_scene(scene, path, EncodeOptions(keep_extra=True), OutOfCoreOptions(folder=Path(folder) / "work"))
 
 

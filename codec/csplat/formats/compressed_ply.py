@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.disk_files import atomic_writer
+from csplat.disk_files import atomic_writer, work_folder
 from csplat.errors import InputError, counted
 from csplat.file_source import open_binary
 from csplat.formats.common import (
@@ -233,7 +233,7 @@ def _write(path: Path, scene: SceneSource) -> list[Finding]:
     A splat far away would make the positions of all splats in its chunk coarse. Invisible splats fill chunks up.
     """
     rest, moved = 3 * scene.metadata_model.shN.shape[1], MovedSplats()
-    with atomic_writer(path) as stream, sorted_shells(scene, path.parent) as shells:
+    with atomic_writer(path, seekable=True) as stream, sorted_shells(scene, work_folder(path)) as shells:
         filling = sum(-shell.count % _CHUNK for shell in shells[:-1])
         count = scene.count + filling
         header = _build_header(scene.metadata_model, count, rest)

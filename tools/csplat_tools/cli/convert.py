@@ -83,6 +83,9 @@ def convert(
             filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)
+    if made.source_count and not made.count:
+        cause = " and ".join(["--crop"] * (crop is not None) + ["--drop-floaters"] * drop_floaters)
+        note(f"warning: {cause} keeps none of {counted(made.source_count, 'splat')}: {output} has no splats")
     if made.lost_words():
         note(f"lost on the way: {made.lost_words()}")
     out.print_findings(made.losses)

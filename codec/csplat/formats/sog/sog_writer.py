@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.disk_files import atomic_writer
+from csplat.disk_files import atomic_writer, work_folder
 from csplat.encoder.kmeans import assign, cluster
 from csplat.errors import InputError, missing_package
 from csplat.formats.common import ClampStatistics, MovedSplats, encode_smallest_three, sorted_along_curve
@@ -53,7 +53,7 @@ def write_sog(path: Path, scene: SceneSource) -> list[Finding]:
     losses = SogLosses()
     if is_folder:
         path.parent.mkdir(exist_ok=True)
-    with sorted_along_curve(scene, path.parent) as ordered:
+    with sorted_along_curve(scene, work_folder(path)) as ordered:
         if is_folder:
             for name, data in encode_files(ordered, losses):  # meta.json comes last
                 with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
