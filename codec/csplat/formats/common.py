@@ -256,7 +256,7 @@ class MovedSplats:
         self.largest = max(self.largest, float(errors.max(where=moved, initial=0.0)))
 
     def findings(self, reason: str) -> list[Finding]:
-        """Return the finding, if there are any; `reason` specifies why the positions are coarse."""
+        """Return the finding, if there are any; `reason` is why the positions are coarse."""
         if not self.count:
             return []
         text = f"{counted(self.count, 'splat')} moved visibly, by up to {self.largest:.3g} scene units: {reason};"

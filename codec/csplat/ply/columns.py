@@ -397,7 +397,7 @@ def flatten_scales(scales: F32) -> NDArray[np.bool_]:
     Args:
         scales: [N, C], natural logarithms.
     """
-    zero = np.isneginf(scales)
+    zero = scales == -np.inf
     scales[zero] = LOG_OF_0
     return np.asarray(zero.any(axis=1))
 
