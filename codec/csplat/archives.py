@@ -24,8 +24,8 @@ DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeErr
             SyntaxError, OSError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the others expand further, LZMA with 4 GiB of memory
-_FREE = 1 << 26  # bytes of an archive of arrays that are accepted regardless of its expansion
-_EXPANSION = 64  # largest expansion of a larger one; trained values hardly compress
+_FREE = 1 << 28  # bytes that compressed data may unpack to regardless of its size
+_EXPANSION = 64  # largest expansion of larger data; trained values compress to a tenth at best
 _MAX_ARRAYS = 4096  # an array of an archive takes 60 bytes of the file if they overlap, and 60 microseconds
 
 
@@ -113,6 +113,11 @@ class Archive(dict[str, NDArray[Any]]):
                 self.refuse(f"its {name} is not of type {kind.__name__}")
 
 
+def unpacked_limit(size: int) -> int:
+    """Return the number of bytes that compressed data of this size may unpack to: 256 MiB, or 64 times its size."""
+    return max(_FREE, _EXPANSION * size)
+
+
 def member_refusal(info: zipfile.ZipInfo, max_bytes: int) -> str:
     """Return why a member of a zip is refused before it is unpacked; "" if it is not.
 
@@ -138,7 +143,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
         kind: as in `Archive`.
 
     Raises:
-        InputError: the file is damaged, not a .npz file, or larger than 64 MiB unpacked and than 64 times its size.
+        InputError: the file is damaged, not a .npz file, or unpacks to more than `unpacked_limit`.
         OSError: the file cannot be read.
     """
     with Path(path).open("rb") as stream:
@@ -155,7 +160,7 @@ def _read_arrays(stream: BinaryIO) -> dict[str, NDArray[Any]]:
     if not zipfile.is_zipfile(stream):
         raise InputError("it is not a .npz file")
     arrays: dict[str, NDArray[Any]] = {}
-    left = max(_FREE, _EXPANSION * stream.seek(0, 2))
+    left = unpacked_limit(stream.seek(0, 2))
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if len(members) > _MAX_ARRAYS:
