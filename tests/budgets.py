@@ -3,8 +3,8 @@
     python tests/budgets.py              # a table in Markdown, as in SECURITY.md
     python tests/budgets.py ply sog      # the inputs whose names contain one of these
 
-Each input has about two megabytes, unless a limit refuses it, and is read by a process of its own that has read a small file
-before. Memory is what the peak exceeds the memory before reading by; it includes a mapped file.
+Each input has about two megabytes, unless a limit refuses it, and is read by a process of its own that has read a small
+file before. Memory is the difference between the peak and the memory before reading; it includes a mapped file.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import time
 import zipfile
 import zlib
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -29,8 +30,8 @@ import numpy as np
 _SIZE = 2_000_000  # bytes of an input
 _ADDRESS_SPACE = 12 << 30  # bytes; a reader without a limit fails instead of the machine
 _SECONDS = 120.0
-_COLUMNS = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
-_PROPERTIES = "".join(f"property float {name}\n" for name in _COLUMNS)
+_GROUPS = {"": "xyz", "f_dc_": "012", "opacity": [""], "scale_": "012", "rot_": "0123"}  # columns of a splat
+_PROPERTIES = "".join(f"property float {group}{end}\n" for group, ends in _GROUPS.items() for end in ends)
 _ONE = "element vertex 1\n" + _PROPERTIES
 _ROW = struct.pack("<14f", *[0.1] * 14)
 _TEXT_ROW = b"0.1 " * 13 + b"0.1\n"
@@ -252,9 +253,9 @@ def _read(path: Path) -> None:
 
 def _measure(path: Path) -> None:
     """Print the bytes, microseconds and result of reading a file, as JSON; runs in a process of its own."""
-    import csplat_render.camera_files
-    import csplat_trainer.data.colmap  # noqa: F401
-    import csplat_trainer.data.loader  # noqa: F401
+    import_module("csplat_render.camera_files")
+    import_module("csplat_trainer.data.colmap")
+    import_module("csplat_trainer.data.loader")
     from csplat.errors import CsplatError
 
     with tempfile.TemporaryDirectory() as folder:  # what is loaded at first use does not count

@@ -1,6 +1,7 @@
 """Defects of PLY files: their name in lint, the result of reading, and the error of strict reading."""
 
 import re
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -715,3 +716,128 @@ def test_an_element_without_properties_is_refused(tmp_path):
     (tmp_path / "a.ply").write_text("ply\nformat ascii 1.0\nelement face 1\nelement vertex 0\nend_header\n1\n")
     with pytest.raises(InputError, match="the element face has no properties"):
         read_ply(tmp_path / "a.ply")
+
+
+def counted_file(count, kind="binary_little_endian", name="vertex"):
+    text = header(good_rows(1), kind=kind, name=name, count=count)
+    return text + (good_rows(1).tobytes() if kind != "ascii" else (lines_of(good_rows(1))[0] + "\n").encode())
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
+def test_numbers_of_any_length_in_a_header_are_reported(path, kind):
+    for count, message in (
+        ("9" * 5000, r"999\.\.\. \(5,000 digits\) rows are declared"),
+        ("0" * 5000 + "1", r"000\.\.\. \(5,001 digits\) rows are declared"),
+        ("-" + "9" * 5000, r"-999.*\.\.\. .*rows are declared"),
+        ("1.0", "the count '1.0' is not a whole number"),
+        ("1e3", "the count '1e3' is not a whole number"),
+    ):
+        path.write_bytes(counted_file(count, kind))
+        with pytest.raises(InputError, match=message) as caught:
+            read_ply(path)
+        assert len(str(caught.value)) < 300
+    names = [*NAMES[:-1], f"f_rest_{'9' * 5000}"]
+    put(path, good_rows(names=names))
+    with pytest.raises(InputError, match=r"f_rest columns are not numbered from 0"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("line", ["property list float float a", "property complex a", "property list uchar int",
+                                  "element a", "elements a 1", "format ascii 2.0", "property float"])  # fmt: skip
+def test_invalid_lines_of_a_header_are_named(path, line):
+    path.write_bytes(header(good_rows(1), after=[line]))
+    with pytest.raises(InputError, match=f"the header line '{line}' is not valid"):
+        read_ply(path)
+
+
+def test_a_header_declares_up_to_4096_elements_and_properties(path):
+    rows = good_rows(1)
+    for declared in (4096, 4097):
+        more = declared - 1 - len(NAMES)
+        after = ["element a 0", *(f"property char {index}" for index in range(more - 1))]
+        path.write_bytes(header(rows, after=after) + rows.tobytes())
+        if declared == 4096:
+            assert 1 == len(read_ply(path))
+    with pytest.raises(InputError, match="more than 4,096 elements and properties"):
+        read_ply(path)
+
+
+def test_elements_without_properties_and_millions_of_empty_lists_are_skipped(path):
+    rows = good_rows(2)
+    count = 100_000
+    for declared, body in (
+        (["property list uchar int a"], bytes(count)),
+        (["property list ushort int a"], bytes(2 * count)),
+        (["property list char double a", "property list uint char b"], bytes(5 * count)),
+        (["property char a", "element none 500"], bytes(count)),
+    ):
+        before = [f"element junk {count}", *declared]
+        path.write_bytes(header(rows, before=before) + body + rows.tobytes())
+        tracemalloc.start()
+        assert np.array_equal(rows["x"], read_ply(path).means[:, 0])
+        assert tracemalloc.get_traced_memory()[1] < 20 * count
+        tracemalloc.stop()
+        path.write_bytes((header(rows, before=before) + body + rows.tobytes())[:-1])
+        assert found(path)["truncated"].repairable is False
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_lists_between_the_columns_of_splats_are_skipped(path, order):
+    rows = good_rows(3)
+    kinds = np.dtype([(name, f"{order}f4") for name in NAMES])
+    lines = (
+        header(rows.astype(kinds), kind=f"binary_{'little' if order == '<' else 'big'}_endian").decode().splitlines()
+    )
+    at = lines.index("property float nx")
+    lines[at:at] = ["property list ushort short a", "property list uchar uchar b"]
+    body = b""
+    for index, row in enumerate(rows.astype(kinds)):
+        data = row.tobytes()
+        some = np.array([index], f"{order}u2").tobytes() + bytes(2 * index)
+        body += data[:12] + some + bytes([7]) + bytes(7) + data[12:]
+    path.write_bytes("\n".join([*lines, ""]).encode() + body)
+    model = read_ply(path)
+    assert np.array_equal(rows["y"], model.means[:, 1])
+    assert np.array_equal(alpha_of_logits(rows["opacity"]), model.opacities)
+    assert np.array_equal(rows["scale_2"], model.scales[:, 2])
+    assert "a, b" in found(path)["list-columns"].text
+    negative = body[:12] + b"\xff\xff" + body[14:]
+    path.write_bytes("\n".join([*lines, ""]).replace("ushort short a", "short short a").encode() + negative)
+    with pytest.raises(InputError, match="row 0 of vertex: the list a has a length of -1"):
+        read_ply(path)
+
+
+@pytest.mark.parametrize(("row", "message"), [
+    ("2 1 2", None),
+    ("0", None),
+    ("2 1", r"row 1 of vertex has 28 values, expected 29"),
+    ("2 1 2 3", r"row 1 of vertex has 30 values, expected 29"),
+    ("-1", r"row 1 of vertex: the length of a is '-1'"),
+    ("x", r"row 1 of vertex: the length of a is 'x'"),
+    ("9" * 5000, r"row 1 of vertex: the length of a is '9+'"),
+])  # fmt: skip
+def test_lists_of_splats_in_text(path, row, message):
+    first, second = lines_of(good_rows(2))
+    put_text(path, f"{first} 0\n{second} {row}\n", good_rows(2), after=["property list uchar int a"])
+    if message is None:
+        assert np.array_equal(good_rows(2)["rot_0"], read_ply(path).quats[:, 0])
+        return
+    with pytest.raises(InputError, match=message) as caught:
+        read_ply(path)
+    assert len(str(caught.value)) < 300
+
+
+def test_rows_of_text_take_memory_in_proportion_to_the_file(path):
+    text = lines_of(ROWS)
+    rows = 100_000
+    for before, body in (
+        ([f"element junk {rows}", "property list uchar int a"], "0\n" * rows + "\n".join(text)),
+        ([f"element junk {rows}", "property uchar a"], "0 " * rows + "\n" + "\n".join(text)),
+        ([], "\n" * rows + "\n".join(text)),
+        ([], "\n".join(text) + "\n" * rows + "1\n"),
+    ):
+        put_text(path, body, before=before)
+        tracemalloc.start()
+        assert np.array_equal(ROWS["x"], read_ply(path).means[:, 0])
+        assert tracemalloc.get_traced_memory()[1] < 64 * path.stat().st_size
+        tracemalloc.stop()

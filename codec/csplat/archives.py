@@ -128,8 +128,7 @@ def member_refusal(info: zipfile.ZipInfo, max_bytes: int) -> str:
         max_bytes: maximum declared size.
     """
     if info.compress_type not in _COMPRESSIONS:
-        method = zipfile.compressor_names.get(info.compress_type, "an unknown method")
-        return f"is compressed with {method}, expected deflate: zip it again"
+        return f"is compressed by method {info.compress_type}, expected 8 (deflate): zip it again"
     if info.file_size > max_bytes:
         return f"of {info.compress_size:,} bytes declares an unpacked size of {info.file_size:,}, allowed {max_bytes:,}"
     return ""

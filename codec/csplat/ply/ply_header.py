@@ -191,8 +191,10 @@ def _parse_lines(lines: Sequence[str], findings: list[Finding], size: int) -> tu
     Raises:
         InputError: a line is invalid, or too many elements and properties are declared.
     """
-    order, elements, declared = "", [], 0
+    order, declared = "", 0
+    elements: list[PlyElement] = []
     comments: list[str] = []
+    names: set[str] = set()  # of the properties of the last element
     remarks: tuple[list[str], list[str]] = [], []  # other information, comments on elements
     for line in lines[1:-1]:
         keyword, *words = line.split(None, 1)
@@ -210,7 +212,7 @@ def _parse_lines(lines: Sequence[str], findings: list[Finding], size: int) -> tu
             elements.append(PlyElement(words[0], _parse_count(words[1], findings, size)))
             if any(one.name == words[0] for one in elements[:-1]):
                 raise InputError(f"the header declares two elements with the same name {words[0][:_SHOWN]}")
-            names: set[str] = set()
+            names = set()
         elif keyword == "property" and elements and (found := _parse_property(words)):
             elements[-1].properties.append(found)
             if found.name in names:

@@ -187,6 +187,7 @@ _SPELLINGS = {
     "an exponent as Fortran writes it": ((b"d", b"D"), _EXPONENT, rb"\1e\2"),
 }
 _NO_THOUSANDS = re.compile(rb"\d,(?!\d{3}(?!\d))\d")  # not followed by three digits exactly
+_SPACE = re.compile(rb"\s")
 _SPACES = np.isin(np.arange(256), list(b" \t\n\v\f\r"))
 
 
@@ -219,7 +220,7 @@ def _read_text(path: Path, header: PlyHeader, names: Sequence[str], findings: li
     oddities = []
     for name, (hints, pattern, spelling) in _SPELLINGS.items():
         if any(hint in body for hint in hints):
-            body, count = pattern.subn(spelling, body)
+            body, count = _substitute(pattern, spelling, body)
             oddities += [f"{name} ({counted(count, 'number')})"] if count else []
     first: RowError | None = None
     for separated, separators in _separations(body):
@@ -239,6 +240,19 @@ def _read_text(path: Path, header: PlyHeader, names: Sequence[str], findings: li
         return {one.element.name: _convert(separated, lines, one) for one in parts if one.element.name in names}
     assert first is not None, "_separations returns at least one reading"
     raise first
+
+
+def _substitute(pattern: re.Pattern[bytes], spelling: bytes, text: bytes) -> tuple[bytes, int]:
+    """Replace words as `re.subn` does, which makes an object per match, block by block."""
+    blocks, total, start = [], 0, 0
+    while start < len(text):
+        end = _SPACE.search(text, start + _BLOCK_SIZE)
+        stop = end.end() if end else len(text)
+        block, count = pattern.subn(spelling, text[start:stop])
+        blocks.append(block)
+        total += count
+        start = stop
+    return b"".join(blocks), total
 
 
 def _separations(text: bytes) -> Iterator[tuple[bytes, str]]:
@@ -324,7 +338,7 @@ def _split_rows(body: bytes, lines: _Lines, elements: Sequence[PlyElement]) -> t
 def _convert(body: bytes, lines: _Lines, part: _Part) -> Rows:
     """Return the single values of an element."""
     element, dtype = part.element, part.element.dtype("=")
-    rows = np.empty(element.count, dtype)
+    rows, width = np.empty(element.count, dtype), len(dtype.names or ())
     done, left = 0, list[bytes]()
     for first, stop in _blocks(lines, part):
         begin = int(lines.ends[first - 1]) if first else 0
@@ -336,8 +350,8 @@ def _convert(body: bytes, lines: _Lines, part: _Part) -> Rows:
             count = stop - first
         else:
             words = left + text.split()
-            count = len(words) // len(dtype)
-            left = words[count * len(dtype) :]
+            count = len(words) // width
+            left = words[count * width :]
         _fill_rows(rows[done : done + count], words, element.name, done)
         done += count
     return rows
@@ -383,8 +397,8 @@ def _fill_rows(rows: Rows, words: list[bytes], name: str, first: int) -> None:
         name: name of the element, for messages.
         first: index of the first row, for messages.
     """
-    width = len(rows.dtype)
-    columns = list(rows.dtype.names or ())
+    columns = rows.dtype.names or ()
+    width = len(columns)
     try:
         for index, column in enumerate(columns):
             with np.errstate(over="ignore"):  # numbers beyond their type become infinite and are dropped later

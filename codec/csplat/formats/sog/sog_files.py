@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.archives import DAMAGED, member_refusal, scenes_of, unpacked_limit
+from csplat.archives import DAMAGED, member_refusal, scenes_of
 from csplat.disk_files import parse_json, path_inside
 from csplat.errors import InputError, missing_package
 from csplat.file_source import describe_substitute
@@ -349,8 +349,6 @@ def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[n
         with WebPImageFile(io.BytesIO(data)) as image:
             if not fits(*image.size):
                 parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which does not match the metadata")
-            if (unpacked := 4 * image.size[0] * image.size[1]) > unpacked_limit(len(data)):
-                parts.refuse(f"{name} of {len(data):,} bytes has {unpacked:,} bytes of pixels, too many for its size")
             return np.asarray(image.convert("RGBA"))
     except (*DAMAGED, DecompressionBombError) as error:
         parts.refuse(f"{name} is not a complete WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")
