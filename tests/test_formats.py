@@ -502,8 +502,8 @@ def checkpoint_of(pickled, way=zipfile.ZIP_STORED):
 
 
 def test_large_pickles_and_compressed_parts_of_checkpoints_are_refused(tmp_path):
-    large = b"\x80\2" + b"]" * (1 << 23)
-    lied = with_size(zip_of([("archive/data/0", bytes(1000))], zipfile.ZIP_DEFLATED), 300_000_000)
+    large = b"\x80\2X" + struct.pack("<I", 1 << 23) + bytes(1 << 23) + b"."
+    lied = with_size(zip_of([("a/data/0", bytes(1000)), ("a/data.pkl", b"N.")], zipfile.ZIP_DEFLATED), 300_000_000)
     for name, data, message in (
         ("a.pt", checkpoint_of(large), "a pickle of more than 4,194,304 bytes"),
         ("a.ckpt", checkpoint_of(large, zipfile.ZIP_DEFLATED), "a pickle of more than 4,194,304 bytes"),
