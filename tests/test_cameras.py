@@ -602,3 +602,18 @@ def test_distances_agree_with_the_cameras_of_the_shared_scenes(data_dir, name):
 
     wanted = distance(load_cameras(data_dir / "psnr_cameras" / f"{name}.json"))
     assert 0.8 < distance(virtual_cameras(model)) / wanted < 1.25
+
+
+def test_numbers_beyond_float64_in_camera_files_are_refused(tmp_path):
+    path = tmp_path / "a.json"
+    for document in (
+        [{"K": np.eye(3).tolist(), "viewmat": np.eye(4).tolist(), "W": 10**400, "H": 2}],
+        [{"width": 2, "height": 2, "position": [0, 0, 10**400], "rotation": np.eye(3).tolist(), "fx": 1, "fy": 1}],
+        {"w": 2, "h": 2, "fl_x": 10**5000 // 3, "frames": []},
+    ):  # fmt: skip
+        limit = sys.get_int_max_str_digits()
+        sys.set_int_max_str_digits(0)
+        path.write_text(json.dumps(document), encoding="utf-8")
+        sys.set_int_max_str_digits(limit)
+        with pytest.raises(InputError, match=r"a\.json is not a JSON file: an integer has \d[\d,]* digits"):
+            load_cameras(path)

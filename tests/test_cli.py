@@ -1086,3 +1086,9 @@ def test_a_scene_keeps_its_extremes(tmp_path):
     call("info", tmp_path / "e.csplat", "--json")
     call("verify", tmp_path / "e.csplat", "--source", tmp_path / "extreme.ply")
     call("verify", tmp_path / "e.csplat", "--source", tmp_path / "extreme.ply", "--source-index", tmp_path / "e.npy")
+
+
+@pytest.mark.parametrize("digits", ["9" * 5000, "9" * 400 + "M", "١", "²"])
+def test_numbers_of_any_length_are_refused(ply, tmp_path, digits):
+    for words in (("encode", ply, tmp_path / "b.csplat", "--levels"), ("convert", ply, tmp_path / "b.ply", "--level")):
+        refused(*words, digits, status=2)

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import csplat
-from csplat import SplatModel
+from csplat import SplatModel, _spec
 from csplat.encoder import PRESETS, EncodeOptions, encode, encode_with_report
 from csplat.encoder.error_bounds import ErrorSums
 from csplat.errors import InputError
@@ -481,3 +481,12 @@ def test_zlib_replaces_an_absent_libdeflate(make_model, monkeypatch):
     assert "zlib" == result.report.options["deflate"]
     with pytest.raises(InputError, match="deflate"):
         encode(make_model(5, 0), EncodeOptions(deflate="libdeflate"))
+
+
+def test_metadata_beyond_the_budget_of_decoders_is_not_written(make_model):
+    model = make_model(2, 0, metadata={"comments": ["a" * 1000] * 10})
+    encode(model)
+    values = _spec.BUDGET_JSON_BYTES // _spec.JSON_VALUE_COST
+    for value in ([[]] * values, " " * (_spec.BUDGET_JSON_BYTES // _spec.JSON_BYTE_COST)):
+        with pytest.raises(InputError, match="more than decoders accept by default: store fewer, or none"):
+            encode(replace(model, metadata={"a": value}))

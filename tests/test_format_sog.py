@@ -621,3 +621,23 @@ def test_real_files_are_read(data_dir):
         with open_scene(data_dir / "sog" / name) as scene:
             assert (count, degree) == (scene.count, scene.metadata_model.sh_degree)
             assert count == sum(map(len, scene.blocks()))
+
+
+def test_a_part_that_is_a_link_out_of_the_folder_is_refused(tmp_path):
+    meta, images = splats()
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (folder / "meta.json").write_text(json.dumps(meta), encoding="utf-8")
+    for name, data in images.items():
+        (folder / name).write_bytes(data if isinstance(data, bytes) else webp(data))
+    assert COUNT == len(csplat.read(folder))
+    (folder / "inside").mkdir()
+    (folder / "sh0.webp").rename(folder / "inside" / "sh0.webp")
+    (folder / "sh0.webp").symlink_to("inside/sh0.webp")  # a link within the folder is followed
+    assert COUNT == len(csplat.read(folder))
+    (folder / "inside" / "sh0.webp").rename(tmp_path / "secret")
+    for target in ("../secret", str(tmp_path / "secret"), "inside/../../secret", "sh0.webp"):
+        (folder / "sh0.webp").unlink()
+        (folder / "sh0.webp").symlink_to(target)
+        with pytest.raises(InputError, match=r"a link that leads out of it|cannot be read|there is no sh0"):
+            csplat.read(folder)

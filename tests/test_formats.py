@@ -6,10 +6,14 @@ import base64
 import html
 import io
 import json
+import math
 import os
+import pickle
 import re
+import struct
 import subprocess
 import sys
+import warnings
 import zipfile
 
 import numpy as np
@@ -19,6 +23,7 @@ from tables import failures
 import csplat
 import csplat_tools
 from csplat.archives import read_archive
+from csplat.disk_files import parse_json, read_array
 from csplat.errors import InputError
 from csplat.formats import assume_format, detect_format, formats, open_scene, write_scene
 from csplat.formats import lint_file as formats_lint
@@ -424,15 +429,127 @@ def test_objects_are_not_run(tmp_path):
         read_archive(tmp_path / "a.npz", KIND)
 
 
-@pytest.mark.parametrize("way", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_damage_is_named_however_the_file_is_packed(tmp_path, way):
+def test_damage_of_a_deflated_file_is_named(tmp_path):
     np.save(tmp_path / "a.npy", np.random.default_rng(1).normal(size=400))
-    path = archive(tmp_path / "a.npz", (tmp_path / "a.npy").read_bytes(), way)
+    path = archive(tmp_path / "a.npz", (tmp_path / "a.npy").read_bytes(), zipfile.ZIP_DEFLATED)
     data = path.read_bytes()
     for place in range(60, 1000, 37):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
         with pytest.raises(InputError, match=r"a\.npz is not a file of tests"):
             read_archive(path, KIND)
+
+
+def npy(header, data=b"", version=1):
+    size = struct.pack("<H" if version == 1 else "<I", len(header))
+    return b"\x93NUMPY" + bytes([version, 0]) + size + header + data
+
+
+def header_of(descr="'|u1'", shape="(4,)"):
+    return f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}}}\n".encode()
+
+
+def zip_of(members, way=zipfile.ZIP_STORED):
+    out = io.BytesIO()
+    with warnings.catch_warnings(action="ignore"), zipfile.ZipFile(out, "w", way) as file:
+        for name, data in members:
+            file.writestr(name, data)
+    return out.getvalue()
+
+
+def with_size(data, size):
+    """Return a zip of one deflated member whose directory declares another unpacked size."""
+    at = data.index(b"PK\1\2") + 24
+    return data[:at] + struct.pack("<I", size) + data[at + 4 :]
+
+
+LARGE = zip_of([("a.npy", npy(header_of(shape="(300000000,)"), bytes(1000)))], zipfile.ZIP_DEFLATED)
+HOSTILE_ARCHIVES = {
+    "bzip2": (zip_of([("a.npy", npy(header_of(), b"abcd"))], zipfile.ZIP_BZIP2), "by method 12, expected 8"),
+    "LZMA": (zip_of([("a.npy", npy(header_of(), b"abcd"))], zipfile.ZIP_LZMA), "by method 14, expected 8"),
+    "larger than its size allows": (with_size(LARGE, 300_000_070), "declares an unpacked size of 300,000,070"),
+    "more than it declares": (
+        with_size(zip_of([("a.npy", npy(header_of(), bytes(9999)))], zipfile.ZIP_DEFLATED), 69), "Bad CRC-32",
+    ),
+    "shape larger than the data": (zip_of([("a.npy", npy(header_of(shape="(4, 9999999999)")))]), "does not fit its 0"),
+    "shape smaller than the data": (zip_of([("a.npy", npy(header_of(), b"abcde"))]), "does not fit its 5 bytes"),
+    "shape below zero": (zip_of([("a.npy", npy(header_of(shape="(-1, -4)"), b"abcd"))]), "does not fit its 4 bytes"),
+    "side of 5,000 digits": (zip_of([("a.npy", npy(header_of(shape=f"({'9' * 5000},)")))]), "."),
+    "values without bytes": (zip_of([("a.npy", npy(header_of("'|V0'", "(1000000000000,)")))]), "expected numbers"),
+    "objects": (zip_of([("a.npy", npy(header_of("'|O'"), bytes(32)))]), "pickled objects are not read"),
+    "header of brackets": (zip_of([("a.npy", npy(b"[" * 9000))]), "a is not an array"),
+    "header of 1 MB": (zip_of([("a.npy", npy(b"{" + b" " * (1 << 20), version=2))]), "a is not an array"),
+    "header of version 3": (zip_of([("a.npy", npy(header_of(), b"abcd", version=3))]), "version 3.0, expected 1.0"),
+    "two arrays of a name": (zip_of([("a.npy", npy(header_of(), b"abcd"))] * 2), "two arrays a"),
+    "5,000 arrays": (zip_of([(f"{index}.npy", b"") for index in range(5000)]), "5,000 members, expected at most"),
+}  # fmt: skip
+
+
+def test_archives_that_need_more_than_their_size_allows_are_refused(tmp_path):
+    def check(case):
+        data, message = case
+        (tmp_path / "a.npz").write_bytes(data)
+        with pytest.raises(InputError, match=rf"a\.npz is not a file of tests: .*{message}") as caught:
+            read_archive(tmp_path / "a.npz", KIND)
+        assert "\n" not in str(caught.value)
+        assert len(str(caught.value)) < 300
+
+    assert [] == failures(HOSTILE_ARCHIVES, check)
+
+
+def test_an_array_file_is_compared_with_its_size(tmp_path):
+    path = tmp_path / "a.npy"
+    for shape, data in (("(1000000000000,)", b"abcd"), ("(4,)", b"abc"), ("(4,)", b"abcde")):
+        path.write_bytes(npy(header_of(shape=shape), data))
+        with pytest.raises(InputError, match="does not fit its"):
+            read_array(path)
+    for array in (np.arange(6.0).reshape(2, 3), np.asfortranarray(np.arange(6).reshape(2, 3)), np.array("text")):
+        np.save(path, array)
+        assert np.array_equal(array, read_array(path))
+        assert read_array(path).flags.writeable
+
+
+def test_a_header_of_python_2_is_read_without_a_warning(tmp_path):
+    (tmp_path / "a.npy").write_bytes(npy(header_of(shape="(4L,)"), b"abcd"))
+    with warnings.catch_warnings(action="error"):
+        assert 4 == len(read_array(tmp_path / "a.npy"))
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("[" * 100_000, "nested too deep"),
+    ("1" * 5000, "an integer has 5,000 digits, expected at most 300"),
+    ('{"a": -%s}' % ("1" * 400), "an integer has 401 digits"),
+    (r'["\ud800"]', "half of a surrogate pair"),
+    (rb'{"\uDC00": 1}', "half of a surrogate pair"),
+    (b'"\xed\xa0\x80"', "can't decode"),
+    (b"{", "Expecting property name"),
+])  # fmt: skip
+def test_json_that_python_accepts_or_fails_on_is_refused(text, message):
+    with pytest.raises(InputError, match=message):
+        parse_json(text)
+
+
+def test_json_is_parsed_in_each_encoding():
+    for encoding in ("utf-8", "utf-8-sig", "utf-16", "utf-32"):
+        assert {"é": [1e300, math.inf, "😀"]} == parse_json('{"é": [1e300, 1e999, "\\ud83d\\ude00"]}'.encode(encoding))
+
+
+def checkpoint_of(pickled, way=zipfile.ZIP_STORED):
+    return zip_of([("archive/data.pkl", pickled), ("archive/version", b"3\n")], way)
+
+
+def test_large_pickles_and_compressed_parts_of_checkpoints_are_refused(tmp_path):
+    large = b"\x80\2X" + struct.pack("<I", 1 << 23) + bytes(1 << 23) + b"."
+    lied = with_size(zip_of([("a/data/0", bytes(1000)), ("a/data.pkl", b"N.")], zipfile.ZIP_DEFLATED), 300_000_000)
+    for name, data, message in (
+        ("a.pt", checkpoint_of(large), "a pickle of more than 4,194,304 bytes"),
+        ("a.ckpt", checkpoint_of(large, zipfile.ZIP_DEFLATED), "a pickle of more than 4,194,304 bytes"),
+        ("b.pt", pickle.dumps(0x1950A86A20F9469CFC6C, 2) + large, "a pickle of more than 4,194,304 bytes"),
+        ("a.pt", lied, "declares an unpacked size of 300,000,000"),
+        ("a.pt", zip_of([("archive/data.pkl", b"N.")], zipfile.ZIP_LZMA), "by method 14, expected 8"),
+    ):
+        (tmp_path / name).write_bytes(data)
+        with pytest.raises(InputError, match=message), open_scene(tmp_path / name):
+            pass
 
 
 @pytest.mark.parametrize("text", [b"[1]", b"{", b"[" * 100_000, b"\xff"], ids=["list", "open", "deep", "no text"])

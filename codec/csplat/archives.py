@@ -24,9 +24,8 @@ DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeErr
             SyntaxError, OSError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 
 _COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the others expand further, LZMA with 4 GiB of memory
-_OTHER_COMPRESSIONS = {9: "deflate64", 12: "bzip2", 14: "LZMA", 93: "Zstandard", 95: "XZ"}  # by number in a zip
-_FREE = 1 << 26  # bytes of an archive of arrays that are accepted regardless of its expansion
-_EXPANSION = 64  # largest expansion of a larger one; trained values hardly compress
+_FREE = 1 << 28  # bytes that compressed data may unpack to regardless of its size
+_EXPANSION = 64  # largest expansion of larger data; trained values compress to a tenth at best
 _MAX_ARRAYS = 4096  # an array of an archive takes 60 bytes of the file if they overlap, and 60 microseconds
 
 
@@ -114,6 +113,11 @@ class Archive(dict[str, NDArray[Any]]):
                 self.refuse(f"its {name} is not of type {kind.__name__}")
 
 
+def unpacked_limit(size: int) -> int:
+    """Return the number of bytes that compressed data of this size may unpack to: 256 MiB, or 64 times its size."""
+    return max(_FREE, _EXPANSION * size)
+
+
 def member_refusal(info: zipfile.ZipInfo, max_bytes: int) -> str:
     """Return why a member of a zip is refused before it is unpacked; "" if it is not.
 
@@ -124,8 +128,7 @@ def member_refusal(info: zipfile.ZipInfo, max_bytes: int) -> str:
         max_bytes: maximum declared size.
     """
     if info.compress_type not in _COMPRESSIONS:
-        method = _OTHER_COMPRESSIONS.get(info.compress_type, "an unknown method")
-        return f"is compressed with {method}, expected deflate: zip it again"
+        return f"is compressed by method {info.compress_type}, expected 8 (deflate): zip it again"
     if info.file_size > max_bytes:
         return f"of {info.compress_size:,} bytes declares an unpacked size of {info.file_size:,}, allowed {max_bytes:,}"
     return ""
@@ -139,7 +142,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
         kind: as in `Archive`.
 
     Raises:
-        InputError: the file is damaged, not a .npz file, or larger than 64 MiB unpacked and than 64 times its size.
+        InputError: the file is damaged, not a .npz file, or unpacks to more than `unpacked_limit`.
         OSError: the file cannot be read.
     """
     with open_binary(path) as stream:
@@ -156,7 +159,7 @@ def _read_arrays(stream: BinaryIO) -> dict[str, NDArray[Any]]:
     if not zipfile.is_zipfile(stream):
         raise InputError("it is not a .npz file")
     arrays: dict[str, NDArray[Any]] = {}
-    left = max(_FREE, _EXPANSION * stream.seek(0, 2))
+    left = unpacked_limit(stream.seek(0, 2))
     with zipfile.ZipFile(stream) as archive:
         members = archive.infolist()
         if len(members) > _MAX_ARRAYS:

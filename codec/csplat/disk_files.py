@@ -499,8 +499,8 @@ def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
         raise InputError(f"{text} of type {dtype}, which does not fit its {rest:,} bytes of values")
     data: NDArray[Any] = np.empty(rest, np.uint8)
     for start in range(0, rest, _PART_SIZE):
-        part = data[start : start + _PART_SIZE]
-        if stream.readinto(part.data) != len(part):
+        part = data[start : start + _PART_SIZE].data
+        if stream.readinto(part) != len(part):
             raise InputError("it is truncated")
     stream.read(1)  # at the end, zipfile compares the checksum
     array = data.view(dtype)

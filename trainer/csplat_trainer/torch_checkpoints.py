@@ -8,8 +8,10 @@ facts, such as antialiased training, are not in the checkpoint, but in other fil
 
 from __future__ import annotations
 
+import io
 import math
 import pickle
+import pickletools
 import re
 import warnings
 import zipfile
@@ -21,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from csplat.archives import DAMAGED, member_refusal, unpacked_limit
 from csplat.detect import detect_content, read_head
 from csplat.errors import InputError, counted, missing_package
 from csplat.formats import Format
@@ -34,6 +37,11 @@ from csplat.spherical_harmonics import SH_C0
 
 _MAGICS = (b"PK\x03\x04", b"\x80")  # a zip, or a pickle as written by torch before 1.6
 _NAMED = 5  # names in a message
+_NAME_SHOWN = 80  # maximum number of characters of a name in a message
+_LARGEST_PICKLE = 1 << 22  # bytes; checkpoints have up to 100 kB, and a byte may become an object of 72
+_LEGACY_PICKLES = (
+    5  # at the beginning of a file written by torch before 1.6; the tensors follow (torch/serialization.py)
+)
 #: Values returned by INRIA's `GaussianModel.capture` after the active SH degree (scene/gaussian_model.py).
 _INRIA = ("means", "sh0", "shN", "scales", "quats", "opacities")
 _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto's tensors; else the top level does
@@ -132,6 +140,7 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
     if not head.startswith(_MAGICS):
         reason = "it begins with" if kind is None else f"it is {kind.title}, and begins with"
         raise InputError(f"{path.name} is not a checkpoint of torch: {reason} {head[:8]!r}")
+    _check_pickles(path)
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -152,6 +161,37 @@ def _read(path: Path, sh_degree: int | None) -> _CheckpointPart:
         return _model_of(content, path.stat().st_size, sh_degree)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
+
+
+def _check_pickles(path: Path) -> None:
+    """Refuse compressed parts that expand too far, and large pickles: each of their bytes may become an object.
+
+    Raises:
+        InputError: a part of the zip, or a pickle, exceeds its limit.
+        OSError: the file cannot be read.
+    """
+    refusal = f"{path.name} has a pickle of more than {_LARGEST_PICKLE:,} bytes, expected tensors next to a small one"
+    if zipfile.is_zipfile(path):
+        try:
+            with zipfile.ZipFile(path) as archive:
+                members = archive.infolist()
+        except DAMAGED:
+            return  # torch reports the damage
+        for info in members:
+            if info.filename.endswith(".pkl") and info.file_size > _LARGEST_PICKLE:
+                raise InputError(refusal)
+            if reason := member_refusal(info, unpacked_limit(info.compress_size)):
+                raise InputError(f"{path.name}: its part {info.filename[:_NAME_SHOWN]} {reason}")
+        return
+    with path.open("rb") as stream:
+        begin = io.BytesIO(stream.read(_LARGEST_PICKLE))
+    try:
+        for _ in range(_LEGACY_PICKLES):
+            for _ in pickletools.genops(begin):
+                pass
+    except (ValueError, IndexError, OverflowError, MemoryError):  # damaged, which torch reports, or cut off here
+        if begin.getbuffer().nbytes == _LARGEST_PICKLE == begin.tell():
+            raise InputError(refusal) from None
 
 
 def _plain_numbers(torch: Any) -> Any:

@@ -29,6 +29,7 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
+from csplat.archives import unpacked_limit
 from csplat.disk_files import atomic_writer
 from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
@@ -153,8 +154,10 @@ def _parse_header(name: str, size: int, stream: BinaryIO) -> SpzArrays:
         raise InputError(f"{name} contains Spark's levels of detail in one list, which csplat does not read")
     packed = SpzArrays(name, version, count, degree, bits, flags, streams)
     unpacked = count * sum(packed.widths)
-    if unpacked > _RATIO * size:
-        raise InputError(f"{name} declares {count:,} splats, too many for its {size:,} bytes")
+    allowed = min(_RATIO * size, unpacked_limit(size))
+    if unpacked > allowed:
+        reason = f"too many for its {size:,} bytes: they unpack to {unpacked:,}, allowed {allowed:,}"
+        raise InputError(f"{name} declares {count:,} splats, {reason}")
     return packed
 
 
