@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import zipfile
 from dataclasses import replace
 
@@ -385,6 +386,24 @@ def test_inconsistent_files_are_refused(tmp_path):
             csplat.read(zipped(tmp_path / "a.sog", files))
 
     assert [] == failures(BAD, check)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
+def test_parts_in_a_folder_are_webp_within_it(tmp_path):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    for name, data in files_of(*splats()).items():
+        (folder / name).write_bytes(data)
+    csplat.read(folder)
+    (folder / "sh0.webp").rename(tmp_path / "sh0.webp")
+    (folder / "sh0.webp").symlink_to(tmp_path / "sh0.webp")
+    with pytest.raises(InputError, match=r"scene: the part sh0\.webp is a link that leads out of its folder"):
+        csplat.read(folder)
+    (folder / "sh0.webp").unlink()
+    for data, title in ((b"%!PS-Adobe-3.0 EPSF-3.0\n", r"PostScript \(EPS\)"), (b"\x89PNG\r\n\x1a\n", "a PNG")):
+        (folder / "sh0.webp").write_bytes(data)
+        with pytest.raises(InputError, match=rf"scene: sh0\.webp is {title}, .*expected WebP"):
+            csplat.read(folder)
 
 
 def test_zip_bombs_are_not_unpacked(tmp_path):

@@ -44,7 +44,7 @@ def tiff(*entries, next_at=0):
 
 
 JPEG = saved("JPEG")
-DEFLATED, LZW = saved("TIFF", compression="tiff_adobe_deflate"), saved("TIFF", compression="tiff_lzw")
+DEFLATED, LZW = (saved("TIFF", compression=kind) for kind in ("tiff_adobe_deflate", "tiff_lzw"))
 LARGE_TEXT = zlib.compress(b"a" * (1 << 25))
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\n%%EndComments\nshowpage\n%%EOF\n"
 
@@ -76,8 +76,8 @@ REFUSED = {
     "a bomb": (png(13_300, 13_300), "has 13300×13300 pixels in 74 bytes, expected at most 67,108,864 pixels: scale"),
     "the largest PNG": (png(2**31 - 1, 2**31 - 1), "has 2147483647×2147483647 pixels"),
     "a bomb of a BMP": (spoilt(saved("BMP"), 20, 21), "pixels in"),
-    "compressed text": (png(8, 8, chunk(b"zTXt", b"k\0\0" + LARGE_TEXT)), "a colour profile of too many bytes"),
-    "international text": (png(8, 8, chunk(b"iTXt", b"k\0\1\0\0\0" + LARGE_TEXT)), "of too many bytes"),
+    "compressed text": (png(8, 8, chunk(b"zTXt", b"k\0\0" + LARGE_TEXT)), "has texts or a colour profile of too many"),
+    "international text": (png(8, 8, chunk(b"iTXt", b"k\0\1\0\0\0" + LARGE_TEXT)), "bytes: save it without them"),
     "a colour profile": (png(8, 8, chunk(b"iCCP", b"k\0\0" + LARGE_TEXT)), "of too many bytes"),
     "a truncated PNG": (saved("PNG")[:300], "is a PNG that is truncated: copy or export it again"),
     "a truncated JPEG": (JPEG[:700], "is a JPEG that is truncated"),
@@ -91,15 +91,11 @@ REFUSED = {
     ),
 }  # fmt: skip
 
-MPF = b"MPF\0II*\0\x08\0\0\0" + b"\xff" * 26  # directories at invalid offsets
-EXIF = b"Exif\0\0II*\0\x08\0\0\0" + b"\xff" * 24
-
 #: Files that are read although Pillow warns of them.
 READ = {
-    "a JPEG of a phone": JPEG[:2] + b"\xff\xe2" + struct.pack(">H", 40) + MPF + JPEG[2:],
-    "damaged EXIF": JPEG[:2] + b"\xff\xe1" + struct.pack(">H", 40) + EXIF + JPEG[2:],
+    "a JPEG of a phone": JPEG[:2] + b"\xff\xe2\0\x28MPF\0II*\0\x08\0\0\0" + b"\xff" * 26 + JPEG[2:],
+    "damaged EXIF": JPEG[:2] + b"\xff\xe1\0\x28Exif\0\0II*\0\x08\0\0\0" + b"\xff" * 24 + JPEG[2:],
     "an animation of no images": png(8, 8, chunk(b"acTL", bytes(8))),
-    "a palette with transparency": png(8, 8),
     "a TIFF with a loop": tiff((256, 8), (257, 8), (273, 8), next_at=8),
 }
 

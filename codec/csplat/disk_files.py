@@ -28,7 +28,8 @@ from csplat.errors import InputError
 from csplat.file_source import File, describe_substitute, named_errors, open_binary, read_bytes
 from csplat.system import take_permissions
 
-_DECIMAL_COMMA = re.compile(r'":\s*([+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*[,}\n]')  # the value of a member of an object
+# As the value of a member; or in a list, since JSON has no numbers that begin with 00 to 09.
+_DECIMAL_COMMA = re.compile(r'":\s*([+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*[,}\n]|[\[,]\s*(-?\d+,0\d+)')
 _TRAILING_BYTE = re.compile(r"([\udc81-\udcfe])\\(?!\\)")  # a backslash that ends a character of Shift-JIS, GBK or Big5
 _PART_SIZE = 1 << 20  # bytes copied at a time
 _NAME_PART = 20  # characters of a file's name in that of its temporary file, which must not be longer than 255 bytes
@@ -109,7 +110,7 @@ def read_json(path: str | os.PathLike[str], *, any_bytes: bool = False) -> Any:
         return parse_json(_TRAILING_BYTE.sub(r"\1\\\\", text) if any_bytes else text)
     except InputError as error:
         comma = _DECIMAL_COMMA.search(text)
-        hint = f"; it has a decimal comma, {comma[1]}, expected a point" if comma else ""
+        hint = f"; it has a decimal comma, {comma[1] or comma[2]}, expected a point" if comma else ""
         raise InputError(f"{os.fspath(path)} is not a JSON file: {error}{hint}") from None
 
 

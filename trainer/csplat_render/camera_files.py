@@ -283,7 +283,8 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{where}: {name} is not a matrix of numbers") from None
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
-        raise InputError(f"{where}: {name} has shape {list(pose.shape)}, expected [4, 4], finite")
+        hint = ", as if by decimal commas" if pose.ndim == 2 and pose.shape[1] == 8 else ""
+        raise InputError(f"{where}: {name} has shape {list(pose.shape)}{hint}, expected [4, 4], finite")
     if len(pose) == 4:
         check_last_row(pose, f"{where}: {name}")
     axes = pose[:3, :3] * np.array([1.0, -1.0, -1.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -49,10 +50,9 @@ class _Commands(TyperGroup):
         return self.commands.get(cmd_name)
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
-        """Move `--trust-paths` from the words of a command to the front, where options of the program are."""
-        if args and args[0] in _OF_DATA_SETS and _TRUST_PATHS in args:
-            args = [_TRUST_PATHS, *(word for word in args if word != _TRUST_PATHS)]
-        return super().parse_args(ctx, args)
+        """Move options of the program from the words of a command to the front, where typer expects them."""
+        options, words = split_program_options(args)
+        return super().parse_args(ctx, [*options, *words])
 
     def invoke(self, ctx: Any) -> Any:
         with report_errors():
@@ -70,6 +70,17 @@ class _Commands(TyperGroup):
         except typer.Exit as error:
             status = error.exit_code
         sys.exit(status)
+
+
+def split_program_options(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the options of the program among the words of a command, and the other words.
+
+    Args:
+        words: name of the command, its arguments and options.
+    """
+    if not words or words[0] not in _OF_DATA_SETS:
+        return [], list(words)
+    return [word for word in words if word == _TRUST_PATHS], [word for word in words if word != _TRUST_PATHS]
 
 
 def _imported(name: str) -> Any:

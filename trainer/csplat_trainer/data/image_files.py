@@ -39,6 +39,7 @@ IMAGE_ENDINGS = (
     *(".avif", ".heic", ".heif", ".jp2", ".jxl", ".gif", ".exr"),
 )
 _SHOWN = 5  # largest number of names in a message
+_SHOWN_MAX = 200  # characters of each
 
 _FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
 _MASK_FOLDERS = ("masks", "mask", "_masks", "_mask")
@@ -257,12 +258,13 @@ def _match_code_pages(
     listed, other = ([name for name in some if not name.isascii()] for some in (names, known))
     best: dict[str, tuple[dict[str, str], str]] = {}  # by the mapping, which several code pages may give
     most = max(1.0, _MOST * len(listed))
+    stems = {_stem(name) for name in known}, {_stem(name) for name in listed}
     for translate, title in _translations() if listed else ():
         for forwards in (True, False):
             ours, theirs = ({name: name for name in some} for some in (listed, known if forwards else other))
             given = ours if forwards else theirs
             given = {read: name for name in given if (read := translate(name)) is not None and read != name}
-            if len(given) < (most if forwards else 1.0):
+            if sum(_stem(name) in stems[not forwards] for name in given) < most:
                 continue
             ours, theirs = (given, theirs) if forwards else (ours, given)
             try:
@@ -284,6 +286,12 @@ def _match_code_pages(
     name, to = next(iter(found.items()))
     text = f"{counted(len(found), 'name')} of {where} found in the code page {title}: {printable(name)} is"
     return found, [f"{text} {printable(to)}" + (", …" if len(found) > 1 else "")]
+
+
+def _stem(name: str) -> str:
+    """Return the part of a name that all rules leave unchanged."""
+    stem = PurePosixPath(name.replace("\\", "/")).name.partition(".")[0]
+    return unicodedata.normalize("NFC", stem).casefold().strip()
 
 
 def _translations() -> Iterator[tuple[Callable[[str], str | None], str]]:
@@ -391,7 +399,7 @@ def _only_lacks_ending(name: str, known: str) -> bool:
 
 def abbreviate(names: Sequence[str]) -> str:
     """Return the first few names, for a message."""
-    return ", ".join(map(printable, names[:_SHOWN])) + (", …" if len(names) > _SHOWN else "")
+    return ", ".join(printable(name)[:_SHOWN_MAX] for name in names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
 
 
 def _size_folders(place: SetFolder, folder: str) -> list[Path]:
@@ -412,7 +420,7 @@ def _size_folders(place: SetFolder, folder: str) -> list[Path]:
 
 
 def _find_in(place: SetFolder, folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
-    files = {name: path for name in names if place.holds(path := folder / name) and path.is_file()}
+    files = {name: path for name in names if place.finds(path := folder / name)}
     left = [name for name in names if name not in files]
     notes: list[str] = []
     if left and not (loose and files):

@@ -72,9 +72,19 @@ class SetFolder:
         real, root = os.path.realpath(self.checked(path)), self._real[0]
         return self.path / os.path.relpath(real, root) if _is_below(real, root) else Path(real)
 
+    def finds(self, path: Path) -> bool:
+        """Return True if a path that the folder holds is a file; links are followed."""
+        try:
+            return self.holds(path) and path.is_file()
+        except OSError:  # the name is too long
+            return False
+
     def finds_outside(self, path: Path) -> bool:
-        """Return True if a path that the folder does not hold is an existing file; no server is contacted."""
-        return not self.holds(path) and not os.fspath(path).startswith(_NETWORK) and path.is_file()
+        """Return True if a path that the folder does not hold exists; no server is contacted."""
+        try:
+            return not self.holds(path) and not os.fspath(path).startswith(_NETWORK) and path.exists()
+        except OSError:
+            return False
 
     def refusal(self, path: Path, where: str = "", *, by_link: bool = False) -> InputError:
         """Return the error for a path outside of the folder."""

@@ -166,7 +166,7 @@ def _shots(
             image, where = found.files[frame.name], f"{path}, frame {frame.number}"
             lens = _lens(frame_values(document, frame.values), image, where)
             viewmat = viewmat_of_opengl(frame.values.get("transform_matrix"), "transform_matrix", where)
-            shots.append(Shot(_plain(frame.name, image), image, lens, viewmat, masks.get(frame.name)))
+            shots.append(Shot(_plain(frame.name, image, place.path), image, lens, viewmat, masks.get(frame.name)))
     report += describe_scales(
         [frame.values["transform_matrix"] for frame in frames if frame.name in found.files], path.name
     )
@@ -252,7 +252,7 @@ def _masks(place: SetFolder, frames: Sequence[_Frame], path: Path, report: list[
     report += found.notes
     missing = next(((name, mask) for name, mask in named.items() if mask not in found.files), None)
     if missing is not None:
-        raise InputError(f"{path}: the mask {printable(missing[1])!r} of {printable(missing[0])} does not exist")
+        raise InputError(f"{path}: the mask {missing[1][:200]!r} of {abbreviate([missing[0]])} does not exist")
     return {name: found.files[mask] for name, mask in named.items()}
 
 
@@ -270,11 +270,11 @@ def _points(
         path.parent / normalise_name(name),
         path.parent / PurePosixPath(normalise_name(name)).name,
     )
-    cloud = next((one for one in candidates if place.holds(one) and one.is_file()), None)
+    cloud = next((one for one in candidates if place.finds(one)), None)
     if cloud is None and place.finds_outside(candidates[0]):
         raise place.refusal(Path(name), f"{path.name}, ply_file_path")
     if cloud is None:
-        report.append(f"{path.name}: ply_file_path {name} does not exist: no points")
+        report.append(f"{path.name}: ply_file_path {abbreviate([name])} does not exist: no points")
         return None, None
     report.append(f"points from {cloud.name}")
     return read_point_cloud(place.checked(cloud, path.name))
@@ -304,8 +304,10 @@ def _read_list(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
     return names
 
 
-def _plain(name: str, image: Path) -> str:
-    """Return the name of an image without `./`, with the ending that Blender's sets omit."""
+def _plain(name: str, image: Path, folder: Path) -> str:
+    """Return the name of an image without `./`, with the ending that Blender's sets omit; that on disk if not UTF-8."""
+    if name != printable(name) and image.is_relative_to(folder):
+        return printable(image.relative_to(folder).as_posix())
     return printable(PurePosixPath(normalise_name(name)).with_name(image.name).as_posix())
 
 
