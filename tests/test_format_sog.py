@@ -397,7 +397,7 @@ def test_parts_in_a_folder_are_webp_within_it(tmp_path):
     csplat.read(folder)
     (folder / "sh0.webp").rename(tmp_path / "sh0.webp")
     (folder / "sh0.webp").symlink_to(tmp_path / "sh0.webp")
-    with pytest.raises(InputError, match=r"scene: the part sh0\.webp is a link that leads out of its folder"):
+    with pytest.raises(InputError, match=r"scene: the part 'sh0\.webp' is a link that leads out of it"):
         csplat.read(folder)
     (folder / "sh0.webp").unlink()
     for data, title in ((b"%!PS-Adobe-3.0 EPSF-3.0\n", r"PostScript \(EPS\)"), (b"\x89PNG\r\n\x1a\n", "a PNG")):

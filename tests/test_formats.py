@@ -186,7 +186,7 @@ def test_scenes_of_other_programs_are_named_with_the_way_out(tmp_path, make_mode
         "png": "PNG compression, .*PngCompr", "png/meta.json": "PNG compression", "png.zip": "PNG compression",
         "lcc": "is LCC, .*splat-transform", "lcc/scene.lcc": "is LCC, ", "lcc/data.bin": ".* takes the .lcc file",
         "lcc2": "is LCC2, .* in data/3dgs", "lcc2/scene.lcc2": "is LCC2, ", "bare/renamed.json": "is LCC, ",
-        "bare/a.drc": "is Draco, a mesh", "bare/a.splatv": "dynamic splats",
+        "bare/a.drc": "is Draco, a mesh", "bare/a.splatv": "splats that move",
     }  # fmt: skip
 
     def check(case):

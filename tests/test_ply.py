@@ -342,7 +342,7 @@ COMMENTS = {
     'training {"background": [0, 0, 0], "test_every": false}': "test_every of training is",
     'training {"background": [0, 0, 0], "near": 1e999}': "near of training is",
     'training {"background": [0, 0, 0], "images": 4}': "images of training is",
-    'training {"background": [0, 0, 0], "images": "\\ud800"}': "images of training is",
+    'training {"background": [0, 0, 0], "images": "\\ud800"}': "half of a surrogate pair",
     **{
         f"view {text}": "csplat view.*is invalid"
         for text in ("", "0 0 1", "[]", '{"near": 1e999}', '{"near": NaN}', "[" * 100_000)

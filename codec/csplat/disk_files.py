@@ -460,7 +460,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
     if Path(path).exists() and not Path(path).is_file():
         raise InputError(f"{path} is not a file")
     size = Path(path).stat().st_size
-    with Path(path).open("rb") as stream:
+    with open_binary(path) as stream:
         if instead := describe_substitute(stream.read(64)):
             raise InputError(f"{path} is {instead}")
         stream.seek(0)

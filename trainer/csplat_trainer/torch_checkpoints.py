@@ -26,6 +26,7 @@ import numpy as np
 from csplat.archives import DAMAGED, member_refusal, unpacked_limit
 from csplat.detect import detect_content, read_head
 from csplat.errors import InputError, counted, missing_package
+from csplat.file_source import open_binary
 from csplat.formats import Format
 from csplat.interop import from_gsplat
 from csplat.lint import Finding, too_many_bands
@@ -183,7 +184,7 @@ def _check_pickles(path: Path) -> None:
             if reason := member_refusal(info, unpacked_limit(info.compress_size)):
                 raise InputError(f"{path.name}: its part {info.filename[:_NAME_SHOWN]} {reason}")
         return
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         begin = io.BytesIO(stream.read(_LARGEST_PICKLE))
     try:
         for _ in range(_LEGACY_PICKLES):
