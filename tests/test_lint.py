@@ -775,7 +775,7 @@ def test_elements_without_properties_and_millions_of_empty_lists_are_skipped(pat
         path.write_bytes(header(rows, before=before) + body + rows.tobytes())
         tracemalloc.start()
         assert np.array_equal(rows["x"], read_ply(path).means[:, 0])
-        assert tracemalloc.get_traced_memory()[1] < 1_400_000  # of which 1 MiB is for the header
+        assert tracemalloc.get_traced_memory()[1] < 1_400_000  # 1 MiB is for the header
         tracemalloc.stop()
         path.write_bytes((header(rows, before=before) + body + rows.tobytes())[:-1])
         assert found(path)["truncated"].repairable is False

@@ -29,7 +29,7 @@ _PART_SIZE = 1 << 20  # bytes copied at a time
 _MB = 1e6  # bytes
 #: Exceptions that NumPy raises for damaged headers of arrays.
 _NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
-_INTEGER_DIGITS = 300  # of an integer in JSON; longer ones exceed float64
+_INTEGER_DIGITS = 300  # maximum digits of an integer in JSON; longer ones exceed float64
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # an escape in JSON
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -372,7 +372,7 @@ def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
         InputError: it is not an array, contains Python objects, or has more or fewer bytes than its shape requires.
     """
     try:
-        with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
+        with warnings.catch_warnings(action="ignore"):  # about headers that Python 2 wrote
             version = np.lib.format.read_magic(stream)
             if version not in _HEADER_READERS:
                 raise InputError(f"it is an array file of version {version[0]}.{version[1]}, expected 1.0 or 2.0")

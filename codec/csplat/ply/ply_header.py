@@ -28,7 +28,7 @@ _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _LINE_END = re.compile(rb"\r\n|\r|\n")
 _FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text
 _SHOWN = 80  # maximum number of characters of a line in a message
-_DIGITS = 18  # of a count; longer ones exceed every file
+_DIGITS = 18  # digits of a count; longer ones exceed every file
 _ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
@@ -194,7 +194,7 @@ def _parse_lines(lines: Sequence[str], findings: list[Finding], size: int) -> tu
     order, declared = "", 0
     elements: list[PlyElement] = []
     comments: list[str] = []
-    names: set[str] = set()  # of the properties of the last element
+    names: set[str] = set()  # the last element has these properties
     remarks: tuple[list[str], list[str]] = [], []  # other information, comments on elements
     for line in lines[1:-1]:
         keyword, *words = line.split(None, 1)

@@ -254,7 +254,7 @@ _LAYOUTS = {
 }
 
 
-_ID_DIGITS = 20  # of an id or a size; COLMAP counts in 64 bits
+_ID_DIGITS = 20  # maximum digits of an id or a size; COLMAP counts in 64 bits
 _SHOWN = 80  # maximum number of characters of a word in a message
 _NO_NUMBER = re.compile(r"^[+-]?(nan\(.*\)|1\.#(ind|qnan|snan|inf)0*)$", re.IGNORECASE)
 
