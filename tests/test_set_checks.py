@@ -640,3 +640,11 @@ def test_other_files_do_not_hide_a_set(tmp_path):
     (tmp_path / "other" / "list.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match=r"other is not a data set: expected transforms_train\.json"):
         load(tmp_path / "other")
+
+
+@pytest.mark.parametrize("name", ["a.JPG", "images/a.png", "input/a.jpeg"])
+def test_images_without_poses_are_named(tmp_path, name):
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(InputError, match="is not a data set: .*; there are images, but no camera poses: compute them"):
+        load(tmp_path)

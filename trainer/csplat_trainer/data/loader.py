@@ -215,7 +215,7 @@ def _read(
     else:
         raise InputError(
             f"{path} is not a data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
-            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{place_hint}"
+            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{place_hint or _missing_poses(path)}"
         )
     if model is not None:
         found = replace(found, report=[*found.report, "there is also a COLMAP model, which is ignored"])
@@ -228,6 +228,14 @@ def _suggest_images(path: Path) -> str:
     """Return the folders of images next to a path that does not exist, or ""."""
     found = [one for one in sorted(path.parent.glob("*/")) if find_image_folder(one)[1]] if path.parent.is_dir() else []
     return f"; {path.parent} has {', '.join(one.name for one in found)}" if found else ""
+
+
+def _missing_poses(path: Path) -> str:
+    """Return a hint for a folder of images without camera poses."""
+    files = (file for folder in (path, path / "images", path / "input") for file in folder.glob("*"))
+    if any(file.suffix.lower() in (".jpg", ".jpeg", ".png") for file in files):
+        return "; there are images, but no camera poses: compute them with COLMAP first"
+    return ""
 
 
 def _suggest_place(path: Path) -> str:
