@@ -646,5 +646,5 @@ def test_other_files_do_not_hide_a_set(tmp_path):
 def test_images_without_poses_are_named(tmp_path, name):
     (tmp_path / name).parent.mkdir(exist_ok=True)
     (tmp_path / name).write_bytes(b"")
-    with pytest.raises(InputError, match="is not a data set: .*; there are images, but no camera poses: compute them"):
+    with pytest.raises(InputError, match=r"is not a data set: .*; there are images, but no camera poses: compute them"):
         load(tmp_path)
