@@ -240,12 +240,12 @@ def deflate(data: bytes) -> bytes:
     return packer.compress(data) + packer.flush()
 
 
-def read(coded=b"abcd", *, expected=4, width_max=4, signed=False, count_max=None, **fields):
+def read(coded=b"abcd", *, expected=4, width_max=4, signed=False, json_bytes=None, **fields):
     """Read a stream of these bytes, with changed fields in its head."""
     head = {"width": 1, "coder": STORED, "transforms": NONE, "reserved": 0, "count": 4, "packed": 4}
     head = {**head, "coded_size": len(coded), **fields}
     data = memoryview(b"...." + _spec.pack_stream_head(_spec.StreamHead(*head.values())) + coded)
-    more = {} if count_max is None else {"count_max": count_max}
+    more = {} if json_bytes is None else {"json_bytes": json_bytes}
     return read_stream(Cursor(data, 4, len(data), "TLE-3"), expected, width_max, signed=signed, **more)
 
 
@@ -327,7 +327,7 @@ def test_inflating_stops_at_the_announced_size():
 
 def test_a_text_beyond_the_budget_is_refused():
     with pytest.raises(LimitError, match=r"E_LIMIT at byte 12 \(STR-8\)"):
-        read(count=2**32 - 1, packed=2**32 - 1, expected=None, count_max=10)
+        read(count=2**32 - 1, packed=2**32 - 1, expected=None, json_bytes=80)
 
 
 def test_the_longest_runs_are_read():
