@@ -13,7 +13,7 @@ not touch this file. `csplat view` serves until it is interrupted, and is left o
 A golden records what it may depend on: versions of libraries, and for whatever is rendered the processor. If a file or
 report differs and one of these differs, too, then sizes are compared to 2 %, PSNR to 0.1 dB and numbers to 5 %, and the
 test reports it at the end of the run. A search for a target may then choose another candidate, as scenes are so small:
-its size is compared to 15 %, its PSNR to 0.3 dB, and nothing else.
+its size is compared to 15 %, its PSNR to 0.6 dB (for a target PSNR: what is missing of it), and nothing else.
 
     python tests/behaviour.py renew           # make all goldens anew; list what changed
     python tests/behaviour.py renew encode    # one group: encode, fit, report or shared
@@ -63,7 +63,7 @@ _PSNR_DB = 0.1  # likewise
 _NUMBER_SHARE = 0.05  # relative difference of other numbers, likewise
 _SEARCH = " target "  # the names of searches contain it
 _SEARCH_SIZE_SHARE = 0.15  # relative difference of sizes that searches find, likewise; two processors differ by 0.08
-_SEARCH_PSNR_DB = 0.3  # likewise, dB; the same two differ by 0.14
+_SEARCH_PSNR_DB = 0.6  # likewise, dB; three processors differ by 0.4
 _DIGITS = 9  # significant digits of numbers in reports: sums of float64 may differ in the last ones
 
 Json = Any
@@ -405,13 +405,14 @@ def _tolerance(where: str, size: float, *, loosely: bool) -> float:
 
 
 def _outcomes(goldens: dict[str, Json]) -> dict[str, Json]:
-    """Return goldens with nothing of a search but its size and PSNR."""
+    """Return goldens with nothing of a search but its size, and its PSNR or what it lacks of the target PSNR."""
     kept = dict(goldens)
     for name, one in goldens.items():
         if _SEARCH in name:
             kept[name] = {"size_bytes": one["size_bytes"]}
             if "target" in one:
-                kept[name]["psnr"] = one["target"]["psnr"]
+                goal, reached = one["target"]["goal"], one["target"]["psnr"]
+                kept[name]["missing psnr"] = max(0.0, goal["psnr"] - reached) if "psnr" in goal else -reached
     return kept
 
 

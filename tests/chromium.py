@@ -9,7 +9,7 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -322,6 +322,8 @@ class Site:
         bytes_per_second: speed of each answer to a path that a test added; 0 for no limit.
         breaks: True for connections that break in the middle of a later part of such a path.
         policy: the Content-Security-Policy of all answers, if any.
+        scripts: for a path, a function of the request's headers and its number, from 1 on, that returns status,
+            headers and body of an answer of its own; None for the usual one.
     """
 
     def __init__(self) -> None:
@@ -330,6 +332,7 @@ class Site:
         self.bytes_per_second = 0
         self.breaks = False
         self.policy = ""
+        self.scripts: dict[str, Callable[[Mapping[str, str], int], tuple[int, dict[str, str], bytes] | None]] = {}
         self._files: dict[str, bytes | Path] = {}
         self._web = web_files()  # from the package that is being tested, a checkout or a wheel
         site = self
@@ -386,6 +389,10 @@ class Site:
                 status = 416 if first >= total else 206
                 body = b"" if status == 416 else body[first : last + 1]
                 headers["Content-Range"] = f"bytes */{total}" if status == 416 else f"bytes {first}-{last}/{total}"
+        script = self.scripts.get(path)
+        own = script(handler.headers, 1 + len(self.statuses(path))) if script else None
+        if own:
+            status, headers, body = own
         self.requests.append(Request(handler.command, path, asked, status, len(body)))
         handler.send_response(status)
         for name, value in {**headers, "Content-Length": str(len(body)), "Cache-Control": "no-store"}.items():

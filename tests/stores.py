@@ -3,7 +3,7 @@
 Memory and web server can be made to misbehave.
 """
 
-import io
+import gzip
 import threading
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -26,8 +26,8 @@ def box_of(data, place):
     """Return the box around a tile of a file."""
     header = read_header(data)
     tile, step = header.tiles[place], header.attributes[3].step
-    low = [corner * step * 2.0**tile.exponent for corner in tile.corner]
-    return (*low, *(a + b * step * 2.0**tile.exponent for a, b in zip(low, tile.extent, strict=True)))
+    corners = np.array([tile.corner, np.add(tile.corner, tile.extent)])
+    return tuple(np.float32(corners * (step * 2.0**tile.exponent)).ravel().tolist())
 
 
 class FileSystem:
@@ -36,7 +36,6 @@ class FileSystem:
     Attributes:
         files: by name.
         protocol: one name, or several.
-        ranges: whether it returns parts of files.
         cut_after: number of requests after which only half of a range is returned; `None`: never.
         answer: raised in place of any answer.
         asked, sent: numbers of requests and of bytes sent.
@@ -47,7 +46,6 @@ class FileSystem:
     def __init__(self, files):
         self.files = dict(files)
         self.protocol = "store"
-        self.ranges = True
         self.cut_after = None
         self.answer = None
         self.asked = self.sent = 0
@@ -62,10 +60,6 @@ class FileSystem:
     def cat_ranges(self, names, starts, stops, on_error):
         assert "return" == on_error
         return [self._part(*one) for one in zip(names, starts, stops, strict=True)]
-
-    def open(self, name, mode, cache_type, size):
-        assert ("rb", "none") == (mode, cache_type)
-        return _Parts(self, name, size)
 
     def _data(self, name):
         self.asked += 1
@@ -83,27 +77,16 @@ class FileSystem:
         return part
 
 
-class _Parts(io.RawIOBase):
-    """An open file of a `FileSystem`, which refuses servers without ranges."""
-
-    def __init__(self, system, name, size):
-        self._system, self._name, self._size, self._at = system, name, size, 0
-
-    def seek(self, at):
-        self._at = at
-
-    def read(self, size):
-        if not self._system.ranges and self._at > 0:
-            raise ValueError("The HTTP server does not appear to support range requests")
-        return self._system._part(self._name, self._at, min(self._at + size, self._size))
-
-
 class Web:
     """A server's files and behaviour.
 
     Attributes:
         files: by path, as `/scene.csplat`.
         ranges: whether it supports HTTP Range.
+        faults: answers to the next GETs, by default right ones: a status; None; or the name of a fault in `_Handler`.
+        tag: its ETag; by default that of the content.
+        coding: Content-Encoding of all answers, as of a file that is stored compressed.
+        released: ends stalled answers.
         cut_after: number of requests after which bodies are cut short; `None`: never.
         asked: method, path and Range of each request so far.
         before: called before each answer.
@@ -112,6 +95,10 @@ class Web:
     def __init__(self, files):
         self.files = dict(files)
         self.ranges = True
+        self.faults = []
+        self.tag = None
+        self.coding = ""
+        self.released = threading.Event()
         self.cut_after = None
         self.asked = []
         self.before = lambda: None
@@ -131,6 +118,7 @@ class Web:
             server.block_on_close = False
             threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
             yield f"http://127.0.0.1:{server.server_address[1]}"
+            self.released.set()
             server.shutdown()
 
 
@@ -151,33 +139,55 @@ class _Handler(BaseHTTPRequestHandler):
         web = self.web
         web.asked.append((self.command, self.path, self.headers.get("Range")))
         web.before()
-        data = web.files.get(self.path)
+        fault = web.faults.pop(0) if send and web.faults else None
+        data = web.files.get(self.path) if not isinstance(fault, int) else fault
         if not isinstance(data, bytes):
             self.send_response(data or 404)
+            if fault in {429, 503}:
+                self.send_header("Retry-After", "0")
             self.send_header("Content-Length", "0")
             self.end_headers()
             return
+        if fault == "hang up":
+            self.close_connection = True
+            return
         try:
-            part = byte_range(self.headers.get("Range"), len(data)) if web.ranges else None
+            part = byte_range(self.headers.get("Range"), len(data)) if web.ranges and fault != "whole" else None
         except ValueError:
             data, part = b"", None
+        if fault == "short":
+            part = part[0], part[1] // 2
         body = data if part is None else data[part[0] : part[0] + part[1]]
-        self.send_response(206 if part else 200 if data else 416)
-        self.send_header("ETag", f'"{hash(data)}"')
-        self.send_header("Content-Length", str(len(body)))
-        if part is not None:
-            self.send_header("Content-Range", f"bytes {part[0]}-{part[0] + part[1] - 1}/{len(data)}")
+        self.send_response(206 if part and fault != "part as 200" else 200 if data else 416)
+        if web.tag != "":
+            self.send_header("ETag", web.tag or f'"{hash(data)}"')
+        if fault == "gzip":
+            body = gzip.compress(body)
+        if web.coding or fault == "gzip":
+            self.send_header("Content-Encoding", web.coding or fault)
+        if fault == "broken chunk":
+            self.send_header("Transfer-Encoding", "chunked")
+        elif fault != "until it closes":
+            self.send_header("Content-Length", str(len(body)))
+        if part is not None and fault != "part as 200":
+            start = part[0] + (fault == "shifted")
+            self.send_header("Content-Range", f"bytes {start}-{start + part[1] - 1}/{len(data)}")
         self.end_headers()
         if not send:
             return
-        if web.cut_after is not None and len(web.gets) > web.cut_after:
+        half = fault in {"half", "stall", "broken chunk", "until it closes"}
+        if half or (web.cut_after is not None and len(web.gets) > web.cut_after):
             body = body[: len(body) // 2]
             self.close_connection = True
+        if fault == "broken chunk":
+            body = b"%x\r\n%s" % (len(body), body)
         try:
             self.wfile.write(body)
             web.sent += len(body)
         except ConnectionError:
             pass  # the client closed the connection
+        if fault == "stall":
+            web.released.wait(5)
 
 
 @contextmanager

@@ -264,6 +264,17 @@ WRONG = {
     ),
     "no pixels": ([inria(fx=0.8, fy=1.0)], "camera 0: the focal length across is 0.8 for 64 pixels, expected 3.2"),
     "swapped": ({**TRANSFORMS, "cx": 24, "cy": 32}, "camera 0: the principal point is 24 32 in 64×48 pixels, expected"),
+    "nerfstudio, keyframes": (
+        {**NERFSTUDIO, "camera_path": [], "keyframes": [{}]},
+        "lists no cameras, but keyframes .*: generate the path in its viewer",
+    ),
+    "nerfstudio, transform": ({"transform": [], "scale": 0.2}, "is dataparser_transforms.json of nerfstudio"),
+    "nerfstudio, exported": ([{"file_path": "a", "transform": []}], "has the poses of `ns-export cameras`, without f"),
+    "instant-ngp": ({"path": [{"R": [0, 0, 0, 1]}], "time": 1.0}, "is a camera path of instant-ngp"),
+    "Record3D": ({"w": 64, "h": 48, "K": [1] * 9, "poses": []}, "has the cameras of Record3D"),
+    "OpenSfM": ([{"cameras": {}, "shots": {}, "points": {}}], "is a reconstruction of OpenSfM"),
+    "SuperSplat 1": ({"camera": {}, "background": {}, "animTracks": []}, "has settings of the SuperSplat viewer"),
+    "SuperSplat 2": ({"version": 2, "cameras": [], "background": {}}, "has settings of the SuperSplat viewer"),
     "another object": ({"cameras": []}, "expected a list of {K, viewmat, W, H}, cameras.json of INRIA"),
 }
 
@@ -276,6 +287,13 @@ def test_faults_of_camera_files_name_the_camera_and_the_field(tmp_path):
             load_cameras(tmp_path / "c.json")
 
     assert [] == failures(WRONG, check)
+
+
+def test_files_of_data_sets_are_no_camera_files(tmp_path):
+    (tmp_path / "images.txt").write_text("# Image list with two lines of data per image:\n")
+    for path, what in ((tmp_path / "images.txt", "is a file of COLMAP"), (tmp_path, "is a folder")):
+        with pytest.raises(InputError, match=rf"{what}, expected a JSON file of cameras; use --data for those of a d"):
+            load_cameras(path)
 
 
 SMALL_K = intrinsics(64, 48, 60.0)

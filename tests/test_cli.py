@@ -1,6 +1,8 @@
 """The command line: output, statuses, messages; no partial files, no tracebacks."""
 
+import errno
 import gzip
+import io
 import json
 import os
 import pty
@@ -8,11 +10,14 @@ import re
 import resource
 import select
 import signal
+import stat
 import subprocess
 import sys
+import tempfile
 import threading
 from contextlib import suppress
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,6 +30,7 @@ import csplat
 from csplat import _spec, decode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_conformance.manifest import VECTORS
 from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
 from csplat_tools.cli.error_lines import RENAMED_OPTIONS
@@ -839,6 +845,188 @@ def test_writes_no_binary_to_a_terminal(ply, csplat_file, monkeypatch, capsys):
         assert not select.select([shown], [], [], 0)[0]
 
 
+# Names, links, permissions, and faults of the disk -------------------------------------------------
+
+
+@pytest.mark.slow
+def test_a_replaced_output_keeps_its_permissions(tmp_path, ply, csplat_file):
+    page, folder = tmp_path / "page.html", tmp_path / "streamed" / "lod-meta.json"
+    folder.parent.mkdir()
+    report, modes = tmp_path / "report.json", (0o640, 0o755, 0o400, 0o2660)
+    outputs = {
+        csplat_file: ("encode", ply, csplat_file, "--preset", "fast"),
+        page: ("info", csplat_file, "--page", page),
+        tmp_path / "back.ply": ("decode", csplat_file, tmp_path / "back.ply"),
+        report: ("lint", ply, "--report", report),
+    }
+    for output, words in outputs.items():
+        for mode in (0o600, *(modes if output == report else ())):
+            output.touch()
+            output.chmod(mode)
+            call(*words, "--force", "--quiet")
+            assert mode == stat.S_IMODE(output.stat().st_mode), output
+            assert output.stat().st_size
+            output.chmod(0o600)
+    call("convert", ply, folder, "--quiet")
+    folder.parent.chmod(0o700)
+    call("convert", ply, folder, "--quiet", "--force")
+    assert 0o700 == stat.S_IMODE(folder.parent.stat().st_mode)
+    if os.getuid() == 0:
+        os.chown(page, 65534, 65534)
+        call(*outputs[page], "--force", "--quiet")
+        assert (65534, 65534) == (page.stat().st_uid, page.stat().st_gid)
+
+
+def test_an_output_that_is_a_link(tmp_path, ply, csplat_file):
+    data = csplat_file.read_bytes()
+    link, hard = tmp_path / "link.csplat", tmp_path / "hard.csplat"
+    link.symlink_to(csplat_file.name)
+    hard.hardlink_to(csplat_file)
+    call("encode", ply, link, "--force", "--quiet", "--preset", "fast")
+    assert link.is_symlink()
+    assert data == hard.read_bytes() != csplat_file.read_bytes()
+    new, nowhere = tmp_path / "new.csplat", tmp_path / "nowhere.csplat"
+    link.unlink()
+    link.symlink_to(new)
+    call("encode", ply, link, "--quiet")
+    assert data == new.read_bytes()
+    nowhere.symlink_to(tmp_path / "absent" / "x.csplat")
+    assert f"{nowhere}: No such file" in refused("encode", ply, nowhere)
+
+
+@pytest.mark.slow
+def test_a_loop_of_links_is_an_error_of_one_line(tmp_path, ply, csplat_file):
+    loop, other = tmp_path / "loop", tmp_path / "other"
+    loop.symlink_to(other)
+    other.symlink_to(loop)
+    new = tmp_path / "new"
+    lines = [
+        ("encode", ply, loop), ("encode", ply, loop, "--force"), ("encode", loop, new), ("encode", ply, loop / "new"),
+        ("encode", ply, new, "--report", f"{loop}.json"), ("encode", ply, new, "--source-index", f"{loop}.npy"),
+        ("decode", csplat_file, loop), ("info", loop), ("info", csplat_file, "--page", f"{loop}.html"),
+        ("convert", ply, loop / "lod-meta.json"), ("convert", ply, f"{loop}.sog"), ("convert", loop, new),
+        ("merge", csplat_file, csplat_file, "-o", loop), ("merge", csplat_file, loop, "-o", new), ("lint", loop),
+        ("extract", csplat_file, loop, "--box", "0,0,0,1,1,1"), ("verify", csplat_file, "--source", loop),
+        ("compare", ply, loop), ("render", ply, loop, "--orbit", 1), ("view", loop), ("export-html", loop, new),
+        ("export-html", csplat_file, loop), ("export-element", loop),
+    ]  # fmt: skip
+    for ending in (".json", ".npy", ".html", ".sog"):
+        tmp_path.joinpath(f"loop{ending}").symlink_to(f"loop{ending}")
+    before = sorted(tmp_path.rglob("*"))
+    for words in lines:
+        line = refused(*words)
+        assert "loop" in line, words
+        assert "(ELOOP)" in line, words
+        assert before == sorted(tmp_path.rglob("*")), words
+
+
+@pytest.mark.slow
+def test_names_may_be_as_long_as_the_file_system_allows(tmp_path, ply, csplat_file, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for letter, count in (("n", 255), ("n", 230), ("ö", 126), ("\U0001f600", 62)):
+        for ending, words in ((".csplat", ["encode", ply]), (".html", ["info", csplat_file, "--page"])):
+            name = letter * (count - len(os.fsencode(ending)) // len(os.fsencode(letter))) + ending
+            call(*words, name, "--quiet")
+            call(*words, name, "--quiet", "--force")
+            longer = letter * 30 + name
+            assert f"{longer}: File name too long; choose a shorter name" in refused(*words, longer)
+    call("encode", ply, f"{'n' * 248}.csplat", "--force", "--memory", "1GB", "--quiet")  # has a folder .work
+    assert [] == [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="reading this file of Linux fails with EIO")
+def test_a_read_error_names_the_input(tmp_path, ply, csplat_file):
+    bad, new = Path("/proc/self/mem"), tmp_path / "new"
+    lines = [
+        ("encode", bad, new), ("decode", bad, new), ("convert", bad, f"{new}.ply"), ("info", bad), ("lint", bad),
+        ("verify", bad), ("verify", csplat_file, "--source", bad), ("compare", ply, bad), ("compare", bad, ply),
+        ("merge", csplat_file, bad, "-o", new), ("extract", bad, new, "--box", "0,0,0,1,1,1"), ("view", bad),
+        ("export-html", bad, new), ("render", bad, new, "--orbit", 1), ("simplify", bad, f"{new}.ply", "--keep", 0.5),
+        ("encode", ply, new, "--importance", bad), ("verify", csplat_file, "--source", ply, "--source-index", bad),
+        ("encode", bad, "-"),
+    ]  # fmt: skip
+    before = sorted(tmp_path.iterdir())
+    for words in lines:
+        line = refused(*words)
+        assert f"{bad}: Input/output error" in line, words
+        assert "standard output" not in line
+    assert before == sorted(tmp_path.iterdir())
+
+
+class FailingInput(io.BytesIO):
+    """A file that fails in the middle."""
+
+    def read(self, size=-1, /):
+        if size < 0 or self.tell():
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().read(min(size, 1000))
+
+    read1 = read
+
+
+def test_a_read_error_of_standard_input_names_it(tmp_path, ply, csplat_file, monkeypatch, capsys):
+    before = sorted(tmp_path.iterdir())
+    for words, data in ((("encode", "-", tmp_path / "new"), ply), (("lint", "-"), ply), (("info", "-"), csplat_file)):
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stdin", SimpleNamespace(buffer=FailingInput(data.read_bytes())))
+            assert 1 == status_of(*words)
+        assert "error: standard input: Input/output error" == capsys.readouterr().err.partition(";")[0]
+    assert before == sorted(tmp_path.iterdir())
+
+
+def test_a_full_folder_of_temporary_files_is_named(tmp_path, ply, csplat_file, monkeypatch):
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        results = [
+            invoke("encode", "-", "-", input=ply.read_bytes()),
+            invoke("merge", csplat_file, csplat_file, "-o", tmp_path / "new.csplat"),
+            invoke("convert", ply, tmp_path / "new.csplat"),
+        ]
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    for result, name in zip(results, (f"temporary files in {tempfile.gettempdir()}", "", "new.csplat"), strict=True):
+        assert 1 == result.exit_code
+        assert f"{name}: File too large" in result.stderr
+        assert 1 == result.stderr.count("\n")
+    assert "TMPDIR names another folder (EFBIG)" in results[0].stderr
+    assert not (tmp_path / "new.csplat").exists()
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, limits[1]))  # no folder passes the test of the module
+    try:
+        result = invoke("encode", "-", "-", input=ply.read_bytes())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert result.stderr.startswith("error: No usable temporary directory")
+    assert "set TMPDIR to a folder that can be written (E_INPUT)" in result.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ply")
+def test_a_closed_standard_stream_is_an_error_of_one_line(tmp_path):
+    cases = {
+        "formats >&-": "error: standard output: Bad file descriptor; the output is incomplete (EBADF)\n",
+        "lint - <&-": "error: standard input: Bad file descriptor (EBADF)\n",
+        "encode scene.ply new.csplat <&- >&- 2>&-": "",
+        "lint absent.ply 2>/dev/full": "",
+    }
+    for line, message in cases.items():
+        command = f'exec "{sys.executable}" -m csplat_tools {line}'
+        run = subprocess.run(["/bin/sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (int("encode" not in line), message) == (run.returncode, run.stderr), line
+    assert (tmp_path / "new.csplat").read_bytes().startswith(_spec.MAGIC)
+
+
+def test_control_characters_of_names_do_not_reach_the_terminal(tmp_path, ply):
+    name = "a\x1b[31m\x07\x9b\nb"
+    path = tmp_path / f"{name}.ply"
+    path.write_bytes(ply.read_bytes())
+    result = invoke("encode", path, tmp_path / "new.csplat")
+    shown = result.stderr + refused("info", tmp_path / f"{name}.absent")
+    assert [] == [letter for letter in shown if not letter.isprintable() and letter != "\n"]
+    assert "a\\x1b[31m\\x07\\x9b" in shown
+
+
 @pytest.mark.slow
 def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
     target = tmp_path / "out.csplat"
@@ -855,6 +1043,34 @@ def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
         assert running.stderr is not None
         assert running.stderr.read() == b"interrupted\n"
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_an_interrupt_while_the_program_loads_is_no_traceback(tmp_path):
+    def interrupted(module, script):
+        """Run a script that imports a module in whose import the interrupt becomes another error."""
+        folder = tmp_path / module
+        folder.mkdir()
+        (folder / f"{module}.py").write_text(
+            "import sys, time\n"
+            "print('loading', flush=True)\n"
+            "try:\n    time.sleep(20)\n"
+            "except KeyboardInterrupt as error:\n    raise ImportError('half of it') from error\n"
+        )
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
+        with subprocess.Popen(
+            [sys.executable, "-c", script, "formats"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
+        ) as running:  # fmt: skip
+            assert running.stdout is not None
+            assert running.stdout.readline() == b"loading\n"
+            running.send_signal(signal.SIGINT)
+            _, errors = running.communicate(timeout=20)
+            return running.returncode, errors
+
+    run = "from csplat_program import main; main()"
+    assert (-signal.SIGINT, b"") == interrupted("contextlib", f"import sys; sys.modules.pop('contextlib', None); {run}")
+    assert (130, b"interrupted\n") == interrupted("typer", run)
 
 
 def test_a_scene_keeps_its_extremes(tmp_path):
@@ -877,3 +1093,9 @@ def test_a_scene_keeps_its_extremes(tmp_path):
 def test_numbers_of_any_length_are_refused(ply, tmp_path, digits):
     for words in (("encode", ply, tmp_path / "b.csplat", "--levels"), ("convert", ply, tmp_path / "b.ply", "--level")):
         refused(*words, digits, status=2)
+
+
+def test_a_file_with_too_much_metadata_is_not_called_a_large_scene():
+    line = refused("info", VECTORS / "invalid" / "json_values_beyond_budget.csplat")
+    assert "its metadata or cameras take more memory than is allowed here" in line
+    assert "Limits(json_bytes=...)" in line

@@ -172,10 +172,15 @@ def test_cuts_are_those_of_the_manifest():
     assert {vector.name for vector in VALID if "TRE-9" in vector.clauses} <= {one.name for one in report.outcomes}
 
 
-def test_every_file_with_levels_has_cuts_and_no_other_file():
-    with_levels = {recipe.name for recipe in sound_recipes() if recipe.scene is not None and recipe.scene.nodes}
+def test_files_with_levels_or_several_tiles_have_cuts_in_boxes_and_no_others_have_any():
+    scenes = {recipe.name: recipe.scene for recipe in sound_recipes() if recipe.scene is not None}
+    several = {name for name, scene in scenes.items() if scene.nodes or len(scene.tiles) > 1}
+    texts = {vector.name: [text for text, _ in vector.expect.get("cuts", ())] for vector in VALID}
 
-    assert with_levels == {vector.name for vector in VALID if "cuts" in vector.expect}
+    assert several == {name for name, cuts in texts.items() if any(" box " in text for text in cuts)}
+    assert {name for name in several if scenes[name].nodes} == {
+        name for name, cuts in texts.items() if any(" box " not in text for text in cuts)
+    }
 
 
 def test_a_wrong_hash_fails_the_run(monkeypatch):

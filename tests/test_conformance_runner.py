@@ -140,7 +140,9 @@ if fault == "no error code":
 if fault == "no sizes":
     lines = ["E_UNSUPPORTED" if "pixel_size" in cut else line for cut, line in zip(known, lines)]
 if fault == "no list of sizes":
-    lines = ["E_UNSUPPORTED" if len(cut.split()) > 2 else line for cut, line in zip(known, lines)]
+    lines = ["E_UNSUPPORTED" if len(cut.split(" box ")[0].split()) > 2 else line for cut, line in zip(known, lines)]
+if fault == "no boxes":
+    lines = ["E_UNSUPPORTED" if " box " in cut else line for cut, line in zip(known, lines)]
 if fault == "no cuts":
     lines = ["E_UNSUPPORTED"] * len(lines)
 for line in lines:
@@ -307,16 +309,17 @@ CUT_FAULTS = {
     "none": (Status.PASSED, ""),
     "status": (Status.WRONG_STATUS, "exit status 77"),
     "refusal": (Status.REFUSED, "refused"),
-    "silent": (Status.NO_OUTPUT, "0 cuts, expected 16, a line for each"),
-    "short": (Status.PARTIAL_OUTPUT, "15 cuts, expected 16"),
-    "long": (Status.FAILED, "17 cuts, expected 16"),
+    "silent": (Status.NO_OUTPUT, "0 cuts, expected 40, a line for each"),
+    "short": (Status.PARTIAL_OUTPUT, "39 cuts, expected 40"),
+    "long": (Status.FAILED, "41 cuts, expected 40"),
     "words": (Status.WRONG_ANSWER, "line 2 is 'tile 2', expected numbers of tiles, or an error code"),
     "one wrong": (Status.FAILED, "the cut 'level 1' is 1 0, expected 2"),
-    "empty cuts": (Status.FAILED, "the cut 'level 0' is empty, expected 0 1; 15 of the other 15 cuts are wrong, too"),
+    "empty cuts": (Status.FAILED, "the cut 'level 0' is empty, expected 0 1; 30 of the other 39 cuts are wrong, too"),
     "no error code": (Status.FAILED, "the cut 'splats 2' is E_INPUT, expected E_LIMIT"),
     "no sizes": (Status.PASSED, "the decoder offers no cut by pixel_size"),
     "no list of sizes": (Status.FAILED, "is E_UNSUPPORTED, expected"),
-    "no cuts": (Status.SKIPPED, "the decoder offers no cut by level, pixel_size, splats"),
+    "no boxes": (Status.PASSED, "the decoder offers no cut by box"),
+    "no cuts": (Status.SKIPPED, "the decoder offers no cut by box, level, pixel_size, splats"),
 }
 
 

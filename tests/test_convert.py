@@ -1,23 +1,32 @@
 """`csplat convert` and `csplat formats`: conversion between all formats, filters, reports of losses."""
 
 import json
+import os
+import sys
+import tempfile
+import threading
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from checked import cloud
 from command_line import call, invoke
 from tables import failures
+from typer.testing import CliRunner
 
 import csplat
 from csplat import formats
 from csplat.editing.transform import convert_axes
 from csplat.encoder import EncodeOptions
+from csplat.errors import InputError
 from csplat.formats import spz
 from csplat.model import SplatModel, normalise_quats
 from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import source_from_model
+from csplat_tools.cli.app import app
 from csplat_tools.convert_file import Filters, convert_file, find_floaters
 from csplat_tools.encode_file import encode_file
 from csplat_tools.scene_files import open_scenes
@@ -47,6 +56,98 @@ def test_losses_are_reported_refused_and_predicted(tmp_path, ply):
     assert "lost" not in call("convert", ply, tmp_path / "out.ply", "--no-loss").stderr
     expected = json.loads(call("convert", ply, tmp_path / "x.ply", "--dry-run", "--json").stdout)["size_bytes"]
     assert expected == pytest.approx((tmp_path / "out.ply").stat().st_size, rel=0.05)
+
+
+def calm(model):
+    """Return the model with values that every format holds."""
+    return replace(
+        model, scales=model.scales.clip(-5.9, -2), sh0=model.sh0.clip(-1, 1), shN=model.shN.clip(-0.9, 0.9)
+    )  # fmt: skip
+
+
+def with_values(model, name, rows, value):
+    """Return the model with values that every format holds, and another value of an attribute in the first rows."""
+    model = calm(model)
+    values = getattr(model, name).copy()
+    values[:rows] = value
+    return replace(model, **{name: values})
+
+
+CLAMPED = [
+    # attribute, value in three splats, suffix, largest error
+    ("scales", 7.0, "spz", 1.0625), ("scales", -20.0, "v4.spz", 10.0), ("scales", -30.0, "compressed.ply", 10.0),
+    ("scales", 95.0, "splat", 7.0), ("scales", 95.0, "glb", 95 - np.log(np.finfo("f4").max)),
+    ("scales", -95.0, "csplat", 7.0),
+    ("sh0", 5.0, "spz", 5 - 0.5 / 0.15), ("sh0", -5.0, "splat", 5 - 0.5 / 0.28209479),
+    ("shN", 1.5, "spz", 1.5 - 127 / 128), ("shN", -4.5, "compressed.ply", 0.5),
+]  # fmt: skip
+
+
+def test_clamped_values_are_counted_by_attribute_with_the_largest_error(tmp_path, make_model):
+    def check(case):
+        name, value, suffix, error = case
+        model = with_values(make_model(40, 1, seed=1), name, 3, np.float32(value))
+        found = [one for one in csplat.write(tmp_path / f"a.{suffix}", model) if one.id == "clamped-values"]
+        assert [("loss", name, 3)] == [(one.kind, one.attribute, one.count) for one in found]
+        assert error == pytest.approx(found[0].largest_error, abs=1e-4)
+        decoded = getattr(csplat.read(tmp_path / f"a.{suffix}"), name)
+        within = np.abs(value) - error
+        assert np.abs(decoded).max() == pytest.approx(within, abs=0.02) or suffix == "csplat"
+        assert not [one for one in csplat.write(tmp_path / f"b.{suffix}", calm(make_model(40, 1))) if one.attribute]
+
+    assert not failures({f"{name} {value} {suffix}": one for one in CLAMPED for name, value, suffix, _ in [one]}, check)
+
+
+def test_a_conversion_reports_clamped_values_apart_from_rounding(tmp_path, make_model):
+    write_ply(tmp_path / "a.ply", with_values(make_model(40, 1), "sh0", 5, np.float32(5.0)))
+    for more in ((), ("--dry-run",), ("--force", "--quiet")):
+        said = call("convert", tmp_path / "a.ply", tmp_path / "a.spz", *more).stderr
+        assert "lost on the way: precision of means, quats, scales, opacities, shN" in said
+        assert "loss: clamped-values: 15 values of sh0 in 5 splats outside -3.333 to 3.333, the range of SPZ" in said
+        assert "by up to 1.67; compressed-ply, ply, csplat, sog and gltf hold them" in said
+    result = json.loads(call("convert", tmp_path / "a.ply", tmp_path / "b.splat", "--json").stdout)
+    assert [("clamped-values", "sh0", 5)] == [(one["id"], one["attribute"], one["count"]) for one in result["losses"]]
+    assert 5 - 0.5 / 0.28209479 == pytest.approx(result["losses"][0]["largest_error"])
+
+
+def test_values_that_are_rounded_to_the_end_of_a_range_are_not_clamped(tmp_path, make_model):
+    model = with_values(make_model(40, 1), "shN", 40, np.float32(1.0))  # the largest of SPZ is 127/128
+    assert not [one for one in csplat.write(tmp_path / "a.spz", model) if one.attribute]
+
+
+def far_scene(make_model, count, far):
+    """Return a scene with some splats far from the others."""
+    model = make_model(count, 1)
+    means = model.means.copy()
+    means[: len(far)] = far
+    return replace(calm(model), means=means, scales=np.full((count, 3), np.float32(-3.0)))
+
+
+def test_splats_that_rounding_moves_visibly_are_counted(tmp_path, make_model):
+    model = far_scene(make_model, 200, [[5e5, 0, 0]])
+    (found,) = csplat.write(tmp_path / "a.spz", model)
+    error = np.abs(csplat.read(tmp_path / "a.spz").means - model.means).max(axis=1)
+    assert ("moved-splats", np.count_nonzero(error > np.exp(-3.0) / 8)) == (found.id, found.count)
+    assert error.max() == pytest.approx(found.largest_error, rel=1e-4)
+    assert "--drop-floaters" in found.text
+    assert not csplat.write(tmp_path / "b.spz", model.select(slice(1, None)))
+    with pytest.raises(InputError, match="SPZ stores up to 8,388,607: --drop-floaters drops"):
+        csplat.write(tmp_path / "c.spz", far_scene(make_model, 20, [[9e6, 0, 0]]))
+
+
+def test_sog_reports_what_its_codes_do_not_reach(tmp_path, make_model):
+    rng = np.random.default_rng(0)
+    colours = rng.normal(0, 1, (3000, 3)).astype("f4")
+    model = replace(calm(make_model(3000, 0)), sh0=colours, opacities=np.ones(3000, "f4"))
+    assert not csplat.write(tmp_path / "a.sog", model)
+    colours[:2, 0] = 500, 1000
+    found = csplat.write(tmp_path / "b.sog", replace(model, opacities=np.full(3000, 1e-3, "f4"), sh0=colours))
+    error = np.abs(np.sort(csplat.read(tmp_path / "b.sog").sh0[:, 0])[-1] - 1000)
+    assert bool(found) == (error > 125)
+    flat = replace(model, antialiased=True, flat=True)
+    assert ["SOG cannot hold that splats are discs and antialiased"] == [
+        one.text for one in csplat.write(tmp_path / "c.sog", flat)
+    ]
 
 
 def test_dropped_columns_are_reported_by_every_command(tmp_path, make_model):
@@ -83,7 +184,8 @@ def test_degree_4_is_converted_and_encoded(tmp_path, ply):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("a.xyz",), "no format has that ending"), (("-",), "standard output"),
+        (("a.xyz",), "no format has that ending"), (("a.html",), "`csplat export-html` writes pages"),
+        ((".",), ".: a folder, not the name of a file"), (("-",), "standard output"),
         (("a.ply", "--to", "zzz"), "expected one of "), (("a.ply", "--rotate", "1,2"), "expected 3 numbers"),
         (("a.ply", "--crop", "0,0,0,-1"), "radius"), (("a.ply", "--crop", "0,0,0,1,2"), "expected 6 or 4 numbers"),
         (("a.ply", "--crop-sphere", "0,0,0,1"), "--crop-sphere is part of --crop now"),
@@ -114,6 +216,125 @@ def test_filters_are_applied_in_the_documented_order(tmp_path, ply):
     assert np.allclose(wanted[inside], found.means, atol=1e-5)
     assert np.allclose(source.scales[inside] + np.log(2.0), found.scales, atol=1e-5)
     assert 1 == found.sh_degree
+
+
+def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_model):
+    model = replace(make_model(30, 1), coordinate_system="RDF")
+    turned = {"glb": "LUF", "spz": "RUB", "ply": "RDF"}
+
+    def own(path, suffix):
+        return convert_axes(source_from_model(csplat.read(path)), turned[suffix]).model()
+
+    def check(case):
+        suffix, words, change = case
+        source, target = tmp_path / f"in.{suffix}", tmp_path / f"out.{suffix}"
+        csplat.write(source, model)
+        said = call("convert", source, target, "--force", *words).stderr
+        before, after = own(source, suffix), own(target, suffix)
+        option = next(word for word in words if word in ("--translate", "--rotate", "--crop"))
+        assert f"{option}: along the axes" in said
+        assert ("= RDF of --to-axes" if "--to-axes" in words else f"x, y, z = {turned[suffix]}; --to-axes") in said
+        wanted = change(before.means)
+        assert len(wanted) == len(after)
+        np.testing.assert_allclose(after.means, wanted, atol=1e-3)
+
+    def tilted(means):
+        c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
+        return np.stack([means[:, 0], c * means[:, 1] - s * means[:, 2], s * means[:, 1] + c * means[:, 2]], axis=1)
+
+    cases, upwards = {}, np.array([0, 1, 0])
+    for suffix in turned:
+        flips = np.array([1, -1, 1]) if suffix != "ply" else np.ones(3)
+        cases |= {
+            f"{suffix} translate": (suffix, ("--translate", "0,1,0"), lambda means: means + upwards),
+            f"{suffix} tilt": (suffix, ("--rotate", "30,0,0"), tilted),
+            f"{suffix} box": (suffix, ("--crop", "-9,0,-9,9,9,9"), lambda means: means[means[:, 1] >= 0]),
+            f"{suffix} sphere": (
+                suffix, ("--crop", "0,1,0,1.5"), lambda means: means[np.linalg.norm(means - [0, 1, 0], axis=1) <= 1.5]
+            ),
+            f"{suffix} chosen": (
+                suffix, ("--translate", "0,1,0", "--to-axes", "RDF"), lambda means, y=flips[1]: means + y * upwards
+            ),
+        }  # fmt: skip
+    assert not failures(cases, check)
+
+
+@contextmanager
+def piped(path):
+    """Yield the name of a pipe with the contents of a file; it can be read once."""
+    pipe = path.with_name("pipe")
+    os.mkfifo(pipe)
+    threading.Thread(target=lambda: pipe.write_bytes(path.read_bytes()), daemon=True).start()
+    yield pipe
+    pipe.unlink()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
+def test_commands_read_pipes(tmp_path, make_model):
+    def check(case):
+        command, suffix, status, words = case
+        path = tmp_path / f"a.{suffix}"
+        csplat.write(path, calm(make_model(20, 0)))
+        command = [tmp_path / word if "." in word else word for word in command.split()]
+        with piped(path) as pipe:
+            result = call(*[pipe if word == "IN" else word for word in command], status=status)
+        assert words in result.stdout + result.stderr
+        assert str(tempfile.gettempdir()) not in (result.stdout + result.stderr).replace(str(tmp_path), "")
+        result = run(*command, stdin=path.read_bytes())
+        assert status == result[0]
+        assert words in result[1]
+
+    def run(*command, stdin):
+        result = CliRunner().invoke(app, [str("-" if word == "IN" else word) for word in command], input=stdin)
+        return result.exit_code, result.stdout + result.stderr
+
+    cases = [
+        *(("info IN", suffix, 0, "20") for suffix in ("ply", "csplat", "spz", "glb", "sog", "compressed.ply")),
+        *(("lint IN", suffix, 0, "nothing found") for suffix in ("spz", "sog")),
+        *(
+            (f"{command} IN", "sog", 1, "is SOG, expected a .csplat file")
+            for command in ("verify", "merge a.csplat -o b.csplat")
+        ),
+        ("convert IN b.ply --force", "glb", 0, "20 splats: gltf"),
+        ("convert IN b.ply --force --from splat", "splat", 0, "20 splats: splat"),
+        ("info IN", "splat", 1, "--from splat reads it"),
+    ]
+    assert not failures({f"{one[0]}, {one[1]}": one for one in cases}, check)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
+@pytest.mark.parametrize("name", ["ply", "csplat", "compressed-ply", "spz", "splat", "gltf", "sog"])
+def test_every_format_is_written_to_a_pipe_and_to_a_device(tmp_path, ply, name):
+    os.mkfifo(tmp_path / "pipe")
+    read = []
+    reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_bytes()), daemon=True)
+    reader.start()
+    call("convert", ply, tmp_path / "pipe", "--to", name)
+    reader.join(10)
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "copy").write_bytes(read[0])
+    with formats.open_scene(tmp_path / "copy", name) as scene:
+        assert 200 == scene.count
+    call("convert", ply, os.devnull, "--to", name)
+    assert Path(os.devnull).is_char_device()
+
+
+def test_a_crop_that_keeps_nothing_is_a_warning(tmp_path, ply):
+    for suffix in ("ply", "csplat", "spz", "splat", "compressed.ply", "sog"):
+        said = call("convert", ply, tmp_path / f"a.{suffix}", "--crop", "90,90,90,1", "--quiet").stderr
+        assert f"warning: --crop keeps none of 200 splats: {tmp_path / f'a.{suffix}'} has no splats" in said
+        result = json.loads(
+            call("convert", ply, tmp_path / f"a.{suffix}", "--crop", "9,9,9,10,10,10", "--json", "--force").stdout
+        )
+        assert (200, 0) == (result["source_splats"], result["splats"])
+    assert "no splats are left" in call("convert", ply, tmp_path / "a.glb", "--crop", "90,90,90,1", status=1).stderr
+    assert "warning" not in call("convert", ply, tmp_path / "b.ply", "--crop", "0,0,0,1").stderr
+
+
+def test_info_names_the_axes_of_the_file(tmp_path, make_model):
+    csplat.write(tmp_path / "a.glb", make_model(5, 0))
+    assert "axes         LUF, read as RDF" in call("info", tmp_path / "a.glb").stdout
+    assert "LUF" == json.loads(call("info", tmp_path / "a.glb", "--json").stdout)["file_axes"]
 
 
 def test_a_crop_sphere_is_in_world_coordinates(make_model):
@@ -155,6 +376,9 @@ def test_sog_is_written_to_a_folder(tmp_path, ply):
     call("convert", ply, tmp_path / "new" / "meta.json")
     assert 200 == len(csplat.read(tmp_path / "new"))
     assert "exists: --force" in call("convert", ply, tmp_path / "new" / "meta.json", status=1).stderr
+    (tmp_path / "new" / "other.bin").write_bytes(bytes(9_999_999))
+    assert " MB" not in call("convert", ply, tmp_path / "new" / "meta.json", "--force").stderr
+    assert " MB" not in call("info", tmp_path / "new").stdout
     call("convert", ply, tmp_path / "no" / "such" / "meta.json", status=1)
     assert not (tmp_path / "no").exists()
 

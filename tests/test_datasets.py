@@ -214,6 +214,22 @@ def test_points_of_a_blender_set_are_read_if_nothing_is_transparent(blender):
     assert [[1.0, 2.0, 3.0]] == load(blender).points.tolist()
 
 
+def test_points_next_to_transforms_json_are_read(ngp):
+    for name in ("sparse_pc.ply", "points3D.ply", "pointcloud.ply"):
+        write_points(ngp / name, ("float x", "float y", "float z"), "1 2 3")
+        assert [[1.0, 2.0, 3.0]] == load(ngp).points.tolist()
+        (ngp / name).unlink()
+
+
+def test_a_model_without_points_says_so(colmap_set):
+    for file in (colmap_set / "sparse" / "0").glob("points3D.*"):
+        file.unlink()
+    for text in (None, "# 3D point list with one line of data per point:\n"):
+        if text is not None:
+            (colmap_set / "sparse" / "0" / "points3D.txt").write_text(text)
+        assert any("there are no points: splats start anywhere" in line for line in load(colmap_set).report)
+
+
 def test_points_of_colmap_may_be_a_ply(colmap_set):
     model = colmap_set / "sparse" / "0"
     (model / "points3D.bin").unlink()
@@ -445,7 +461,7 @@ def test_text_files_may_begin_with_a_byte_order_mark(tmp_path, encoding):
 
 def test_text_in_another_encoding_is_refused(colmap_set):
     for name, data, message in (
-        ("cp1252", "im 002.png\nK\xf6ln.png".encode("cp1252"), r"byte 12 is 0xf6"),
+        ("cp1252", "im 002.png\nK\xf6ln.png".encode("cp1252"), r"K\\xf6ln\.png is no image in any code page"),
         ("UTF-16 without a mark", "im 002.png".encode("utf-16-le"), "byte 1 is 0"),
         ("binary", bytes(range(256)), "is not a text file in UTF-8"),
     ):
@@ -623,7 +639,7 @@ def test_models_are_found_in_several_folders(colmap_set, model):
     [
         ({"frames": []}, "lists no frames"), ({"frames": [{"transform_matrix": []}]}, "frame 0 has no file_path"),
         ({"fl_x": -5}, "fl_x is -5, expected above 0"), ({"fl_x": "wide"}, "fl_x is 'wide'"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "camera_model is EQUIRECTANGULAR, expected one of PINHOLE"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "is EQUIRECTANGULAR, expected one of PINHOLE, .*: split panoramas"),
         ({"w": 0}, "w and h are 0 and 32"), ({"k1": -30.0}, "cannot be undone"),
     ],
 )  # fmt: skip
@@ -646,7 +662,7 @@ def test_missing_invalid_and_truncated_images_are_refused(ngp):
     path = ngp / "images" / "0001.png"
     path.write_bytes(path.read_bytes()[:60])
     data = load(ngp)
-    with pytest.raises(InputError, match=r"0001\.png is not an image that can be read"):
+    with pytest.raises(InputError, match=r"0001\.png is a PNG that is truncated: copy or export it again"):
         data.read()
     path.write_text("not a picture")
     with pytest.raises(InputError, match=r"0001\.png"):

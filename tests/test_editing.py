@@ -42,8 +42,8 @@ def extract(data, box):
 
 def box_of(tile, header):
     step = math.ldexp(header.attributes[3].step, tile.exponent)
-    low = [corner * step for corner in tile.corner]
-    return low, [(corner + extent) * step for corner, extent in zip(tile.corner, tile.extent, strict=True)]
+    far = np.add(tile.corner, tile.extent)
+    return [[float(np.float32(n * step)) for n in corner] for corner in (np.array(tile.corner), far)]
 
 
 def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
@@ -98,11 +98,70 @@ def test_a_part_of_all_tiles_of_a_vector_decodes_to_the_same(name):
     assert decode(data).extra.keys() == decode(part).extra.keys()
 
 
+def _scene(**changes):
+    rng = np.random.default_rng(5)
+    means = rng.normal(size=(300, 3)).astype(np.float32) * 10
+    model = csplat.SplatModel(
+        means=means,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
+        scales=np.full((300, 3), -4, np.float32),
+        opacities=np.full(300, 0.5, np.float32),
+        sh0=np.zeros((300, 3), np.float32),
+        shN=np.zeros((300, 0, 3), np.float32),
+    )
+    return replace(model, **{key: change(means) if callable(change) else change for key, change in changes.items()})
+
+
+def _far(means):
+    means[7] = (3e7, -2e6, 1e5)
+    return means
+
+
+SCENES = {
+    "ordinary": {},
+    "far from the origin": {"origin": (500_000.1, -4_649_776.3, 1e12)},
+    "an outlier": {"means": _far},
+    "huge": {"means": lambda means: means * np.float32(3e36)},
+    "subnormal": {"means": lambda means: means * np.float32(1e-41)},
+    "around zero": {"means": lambda means: np.where(np.abs(means) < 9, 0, means) * np.float32(-1)},
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_box_that_touches_a_decoded_centre_returns_its_splat(name):
+    data = encode(_scene(**SCENES[name]), EncodeOptions(tile_splats=64))
+    means = decode(data).means.astype(np.float64)
+    header = read_header(data)
+    ends = np.cumsum([tile.splat_count for tile in header.tiles])
+    wrong = []
+    with csplat.open(data) as file:
+        for tile, (low, high) in enumerate(file.boxes):
+            own = means[ends[tile] - header.tiles[tile].splat_count : ends[tile]]
+            assert (own.min(axis=0) == low).all()
+            assert (own.max(axis=0) == high).all()
+        for axis in range(3):
+            for row, end in ((means[:, axis].argmax(), math.inf), (means[:, axis].argmin(), -math.inf)):
+                tile = int(np.searchsorted(ends, row, side="right"))
+                box = [-math.inf] * 3 + [math.inf] * 3
+                box[axis], box[axis + 3] = means[row, axis], end  # corners in any order
+                found = [
+                    [one.tile.index for one in file.tiles(box)],
+                    file.cut(box=box),
+                    list(extract(data, box)[0].tiles),
+                    file.cut(box=[*means[row], *means[row]]),
+                ]
+                wrong += [(axis, end, tiles) for tiles in found if tile not in tiles]
+                box[axis] = math.nextafter(means[row, axis], end)
+                with pytest.raises(InputError, match="no tile touches the box"):
+                    file.cut(box=box)
+    assert [] == wrong
+
+
 def test_a_box_that_nothing_touches_is_refused(data):
     with pytest.raises(InputError, match="no tile touches the box 1000, 1000, 1000"):
         extract(data, (1000, 1000, 1000, 1001, 1001, 1001))
-    with pytest.raises(InputError, match="six finite numbers"):
-        extract(data, (0, 0, 0, 1, 1, math.inf))
+    with pytest.raises(InputError, match="six numbers other than NaN"):
+        extract(data, (0, 0, 0, 1, 1, math.nan))
 
 
 def test_extracting_checks_the_bytes_that_it_copies(data):
@@ -245,12 +304,17 @@ def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
     options = EncodeOptions(preset="fast", **STEPS)
     models = [make_model(40, 1), make_model(50, 1, coordinate_system="RDF", unit_metres=2.0)]
     models[0] = replace(models[0], metadata={"licence": "CC0-1.0", "only": 1, "up": [0, -1, 0]})
-    models[1] = replace(models[1], metadata={"licence": "CC0-1.0", "up": [0, 1, 0]})
+    models[1] = replace(models[1], metadata={"licence": "CC0-1.0", "up": [0, -0.8, 0.6]}, cameras=[])
     done, data = merge(*(encode(model, options) for model in models))
     assert not done.why
     header = read_header(data)
     assert ("RDF", 2.0) == (header.coordinate_system, header.unit_metres)
     assert {"licence": "CC0-1.0"} == read_metadata(data)
+    assert (
+        "file 1 without axes: RDF is assumed, as the other files have",
+        "file 1 without a unit: 2 m is assumed, as the other files have",
+        "metadata left out, because not all files have the same: only, up",
+    ) == tuple(one.removesuffix(", cameras") for one in done.notes)
 
 
 def test_merging_checks_the_bytes_that_it_copies(halves):
@@ -290,6 +354,10 @@ def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, de
 
 @pytest.mark.parametrize(("fields", "message"), [
     (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be merged: RDF in .*a, RUB in .*b"),
+    (({}, {"coordinate_system": "RUB"}), "none, for which RDF is assumed, in .*a, RUB in .*b: turn one with"),
+    (({"coordinate_system": "LUF"}, {}), "axes cannot be merged: LUF in .*a, none, for which RDF is assumed, in .*b"),
+    (({"metadata": {"up": [0, 0, 1]}}, {"metadata": {"up": [0, 1, 0]}}), "up direct.*: 0,0,1 in .*a, 0,1,0 in .*b"),
+    (({"coordinate_system": "RDF"}, {"metadata": {"up": [0, 1, 0]}}), "up directions cannot be merged: 0,-1,0 in .*a"),
     (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
     (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
     (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),
@@ -299,6 +367,8 @@ def test_scenes_that_contradict_each_other_are_refused(make_model, tmp_path, fie
         (tmp_path / name).write_bytes(encode(make_model(20, 0, **its), EncodeOptions(preset="fast", **STEPS)))
     with pytest.raises(InputError, match=message):
         csplat.merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out.csplat")
+    with pytest.raises(InputError, match="cannot be merged"):
+        csplat.merge([tmp_path / "b", tmp_path / "b", tmp_path / "a"], tmp_path / "out.csplat")
     assert not (tmp_path / "out.csplat").exists()
 
 

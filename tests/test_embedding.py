@@ -384,6 +384,187 @@ def test_errors_are_shown_as_text(tab, site, blog):
     tab.problems.clear()  # browsers report a status, and what a policy forbids
 
 
+def rights(data):
+    """Return a script that answers ranges of a file, for others to build on."""
+
+    def answer(headers, of=data, **more):
+        asked = re.fullmatch(r"bytes=(\d+)-(\d*)", headers.get("Range") or "")
+        if not asked:
+            return 200, more, of
+        first, last = int(asked[1]), min(int(asked[2] or len(of)), len(of) - 1)
+        return 206, {"Content-Range": f"bytes {first}-{last}/{len(of)}", **more}, of[first : last + 1]
+
+    return answer
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_properties_count_that_were_set_before_the_script_had_run(tab, blog):
+    before = """
+    <csplat-view src="/none.csplat"></csplat-view><script>
+    globalThis.view = document.querySelector('csplat-view');
+    Object.assign(view, { src: '/scene.csplat', alt: 'A garden', background: 'ff0000', up: [0, -1, 0] });
+    const viewmat = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 9, 0, 0, 0, 1];
+    view.camera = { K: [[100, 0, 80], [0, 100, 60], [0, 0, 1]], viewmat, W: 160, H: 120 };
+    view.request = { headers: { 'x-key': 'k' } };
+    </script>"""
+    page = blog(before, policy="")
+    kind, stats = told(tab)
+    assert ("load", 60) == (kind, stats["splatCount"])
+    assert page.locator("csplat-view canvas").get_attribute("aria-label").startswith("A garden.")
+    assert [255, 0, 0] == page.evaluate("view.engine.readPixels().then((pixels) => Array.from(pixels.slice(0, 3)))")
+    assert [[], "0,-1,0", "k"] == page.evaluate("[Object.keys(view), view.up, view.request.headers['x-key']]")
+    page.evaluate("view.src = '/other.csplat'")
+    assert 90 == told(tab)[1]["splatCount"]
+    page.evaluate("view.background = null; view.alt = undefined")
+    assert page.evaluate("!view.hasAttribute('background') && view.background === '' && !view.hasAttribute('alt')")
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_an_address_is_another_try_after_an_error_and_a_script_may_run_twice(tab, site, blog):
+    page = blog('<csplat-view src="/late.csplat"></csplat-view>' + ONE_FILE)
+    for again in ("view.src = view.src", "view.setAttribute('src', view.getAttribute('src'))"):
+        report = told(tab)[1]
+        assert ("E_INPUT", "refused", 404, True) == tuple(
+            report[name] for name in ("code", "reason", "status", "fatal")
+        )
+        assert "no file at this address" in page.inner_text("csplat-view [role=alert]")
+        if "setAttribute" in again:
+            site.add("/late.csplat", site._files["/scene.csplat"])
+        page.evaluate(f"{{ const view = document.querySelector('csplat-view'); {again}; }}")
+    assert 60 == told(tab)[1]["splatCount"]
+    assert page.evaluate("document.querySelector('csplat-view').shadowRoot.querySelector('#error').hidden")
+    tab.problems.clear()  # the browser reports each 404
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_requests_of_an_element_are_the_pages(tab, site, blog):
+    data = site._files["/scene.csplat"]
+    right = rights(data)
+    seen = []
+
+    def signed(headers, number):
+        seen.append((headers.get("Cookie"), headers.get("X-Key")))
+        return (403, {}, b"") if number > 1 else right(headers)
+
+    site.scripts["/signed.csplat"] = signed
+    page = blog("<csplat-view></csplat-view>")
+    page.evaluate(
+        """{ const view = document.querySelector('csplat-view'); globalThis.asked = [];
+        view.request = { headers: { 'x-key': 'k' } }; view.crossOrigin = 'use-credentials'; view.timeoutMs = 5000;
+        view.fetch = (url, init) => (asked.push([new URL(url).pathname, init.credentials]), fetch(url, init));
+        view.renew = async ({ status }) => (asked.push(status), '/scene.csplat');
+        view.src = '/signed.csplat'; }"""
+    )
+    assert 60 == told(tab)[1]["splatCount"]
+    assert ["/signed.csplat", "include"] == page.evaluate("asked[0]")
+    assert "k" == seen[0][1]
+    page.evaluate("{ const view = document.querySelector('csplat-view'); view.src = '/signed.csplat?2'; }")
+    assert 60 == told(tab)[1]["splatCount"]
+    assert [403, ["/scene.csplat", "include"]] == page.evaluate(
+        "asked.slice(asked.indexOf(403), asked.indexOf(403) + 2)"
+    )
+    assert {"use-credentials"} == {page.get_attribute("csplat-view", "crossorigin")}
+    tab.problems.clear()  # the browser reports the status
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_a_file_that_is_replaced_while_it_is_read_is_opened_anew(tab, site, blog, make_model):
+    old, new = (
+        encode(make_model(count, 3, scales=np.full((count, 3), -2, "f")), replace(FAST, tile_splats=2000))
+        for count in (6000, 6500)
+    )
+    assert len(old) > 2**17
+    for tags in (("a", "b"), (None, None)):
+        name = f"/changing{tags[0]}.csplat"
+
+        def answer(headers, number, tags=tags):
+            tag = tags[number > 1]
+            return rights(old if number == 1 else new)(headers, **({"ETag": f'"{tag}"'} if tag else {}))
+
+        site.scripts[name] = answer
+        site.add(name, new)
+        page = blog(f'<csplat-view src="{name}"></csplat-view>')
+        kind, report = told(tab)
+        assert ("error", "replaced", False) == (kind, report["reason"], report["fatal"])
+        assert "the file was replaced on the server" in report["message"]
+        assert 6500 == told(tab)[1]["splatCount"]
+        assert page.evaluate("document.querySelector('csplat-view').shadowRoot.querySelector('#error').hidden")
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_servers_that_fail_once_or_send_coded_bodies_suffice(tab, site, blog):
+    data = site._files["/scene.csplat"]
+    right = rights(data)
+    coded = {"Content-Encoding": "gzip"}
+    cases = {
+        "busy": lambda headers, number: (503, {"Retry-After": "0"}, b"") if number == 1 else right(headers),
+        "coded": lambda *_: (200, coded, gzip.compress(data)),
+        "coded_parts": lambda headers, _: (
+            (206, {**right(headers)[1], **coded}, data[:50])
+            if headers.get("Range")
+            else (200, coded, gzip.compress(data))
+        ),
+    }
+    for name, script in cases.items():
+        site.scripts[f"/{name}.csplat"] = script
+        site.add(f"/{name}.csplat", data)
+        blog(f'<csplat-view src="/{name}.csplat"></csplat-view>')
+        kinds = [told(tab)]
+        while kinds[-1][0] == "error":
+            assert not kinds[-1][1]["fatal"], kinds
+            kinds.append(told(tab))
+        assert 60 == kinds[-1][1]["splatCount"]
+    tab.problems.clear()  # the browser reports the status, and coded bodies
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_a_blob_may_be_revoked_at_once(tab, blog):
+    page = blog('<br style="line-height:300vh"><csplat-view></csplat-view>', policy="")
+    page.evaluate(
+        """fetch('/scene.csplat').then((response) => response.blob()).then((blob) => {
+          const view = document.querySelector('csplat-view');
+          const url = URL.createObjectURL(blob);
+          view.src = url;
+          URL.revokeObjectURL(url);
+          view.scrollIntoView();
+        })"""
+    )
+    assert 60 == told(tab)[1]["splatCount"]
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_a_policy_of_trusted_types_allows_the_worker_by_its_name(tab, blog):
+    types = "; require-trusted-types-for 'script'; trusted-types"
+    blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{POLICY}{types} csplat")
+    assert 60 == told(tab)[1]["splatCount"]
+    blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{POLICY}{types} 'none'")
+    report = told(tab)[1]
+    assert ("E_WORKER", True) == (report["code"], "trusted-types" in report["message"])
+    tab.problems.clear()  # the browser reports what a policy forbids
+
+
+@pytest.mark.slow
+@pytest.mark.area(name="chromium")
+def test_a_page_from_disk_says_what_to_do(tab, tmp_path):
+    (tmp_path / "csplat-view.js").write_bytes(export_element())
+    (tmp_path / "page.html").write_text(
+        f"<!doctype html><script>{RECORD}</script><script src=csplat-view.js></script>"
+        '<csplat-view src="scene.csplat"></csplat-view>'
+    )
+    tab.page.goto((tmp_path / "page.html").as_uri())
+    report = told(tab)[1]
+    assert ("E_INPUT", "local", True) == (report["code"], report["reason"], report["fatal"])
+    assert "csplat export-html" in tab.page.inner_text("csplat-view [role=alert]")
+    tab.problems.clear()  # the browser reports the access
+
+
 @pytest.mark.slow
 @pytest.mark.area(name="chromium")
 def test_the_script_is_written_once(tmp_path):

@@ -1,6 +1,7 @@
 """Measured and declared errors agree with the definitions of the spec, computed splat by splat in Python floats."""
 
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -259,3 +260,16 @@ def test_a_source_about_another_origin_has_the_same_errors():
     assert abs(ours - theirs) <= bound_tolerance("means", ours, source.reach(ORIGIN))
     assert source.reach(ORIGIN) == pytest.approx(float(np.abs(source.means).max()), rel=1e-12)
     assert float(np.abs(near.to_model(ORIGIN).means).max()) < 20.0
+
+
+def test_declared_bounds_are_the_same_when_a_processor_rounds_otherwise() -> None:
+    for value in (1e-150, 3.7e-5, 0.1, 2 / 3, 7.25e9, 1e150):
+        other = math.nextafter(math.nextafter(value, math.inf), math.inf)
+        here, there = (ErrorSums(1, {"means": v}, {"means": v * v}).declared()["means"] for v in (value, other))
+        assert here == there
+        assert value <= here[0] <= value * (1 + 1e-4)
+
+
+def test_a_bound_that_leaves_float64_by_rounding_up_is_refused() -> None:
+    with pytest.raises(InputError, match="too large to declare"):
+        ErrorSums(1, {"means": sys.float_info.max}, {"means": 0.0}).declared()

@@ -67,6 +67,17 @@ def read(said, data):
     return checked(glb(said, data))
 
 
+def test_json_may_be_padded_with_zeros():
+    data = glb(*document({**TWO}))
+    start = data.index(b"JSON") + 4
+    (size,) = struct.unpack_from("<I", data, start - 8)
+    text = data[start : start + size].rstrip()
+    padded = text + b"\0" * (4 + -len(text) % 4)
+    chunks = struct.pack("<I4s", len(padded), b"JSON") + padded + data[start + size :]
+    model = checked(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    assert TWO["POSITION"].tolist() == model.means.tolist()
+
+
 def test_attributes_are_read():
     model = read(*document(TWO | BAND))
     assert "LUF" == model.coordinate_system

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import zipfile
 from dataclasses import replace
 
@@ -367,10 +368,10 @@ BAD = {
     "a large palette": (changed(["shN", "count"], 65), "192 x 1 pixels"),
     "pictures of two sizes": (changed([], 0, quats=webp(pixels(1, (8, 4)))), "4 x 8 pixels"),
     "far too many pixels": (changed([], 0, means_l=webp(np.zeros((900, 900, 4), np.uint8))), "900 x 900"),
-    "a text for a picture": (changed([], 0, means_l=b"no picture"), "not a complete WebP"),
+    "a text for a picture": (changed([], 0, means_l=b"no picture"), "means_l.webp is not an image"),
     "a lossy picture": (changed([], 0, scales=webp(pixels(3), lossless=False)),
         "scales.webp is a lossy WebP, expected"),
-    "half a picture": (changed([], 0, means_l=webp(pixels(0))[:50]), "not a complete WebP"),
+    "half a picture": (changed([], 0, means_l=webp(pixels(0))[:50]), "means_l.webp is a WebP that is damaged"),
     "brackets": (changed([], 0) | {"meta.json": b"[" * 100_000}, "nested too deep"),
     "no JSON": (changed([], 0) | {"meta.json": b"{"}, "not JSON"),
     "not an object": (changed([], 0) | {"meta.json": b"3"}, "is missing"),
@@ -387,10 +388,37 @@ def test_inconsistent_files_are_refused(tmp_path):
     assert [] == failures(BAD, check)
 
 
+@pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
+def test_parts_in_a_folder_are_webp_within_it(tmp_path):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    for name, data in files_of(*splats()).items():
+        (folder / name).write_bytes(data)
+    csplat.read(folder)
+    (folder / "sh0.webp").rename(tmp_path / "sh0.webp")
+    (folder / "sh0.webp").symlink_to(tmp_path / "sh0.webp")
+    with pytest.raises(InputError, match=r"scene: the part 'sh0\.webp' is a link that leads out of it"):
+        csplat.read(folder)
+    (folder / "sh0.webp").unlink()
+    for data, title in ((b"%!PS-Adobe-3.0 EPSF-3.0\n", r"PostScript \(EPS\)"), (b"\x89PNG\r\n\x1a\n", "a PNG")):
+        (folder / "sh0.webp").write_bytes(data)
+        with pytest.raises(InputError, match=rf"scene: sh0\.webp is {title}, .*expected WebP"):
+            csplat.read(folder)
+
+
 def test_zip_bombs_are_not_unpacked(tmp_path):
     files = files_of(*splats()) | {"meta.json": b" " * 30_000_000}
     with pytest.raises(InputError, match="unpacked size of 30,000,000"):
         csplat.read(zipped(tmp_path / "a.sog", files, how=zipfile.ZIP_DEFLATED))
+
+
+def test_a_cut_zip_is_named_as_such(tmp_path, make_model):
+    csplat.write(tmp_path / "a.sog", make_model(5, 0))
+    data = (tmp_path / "a.sog").read_bytes()
+    for size in (len(data) // 2, len(data) - 5):
+        (tmp_path / "a.sog").write_bytes(data[:size])
+        with pytest.raises(InputError, match=r"a\.sog: a damaged zip: its end is missing, .*: copy or download it aga"):
+            csplat.read(tmp_path / "a.sog")
 
 
 def test_damage_is_refused_or_read(tmp_path):

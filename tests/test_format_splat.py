@@ -11,6 +11,7 @@ from checked import flipped, refusals
 import csplat
 from csplat.errors import InputError
 from csplat.formats import assume_format, lint_file, open_scene
+from csplat.ply.columns import LOG_OF_0
 from csplat.scene_source import BLOCK_SPLATS
 
 ROW = struct.pack("<6f8B", 1.5, -2, 3e9, 1, 0.5, 0, 0, 255, 51, 102, 128, 0, 128, 128)
@@ -20,7 +21,7 @@ def test_rows_of_a_splat_are_read(tmp_path):
     (tmp_path / "a.splat").write_bytes(ROW + ROW[:-4] + b"\x80" * 4)
     model = csplat.read(tmp_path / "a.splat")
     assert [1.5, -2, 3e9] == model.means[0].tolist()
-    np.testing.assert_allclose([0, np.log(0.5), np.log(1e-20)], model.scales[0], rtol=1e-6)
+    np.testing.assert_allclose([0, np.log(0.5), LOG_OF_0], model.scales[0], rtol=1e-6)
     assert [[0, -1, 0, 0], [1, 0, 0, 0]] == model.quats.tolist()
     assert model.opacities[0] == np.float32(0.4)
     np.testing.assert_allclose(np.array([-0.5, 0.5, -0.3]) / 0.28209479, model.sh0[0], rtol=1e-6)
@@ -50,7 +51,7 @@ def test_the_identity_is_exact_and_values_beyond_the_range_are_clipped(tmp_path,
     data = (tmp_path / "a.splat").read_bytes()
     assert bytes([0, 128, 128, 128]) == data[28:]
     assert [255, 0, 128] == list(data[24:27])
-    np.testing.assert_allclose(csplat.read(tmp_path / "a.splat").scales, [[88, 0, np.log(1e-20)]], rtol=1e-6)
+    np.testing.assert_allclose(csplat.read(tmp_path / "a.splat").scales, [[88, 0, LOG_OF_0]], rtol=1e-6)
 
 
 def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import io
+import json
 import math
 import os
 import pickle
@@ -24,7 +25,7 @@ import csplat_tools
 from csplat.archives import read_archive
 from csplat.disk_files import parse_json, read_array
 from csplat.errors import InputError
-from csplat.formats import assume_format, formats, open_scene, write_scene
+from csplat.formats import assume_format, detect_format, formats, open_scene, write_scene
 from csplat.formats import lint_file as formats_lint
 from csplat.ply import read_ply, write_ply
 from csplat.scene_source import BLOCK_SPLATS, SceneSource, source_from_model
@@ -129,6 +130,11 @@ def test_each_format_has_a_name_of_its_own():
     ("a.xz", b"\xfd7zXZ\0\0", "is xz, unpack it first, with unxz"),
     ("a.ply", b"BZh91AY&SY", "is bzip2, unpack it first"),
     ("a.csplat", b"\x1f\x8b\x08\0hello", "is gzip, unpack it first, with gunzip"),
+    ("a.ply", b"PAR1\0\0\0\0PAR1", "is Parquet, which csplat does not read: convert it to PLY first"),
+    ("a.splat", b"\x4b\x67\0\0\x64\0\0\0[{}]".ljust(64), "is .splatv of splaTV, splats that move"),
+    ("a.psht", b"hello", "is a project of Postshot, not a scene: export the splats as PLY"),
+    ("a.licht", b"hello", "is a project of LichtFeld Studio, not a scene: export the splats as PLY"),
+    ("a.ply", b"BLENDER-v300", "is a file of Blender, not a scene: export the splats as PLY"),
 ])  # fmt: skip
 def test_other_files_are_refused_with_their_type(tmp_path, name, data, message):
     (tmp_path / name).write_bytes(data)
@@ -161,6 +167,36 @@ def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, 
     (tmp_path / "sog" / "quats.webp").write_bytes(LFS)
     with pytest.raises(InputError, match=r"quats\.webp is a pointer of Git LFS"):
         csplat.read(tmp_path / "sog")
+
+
+def test_scenes_of_other_programs_are_named_with_the_way_out(tmp_path, make_model):
+    png = {"shape": [50, 3], "dtype": "float32", "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
+    meta = json.dumps({"means": png, "scales": png, "opacities": {**png, "mins": 0}, "sh0": png})
+    for folder, name, text in (
+        ("png", "meta.json", meta), ("lcc", "scene.lcc", '{"version": "1", "cellLengthX": 30, "fileType": "Quality"}'),
+        ("lcc", "data.bin", "\1" * 64), ("lcc2", "scene.lcc2", '{"version": "2.0", "splatType": "sog", "root": {}}'),
+        ("bare", "renamed.json", '{"version": "1.1", "cellLengthX": 30}'), ("bare", "a.drc", "DRACO\2\2"),
+        ("bare", "a.splatv", "Kg\0\0\1\2\3"),
+    ):  # fmt: skip
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / name).write_text(text)
+    with zipfile.ZipFile(tmp_path / "png.zip", "w") as archive:
+        archive.writestr("compression/meta.json", meta)
+    wanted = {
+        "png": "PNG compression, .*PngCompr", "png/meta.json": "PNG compression", "png.zip": "PNG compression",
+        "lcc": "is LCC, .*splat-transform", "lcc/scene.lcc": "is LCC, ", "lcc/data.bin": ".* takes the .lcc file",
+        "lcc2": "is LCC2, .* in data/3dgs", "lcc2/scene.lcc2": "is LCC2, ", "bare/renamed.json": "is LCC, ",
+        "bare/a.drc": "is Draco, a mesh", "bare/a.splatv": "splats that move",
+    }  # fmt: skip
+
+    def check(case):
+        name, message = case
+        with pytest.raises(InputError, match=message):
+            csplat.read(tmp_path / name)
+
+    assert not failures({one[0]: one for one in wanted.items()}, check)
+    csplat.write(tmp_path / "sog" / "meta.json", make_model(5, 0))
+    assert "sog" == detect_format(tmp_path / "sog").name
 
 
 def test_a_zip_is_recognised_by_its_contents(tmp_path):

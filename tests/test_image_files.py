@@ -1,5 +1,6 @@
 """Images of data sets: names and the files they are found to be; values of every kind of pixel, and masks."""
 
+import json
 import re
 import struct
 import unicodedata
@@ -7,7 +8,7 @@ import zlib
 
 import numpy as np
 import pytest
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, ImageFile
 from posed_sets import (
     H,
     W,
@@ -53,7 +54,8 @@ NAMES = {
     "another case rather than another ending": ("1.JPG", ["1.jpg", "1.png"], "1.jpg", "in another case"),
     "another case, two files": ("img_1.png", ["IMG_1.png", "Img_1.png"], "matches 2 files", None),
     "another case and ending": ("img_1.jpg", ["IMG_1.PNG"], "IMG_1.PNG", "with another ending"),
-    "another Unicode form": (NFD, [NFC], NFC, "in another case"),
+    "another Unicode form": (NFD, [NFC], NFC, "in another Unicode form"),
+    "another Unicode form, the other way": (NFC, [NFD], NFD, "in another Unicode form"),
     "a URL": ("a/my%20file.png", ["a/my file.png"], "a/my file.png", "as a URL"),
     "a percent sign": ("100%25.png", ["100%25.png", "100%.png"], "100%25.png", None),
     "a file URL": ("file:///home/x/a/1.png", ["a/1.png"], "a/1.png", "without leading folders"),
@@ -214,6 +216,76 @@ def test_masks_are_found_like_images(transforms):
     assert any(note in line for line in data.report)
 
 
+#: Names on disk, and the code page in which a list has them, with its title.
+CODE_PAGES = {
+    "GBK": ("图像{}.png", "gbk", "GBK"),
+    "Shift-JIS": ("写真表示{}.png", "cp932", "Shift-JIS"),
+    "Shift-JIS with bytes of backslashes": ("ソース{}.JPG", "cp932", "Shift-JIS"),
+    "Big5": ("圖像功能{}.png", "big5", "Big5"),
+    "EUC-KR": ("사진{}.png", "euc_kr", "EUC-KR"),
+    "Windows-1252": ("Gebäude_{}.png", "cp1252", "Windows-1252"),
+    "Windows-1251": ("Дом_{}.png", "cp1251", "Windows-1251"),
+    "Windows-1250": ("Łódź_{}.png", "cp1250", "Windows-1250"),
+    "code page of zips": ("Größe_{}.png", "cp437", "CP437"),
+}
+
+
+def test_names_in_other_code_pages_are_matched_by_their_bytes():
+    def check(case):
+        form, page, title = case
+        names = [form.format(i) for i in range(3)]
+        raw = [name.encode(page).decode("utf-8", "surrogateescape") for name in names]
+        misread = [name.encode("utf-8").decode("cp437") for name in names]
+        for listed, files in ((raw, names), (names, raw), (misread, names), (names, misread)):
+            matched, (note,) = match_names(listed, files, "images.bin")
+            assert dict(zip(listed, files, strict=True)) == matched
+            assert note.startswith(
+                f"3 names of images.bin found in the code page {title if raw in (listed, files) else ''}"
+            )
+            note.encode("utf-8")
+
+    assert [] == failures(CODE_PAGES, check)
+
+
+def test_bytes_that_fit_no_file_or_several_are_no_match():
+    listed = ["K\xf6ln.png".encode("cp1252").decode("utf-8", "surrogateescape")]
+    assert ({}, []) == match_names(listed, ["Koeln.png", "a.png"], "x")
+    with pytest.raises(InputError, match="names match different files in Windows-1252 and CP437: rename"):
+        match_names(listed, ["Köln.png", "K÷ln.png"], "x")
+
+
+@pytest.mark.parametrize(("page", "form"), [("gbk", "图像{}.png"), ("cp932", "図面表{}.png")])
+def test_sets_with_names_in_another_code_page_are_read(colmap_set, page, form):
+    names = [form.format(i) for i in range(9)]
+    model = colmap_set / "sparse" / "0" / "images.bin"
+    data = model.read_bytes()
+    for i, name in enumerate(names):
+        (colmap_set / "images" / f"im {i:03}.png").rename(colmap_set / "images" / name)
+        data = data.replace(b"im %03d.png\0" % i, name.encode(page) + b"\0")
+    model.write_bytes(data)
+    (colmap_set / "test.txt").write_bytes(names[2].encode(page))
+    found = load(colmap_set)
+    assert [names[2]] == [image.camera.image for image in found.test]
+    assert names[3] in [image.camera.image for image in found.train]
+    assert any("9 names of images.bin found in the code page" in line for line in found.report)
+    rename_in_images_txt(colmap_set, names.__getitem__)
+    text = colmap_set / "sparse" / "0" / "images.txt"
+    text.write_bytes(text.read_text("utf-8").encode(page))
+    assert [names[2]] == [image.camera.image for image in load(colmap_set).test]
+
+
+@pytest.mark.parametrize(("page", "form"), [("gbk", "图像{}.png"), ("cp932", "表{}.png"), ("cp1252", "Größe{}.png")])
+def test_a_transforms_json_may_be_in_another_code_page(transforms, page, form):
+    names = [form.format(i) for i in range(10)]
+    for i, name in enumerate(names):
+        (transforms / "images" / f"{i:04}.png").rename(transforms / "images" / name)
+        change_frames(transforms, [i], file_path=f"images/{name}")
+    file = transforms / "transforms.json"
+    file.write_bytes(json.dumps(json.loads(file.read_text()), ensure_ascii=False).encode(page))
+    data = load(transforms, test_every=0)
+    assert [f"images/{name}" for name in names] == sorted(image.camera.image for image in data.train)
+
+
 def test_a_link_to_nowhere_is_a_missing_image(colmap_set):
     (colmap_set / "images" / "im 003.png").unlink()
     (colmap_set / "images" / "im 003.png").symlink_to(colmap_set / "absent.png")
@@ -237,15 +309,17 @@ def test_masks_that_fit_no_image_are_reported(colmap_set):
 
 MASK_NAMES = [
     "masks/im 003.png", "masks/im 003.png.png", "masks/im 003.jpg", "Masks/im 003.png", "mask/im 003_mask.png",
-    "masks/mask_im 003.jpg", "masks/im 003.mask.png",
+    "masks/mask_im 003.jpg", "masks/im 003.mask.png", "masks/im 003.png.mask.png", "masks/IM 003.PNG.MASK.PNG",
+    "_mask/im 003.png", "masks/im 003.png_mask.png", "images/im 003.png.mask.png", "images/im 003.PNG.Mask.png",
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MASK_NAMES)
 def test_masks_have_names_of_several_programs(colmap_set, name):
-    (colmap_set / name).parent.mkdir()
+    (colmap_set / name).parent.mkdir(exist_ok=True)
     write_picture(colmap_set / name, cameras(9)[3])
     data = load(colmap_set)
+    assert 9 == len(data.train) + len(data.test)
     assert "masks hide parts of 1 image, which do not count" in data.report
     assert ["im 003.png"] == [picture.camera.image for picture in data.train if picture.masked is not None]
 
@@ -348,7 +422,6 @@ READ = {
     "16-bit grey TIFF": ("a.tif", saved(UINT16), GREY, 0),
     "16-bit grey, bytes swapped": ("a.tif", lambda p: Image.frombytes("I;16B", (W, H), SWAPPED).save(p), GREY, 0),
     "16-bit grey, white is 0": ("a.tif", lambda p: tiff(p, 65535 - UINT16, 16, 1, photometric=0), GREY, 0),
-    "16-bit grey PGM": ("a.pgm", lambda p: p.write_bytes(f"P5 {W} {H} 65535 ".encode() + SWAPPED), GREY, 0),
     "16-bit RGB": ("a.tif", lambda p: tiff(p, RGB.astype(np.uint16) * 257, 16, 1, channels=3, photometric=2), RGB, 0),
     "16-bit RGB PNG": ("a.png", lambda p: png_16(p, np.ascontiguousarray(RGB.astype(">u2") * 257, ">u2")), RGB, 0),
     "float TIFF": ("a.tif", saved(RAMP.astype(np.float32)), GREY, 0),
@@ -433,7 +506,7 @@ def test_a_set_reports_how_its_pixels_are_read(tmp_path):
     for path in files:
         frames[0].save(path, save_all=True, append_images=frames[1:])
     data = load(tmp_path)
-    assert "10 files with several images: the first of each is read (0001.png has 2)" in data.report
+    assert "10 files with several images: the first of each is read (such as 0001.png)" in data.report
     assert (data.train[0].pixels == (255, 0, 0)).all()
 
 
@@ -483,6 +556,47 @@ MASKS = {
     "alpha": (Image.fromarray(np.dstack([np.zeros((H, W, 3), np.uint8), 255 * LABELS])), True),
     "alpha of white": (Image.fromarray(np.dstack([np.full((H, W, 3), 255, np.uint8), 255 * LABELS])), True),
 }
+
+
+def test_images_and_masks_much_larger_than_their_cameras_are_refused_before_decoding(transforms, monkeypatch):
+    path = transforms / "images" / "0003.png"
+    original = path.read_bytes()
+    Image.new("1", (6000, 4000)).save(path)
+    Image.new("1", (6000, 4000)).save(transforms / "mask.png")
+    monkeypatch.setattr(ImageFile.ImageFile, "load", lambda file: pytest.fail(f"{file.filename} is decoded"))
+    with pytest.raises(
+        InputError, match=r"0003\.png has 6000×4000 pixels, expected about 48×32 as its camera: scale it"
+    ):
+        load(transforms)
+    path.write_bytes(original)
+    change_frames(transforms, range(10), mask_path="mask.png")
+    with pytest.raises(InputError, match=r"mask\.png has 6000×4000 pixels, expected about 48×32 as its image"):
+        load(transforms)
+
+
+def test_images_without_a_camera_have_a_budget(transforms):
+    document = json.loads((transforms / "transforms.json").read_text())
+    kept = {name: value for name, value in document.items() if name not in ("w", "h", "cx", "cy")}
+    (transforms / "transforms.json").write_text(json.dumps({**kept, "fl_x": 9000.0, "fl_y": 9000.0}))
+    file = transforms / "images" / "0000.png"
+    head = struct.pack(">II", 13_300, 13_300) + file.read_bytes()[24:29]
+    crc = struct.pack(">I", zlib.crc32(b"IHDR" + head))
+    file.write_bytes(file.read_bytes()[:16] + head + crc + file.read_bytes()[33:])
+    with pytest.raises(
+        InputError, match=r"0000\.png has 13300×13300 pixels in [0-9,]+ bytes, expected at most 67,108,864"
+    ):
+        load(transforms)
+
+
+def test_other_formats_in_a_set_are_named(transforms):
+    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\nshowpage\n"
+    (transforms / "mask.png").write_bytes(eps)
+    change_frames(transforms, range(10), mask_path="mask.png")
+    with pytest.raises(InputError, match=r"mask\.png is PostScript"):
+        load(transforms)
+    (transforms / "images" / "0003.png").write_bytes(eps)
+    with pytest.raises(InputError, match=r"0003\.png is PostScript \(EPS\), which is not read"):
+        load(transforms)
 
 
 def test_masks_of_every_kind_are_read_alike(tmp_path):

@@ -362,11 +362,12 @@ def test_importing_csplat_loads_none_of_its_modules():
     assert set() == {one for one in modules_after("import csplat") if one.startswith("csplat.")}
 
 
-def test_the_decoder_loads_no_other_part():
-    loaded = modules_after("import csplat.decoder; from csplat import decode")
+def test_the_decoder_loads_no_other_part_and_works_without_plyfile():
+    loaded = modules_after("sys.modules['plyfile'] = None; import csplat.decoder; from csplat import decode")
     assert "csplat.decoder" in loaded
+    loaded.remove("plyfile")
     packages = {name.split(".")[0] for name in loaded}
-    assert not packages & {"torch", "numba", "deflate", "typer", "rich", "csplat_tools"}
+    assert not packages & {"plyfile", "torch", "numba", "deflate", "typer", "rich", "csplat_tools"}
     foreign = ("csplat.encoder", "csplat.ply", "csplat.lint", "csplat.detect", "csplat.disk_files")
     assert not [name for name in loaded if name.startswith(foreign)]
 
@@ -390,7 +391,7 @@ def test_the_renderer_requires_no_torch():
     pytest.importorskip("numba", reason="the renderer requires the extra [render]")
     loaded = modules_after("import csplat_render.rasteriser, csplat_render.reference_rasteriser")
     packages = {name.split(".")[0] for name in loaded}
-    assert not packages & {"torch", "csplat_trainer", "csplat_tools"}  # numba itself may load scipy
+    assert not packages & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy
 
 
 @pytest.mark.parametrize(("error", "message", "fields"), [

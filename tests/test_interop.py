@@ -148,6 +148,11 @@ def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
         ({"splats": {**splats, "means": "many"}}, "means is not a tensor"),
         ({"splats": {**splats, "means": tensor(np.full((5, 3), np.inf))}}, "NaN or infinite"),
         ({"splats": {"means": splats["means"]}}, "no quats"),
+        (
+            {f"m.{name}": splats[name] for name in ("means", "quats", "scales", "opacities")}
+            | {"m.appearance_features": splats["sh0"]},
+            "no sh0, .*; it was trained with appearance features",
+        ),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
     ):
         with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{expected}"):
@@ -167,6 +172,16 @@ def of_inria(splats):
     return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
 
 
+LIGHTNING = ("means", "rotations", "scales", "opacities", "shs_dc", "shs_rest")  # names in Gaussian Splatting Lightning
+INRIA_STATE = ("_xyz", "_rotation", "_scaling", "_opacity", "_features_dc", "_features_rest")
+
+
+def other_names(splats, prefix, names):
+    """Return tensors under the names of another program, in the order means, quats, scales, opacities, sh0, shN."""
+    order = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    return {prefix + name: splats[own] for own, name in zip(order, names, strict=True)}
+
+
 def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(read_holding, make_model):
     splats = made_splats(make_model, 3)
     expected = read_holding({"splats": splats})
@@ -177,6 +192,8 @@ def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(read_hol
         renamed(splats, "_model."),
         splats,
         of_inria(splats),
+        {"state_dict": other_names(splats, "gaussian_model.gaussians.", LIGHTNING)},
+        other_names(splats, "", INRIA_STATE),
     ):
         read = read_holding(said)
         assert all(np.array_equal(getattr(expected, name), getattr(read, name)) for name in ARRAYS)
@@ -229,6 +246,22 @@ def test_values_are_checked_like_those_of_a_ply(read_holding):
     assert {"zero-quats", "opacities-are-alphas", "scales-are-linear", "filter-3d"} <= set(found)
     assert "repair" == found["zero-quats"].kind == found["filter-3d"].kind
     assert [1, 0, 0, 0] == model.quats[3].tolist()
+
+
+def test_one_scale_is_the_size_of_all_axes(read_holding, make_model):
+    splats = made_splats(make_model, 0)
+    for one in (splats["scales"][:, :1], splats["scales"][:, 0]):
+        model, found = read_splats(read_holding, {**splats, "scales": one})
+        assert "one-scale" in found
+        assert np.array_equal(np.repeat(splats["scales"][:, :1], 3, axis=1), model.scales)
+
+
+def test_log_scales_of_minus_infinity_in_a_checkpoint_are_sizes_of_0(read_holding, make_model):
+    splats = made_splats(make_model, 0)
+    splats["scales"][1:, 2] = -np.inf
+    model, found = read_splats(read_holding, splats)
+    assert "zero-scales" in found
+    assert (np.exp(model.scales[1:, 2].astype(float)) < 1e-37).all()
 
 
 def test_two_scales_are_discs(read_holding, make_model):

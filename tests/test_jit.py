@@ -1,7 +1,9 @@
 """Kernels: threads run every lane once and pass errors on; a fork gets its own; warming up compiles everything."""
 
+import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -154,6 +156,92 @@ def test_compilation_is_reported_once():
     assert [1] == calls
     assert kernels.is_cached(plain)
     assert not kernels.is_cached(kernels.numba.njit(lambda x: x + 2))
+
+
+def unlucky(x):
+    return x + 1
+
+
+def kernel_with_cache(folder, monkeypatch):
+    monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", str(folder))
+    return kernel(unlucky)
+
+
+@pytest.mark.slow
+def test_an_unusable_cache_costs_a_compilation_not_the_run(tmp_path, monkeypatch):
+    def replace_by_folder(path):
+        path.unlink()
+        path.mkdir()
+
+    damages = {
+        "nothing": lambda _index, _data: None,
+        "an empty index": lambda index, _: index.write_bytes(b""),
+        "an index that ends early": lambda index, _: index.write_bytes(index.read_bytes()[:-9]),
+        "an index of another file": lambda index, _: index.write_bytes(b"\x89PNG\r\n\x1a\n" * 99),
+        "an index of zeros": lambda index, _: index.write_bytes(bytes(index.stat().st_size)),
+        "an index of an older numba": lambda index, _: index.write_bytes(b"\x80\x04\x8c\x060.60.0\x94.garbage"),
+        "an index of another pickle": lambda index, _: index.write_bytes(index.read_bytes()[:-30] + b"N."),
+        "an index that is a folder": lambda index, _: replace_by_folder(index),
+        "data that are absent": lambda _, data: data.unlink(),
+        "data of 0 bytes": lambda _, data: data.write_bytes(b""),
+        "data that end early": lambda _, data: data.write_bytes(data.read_bytes()[:-100]),
+        "data of another pickle": lambda _, data: data.write_bytes(b"\x80\x04K\x01."),
+        "data that are a folder": lambda _, data: replace_by_folder(data),
+    }
+    whole = tmp_path / "whole"
+    assert 2 == kernel_with_cache(whole, monkeypatch)(1)
+    healed = {}
+    for number, (what, damage) in enumerate(damages.items()):
+        folder = shutil.copytree(whole, tmp_path / str(number))
+        damage(next(folder.rglob("*.nbi")), next(folder.rglob("*.nbc")))
+        again = kernel_with_cache(folder, monkeypatch)
+        assert kernels.is_cached(again) in (True, False), what
+        assert 2 == again(1), what
+        third = kernel_with_cache(folder, monkeypatch)
+        third(1)
+        healed[what] = bool(third.stats.cache_hits)
+    assert {"an index that is a folder", "data that are a folder"} == {what for what in healed if not healed[what]}
+    assert kernels.cache_failure().endswith("Is a directory")
+
+    file = tmp_path / "file"
+    file.write_bytes(b"")
+    for folder in (file, file / "below"):  # the cache is next to the source instead, or in the home
+        assert 2 == kernel_with_cache(folder, monkeypatch)(1)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the sizes of files by RLIMIT_FSIZE")
+def test_a_full_disk_costs_the_cache_not_the_run(tmp_path, monkeypatch):
+    from resource import RLIM_INFINITY, RLIMIT_FSIZE, setrlimit
+
+    full = kernel_with_cache(tmp_path, monkeypatch)
+    setrlimit(RLIMIT_FSIZE, (0, RLIM_INFINITY))
+    try:
+        assert 2 == full(1)
+    finally:
+        setrlimit(RLIMIT_FSIZE, (RLIM_INFINITY, RLIM_INFINITY))
+    assert kernels.cache_failure().endswith("File too large")
+    assert [] == [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a home of Windows is not found by HOME")
+def test_without_a_home_kernels_are_compiled_without_a_cache(tmp_path, monkeypatch):
+    # numba would create a folder of the name ~ in the working folder.
+    package, work = tmp_path / "package", tmp_path / "work"
+    package.mkdir()
+    work.mkdir()
+    (package / "__pycache__").write_bytes(b"")  # not even root can write below a file
+    (package / "uncached.py").write_text("def f(x):\n    return x + 1\n")
+    monkeypatch.syspath_prepend(package)
+    monkeypatch.chdir(work)
+    monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", "")
+    function = importlib.import_module("uncached").f
+    for name, value in (("HOME", "relative"), ("XDG_CACHE_HOME", ""), ("XDG_CACHE_HOME", "relative")):
+        monkeypatch.setenv(name, value)
+        compiled = kernel(function)
+        assert "no folder for numba's cache can be written" == kernels.cache_failure()
+        assert not kernels.is_cached(compiled)
+        assert [] == list(work.iterdir())
+    assert 2 == compiled(1)
 
 
 # The compiled versions of each kernel after warming up, and those added by using it for a scene.

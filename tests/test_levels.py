@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -153,23 +154,32 @@ def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):  #
         assert expected == selected(max_splats=budget)
 
 
-@given(nodes=trees(), level=st.integers(0, 5), low=st.floats(-1, 1), width=st.floats(0, 0.1))
-def test_a_box_selects_nodes_whose_region_touches_it(nodes, level, low, width):
+@given(nodes=trees(), level=st.integers(0, 5), low=st.floats(-0.06, 0.06), near=st.integers(-2, 2), data=st.data())
+def test_the_tiles_of_a_box_are_those_of_the_pseudo_code(spec, nodes, level, low, near, data):  # noqa: F811 - a fixture
     header = header_of(nodes)
-    box = np.array([[low, -9, -9], [low + width, 9, 9]])
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
 
-    def region(number):
-        parts = [nodes[number].tiles[0].corners(step), *map(region, nodes[number].children)]
-        return np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
+    def boxed(number, low, high, **more):
+        return SimpleNamespace(number=number, low=low, high=high, level=nodes[number].level, **more)
 
-    def touches(number):
-        low, high = region(number)
-        return bool((low <= box[1]).all() and (high >= box[0]).all())
+    def corner(integers):
+        return [float(np.float32(float(n) * step)) for n in integers]
 
+    plain = []
+    for number, node in enumerate(nodes):  # with one tile each
+        tile = node.tiles[0]
+        own = boxed(number, corner(tile.corner), corner(np.add(tile.corner, tile.extent)))
+        below = [own, *(plain[child] for child in node.children)]
+        lows, highs = ([*zip(*ends, strict=True)] for ends in ([b.low for b in below], [b.high for b in below]))
+        plain.append(boxed(number, [*map(min, lows)], [*map(max, highs)], tiles=[own]))
+    sides = [side for one in plain for side in (one.low[0], one.high[0])]
+    edge = data.draw(st.sampled_from([low, *sides]))  # and the numbers next to a side
+    for _ in range(abs(near)):
+        edge = math.nextafter(edge, math.copysign(math.inf, near))
     whole = [tile.index for tile in select_tiles(header, nodes, level=level)]
-    part = [tile.index for tile in select_tiles(header, nodes, level=level, box=box)]
-    assert [number for number in whole if touches(number)] == part
+    for box in ([[edge, -9, -9], [math.inf, 9, 9]], [[-math.inf, -9, -9], [edge, 9, 9]]):
+        part = [tile.index for tile in select_tiles(header, nodes, level=level, box=np.array(box))]
+        assert spec.tiles_in_box(plain, whole, SimpleNamespace(low=box[0], high=box[1])) == part
 
 
 @pytest.mark.parametrize(
@@ -182,7 +192,12 @@ def test_a_box_selects_nodes_whose_region_touches_it(nodes, level, low, width):
         ({"pixel_size": math.nan}, "pixel_size is nan, expected 0 or more"),
         ({"pixel_size": [1.0, 2.0]}, "pixel_size has 2 numbers, expected one, or one for each of 13 nodes"),
         ({"max_splats": -1}, "max_splats is -1, expected 0 or more"),
-        ({"box": (1, 2, 3)}, "expected six finite numbers"),
+        ({"box": (1, 2, 3)}, "box is \\(1, 2, 3\\), expected six numbers other than NaN"),
+        ({"box": (0, 0, 0, 1, 1, math.nan)}, "expected six numbers other than NaN"),
+        ({"box": ((0, 0, 0), (1, 1, 1))}, "expected six numbers other than NaN"),
+        ({"box": "000111x"}, "expected six numbers other than NaN"),
+        ({"box": 1.0}, "expected six numbers other than NaN"),
+        ({"box": (10**400, 0, 0, 1, 1, 1)}, "expected six numbers other than NaN"),
         ({"box": (9e9, 0, 0, 9e9, 1, 1)}, "no tile touches the box"),
     ],
 )

@@ -19,11 +19,12 @@ from captures import around, cameras, crowded, found_within, judged_by, photogra
 from checked import cloud, measure_errors
 from command_line import call, change_views, invoke
 
-from csplat import EncodeOptions, decode, write_ply
+from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.decoder import decode_scene
 from csplat.encoder import Importance, SearchReport, Target, encode_with_report, meet_bounds
 from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
+from csplat_conformance.validator import validate
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.camera_files import save_cameras
 from csplat_render.scene_frame import scene_frame
@@ -545,6 +546,54 @@ def test_a_bound_of_the_means_holds_for_outliers(scene):
 def test_an_impossible_bound_is_refused(scene):
     with pytest.raises(InputError, match="no lattice keeps the error of opacities within 1e-09"):
         meet_bounds(scene, EncodeOptions(), Target(max_error={"opacities": 1e-9}))
+
+
+def placed(scene, means, **changes):
+    """Return splats of a scene at other places."""
+    return replace(scene.select(np.arange(len(means)) % len(scene)), means=means.astype(np.float32), **changes)
+
+
+@pytest.mark.slow
+def test_position_error_holds_or_is_refused(scene):
+    """Half a step per axis is within it, but decoded means are rounded to float32, by up to another half."""
+    unit = np.random.default_rng(1).random((60, 3))
+    doubles = np.array([4e5, 5e6, 100.0]) + 2000.0 * unit
+    origin = tuple(doubles.mean(axis=0))
+    huge = np.array([[3.4e38, 2.9e24, -1.0], *np.tile(20.0 * unit, (2, 1))])
+    kept = [
+        ("near", placed(scene, 20.0 * unit), 1e-4),
+        ("rounded by float32", placed(scene, 500.0 + 500.0 * unit), 1e-4),
+        ("at the end of float32", placed(scene, (unit - 0.5) * 6.8e38), 1e31),
+        ("doubles", placed(scene, doubles - origin, means_double=doubles, origin=origin), 1e-4),
+        ("an outlier on an axis", placed(scene, np.array([[3.4e38, 0.0, 0.0], *(20.0 * unit)])), 1e-4),
+    ]
+    for name, model, bound in kept:
+        found = encode_with_report(model, EncodeOptions(position_error=bound))
+        assert 0.0 < found.report.errors["means"][0] <= bound, name
+        largest, _ = measure_errors(model, decode(found.data), found.source_index)["means"]
+        assert largest <= bound, name
+        assert () == validate(found.data).violations, name
+    options = EncodeOptions(position_error=1e-4)
+    refused = [
+        (
+            placed(scene, huge),
+            r"within 0.0001: the best possible is 2.9e\+24, for a splat 3.4e\+38 from the origin .* allow",
+        ),
+        (
+            placed(scene, doubles * 8 - origin, means_double=doubles * 8, origin=origin),
+            "the best possible is 2, for a splat 3.5e",
+        ),
+    ]
+    for model, message in refused:
+        for ask in (
+            lambda model=model: encode(model, options),
+            lambda model=model: encode(model, replace(options, bucket_splats=100)),
+            lambda model=model: encode(model, target=Target(max_error={"means": 1e-4})),
+            lambda model=model: encode(model, target=Target(psnr=30.0, max_error={"means": 1e-4})),
+            lambda model=model: encode(model, options, target=Target(psnr=30.0)),
+        ):
+            with pytest.raises(InputError, match=message):
+                ask()
 
 
 def test_an_option_that_contradicts_a_bound_is_refused(scene):

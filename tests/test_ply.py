@@ -342,7 +342,7 @@ COMMENTS = {
     'training {"background": [0, 0, 0], "test_every": false}': "test_every of training is",
     'training {"background": [0, 0, 0], "near": 1e999}': "near of training is",
     'training {"background": [0, 0, 0], "images": 4}': "images of training is",
-    'training {"background": [0, 0, 0], "images": "\\ud800"}': "images of training is",
+    'training {"background": [0, 0, 0], "images": "\\ud800"}': "half of a surrogate pair",
     **{
         f"view {text}": "csplat view.*is invalid"
         for text in ("", "0 0 1", "[]", '{"near": 1e999}', '{"near": NaN}', "[" * 100_000)
@@ -457,6 +457,14 @@ def test_other_formats_are_named_with_a_converter(tmp_path, name, data, format):
     with pytest.raises(InputError, match="convert it to PLY first, with") as caught:
         read_ply(tmp_path / name)
     assert format in str(caught.value)
+
+
+def test_a_ply_with_codebooks_is_named(tmp_path):
+    columns = "\nproperty uchar opacity\nproperty uchar scaling\n"
+    text = f"ply\nformat binary_little_endian 1.0\nelement vertex_0 1{columns}element codebook_centers 1{columns}"
+    (tmp_path / "a.ply").write_bytes(f"{text}end_header\n".encode() + bytes(4))
+    with pytest.raises(InputError, match=r"is a PLY with codebooks .*: save it there without quantisation"):
+        read_ply(tmp_path / "a.ply")
 
 
 def test_sog_is_named_in_a_zip_and_in_a_folder(tmp_path):

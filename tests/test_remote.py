@@ -82,8 +82,8 @@ def test_boxes_of_tiles_are_exact(data):
     with csplat.open(data) as file:
         assert (len(file.header.tiles), 2, 3) == file.boxes.shape
         for box, tile in zip(file.boxes, file.tiles(sh_degree=0), strict=True):
-            np.testing.assert_array_equal(box[0].astype(np.float32), tile.means.min(axis=0))
-            np.testing.assert_array_equal(box[1].astype(np.float32), tile.means.max(axis=0))
+            np.testing.assert_array_equal(box[0], tile.means.min(axis=0))
+            np.testing.assert_array_equal(box[1], tile.means.max(axis=0))
 
 
 def test_tiles_are_iterated_and_released(data, box):
@@ -164,8 +164,8 @@ def test_invalid_arguments_are_refused_before_reading(data):
     with csplat.open(data, limits=Limits(splats=1000)) as file:
         before = file.bytes_read
         for call, error, message in (
-            (lambda: file.read((0, 0, 0, 1, 1, math.nan)), InputError, "six finite numbers"),
-            (lambda: file.read((1e6,) * 6), InputError, "no tile touches the box 1e.06"),
+            (lambda: file.read((0, 0, 0, 1, 1, math.nan)), InputError, "six numbers other than NaN"),
+            (lambda: file.read((1e6,) * 6), InputError, "no tile touches the box 1000000, 1000000"),
             (lambda: file.read(tiles=[99]), InputError, "tile 99"),
             (lambda: file.read(sh_degree=5), InputError, "sh_degree is 5"),
             (lambda: file.tiles(sh_degree=-1), InputError, "sh_degree is -1"),
@@ -240,15 +240,6 @@ def test_an_incomplete_answer_of_a_store_is_a_typed_error(store):
         store.answer = ConnectionError("lost")
         with pytest.raises(StoreError, match=r"/scene\.csplat: lost"):
             file.read(sh_degree=0)
-
-
-def test_a_web_server_without_parts_is_refused(store):
-    store.protocol, store.ranges = ("http", "https"), False
-    with (
-        csplat.open("https://example.org/scene.csplat") as file,
-        pytest.raises(StoreError, match=r"/scene\.csplat: the server sends only whole files"),
-    ):
-        file.read(sh_degree=0)
 
 
 def test_a_web_server_with_parts_is_used(store, data):

@@ -1,6 +1,8 @@
 """Files at URLs of a local web server and a local S3, through fsspec."""
 
 import io
+import re
+import threading
 
 import numpy as np
 import pytest
@@ -9,13 +11,15 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat import EncodeOptions, FormatError, InputError, StoreError, decode, encode
+from csplat.byte_store import RequestSizes
 from csplat.encoder import EncodePlan, LevelNode, encode_levels
+from csplat.remote_store import RemoteStore
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.area(name="remote")
 pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
-pytest.importorskip("aiohttp", reason="URLs require the extra [remote]")
+aiohttp = pytest.importorskip("aiohttp", reason="URLs require the extra [remote]")
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +33,9 @@ def box(data):
 
 
 @pytest.fixture
-def web(data):
+def web(data, monkeypatch):
+    monkeypatch.setattr(RemoteStore, "sizes", RequestSizes(waits=(0.01, 0.01, 0.01)))
+    monkeypatch.setenv("no_proxy", "127.0.0.1")
     server = Web({"/scene.csplat": data})
     with server.serve() as address:
         server.url = f"{address}/scene.csplat"
@@ -63,10 +69,91 @@ def test_a_coarser_version_is_read_without_the_rest(web, sample_path):
         assert file.bytes_read - before > len(data) / 2
 
 
-def test_a_server_without_parts_is_refused(web):
-    web.ranges = False
-    with csplat.open(web.url) as file, pytest.raises(StoreError, match="sends only whole files"):
-        file.read(sh_degree=0)
+#: Answers to the GETs of a read, and the error; none if the data are right in the end.
+FAULTS = [
+    (["short"], ""),
+    (["short", "short", "short"], ""),
+    ([None, "short"], ""),
+    (["until it closes"], ""),
+    ([503], ""),
+    ([429, 503, 502], ""),
+    ([None, 503], ""),
+    (["hang up"], ""),
+    ([None, "hang up", "hang up"], ""),
+    (["half"], ""),
+    ([None, "half", "broken chunk"], ""),
+    (["stall"], ""),
+    ([None, "stall"], ""),
+    ([None, "part as 200"], ""),
+    (["gzip", "gzip"], ""),
+    ([503] * 9, "HTTP status 503, try again after 0 s; tried 4 times"),
+    (["stall"] * 9, "the server sends nothing; tried 4 times"),
+    ([None, *["hang up"] * 9], "Server disconnected; tried 4 times"),
+    (["whole"], "the server sends only whole files"),
+    ([None, "whole"], "the server sends only whole files"),
+    (["shifted"], "the server sent the part from byte 1, requested was the one from byte 0"),
+    ([None, 403], "403: not public, or the signature of the URL has expired"),
+    ([None, 404], "No such file"),
+    ([None, 500], "HTTP status 500"),
+]
+
+
+def test_failed_requests_are_repeated_and_short_answers_continued(web, data):
+    storage = {"client_kwargs": {"timeout": aiohttp.ClientTimeout(sock_read=0.1)}}
+    right, wrong = decode(data, sh_degree=0), {}
+    for faults, message in FAULTS:
+        web.faults = list(faults)
+        try:
+            with csplat.open(web.url, storage=storage) as file:
+                assert_same(right, file.read(sh_degree=0))
+            said = ""
+        except (StoreError, OSError) as error:
+            said = str(error)
+            assert web.url in said
+            assert 1 == len(said.splitlines())
+        if re.search(message, said) is None or bool(message) != bool(said):
+            wrong[str(faults)] = said
+        web.released.set()
+        web.released = threading.Event()
+    assert {} == wrong
+
+
+def test_a_connection_without_bytes_is_lost_after_a_while(web):
+    with csplat.open(web.url) as file:
+        timeout = file._store._fs.client_kwargs["timeout"]
+    assert timeout.total is None  # large files take longer than the five minutes of aiohttp
+    assert 0 < timeout.sock_read <= 60
+    assert 0 < timeout.sock_connect <= 60
+
+
+def test_a_server_that_asks_for_a_long_break_is_not_waited_for(web, monkeypatch):
+    web.files["/scene.csplat"] = 503
+    monkeypatch.setattr(RemoteStore, "sizes", RequestSizes(waits=(100.0,)))
+    with pytest.raises(StoreError, match=r"HTTP status 503$"):
+        csplat.open(web.url)
+
+
+def test_a_file_that_is_stored_compressed_is_refused(web):
+    for web.coding in ("gzip", "br"):  # aiohttp unpacks br only with another package
+        with pytest.raises(StoreError, match=rf"compressed \(Content-Encoding(: {web.coding})?\), so no parts"):
+            csplat.open(web.url)
+
+
+def test_a_proxy_of_the_environment_is_used(web, data, monkeypatch):
+    web.files["http://far.example/scene.csplat"] = data
+    monkeypatch.setenv("http_proxy", web.url.removesuffix("/scene.csplat"))
+    monkeypatch.setenv("no_proxy", "")
+    with csplat.open("http://far.example/scene.csplat") as file:
+        assert_same(decode(data, sh_degree=0), file.read(sh_degree=0))
+
+
+def test_a_weak_etag_is_the_same_version(web, data):
+    web.tag = '"a"'
+    web.files["/scene.csplat"] = data[:-1] + bytes([data[-1] ^ 1])
+    with csplat.open(web.url) as file:
+        web.tag = 'W/"a"'
+        with pytest.raises(FormatError, match="E_CRC"):
+            file.read()
 
 
 def test_a_lost_connection_is_a_typed_error(web):

@@ -208,6 +208,14 @@ def test_a_wrong_command_line_has_status_2(ply, tmp_path, words):
     assert 2 == invoke("render", ply, tmp_path / "out", *words).exit_code
 
 
+def test_a_name_of_another_image_format_is_no_folder(ply, tmp_path):
+    for name in ("a.exr", "a.tif", "a.mov"):
+        result = invoke("render", ply, tmp_path / name, "--orbit", "3")
+        assert 2 == result.exit_code
+        assert "expected a folder, or a video: NAME.mp4, .webp, .gif or .png" in result.stderr
+        assert not (tmp_path / name).exists()
+
+
 @pytest.mark.parametrize(("module", "package"), [("numba", "numba"), ("PIL", "pillow")])
 def test_missing_packages_are_named(ply, cameras, tmp_path, monkeypatch, module, package):
     pytest.importorskip("numba", reason="one of the two is absent anyway")

@@ -2,6 +2,8 @@
 
 import json
 import math
+import re
+import shutil
 import struct
 from dataclasses import replace
 
@@ -94,7 +96,8 @@ def test_lens_models_agree_with_the_documentation_of_colmap(tmp_path):
     def check(case):
         model, parameters = case
         if parameters is None:
-            with pytest.raises(InputError, match=f"the lens is {model}, expected one of .*colmap image_undistorter"):
+            remedy = "split panoramas" if model == "EQUIRECTANGULAR" else "use `colmap image_undistorter"
+            with pytest.raises(InputError, match=f"the lens is {model}, expected one of .*: {remedy}"):
                 read_lens(tmp_path, model, [1.0] * 4)
             return
         lens = read_lens(tmp_path, model, parameters)
@@ -491,3 +494,149 @@ def test_pointers_of_git_lfs_are_named(tmp_path, name):
     (tmp_path / name).write_text("<!DOCTYPE html><html>")
     with pytest.raises(InputError, match=r"is a web page \(HTML\)"):
         load(tmp_path).read()
+
+
+def with_commas(name, columns=slice(None)):
+    """Return a change of a model's text file: commas for points in some columns of its lines."""
+
+    def change(folder):
+        path = folder / "sparse" / "0" / name
+        lines = path.read_text().split("\n")
+        for i, line in enumerate(lines):
+            words = line.split(" ")
+            if not line.startswith("#"):
+                words[columns] = [word.replace(".", ",") for word in words[columns]]
+            lines[i] = " ".join(words)
+        path.write_text("\n".join(lines))
+
+    return change
+
+
+def replaced(name, old, new):
+    def change(folder):
+        path = folder / "sparse" / "0" / name
+        path.write_text(path.read_text().replace(old, new, 1))
+
+    return change
+
+
+#: Changes of a model in text, and the note or the error.
+COMMAS = {
+    "images": ([with_commas("images.txt", slice(0, 8))], "images.txt: decimal commas are read as points: "),
+    "keypoints too": ([with_commas("images.txt", slice(0, 8)), replaced("images.txt", "1.5 2", "1,5 2")], "images.txt"),
+    "cameras": ([with_commas("cameras.txt")], "cameras.txt: decimal commas are read as points: "),
+    "points": ([with_commas("points3D.txt")], "points3D.txt: decimal commas are read as points: 0,05 is 0.05, …"),
+    "one of many": ([replaced("points3D.txt", "0.05", "0,05")], "0,05 has a comma, but 0.03 in line 2 a point"),
+    "thousands": ([replaced("points3D.txt", "0.05", "1,234.5")], "'1,234.5' has a comma, expected a number"),
+    "separators": ([replaced("cameras.txt", "48 32", "48, 32")], "'48,' has a comma, expected a number such"),
+    "a word": ([replaced("cameras.txt", "48 32", "48 x32")], "cameras.txt, line 2: 'x32' is not a number"),
+    "digits in groups": ([replaced("points3D.txt", "0.05", "1_0")], "points3D.txt, line 2: '1_0' is not a number"),
+}  # fmt: skip
+
+
+def test_decimal_commas_are_read_or_named(tmp_path):
+    write_colmap_set(tmp_path / "set", text=True)
+    expected = load(tmp_path / "set")
+
+    def check(case):
+        changes, message = case
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        shutil.copytree(tmp_path / "set", folder)
+        for change in changes:
+            change(folder)
+        if not message.startswith(("images.txt", "cameras.txt: dec", "points3D.txt: dec")):
+            with pytest.raises(InputError, match=re.escape(message)):
+                load(folder)
+            return
+        found = load(folder)
+        assert any(line.startswith(message) for line in found.report)
+        assert (found.points == expected.points).all()
+        for one, other in zip(found.train, expected.train, strict=True):
+            assert (one.camera.viewmat == other.camera.viewmat).all()
+            assert (one.camera.K == other.camera.K).all()
+
+    assert [] == failures(COMMAS, check)
+
+
+def test_decimal_commas_in_json_are_named(tmp_path):
+    write_transforms(tmp_path)
+    file = tmp_path / "transforms.json"
+    text = file.read_text()
+    file.write_text(text.replace('"cx": 24.0', '"cx": 24,5'))
+    with pytest.raises(
+        InputError, match=r"transforms\.json is not a JSON file: .*; it has a decimal comma, 24,5, expected a"
+    ):
+        load(tmp_path)
+    file.write_text(text.replace("0.", "0,"))
+    with pytest.raises(InputError, match=r"is not a JSON file: .*; it has a decimal comma, -?0,0\d+, expected a point"):
+        load(tmp_path)
+    file.write_text(text)
+    change_frames(tmp_path, [3], transform_matrix=[[0, 5] * 4] * 4)
+    with pytest.raises(InputError, match=r"transform_matrix has shape \[4, 8\], as if by decimal commas"):
+        load(tmp_path)
+
+
+#: Files of other programs, with their beginnings, and a part of the message.
+FOREIGN = {
+    "Polycam": (
+        "keyframes/corrected_cameras/1.json",
+        "{}",
+        "a raw export of Polycam, which is not read: convert it with",
+    ),
+    "Polycam, uncorrected": ("keyframes/cameras/1.json", "{}", "`ns-process-data polycam`"),
+    "Record3D": ("scan.r3d", "PK", "`ns-process-data record3d`"),
+    "Metashape": ("Scan.PSX", "<document/>", "a project of Metashape"),
+    "cameras of Metashape": (
+        "cameras.xml",
+        '<?xml version="1.0"?>\n<document version="1.5">',
+        "`ns-process-data metashape`",
+    ),
+    "RealityScan": ("rc.csv", "#name,x,y,alt", "a camera list of RealityScan (RealityCapture)"),
+    "XMP": (
+        "images/1.xmp",
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:Description xcr:Version="3"',
+        "XMP files of Reality",
+    ),
+    "OpenMVG": ("reconstruction/sfm_data.json", "{}", "openMVG_main_openMVG2Colmap"),
+    "Meshroom": ("cameras.sfm", "{}", "a scene of Meshroom"),
+    "OpenSfM": ("opensfm/reconstruction.json", "[]", "`opensfm export_colmap`"),
+    "Bundler": ("bundle/bundle.out", "# Bundle file v0.3", "a file of Bundler"),
+    "VisualSFM": ("scan.nvm", "NVM_V3", "a file of VisualSFM"),
+    "Pix4D": ("scan.p4d", "", "a project of Pix4D"),
+    "LLFF": ("poses_bounds.npy", "", "llff2nerf"),
+    "NeuS": ("cameras_sphere.npz", "", "a set of NeuS"),
+    "Stray Scanner": ("odometry.csv", "timestamp, frame", "a capture of Stray Scanner"),
+    "3DGS": ("cfg_args", "Namespace()", "name the data set that it was trained on"),
+    "LAS": ("cloud.laz", "LASF", "training needs images with poses"),
+    "a video": ("walk.MOV", "", "take frames of it"),
+}
+
+
+def test_sets_of_other_programs_are_named_with_a_way_out(tmp_path):
+    def check(case):
+        name, begin, message = case
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_text(begin)
+        Image.new("RGB", (8, 8)).save(folder / "photo.png")
+        with pytest.raises(InputError, match=re.escape(message)) as raised:
+            load(folder)
+        assert "\n" not in str(raised.value)
+        if "Polycam" not in message and "polycam" not in message:
+            with pytest.raises(InputError, match=re.escape(message)):
+                load(folder / name)
+
+    assert [] == failures(FOREIGN, check)
+
+
+def test_other_files_do_not_hide_a_set(tmp_path):
+    write_transforms(tmp_path / "scan")
+    for name in ("scan/bundle.out", "scan/cameras.xml", "scan/scan.mp4", "scan/cloud.las", "walk.mp4"):
+        (tmp_path / name).write_text("<document/>")
+    assert load(tmp_path / "scan").train
+    with pytest.raises(InputError, match=r"is not a data set: .*; did you mean scan in it"):
+        load(tmp_path)
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "list.csv").write_text("a,b\n1,2\n")
+    with pytest.raises(InputError, match=r"other is not a data set: expected transforms_train\.json"):
+        load(tmp_path / "other")

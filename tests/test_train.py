@@ -400,12 +400,12 @@ def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch)
     folder = write_set(tmp_path, data)
     (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
     monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
-    assert "11.png is not an image that can be read" in call("train", folder, tmp_path / "a.ply", status=1).stderr
+    assert "11.png is a PNG that is truncated" in call("train", folder, tmp_path / "a.ply", status=1).stderr
     document = json.loads((folder / "transforms.json").read_text())
     for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
         frames = document["frames"][rows]
         (folder / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": frames}))
-    assert "11.png is not an image that can be read" in call("train", folder, tmp_path / "a.csplat", status=1).stderr
+    assert "11.png is a PNG that is truncated" in call("train", folder, tmp_path / "a.csplat", status=1).stderr
     assert [] == [*tmp_path.glob("a.*")]
 
 

@@ -71,6 +71,14 @@ RANGES = {
     "bytes=0-1,5-6": None,  # several ranges may be answered with everything
     "items=0-1": None,
     "bytes=\u0661-2": None,  # a digit, but none of ASCII
+    "bytes= 0-9 ": (0, 10),
+    "bytes=0 - 9": None,
+    "bytes=0-" + "9" * 5000: (0, 1000),
+    "bytes=-" + "9" * 5000: (0, 1000),
+    "bytes=" + "0" * 5000 + "7-9": (7, 3),
+    "bytes=" + "9" * 5000 + "-5": None,
+    "bytes=--1": None,
+    "Bytes=990-99999999999999999999999999": (990, 10),
 }
 
 
@@ -174,6 +182,124 @@ def test_another_name_for_this_machine_is_misdirected(scene_path):
         assert 421 == ask(server, "/", Host="evil.example:80")[0]
         assert 421 == ask(server, "http://evil.example/scene/a%20scene.csplat")[0]
         assert 302 == ask(server, "/", Host=f"localhost:{port}")[0]
+
+
+LOOPBACK = ["127.0.0.1", "127.0.0.2", "127.1", "LOCALHOST", "localhost", "::1", "0:0:0:0:0:0:0:1", "::ffff:127.0.0.1"]
+ANYWHERE = "0.0.0.0"  # noqa: S104  # the documented value of --host
+GOOD = [
+    "localhost", "LOCALHOST:80", "localhost.", "localhost:", "127.0.0.1:9", "127.0.0.2", "[::1]", "[::1]:80",
+    "192.0.2.1",
+]  # fmt: skip
+BAD = [
+    "evil.example", "EVIL.example:80", "127.0.0.1.evil.example", "localhost.evil.example", "evil.example.", "[evil]",
+    "user@localhost", "localhost:80:80", "x[::1]", "evil.example:80]", "localhost\t.evil.example", "127.0.0.1..",
+    "[::1", "",
+]  # fmt: skip
+
+
+def host_statuses(server, hosts):
+    """The statuses of requests for several hosts, on one connection."""
+    connection = http.client.HTTPConnection(server.server_address[0], server.server_address[1], timeout=10)
+    found = {}
+    for host in hosts:
+        connection.putrequest("GET", "/", skip_host=True)
+        connection.putheader("Host", host)
+        connection.endheaders()
+        response = connection.getresponse()
+        response.read()
+        found[host] = response.status
+    connection.close()
+    return found
+
+
+def test_the_bound_address_decides_which_hosts_are_served(scene_path):
+    own = socket.gethostname()
+    with open_viewer_scene(str(scene_path), preset="fast") as scene:
+        served_at = []
+        for place in (*LOOPBACK, ANYWHERE):
+            try:
+                server = open_server(scene, host=place)
+                opened = server.__enter__()
+            except InputError:  # a system without IPv6
+                continue
+            thread = threading.Thread(target=opened.serve_forever, kwargs={"poll_interval": 0.02})
+            thread.start()
+            try:
+                is_public = place == ANYWHERE
+                good = [*GOOD, own, f"{own}.local:80"] if is_public else GOOD
+                bad = BAD if is_public else [*BAD, own, "elsewhere.local"]
+                assert dict.fromkeys(good, 302) | dict.fromkeys(bad, 421) == host_statuses(opened, [*good, *bad]), place
+                served_at.append(place)
+            finally:
+                opened.shutdown()
+                thread.join()
+                server.__exit__(None, None, None)
+    assert {"127.0.0.1", "LOCALHOST", ANYWHERE} <= set(served_at)
+
+
+def test_an_empty_host_and_one_that_is_no_name_are_refused(scene_path):
+    with open_viewer_scene(str(scene_path), preset="fast") as scene:
+        for host, message in (
+            ("", "is empty"),
+            (" \t", "is empty"),
+            ("a" * 300, "not an address"),
+            (" 127.0.0.1", "not an address"),
+        ):
+            with pytest.raises(InputError, match=message), open_server(scene, host=host):
+                pass
+
+
+def exchange(server, data):
+    """Send bytes, and return all that is answered until the server closes the connection."""
+    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        connection.sendall(data)
+        return b"".join(iter(lambda: connection.recv(1 << 16), b""))
+
+
+def test_every_request_gets_one_answer_with_a_status(scene_path):
+    head = b"Host: localhost\r\nConnection: close\r\n"
+    follower = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+    heads = {
+        b"GET http://[ HTTP/1.1\r\n" + head: 400,
+        b"GET //[ HTTP/1.1\r\n" + head: 404,
+        b"GET * HTTP/1.1\r\n" + head: 400,
+        b"GET viewer.html HTTP/1.1\r\n" + head: 400,
+        b"GET ftp://localhost/ HTTP/1.1\r\n" + head: 400,
+        b"GET http://localhost/ HTTP/1.1\r\n" + head: 302,
+        b"GET http://evil.example/ HTTP/1.1\r\n" + head: 421,
+        b"GET https://user@localhost/ HTTP/1.1\r\n" + head: 421,
+        b"GET /%00 HTTP/1.1\r\n" + head: 404,
+        b"GET /\xff\xfe HTTP/1.1\r\n" + head: 404,
+        b"GET /%ff HTTP/1.1\r\n" + head: 404,
+        b"GET / HTTP/1.1\r\nConnection: close\r\n": 400,
+        b"GET / HTTP/1.0\r\n": 421,
+        b"GET / HTTP/1.1\r\nHost: localhost\r\n" + head: 400,
+        b"GET / HTTP/9.9\r\n" + head: 505,
+        b"GET / HTTP/x\r\n" + head: 400,
+        b"GET /\r\n": 400,
+        b"GET\r\n": 400,
+        b"GET / there HTTP/1.1\r\n" + head: 400,
+        b"get / HTTP/1.1\r\n" + head: 501,
+        b"PROPFIND / HTTP/1.1\r\n" + head: 501,
+        b"GET / HTTP/1.1\r\n" + head + b"X: " + b"a" * 70_000 + b"\r\n": 431,
+        b"GET / HTTP/1.1\r\n" + head + b"X: a\r\n" * 300: 431,
+        b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n" + head: 414,
+        b"GET / HTTP/1.1\r\n" + head + b"Expect: 100-continue\r\nContent-Length: 5\r\n": 302,
+    }
+    bodies = {
+        b"Content-Length: %d\r\n\r\n" % len(follower) + follower: 404,
+        b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n" + follower: 404,
+        b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n" + follower: 404,
+        b"Content-Length: nonsense\r\n\r\n" + follower: 404,
+        b"Content-Length: 200000\r\n\r\n" + bytes(200_000): 404,
+        b"Content-Length: 0\r\n\r\n" + follower: (404, 302),  # no body: the connection stays open
+    }
+    requests = {words + b"\r\n": status for words, status in heads.items()}
+    requests |= {b"GET /nothing HTTP/1.1\r\nHost: localhost\r\n" + rest: status for rest, status in bodies.items()}
+    with served(scene_path) as server:
+        for request, status in requests.items():
+            found = tuple(map(int, re.findall(rb"HTTP/1\.1 (\d+) ", exchange(server, request))))
+            assert (status if isinstance(status, tuple) else (status,)) == found, request[:80]
 
 
 def test_other_methods_are_refused(scene_path):

@@ -37,6 +37,7 @@ def unpack(wheel: Path, folder: Path) -> None:
                 os.utime(path, (_EPOCH + info.CRC, _EPOCH + info.CRC))
     for package in PACKAGES:
         assert (folder / package / "__init__.py").exists(), f"{wheel} holds no package {package}"
+    assert (folder / "csplat_program.py").exists(), f"{wheel} holds no entry point"
 
 
 def kernel_cache(folder: Path) -> Path:

@@ -1355,10 +1355,9 @@ static int read_tile(csplat *d, tile *t, const uint8_t *p)
             return fail(d, CSPLAT_E_VALUE, "TIL-8", extent_at, "an extent of %lu", (unsigned long)t->extent[i]);
         if (t->corner[i] < -SPEC_INTEGER_MAX || t->corner[i] > SPEC_INTEGER_MAX - (int64_t)t->extent[i])
             return fail(d, CSPLAT_E_VALUE, "TIL-7", corner_at, "a box beyond 2^53");
-        /* By TIL-10 some splats are on these two planes, so their values are the extremes for MEA-1. */
         high = (double)(t->corner[i] + (int64_t)t->extent[i]) * t->step;
         if (!(high < FLOAT32_END && high > -FLOAT32_END && fabs((double)t->corner[i] * t->step) < FLOAT32_END))
-            return fail(d, CSPLAT_E_RANGE, "MEA-1", corner_at, "means outside binary32");
+            return fail(d, CSPLAT_E_RANGE, "MEA-1", corner_at, "a box outside binary32");
     }
     for (unsigned i = 0; i < t->table_count; i++) {
         unsigned id = get_u16(t->tables + 2 * i);
@@ -2999,11 +2998,13 @@ static int replace_within(csplat *d, uint64_t splats, uint8_t *replaced)
     return 1;
 }
 
-static int touches(const float *box, const float min[3], const float max[3])
+static int touches(const double *box, const float min[3], const float max[3])
 {
-    for (int i = 0; box && i < 3; i++)
-        if (!(min[i] <= box[3 + i] && max[i] >= box[i]))
+    for (int i = 0; box && i < 3; i++) {
+        const double one = box[i], other = box[3 + i];
+        if (!(min[i] <= (one > other ? one : other) && max[i] >= (one < other ? one : other)))
             return 0;
+    }
     return 1;
 }
 
@@ -3018,9 +3019,9 @@ static int check_cut(csplat *d, const csplat_cut *cut)
     for (uint32_t i = 0; cut->kind == CSPLAT_CUT_PIXEL_SIZE && i < cut->pixel_size_count; i++)
         if (!(cut->pixel_sizes[i] >= 0))
             return refuse(d, "a pixel size is not at least 0");
-    for (int i = 0; cut->box && i < 3; i++)
-        if (!(cut->box[i] <= cut->box[3 + i]))
-            return refuse(d, "a box whose smallest corner is not the first");
+    for (int i = 0; cut->box && i < 6; i++)
+        if (cut->box[i] != cut->box[i])
+            return refuse(d, "a box with NaN");
     return 1;
 }
 

@@ -149,7 +149,8 @@ typedef struct csplat_cut {
     uint32_t pixel_size_count; /* PIXEL_SIZE: 1, or the number of nodes */
     const double *pixel_sizes; /* size of a pixel, scene units, at least 0: everywhere, or at each node */
     uint64_t splats;           /* SPLATS: maximum number of splats */
-    const float *box;          /* [6], smallest and largest corner; select only what touches it. NULL: everything */
+    const double *box;         /* [6], two corners in any order, relative to the origin; may be infinite. Select only
+                                  what touches it. NULL: everything */
 } csplat_cut;
 
 /* Arrays for a tile's values; NULL to skip one. K = (degree + 1)^2 - 1, at most 24. */

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from csplat.disk_files import parse_array, parse_json
 from csplat.errors import InputError
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, open_binary
 
 #: Exceptions that zipfile and Pillow raise for damaged files: RuntimeError for passwords and unknown compression,
 #: MemoryError for impossible sizes, OSError for offsets outside the file.
@@ -145,7 +145,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
         InputError: the file is damaged, not a .npz file, or unpacks to more than `unpacked_limit`.
         OSError: the file cannot be read.
     """
-    with Path(path).open("rb") as stream:
+    with open_binary(path) as stream:
         if instead := describe_substitute(stream.read(64)):
             raise InputError(f"{path} is {instead}")
         try:

@@ -12,7 +12,7 @@ import numpy as np
 
 from csplat.decoder.container import view_of
 from csplat.errors import CsplatError, FormatError, LimitError, StoreError
-from csplat.file_source import File
+from csplat.file_source import File, named_errors, open_binary
 from csplat.system import Pages, read_at
 
 
@@ -26,6 +26,7 @@ class RequestSizes:
         gap: largest gap between two ranges that one request reads through, bytes; a second request takes longer.
         request: maximum size of one request, bytes.
         at_once: maximum number of concurrent requests.
+        waits: breaks before a failed request to a web server is repeated, seconds: one for each repetition.
     """
 
     first: int = 1 << 16
@@ -33,6 +34,7 @@ class RequestSizes:
     gap: int = 1 << 16
     request: int = 1 << 23
     at_once: int = 8
+    waits: tuple[float, ...] = (0.25, 1.0, 4.0)
 
 
 class Store:
@@ -123,12 +125,13 @@ class DiskStore(Store):
     """A file on disk. It is not mapped: truncating a mapped file would kill the process that reads it."""
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("rb")
+        self._file = open_binary(path)
         self._stat = os.fstat(self._file.fileno())
         super().__init__(str(path), self._stat.st_size)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        return [read_at(self._file.fileno(), stop - start, start) for start, stop in ranges]
+        with named_errors(self.name):
+            return [read_at(self._file.fileno(), stop - start, start) for start, stop in ranges]
 
     def _is_other(self) -> bool:
         now = os.fstat(self._file.fileno())

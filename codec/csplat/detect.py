@@ -17,7 +17,7 @@ from pathlib import Path
 from csplat._spec import MAGIC
 from csplat.archives import folder_refusal, zip_refusal
 from csplat.errors import InputError
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, open_binary
 
 #: Size of the beginning of a file that identifies it, bytes.
 HEAD_SIZE = 512
@@ -25,10 +25,12 @@ HEAD_SIZE = 512
 _SPLAT_TRANSFORM = "splat-transform (npm package @playcanvas/splat-transform)"
 _NOT_READ = "which csplat does not read: convert it to PLY first, with"
 _NO_SPLATS = "not a scene of splats"
+_PROJECT = "not a scene: export the splats as PLY in that program"
 _PLY_HEADER_SIZE = 1 << 16  # bytes within which a compressed PLY declares its packed columns
 _KSPLAT_HEAD = 44  # used bytes of .ksplat's header; the rest are 0
 _SPLAT_ROW_SIZE = 32  # bytes of one splat in a .splat file
 _SAFETENSORS_HEAD = 100_000_000  # maximum size of the JSON header of safetensors, bytes
+_LCC_PARTS = {"data.bin", "index.bin", "shcoef.bin", "environment.bin", "attrs.lcp"}  # files next to an LCC's index
 _MANIFESTS = {"meta.json", "lod-meta.json"}  # manifests in a SOG file
 _PLY, _CSPLAT = "ply", "csplat"
 
@@ -88,21 +90,22 @@ def read_head(path: Path) -> bytes:
     """
     if path.is_dir():
         return b""
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         return stream.read(HEAD_SIZE)
 
 
-def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
+def refusal(path: Path, head: bytes, *, wanted: str = "", shown: str = "") -> InputError:
     """Return the error for a file of the wrong kind; it names the kind and a remedy.
 
     Args:
         path: path of the file.
         head: as in `detect_content`.
         wanted: name of the only kind that the caller reads; "" if it reads all formats of csplat.
+        shown: name of the file, if it is a copy; "": `path`.
     """
     if path.is_dir() and wanted and not detect_content(path, head):
         return InputError(f"{path.name} is a folder, expected a {KINDS[wanted].title}")
-    if path.is_dir() and not wanted:
+    if path.is_dir() and not wanted and not detect_content(path, head):
         return InputError(folder_refusal(path))
     if not (head or path.is_dir()):
         return InputError(f"{path.name} is empty" + (f", expected a {KINDS[wanted].title}" if wanted else ""))
@@ -123,7 +126,7 @@ def refusal(path: Path, head: bytes, *, wanted: str = "") -> InputError:
         return InputError(f"{path.name} is {state}: {begin}" + ("; expected Gaussian splats" if wanted else ""))
     if wanted == _CSPLAT:
         title = f"a {kind.title}" if kind.name == _PLY else kind.title
-        return InputError(f"{path} is {title}, expected a .csplat file: convert it with `csplat encode`")
+        return InputError(f"{shown or path} is {title}, expected a .csplat file: convert it with `csplat encode`")
     tool = "`csplat decode`" if kind.name == _CSPLAT else "`csplat convert`, or use csplat.read, which reads it"
     return InputError(f"{path.name} is {kind.title}, not a plain PLY: convert it to PLY first, with {tool}")
 
@@ -138,13 +141,18 @@ def is_ply(head: bytes) -> bool:
     return head[:3].lower() == b"ply" and head[3:].lstrip(b" \t")[:1] in (b"\n", b"\r")
 
 
-def _is_compressed_ply(path: Path, head: bytes) -> bool:
-    if not is_ply(head):
-        return False
-    if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
-        with path.open("rb") as stream:
-            head = stream.read(_PLY_HEADER_SIZE)
-    return b"packed_position" in head.partition(b"end_header")[0]
+def _declares(word: bytes) -> Callable[[Path, bytes], bool]:
+    """Return a test for PLYs with a word in their headers."""
+
+    def matches(path: Path, head: bytes) -> bool:
+        if not is_ply(head):
+            return False
+        if b"end_header" not in head and path.is_file():  # packed columns are declared after bounds and comments
+            with open_binary(path) as stream:
+                head = stream.read(_PLY_HEADER_SIZE)
+        return word in head.partition(b"end_header")[0]
+
+    return matches
 
 
 def _is_spz(_path: Path, head: bytes) -> bool:
@@ -207,6 +215,28 @@ def _is_json(_path: Path, head: bytes) -> bool:
     return begins and not any(byte < 32 and byte not in b"\t\n\r" for byte in text)
 
 
+def _is_lcc(path: Path, head: bytes) -> bool:
+    """Return True for the index of an LCC scene, its folder, or another file of it."""
+    if path.is_dir():
+        return _holds(path, ".lcc")
+    if path.name.lower() in _LCC_PARTS:
+        return _holds(path.parent, ".lcc")
+    return _is_json(path, head) and (path.suffix.lower() == ".lcc" or b'"cellLengthX"' in head)
+
+
+def _is_lcc2(path: Path, head: bytes) -> bool:
+    if path.is_dir():
+        return _holds(path, ".lcc2")
+    return _is_json(path, head) and (path.suffix.lower() == ".lcc2" or b'"splatType"' in head)
+
+
+def _holds(folder: Path, suffix: str) -> bool:
+    try:
+        return any(one.suffix.lower() == suffix for one in folder.iterdir())
+    except OSError:
+        return False
+
+
 def _is_safetensors(_path: Path, head: bytes) -> bool:
     return head[8:10] == b'{"' and 0 < int.from_bytes(head[:8], "little") < _SAFETENSORS_HEAD
 
@@ -219,13 +249,28 @@ def _is_usd(path: Path, head: bytes) -> bool:
 KINDS: dict[str, FileKind] = {
     kind.name: kind
     for kind in (
-        FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _is_compressed_ply),
+        FileKind("compressed-ply", "compressed PLY", (".compressed.ply",), _declares(b"packed_position")),
+        FileKind(
+            "codebook-ply",
+            "a PLY with codebooks (Reducing the Memory Footprint of 3D Gaussian Splatting)",
+            (),
+            _declares(b"element codebook_centers"),
+            "which csplat does not read: save it there without quantisation",
+        ),
         FileKind(_PLY, "PLY", (".ply",), lambda _path, head: is_ply(head)),
         FileKind(_CSPLAT, "csplat", (".csplat",), _starts_with(MAGIC)),
         FileKind("spz", "SPZ", (".spz",), _is_spz),
         FileKind("spz4", "SPZ 4", (".v4.spz",)),
         FileKind("splat", ".splat", (".splat",)),
         FileKind("ksplat", ".ksplat", (".ksplat",), _is_ksplat),
+        FileKind("lcc", "LCC", (".lcc",), _is_lcc, f"{_NOT_READ} {_SPLAT_TRANSFORM}, which takes the .lcc file"),
+        FileKind(
+            "lcc2",
+            "LCC2",
+            (".lcc2",),
+            _is_lcc2,
+            "which csplat does not read: its splats are .sog or .spz files in data/3dgs, which csplat reads one by one",
+        ),
         FileKind("sog", "SOG", (".sog", "meta.json", "lod-meta.json"), _is_sog),
         FileKind(
             "tileset", "a tileset of 3D Tiles", (), _is_tileset, "which csplat does not read: its tiles are .glb files"
@@ -233,7 +278,18 @@ KINDS: dict[str, FileKind] = {
         FileKind("gltf", "glTF", (".glb", ".gltf"), _is_gltf),
         FileKind("checkpoint", "a checkpoint of gsplat, splatfacto or INRIA", (".pt", ".ckpt"), _zip_with("/data.pkl")),
         FileKind("spx", ".spx", (".spx",), _starts_with(b"spx\1", b"spx\2", b"spx\3"), f"{_NOT_READ} gsbox"),
-        FileKind("lcc", "LCC", (".lcc",), remedy=f"{_NOT_READ} {_SPLAT_TRANSFORM}"),
+        FileKind("parquet", "Parquet", (".parquet",), _starts_with(b"PAR1"), f"{_NOT_READ} the program that wrote it"),
+        FileKind(
+            "splatv",
+            ".splatv of splaTV",
+            (".splatv",),
+            _starts_with(b"\x4b\x67\0\0"),
+            "splats that move, which csplat does not read",
+        ),
+        FileKind("psht", "a project of Postshot", (".psht",), remedy=_PROJECT),
+        FileKind("licht", "a project of LichtFeld Studio", (".licht",), remedy=_PROJECT),
+        FileKind("blend", "a file of Blender", (".blend",), _starts_with(b"BLENDER"), _PROJECT),
+        FileKind("draco", "Draco", (".drc",), _starts_with(b"DRACO"), f"a mesh or point cloud, {_NO_SPLATS}"),
         FileKind(
             "rad",
             "RAD of Spark",

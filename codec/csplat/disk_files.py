@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import codecs
 import io
+import itertools
 import json
 import math
 import os
 import re
 import shutil
-import threading
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape
 from mmap import mmap
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,13 +25,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError
-from csplat.file_source import File, describe_substitute
+from csplat.file_source import File, describe_substitute, named_errors, open_binary, read_bytes
+from csplat.system import take_permissions
 
+# As the value of a member; or in a list, since JSON has no numbers that begin with 00 to 09.
+_DECIMAL_COMMA = re.compile(r'":\s*([+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*[,}\n]|[\[,]\s*(-?\d+,0\d+)')
+_TRAILING_BYTE = re.compile(r"([\udc81-\udcfe])\\(?!\\)")  # a backslash that ends a character of Shift-JIS, GBK or Big5
 _PART_SIZE = 1 << 20  # bytes copied at a time
+_NAME_PART = 20  # characters of a file's name in that of its temporary file, which must not be longer than 255 bytes
+_TEMPORARY = "csplat-"  # beginning of the names of files in the system's folder for temporary files
+_numbers = itertools.count()  # tells the temporary files of this process apart
 _MB = 1e6  # bytes
 #: Exceptions that NumPy raises for damaged headers of arrays.
 _NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
-_INTEGER_DIGITS = 300  # maximum digits of an integer in JSON; longer ones exceed float64
+_INTEGER_DIGITS = 300  # digits of the longest integer in JSON; longer ones exceed float64
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # an escape in JSON
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -52,11 +61,13 @@ _MARKS = (
 )
 
 
-def read_text(path: str | os.PathLike[str]) -> str:
+def read_text(path: str | os.PathLike[str], *, any_bytes: bool = False) -> str:
     """Read a text file in UTF-8, or in the encoding of its byte order mark.
 
     Args:
         path: path of the file.
+        any_bytes: keep bytes that are not UTF-8 as lone surrogates, as `os.fsdecode` does, for file names in the code
+            page of another system; False: refuse them.
 
     Returns:
         The text without the mark, with line feeds as line ends.
@@ -65,7 +76,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
         InputError: the file cannot be read, has another encoding, or is not text.
     """
     try:
-        data = Path(path).read_bytes()
+        data = read_bytes(path)
     except OSError as error:
         raise InputError(f"{os.fspath(path)}: {error.strerror or error}") from error
     instead = describe_substitute(data[:64])
@@ -73,7 +84,7 @@ def read_text(path: str | os.PathLike[str]) -> str:
         raise InputError(f"{os.fspath(path)} is {instead}")
     encoding = next((name for mark, name in _MARKS if data.startswith(mark)), "utf-8")
     try:
-        text = data.decode(encoding)
+        text = data.decode(encoding, "surrogateescape" if any_bytes and encoding.startswith("utf-8") else "strict")
     except UnicodeDecodeError as error:
         found = f"byte {error.start} is 0x{data[error.start]:02x}, which is not {encoding.removesuffix('-sig').upper()}"
         raise InputError(f"{os.fspath(path)} is not a text file in UTF-8 ({found}): save it as UTF-8") from None
@@ -84,17 +95,23 @@ def read_text(path: str | os.PathLike[str]) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def read_json(path: str | os.PathLike[str]) -> Any:
+def read_json(path: str | os.PathLike[str], *, any_bytes: bool = False) -> Any:
     """Read a JSON file, in the encodings of `read_text`; otherwise as `parse_json`.
+
+    Args:
+        path: path of the file.
+        any_bytes: as in `read_text`.
 
     Raises:
         InputError: the file cannot be read or is not JSON.
     """
-    text = read_text(path)
+    text = read_text(path, any_bytes=any_bytes)
     try:
-        return parse_json(text)
+        return parse_json(_TRAILING_BYTE.sub(r"\1\\\\", text) if any_bytes else text)
     except InputError as error:
-        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}") from None
+        comma = _DECIMAL_COMMA.search(text)
+        hint = f"; it has a decimal comma, {comma[1] or comma[2]}, expected a point" if comma else ""
+        raise InputError(f"{os.fspath(path)} is not a JSON file: {error}{hint}") from None
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -171,42 +188,85 @@ def local_file(file: File, name: str = "") -> Iterator[Path]:
         if not path.is_fifo():
             yield path
             return
-        with path.open("rb") as pipe, local_file(pipe) as copied:
+        with open_binary(path) as pipe, local_file(pipe, path.name if path.suffix else "pipe") as copied:
             yield copied
             return
-    with TemporaryDirectory(
-        prefix="csplat-", ignore_cleanup_errors=True
-    ) as folder:  # Windows: the copy may still be mapped
-        own = getattr(file, "name", None)
-        spool = Path(folder) / (name or (Path(own).name if isinstance(own, str) else "") or "data")
-        with _name_errors(spool), spool.open("wb") as stream:
-            for part in _parts(file):
+    own = getattr(file, "name", None)
+    own = own if isinstance(own, str) else ""
+    with temporary_folder() as folder:
+        spool = folder / (name or Path(own).name or "data")
+        with open_binary(spool, "x") as stream:
+            for part in _parts(file, own or name or "the input"):
                 stream.write(part)
         yield spool
 
 
-def _parts(file: Any) -> Iterator[memoryview]:
-    """Yield the bytes of a binary file or buffer in pieces."""
+def _parts(file: Any, name: str) -> Iterator[memoryview]:
+    """Yield the bytes of a binary file or buffer in pieces; errors of reading get its name."""
     try:
         if isinstance(file, mmap) or not hasattr(file, "read"):
             yield memoryview(file).cast("B")
             return
-        while data := file.read(_PART_SIZE):
+        while data := _read_part(file, name):
             yield memoryview(data)
     except (TypeError, ValueError) as error:  # ValueError: text that does not decode
-        name = type(file).__name__
-        raise InputError(f"file is a {name}, expected a path, a binary file or bytes: {error}") from None
+        kind = type(file).__name__
+        raise InputError(f"file is a {kind}, expected a path, a binary file or bytes: {error}") from None
+
+
+def _read_part(file: Any, name: str) -> Any:
+    with named_errors(name):
+        return file.read(_PART_SIZE)
+
+
+def temporary_root() -> str:
+    """Return the folder for temporary files, which the environment variable TMPDIR sets.
+
+    Raises:
+        InputError: there is none that can be written.
+    """
+    try:
+        return tempfile.gettempdir()
+    except FileNotFoundError as error:
+        refused = InputError(f"{error.strerror}: set TMPDIR to a folder that can be written")
+        refused.path = "TMPDIR"  # not the file that was to be copied
+        raise refused from None
 
 
 @contextmanager
-def _name_errors(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Add the name of the file to errors that lack one."""
-    try:
-        yield
-    except OSError as error:
-        if error.filename is None:
-            error.filename = os.fspath(path)
-        raise
+def temporary_folder() -> Iterator[Path]:
+    """Yield a new folder for temporary files, which is deleted afterwards.
+
+    Raises:
+        InputError: no folder for temporary files can be written.
+        OSError: the disk is full.
+    """
+    with TemporaryDirectory(
+        prefix=_TEMPORARY, dir=temporary_root(), ignore_cleanup_errors=True
+    ) as folder:  # Windows: files in it may still be mapped
+        yield Path(folder)
+
+
+def temporary_file() -> BinaryIO:
+    """Open a temporary file for writing and reading, which vanishes when it is closed.
+
+    Raises:
+        InputError: no folder for temporary files can be written.
+    """
+    path = Path(temporary_root(), f"{_TEMPORARY}{os.urandom(8).hex()}")
+    vanishes = getattr(os, "O_TEMPORARY", 0)  # on Windows
+    stream = open_binary(path, "x+", permissions=0o600, flags=vanishes)
+    if not vanishes:
+        path.unlink()
+    return stream
+
+
+def is_temporary(path: str) -> bool:
+    """Return True for the path of a file of `temporary_folder` or `temporary_file`, which users do not know."""
+    if tempfile.tempdir is None:  # none has been needed
+        return False
+    parts, root = Path(path).parts, Path(tempfile.tempdir).parts
+    return parts[: len(root)] == root and parts[len(root) :] != () and parts[len(root)].startswith(_TEMPORARY)
 
 
 @contextmanager
@@ -227,14 +287,16 @@ def open_writer(file: str | os.PathLike[str] | BinaryWriter) -> Iterator[BinaryW
 
 
 @contextmanager
-def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iterator[BinaryIO]:
+def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekable: bool = False) -> Iterator[BinaryIO]:
     """Write a file that appears under its name only when complete.
 
     Bytes go to a temporary file in the same folder, which is renamed on success and removed on any error. The target
-    of a symbolic link is replaced, not the link. Devices and pipes are written directly.
+    of a symbolic link is replaced, not the link. A file that is replaced keeps its permissions, and if possible its
+    owner and group; other hard links keep the older content. Devices and pipes are written directly, if possible.
 
     Args:
         path: path of the file to write.
+        seekable: the caller seeks; what a pipe gets is complete before.
         replace: replace an existing file; False also keeps a file that another process creates in the meantime.
 
     Yields:
@@ -244,30 +306,79 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True) -> Iter
         FileExistsError: the file exists and `replace` is False.
         OSError: the folder does not exist, is full or is not writable.
     """
-    if Path(path).exists() and not Path(path).is_file():
-        with (
-            _name_errors(path),
-            Path(path).open("wb") as stream,
-        ):  # not resolved: /dev/stdout may point to an unnamed pipe
-            yield stream
+    if Path(path).exists() and not Path(path).is_file():  # not resolved: /dev/stdout may point to an unnamed pipe
+        with open_binary(path, "w") as stream:
+            if not seekable or stream.seekable():
+                yield stream
+                return
+            with temporary_file() as spool:
+                yield spool
+                spool.seek(0)
+                shutil.copyfileobj(spool, stream, _PART_SIZE)
         return
-    target = Path(path).resolve()
-    temporary = target.with_name(f".{target.name}.{os.getpid()}.{threading.get_ident()}.tmp")
+    target = resolve_links(path)
+    old = target.stat() if target.exists() else None
+    temporary = _temporary_name(target)
     try:
-        with temporary.open("xb") as stream:
+        permissions = 0o666 if old is None else 0o600  # until it has those of the old file
+        with open_binary(temporary, "x", name=path, permissions=permissions) as stream:
+            if old is not None:
+                take_permissions(stream.fileno(), old)
             yield stream
             stream.flush()
-            os.fsync(stream.fileno())  # the bytes must reach the disk before the name
+            with named_errors(path):
+                os.fsync(stream.fileno())  # the bytes must reach the disk before the name
         if replace:
             temporary.replace(target)
         else:
             _take_name(temporary, target)
     except BaseException as error:
-        with suppress(FileNotFoundError):
+        with suppress(OSError):
             temporary.unlink()
-        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            error.filename = os.fspath(path)  # report the caller's name
+        _report_as(path, temporary, error)
         raise
+
+
+def resolve_links(path: str | os.PathLike[str]) -> Path:
+    """Return the absolute path of a file that may not exist yet, without symbolic links.
+
+    Raises:
+        OSError: the path cannot name a file: its links form a loop, a name is too long, or a parent is a file.
+    """
+    with suppress(FileNotFoundError):
+        Path(path).stat()  # `exists` hides loops of links, for which `resolve` raises a RuntimeError, or nothing
+    return Path(path).resolve()
+
+
+def _temporary_name(target: Path) -> Path:
+    """Return an unused name in the same folder, which is not longer than 255 bytes, with the number of the process."""
+    return target.with_name(f".{target.name[:_NAME_PART]}.{os.getpid()}.{next(_numbers)}.tmp")
+
+
+def remove_unfinished(path: str | os.PathLike[str], pid: int) -> None:
+    """Remove the temporary files of a process that was killed while it wrote a file by `atomic_writer`.
+
+    Args:
+        path: path of the file.
+        pid: number of the process.
+    """
+    target = Path(path)
+    for file in target.parent.glob(f".{escape(target.name[:_NAME_PART])}.{pid}.*.tmp"):
+        file.unlink(missing_ok=True)
+
+
+def _report_as(path: str | os.PathLike[str], temporary: Path, error: BaseException) -> None:
+    """Replace the name of a temporary file or folder in an error by the name that the caller knows."""
+    if isinstance(error, OSError) and isinstance(error.filename, str):
+        failed = Path(error.filename)
+        if failed.is_relative_to(temporary):
+            error.filename = str(Path(path, failed.relative_to(temporary)))
+
+
+def work_folder(path: str | os.PathLike[str]) -> Path:
+    """Return the folder for temporary files of an output: its own, or for a device or pipe that of the system."""
+    target = Path(path)
+    return Path(temporary_root()) if target.exists() and not target.is_file() else target.parent
 
 
 @contextmanager
@@ -283,10 +394,12 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     Raises:
         OSError: the parent folder does not exist, is full or is not writable.
     """
-    target = Path(path).resolve()
-    temporary, old = (target.with_name(f".{target.name}.{os.getpid()}.{end}") for end in ("tmp", "old"))
+    target = resolve_links(path)
+    temporary, old = _temporary_name(target), _temporary_name(target)
     try:
         temporary.mkdir()
+        if target.exists():
+            shutil.copymode(target, temporary)
         yield temporary
         if target.exists():
             target.rename(old)
@@ -295,8 +408,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         if old.exists() and not target.exists():
             old.rename(target)
-        if isinstance(error, OSError) and error.filename in (None, str(temporary)):
-            error.filename = os.fspath(path)  # report the caller's name
+        _report_as(path, temporary, error)
         raise
     shutil.rmtree(old, ignore_errors=True)
 
@@ -348,7 +460,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
     if Path(path).exists() and not Path(path).is_file():
         raise InputError(f"{path} is not a file")
     size = Path(path).stat().st_size
-    with Path(path).open("rb") as stream:
+    with open_binary(path) as stream:
         if instead := describe_substitute(stream.read(64)):
             raise InputError(f"{path} is {instead}")
         stream.seek(0)
@@ -372,7 +484,7 @@ def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
         InputError: it is not an array, contains Python objects, or has more or fewer bytes than its shape requires.
     """
     try:
-        with warnings.catch_warnings(action="ignore"):  # about headers that Python 2 wrote
+        with warnings.catch_warnings(action="ignore"):  # Python 2 wrote headers that NumPy warns of
             version = np.lib.format.read_magic(stream)
             if version not in _HEADER_READERS:
                 raise InputError(f"it is an array file of version {version[0]}.{version[1]}, expected 1.0 or 2.0")
@@ -386,7 +498,7 @@ def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
     if min(shape, default=0) < 0 or count * dtype.itemsize != rest:
         text = f"its shape is {', '.join(str(side)[:20] for side in shape[:4])}" if shape else "it is a single value"
         raise InputError(f"{text} of type {dtype}, which does not fit its {rest:,} bytes of values")
-    data = np.empty(rest, np.uint8)
+    data: NDArray[Any] = np.empty(rest, np.uint8)
     for start in range(0, rest, _PART_SIZE):
         part = data[start : start + _PART_SIZE].data
         if stream.readinto(part) != len(part):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
 import mmap as mmaps
 import os
 import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
-from pathlib import Path
-from typing import Protocol
+from typing import Any, BinaryIO, Protocol, overload
 
 _LFS = "Git LFS, not the file itself: run `git lfs pull`"
 #: First bytes of pointer files in repositories, with program and remedy.
@@ -42,11 +44,116 @@ def map_file(path: str | os.PathLike[str]) -> bytes | mmap:
     Raises:
         OSError: the file cannot be read.
     """
-    with Path(path).open("rb") as stream:
+    with open_binary(path) as stream:
         try:
             return mmap(stream.fileno(), 0, access=ACCESS_READ)
         except (ValueError, OSError):  # empty, or a pipe
             return stream.read()
+
+
+@contextmanager
+def named_errors(name: str | os.PathLike[str]) -> Iterator[None]:
+    """Add the name of a file to errors of the operating system that lack one: those of reading, writing and closing."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None and error.errno is not None:
+            error.filename = os.fspath(name)
+        raise
+
+
+class _NamedFile(io.FileIO):
+    """An unbuffered file whose errors all have its name, not only that of opening it."""
+
+    def __init__(self, path: str, mode: str, name: str, opener: Callable[[str, int], int]) -> None:
+        self._label = name
+        super().__init__(path, mode, opener=opener)
+
+    def read(self, size: int | None = -1, /) -> Any:
+        with named_errors(self._label):
+            return super().read(-1 if size is None else size)
+
+    def readall(self) -> Any:
+        with named_errors(self._label):
+            return super().readall()
+
+    def readinto(self, buffer: Any, /) -> Any:
+        with named_errors(self._label):
+            return super().readinto(buffer)
+
+    def write(self, data: Any, /) -> Any:
+        with named_errors(self._label):
+            return super().write(data)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET, /) -> int:
+        with named_errors(self._label):
+            return super().seek(offset, whence)
+
+    def close(self) -> None:
+        with named_errors(self._label):
+            super().close()
+
+
+@overload
+def open_binary(path: str | os.PathLike[str]) -> io.BufferedReader: ...
+
+
+@overload
+def open_binary(
+    path: str | os.PathLike[str],
+    mode: str,
+    *,
+    name: str | os.PathLike[str] | None = None,
+    permissions: int = 0o666,
+    flags: int = 0,
+) -> BinaryIO: ...
+
+
+def open_binary(
+    path: str | os.PathLike[str],
+    mode: str = "r",
+    *,
+    name: str | os.PathLike[str] | None = None,
+    permissions: int = 0o666,
+    flags: int = 0,
+) -> io.BufferedReader | BinaryIO:
+    """Open a file on disk; errors of reading, writing and closing have its name, not only that of opening.
+
+    Args:
+        path: path of the file.
+        mode: as for `open`, without "b".
+        name: name of the file in messages, if it differs from `path`.
+        permissions: permissions of a file that is created, reduced by the process's umask.
+        flags: further flags of `os.open`.
+
+    Raises:
+        OSError: the file cannot be opened.
+    """
+    opener = lambda path, own: os.open(path, own | flags, permissions)  # noqa: E731  # one line, used once
+    file = _NamedFile(os.fspath(path), mode, os.fspath(path if name is None else name), opener)
+    kind: Any = io.BufferedRandom if "+" in mode else io.BufferedReader if mode == "r" else io.BufferedWriter
+    opened: BinaryIO = kind(file)
+    return opened
+
+
+def read_bytes(path: str | os.PathLike[str]) -> bytes:
+    """Read a file.
+
+    Raises:
+        OSError: the file cannot be read; it has its name.
+    """
+    with open_binary(path) as stream:
+        return stream.read()
+
+
+def write_file(path: str | os.PathLike[str], data: bytes) -> None:
+    """Write a file whose name need not be kept for complete content, as in a temporary folder.
+
+    Raises:
+        OSError: the file cannot be written; it has its name.
+    """
+    with open_binary(path, "w") as stream:
+        stream.write(data)
 
 
 def describe_substitute(head: bytes) -> str:

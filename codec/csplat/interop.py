@@ -23,7 +23,7 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model, normalise_quats
-from csplat.ply.columns import alpha_of_logits, logits_of_alpha
+from csplat.ply.columns import alpha_of_logits, flatten_scales, logits_of_alpha
 from csplat.types import F32
 
 if TYPE_CHECKING:
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 Form = Literal["parameters", "activated"]
 
 _REQUIRED = ("means", "quats", "scales", "opacities", "sh0")
+#: Names in checkpoints of gsplat's simple_trainer with `app_opt`, and of splatfacto-w.
+_APPEARANCE = ("features", "appearance_features")
 _SPLATS = "splats"  # key of the splats in gsplat's checkpoints
 
 
@@ -67,7 +69,8 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
         splats = splats[_SPLATS]
     missing = [name for name in _REQUIRED if name not in splats]
     if missing:
-        hint = "; it was trained with appearance features, which are not SH" if "features" in splats else ""
+        learnt = any(name in splats for name in _APPEARANCE)
+        hint = "; it was trained with appearance features, which are not SH" if learnt else ""
         raise InputError(f"the splats have no {', '.join(missing)}, expected gsplat's names{hint}")
     means, quats, scales, opacities, sh0 = (_array(name, splats[name]) for name in _REQUIRED)
     count = len(means) if means.ndim else 0
@@ -79,10 +82,12 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
     opacities = _reshape("opacities", opacities, (count,), (count, 1))
     if form == "parameters":
         opacities = alpha_of_logits(opacities)
-    elif (scales > 0.0).all():
-        scales = np.log(scales.astype(np.float64)).astype(np.float32)
+    elif (scales >= 0.0).all():
+        with np.errstate(divide="ignore"):
+            scales = np.log(scales.astype(np.float64)).astype(np.float32)
     else:
-        raise InputError('scales are not all above 0: use form="parameters" for logarithms')
+        raise InputError('scales are not all at least 0: use form="parameters" for logarithms')
+    flatten_scales(scales.reshape(-1, 1))  # a view
     sh0 = _reshape("sh0", sh0, (count, 3), (count, 1, 3))
     return SplatModel(means, normalise_quats(quats), scales, opacities, sh0, shN)
 

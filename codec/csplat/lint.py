@@ -1,7 +1,8 @@
 """Describe findings about splat files: unusual or invalid content and its repair.
 
 A *note* is ordinary variation; nothing is lost or looks different. A *repair* changes or drops data safely; `strict`
-refuses it. An *error* cannot be repaired without guessing.
+refuses it. An *error* cannot be repaired without guessing. A *loss* is found while writing: the target cannot hold
+part of the scene.
 
 | id | meaning | kind |
 |---|---|---|
@@ -21,6 +22,9 @@ refuses it. An *error* cannot be repaired without guessing.
 | `zero-quats` | rotations of length 0: replaced by the identity | repair |
 | `unnormalised-quats` | rotations that are not of unit length: normalised, as in every renderer | note |
 | `infinite-logits` | opacities of exactly 0 or 1 | note |
+| `zero-scales` | log scales of -infinity, which are sizes of 0: read as flat | note |
+| `one-scale` | one scale instead of three: spheres, which may have no rotations | note |
+| `packed-colours` | three bytes of colour in a row, of which the header declares one (nerfstudio) | note |
 | `flat-scales` | two scales instead of three: discs (2DGS) | note |
 | `nonzero-normals` | normals, which splats do not use: dropped | note |
 | `huge-values` | log scales beyond ± 88, colours beyond ± 1e6 | note |
@@ -54,6 +58,10 @@ refuses it. An *error* cannot be repaired without guessing.
 | `unclear-scales` | no scale is negative, but the program is known to write logarithms (glTF) | note |
 | `spz-axes` | SPZ in glTF along other axes than its extension names | note |
 | `short-buffer` | a buffer of glTF is shorter than declared, but holds all splats | note |
+| `lost-contents` | parts of the scene that the target format does not have: SH bands, axes, metadata | loss |
+| `clamped-values` | values of an attribute beyond the range of the target format: clamped | loss |
+| `moved-splats` | positions that the target format rounds by more than the size of their splats | loss |
+| `filling-splats` | invisible splats that fill chunks of a compressed PLY, so that far splats have their own | loss |
 """
 
 from __future__ import annotations
@@ -65,7 +73,7 @@ from typing import Literal
 from csplat.errors import InputError, counted
 from csplat.model import MAX_SH_DEGREE
 
-FindingKind = Literal["note", "repair", "error"]
+FindingKind = Literal["note", "repair", "error", "loss"]
 
 
 @dataclass(frozen=True)
@@ -76,8 +84,10 @@ class Finding:
         id: id in the table above, stable across versions.
         count: number of splats, columns, elements or bytes affected.
         text: one line that describes the finding and its treatment.
-        kind: `note`, `repair` or `error`.
+        kind: `note`, `repair`, `error` or `loss`.
         usual: True if most trained scenes have the finding; it is shown only if all findings are requested.
+        attribute: name of the array concerned; "" if the finding is not about one.
+        largest_error: largest difference from the source among the values of the attribute; `None`: unknown.
     """
 
     id: str
@@ -85,6 +95,8 @@ class Finding:
     text: str
     kind: FindingKind
     usual: bool = False
+    attribute: str = ""
+    largest_error: float | None = None
 
     @property
     def repairable(self) -> bool:

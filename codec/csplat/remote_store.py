@@ -6,6 +6,7 @@ import errno
 import os
 import re
 import stat
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,19 @@ _URL = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*(://|::)")
 _LINK = r"(?!::[A-Za-z][A-Za-z0-9+.-]*(?:://|::))"
 #: A URL in any text: scheme, user and password, host and path, query and fragment.
 _URL_IN_TEXT = re.compile(rf"([A-Za-z][A-Za-z0-9+.-]*://)(?:[^\s/?#]*@)?((?:{_LINK}[^\s?#])*)(?:[?#](?:{_LINK}\S)*)?")
-#: Protocols of servers that may ignore a range request and send the whole file.
 _WEB = {"http", "https"}
+_RANGE = re.compile(r"bytes=(\d+)-(\d+)")
+_CONTENT_RANGE = re.compile(r"\s*bytes\s+(\d+)-\d+/", re.IGNORECASE)
+#: Status codes of servers that are overloaded or being restarted.
+_BUSY = {408, 429, 502, 503, 504}
+_WHOLE, _PART, _FORBIDDEN = 200, 206, 403  # status codes of HTTP
+_COMPRESSED = (
+    "the server sends the file compressed (Content-Encoding{}), so no parts can be read: store it there without, or"
+    " download it"
+)
+_SILENCE = 30.0  # seconds without a byte after which a connection counts as lost; proxies wait up to 60 s for others
+_LONGEST_WAIT = 60.0  # seconds; a server that asks for a longer break has an error reported instead
+_MAX_ROUNDS = 1000  # answers from which a range is put together: 8 MiB in pieces of 8 KiB
 #: Fields that identify a version of a file, under the names of fsspec's file systems.
 _VERSION = (
     "size", "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "created", "VersionId",
@@ -56,16 +68,33 @@ def open_store(file: File, storage: Mapping[str, Any] | None = None) -> Store:
     return MemoryStore(file)
 
 
+class _BusyError(Exception):
+    """A server is busy.
+
+    Attributes:
+        status: HTTP status.
+        wait: seconds after which the server asks to try again; `None` if it does not say.
+    """
+
+    def __init__(self, status: int, wait: float | None) -> None:
+        super().__init__(f"HTTP status {status}")
+        self.status = status
+        self.wait = wait
+
+
 class RemoteStore(Store):
-    """A file at a URL. fsspec manages retries and connections, which it keeps for the next file."""
+    """A file at a URL.
+
+    fsspec manages connections, which it keeps for the next file. Requests to web servers are repeated after the breaks
+    of `RequestSizes.waits`, and short answers are continued; the libraries of other stores repeat theirs.
+    """
 
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
         self._fs, self._path = _file_system(url, options)
         self._shown = _redact(url)
         names = self._fs.protocol
         self._web = not _WEB.isdisjoint((names,) if isinstance(names, str) else names)
-        self._supports_ranges = not self._web
-        self._info = self._read_info()
+        self._info = self._read_info(self.sizes.waits)
         size = self._info.get("size")
         if self._info.get("type") == "directory":
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), self._shown)
@@ -74,54 +103,87 @@ class RemoteStore(Store):
         super().__init__(self._shown, size, requests=1)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
-        parts: list[bytes] = []
-        while not self._supports_ranges and len(parts) < len(ranges):
-            parts.append(self._read_checked(*ranges[len(parts)]))
-        rest = ranges[len(parts) :]
+        parts = [b""] * len(ranges)
+        repeats = 0
+        for round_ in range(_MAX_ROUNDS):
+            missing = [at for at, (start, stop) in enumerate(ranges) if len(parts[at]) < stop - start]
+            if not missing:
+                break
+            self.requests += len(missing) if round_ else 0  # `read` has counted the first ones
+            lost: BaseException | None = None
+            answers = self._answers([(ranges[at][0] + len(parts[at]), ranges[at][1]) for at in missing])
+            for at, answer in zip(missing, answers, strict=True):
+                if isinstance(answer, BaseException):
+                    lost = answer
+                else:
+                    parts[at] += answer
+            if lost is not None:
+                self._wait(lost, repeats, self.sizes.waits)
+                repeats += 1
+            elif not (self._web and any(answers)):
+                break
+        return parts
+
+    def _answers(self, ranges: Sequence[tuple[int, int]]) -> list[Any]:
+        """Request ranges; return bytes, which may be too few, or an exception for each."""
+        starts, stops = zip(*ranges, strict=True)
         # File systems without coroutines open files, which would read ahead.
         cache = {} if self._fs.async_impl else {"cache_type": "none"}
-        starts, stops = [start for start, _ in rest], [stop for _, stop in rest]
+        paths = [self._path] * len(ranges)
         try:
-            found: list[Any] = self._fs.cat_ranges([self._path] * len(rest), starts, stops, on_error="return", **cache)
+            found: list[Any] = self._fs.cat_ranges(paths, list(starts), list(stops), on_error="return", **cache)
         except Exception as error:  # noqa: BLE001  # stores raise the exceptions of their libraries
-            raise self._failure(error) from None
-        for one in found:
-            if isinstance(one, BaseException):
-                raise self._failure(one) from None
-        return parts + found
+            return [error] * len(ranges)
+        return found
 
-    def _read_checked(self, start: int, stop: int) -> bytes:
-        """Read a range from a server that may not support ranges, which fsspec's file object detects early."""
-        try:
-            with self._fs.open(self._path, "rb", cache_type="none", size=self.size) as stream:
-                stream.seek(start)
-                part: bytes = stream.read(stop - start)
-        except ValueError:  # raised by fsspec
-            raise StoreError(f"{self.name}: the server sends only whole files, no parts (HTTP Range)") from None
-        except Exception as error:  # noqa: BLE001  # as above
-            raise self._failure(error) from None
-        self._supports_ranges = start > 0  # a server without ranges also returns the beginning
-        return part
+    def _read_info(self, waits: Sequence[float]) -> dict[str, Any]:
+        repeats = 0
+        while True:
+            try:
+                info: dict[str, Any] = self._fs.info(self._path)
+            except Exception as error:  # noqa: BLE001  # as above
+                self._wait(error, repeats, waits)
+                repeats += 1
+            else:
+                return info
 
-    def _read_info(self) -> dict[str, Any]:
-        try:
-            info: dict[str, Any] = self._fs.info(self._path)
-        except Exception as error:  # noqa: BLE001  # as above
-            raise self._failure(error) from None
-        return info
+    def _wait(self, error: BaseException, repeats: int, waits: Sequence[float]) -> None:
+        """Wait before a request is repeated.
+
+        Args:
+            error: an exception of fsspec.
+            repeats: number of repetitions so far.
+            waits: break before each repetition, seconds, unless the server specifies it.
+
+        Raises:
+            StoreError, OSError, InputError: the error, if it is permanent, or was the last one.
+        """
+        cause = self._cause(error)
+        if not (self._web and repeats < len(waits) and _is_transient(cause)):
+            raise self._failure(error, repeats) from None
+        wait = waits[repeats]
+        if isinstance(cause, _BusyError) and cause.wait is not None:
+            wait = cause.wait
+        if wait > _LONGEST_WAIT:
+            raise self._failure(error, repeats) from None
+        time.sleep(wait)
 
     def _is_other(self) -> bool:
         self._fs.invalidate_cache(self._path)
         self.requests += 1
-        now = self._read_info()
-        return any(self._info.get(name) != now.get(name) for name in _VERSION)
+        now = self._read_info(())
+        return any(_strong(self._info.get(name)) != _strong(now.get(name)) for name in _VERSION)
 
-    def _failure(self, error: BaseException) -> Exception:
-        """Translate an exception of fsspec."""
+    def _cause(self, error: BaseException) -> BaseException:
+        """Return the exception of aiohttp: fsspec raises FileNotFoundError from it for any failure."""
+        wrapped = self._web and isinstance(error, FileNotFoundError) and error.__cause__ is not None
+        return error.__cause__ or error if wrapped else error
+
+    def _failure(self, error: BaseException, repeats: int) -> Exception:
+        """Translate an exception of fsspec, after a number of repetitions."""
         if isinstance(error, ModuleNotFoundError):
             return missing_package(error, extra="remote")
-        if self._web and isinstance(error, FileNotFoundError) and error.__cause__ is not None:
-            error = error.__cause__  # fsspec raises FileNotFoundError for any failure
+        error = self._cause(error)
         status = getattr(error, "status", 0)
         number = _STATUS.get(status, 0)
         if isinstance(error, FileNotFoundError):
@@ -129,9 +191,73 @@ class RemoteStore(Store):
         elif isinstance(error, PermissionError):
             number = errno.EACCES
         if number:
-            return OSError(number, os.strerror(number), self._shown)  # creates the subclass for the number
-        text = f"HTTP status {status}" if status else _message(error)
-        return StoreError(f"{self._shown}: {text or type(error).__name__}")
+            text = os.strerror(number)
+            if status == _FORBIDDEN:
+                text += " (HTTP status 403: not public, or the signature of the URL has expired)"
+            return OSError(number, text, self._shown)  # creates the subclass for the number
+        if isinstance(error, TimeoutError):
+            text = "the server sends nothing"
+        elif "content-encoding" in getattr(error, "message", ""):  # one that aiohttp cannot unpack
+            text = _COMPRESSED.format("")
+        else:
+            text = f"HTTP status {status}" if status else _message(error) or type(error).__name__
+        if isinstance(error, _BusyError) and error.wait is not None:
+            text += f", try again after {error.wait:g} s"
+        tried = f"; tried {repeats + 1} times" if repeats else ""
+        return StoreError(f"{self._shown}: {text}{tried}")
+
+
+def _strong(value: Any) -> Any:
+    """Return an ETag without the mark of a weak one, which proxies add; other values as they are."""
+    return value.removeprefix("W/") if isinstance(value, str) else value
+
+
+def _is_transient(error: BaseException) -> bool:
+    """Return True if a request to a web server may succeed when it is repeated."""
+    if isinstance(error, _BusyError | TimeoutError):
+        return True
+    import aiohttp
+
+    if isinstance(error, aiohttp.ClientConnectorError):  # a wrong name, a closed port, a wrong certificate
+        return False
+    return isinstance(error, aiohttp.ClientConnectionError | aiohttp.ClientPayloadError)
+
+
+async def _check_answer(answer: Any) -> None:
+    """Check the answer of a web server before its body is read (`raise_for_status` of aiohttp).
+
+    Raises:
+        _BusyError: the server is busy.
+        StoreError: the file is compressed, or the body is not the range that was requested.
+    """
+    fault: Exception | None = None
+    if answer.status in _BUSY:
+        wait = answer.headers.get("Retry-After", "")
+        fault = _BusyError(answer.status, float(wait) if wait.isdecimal() and len(wait) < 10 else None)
+    elif answer.status in {_WHOLE, _PART}:
+        text = _describe_fault(answer)
+        fault = StoreError(text) if text else None
+    if fault is not None:
+        answer.close()  # the rest of the body may be long
+        raise fault
+
+
+def _describe_fault(answer: Any) -> str:
+    """Return an error message if an answer of status 200 or 206 has other bytes than requested, otherwise ""."""
+    asked = _RANGE.fullmatch(answer.request_info.headers.get("Range", ""))
+    coding = answer.headers.get("Content-Encoding", "").strip().lower()
+    if coding not in {"", "identity"} and (asked is None or answer.status == _WHOLE):
+        # aiohttp unpacks parts that are compressed on the way; ranges of a file that is stored compressed are useless.
+        return _COMPRESSED.format(f": {coding}")
+    if asked is None:
+        return ""
+    start, size = int(asked[1]), int(asked[2]) + 1 - int(asked[1])
+    sent = _CONTENT_RANGE.match(answer.headers.get("Content-Range", ""))
+    if answer.status == _WHOLE and sent is None and answer.content_length != size:
+        return "the server sends only whole files, no parts (HTTP Range): download it"
+    if sent is not None and int(sent[1]) != start:
+        return f"the server sent the part from byte {int(sent[1])}, requested was the one from byte {start}"
+    return ""
 
 
 def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
@@ -140,15 +266,30 @@ def _file_system(url: str, options: Mapping[str, Any]) -> tuple[Any, str]:
         from fsspec.core import url_to_fs
     except ModuleNotFoundError as error:
         raise missing_package(error, extra="remote") from None
-    if url.startswith(("http://", "https://")):  # ranges must refer to the file, not to compressed data
-        options = {**options, "headers": {"Accept-Encoding": "identity", **options.get("headers", {})}}
     try:
+        if url.startswith(("http://", "https://")):
+            options = _web_options(options)
         fs, path = url_to_fs(url, **options)
     except ImportError as error:  # fsspec's message names the package
         raise InputError(f"{_redact(url)}: {_message(error)}; for HTTP and S3: pip install 'csplat[remote]'") from None
     except (ValueError, TypeError) as error:
         raise InputError(f"{_redact(url)}: {_message(error)}") from None
     return fs, path
+
+
+def _web_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options for a web server, with defaults for what the caller does not specify."""
+    import aiohttp
+
+    client: dict[str, Any] = {
+        "timeout": aiohttp.ClientTimeout(total=None, sock_connect=_SILENCE, sock_read=_SILENCE),
+        "raise_for_status": _check_answer,
+        "trust_env": True,  # proxies in HTTP_PROXY, HTTPS_PROXY and NO_PROXY
+        **options.get("client_kwargs", {}),
+    }
+    # Ranges must refer to the file, not to compressed data.
+    headers = {"Accept-Encoding": "identity", **options.get("headers", {})}
+    return {**options, "headers": headers, "client_kwargs": client}
 
 
 def _message(error: BaseException) -> str:

@@ -34,6 +34,7 @@ class SceneSource:
         findings: findings so far; the first iteration over the blocks may add some.
         format: name of the format that the scene is read from; "" if it is in memory.
         levels: number of splats of each level of detail, finest first, if the file has several; this scene is one.
+        file_axes: axes of the coordinates in the file, if the scene was converted from them while it was opened.
     """
 
     count: int
@@ -42,6 +43,7 @@ class SceneSource:
     findings: list[Finding] = field(default_factory=list)
     format: str = ""
     levels: tuple[int, ...] = ()
+    file_axes: str = ""
 
     def numbered(self) -> Iterator[tuple[slice, SplatModel]]:
         """Yield each block with the range of its splats in the scene."""

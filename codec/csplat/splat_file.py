@@ -27,7 +27,7 @@ from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
 from csplat.decoder.decode_api import DecodeRequest, prepare_decode
 from csplat.decoder.limits import check_budget, float_bytes
-from csplat.decoder.reconstruct import tile_boxes
+from csplat.decoder.reconstruct import boxes_touching, tile_boxes
 from csplat.decoder.tiles import wanted_layers
 from csplat.decoder.tree import read_nodes, select_tiles
 from csplat.disk_files import BinaryWriter
@@ -101,7 +101,10 @@ class SplatFile:
 
     @cached_property
     def boxes(self) -> F64:
-        """Boxes around the centres of each tile of level 0: [T, 2, 3] float64, scene units, relative to the origin."""
+        """Boxes around the centres of each tile of level 0: [T, 2, 3] float64, scene units, relative to the origin.
+
+        Their sides go through decoded centres, which are numbers of binary32.
+        """
         return tile_boxes(self.header, self.header.tiles)
 
     @cached_property
@@ -183,8 +186,9 @@ class SplatFile:
         """Decode tile by tile; memory holds the codebooks, one tile and a few megabytes of the file.
 
         Args:
-            box: region whose tiles are read; tiles that touch it are returned whole. Two corners, x, y, z each, in any
-                order, in scene units relative to the origin. Default: all tiles of level 0.
+            box: region whose tiles are read; tiles that touch it, or share a point with it, are returned whole. Two
+                corners, x, y, z each, in any order, possibly infinite, in scene units relative to the origin. Default:
+                all tiles of level 0.
             sh_degree: highest SH band to read; default: all.
 
         Raises:
@@ -307,8 +311,8 @@ def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any]
     Raises:
         FormatError, UnsupportedError: as in `read_header`, or the file is shorter or longer than its header specifies.
         InputError: `file` has another type; storage options without a URL; the extra is not installed.
-        StoreError: the server does not answer, does not support ranges (HTTP Range), or closes the connection; or the
-            file has changed since it was opened.
+        StoreError: the server does not answer, does not support ranges (HTTP Range), or closes the connection, also
+            when requests are repeated; or the file has changed since it was opened.
         OSError: the file does not exist or cannot be read.
     """
     store = open_store(file, storage)
@@ -335,7 +339,7 @@ def extract(
 
     Args:
         file: as in `open`.
-        box: two corners, x, y, z each, in any order, in scene units relative to the origin.
+        box: two corners, x, y, z each, in any order, possibly infinite, in scene units relative to the origin.
         output: a path, written atomically and replaced if it exists; or an open binary file.
         storage: as in `open`.
 
@@ -346,7 +350,7 @@ def extract(
         True
 
     Raises:
-        InputError: the box is not six finite numbers, or no tile touches the box.
+        InputError: the box is not six numbers, or no tile touches the box.
         FormatError: the header, the index or a copied chunk breaks a clause.
         UnsupportedError, StoreError, OSError: as in `open`, or the output cannot be written.
     """
@@ -398,11 +402,10 @@ def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
         box: as in `extract`.
 
     Raises:
-        InputError: the box is not six finite numbers, or no tile touches it.
+        InputError: the box is not six numbers, or no tile touches it.
     """
     corners = box_corners(box)
-    boxes = tile_boxes(header, header.tiles)
-    found = ((boxes[:, 0] <= corners[1]) & (boxes[:, 1] >= corners[0])).all(axis=1)
+    found = boxes_touching(tile_boxes(header, header.tiles), corners)
     if not found.any():
         raise _nothing_touches(header, corners)
     return [header.tiles[index] for index in np.flatnonzero(found)]
@@ -412,11 +415,14 @@ def box_corners(box: Sequence[float]) -> F64:
     """Return the corners of a box, [2, 3], smallest first.
 
     Raises:
-        InputError: the box is not six finite numbers.
+        InputError: the box is not six numbers, or one is NaN.
     """
-    numbers = [float(value) for value in box]
-    if len(numbers) != 6 or not all(map(math.isfinite, numbers)):
-        raise InputError(f"box is {tuple(box)!r}, expected six finite numbers: two corners, x, y, z each")
+    try:
+        numbers = [float(value) for value in box]
+    except (TypeError, ValueError, OverflowError):
+        numbers = []
+    if len(numbers) != 6 or any(map(math.isnan, numbers)):
+        raise InputError(f"box is {box!r}, expected six numbers other than NaN: two corners, x, y, z each")
     return np.sort(np.reshape(numbers, (2, 3)), axis=0)
 
 
@@ -427,7 +433,7 @@ def _nothing_touches(header: SceneHeader, corners: F64) -> InputError:
 
 
 def _corner_text(corner: F64) -> str:
-    return ", ".join(f"{value:g}" for value in corner)
+    return ", ".join(f"{value:.9g}" for value in corner)  # tells numbers of binary32 apart
 
 
 def _extent_text(boxes: F64) -> str:

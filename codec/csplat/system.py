@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import shlex
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -19,7 +20,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, BinaryIO, TypeVar
 
 #: True if a process may be forked. On macOS, system libraries are unsafe after a fork.
 CAN_FORK = sys.platform == "linux" and hasattr(os, "fork")
@@ -47,6 +48,42 @@ _task: list[Any] = []  # set in worker processes only: [function, shared value]
 def core_count() -> int:
     """Return the number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
+    """Open a regular file for reading. A pipe or a device, whose reader may wait forever, is refused unread.
+
+    Raises:
+        OSError: the file cannot be opened, or is not a regular file.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0)
+    descriptor = os.open(path, flags)  # does not wait for the writer of a pipe
+    try:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", os.fspath(path))
+        return os.fdopen(descriptor, "rb")
+    except OSError:
+        os.close(descriptor)
+        raise
+
+
+def take_permissions(descriptor: int, old: os.stat_result) -> None:
+    """Give a file the permissions, and if possible owner and group, of the file that it replaces.
+
+    In another group it gives the group the rights of all others: the group may be one that had no more.
+    """
+    if sys.platform == "win32" or not hasattr(os, "fchown"):
+        return
+    for owner, group in ((-1, old.st_gid), (old.st_uid, -1)):
+        with suppress(OSError):
+            os.fchown(descriptor, owner, group)
+    new, mode = os.fstat(descriptor), stat.S_IMODE(old.st_mode)
+    if new.st_gid != old.st_gid:
+        mode = mode & ~stat.S_IRWXG | (mode & stat.S_IRWXO) << 3
+    if (new.st_uid, new.st_gid) != (old.st_uid, old.st_gid):
+        mode &= ~(stat.S_ISUID | stat.S_ISGID)
+    with suppress(OSError):  # a file system without permissions
+        os.fchmod(descriptor, mode)
 
 
 def read_at(descriptor: int, size: int, offset: int) -> bytes:

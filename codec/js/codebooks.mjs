@@ -127,7 +127,7 @@ function checkEntries({ integers, bound, offset }, codebook, layer, attributes) 
       checkIntegers(block, size);
       if (attribute.step !== 0) {
         liftColours(block);
-        checkFinite(block, attribute.step, 'LAT-5');
+        checkFinite(block, attribute.step);
       }
     }
     first = end;

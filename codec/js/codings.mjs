@@ -408,17 +408,16 @@ export function liftColours(block) {
 }
 
 /**
- * Refuse integers whose values are outside binary32.
+ * Refuse integers whose values are outside binary32 (LAT-5).
  *
  * @param {Block} block
  * @param {number} step
- * @param {string} clause
  */
-export function checkFinite({ attribute, columns, bound, offset }, step, clause) {
+export function checkFinite({ attribute, columns, bound, offset }, step) {
   if (Number.isFinite(Math.fround(bound * step))) return;
   for (const n of columns) {
     if (!Number.isFinite(Math.fround(n * step))) {
-      throw fault(ERROR_RANGE, offset, clause, `${attribute.name}: ${n} × ${step} is beyond binary32`);
+      throw fault(ERROR_RANGE, offset, 'LAT-5', `${attribute.name}: ${n} × ${step} is beyond binary32`);
     }
   }
 }

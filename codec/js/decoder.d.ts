@@ -105,7 +105,7 @@ export interface TileRecord {
   step: number;
   corner: number[];
   extent: number[];
-  /** Bounding box of the centres. */
+  /** Bounding box of the centres, numbers of binary32 as these are. */
   min: number[];
   max: number[];
   /** Natural logarithm of the largest standard deviation. */
@@ -172,9 +172,9 @@ export interface CutOptions {
   /** Maximum number of splats of the version. Nodes with the largest errors are replaced first by their children. */
   maxSplats?: number;
   /**
-   * Select a part of the version: x, y, z of the smallest corner of a box and of the largest, relative to the header's
-   * origin. Of level 0, these are the tiles whose box touches it. Of a coarser node, they are all of its tiles if its
-   * region, from `min` to `max`, does.
+   * Select a part of the version: two corners of a box, x, y, z each, in any order, possibly infinite, relative to the
+   * header's origin. Of level 0, these are the tiles whose box touches it, or shares a point with it. Of a coarser node,
+   * they are all of its tiles if its region, from `min` to `max`, does.
    */
   box?: ArrayLike<number>;
 }
@@ -327,17 +327,49 @@ export interface ByteSource {
   readonly isSequential?: boolean;
 }
 
-export interface ReaderOptions {
+/**
+ * What failed: no connection, a broken or stalled one; an address that is refused (4xx, a revoked blob); a server that is
+ * busy or out of order (408, 425, 429, 5xx); a server that answers otherwise than HTTP requires; a file that was replaced
+ * while it was read; a page from disk, which may not load files.
+ */
+export type FetchReason = 'connection' | 'refused' | 'busy' | 'server' | 'replaced' | 'local';
+
+/** A new address for a file: a URL, or a URL with options of its requests, which replace the earlier ones. */
+export type NewAddress = string | URL | Request | (RequestInit & { url?: string | URL });
+
+/** How a URL is fetched. */
+export interface FetchOptions {
+  /** Replaces the platform's function. Called with an absolute URL, Range in `headers`, and a signal. */
+  fetch?: typeof fetch;
+  /** Headers, credentials and mode of each request. */
+  request?: RequestInit;
+  /** Retries of a request in a row, after failures that may pass. Default: 4. */
+  retries?: number;
+  /** Milliseconds until the first retry, doubled each time up to 30 s. Retry-After counts, up to 30 s. Default: 500. */
+  retryMs?: number;
+  /** Milliseconds without a byte after which a request is made again; doubled each time. Default: 8000. */
+  timeoutMs?: number;
+  /**
+   * Called if the server refuses the address (status 4xx), for example because a signed URL has expired. Returns another
+   * address, or nothing to give up. Called again when that has worked and is refused later.
+   */
+  renew?: (refusal: {
+    url: string;
+    status: number;
+    message: string;
+  }) => NewAddress | null | undefined | void | Promise<NewAddress | null | undefined | void>;
+}
+
+export interface ReaderOptions extends FetchOptions {
   limits?: Limits;
   /** Size of the first request, which should cover header and index. Default: 64 KiB. */
   firstBytes?: number;
-  /** Aborts `open`, and the body of a server without ranges. */
+  /** Aborts `open` and all that is read later, which then reject with its reason. */
   signal?: AbortSignal;
-  /** Called with the bytes received so far and the size of the file (0 before the header has arrived). */
+  /** Called with the bytes received so far, each counted once, and the size of the file (0 before the header is here). */
   onProgress?: (received: number, fileSize: number) => void;
-  fetch?: typeof fetch;
-  /** Credentials, headers and mode of each request. */
-  request?: RequestInit;
+  /** Called before each retry, with the error and the wait in milliseconds. */
+  onRetry?: (error: InputError, waitMs: number) => void;
   inflate?: Inflate;
 }
 
@@ -365,9 +397,15 @@ export interface LayerRequest {
 
 /** Reads tiles and layers of a file in any order; checks the CRC of each part. */
 export class CsplatReader {
-  static open(from: string | URL | Blob | ArrayBuffer | ByteSource, options?: ReaderOptions): Promise<CsplatReader>;
+  /** Open a URL, or data. In Node, pass a file on disk as `await fs.openAsBlob(path)`. */
+  static open(
+    from: string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource,
+    options?: ReaderOptions,
+  ): Promise<CsplatReader>;
   readonly header: Header;
   readonly checks: Checks;
+  /** Retries of a request, as in the options; may be changed. */
+  retries: number;
   /** Total milliseconds that reads have waited for bytes; concurrent reads count separately. */
   readonly waitedMs: number;
   /** Read a tile with its SH bands up to a degree, and its extra columns if requested. */
@@ -449,4 +487,16 @@ export class CsplatError extends Error {
 export class FormatError extends CsplatError {}
 export class UnsupportedError extends CsplatError {}
 export class LimitError extends CsplatError {}
-export class InputError extends CsplatError {}
+/** Invalid arguments, or a file that cannot be fetched. */
+export class InputError extends CsplatError {
+  /** What failed; null for arguments. */
+  readonly reason: FetchReason | null;
+  /** HTTP status, if it is the cause. */
+  readonly status: number | null;
+  /** Whether the same request may succeed later. */
+  readonly isTransient: boolean;
+  /** Milliseconds that the server requests to wait, 0 if it does not. */
+  readonly retryAfterMs: number;
+  /** Whether the server has another file by now: open it again. */
+  readonly isReplaced: boolean;
+}

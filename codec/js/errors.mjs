@@ -35,16 +35,29 @@ export class UnsupportedError extends CsplatError {}
 /** The file exceeds the caller's budget. */
 export class LimitError extends CsplatError {}
 
-/** The caller's arguments are invalid, or the file cannot be fetched. */
+/**
+ * The caller's arguments are invalid, or the file cannot be fetched.
+ *
+ * `reason` is null for arguments and otherwise names what failed, see decoder.d.ts; `status` is the HTTP status, if it did.
+ */
 export class InputError extends CsplatError {
   /**
    * @param {string} detail
-   * @param {unknown} [cause]
-   * @param {boolean} [isTransient] whether the same request may succeed later: the connection or the server failed
+   * @param {{cause?: unknown, reason?: import('./decoder.d.ts').FetchReason | null, status?: number | null,
+   *   isTransient?: boolean, retryAfterMs?: number}} [facts] `isTransient`: the same request may succeed later;
+   *   `retryAfterMs`: the wait that the server requests
    */
-  constructor(detail, cause, isTransient = false) {
+  constructor(detail, { cause, reason = null, status = null, isTransient = false, retryAfterMs = 0 } = {}) {
     super(ERROR_INPUT, detail, { cause });
+    this.reason = reason;
+    this.status = status;
     this.isTransient = isTransient;
+    this.retryAfterMs = retryAfterMs;
+  }
+
+  /** Whether the server has another file at this address than at first. */
+  get isReplaced() {
+    return this.reason === 'replaced';
   }
 }
 

@@ -23,7 +23,19 @@ export function toBytes(data) {
     // Another thread could change shared memory between a check and its use.
     return bytes.buffer instanceof ArrayBuffer ? /** @type {Uint8Array<ArrayBuffer>} */ (bytes) : bytes.slice();
   }
-  throw new InputError('the data is neither an ArrayBuffer nor a view of one');
+  throw new InputError(`the data is neither an ArrayBuffer nor a view of one${remedyFor(data)}`);
+}
+
+/**
+ * @param {unknown} data
+ * @returns {string} starts with a colon; '' if it is nothing that users often pass
+ */
+function remedyFor(data) {
+  if (typeof data === 'string' || data instanceof URL) return ': CsplatReader.open takes addresses';
+  const name = typeof data === 'object' && data !== null ? data.constructor?.name : '';
+  if (name === 'Response' || name === 'Blob' || name === 'File')
+    return `: pass \`await ${name.toLowerCase()}.arrayBuffer()\``;
+  return name === 'ReadableStream' ? ': pass `await new Response(stream).arrayBuffer()`' : '';
 }
 
 /**
@@ -117,10 +129,11 @@ function checkAmount(name, value) {
 function checkedBox(box) {
   if (box === undefined) return undefined;
   const corners = Array.from(box ?? []);
-  const isBox = corners.length === 6 && corners.every((value) => typeof value === 'number');
-  if (!isBox || !corners.slice(0, 3).every((low, axis) => low <= corners[axis + 3]))
-    throw new InputError(`box is ${corners}, expected x, y, z of its smallest and of its largest corner`);
-  return corners;
+  if (corners.length !== 6 || !corners.every((value) => typeof value === 'number' && !Number.isNaN(value)))
+    throw new InputError(`box is ${corners}, expected six numbers other than NaN: two corners, x, y, z each`);
+  const [one, other] = [corners.slice(0, 3), corners.slice(3)];
+  const ends = (/** @type {'min' | 'max'} */ end) => one.map((value, axis) => Math[end](value, other[axis]));
+  return [...ends('min'), ...ends('max')];
 }
 
 /**

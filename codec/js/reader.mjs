@@ -4,12 +4,14 @@
 // decodes if the page's content security policy forbids WebAssembly, for integers, and to locate errors.
 
 import { describe, emptyDescription } from './ancillary.mjs';
+import { replaced } from './answers.mjs';
 import { FloatArrays, arrayBytes, bandArray } from './arrays.mjs';
 import { Assembly, checkBudget, codebooksById } from './assemble.mjs';
+import { CRC_SIZE } from './checksums.mjs';
 import { readTable, tableBytes } from './codebooks.mjs';
 import { WasmDecoder } from './wasm_decoder.mjs';
 import { checkFileSize, openChunk, readFileHeader } from './container.mjs';
-import { InputError } from './errors.mjs';
+import { FormatError, InputError } from './errors.mjs';
 import { readIndex } from './file_index.mjs';
 import { checkedInflate, platformInflate } from './inflate.mjs';
 import { checkedDegree, checkedForm, checkedLimits, checkedTile } from './options.mjs';
@@ -18,8 +20,10 @@ import { Payload } from './payload.mjs';
 import { openSource } from './source.mjs';
 import * as spec from './spec.mjs';
 import { Tile } from './tile_blocks.mjs';
+import { abortable, wayOf } from './transport.mjs';
 import { readNodes } from './tree.mjs';
 
+const OUTDATED = [spec.ERROR_CRC, spec.ERROR_TRUNCATED, spec.ERROR_TRAILING]; // also caused by parts of two files
 const FIRST_BYTES = 1 << 16; // bytes; header and index of most files up to about thirty million splats
 
 /**
@@ -39,7 +43,28 @@ const FIRST_BYTES = 1 << 16; // bytes; header and index of most files up to abou
  * @typedef {import('./codebooks.mjs').Table} Table
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
+ *
+ * A source; those of this package can tell whether their file was replaced, and end their requests.
+ *
+ * @typedef {ByteSource & {transport?: {url: string}, isOther?: (offset: number, bytes: Bytes) => Promise<boolean>, close?: () => void}} Source
  */
+
+/**
+ * Return the error of a read: that the file was replaced, if its bytes are wrong because the server has another file by now.
+ *
+ * @param {unknown} error
+ * @param {Source | null} source
+ * @param {Map<number, Bytes>} opening header and index by their offsets
+ * @returns {Promise<unknown>}
+ */
+async function explained(error, source, opening) {
+  if (!(error instanceof FormatError) || !OUTDATED.includes(error.code) || !source?.isOther) return error;
+  const [head, index] = [opening.get(0), opening.get(spec.HEADER_SIZE)];
+  // The CRC of the index covers those of all parts.
+  const [offset, bytes] = index ? [spec.HEADER_SIZE + index.length - CRC_SIZE, index.subarray(-CRC_SIZE)] : [0, head];
+  if (!bytes || !(await source.isOther(offset, bytes))) return error;
+  return replaced(source.transport?.url ?? 'the file', error.message, error);
+}
 
 /**
  * Select the layers of a tile that a read requires.
@@ -55,41 +80,52 @@ export class Reader {
   /**
    * Open a file, with one request for header and index unless the index is very large.
    *
-   * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
+   * @param {string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource} from
    * @param {ReaderOptions} [options]
    * @returns {Promise<Reader>} of the class that `open` is called on
    */
   static async open(from, options = {}) {
-    const { signal } = options;
     const limits = checkedLimits(options.limits);
     const progress = { received: 0, fileSize: 0 };
-    const source = await openSource(from, {
-      fetch: options.fetch ?? ((...request) => globalThis.fetch(...request)),
-      init: { ...options.request, signal },
+    const way = wayOf(options, {
       firstBytes: Math.max(spec.HEADER_SIZE, options.firstBytes ?? FIRST_BYTES),
       limit: limits.bytes,
       received: (size) => options.onProgress?.((progress.received += size), progress.fileSize),
     });
-    const known = source.size ?? Infinity;
-    const head = await source.read(0, Math.min(spec.HEADER_SIZE, known), signal);
-    const file = readFileHeader(head);
-    if (known !== Infinity) checkFileSize(known, file);
-    progress.fileSize = file.fileSize;
-    const index = await source.read(spec.HEADER_SIZE, file.indexSize, signal);
-    const header = readIndex(index, file, limits);
-    const compiled = options.inflate ? null : await WasmDecoder.open(file.fileSize, head, index);
-    const inflate = options.inflate ? checkedInflate(options.inflate) : await platformInflate();
-    const reader = new this(source, header, limits, inflate, compiled);
-    reader.inflates = options.inflate !== undefined;
-    reader.opening = new Map([
-      [0, head],
-      [spec.HEADER_SIZE, index],
-    ]);
-    return reader;
+    /** @type {Source | null} */
+    let source = null;
+    const opening = new Map();
+    const open = async () => {
+      const { signal } = options;
+      source = await openSource(from, way);
+      const known = source.size ?? Infinity;
+      const head = await source.read(0, Math.min(spec.HEADER_SIZE, known), signal);
+      const file = readFileHeader(head);
+      if (known !== Infinity) checkFileSize(known, file);
+      progress.fileSize = file.fileSize;
+      opening.set(0, head);
+      const index = await source.read(spec.HEADER_SIZE, file.indexSize, signal);
+      const header = readIndex(index, file, limits);
+      opening.set(spec.HEADER_SIZE, index);
+      const compiled = options.inflate ? null : await WasmDecoder.open(file.fileSize, head, index);
+      const inflate = options.inflate ? checkedInflate(options.inflate) : await platformInflate();
+      return new this(source, header, limits, inflate, compiled);
+    };
+    try {
+      const reader = await abortable(open(), options.signal);
+      reader.inflates = options.inflate !== undefined;
+      reader.opening = opening;
+      reader.way = way;
+      return reader;
+    } catch (error) {
+      const cause = await explained(error, source, opening);
+      /** @type {Source | null} */ (source)?.close?.();
+      throw cause;
+    }
   }
 
   /**
-   * @param {ByteSource} source
+   * @param {Source} source
    * @param {Header} header
    * @param {Required<Limits>} limits
    * @param {Inflate} inflate
@@ -103,6 +139,8 @@ export class Reader {
     this.compiled = compiled;
     /** @type {Map<number, Bytes>} header and index by their offsets */
     this.opening = new Map();
+    /** How it fetches. @type {import('./transport.mjs').Way | null} */
+    this.way = null;
     /** Whether the caller supplies the inflate, which workers cannot use. */
     this.inflates = false;
     /** @type {Set<number>} offsets of the chunks whose CRC has been checked */
@@ -129,6 +167,15 @@ export class Reader {
     this.table = this.table.bind(this);
   }
 
+  /** Retries of a request in a row, until it fails. */
+  get retries() {
+    return this.way?.retries ?? 0;
+  }
+
+  set retries(count) {
+    if (this.way) this.way.retries = count;
+  }
+
   /** The CRCs checked so far. */
   get checks() {
     return { header: true, index: true, chunks: this.checked.size };
@@ -142,7 +189,33 @@ export class Reader {
    * @param {any} [spare] an earlier result, of floats, whose memory may be reused
    * @returns {Promise<any>} the arrays that `decode` returns, for this tile; for packed tiles see decoder.d.ts
    */
-  async readTile(index, { shDegree, extra = false, form, signal } = {}, spare) {
+  readTile(index, options = {}, spare) {
+    return this.whole(this.decodeTile(index, options, spare), options.signal);
+  }
+
+  /**
+   * Do the work of a read.
+   *
+   * @template T
+   * @param {Promise<T>} work
+   * @param {AbortSignal} [signal] ends it at once, whatever it waits for
+   * @returns {Promise<T>}
+   */
+  async whole(work, signal) {
+    try {
+      return await abortable(work, signal);
+    } catch (error) {
+      throw await explained(error, this.source, this.opening);
+    }
+  }
+
+  /**
+   * @param {number} index
+   * @param {{form?: LayerForm, shDegree?: number, extra?: boolean, signal?: AbortSignal}} options
+   * @param {any} [spare]
+   * @returns {Promise<any>}
+   */
+  async decodeTile(index, { shDegree, extra = false, form, signal }, spare) {
     const record = checkedTile(index, this.header);
     if (form === 'packed') return this.readPackedTile(record, checkedDegree(shDegree, this.header), signal);
     const wanted = { shDegree: checkedDegree(shDegree, this.header), integers: checkedForm(form), extra };
@@ -160,10 +233,10 @@ export class Reader {
     const bands = Array.from({ length: shDegree }, (_, i) => i + 1);
     const layers = [spec.LAYER_GEOMETRY, ...bands].map((layer) => ({ tile: record.index, layer }));
     this.prefetch(layers, { signal });
-    const geometry = await this.readLayer(record.index, spec.LAYER_GEOMETRY, { form: 'packed', signal });
+    const geometry = await this.decodeLayer(record.index, spec.LAYER_GEOMETRY, { form: 'packed', signal });
     const sh = [];
     for (const band of bands) {
-      const read = await this.readLayer(record.index, band, { form: 'packed', signal });
+      const read = await this.decodeLayer(record.index, band, { form: 'packed', signal });
       sh.push(read && read.sh);
     }
     this.forget(record.index);
@@ -200,11 +273,14 @@ export class Reader {
    *
    * @param {{shDegree: number, extra: boolean}} wanted
    * @param {TileRecord} [record]
+   * @param {AbortSignal} [signal]
    * @returns {Promise<Map<number, Bytes>>}
    */
-  async partsOf(wanted, record) {
+  async partsOf(wanted, record, signal) {
     const parts = record ? [] : [...this.opening];
-    for (const place of record ? wantedLayers(record, wanted) : []) parts.push([place.offset, await this.fetch(place)]);
+    for (const place of record ? wantedLayers(record, wanted) : []) {
+      parts.push([place.offset, await this.fetch(place, signal)]);
+    }
     for (const [key, { layer, offset }] of record ? [] : this.codebookChunks) {
       if (layer <= wanted.shDegree) parts.push([offset, await this.codebookChunk(key)]); // every worker needs them
     }
@@ -221,11 +297,21 @@ export class Reader {
    * @returns {Promise<any>} the arrays by name, an SH band as `sh` [count, 2l + 1, 3]; null if the tile leaves the band
    *   out and its coefficients are 0
    */
-  async readLayer(index, layer, { form, signal } = {}) {
+  readLayer(index, layer, options = {}) {
+    return this.whole(this.decodeLayer(index, layer, options), options.signal);
+  }
+
+  /**
+   * @param {number} index
+   * @param {number} layer
+   * @param {{form?: LayerForm, signal?: AbortSignal}} options
+   * @returns {Promise<any>}
+   */
+  async decodeLayer(index, layer, { form, signal }) {
     const record = checkedTile(index, this.header);
     const packed = form === 'packed';
     const integers = !packed && checkedForm(form);
-    if (layer === spec.LAYER_GEOMETRY && !packed) return this.readTile(index, { shDegree: 0, form, signal });
+    if (layer === spec.LAYER_GEOMETRY && !packed) return this.decodeTile(index, { shDegree: 0, form, signal });
     if (layer === spec.LAYER_EXTRA || !Object.hasOwn(spec.LAYER_NAMES, layer)) {
       throw new InputError(`layer ${layer}: the layers of colour are 0 to ${spec.SH_DEGREE_MAX}`);
     }
@@ -293,7 +379,12 @@ export class Reader {
    *
    * @param {{signal?: AbortSignal}} [options]
    */
-  async describe({ signal } = {}) {
+  describe({ signal } = {}) {
+    return this.whole(this.describeFile(signal), signal);
+  }
+
+  /** @param {AbortSignal} [signal] */
+  async describeFile(signal) {
     const description = emptyDescription();
     const { version, splatCount } = this.header;
     const scene = { version, splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
@@ -314,7 +405,7 @@ export class Reader {
    */
   nodes() {
     if (this.tree === null) {
-      this.tree = this.fetchNodes();
+      this.tree = this.whole(this.fetchNodes());
       this.tree.catch(() => (this.tree = null)); // allows another try
     }
     return this.tree;

@@ -1,145 +1,139 @@
 // Sources of a file that is not in memory: HTTP with Range, or one of those in `whole_sources.mjs`.
 
+import { readFileHeader } from './container.mjs';
 import { InputError } from './errors.mjs';
-import {
-  BlobSource,
-  CallerSource,
-  MemorySource,
-  WholeSource,
-  asInputError,
-  bodyParts,
-  shortData,
-} from './whole_sources.mjs';
+import { toBytes } from './options.mjs';
+import { HEADER_SIZE } from './spec.mjs';
+import { Transport, onAbort, unlessAborted } from './transport.mjs';
+import { BlobSource, CallerSource, MemorySource, WholeSource, cutShort, shortData } from './whole_sources.mjs';
 
 const GAP_BYTES = 1 << 14; // bytes; ranges separated by less are fetched together
 const REQUEST_BYTES = 1 << 23; // bytes; joined ranges do not exceed this
-const TRANSIENT = new Set([408, 429]); // HTTP statuses below 500 after which the same request may succeed
+const TINY_BYTES = 256; // an answer to a longer range with fewer bytes is no progress
+const TINY_ANSWERS = 16; // in a row after which the server is asked for the whole file
 
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
  * @typedef {import('./decoder.d.ts').ByteRange} ByteRange
+ * @typedef {import('./transport.mjs').Way} Way
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
- * @typedef {(received: number) => void} Received called with the number of bytes of each part that arrives
- * @typedef {{fetch: typeof fetch, init: RequestInit, firstBytes: number, received: Received, limit: number}} Way
  */
 
 /**
- * @param {string | URL | Blob | ArrayBuffer | ByteSource} from
+ * @param {string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource} from
  * @param {Way} way request options
  * @returns {Promise<ByteSource>}
  */
 export async function openSource(from, way) {
-  if (typeof from === 'string' || from instanceof URL) return openUrl(from, way);
+  if (typeof from === 'string' || from instanceof URL) return openUrl(absolute(from, way), way);
   if (from instanceof Blob) return new BlobSource(from);
-  if (from instanceof ArrayBuffer) return new MemorySource(new Uint8Array(from));
+  if (from instanceof ArrayBuffer || ArrayBuffer.isView(from)) return new MemorySource(toBytes(from));
   if (typeof from?.read === 'function') return new CallerSource(from);
-  throw new InputError('the source is not a URL, a Blob, an ArrayBuffer or an object with a method read');
+  throw new InputError(
+    'the source is not a URL, a Blob, an ArrayBuffer, a view of one or an object with a method read',
+  );
+}
+
+const { process, Deno, Bun } = /** @type {any} */ (globalThis);
+const IS_NODE = process?.versions?.node !== undefined && !Deno && !Bun;
+const DISK = /^(file|[a-z]):/i; // with a drive of Windows
+const FROM_DISK = 'for a file on disk pass `await fs.openAsBlob(path)`, of node:fs';
+
+/**
+ * @param {string | URL} url
+ * @param {Way} way
+ */
+function absolute(url, { hasFetch }) {
+  const { document, location } = /** @type {any} */ (globalThis);
+  try {
+    const { href } = new URL(url, document?.baseURI ?? location?.href);
+    if (hasFetch || !IS_NODE || !DISK.test(href)) return href;
+  } catch {
+    if (hasFetch) return String(url); // which may understand it
+    if (!IS_NODE) throw new InputError(`“${url}” is not a URL`);
+  }
+  throw new InputError(`“${url}” is not a URL that can be fetched: ${FROM_DISK}`);
 }
 
 /**
  * Open a URL with one request for the first bytes. If the server ignores the range and sends the whole file, the body is
  * read as it arrives.
  *
- * @param {string | URL} url
+ * @param {string} url absolute
  * @param {Way} way
- * @returns {Promise<HttpSource | WholeSource>}
  */
 async function openUrl(url, way) {
-  const response = await request(url, 0, way.firstBytes, way);
-  if (response.status === 416) return new HttpSource(url, new Uint8Array(0), 0, way, null); // an empty file
-  if (response.status === 200) return WholeSource.open(response, way);
-  const { total } = checkRange(response, 0);
-  return new HttpSource(
-    url,
-    await readBody(response, way.firstBytes, way.received),
-    total,
-    way,
-    response.headers.get('etag'),
-  );
-}
-
-/**
- * @param {string | URL} url
- * @param {number} start
- * @param {number} end
- * @param {Way} way
- * @param {AbortSignal} [signal]
- */
-async function request(url, start, end, way, signal) {
-  /** @type {Response} */
-  let response;
-  const headers = new Headers(way.init.headers);
-  headers.set('Range', `bytes=${start}-${end - 1}`);
+  if (/^(blob|data):/.test(url)) return new BlobSource(await fetchBlob(url, way));
+  const isLocal = url.startsWith('file:');
+  const source = new HttpSource(new Transport(url, isLocal ? { ...way, retries: 0 } : way));
   try {
-    response = await way.fetch(url, { ...way.init, headers, signal: signal ?? way.init.signal });
+    await source.begin(way.firstBytes);
+    return source;
   } catch (error) {
-    throw asInputError(error, url);
+    source.close();
+    if (!isLocal || !(error instanceof InputError)) throw error;
+    const detail =
+      'a page opened from disk cannot load files. `csplat export-html` puts viewer and scene into one page';
+    throw new InputError(`${url}: ${detail}; or open the page from a local server`, { cause: error, reason: 'local' });
   }
-  if (response.status !== 200 && response.status !== 206 && response.status !== 416) {
-    await response.body?.cancel();
-    const isTransient = TRANSIENT.has(response.status) || response.status >= 500;
-    throw new InputError(`${url}: HTTP status ${response.status}`, undefined, isTransient);
-  }
-  return response;
 }
 
 /**
- * @param {Response} response with status 206
- * @param {number} start
- * @returns {{total: number | null}} size of the file if the server reports it (it may be hidden across origins)
+ * Fetch an address whose bytes are in this browser: once, since a page may revoke it, and since Node serves its ranges wrong.
+ *
+ * @param {string} url of the scheme blob or data
+ * @param {Way} way
  */
-function checkRange(response, start) {
-  const range = response.headers.get('content-range');
-  if (range === null) return { total: null };
-  const match = /^bytes (\d+)-\d+\/(\d+|\*)$/.exec(range);
-  if (!match || Number(match[1]) !== start)
-    throw new InputError(`the server sent the range ${range} instead of one from ${start}`);
-  return { total: match[2] === '*' ? null : Number(match[2]) };
-}
-
-/**
- * @param {Response} response
- * @param {number} most maximum number of bytes to read
- * @param {Received} received
- * @returns {Promise<Bytes>}
- */
-async function readBody(response, most, received) {
-  const bytes = new Uint8Array(most);
-  let filled = 0;
-  for await (const part of bodyParts(response)) {
-    const taken = part.subarray(0, most - filled);
-    bytes.set(taken, filled);
-    filled += taken.length;
-    received(taken.length);
-    if (filled === most) break;
+async function fetchBlob(url, way) {
+  try {
+    return await unlessAborted(way.signals, async (signal) => {
+      const blob = await (await way.fetch(url, { ...way.init, signal })).blob();
+      way.received(blob.size);
+      return blob;
+    });
+  } catch (error) {
+    for (const signal of way.signals) if (signal?.aborted) throw signal.reason;
+    const shown = url.length > 100 ? `${url.slice(0, 100)}…` : url;
+    const isBlob = url.startsWith('blob:');
+    const why = isBlob ? 'it may have been revoked too early, or belong to another origin' : 'it may be malformed';
+    throw new InputError(`${shown}: ${error}; ${why}, or connect-src of the page's policy forbids it`, {
+      ...{ cause: error, reason: 'refused' },
+    });
   }
-  return bytes.subarray(0, filled);
 }
 
-/** A server that supports ranges. */
+/** A file on a server. */
 export class HttpSource {
-  /**
-   * @param {string | URL} url
-   * @param {Bytes} head the first bytes
-   * @param {number | null} size size of the file, if known
-   * @param {Way} way
-   * @param {string | null} etag
-   */
-  constructor(url, head, size, way, etag) {
-    this.url = url;
-    this.head = head;
-    this.size = size;
-    this.way = way;
-    this.etag = etag;
-    /** @type {{start: number, end: number, bytes: Promise<Bytes>, due: number}[]} */
+  /** @param {Transport} transport */
+  constructor(transport) {
+    this.transport = transport;
+    /** The first bytes. @type {Bytes} */
+    this.head = new Uint8Array(0);
+    /** @type {{start: number, end: number, bytes: Promise<Bytes>, due: number, signal?: AbortSignal}[]} */
     this.fetched = []; // prefetched ranges, each kept until all its parts have been read
     /** @type {WholeSource | null} */
     this.whole = null;
   }
 
-  /** Whether later bytes arrive later: the server has sent the whole file. */
+  /** Size of the file as the server reports it; null if unknown. */
+  get size() {
+    return this.whole ? null : this.transport.total;
+  }
+
+  /** Whether later bytes arrive later: the server sends the whole file. */
   get isSequential() {
     return this.whole !== null;
+  }
+
+  /** End all requests. */
+  close() {
+    this.transport.close();
+  }
+
+  /** @param {number} firstBytes */
+  async begin(firstBytes) {
+    const head = await this.#collect(0, firstBytes);
+    if (head) this.head = head;
   }
 
   /**
@@ -150,7 +144,7 @@ export class HttpSource {
    */
   async read(offset, size, signal) {
     const end = offset + size;
-    if (this.whole) return this.whole.read(offset, size);
+    if (this.whole) return this.whole.read(offset, size, signal);
     if (end <= this.head.length) return this.head.subarray(offset, end);
     const start = Math.max(offset, this.head.length);
     const bytes = await this.readBehindHead(start, end, signal);
@@ -170,7 +164,10 @@ export class HttpSource {
   async readBehindHead(start, end, signal) {
     const range = this.fetched.find((one) => one.start <= start && end <= one.end);
     if (range === undefined) return this.fetch(start, end, signal);
-    const bytes = await range.bytes;
+    const bytes = await range.bytes.catch((error) => {
+      if (!range.signal?.aborted || signal?.aborted) throw error;
+    });
+    if (!bytes) return this.fetch(start, end, signal); // another reader has cancelled the request
     if (--range.due <= 0) this.fetched = this.fetched.filter((one) => one !== range);
     return bytes.subarray(start - range.start, end - range.start);
   }
@@ -182,6 +179,7 @@ export class HttpSource {
    * @param {AbortSignal} [signal] cancels the requests, and drops what has arrived
    */
   prefetch(wanted, signal) {
+    if (this.whole) return; // all of it is on its way
     const missing = wanted
       .filter(({ offset, size }) => offset + size > this.head.length)
       .map(({ offset, size }) => {
@@ -200,10 +198,10 @@ export class HttpSource {
       } else joined.push({ start: offset, end: offset + size, due: 1 });
     }
     for (const range of joined) {
-      const entry = { ...range, bytes: this.fetch(range.start, range.end, signal) };
+      const entry = { ...range, signal, bytes: this.fetch(range.start, range.end, signal) };
       const drop = () => (this.fetched = this.fetched.filter((one) => one !== entry)); // allows another try
       entry.bytes.catch(drop);
-      signal?.addEventListener('abort', drop, { once: true });
+      if (signal) onAbort(signal, drop);
       this.fetched.push(entry);
     }
   }
@@ -215,19 +213,123 @@ export class HttpSource {
    * @returns {Promise<Bytes>}
    */
   async fetch(start, end, signal) {
-    const response = await request(this.url, start, end, this.way, signal);
-    if (response.status === 416) throw shortData(start, end - start);
-    if (response.status === 200) {
-      this.whole = await WholeSource.open(response, this.way);
-      return this.whole.read(start, end - start);
-    }
-    checkRange(response, start);
-    const etag = response.headers.get('etag');
-    if (etag !== null && this.etag !== null && etag !== this.etag) {
-      throw new InputError(`${this.url} has changed since it was opened`);
-    }
-    const bytes = await readBody(response, end - start, this.way.received);
+    const bytes = await this.#collect(start, end, signal);
+    if (bytes === null) return /** @type {WholeSource} */ (this.whole).read(start, end - start, signal);
     if (bytes.length < end - start) throw shortData(start + bytes.length, end - start);
     return bytes;
+  }
+
+  /**
+   * Request a range until all of it is here.
+   *
+   * @param {number} start
+   * @param {number} end
+   * @param {AbortSignal} [signal]
+   * @returns {Promise<Bytes | null>} fewer bytes if the file ends before; null if the whole file is on its way
+   */
+  async #collect(start, end, signal) {
+    const { transport } = this;
+    const tries = transport.tries(signal);
+    const bytes = new Uint8Array(end - start);
+    let filled = 0;
+    let tiny = 0;
+    for (;;) {
+      if (this.whole) return null;
+      const until = Math.min(end, transport.size ?? Infinity);
+      const asked = { start: start + filled, end: until };
+      if (asked.start >= until) return bytes.subarray(0, filled);
+      const before = filled;
+      try {
+        const answer = await tries.ask(transport.isPlain ? null : asked);
+        if (answer.take === 'plain') transport.isPlain = true;
+        if (answer.take === 'whole') this.#becomeWhole(answer, transport.isPlain ? null : asked, signal);
+        if (answer.take === 'end') return bytes.subarray(0, filled);
+        if (answer.take !== 'part') continue;
+        for await (const part of answer.body.parts()) {
+          const taken = part.subarray(0, until - start - filled);
+          bytes.set(taken, filled);
+          transport.count(start + filled, start + filled + taken.length);
+          filled += taken.length;
+          if (start + filled >= until) break;
+        }
+        const got = filled - before;
+        if (start === 0) transport.stated ??= statedSize(bytes.subarray(0, filled));
+        if (answer.end === null && got === 0 && transport.size === null) return bytes.subarray(0, filled);
+        const promised = Math.min(answer.end ?? (got > 0 ? 0 : until), transport.size ?? Infinity);
+        if (start + filled < promised) throw cutShort(got, promised - asked.start);
+        tiny = got < TINY_BYTES ? tiny + 1 : 0;
+        if (tiny > TINY_ANSWERS) transport.isPlain = true;
+      } catch (error) {
+        await tries.again(error, filled - before);
+      }
+    }
+  }
+
+  /**
+   * @param {import('./transport.mjs').Answer} answer
+   * @param {import('./answers.mjs').Asked | null} asked
+   * @param {AbortSignal} [signal]
+   */
+  #becomeWhole(answer, asked, signal) {
+    const { body } = answer;
+    if (this.whole || signal?.aborted) return body.drop();
+    body.detach(); // others wait for it, too
+    this.whole = new WholeSource(this.transport, this.head);
+    this.whole.begin(answer, asked);
+  }
+
+  /**
+   * Tell whether the server has another file by now.
+   *
+   * @param {number} offset
+   * @param {Bytes} bytes of the file as it was
+   * @returns {Promise<boolean>} false if the server does not tell
+   */
+  async isOther(offset, bytes) {
+    const { transport, whole } = this;
+    if (transport.isChanged) return true;
+    try {
+      const end = offset + bytes.length;
+      const now = whole ? await whole.read(offset, bytes.length) : await readNow(transport, offset, end);
+      return now !== null && bytes.some((byte, i) => byte !== now[i]);
+    } catch (error) {
+      return error instanceof InputError && error.isReplaced;
+    }
+  }
+}
+
+/**
+ * Request a range once, not from a cache.
+ *
+ * @param {Transport} transport
+ * @param {number} start
+ * @param {number} end
+ * @returns {Promise<Bytes | null>} null if the server sends something else
+ */
+async function readNow(transport, start, end) {
+  const { take, body } = await transport.tries().ask({ start, end }, { cache: 'no-store' });
+  if (take !== 'whole' && take !== 'part') return null;
+  const bytes = new Uint8Array(take === 'whole' ? end : end - start);
+  let filled = 0;
+  for await (const part of body.parts()) {
+    const taken = part.subarray(0, bytes.length - filled);
+    bytes.set(taken, filled);
+    filled += taken.length;
+    if (filled === bytes.length) break;
+  }
+  return filled === bytes.length ? bytes.subarray(start - end) : null;
+}
+
+/**
+ * Return the size in a header.
+ *
+ * @param {Bytes} bytes
+ * @returns {number | null} null without a valid header, which its reader reports
+ */
+function statedSize(bytes) {
+  try {
+    return bytes.length < HEADER_SIZE ? null : readFileHeader(bytes).fileSize;
+  } catch {
+    return null;
   }
 }

@@ -5,7 +5,7 @@ import { ldexp } from './lattice.mjs';
 import { levelMax, nameOf, registeredFlags } from './registry.mjs';
 import * as spec from './spec.mjs';
 
-const { ERROR_INDEX, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
+const { ERROR_INDEX, ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
 const { TILE_RECORD_OFFSETS: AT, TILE_RECORD_STRIDES: STRIDES, LAYER_RECORD_OFFSETS: AT_LAYER } = spec;
 const TABLE_ID_SIZE = Uint16Array.BYTES_PER_ELEMENT;
 const AXES = [0, 1, 2];
@@ -58,6 +58,14 @@ export function readTile(index, sizes, header, before) {
   const step = ldexp(header.attributes[spec.ATTRIBUTE_MEANS - 1].step, exponent);
   if (!(step > 0 && step < Infinity))
     throw fault(ERROR_VALUE, offset + AT.exponent, 'TIL-9', `a lattice with the exponent ${exponent}`);
+  const min = AXES.map((axis) => Math.fround(corner[axis] * step));
+  const max = AXES.map((axis) => Math.fround((corner[axis] + extent[axis]) * step));
+  for (const axis of AXES) {
+    if (!Number.isFinite(min[axis]) || !Number.isFinite(max[axis])) {
+      const what = `a box from ${corner[axis]} × ${step}, ${extent[axis]} wide, is beyond binary32`;
+      throw fault(ERROR_RANGE, offset + AT.corner + STRIDES.corner * axis, 'MEA-1', what);
+    }
+  }
   const layers = readLayers(index, sizes.layer_size, fields, header);
   const tablesOffset = index.offset;
   const tables = [];
@@ -72,8 +80,8 @@ export function readTile(index, sizes, header, before) {
     corner,
     extent,
     step,
-    min: AXES.map((axis) => Math.fround(corner[axis] * step)),
-    max: AXES.map((axis) => Math.fround((corner[axis] + extent[axis]) * step)),
+    min,
+    max,
     maxScale: fields.max_scale,
     layers,
     tables,

@@ -1,15 +1,19 @@
 // Sources that hold the whole file: a body from a server without ranges, memory, a Blob.
 
+import { replaced } from './answers.mjs';
 import { readFileHeader } from './container.mjs';
-import { CsplatError, InputError, LimitError, allocate, fault } from './errors.mjs';
+import { InputError, LimitError, allocate, fault } from './errors.mjs';
 import { toBytes } from './options.mjs';
-import { ERROR_LIMIT, ERROR_TRAILING, ERROR_TRUNCATED, HEADER_SIZE } from './spec.mjs';
+import { ERROR_LIMIT, ERROR_TRAILING, ERROR_TRUNCATED, HEADER_SIZE, MAGIC } from './spec.mjs';
+import { abortable, asInputError } from './transport.mjs';
 
 /**
  * @typedef {import('./decoder.d.ts').ByteSource} ByteSource
  * @typedef {import('./decoder.d.ts').ByteRange} ByteRange
  * @typedef {Uint8Array<ArrayBuffer>} Bytes
- * @typedef {(received: number) => void} Received called with the number of bytes of each part that arrives
+ * @typedef {import('./answers.mjs').Asked} Asked
+ * @typedef {import('./transport.mjs').Transport} Transport
+ * @typedef {import('./transport.mjs').Answer} Sent
  */
 
 /**
@@ -22,139 +26,191 @@ export const shortData = (offset, size) =>
   fault(ERROR_TRUNCATED, offset, 'HDR-5', `${size} bytes were requested, the data ends earlier`);
 
 /**
- * Turn a network error into E_INPUT; keep aborts and errors of the decoder.
+ * Return the error for an answer that a proxy has ended early, as if it were complete.
  *
- * @param {unknown} error
- * @param {string | URL} url
+ * @param {number} got bytes
+ * @param {number | string} promised
  */
-export function asInputError(error, url) {
-  const isAbort = error instanceof Error && (error.name === 'AbortError' || error.name === 'TimeoutError');
-  return isAbort || error instanceof CsplatError ? error : new InputError(`${url}: ${error}`, error, true);
-}
+export const cutShort = (got, promised) =>
+  new InputError(`the answer of the server ended after ${got} of ${promised} bytes`, {
+    ...{ reason: 'connection', isTransient: true },
+  });
 
-/**
- * Yield the parts of a body as they arrive; the rest is cancelled if the loop is left early.
- *
- * @param {Response} response
- */
-export async function* bodyParts(response) {
-  const reader = response.body?.getReader();
-  if (!reader) return;
-  try {
-    for (let part = await reader.read(); !part.done; part = await reader.read()) yield part.value;
-  } catch (error) {
-    throw asInputError(error, response.url);
-  } finally {
-    reader.cancel().catch(() => {});
-  }
-}
-
-/** A body with the whole file, usable as soon as its first part has arrived. */
+/** A body with the whole file, usable as soon as its first part has arrived; requested again if it breaks. */
 export class WholeSource {
   /**
-   * @param {Response} response
-   * @param {{limit: number, received: Received}} way maximum size of the file, and the callback for each part
+   * @param {Transport} transport
+   * @param {Bytes} head first bytes of the file, if they are known from an earlier answer
    */
-  static async open(response, way) {
-    const source = new WholeSource();
-    const arriving = bodyParts(response);
-    /** @type {Uint8Array[]} */
-    const first = [];
-    let size = 0;
-    while (size < HEADER_SIZE) {
-      const { value, done } = await arriving.next();
-      if (done) break;
-      first.push(value);
-      size += value.length;
-      way.received(value.length);
-    }
-    const head = new Uint8Array(Math.min(size, HEADER_SIZE));
-    copyParts(head, first);
-    const { fileSize } = readFileHeader(head);
-    if (fileSize > way.limit) {
-      await arriving.return();
-      throw new LimitError(
-        ERROR_LIMIT,
-        `a file of ${fileSize} bytes from a server without ranges, the budget is ${way.limit}`,
-      );
-    }
-    source.bytes = allocate(() => new Uint8Array(fileSize));
-    source.take(first);
-    source.pump(arriving, way.received).catch((error) => source.fail(error));
-    return source;
+  constructor(transport, head) {
+    this.transport = transport;
+    this.head = head.subarray(0, HEADER_SIZE);
+    /** Room for the header, then for the file. @type {Bytes} */
+    this.bytes = new Uint8Array(HEADER_SIZE);
+    this.isOpen = false; // its header has arrived
+    this.filled = 0;
+    /** @type {{error: unknown} | null} */
+    this.failure = null;
+    /** @type {Set<{end: number, resolve: (value?: unknown) => void, reject: (error: unknown) => void}>} */
+    this.waiting = new Set();
   }
 
-  constructor() {
-    /** Whether later bytes arrive later. */
-    this.isSequential = true;
-    /** @type {Bytes} */
-    this.bytes = new Uint8Array(0);
-    this.filled = 0;
-    /** @type {unknown} */
-    this.error = null;
-    /** @type {{end: number, resolve: (value?: unknown) => void, reject: (error: unknown) => void}[]} */
-    this.waiting = [];
+  /**
+   * Read the file in the background.
+   *
+   * @param {Sent | null} sent what has been answered; null for a new request
+   * @param {Asked | null} asked the range that it answers
+   */
+  begin(sent, asked) {
+    this.failure = null;
+    this.#pump(sent, asked).catch((error) => {
+      this.failure = { error };
+      for (const waiter of this.waiting) waiter.reject(error);
+      this.waiting.clear();
+    });
   }
 
   /**
    * @param {number} offset
    * @param {number} size
-   * @param {AbortSignal} [_signal]
+   * @param {AbortSignal} [signal]
    * @returns {Promise<Bytes>}
    */
-  async read(offset, size, _signal) {
+  async read(offset, size, signal) {
     const end = offset + size;
+    if (this.failure) {
+      const { error } = this.failure;
+      if (!(error instanceof InputError && error.isTransient)) throw error;
+      this.begin(null, null); // the caller tries again
+    }
+    if (!this.isOpen) await this.#arrival(HEADER_SIZE, signal);
     if (end > this.bytes.length) throw shortData(this.bytes.length, size);
-    if (this.error !== null) throw this.error;
-    if (end > this.filled) await new Promise((resolve, reject) => this.waiting.push({ end, resolve, reject }));
+    if (end > this.filled) await this.#arrival(end, signal);
     return this.bytes.subarray(offset, end);
   }
 
-  /** Do nothing: the whole file is already on its way. */
-  prefetch() {}
+  /**
+   * @param {number} end
+   * @param {AbortSignal} [signal]
+   */
+  #arrival(end, signal) {
+    return abortable(new Promise((resolve, reject) => this.waiting.add({ end, resolve, reject })), signal);
+  }
 
   /**
-   * @param {AsyncGenerator<Uint8Array>} arriving
-   * @param {Received} received
+   * @param {Sent | null} sent
+   * @param {Asked | null} asked
    */
-  async pump(arriving, received) {
-    for await (const part of arriving) {
-      received(part.length);
-      this.take([part]);
+  async #pump(sent, asked) {
+    const { transport } = this;
+    const tries = transport.tries();
+    let ended = -1;
+    for (;;) {
+      const before = this.filled;
+      try {
+        if (sent === null) {
+          asked = transport.isPlain ? null : { start: before, end: Infinity };
+          sent = await tries.ask(asked);
+        }
+        const { take } = sent;
+        if (take === 'plain' || (take === 'end' && sent.total === null)) transport.isPlain = true;
+        else if (take === 'end') throw shortData(before, this.bytes.length);
+        else if (take !== 'within' && (await this.#receive(sent, asked, ended))) return;
+      } catch (error) {
+        if (error instanceof InputError && error.reason === 'connection') ended = this.filled;
+        await tries.again(error, this.filled - before);
+      }
+      sent = null;
     }
-    if (this.filled < this.bytes.length) throw shortData(this.filled, this.bytes.length);
   }
 
-  /** @param {Uint8Array[]} arrived */
-  take(arrived) {
-    for (const part of arrived) {
-      if (part.length > this.bytes.length - this.filled) {
+  /**
+   * Read one body to its end.
+   *
+   * @param {Sent} sent
+   * @param {Asked | null} asked
+   * @param {number} ended where the last answer ended: two that end there without an announced size are complete
+   * @returns {Promise<boolean>} whether the file is
+   */
+  async #receive({ take, body }, asked, ended) {
+    const start = take === 'part' ? this.filled : 0;
+    let at = start;
+    for await (const part of body.parts()) {
+      this.#take(part, at, asked);
+      at += part.length;
+    }
+    if (this.isOpen && this.filled === this.bytes.length) return true;
+    const isComplete = body.size === at - start;
+    if (take === 'part' && isComplete && at > start) return false; // fewer bytes than requested
+    if (this.isOpen && asked && take === 'whole' && at === asked.end - asked.start) throw this.#partAsWhole(asked);
+    const size = this.isOpen ? this.bytes.length : HEADER_SIZE;
+    if (take === 'part' || (!isComplete && (at !== ended || at !== this.filled))) throw cutShort(at, size);
+    if (!this.isOpen) readFileHeader(this.bytes.subarray(0, this.filled)); // throws
+    throw shortData(this.filled, size);
+  }
+
+  /**
+   * @param {Uint8Array} part
+   * @param {number} at its offset in the file
+   * @param {Asked | null} asked
+   */
+  #take(part, at, asked) {
+    for (let from = 0; from < part.length;) {
+      const here = at + from;
+      if (here < this.filled) {
+        const known = this.bytes.subarray(here, Math.min(this.filled, at + part.length));
+        if (known.some((byte, i) => byte !== part[from + i])) {
+          throw replaced(this.transport.url, 'an answer differs from the one before');
+        }
+        from += known.length;
+        continue;
+      }
+      if (this.filled === this.bytes.length) {
         throw fault(ERROR_TRAILING, this.bytes.length, 'HDR-6', 'the server sends bytes after the end of the file');
       }
-      this.bytes.set(part, this.filled);
-      this.filled += part.length;
+      const taken = part.subarray(from, from + this.bytes.length - this.filled);
+      this.bytes.set(taken, this.filled);
+      this.transport.count(this.filled, this.filled + taken.length);
+      this.filled += taken.length;
+      from += taken.length;
+      if (!this.isOpen) this.#open(asked);
     }
-    for (const waiter of this.waiting) if (waiter.end <= this.filled) waiter.resolve();
-    this.waiting = this.waiting.filter((waiter) => waiter.end > this.filled);
+    for (const waiter of this.waiting) {
+      if (waiter.end > this.filled) continue;
+      waiter.resolve();
+      this.waiting.delete(waiter);
+    }
   }
 
-  /** @param {unknown} error */
-  fail(error) {
-    this.error = error;
-    for (const waiter of this.waiting) waiter.reject(error);
+  /** @param {Asked | null} asked */
+  #open(asked) {
+    const { bytes, filled, head, transport } = this;
+    if (head.subarray(0, filled).some((byte, i) => byte !== bytes[i])) {
+      const isScene = MAGIC.every((byte, i) => i >= filled || byte === bytes[i]);
+      if (asked && !isScene && !transport.isChanged) throw this.#partAsWhole(asked);
+      throw replaced(transport.url, 'another answer begins with other bytes');
+    }
+    if (filled < HEADER_SIZE) return;
+    const { fileSize } = readFileHeader(bytes);
+    const { limit } = transport.way;
+    if (fileSize > limit) {
+      throw new LimitError(
+        ERROR_LIMIT,
+        `a file of ${fileSize} bytes from a server without ranges, the budget is ${limit}`,
+      );
+    }
+    this.bytes = allocate(() => new Uint8Array(fileSize));
+    this.bytes.set(bytes);
+    this.isOpen = true;
+    transport.stated ??= fileSize;
   }
-}
 
-/**
- * @param {Uint8Array} into
- * @param {Uint8Array[]} from
- */
-function copyParts(into, from) {
-  let filled = 0;
-  for (const part of from) {
-    const taken = part.subarray(0, into.length - filled);
-    into.set(taken, filled);
-    filled += taken.length;
+  /** @param {Asked} asked */
+  #partAsWhole({ start, end }) {
+    const detail = `the server answers a request for the bytes ${start}–${end - 1} with them, but with status 200`;
+    return new InputError(`${this.transport.url}: ${detail}, which announces the whole file; a part needs status 206`, {
+      ...{ reason: 'server', status: 200 },
+    });
   }
 }
 

@@ -1,6 +1,7 @@
 // Decodes tiles in workers. csplat-worker.mjs runs in the worker and does not import this module: bundlers would not end.
 
 import { buffersOf } from './arrays.mjs';
+import { abortable } from './transport.mjs';
 
 /**
  * @typedef {import('./decoder.d.ts').TileRecord} TileRecord
@@ -91,12 +92,14 @@ async function start() {
  * @param {Wanted} wanted
  * @param {boolean} isFirst
  * @param {any} spare fields of another tile, whose memory the worker may reuse
- * @returns {Promise<{worker: Correspondent, tile: TileRecord, fields?: any}>}
+ * @param {AbortSignal} [signal]
+ * @returns {Promise<{worker: Correspondent, tile: TileRecord, fields?: any}>} rejects if the tile cannot be fetched
  */
-async function decodeTile(reader, worker, tile, wanted, isFirst, spare) {
+async function decodeTile(reader, worker, tile, wanted, isFirst, spare, signal) {
+  const opening = isFirst ? await reader.partsOf(wanted) : null;
+  const parts = await reader.partsOf(wanted, tile, signal);
   try {
-    if (isFirst && (await worker.ask({ open: await reader.partsOf(wanted), wanted })) === null) return { worker, tile };
-    const parts = await reader.partsOf(wanted, tile);
+    if (opening && (await worker.ask({ open: opening, wanted })) === null) return { worker, tile };
     const offsets = [...parts.keys()];
     const answer = await worker.ask({ tile: tile.index, parts, spare });
     if (answer?.fields) for (const offset of offsets) reader.checked.add(offset);
@@ -120,16 +123,21 @@ async function decodeTile(reader, worker, tile, wanted, isFirst, spare) {
 export async function* byWorkers(reader, waiting, wanted, count, signal, spares = []) {
   /** @type {Map<Correspondent, ReturnType<typeof decodeTile>>} */
   const jobs = new Map();
+  const start = (/** @type {Correspondent} */ worker, /** @type {TileRecord} */ tile, isFirst = false) => {
+    const job = decodeTile(reader, worker, tile, wanted, isFirst, isFirst ? undefined : spares.pop(), signal);
+    job.catch(() => {}); // it is reported below, if nothing is before
+    jobs.set(worker, job);
+  };
   /** @type {Map<string, PackedColumns>} */
   const tables = new Map();
   try {
     for (const tile of waiting.splice(Math.max(0, waiting.length - count)).reverse()) {
       const worker = await take().catch(() => null);
       if (worker === null) waiting.push(tile);
-      else jobs.set(worker, decodeTile(reader, worker, tile, wanted, true, undefined));
+      else start(worker, tile, true);
     }
     while (jobs.size) {
-      const { worker, tile, fields } = await Promise.race(jobs.values());
+      const { worker, tile, fields } = await abortable(Promise.race(jobs.values()), signal);
       signal?.throwIfAborted();
       if (fields === undefined) {
         worker.worker.terminate();
@@ -142,7 +150,7 @@ export async function* byWorkers(reader, waiting, wanted, count, signal, spares 
         jobs.delete(worker);
         giveBack(worker);
       } else {
-        jobs.set(worker, decodeTile(reader, worker, next, wanted, false, spares.pop()));
+        start(worker, next);
       }
       restore(fields, tables);
       yield { tile, fields, worker };

@@ -6,6 +6,7 @@ It uses Python integers and single IEEE operations: slow on purpose, and indepen
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat_authoring.scene import Block, Rows, Scene, Tile, attribute_named, band_of
+from csplat_authoring.scene import Block, Node, Rows, Scene, Tile, attribute_named, band_of
 
 Array = NDArray[Any]
 
@@ -21,12 +22,16 @@ Array = NDArray[Any]
 EXTRA_DTYPES = {value: f"<{name[0]}{_spec.EXTRA_DTYPE_BYTES[value]}" for value, name in _spec.EXTRA_DTYPE_NAMES.items()}
 
 _ROOT_2 = float.fromhex("0x1.6A09E667F3BCDp+0")
+#: Smallest and largest corner of a box.
+_Box = tuple[list[float], list[float]]
+_FAR = 1e300  # beyond every centre
+_BOXES = 6  # tiles or regions of a level, at most, from whose sides boxes start
 _COLOURS = range(_spec.ATTRIBUTE_SH0, _spec.ATTRIBUTE_SH4 + 1)
 
 
 @dataclass
 class Expected:
-    """Header fields and arrays; for files with levels, some cuts and their tiles or error codes."""
+    """Header fields and arrays; for files with levels or several tiles, some cuts and their tiles or error codes."""
 
     header: dict[str, Any]
     integers: dict[str, Array] = field(default_factory=dict)
@@ -40,8 +45,9 @@ def expected(scene: Scene) -> Expected:
     result = Expected(_header(scene))
     rows = {attribute: _all_rows(scene, attribute) for attribute in scene.attributes}
     result.integers = _integers(scene, rows)
-    if scene.nodes:
+    if scene.nodes or len(scene.tiles) > 1:
         result.cuts = _cuts(scene)
+    if scene.nodes:
         scene = scene.finest
         rows = {attribute: tiles[: len(scene.tiles)] for attribute, tiles in rows.items()}
     result.floats = _floats(scene, rows)
@@ -69,11 +75,18 @@ def _header(scene: Scene) -> dict[str, Any]:
 
 
 def _cuts(scene: Scene) -> list[tuple[str, list[int] | str]]:
-    """Return cuts by every level, by pixel sizes at and around each error, and by several budgets, with their tiles."""
-    nodes = [_Node(n, scene) for n in range(len(scene.nodes))]
+    """Return cuts by every level, by pixel sizes at and around each error, by several budgets, and in boxes.
+
+    A file without levels has boxes alone.
+    """
+    records = scene.nodes or (Node(_spec.NO_PARENT, len(scene.tiles), 0.0),)
+    nodes = [_Node(n, scene, records) for n in range(len(records))]
     for node in nodes:
         node.children = [child for child in nodes if child.parent == node.number]
     roots = [node for node in nodes if node.parent == _spec.NO_PARENT]
+    boxes = _box_cuts(scene, nodes, roots)
+    if not scene.nodes:
+        return boxes
     errors = [node.error for node in nodes]
     around = {size for e in errors for size in (math.nextafter(e, -1.0), e, math.nextafter(e, math.inf)) if size >= 0}
     mixed = [[errors[(step * n + 1) % len(errors)] for n in range(len(errors))] for step in (1, 3)]
@@ -91,19 +104,71 @@ def _cuts(scene: Scene) -> list[tuple[str, list[int] | str]]:
     least = sum(node.splats for node in roots)
     most = sum(node.splats for node in nodes if node.level == 0)
     budgets = sorted({least - 1, least, least + 1, (least + most) // 2, most - 1, most, 2**40})
-    return [*cuts, *((f"splats {budget}", _refine(roots, budget)) for budget in budgets)]
+    return [*cuts, *((f"splats {budget}", _limited(roots, budget)) for budget in budgets), *boxes]
+
+
+def _box_cuts(scene: Scene, nodes: list[_Node], roots: list[_Node]) -> list[tuple[str, list[int] | str]]:
+    """Return cuts in half spaces that end at sides of boxes and regions, or just before, and in some corners."""
+    boxes = [tile_box(scene, tile) for tile in scene.tiles]
+    cuts: dict[str, list[int] | str] = {}  # boxes may share a side
+
+    def select(cut: str, chosen: list[_Node], low: list[float], high: list[float]) -> None:
+        tiles = [
+            number for node in chosen for number in node.tiles
+            if _touch(boxes[number] if node.level == 0 else node.region(boxes), (low, high))
+        ]  # fmt: skip
+        cuts[f"{cut} box {' '.join(map(repr, low + high))}"] = sorted(tiles)
+
+    below, above = [-_FAR] * 3, [_FAR] * 3
+    for level in sorted({0, *(node.level for node in nodes)})[:2]:
+        cut = _descend(roots, [node.level > level for node in nodes])
+        edges = [node.region(boxes) for node in cut if node.level > 0] if level else boxes
+        for number, (low, high) in enumerate(edges[:: 1 + len(edges) // _BOXES]):
+            axis = number % 3
+            for edge in (high[axis], math.nextafter(high[axis], math.inf)):
+                select(f"level {level}", cut, [edge if i == axis else -_FAR for i in range(3)], above)
+            for edge in (low[axis], math.nextafter(low[axis], -math.inf)):
+                select(f"level {level}", cut, below, [edge if i == axis else _FAR for i in range(3)])
+            select(f"level {level}", cut, low, low)
+            select(f"level {level}", cut, high, high)
+    if scene.nodes:
+        error, middle = max(node.error for node in nodes) / 2, boxes[0][1]
+        select(f"pixel_size {error!r}", _descend(roots, [node.error > error for node in nodes]), middle, above)
+        budget = sum(node.splats for node in roots)  # includes splats outside the box
+        select(f"splats {budget}", _refine(roots, budget), middle, above)
+    return [*cuts.items()]
+
+
+def tile_box(scene: Scene, tile: Tile) -> _Box:
+    """Return the box of a tile (spec 4.3.5): the smallest and the largest values of its means."""
+    step = scene.attributes[_spec.ATTRIBUTE_MEANS].step
+    rows = block_rows(scene, tile, _spec.ATTRIBUTE_MEANS, tile.blocks[_spec.ATTRIBUTE_MEANS])
+    values = [
+        [float(lattice_value(corner + q, step, tile.exponent)) for q in column]
+        for corner, column in zip(tile.corner, zip(*rows, strict=True), strict=True)
+    ]
+    return [min(column) for column in values], [max(column) for column in values]
+
+
+def _touch(one: _Box, other: _Box) -> bool:
+    return all(a <= d and b >= c for a, b, c, d in zip(*one, *other, strict=True))
 
 
 class _Node:
-    def __init__(self, number: int, scene: Scene) -> None:
-        first = sum(node.tile_count for node in scene.nodes[:number])
-        record = scene.nodes[number]
+    def __init__(self, number: int, scene: Scene, records: Sequence[Node]) -> None:
+        first = sum(node.tile_count for node in records[:number])
+        record = records[number]
         self.number, self.parent = number, record.parent
         self.error = float(np.float32(record.error))
         self.tiles = [*range(first, first + record.tile_count)]
         self.level = scene.tiles[first].level
         self.splats = sum(scene.tiles[i].splat_count for i in self.tiles)
         self.children: list[_Node] = []
+
+    def region(self, boxes: list[_Box]) -> _Box:
+        parts = [boxes[number] for number in self.tiles] + [child.region(boxes) for child in self.children]
+        lows, highs = ([*zip(*ends, strict=True)] for ends in zip(*parts, strict=True))
+        return [min(axis) for axis in lows], [max(axis) for axis in highs]
 
 
 def _tiles_of(nodes: list[_Node]) -> list[int]:
@@ -118,18 +183,21 @@ def _descend(nodes: list[_Node], is_replaced: list[bool]) -> list[_Node]:
     return found
 
 
-def _refine(roots: list[_Node], budget: int) -> list[int] | str:
+def _limited(roots: list[_Node], budget: int) -> list[int] | str:
+    fits = sum(node.splats for node in roots) <= budget
+    return _tiles_of(_refine(roots, budget)) if fits else _spec.ERROR_LIMIT
+
+
+def _refine(roots: list[_Node], budget: int) -> list[_Node]:
     """Replace one node at a time while the budget lasts."""
     cut = list(roots)
-    if sum(node.splats for node in cut) > budget:
-        return _spec.ERROR_LIMIT
     while any(node.children for node in cut):
         worst = max((node for node in cut if node.children), key=lambda node: (node.error, node.number))
         finer = [node for node in cut if node is not worst] + worst.children
         if sum(node.splats for node in finer) > budget:
             break
         cut = finer
-    return _tiles_of(cut)
+    return cut
 
 
 def block_rows(scene: Scene, tile: Tile, attribute: int, block: Block) -> list[list[int]]:

@@ -62,7 +62,7 @@ def cuts_of(data: bytes, lines: Sequence[str]) -> list[list[int] | str]:
 
     Args:
         data: the file.
-        lines: a cut each: `level 1`, `pixel_size 0.5`, `pixel_size 0.5 0.25`, `splats 100`.
+        lines: a cut each: `level 1`, `pixel_size 0.5`, `pixel_size 0.5 0.25`, `splats 100`, `level 0 box 0 0 0 1 1 1`.
 
     Returns:
         For each cut, the indices of its tiles or an error code.
@@ -77,13 +77,15 @@ def cuts_of(data: bytes, lines: Sequence[str]) -> list[list[int] | str]:
     nodes = read_nodes(memoryview(data), header)
     result: list[list[int] | str] = []
     for line in lines:
-        name, *words = line.split()
+        cut, _, corners = line.partition(" box ")
+        name, *words = cut.split()
         sizes = [float(word) for word in words] if name == "pixel_size" else None
         pixel_size = sizes[0] if sizes is not None and len(sizes) == 1 else sizes
         level = int(words[0]) if name == "level" else None
         max_splats = int(words[0]) if name == "splats" else None
+        box = np.array(corners.split(), np.float64).reshape(2, 3) if corners else None
         try:
-            tiles = select_tiles(header, nodes, level=level, pixel_size=pixel_size, max_splats=max_splats)
+            tiles = select_tiles(header, nodes, level=level, pixel_size=pixel_size, max_splats=max_splats, box=box)
             result.append([tile.index for tile in tiles])
         except LimitError as error:
             result.append(error.code)

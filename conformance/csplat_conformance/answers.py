@@ -5,7 +5,7 @@
 | L1 | `header.json`; for invalid files the refusal |
 | L2 | the integer arrays of spec 9.2 |
 | L3 | the float arrays of spec section 3 and the extra columns, bit for bit, or by `tolerance` for the class renderer |
-| L5 | the tiles of cuts through the levels of detail (spec 5.7), by `compare_cuts` |
+| L5 | the tiles of cuts through the levels of detail and of boxes (spec 5.7), by `compare_cuts` |
 
 L4, renders, is in `reference_renders`.
 """
@@ -243,7 +243,7 @@ def _compare_values(vector: Vector, answer: Answer, key: str, near: FloatsByVect
 
 
 def cuts_of_vector(vector: Vector) -> list[str]:
-    """Return the cuts to request, such as `level 1`; none for an invalid file or one without levels of detail."""
+    """Return the cuts to request, such as `level 1`; none for an invalid file or one of a single tile."""
     return [text for text, _ in vector.expect.get("cuts", ())]
 
 
@@ -265,23 +265,26 @@ def _compare_cuts(expect: Sequence[tuple[str, Cut]], found: Sequence[Cut]) -> tu
     if len(found) != len(expect):
         status = Status.PARTIAL_OUTPUT if len(found) < len(expect) else Status.FAILED
         return (status if found else Status.NO_OUTPUT), f"{len(found)} cuts, expected {len(expect)}, a line for each"
-    offered = {_kind(text) for (text, _), cut in zip(expect, found, strict=True) if cut != _spec.ERROR_UNSUPPORTED}
+    answered = (text for (text, _), cut in zip(expect, found, strict=True) if cut != _spec.ERROR_UNSUPPORTED)
+    offered = {kind for text in answered for kind in _kinds(text)}
     wrong = [
         f"the cut {_shorten(text)!r} is {_shorten(_cut_text(cut))}, expected {_shorten(_cut_text(wanted))}"
         for (text, wanted), cut in zip(expect, found, strict=True)
-        if cut != wanted and _kind(text) in offered
+        if cut != wanted and _kinds(text) <= offered
     ]
     if wrong:
         more = f"; {len(wrong) - 1} of the other {len(expect) - 1} cuts are wrong, too" if len(wrong) > 1 else ""
         return Status.FAILED, wrong[0] + more
-    missing = sorted({_kind(text) for text, _ in expect} - offered)
+    missing = sorted({kind for text, _ in expect for kind in _kinds(text)} - offered)
     if missing:
         return (Status.PASSED if offered else Status.SKIPPED), f"the decoder offers no cut by {', '.join(missing)}"
     return Status.PASSED, ""
 
 
-def _kind(text: str) -> str:
-    return text.split(maxsplit=1)[0]
+def _kinds(text: str) -> set[str]:
+    """Return what a decoder needs to offer for a cut: `level`, `pixel_size` or `splats`, and perhaps `box`."""
+    words = text.split()
+    return {words[0], "box"} & {*words}
 
 
 def _cut_text(cut: Cut) -> str:

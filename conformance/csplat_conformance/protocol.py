@@ -8,9 +8,9 @@ Or it exits with status 1, its last line on standard output is JSON, `{"code": "
 
     my-cuts INPUT CUTS
 
-CUTS is a text file with a cut per line, `level 1`, `pixel_size 0.5` or `splats 100`. The program exits with status 0
-and prints a line for each: the numbers of its tiles, or an error code. If it refuses the file, it exits with status 1
-and a line of JSON as above.
+CUTS is a text file with a cut per line, `level 1`, `pixel_size 0.5` or `splats 100`, perhaps in a box, `level 0 box 0
+0 0 1 1 1`. The program exits with status 0 and prints a line for each: the numbers of its tiles, or an error code. If
+it refuses the file, it exits with status 1 and a line of JSON as above.
 
 `run_program` runs any program with a time limit:
 
@@ -31,7 +31,6 @@ import json
 import os
 import re
 import subprocess
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +38,7 @@ from pathlib import Path
 from typing import IO, Any
 from urllib.parse import unquote
 
+from csplat.disk_files import temporary_file, temporary_folder
 from csplat.errors import InputError
 from csplat.system import kill_group, split_words
 from csplat_conformance.answers import Answer, whole_number
@@ -58,8 +58,8 @@ def ask_decoder(command: str, path: Path, timeout: float, *, keep_floats: bool =
         timeout: time limit in seconds, after which the process and its children are killed.
         keep_floats: keep the values of float arrays in the answer, not only their hashes.
     """
-    with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as folder:
-        outdir = Path(folder) / "out"
+    with temporary_folder() as folder:
+        outdir = folder / "out"
         outdir.mkdir()
         end = run_program(command, {"input": str(path), "outdir": str(outdir)}, timeout)
         return read_answer(end, outdir, keep_floats=keep_floats)
@@ -90,8 +90,8 @@ def ask_cuts(command: str, path: Path, cuts: Sequence[str], timeout: float) -> A
         cuts: the cuts to request.
         timeout: as in `ask_decoder`.
     """
-    with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as folder:
-        text = Path(folder) / "cuts.txt"
+    with temporary_folder() as folder:
+        text = folder / "cuts.txt"
         text.write_text("".join(f"{cut}\n" for cut in cuts), encoding="utf-8", newline="\n")
         end = run_program(command, {"input": str(path), "cuts": str(text)}, timeout)
     if end.status is not None:
@@ -232,7 +232,7 @@ def run_program(
         ]
     arguments = [argument.format(**values) for argument in arguments]
     start = time.perf_counter()
-    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+    with temporary_file() as out, temporary_file() as err:
         try:
             process = subprocess.Popen(  # noqa: S603 - runs the caller's command on purpose
                 arguments, stdin=subprocess.DEVNULL, stdout=out, stderr=err, start_new_session=True, cwd=cwd

@@ -16,16 +16,15 @@ import importlib.util
 import json
 import math
 import struct
-import tempfile
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import temporary_folder
 from csplat.errors import InputError
 from csplat.types import U8
 from csplat_conformance.conformance_report import Outcome, Status
@@ -93,8 +92,7 @@ def skip_views(vector: Vector, why: str) -> list[Outcome]:
 
 
 def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Outcome:
-    with tempfile.TemporaryDirectory(prefix="csplat-conformance-") as name:
-        folder = Path(name)
+    with temporary_folder() as folder:
         outdir, camera = folder / "out", folder / "camera.json"
         outdir.mkdir()
         camera.write_text(json.dumps([vector.views[number]["camera"]]), encoding="utf-8")

@@ -24,7 +24,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Final
@@ -33,17 +33,24 @@ from unittest import mock
 import numpy as np
 
 from csplat import _spec, decoder
-from csplat.decoder import blocks, container, entropy, reconstruct
+from csplat.decoder import blocks, container, entropy, index, reconstruct
 from csplat.errors import FormatError, InputError, UnsupportedError
 from csplat_authoring.recipes import exact_floats
-from csplat_conformance.adapter import answer
-from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
+from csplat_conformance.adapter import answer, cuts_of
+from csplat_conformance.answers import (
+    PARTS,
+    Answer,
+    check_payload_consistency,
+    compare_answer,
+    compare_cuts,
+    cuts_of_vector,
+)
 from csplat_conformance.conformance_report import Outcome, Status
 from csplat_conformance.manifest import Vector, load
 from csplat_conformance.single_precision import GPUS, GpuArithmetic, lattice_values, opacities, quats
 from csplat_conformance.tolerance import EXACT, RENDERER
 from csplat_conformance.validator.inflate import CodedError, Inflater
-from csplat_selftest.decoder_processes import JsDecoder, js_folder
+from csplat_selftest.decoder_processes import JsDecoder, js_folder, select_in_javascript
 
 _EDITS: Final = Path(__file__).with_suffix(".toml")
 #: A faulty function; called with the original function and then the arguments.
@@ -114,21 +121,27 @@ class Finding:
 def find(fault: DecoderFault, vectors: Iterable[Vector] | None = None) -> Finding:
     """Run a decoder with a fault over the vectors, or over some of them.
 
-    Codes of refusals are not compared, as for other decoders.
+    Codes of refusals are not compared, as for other decoders. Cuts (L5) are compared for faults of TRE-9 alone, because
+    a process for each vector takes a second.
 
     Raises:
         InputError: Node or the JavaScript decoder is missing.
     """
     outcomes: list[Outcome] = []
     with ExitStack() as stack:
+        ask: Callable[[bytes], Answer]
+        select: Callable[[Vector], Answer]
         if isinstance(fault.plant, ModuleEdit):
-            ask = stack.enter_context(_edited_javascript(stack, fault.plant)).ask
+            folder = _edited_javascript(stack, fault.plant)
+            ask, select = stack.enter_context(JsDecoder(folder)).ask, partial(select_in_javascript, folder)
         else:
             fault.plant(stack)
-            ask = _answer
+            ask, select = _answer, _cuts
         near = exact_floats if fault.by == RENDERER else None
         for vector in load() if vectors is None else vectors:
             outcomes += compare_answer(vector, ask(vector.data), tuple(PARTS), near=near)
+            if fault.clause == "TRE-9" and cuts_of_vector(vector):
+                outcomes.append(compare_cuts(vector, select(vector)))
     return Finding(fault, [one for one in check_payload_consistency(outcomes)[0] if not one.good])
 
 
@@ -139,12 +152,19 @@ def _answer(data: bytes) -> Answer:
         return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
 
 
-def _edited_javascript(stack: ExitStack, edit: ModuleEdit) -> JsDecoder:
+def _cuts(vector: Vector) -> Answer:
+    try:
+        return Answer(Status.PASSED, cuts=cuts_of(vector.data, cuts_of_vector(vector)))
+    except Exception as error:  # noqa: BLE001 - a faulty decoder may fail in any way
+        return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
+
+
+def _edited_javascript(stack: ExitStack, edit: ModuleEdit) -> Path:
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="csplat-fault-")))
     for path in js_folder().glob("*.mjs"):
         shutil.copy(path, folder)
     (folder / edit.file).write_text(edited_module(edit), encoding="utf-8")
-    return JsDecoder(folder)
+    return folder
 
 
 def table(findings: Sequence[Finding]) -> str:
@@ -541,16 +561,24 @@ def _overflowing(_right: Wrong, integers: Any, step: float, out: Any, **_options
         out[...] = integers.astype(np.float32) * np.float32(step)
 
 
-def _checked_when_rounded(_right: Wrong, parts: Any, step: float, record: Any, at: int) -> None:
-    """Check that the values in single precision are finite."""
-    with np.errstate(over="ignore"):
-        finite = all(np.isfinite(part.astype(np.float32) * np.float32(step)).all() for part in parts)
+def _checked_when_rounded(right: Wrong, tile: container.Tile, means_step: float) -> None:
+    """Check that the corners of a box in single precision are finite."""
+    right(tile, means_step)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ends = np.array([tile.corner, np.add(tile.corner, tile.extent)], np.float32)
+        finite = np.isfinite(ends * np.float32(math.ldexp(means_step, tile.exponent))).all()
     if not finite:
-        raise FormatError(_spec.ERROR_RANGE, at, "MEA-1", _spec.ATTRIBUTE_NAMES[record.attribute])
+        raise FormatError(_spec.ERROR_RANGE, tile.offset, "MEA-1", "corner")
 
 
-def _never(_right: Wrong, _integer: int, _step: float) -> bool:
-    return False
+def _boxes_without_limit(stack: ExitStack) -> None:
+    stack.enter_context(mock.patch.object(index, "_SINGLE_END", math.inf))
+
+
+def _wide_corners(_right: Wrong, tile: container.Tile, step: float) -> tuple[list[float], list[float]]:
+    scaled = math.ldexp(step, tile.exponent)
+    low = [n * scaled for n in tile.corner]
+    return low, [(n + m) * scaled for n, m in zip(tile.corner, tile.extent, strict=True)]
 
 
 def _renderer(name: str, what: str, clause: str, plant: Plant) -> DecoderFault:
@@ -565,6 +593,9 @@ _NO_LIMITS = constants(
 _NOTHING_READ = together(replaced("json_chunk", nothing), replaced("bounds_chunk", nothing))
 
 _REPLACEMENTS: Final = (
+    DecoderFault(
+        "boxes", "corners are not rounded to binary32", "TRE-9", replaced("corners", _wide_corners, container.Tile)
+    ),
     DecoderFault("CRC of the index", "not checked", "IDX-1", replaced("_check_crc", crc_but("IDX-1"))),
     DecoderFault("CRCs of chunks", "not checked", "CHK-1", replaced("_check_crc", crc_but("CHK-1"))),
     DecoderFault("unused chunks", "unused chunks are not read", "CHK-2", replaced("read_side_chunks", _no_side_chunks)),
@@ -657,13 +688,13 @@ _REPLACEMENTS: Final = (
         "range by rounded values",
         "values that overflow in single precision are refused",
         "CNF-8",
-        together(replaced("_is_finite", _never), replaced("_check_finite", _checked_when_rounded)),
+        replaced("_check_tile", _checked_when_rounded),
     ),
     _renderer(
         "range by truncated values",
         "truncating arithmetic gives no infinite values, and the range is not checked",
         "CNF-8",
-        together(replaced("_check_finite", nothing), single_precision(GPUS["WGSL"][1])),
+        together(_boxes_without_limit, single_precision(GPUS["WGSL"][1])),
     ),
 )
 

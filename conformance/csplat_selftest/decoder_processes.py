@@ -7,6 +7,7 @@ import mmap
 import os
 import queue
 import select
+import shlex
 import shutil
 import struct
 import subprocess
@@ -18,9 +19,10 @@ from pathlib import Path
 from typing import IO, Any, Self
 
 from csplat.errors import InputError
-from csplat_conformance.answers import Answer, whole_number
+from csplat_conformance.answers import Answer, cuts_of_vector, whole_number
 from csplat_conformance.conformance_report import Status
-from csplat_conformance.protocol import ProcessEnd, read_answer
+from csplat_conformance.manifest import VECTORS, Vector
+from csplat_conformance.protocol import ProcessEnd, ask_cuts, read_answer
 
 _READ_BYTES = 1 << 16
 
@@ -258,6 +260,13 @@ def missing_javascript() -> str:
     except InputError as error:
         return str(error)
     return ""
+
+
+def select_in_javascript(folder: Path, vector: Vector, timeout: float = 20.0) -> Answer:
+    """Select the cuts of a vector in a process of the JavaScript decoder whose modules are in a folder."""
+    command = f"env CSPLAT_JS={shlex.quote(str(folder))} node {shlex.quote(str(js_folder() / _JS_ADAPTER))}"
+    path = VECTORS / vector.file
+    return ask_cuts(f"{command} --cuts {{input}} {{cuts}}", path, cuts_of_vector(vector), timeout)
 
 
 class JsDecoder(DecoderProcess):

@@ -22,7 +22,7 @@ from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parent.parent.parent
 _PACKAGES = ("codec", "trainer", "tools", "tools/benchmarks")
-_WHEELS = ("gsplat==1.5.3", "zstandard", "deflate")  # what machines with torch usually lack
+_WHEELS = ("gsplat==1.5.3", "plyfile", "zstandard", "deflate")  # what machines with torch usually lack
 _PLATFORMS = ("manylinux_2_28", "manylinux_2_17", "manylinux2014", "manylinux1")  # pip matches names exactly
 
 

@@ -1,10 +1,12 @@
-"""`csplat`: entry point of the installed script, and of `python -m csplat_tools`."""
+"""`csplat`: the program, and entry point of `python -m csplat_tools`."""
 
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from contextlib import suppress
+from types import FrameType
 
 from csplat_tools import VERSIONS
 
@@ -21,13 +23,55 @@ def main() -> None:
         with suppress(OSError):  # the code below reports a full disk
             os.write(sys.stdout.fileno(), f"{VERSIONS}\n".encode())
             return
+    _open_closed_streams()
+    interrupts: list[int] = []
+
+    def interrupt(number: int, _frame: FrameType | None) -> None:
+        interrupts.append(number)
+        raise KeyboardInterrupt
+
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # a shell's background ignores it
+        signal.signal(signal.SIGINT, interrupt)
     try:
         from csplat_tools.cli.app import app
 
+        _silence_libraries()
         app(prog_name="csplat")
+    except Exception:
+        if not interrupts:  # modules that are being imported turn an interrupt into other errors
+            raise
     except KeyboardInterrupt:
-        sys.stderr.write("interrupted\n")
-        sys.exit(_INTERRUPTED)
+        pass
+    sys.stderr.write("interrupted\n")
+    sys.exit(_INTERRUPTED)
+
+
+def _open_closed_streams() -> None:
+    """Open standard streams that the caller has closed, so that reading or writing one is an error of its own.
+
+    Otherwise the next file that is opened would get its number, and what is printed.
+    """
+    for number, name, mode, flags in ((0, "stdin", "r", os.O_WRONLY), (1, "stdout", "w", os.O_RDONLY)):
+        if getattr(sys, name) is None:
+            os.open(os.devnull, flags)  # gets the lowest free number
+            setattr(sys, name, open(number, mode, closefd=False))  # noqa: SIM115  # stays open
+    if sys.stderr is None:
+        sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: PTH123, SIM115  # stays open
+
+
+def _silence_libraries() -> None:
+    """Keep log messages of libraries off standard error, and print warnings without places in source code."""
+    import logging
+    import warnings
+
+    from csplat_tools.console import note
+
+    def show(message: Warning | str, *_: object) -> None:
+        note(f"warning: {message}")
+
+    logging.getLogger().addHandler(logging.NullHandler())  # without one, what nobody handles would be printed
+    warnings.filterwarnings("ignore", module=r"(?!csplat)")
+    warnings.showwarning = show  # type: ignore[assignment]  # the category and the place are not printed
 
 
 if __name__ == "__main__":

@@ -11,11 +11,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
 from csplat.errors import InputError
+from csplat.file_source import named_errors
 from csplat.types import Progress
 
 if TYPE_CHECKING:
@@ -40,13 +41,20 @@ NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 _UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
 _FILE_BYTES_MIN = 64  # size of a file's header: no file is smaller
 
+STANDARD_OUTPUT = "standard output"  # its name in messages
+
 #: Seconds; the expected time of longer work is announced.
 LONG_WORK_SECONDS = 10.0
 
 
 def print_data(text: str) -> None:
-    """Print data."""
-    _echo(text, sys.stdout)
+    """Print data.
+
+    Raises:
+        OSError: standard output, which the error names, cannot be written.
+    """
+    with named_errors(STANDARD_OUTPUT):
+        _echo(text, sys.stdout)
 
 
 def print_json(value: Any) -> None:
@@ -55,8 +63,9 @@ def print_json(value: Any) -> None:
 
 
 def note(text: str) -> None:
-    """Print a message on standard error."""
-    _echo(text, sys.stderr)
+    """Print a message on standard error, if it can be written."""
+    with suppress(OSError):
+        _echo(text, sys.stderr)
 
 
 class RunProgress(Protocol):
@@ -313,8 +322,13 @@ def _new_bars() -> Bars:
     )  # fmt: skip
 
 
+#: Control characters but tabs and line ends: in file names and metadata they would command the terminal.
+_CONTROLS = {code: f"\\x{code:02x}" for code in (*range(32), *range(127, 160)) if chr(code) not in "\t\n"}
+
+
 def _echo(text: str, stream: TextIO) -> None:
     for display in _displays:
         display.close()  # bars and lines on one terminal do not mix
+    text = text.translate(_CONTROLS)
     encoding = stream.encoding or "utf-8"  # may lack characters of file names and metadata
     stream.write(text.encode(encoding, "backslashreplace").decode(encoding) + "\n")

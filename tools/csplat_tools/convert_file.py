@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.decoder import Limits, open_tiles
-from csplat.editing.transform import convert_axes, rotate_scene, scale_scene, translate_scene
+from csplat.disk_files import resolve_links
+from csplat.editing.transform import axes_rotation, convert_axes, rotate_scene, scale_scene, translate_scene
+from csplat.editing.up_axis import UP
 from csplat.errors import InputError
-from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, write_levels
+from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, survey_losses, write_levels
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
-from csplat.model import SplatModel
+from csplat.model import UNSPECIFIED, SplatModel
 from csplat.scene_source import SceneSource, drop_bands
 from csplat.types import F64, Mask, Progress
 from csplat_tools.file_streams import is_one_way, local_path, mapped_csplat, write_model
@@ -35,7 +37,9 @@ class Filters:
     Attributes:
         to_axes: convert the scene to these axes, as in `SplatModel`; a scene without axes is assumed to have x right,
             y down, z forward.
-        rotate: rotate about x, y, z in this order, degrees, counter-clockwise as seen from the tip of the axis.
+        axes: axes along which `rotate`, `translate` and the crops are given; `None`: those of the scene.
+        rotate: rotate about x, y, z in this order, degrees, counter-clockwise as seen from the tip of the axis. The
+            scene keeps the names of its axes, so that converting it to axes of a format does not rotate it back.
         scale: scale the scene about the origin of its coordinates by this factor.
         translate: offset added to all positions, scene units.
         crop_box: keep splats whose centres lie between two corners, x y z each.
@@ -45,6 +49,7 @@ class Filters:
     """
 
     to_axes: str | None = None
+    axes: str | None = None
     rotate: tuple[float, float, float] | None = None
     scale: float | None = None
     translate: tuple[float, float, float] | None = None
@@ -57,20 +62,22 @@ class Filters:
         """Return the changed scene."""
         if self.to_axes is not None:
             scene = convert_axes(scene, self.to_axes)
+        letters = scene.metadata_model.coordinate_system
+        turn = np.eye(3) if self.axes is None or self.axes == letters else axes_rotation(self.axes, letters)
         if self.rotate is not None:
-            matrix = _rotation(self.rotate)
-            scene = _map_blocks(scene, lambda model: rotate_scene(model, matrix))
+            matrix = turn @ _rotation(self.rotate) @ turn.T
+            scene = _map_blocks(scene, lambda model: _rotate_in_axes(model, matrix))
         if self.scale is not None:
             factor = self.scale
             scene = _map_blocks(scene, lambda model: scale_scene(model, factor))
         if self.translate is not None:
-            offset = self.translate
-            scene = _map_blocks(scene, lambda model: translate_scene(model, offset))
+            x, y, z = (turn @ self.translate).tolist()
+            scene = _map_blocks(scene, lambda model: translate_scene(model, (x, y, z)))
         if self.crop_box is not None:
-            corners = np.sort(np.array(self.crop_box).reshape(2, 3), axis=0)
+            corners = np.sort(np.array(self.crop_box).reshape(2, 3) @ turn.T, axis=0)
             scene = _select(scene, lambda model: _inside_box(model, corners))
         if self.crop_sphere is not None:
-            sphere = np.array(self.crop_sphere)
+            sphere = np.array([*(turn @ self.crop_sphere[:3]), self.crop_sphere[3]])
             scene = _select(scene, lambda model: _inside_sphere(model, sphere))
         if self.drop_floaters:
             scene = _without_floaters(scene)
@@ -78,6 +85,15 @@ class Filters:
             degree = self.sh_degree
             scene = _map_blocks(scene, lambda model: drop_bands(model, degree))
         return scene
+
+
+def _rotate_in_axes(model: SplatModel, matrix: F64) -> SplatModel:
+    """Rotate a scene whose axes keep their names; an up direction in its metadata rotates with it."""
+    turned, letters = rotate_scene(model, matrix), model.coordinate_system
+    if letters == UNSPECIFIED:
+        return turned
+    metadata = {name: value for name, value in turned.metadata.items() if name != UP or name in model.metadata}
+    return replace(turned, coordinate_system=letters, metadata=metadata)
 
 
 def find_floaters(points: F64, sizes: F64) -> Mask:
@@ -187,17 +203,22 @@ class Conversion:
 
     Attributes:
         source_format, target_format: names of the formats.
+        source_count: number of splats of the source.
         count, sh_degree: number of splats and SH degree of the target.
         levels: number of splats of each level of detail of the target, finest first.
         source_bytes, size_bytes: sizes of the files; in a dry run the latter is an estimate, or `None` if unknown.
         lost: contents that the target format does not support.
         rounded: names of the arrays that the target rounds.
+        losses: findings about values that the target does not hold: clamped, or moved visibly; a dry run does not find
+            the latter.
         axes: axes before and after.
+        filter_axes: axes along which the filters were given.
         findings: lint findings in the source.
     """
 
     source_format: str
     target_format: str
+    source_count: int
     count: int
     sh_degree: int
     levels: tuple[int, ...]
@@ -205,7 +226,9 @@ class Conversion:
     size_bytes: int | None
     lost: tuple[str, ...]
     rounded: tuple[str, ...]
+    losses: tuple[Finding, ...]
     axes: tuple[str, str]
+    filter_axes: str
     findings: tuple[Finding, ...]
 
     def as_json(self) -> dict[str, Any]:
@@ -213,6 +236,7 @@ class Conversion:
         return {
             "source_format": self.source_format,
             "format": self.target_format,
+            "source_splats": self.source_count,
             "splats": self.count,
             "sh_degree": self.sh_degree,
             "levels": list(self.levels),
@@ -220,14 +244,19 @@ class Conversion:
             "size_bytes": self.size_bytes,
             "lost": list(self.lost),
             "rounded": list(self.rounded),
+            "losses": findings_as_json(self.losses),
             "axes": list(self.axes),
+            "filter_axes": self.filter_axes,
             "defects": findings_as_json(self.findings),
         }
 
-    def losses(self) -> str:
-        """Describe in one line the contents and precision that are lost; empty if there are none."""
-        words = [*self.lost, *([f"precision of {', '.join(self.rounded)}"] if self.rounded else [])]
-        return "; ".join(words)
+    def lost_words(self) -> str:
+        """Describe in one line the contents and precision that are lost; empty if there are none.
+
+        Attributes with a finding in `losses` are left out: more than their precision is lost.
+        """
+        rounded = [name for name in self.rounded if name not in {one.attribute for one in self.losses}]
+        return "; ".join([*self.lost, *([f"precision of {', '.join(rounded)}"] if rounded else [])])
 
 
 def convert_file(
@@ -255,7 +284,8 @@ def convert_file(
             lod-meta.json) gets it and all coarser ones.
         max_splats: as in `open_scene`; streamed SOG gets one level then.
         overrides: overrides of the source's metadata.
-        filters: changes of the scene.
+        filters: changes of the scene. By default, they are along `to_axes`, otherwise along the axes of the source's
+            format, if these are fixed, although the scene is read along others.
         no_loss: refuse if anything would be lost.
         dry_run: write nothing.
         progress: progress callback; some formats read splats twice.
@@ -268,7 +298,10 @@ def convert_file(
     writes = format_by_suffix(path) if write_as is None else format_by_name(write_as)
     if writes.write is None:
         raise InputError(f"{target} has the name of {writes.title}, which csplat does not write")
-    if writes.takes_levels(path) and path.parent.resolve() in (Path(source).resolve(), *Path(source).resolve().parents):
+    if writes.takes_levels(path) and resolve_links(path.parent) in (
+        place := resolve_links(source),
+        *place.parents,
+    ):
         raise InputError(f"{source} is in the folder of {target}, which a new folder replaces: name another")
     changes, sh_degree = filters or Filters(), None if filters is None else filters.sh_degree
     with local_path(source) as local, ExitStack() as stack:
@@ -283,6 +316,9 @@ def convert_file(
         if more and changes.drop_floaters:
             raise InputError("floaters cannot be dropped from several levels: coarser ones have too few splats to tell")
         before = (overrides or MetadataOverrides()).apply_to_scene(reader).metadata_model.coordinate_system
+        own = reader.file_axes if overrides is None or overrides.coordinate_system is None else ""
+        filter_axes = changes.axes or changes.to_axes or own or before
+        changes = replace(changes, axes=None if filter_axes == UNSPECIFIED else filter_axes)
         levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
         scene, counts = levels[0], tuple(one.count for one in levels if one.count)
         lost = writes.losses(scene.metadata_model)
@@ -290,19 +326,22 @@ def convert_file(
             name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.metadata_model.sh_degree)
         )
         result = Conversion(
-            reader.format, writes.name, scene.count, scene.metadata_model.sh_degree, counts or (0,),
-            size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded,
-            (before, writes.axes or scene.metadata_model.coordinate_system), (),
+            reader.format, writes.name, reader.count, scene.count, scene.metadata_model.sh_degree, counts or (0,),
+            size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded, (),
+            (before, writes.axes or scene.metadata_model.coordinate_system), filter_axes, (),
         )  # fmt: skip
         if no_loss and (lost or rounded):
-            raise InputError(f"{writes.title} does not keep all of {source}: {result.losses()}")
-        if not dry_run:
-            reporting = [
-                with_progress(one, f"reading level {level + at}" if more else "reading", progress)
-                for at, one in enumerate(levels)
-            ]
-            write_levels(path, reporting, writes.name)
+            raise InputError(f"{writes.title} does not keep all of {source}: {result.lost_words()}")
+        reporting = [
+            with_progress(one, f"reading level {level + at}" if more else "reading", progress)
+            for at, one in enumerate(levels)
+        ]
+        if dry_run:
+            losses = survey_losses(reporting, writes.name)
+        else:
+            losses = write_levels(path, reporting, writes.name)
             result = replace(result, size_bytes=size_on_disk(path))
+        result = replace(result, losses=tuple(one for one in losses if one.id != "lost-contents"))
         return replace(result, findings=tuple(one for one in reader.findings if not (more and one.id == "levels")))
 
 

@@ -6,6 +6,7 @@ replaced only with `force`.
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -15,24 +16,25 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from mmap import mmap
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat._spec import MAGIC
-from csplat.detect import HEAD_SIZE, detect_content, detect_name, read_head, refusal
-from csplat.disk_files import atomic_writer, local_file
+from csplat.detect import detect_content, detect_name, read_head, refusal
+from csplat.disk_files import atomic_writer, local_file, resolve_links, temporary_file
 from csplat.errors import CsplatError, InputError
-from csplat.file_source import File, map_file
+from csplat.file_source import File, map_file, named_errors, open_binary, read_bytes
 from csplat.formats import formats
 from csplat.model import SplatModel
 from csplat.ply import write_ply, write_scene_ply
 from csplat.remote_store import is_url
 from csplat.scene_source import SceneSource
+from csplat_tools.console import STANDARD_OUTPUT
 
 STANDARD_STREAM = "-"
+STANDARD_INPUT = "standard input"  # its name in messages
 
 _OWN_FORMATS = ("ply", "csplat")  # formats that commands other than `convert` write
 _PLY_MAGICS = (b"ply\n", b"ply\r")
@@ -49,8 +51,24 @@ _MAKERS = {
 _NO_SCENES = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
 
 
-class _StandardInput(io.BytesIO):
-    name = "standard input"
+class _Spooled(io.BytesIO):
+    """The contents of standard input or of a pipe."""
+
+    def __init__(self, data: bytes, name: str) -> None:
+        super().__init__(data)
+        self.name = name
+
+
+class _StandardOutput:
+    """Standard output as a binary file, whose errors have its name."""
+
+    def write(self, data: bytes | memoryview, /) -> int:
+        with named_errors(STANDARD_OUTPUT):
+            return sys.stdout.buffer.write(data)
+
+    def flush(self) -> None:
+        with named_errors(STANDARD_OUTPUT):
+            sys.stdout.buffer.flush()
 
 
 _free: set[Path] = set()  # paths without a file when checked; a file that appeared since is not replaced
@@ -72,14 +90,16 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
         if sys.stdout.isatty():
             raise InputError("binary data are not written to a terminal: name a file, or use a pipe")
         return
-    target = Path(path)
+    target, resolved = Path(path), resolve_links(path)
     if target.is_dir():
         raise InputError(f"{path} is a folder, expected the name of a file")
-    _free.discard(target.resolve())
+    _free.discard(resolved)
     if not target.exists():
         target.parent.stat()  # raises an OSError that names the folder
+        if not resolved.parent.exists():  # a link to a file in a folder that is absent
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
         if not force:
-            _free.add(target.resolve())
+            _free.add(resolved)
         return
     for other in inputs:
         if other != STANDARD_STREAM and Path(other).exists() and target.samefile(other):
@@ -101,7 +121,7 @@ def check_outputs(paths: Sequence[str | None], *, force: bool, inputs: Sequence[
         OSError: an input does not exist, or the folder of an output.
     """
     outputs = [path for path in paths if path is not None]
-    places = [path if path == STANDARD_STREAM else Path(path).resolve() for path in outputs]
+    places = [path if path == STANDARD_STREAM else resolve_links(path) for path in outputs]
     for number, place in enumerate(places):
         if place in places[:number]:
             raise InputError(f"{outputs[number]} is given for two outputs: name a file for each")
@@ -158,7 +178,7 @@ def local_path(file: File) -> Iterator[Path]:
 def kept_path(file: File) -> AbstractContextManager[Path]:
     """Return a context like `local_path` that does not attribute errors to this file."""
     if isinstance(file, str) and file == STANDARD_STREAM:
-        return local_file(sys.stdin.buffer, "standard input")
+        return local_file(sys.stdin.buffer, STANDARD_INPUT)
     return local_file(file)
 
 
@@ -169,7 +189,7 @@ def naming(file: object) -> Iterator[None]:
         yield
     except CsplatError as error:
         if error.path is None and isinstance(file, (str, os.PathLike)):
-            error.path = "standard input" if file == STANDARD_STREAM else os.fspath(file)
+            error.path = STANDARD_INPUT if file == STANDARD_STREAM else os.fspath(file)
         raise
 
 
@@ -183,7 +203,7 @@ def source_path(file: File) -> Iterator[Path]:
     """
     with local_path(file) as local:
         if is_csplat(local):
-            _refuse_others(local.name, read_head(local))
+            _refuse_others(local)
             raise InputError(
                 f"{local.name} is a .csplat file already: `csplat decode` converts it to a PLY,"
                 " `csplat info` describes it"
@@ -201,28 +221,31 @@ def is_csplat(path: Path) -> bool:
     """
     if path.is_dir():
         return False
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         head = stream.read(max(len(MAGIC), 4))
     return head.startswith(MAGIC) or (path.suffix.lower() == ".csplat" and not head.startswith(_PLY_MAGICS))
 
 
 @contextmanager
-def mapped_csplat(path: str) -> Iterator[bytes | mmap]:
+def mapped_csplat(path: str, shown: str | None = None) -> Iterator[bytes | mmap]:
     """Yield the bytes of a .csplat file, memory-mapped if possible; they are not validated.
+
+    Args:
+        path: a path, which may be that of a pipe, or `-`.
+        shown: name for messages; `None`: `path`.
 
     Raises:
         InputError: the file is in another format.
         OSError: the file cannot be read.
     """
-    is_path = path != STANDARD_STREAM
-    data = map_file(path) if is_path else sys.stdin.buffer.read()
-    try:
-        with naming(path):
-            _refuse_others(path if is_path else "standard input", data[:HEAD_SIZE])
+    with naming(path if shown is None else shown), kept_path(path) as local:
+        data = map_file(local)
+        try:
+            _refuse_others(local, path if shown is None else shown)
             yield data
-    finally:
-        if isinstance(data, mmap):
-            _close(data)
+        finally:
+            if isinstance(data, mmap):
+                _close(data)
 
 
 def csplat_file(path: str) -> File:
@@ -232,13 +255,12 @@ def csplat_file(path: str) -> File:
         InputError: the file is in another format.
         OSError: the file cannot be read.
     """
-    if path == STANDARD_STREAM:
-        data = sys.stdin.buffer.read()
-        _refuse_others(_StandardInput.name, data[:HEAD_SIZE])
-        return _StandardInput(data)
+    if path == STANDARD_STREAM or (not is_url(path) and Path(path).is_fifo()):
+        with naming(path), kept_path(path) as local:
+            _refuse_others(local, path)
+            return _Spooled(read_bytes(local), STANDARD_INPUT if path == STANDARD_STREAM else path)
     if not is_url(path) and Path(path).is_file():
-        with Path(path).open("rb") as stream:
-            _refuse_others(path, stream.read(HEAD_SIZE))
+        _refuse_others(Path(path))
     return path
 
 
@@ -259,8 +281,9 @@ def write_bytes(path: str, data: bytes) -> None:
 def _output_stream(path: str) -> Iterator[BinaryIO]:
     """Yield standard output for `-`, else the stream of `open_output`."""
     if path == STANDARD_STREAM:
-        yield sys.stdout.buffer
-        sys.stdout.buffer.flush()
+        output = _StandardOutput()
+        yield cast(BinaryIO, output)  # writers of streams need nothing else
+        output.flush()
     else:
         with open_output(path) as stream:
             yield stream
@@ -273,8 +296,8 @@ def whole_output(path: str) -> Iterator[BinaryIO]:
         with open_output(path) as stream:
             yield stream
         return
-    with TemporaryFile() as spool, _output_stream(path) as stream:
-        yield cast(BinaryIO, spool)  # on Windows a wrapper of a file
+    with temporary_file() as spool, _output_stream(path) as stream:
+        yield spool
         spool.seek(0)
         shutil.copyfileobj(spool, stream)
 
@@ -287,7 +310,7 @@ def open_output(path: str) -> Iterator[BinaryIO]:
         InputError: another program has written a file of that name since `check_output`.
         OSError: the file cannot be written.
     """
-    target = Path(path).resolve()
+    target = resolve_links(path)
     try:
         with atomic_writer(path, replace=target not in _free) as stream:
             yield stream
@@ -315,11 +338,11 @@ def is_one_way(path: str) -> bool:
     return path == STANDARD_STREAM or (Path(path).exists() and not Path(path).is_file())
 
 
-def _refuse_others(name: str, data: bytes) -> None:
-    head = data[:HEAD_SIZE]
-    kind = detect_content(Path(name), head) or detect_name(Path(name))
+def _refuse_others(path: Path, shown: str = "") -> None:
+    head = read_head(path)
+    kind = detect_content(path, head) or detect_name(path)
     if kind is not None and kind.name != "csplat":
-        raise refusal(Path(name), head, wanted="csplat")
+        raise refusal(path, head, wanted="csplat", shown=STANDARD_INPUT if shown == STANDARD_STREAM else shown)
 
 
 def _close(data: mmap) -> None:

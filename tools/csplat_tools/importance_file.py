@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 from csplat.disk_files import read_array
 from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, Target
 from csplat.errors import InputError
+from csplat.file_source import open_binary
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.scene_frame import scene_frame
@@ -32,7 +32,7 @@ def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance |
         InputError: the file is neither, or belongs to another scene.
         OSError: the file cannot be read.
     """
-    with Path(path).open("rb") as stream:
+    with open_binary(path) as stream:
         begin = stream.read(len(_ZIP))
     return read_sensitivity(path, model) if begin == _ZIP else read_array(path)
 

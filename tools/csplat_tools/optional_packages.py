@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -102,6 +104,8 @@ def require_plots() -> None:
         InputError: matplotlib is not installed.
     """
     _need("matplotlib")
+    with _silent_stderr():  # fontconfig, which lists the fonts, complains about a cache that it cannot write
+        import_module("matplotlib.font_manager")
 
 
 def require_data_sets() -> None:
@@ -128,6 +132,23 @@ def _need(module: str, package: str | None = None, *, extra: str = "render") -> 
         import_module(module)
     except ModuleNotFoundError as error:
         raise missing_package(error, package, extra=extra) from None
+
+
+@contextmanager
+def _silent_stderr() -> Iterator[None]:
+    """Discard what this process and its children write to standard error."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # it is closed
+        yield
+        return
+    try:
+        with open(os.devnull, "wb") as null:  # noqa: PTH123  # no path of ours
+            os.dup2(null.fileno(), 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _limit_spinning() -> None:

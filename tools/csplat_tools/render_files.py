@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import tempfile
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -12,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import resolve_links, temporary_folder
 from csplat.errors import InputError
 from csplat.types import F32, U8
 from csplat_tools.file_streams import write_bytes
@@ -51,6 +51,7 @@ def make_output_folder(folder: str, names: Sequence[str], *, force: bool) -> Pat
         OSError: the folder cannot be made.
     """
     path = Path(folder)
+    resolve_links(path)  # refuses a loop of links, which `exists` takes for nothing
     if path.exists() and not path.is_dir():
         raise InputError(f"{folder} is not a folder")
     if len(set(names)) < len(names):
@@ -212,8 +213,8 @@ def _mp4(frames: Sequence[U8], fps: float) -> bytes:
 
     height, width = (side - side % 2 for side in frames[0].shape[:2])  # even, since chroma has half the resolution
     rate = Fraction(fps).limit_denominator(1001)
-    with tempfile.TemporaryDirectory(prefix="csplat-") as folder:
-        path = Path(folder) / "video.mp4"  # a file, since PyAV rewrites it to put the index first
+    with temporary_folder() as folder:
+        path = folder / "video.mp4"  # a file, since PyAV rewrites it to put the index first
         options = {"movflags": "+faststart", "fflags": "+bitexact"}
         with av.open(path, "w", format="mp4", options=options) as container:
             try:

@@ -350,17 +350,24 @@ def _together_bytes(found: Sequence[OpenedScene]) -> float:
 
 
 def size_on_disk(path: Path) -> int:
-    """Return the size in bytes of a file, or of all files of a folder."""
-    if path.name.lower() in FOLDER_NAMES:
-        path = path.parent
-    if not path.is_dir():
+    """Return the size in bytes of a file, or of all files of a folder; for SOG, without other files of its folder."""
+    manifest = path.name.lower() if path.name.lower() in FOLDER_NAMES else ""
+    if not (path.is_dir() or manifest):
         return path.stat().st_size
-    return sum(one.stat().st_size for one in path.rglob("*") if one.is_file())
+    folder = path if path.is_dir() else path.parent
+    manifest = manifest or next((name for name in reversed(FOLDER_NAMES) if (folder / name).is_file()), "")
+    inside = folder.iterdir() if manifest == "meta.json" else folder.rglob("*")
+    parts = (".webp", *FOLDER_NAMES) if manifest else ("",)
+    return sum(one.stat().st_size for one in inside if one.name.lower().endswith(parts) and one.is_file())
 
 
 def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict[str, Any]]:
     """Return findings as JSON-compatible values."""
-    return [{"id": one.id, "kind": one.kind, "count": one.count, "text": one.text} for one in findings]
+    return [
+        {"id": one.id, "kind": one.kind, "count": one.count, "text": one.text}
+        | ({"attribute": one.attribute, "largest_error": one.largest_error} if one.attribute else {})
+        for one in findings
+    ]
 
 
 def ply_splat_bytes(sh_degree: int) -> int:

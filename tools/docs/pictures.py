@@ -26,6 +26,7 @@ from PIL import Image
 
 import csplat
 from csplat.encoder import PresetName
+from csplat.image_opener import open_image
 from csplat.types import U8
 from csplat_bench.measuring import timed
 from csplat_bench.peers import find_splat_transform, splat_transform_version
@@ -132,19 +133,25 @@ def draw_tutorial(folder: Path) -> None:
         page.goto((folder / "garden.html").resolve().as_uri())
         page.wait_for_selector("canvas")
         page.wait_for_timeout(8000)
-        shot = Image.open(io.BytesIO(page.screenshot()))
+        data = page.screenshot()
         browser.close()
-    _save(shot.convert("RGB"), "tutorial-page.webp")
+    with open_image(data) as shot:
+        _save(shot.convert("RGB"), "tutorial-page.webp")
 
 
 def _row(names: Sequence[Path]) -> Image.Image:
     """Put images of one size next to each other."""
-    pictures = [Image.open(name).convert("RGBA") for name in names]
+    pictures = [_read(name) for name in names]
     width, height = pictures[0].size
     row = Image.new("RGBA", (width * len(pictures), height))
     for place, one in enumerate(pictures):
         row.paste(one, (place * width, 0))
     return row
+
+
+def _read(name: Path) -> Image.Image:
+    with open_image(name) as picture:
+        return picture.convert("RGBA")
 
 
 def _target(scorer: Scorer, folder: Path, psnr: int, *options: str) -> dict[str, Any]:

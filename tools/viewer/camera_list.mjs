@@ -96,6 +96,12 @@ export class CameraList {
     this.controls.touched = false;
   }
 
+  /** Place the camera for a new version of the scene, unless the user has moved it. */
+  placeAgain() {
+    this.bounds = null;
+    this.waits = true;
+  }
+
   /** The cameras to step through. */
   get cameras() {
     return this.wantedCameras.length ? this.wantedCameras : this.facts.cameras;

@@ -1,8 +1,10 @@
 // <csplat-view src="scene.csplat" alt="A garden">: a scene in a page, used like an image and sized by CSS.
 //
-// Attributes: src, alt, and these parameters of main.mjs: camera, view, up, axes, background.
+// Attributes: src, alt, crossorigin, and these parameters of main.mjs: camera, view, up, axes, background, backend; all of them
+// are properties, too. Properties alone: fetch, request, renew, retries, timeoutMs, as of the engine.
 // Events: progress, load (detail: the engine's Stats), error (detail: ErrorReport). Property `engine`: null until it loads.
 
+import { heldBlob } from './engine.mjs';
 import { E_CONTEXT } from './engine_error.mjs';
 import { explain } from './messages.mjs';
 import { nameOf, readWishes } from './page.mjs';
@@ -15,6 +17,8 @@ import { SceneViewer } from './viewer.mjs';
  */
 
 const WISHES = ['camera', 'view', 'up', 'axes', 'background', 'backend'];
+const REFLECTED = ['src', 'alt', ...WISHES]; // properties of the same name
+const FETCHING = /** @type {const} */ (['fetch', 'request', 'renew', 'retries', 'timeoutMs']);
 const HOW =
   'Arrow keys fly, Shift and arrow keys turn around it, plus and minus zoom, R returns to the initial view, Escape leaves the scene.';
 const AHEAD = '50% 0px'; // distance from the window at which an element starts to load
@@ -58,8 +62,11 @@ function sharedSheet() {
   return sheet;
 }
 
-export class CsplatView extends HTMLElement {
-  static observedAttributes = ['src', 'alt', 'aria-label', ...WISHES];
+/** A page that is rendered on a server may import this module there, where no elements are. */
+const Base = globalThis.HTMLElement ?? /** @type {typeof HTMLElement} */ (class {});
+
+export class CsplatView extends Base {
+  static observedAttributes = ['src', 'alt', 'aria-label', 'crossorigin', ...WISHES];
 
   /** @type {SceneViewer | null} */
   #showing = null;
@@ -74,6 +81,10 @@ export class CsplatView extends HTMLElement {
   #observer = new IntersectionObserver((seen) => this.#seen(seen[seen.length - 1].isIntersecting), {
     rootMargin: AHEAD,
   });
+  /** Content of a blob: URL, fetched at once like an image's. @type {{src: string, blob: Promise<Blob>} | null} */
+  #held = null;
+  /** @type {import('./types.d.ts').FetchOptions} */
+  #fetching = {};
 
   constructor() {
     super();
@@ -82,15 +93,53 @@ export class CsplatView extends HTMLElement {
     this.#root.adoptedStyleSheets = [sharedSheet()];
     this.#root.append(this.#canvas, this.#progress, this.#error);
     this.#renewCanvas();
+    // Properties that were set before this script had run hide those of the class.
+    for (const name of [...FETCHING, 'crossOrigin', ...REFLECTED]) {
+      if (!Object.hasOwn(this, name)) continue;
+      const own = /** @type {any} */ (this);
+      const value = own[name];
+      delete own[name];
+      own[name] = value;
+    }
+    this.#label();
+    this.#hold();
   }
 
-  /** Address of the scene. */
-  get src() {
-    return this.getAttribute('src') ?? '';
+  static {
+    const define = (/** @type {string} */ name, /** @type {PropertyDescriptor & ThisType<CsplatView>} */ accessor) =>
+      Object.defineProperty(this.prototype, name, { configurable: true, enumerable: true, ...accessor });
+    for (const name of REFLECTED) {
+      define(name, {
+        get() {
+          return this.getAttribute(name) ?? '';
+        },
+        set(value) {
+          reflect(this, name, value);
+        },
+      });
+    }
+    // Options of requests; a scene uses those that are set when it is loaded.
+    for (const name of FETCHING) {
+      define(name, {
+        get() {
+          return this.#fetching[name];
+        },
+        set(value) {
+          this.#fetching = { ...this.#fetching, [name]: value ?? undefined };
+        },
+      });
+    }
   }
 
-  set src(address) {
-    this.setAttribute('src', address);
+  /** @returns {'anonymous' | 'use-credentials' | null} */
+  get crossOrigin() {
+    const value = this.getAttribute('crossorigin');
+    if (value === null) return null;
+    return value.toLowerCase() === 'use-credentials' ? 'use-credentials' : 'anonymous';
+  }
+
+  set crossOrigin(value) {
+    reflect(this, 'crossorigin', value);
   }
 
   /** The engine; null before the element loads and after it has left the page. */
@@ -122,10 +171,23 @@ export class CsplatView extends HTMLElement {
    * @param {string | null} after
    */
   attributeChangedCallback(name, before, after) {
-    if (before === after) return;
+    if (name === 'src') this.#hold();
+    // The same address again is another try, as of an image.
+    if (before === after && !(name === 'src' && this.#hasFailed)) return;
     if (name === 'alt' || name === 'aria-label') this.#label();
     else if (name === 'background' && this.#showing) this.#showing.setBackground(this.#wishes().background);
     else this.#renew();
+  }
+
+  /** Fetch the content of a blob: URL at once, before the page revokes it. */
+  #hold() {
+    const src = this.getAttribute('src') ?? '';
+    if (!src.startsWith('blob:')) this.#held = null;
+    else if (this.#held?.src !== src) {
+      const blob = heldBlob(src, this.#fetching.fetch);
+      blob.catch(() => {}); // the engine tries again, and reports it
+      this.#held = { src, blob };
+    }
   }
 
   /** Load again, once for attributes that change together. */
@@ -146,7 +208,7 @@ export class CsplatView extends HTMLElement {
   }
 
   async #start() {
-    const { src } = this;
+    const src = this.getAttribute('src') ?? '';
     if (!src) return;
     const canvas = this.#canvas;
     /** @type {SceneViewer} */
@@ -166,6 +228,7 @@ export class CsplatView extends HTMLElement {
         failed: (report) => this.#failed(report),
       },
       { keys: canvas, wheel: () => canvas.classList.contains('active') },
+      this.#requests(),
     );
     this.#showing = showing;
     this.#bar.style.transform = 'scaleX(0)';
@@ -173,7 +236,18 @@ export class CsplatView extends HTMLElement {
     if (!(await showing.start())) return;
     const complaint = await showing.readCameras();
     if (complaint) console.warn(`csplat-view: ${complaint}`);
-    await showing.show(src);
+    const held = this.#held;
+    const source = held?.src === src ? await held.blob.catch(() => src) : src;
+    if (this.#showing === showing) await showing.show(source);
+  }
+
+  /** The options of requests, with the credentials of `crossorigin`. */
+  #requests() {
+    const { request, ...others } = this.#fetching;
+    const { crossOrigin } = this;
+    /** @type {RequestCredentials} */
+    const credentials = crossOrigin === 'use-credentials' ? 'include' : 'same-origin';
+    return { ...others, request: { ...(crossOrigin !== null && { credentials }), ...request } };
   }
 
   /** Free everything. The next scene gets a new canvas, context and worker, so that nothing is left over. */
@@ -241,7 +315,7 @@ export class CsplatView extends HTMLElement {
     if (report.code !== E_CONTEXT && !report.fatal) return this.#tell('error', report);
     this.#hasFailed = report.fatal;
     this.#progress.hidden = true;
-    const { title, advice, facts } = explain(report, nameOf(this.src));
+    const { title, advice, facts } = explain(report, nameOf(this.getAttribute('src') ?? ''));
     const paragraphs = [made('strong', {}, title), made('p', {}, advice), made('p', { class: 'facts' }, facts)];
     this.#error.replaceChildren(...paragraphs);
     this.#error.dataset.code = report.code;
@@ -258,4 +332,20 @@ export class CsplatView extends HTMLElement {
   }
 }
 
-if (!customElements.get('csplat-view')) customElements.define('csplat-view', CsplatView);
+/**
+ * Set an attribute to the value of a property.
+ *
+ * @param {Element} element
+ * @param {string} name
+ * @param {unknown} value null or undefined to remove it; a camera may be an object
+ */
+function reflect(element, name, value) {
+  if (value === null || value === undefined) element.removeAttribute(name);
+  else {
+    const isJson = name === 'camera' && typeof value === 'object' && !(value instanceof URL);
+    element.setAttribute(name, isJson ? JSON.stringify(value) : String(value));
+  }
+}
+
+const registry = globalThis.customElements;
+if (registry && !registry.get('csplat-view')) registry.define('csplat-view', CsplatView);

@@ -8,6 +8,7 @@
 
 import { NO_CAMERA, viewOf } from './camera_maths.mjs';
 import { EngineError, E_CONTEXT, E_INPUT, E_LIMIT, E_REPLACED, E_WEBGL2, E_WORKER } from './engine_error.mjs';
+import { answer, sendable } from './fetch_port.mjs';
 import { FrameScheduler } from './frame_scheduler.mjs';
 import { SceneLoad } from './scene_load.mjs';
 import { createRenderer } from './renderer.mjs';
@@ -52,7 +53,8 @@ export async function createEngine(canvas, options = {}) {
   }
 }
 
-const NO_WORKER = 'it did not start; the Content-Security-Policy of the page may forbid it (worker-src)';
+const NO_WORKER =
+  'it did not start; the Content-Security-Policy of the page may forbid it (worker-src, or trusted-types without csplat)';
 
 /**
  * @param {EngineOptions} options
@@ -89,6 +91,22 @@ function aimsOf({ splatBudget, pixelError }, sort) {
   const saves = connection?.saveData === true;
   const usual = (sort ? SORTED_SPLATS : UNSORTED_SPLATS) / (saves || deviceMemory < SMALL_GB ? 2 : 1);
   return { budget: splatBudget ?? usual, pixels: pixelError ?? (saves ? SAVING_PIXELS : USUAL_PIXELS), around: !saves };
+}
+
+/** How often a scene is opened anew because its file was replaced, before that is an error. */
+const REPLACEMENTS = 3;
+
+/**
+ * @param {string} url
+ * @param {typeof fetch} [own] the caller's
+ */
+export async function heldBlob(url, own = fetch) {
+  try {
+    return await (await own(url)).blob();
+  } catch (error) {
+    const why = "it may have been revoked too early, or connect-src of the page's policy forbids blob:";
+    throw new Error(`${url}: ${error}; ${why}`);
+  }
 }
 
 /** @implements {Engine} */
@@ -144,30 +162,61 @@ class SplatEngine {
   open(source) {
     this.replaced('another scene was opened before everything was decoded');
     const isAddress = typeof source === 'string' || source instanceof URL;
-    const from = isAddress ? new URL(source, document.baseURI).href : source; // the worker has a different base URL
+    const from = isAddress ? this.held(new URL(source, document.baseURI).href) : source; // the worker has a different base URL
     return new Promise((/** @type {(value: void) => void} */ resolve, reject) => this.begin(from, { resolve, reject }));
+  }
+
+  /**
+   * Fetch the content of a blob: URL at once, before the page revokes it, as images do.
+   *
+   * @param {string} url
+   * @returns {import('./scene_load.mjs').Source}
+   */
+  held(url) {
+    if (!url.startsWith('blob:')) return url;
+    const blob = heldBlob(url, this.options.fetch);
+    blob.catch(() => {}); // it is reported by `begin`
+    return blob;
   }
 
   /**
    * Start to read a scene.
    *
-   * @param {string | Blob | ArrayBuffer} source
+   * @param {import('./scene_load.mjs').Source} source
    * @param {import('./scene_load.mjs').Settle} settle
+   * @param {number} [replacements] how often its file was replaced
    */
-  begin(source, settle) {
+  begin(source, settle, replacements = 0) {
     this.stats = emptyStats(this.renderer.capabilities);
     const sort = !this.renderer.capabilities.sorts;
     const aims = aimsOf(this.options, sort);
     const opening = new SceneLoad(source, ++this.sceneCount, this.stats, aims.budget, this.options, settle);
+    opening.replacements = replacements;
     this.opening = opening;
+    const { fetch, renew, request, retries, retryMs, timeoutMs } = this.options;
+    const fetching = {
+      ...{ retries, retryMs, timeoutMs, hasFetch: fetch !== undefined, hasRenew: renew !== undefined },
+      // A cache may hold parts of the file before.
+      request: { ...sendable(request), ...(replacements > 0 && { cache: /** @type {const} */ ('reload') }) },
+    };
     const tell = (/** @type {string | Blob | ArrayBuffer} */ readable) => {
       if (this.opening !== opening) return;
-      this.tell({ type: 'open', scene: opening.scene, source: readable, sort, aims });
+      this.tell({ type: 'open', scene: opening.scene, source: readable, sort, aims, fetching });
     };
     // In WebKit, the worker of a file: page cannot read a Blob, but the page can.
-    if (self.origin !== 'null' || !(source instanceof Blob)) return tell(source);
-    source.arrayBuffer().then(tell, (error) => {
-      if (this.opening === opening) this.fail(new EngineError({ code: E_INPUT, message: String(error) }));
+    const isOpaque = self.origin === 'null';
+    if (!(source instanceof Promise) && !(isOpaque && source instanceof Blob)) return tell(source);
+    /** @type {Promise<Blob | ArrayBuffer>} */
+    const readable = Promise.resolve(/** @type {Blob | Promise<Blob>} */ (source)).then((blob) =>
+      isOpaque ? blob.arrayBuffer() : /** @type {any} */ (blob),
+    );
+    readable.then(tell, (error) => {
+      const report = {
+        code: E_INPUT,
+        message: String(error?.message ?? error),
+        reason: /** @type {const} */ ('refused'),
+      };
+      if (this.opening === opening) this.fail(new EngineError(report));
     });
   }
 
@@ -298,6 +347,11 @@ class SplatEngine {
   take(reply) {
     const { opening } = this;
     if (opening === null || reply.scene !== opening.scene || opening.error) return;
+    if (reply.type === 'ask') return void answer(reply.question, reply.port, this.options);
+    if (reply.type === 'error' && reply.error.reason === 'replaced' && opening.replacements < REPLACEMENTS) {
+      this.options.onError?.({ ...reply.error, fatal: false });
+      return this.begin(opening.source, opening.settle, opening.replacements + 1);
+    }
     try {
       opening.take(reply, this.renderer);
     } catch (error) {

@@ -18,22 +18,26 @@ export const E_LIMIT = 'E_LIMIT';
 /** An error of the engine (see above) or of the file, with the format's code, offset and clause. */
 export class EngineError extends Error {
   /** @param {Omit<ErrorReport, 'fatal'>} report */
-  constructor({ code, message, offset, clause }) {
+  constructor({ code, message, offset, clause, reason, status }) {
     super(message);
     this.name = 'EngineError';
     this.code = code;
     this.offset = offset;
     this.clause = clause;
+    this.reason = reason;
+    this.status = status;
   }
 
   /** @returns {ErrorReport} */
   report() {
-    const { code, message, offset, clause } = this;
+    const { code, message, offset, clause, reason, status } = this;
     return {
       code,
       message,
       ...(offset !== undefined && { offset }),
       ...(clause !== undefined && { clause }),
+      ...(reason !== undefined && { reason }),
+      ...(status !== undefined && { status }),
       fatal: true,
     };
   }

@@ -46,6 +46,7 @@ const showing = new SceneViewer(canvas, wishes, {
   failed: (report) => {
     const isScene = report.code !== E_CONTEXT;
     if (report.fatal || !isScene) overlay.error(report, showing.engine !== null && isScene);
+    else if (report.reason === 'replaced') overlay.toast('The file was replaced on the server. It is opened anew.');
     else if (report.code === E_INPUT) overlay.toast('The connection is lost. It is tried again.');
     else overlay.warn(report);
   },

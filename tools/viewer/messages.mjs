@@ -1,11 +1,12 @@
 // Error messages for users who do not know the format.
 
 /**
- * @typedef {{code: string, message: string, offset?: number | null, clause?: string | null}} Problem
+ * @typedef {{code: string, message: string, offset?: number | null, clause?: string | null, reason?: string | null,
+ *   status?: number | null}} Problem
  * @typedef {{title: string, advice: string, facts: string}} Message
  */
 
-const AGAIN = 'Download or copy it again. If that does not help, it has to be created again.';
+const AGAIN = 'Reload the page, or download or copy the file again. If that does not help, it has to be created again.';
 const NEWER = 'A newer version of this viewer may support it.';
 const BROKEN = {
   title: 'This file is invalid.',
@@ -46,6 +47,41 @@ const WORDS = {
   },
 };
 
+/** Words for files that cannot be fetched, by what failed. @type {Record<string, {title: string, advice: string}>} */
+const FETCHING = {
+  connection: {
+    title: 'The file could not be read.',
+    advice:
+      'Check the address and the connection, then try again. A file on another server needs its permission (Access-Control-Allow-Origin).',
+  },
+  refused: {
+    title: 'The file could not be read.',
+    advice: 'Check the address. A link that was valid once may have expired: reload the page.',
+  },
+  busy: { title: 'The server cannot send the file now.', advice: 'It is busy or out of order. Try again later.' },
+  server: {
+    title: 'The server does not send the file as it should.',
+    advice: 'The file may be sound. The details below help whoever runs the server.',
+  },
+  replaced: { title: 'The file was replaced on the server.', advice: 'Reload the page to see the new one.' },
+  local: {
+    title: 'A page opened from disk cannot load files.',
+    advice:
+      'Put viewer and scene into one page with “csplat export-html”, or open the page from a local server, such as that of “csplat view”.',
+  },
+};
+
+/** Words for statuses of HTTP. @type {Record<number, {title: string, advice: string}>} */
+const STATUSES = {
+  401: { title: 'The server does not give access to the file.', advice: 'Sign in again, then reload the page.' },
+  403: {
+    title: 'The server does not give access to the file.',
+    advice: 'The link may have expired, or access is not allowed. Reload the page.',
+  },
+  404: { title: 'The file could not be read.', advice: 'There is no file at this address. Check the address.' },
+  410: { title: 'The file could not be read.', advice: 'There is no file at this address any more.' },
+};
+
 /**
  * Explain an error.
  *
@@ -53,8 +89,10 @@ const WORDS = {
  * @param {string} [name] name of the file
  * @returns {Message} a title for all users, advice, and the details for a bug report
  */
-export function explain({ code, message, offset, clause }, name = '') {
-  let words = WORDS[code] ?? { title: 'Something went wrong.', advice: 'Reload the page.' };
+export function explain({ code, message, offset, clause, reason, status }, name = '') {
+  let words = STATUSES[status ?? 0] ??
+    FETCHING[reason ?? ''] ??
+    WORDS[code] ?? { title: 'Something went wrong.', advice: 'Reload the page.' };
   if (code === 'E_MAGIC' && /\.ply$/i.test(name)) {
     words = {
       title: 'This is a PLY, not a .csplat file.',

@@ -81,12 +81,13 @@ export function readWishes(query) {
  * Fetch the cameras in the address.
  *
  * @param {string} text JSON, or its URL
+ * @param {import('./types.d.ts').FetchOptions} [fetching]
  * @returns {Promise<unknown[]>} cameras of a camera file
  */
-export async function fetchCameras(text) {
+export async function fetchCameras(text, { fetch = globalThis.fetch, request } = {}) {
   let json = text;
   if (!/^\s*[[{]/.test(text)) {
-    const response = await fetch(text);
+    const response = await fetch(text, request);
     if (!response.ok) throw new Error(`${text}: HTTP status ${response.status}`);
     json = await response.text();
   }

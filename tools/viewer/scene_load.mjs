@@ -10,13 +10,15 @@ import { expandedBytes } from './statistics.mjs';
  * @typedef {import('./types.d.ts').Header} Header
  * @typedef {import('./worker.mjs').Reply} Reply
  *
+ * @typedef {string | Blob | ArrayBuffer | Promise<Blob>} Source
+ *
  * The callbacks of the promise that `open` returned.
  * @typedef {{resolve: () => void, reject: (error: EngineError) => void}} Settle
  */
 
 export class SceneLoad {
   /**
-   * @param {string | Blob | ArrayBuffer} source
+   * @param {Source} source
    * @param {number} scene number that distinguishes the worker's messages from those for earlier scenes
    * @param {import('./types.d.ts').Stats} stats statistics of this scene; changed in place
    * @param {number} budget splats to draw
@@ -30,6 +32,8 @@ export class SceneLoad {
     this.budget = budget;
     this.hooks = hooks;
     this.settle = settle;
+    /** How often its file was replaced on the server. */
+    this.replacements = 0;
     /** Start time, milliseconds. */
     this.begun = performance.now();
     /** @type {EngineError | null} */

@@ -2,7 +2,7 @@
 // layer 0 before the SH bands; then what surrounds it. Packs each part for the GPU as it arrives, and evicts what was not
 // needed for longest when the memory is full. A file without levels of detail is read completely.
 
-import { CsplatReader, FormatError, InputError } from '../../codec/js/decoder.mjs';
+import { CsplatReader, FormatError } from '../../codec/js/decoder.mjs';
 import { allTiles } from '../../codec/js/tile_records.mjs';
 import { SAMPLE_COUNT, showing } from './bounds.mjs';
 import { reachClass } from './cull.mjs';
@@ -68,10 +68,6 @@ const KEPT = 2;
 /** Share of the memory that is filled on purpose, since free ranges may be too small. */
 const FILLED = 0.9;
 
-/** Milliseconds until a lost connection is tried again; doubled each time, up to the maximum. */
-const RETRY_MS = 1000;
-const RETRY_MS_MAX = 30_000;
-
 /** The reading of a file. */
 export class TileStream {
   /**
@@ -81,8 +77,9 @@ export class TileStream {
    * @param {Sink} sink
    * @param {Aims} aims
    * @param {AbortSignal} signal
+   * @param {import('../../codec/js/decoder.d.ts').FetchOptions} [fetching]
    */
-  static async open(source, sink, aims, signal) {
+  static async open(source, sink, aims, signal, fetching = {}) {
     /** @type {Amounts} */
     const amounts = {
       phase: 'open',
@@ -94,21 +91,28 @@ export class TileStream {
       layer: 0,
       decodeMs: 0,
     };
+    const connection = { isLost: false };
     const reader = await CsplatReader.open(source, {
+      ...fetching,
       signal,
+      onRetry: (error) => {
+        if (!connection.isLost) sink.warn(error);
+        connection.isLost = true;
+      },
       onProgress: (received) => {
         amounts.received = received;
         sink.progress(amounts);
       },
     });
+    reader.retries = fetching.retries ?? Infinity; // the scene stays usable meanwhile
     const { header } = reader;
     const described = reader.describe({ signal });
     described.catch(() => {}); // it is waited for below
     const nodes = nodesOrTiles(header, header.coarseTiles.length > 0 ? await reader.nodes() : []);
     Object.assign(amounts, { phase: 'layers', fileSize: header.fileSize, splatCount: header.splatCount });
-    const isLocal = typeof source !== 'string'; // the decoder then reports no received bytes
+    const isLocal = typeof source !== 'string' || /^(blob|data):/.test(source); // the decoder reports no parts of these
     if (isLocal) amounts.received = header.indexSize;
-    const stream = new TileStream(reader, nodes, sink, aims, amounts, isLocal, signal);
+    const stream = new TileStream(reader, nodes, sink, aims, amounts, isLocal, signal, connection);
     // What is shown first comes together with the description.
     if (stream.hasLevels)
       reader.prefetch(
@@ -128,15 +132,16 @@ export class TileStream {
    * @param {Amounts} amounts
    * @param {boolean} isLocal
    * @param {AbortSignal} signal
+   * @param {{isLost: boolean}} connection
    */
-  constructor(reader, nodes, sink, aims, amounts, isLocal, signal) {
+  constructor(reader, nodes, sink, aims, amounts, isLocal, signal, connection) {
     this.reader = reader;
     this.nodes = nodes;
     this.sink = sink;
     this.aims = aims;
     this.amounts = amounts;
     this.isLocal = isLocal;
-    this.signal = signal;
+    this.connection = connection;
     this.all = allTiles(reader.header);
     const roots = nodes.filter(({ parent }) => parent === null);
     const rootSplats = roots.reduce((sum, { splatCount }) => sum + splatCount, 0);
@@ -169,8 +174,6 @@ export class TileStream {
     this.view = null;
     this.looks = looksOf(nodes, null);
     this.isPaused = false;
-    this.isLost = false; // the connection
-    this.retryMs = RETRY_MS;
     /** Whether everything that the view requires is here. */
     this.isComplete = false;
     /** Batches are read one after the other. @type {Promise<void>} */
@@ -213,12 +216,6 @@ export class TileStream {
     this.readOn();
   }
 
-  /** Try a lost connection again. */
-  retry() {
-    this.isLost = false;
-    this.readOn();
-  }
-
   /** Request what the view requires most urgently, and cancel requests for what it does not require. */
   readOn() {
     if (this.hasFailed) return;
@@ -234,7 +231,7 @@ export class TileStream {
     for (const controller of this.pending.values()) if (!due.has(controller)) controller.abort();
     // The coarsest version is requested alone, then one layer at a time, so that nothing else delays it.
     const isFirst = this.hasLevels && parts.some(({ tile, place }) => place.layer === 0 && this.roots.has(tile.index));
-    if (this.isLost || (this.isPaused && this.hasLevels && !isFirst)) return;
+    if (this.isPaused && this.hasLevels && !isFirst) return;
     const layer = parts[0]?.place.layer;
     const left = parts.filter(({ tile, place }) => {
       const isNext = place.layer === layer && (!isFirst || this.roots.has(tile.index));
@@ -324,13 +321,13 @@ export class TileStream {
     const { reader, amounts } = this;
     const begun = performance.now() - reader.waitedMs;
     try {
-      if (place.layer === 0) await this.#readGeometry(tile, place);
-      else if (this.here.has(tile.index)) await this.#readBand(tile, place);
+      if (place.layer === 0) await this.#readGeometry(tile, place, signal);
+      else if (this.here.has(tile.index)) await this.#readBand(tile, place, signal);
     } catch (error) {
       if (!signal.aborted) this.#refuse(tile, error);
       return;
     }
-    this.retryMs = RETRY_MS;
+    this.connection.isLost = false;
     amounts.decodeMs += performance.now() - reader.waitedMs - begun;
     amounts.layer = place.layer;
     if (this.isLocal) amounts.received += place.size;
@@ -343,14 +340,7 @@ export class TileStream {
    */
   #refuse(tile, error) {
     const { index } = tile;
-    if (error instanceof InputError && error.isTransient) {
-      if (this.isLost) return;
-      this.isLost = true;
-      for (const controller of this.pending.values()) controller.abort();
-      if (this.retryMs === RETRY_MS) this.sink.warn(error);
-      setTimeout(() => this.retry(), this.retryMs);
-      this.retryMs = Math.min(2 * this.retryMs, RETRY_MS_MAX);
-    } else if (error instanceof FormatError && !this.roots.has(index)) {
+    if (error instanceof FormatError && !this.roots.has(index)) {
       this.damaged.add(index);
       if (this.here.has(index)) this.#evict(index);
       this.sink.warn(error);
@@ -360,12 +350,13 @@ export class TileStream {
   /**
    * @param {TileRecord} tile
    * @param {LayerRecord} place
+   * @param {AbortSignal} signal
    */
-  async #readGeometry(tile, place) {
+  async #readGeometry(tile, place, signal) {
     const { index } = tile;
     const { header } = this.reader;
     /** @type {PackedGeometry} */
-    const packed = await this.reader.readLayer(index, 0, { form: 'packed', signal: this.signal });
+    const packed = await this.reader.readLayer(index, 0, { form: 'packed', signal });
     const slot = this.#room(tile);
     if (slot === null) return void this.crowded.add(index);
     const [opacities, , quats] = header.attributes;
@@ -382,11 +373,12 @@ export class TileStream {
   /**
    * @param {TileRecord} tile
    * @param {LayerRecord} place
+   * @param {AbortSignal} signal
    */
-  async #readBand({ index, layers }, place) {
+  async #readBand({ index, layers }, place, signal) {
     const { layer } = place;
     /** @type {import('../../codec/js/decoder.d.ts').PackedBand} */
-    const { sh, count } = await this.reader.readLayer(index, layer, { form: 'packed', signal: this.signal });
+    const { sh, count } = await this.reader.readLayer(index, layer, { form: 'packed', signal });
     if (sh.lookup) {
       const key = `${sh.lookup.codebook}.${layer}`;
       if (!this.tables.has(key)) this.sink.table(sh.lookup.codebook, layer, packRows(sh.lookup.table));

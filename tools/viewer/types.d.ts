@@ -1,8 +1,8 @@
 // Types shared by the viewer's modules. engine.mjs is the entry point for pages.
 
-import type { Description, Header, TileRecord, TreeNode } from '../../codec/js/decoder.d.ts';
+import type { Description, FetchOptions, FetchReason, Header, TileRecord, TreeNode } from '../../codec/js/decoder.d.ts';
 
-export type { Description, Header, TileRecord, TreeNode };
+export type { Description, FetchOptions, Header, TileRecord, TreeNode };
 
 /** A pinhole camera, in pixels of the drawing buffer; the centre of the first pixel is at (0.5, 0.5). */
 export interface Camera {
@@ -94,6 +94,9 @@ export interface ErrorReport {
   /** Offset in the file and clause of the specification, if the file is invalid. */
   offset?: number;
   clause?: string;
+  /** What failed, and the HTTP status, if the file cannot be fetched. `replaced`: it is opened anew unless `fatal`. */
+  reason?: FetchReason;
+  status?: number;
   fatal: boolean;
 }
 
@@ -107,7 +110,8 @@ export type PictureFormat = 'RGBA16F' | 'RGBA32F' | 'RGBA8';
  */
 export type Backend = 'auto' | 'webgl2' | 'webgpu' | 'webgpu-tiles' | 'webgpu-quads';
 
-export interface EngineOptions {
+/** The options of FetchOptions apply to scenes that are URLs; after its opening, a scene is retried without end by default. */
+export interface EngineOptions extends FetchOptions {
   /** Red, green, blue, 0 to 1. */
   background?: [number, number, number];
   /** Creates the worker that decodes and sorts. */
@@ -164,4 +168,32 @@ export interface Engine {
   readonly header: Header | null;
   /** Free everything; no method may be called afterwards. */
   close(): void;
+}
+
+/** The element `<csplat-view>`. Properties other than those below reflect the attributes of the same name. */
+export interface CsplatViewElement extends HTMLElement {
+  src: string;
+  alt: string;
+  /** JSON, an object or list of the same form, or a URL. */
+  camera: string | object;
+  view: string | number;
+  up: string | readonly number[];
+  axes: string;
+  background: string;
+  backend: Backend | '';
+  crossOrigin: 'anonymous' | 'use-credentials' | null;
+  /** How scenes are fetched; used from the next `src` on. */
+  fetch: FetchOptions['fetch'];
+  request: FetchOptions['request'];
+  renew: FetchOptions['renew'];
+  retries: FetchOptions['retries'];
+  timeoutMs: FetchOptions['timeoutMs'];
+  /** Null before the element loads and after it has left the page. */
+  readonly engine: Engine | null;
+}
+
+declare global {
+  interface HTMLElementTagNameMap {
+    'csplat-view': CsplatViewElement;
+  }
 }

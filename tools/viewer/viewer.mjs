@@ -33,11 +33,13 @@ export class SceneViewer {
    * @param {import('./page.mjs').Wishes} wishes
    * @param {Hooks} hooks
    * @param {import('./controls.mjs').Reach} [reach] scope of the controls
+   * @param {import('./types.d.ts').FetchOptions} [fetching]
    */
-  constructor(canvas, wishes, hooks, reach) {
+  constructor(canvas, wishes, hooks, reach, fetching = {}) {
     this.canvas = canvas;
     this.wishes = wishes;
     this.hooks = hooks;
+    this.fetching = fetching;
     /** @type {Engine | null} */
     this.engine = null;
     this.turn = 0; // number of scenes so far; discards late results of earlier scenes
@@ -83,6 +85,7 @@ export class SceneViewer {
     const { hooks } = this;
     try {
       const engine = await createEngine(this.canvas, {
+        ...this.fetching,
         background: this.background,
         backend: this.wishes.backend,
         onHeader: (header, description) => {
@@ -100,7 +103,11 @@ export class SceneViewer {
           hooks.frame(stats);
         },
         // `show` reports the rejections of `open`
-        onError: (report) => (report.fatal && this.isOpening) || hooks.failed(report),
+        onError: (report) => {
+          if (report.fatal && this.isOpening) return;
+          if (report.reason === 'replaced' && !report.fatal) this.view.placeAgain();
+          hooks.failed(report);
+        },
       });
       if (this.isClosed) {
         engine.close();
@@ -123,7 +130,7 @@ export class SceneViewer {
     const { camera, view } = this.wishes;
     if (camera === null) return '';
     try {
-      this.view.useCameras(await fetchCameras(camera), view);
+      this.view.useCameras(await fetchCameras(camera, this.fetching), view);
       return '';
     } catch (error) {
       return `The camera cannot be used: ${error instanceof Error ? error.message : error}`;
@@ -190,6 +197,6 @@ export class SceneViewer {
  * @returns {ErrorReport}
  */
 function asReport(error) {
-  const { code = 'E_UNKNOWN', message = String(error), offset, clause } = /** @type {any} */ (error);
-  return new EngineError({ code, message, offset, clause }).report();
+  const { code = 'E_UNKNOWN', message = String(error), offset, clause, reason, status } = /** @type {any} */ (error);
+  return new EngineError({ code, message, offset, clause, reason, status }).report();
 }

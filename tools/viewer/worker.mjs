@@ -1,6 +1,8 @@
 // The viewer's worker: reads and packs what the view requires and sorts the visible splats. engine.mjs sends it requests.
 
+import { CsplatReader } from '../../codec/js/decoder.mjs';
 import { cull } from './cull.mjs';
+import { pageFunctions } from './fetch_port.mjs';
 import { chooseTiles } from './level_cut.mjs';
 import { withUp } from './meta_writer.mjs';
 import { DepthSorter } from './sort.mjs';
@@ -14,12 +16,17 @@ import { TileStream } from './tile_stream.mjs';
  * Messages to the worker: `scene` counts the calls of `open`, `id` the cameras.
  *
  * @typedef {{type: 'open', scene: number, source: string | Blob | ArrayBuffer, sort: boolean,
- *      aims: import('./tile_stream.mjs').Aims}
+ *      aims: import('./tile_stream.mjs').Aims, fetching: Fetching}
  *   | {type: 'view', id: number, view: View}
  *   | {type: 'recycle', order: Uint32Array<ArrayBuffer>}
  *   | {type: 'pause', isPaused: boolean}
  *   | {type: 'rewrite', up: number[], port: MessagePort}
  *   | {type: 'stop'}} Request
+ *
+ * How to fetch: options of the engine that can be sent, and whether the page has functions for the others.
+ *
+ * @typedef {Pick<import('./types.d.ts').FetchOptions, 'request' | 'retries' | 'retryMs' | 'timeoutMs'>
+ *   & {hasFetch: boolean, hasRenew: boolean}} Fetching
  *
  * The answer to `rewrite`, sent to its port.
  *
@@ -39,6 +46,7 @@ import { TileStream } from './tile_stream.mjs';
  *   | {type: 'order', id: number, isComplete: boolean, isWhole: boolean, order: Uint32Array<ArrayBuffer>, count: number,
  *      cullMs: number, sortMs: number}
  *   | {type: 'done'}
+ *   | {type: 'ask', question: import('./fetch_port.mjs').Question, port: MessagePort}
  *   | {type: 'error', error: ErrorReport})} Reply
  *
  * `order`: `isWhole` if it covers the scene, at any level, `isComplete` if everything that the view requires was here. `done`:
@@ -62,6 +70,8 @@ class Job {
     this.scene = 0;
     /** @type {string | Blob | ArrayBuffer} */
     this.source = new ArrayBuffer(0);
+    /** @type {import('./types.d.ts').FetchOptions} */
+    this.fetching = {};
     this.abort = new AbortController();
     /** @type {TileStream | null} */
     this.stream = null;
@@ -114,7 +124,7 @@ class Job {
   }
 
   /** @param {Request & {type: 'open'}} request `sort`: the renderer needs an order */
-  async open({ scene, source, sort, aims }) {
+  async open({ scene, source, sort, aims, fetching: { hasFetch, hasRenew, ...fetching } }) {
     this.reset();
     this.scene = scene;
     this.sorts = sort;
@@ -125,8 +135,10 @@ class Job {
     const post = (message, transfer = []) => {
       if (!signal.aborted) this.scope.postMessage({ ...message, scene }, transfer);
     };
+    const { fetch, renew } = pageFunctions((question, port) => post({ type: 'ask', question, port }, [port]));
+    this.fetching = { ...fetching, ...(hasFetch && { fetch }), ...(hasRenew && { renew }) };
     try {
-      const stream = await TileStream.open(source, this.sink(post), aims, signal);
+      const stream = await TileStream.open(source, this.sink(post), aims, signal, this.fetching);
       this.stream = stream;
       stream.pause(this.isPaused);
       stream.setView(this.camera?.view ?? null);
@@ -145,7 +157,7 @@ class Job {
    */
   async rewrite(up, port) {
     try {
-      const bytes = await withUp(await whole(this.source), up);
+      const bytes = await withUp(await whole(this.source, this.fetching), up);
       port.postMessage({ bytes }, [bytes.buffer]);
     } catch (error) {
       port.postMessage({ error: reportOf(error, true) });
@@ -261,13 +273,14 @@ class Job {
  * Return all bytes of a file.
  *
  * @param {string | Blob | ArrayBuffer} source
+ * @param {import('./types.d.ts').FetchOptions} fetching
  */
-async function whole(source) {
+async function whole(source, fetching) {
   if (source instanceof ArrayBuffer) return source;
   if (source instanceof Blob) return source.arrayBuffer();
-  const response = await fetch(source);
-  if (!response.ok) throw new Error(`${source}: HTTP status ${response.status}`);
-  return response.arrayBuffer();
+  const reader = /** @type {any} */ (await CsplatReader.open(source, fetching));
+  const bytes = await reader.source.read(0, reader.header.fileSize);
+  return bytes.slice().buffer;
 }
 
 /**
@@ -276,13 +289,16 @@ async function whole(source) {
  * @returns {ErrorReport}
  */
 function reportOf(error, fatal) {
-  const { code, message, offset, clause } = /** @type {any} */ (error instanceof Error ? error : { message: error });
+  const problem = /** @type {any} */ (error instanceof Error ? error : { message: error });
+  const { code, message, offset, clause, reason, status } = problem;
   const isOurs = typeof code === 'string';
   return {
     code: isOurs ? code : 'E_INPUT',
     message: String(message),
     ...(offset !== null && offset !== undefined && { offset }),
     ...(clause && { clause }),
+    ...(reason && { reason }),
+    ...(status && { status }),
     fatal,
   };
 }
@@ -290,4 +306,3 @@ function reportOf(error, fatal) {
 const scope = /** @type {Scope} */ (/** @type {unknown} */ (globalThis));
 const job = new Job(scope);
 scope.onmessage = (/** @type {{data: Request}} */ { data }) => job.take(data);
-globalThis.addEventListener?.('online', () => job.stream?.retry());

@@ -36,6 +36,34 @@ _SWAPPED = 0.02  # tolerance for a principal point that fits the swapped image s
 _NERFSTUDIO_NEAR = 0.01  # near plane of nerfstudio's renderer, scene units
 _SCALE_TOLERANCE = 1e-3
 _ANGLE_TOLERANCE = 0.01  # relative difference between a focal length and an angle of view; files have few digits
+#: Files with poses that are not read: fields of the document, or of each entry of a list; and what to use instead.
+_UNREAD = (
+    (
+        {"transform", "scale"},
+        "is dataparser_transforms.json of nerfstudio, which has no cameras: export a camera path from its viewer",
+    ),
+    (
+        {"file_path", "transform"},
+        "has the poses of `ns-export cameras`, without focal lengths: export a camera path from its viewer",
+    ),
+    (
+        {"path", "time"},
+        "is a camera path of instant-ngp, in its own coordinates: use the transforms.json of the images",
+    ),
+    (
+        {"K", "poses"},
+        "has the cameras of Record3D: convert it with `ns-process-data record3d`, and use the transforms.json",
+    ),
+    (
+        {"cameras", "shots", "points"},
+        "is a reconstruction of OpenSfM: export it with `opensfm export_colmap`, and use --data",
+    ),
+    (
+        {"background"},
+        "has settings of the SuperSplat viewer, expected one of the formats that `csplat render --help` lists",
+    ),
+)
+_COLMAP = {"cameras.bin", "images.bin", "cameras.txt", "images.txt"}
 _LISTED = ("k1", "k2", "k3", "k4", "p1", "p2")  # distortion_params
 _DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
@@ -59,6 +87,9 @@ def load_cameras(
         InputError: the file does not exist, is not JSON, or contains no cameras.
     """
     path, report = Path(path), [] if report is None else report
+    if path.is_dir() or path.name in _COLMAP:
+        what = "a folder" if path.is_dir() else "a file of COLMAP"
+        raise InputError(f"{path} is {what}, expected a JSON file of cameras; use --data for those of a data set")
     entries = read_json(path)
     cameras = parse_foreign_cameras(entries, str(path), report)
     if cameras is None:
@@ -103,6 +134,11 @@ def parse_foreign_cameras(document: object, where: str, report: list[str]) -> li
     if not isinstance(document, Mapping):
         return None
     if isinstance(document.get("camera_path"), list):
+        if not document["camera_path"] and document.get("keyframes"):
+            raise InputError(
+                f"{where} lists no cameras, but keyframes between which nerfstudio has not interpolated: generate the"
+                " path in its viewer, with a duration above 0, and export it again"
+            )
         cameras = _parse_each(
             document["camera_path"], where, "camera_path", lambda e, at: _parse_nerfstudio(document, e, at)
         )
@@ -247,7 +283,8 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{where}: {name} is not a matrix of numbers") from None
     if pose.shape not in ((4, 4), (3, 4)) or not np.isfinite(pose).all():
-        raise InputError(f"{where}: {name} has shape {list(pose.shape)}, expected [4, 4], finite")
+        hint = ", as if by decimal commas" if pose.ndim == 2 and pose.shape[1] == 8 else ""
+        raise InputError(f"{where}: {name} has shape {list(pose.shape)}{hint}, expected [4, 4], finite")
     if len(pose) == 4:
         check_last_row(pose, f"{where}: {name}")
     axes = pose[:3, :3] * np.array([1.0, -1.0, -1.0])
@@ -282,6 +319,10 @@ def describe_scales(matrices: Sequence[Any], where: str) -> list[str]:
 
 
 def _own_cameras(entries: object, path: Path) -> list[Camera]:
+    first = entries[0] if isinstance(entries, list) and entries else entries
+    unread = [text for fields, text in _UNREAD if isinstance(first, Mapping) and fields <= first.keys()]
+    if unread:
+        raise InputError(f"{path} {unread[0]}")
     if not isinstance(entries, list) or not entries:
         raise InputError(
             f"{path} is not a camera file, expected a list of {{K, viewmat, W, H}}, cameras.json of INRIA, a camera "

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import os
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 import numba as typed_numba
 import numpy as np
 from numba import extending as typed_extending
+from numba.core import caching as typed_caching
 from numba.core import compiler as typed_compiler
 from numba.core import event as typed_event
 
@@ -21,6 +24,7 @@ from csplat.errors import InputError
 # Typed as Any because numba's own types differ between versions.
 numba: Any = typed_numba
 extending: Any = typed_extending
+caching: Any = typed_caching
 compiler: Any = typed_compiler
 event: Any = typed_event
 
@@ -40,13 +44,13 @@ _RELAXED = {"reassoc", "nsz", "arcp", "contract", "afn"}
 
 def kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a single-threaded kernel with strict IEEE arithmetic."""
-    compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy")
+    compiled: Callable[P, R] = _compile(function)
     return compiled
 
 
 def device_function(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a small function that kernels call; if LLVM inlines it, it uses the kernel's arithmetic."""
-    compiled: Callable[P, R] = numba.njit(function, inline="never", cache=True, nogil=True, error_model="numpy")
+    compiled: Callable[P, R] = _compile(function, inline="never")
     return compiled
 
 
@@ -58,8 +62,92 @@ def inlined(function: Callable[P, R]) -> Callable[P, R]:
 
 def relaxed_kernel(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a single-threaded kernel with relaxed arithmetic (reassociation, contraction), for loops over pixels."""
-    compiled: Callable[P, R] = numba.njit(function, cache=True, nogil=True, error_model="numpy", fastmath=_RELAXED)
+    compiled: Callable[P, R] = _compile(function, fastmath=_RELAXED)
     return compiled
+
+
+def cache_failure() -> str:
+    """Return why kernels that this process compiles are not kept for the next run; "" if they are."""
+    return _failures[-1] if _failures else ""
+
+
+_failures: list[str] = []  # reasons why numba's cache could not be used
+
+
+def _compile(function: Any, **options: Any) -> Any:
+    """Compile a function with numba, and keep the result on disk if possible."""
+    compiled = numba.njit(function, nogil=True, error_model="numpy", **options)
+    try:
+        compiled._cache = _KernelCache(function)  # noqa: SLF001  # `cache=True` raises if there is no folder
+    except (RuntimeError, OSError):
+        _failures.append("no folder for numba's cache can be written")
+    return compiled
+
+
+class _UserCacheLocator(caching.UserWideCacheLocator):  # type: ignore[misc]  # numba's types differ between versions
+    """A locator of numba's cache in the user's home that refuses a relative path, as results if there is no home."""
+
+    def ensure_cache_path(self) -> None:
+        """Create the folder.
+
+        Raises:
+            OSError: it cannot be created, or there is no home.
+        """
+        if not Path(self.get_cache_path()).is_absolute():
+            raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), self.get_cache_path())
+        super().ensure_cache_path()
+
+
+class _CacheFiles(caching.FunctionCache._impl_class):  # type: ignore[misc]  # noqa: SLF001  # as above
+    """The files of a kernel's cache. Knows the folders that are tried for them."""
+
+    _locator_classes = [  # noqa: RUF012  # numba's
+        _UserCacheLocator if one is caching.UserWideCacheLocator else one
+        for one in caching.FunctionCache._impl_class._locator_classes  # noqa: SLF001
+    ]
+
+
+class _KernelCache(caching.FunctionCache):  # type: ignore[misc]  # numba's types differ between versions
+    """A kernel in numba's cache. Files that are damaged or cannot be accessed cost a compilation, not the run."""
+
+    _impl_class = _CacheFiles
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load a compiled version of the kernel; `None` if there is none, or if the files are unusable."""
+        try:
+            return super().load_overload(sig, target_context)
+        except OSError as error:
+            self._give_up(error)
+        except Exception:  # noqa: BLE001  # unpickling a damaged file raises anything
+            self._repair()
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Save a compiled version of the kernel, if possible."""
+        try:
+            super().save_overload(sig, data)
+        except Exception as error:  # noqa: BLE001  # the kernel works without
+            self._give_up(error)
+
+    def is_empty(self) -> bool:
+        """Return True if no compiled version is on disk, or none that can be read."""
+        try:
+            return not self._cache_file._load_index()  # noqa: SLF001  # there is no public interface
+        except Exception:  # noqa: BLE001  # as in `load_overload`
+            return True
+
+    def _repair(self) -> None:
+        """Replace a damaged index by an empty one, so that compiled versions can be saved again."""
+        try:
+            self.flush()
+        except OSError as error:
+            self._give_up(error)
+
+    def _give_up(self, error: Exception) -> None:
+        """Use the files no more, and note why."""
+        self.disable()
+        reason = (error.strerror if isinstance(error, OSError) else None) or str(error) or type(error).__name__
+        _failures.append(f"numba's cache in {self.cache_path}: {reason}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +198,7 @@ def parallel_kernel(
     options: dict[str, Any] = {"fastmath": _RELAXED} if relaxed else {}
 
     def decorate(function: Callable[Concatenate[int, int, P], None]) -> ParallelKernel[P]:
-        return ParallelKernel(
-            numba.njit(
-                function, cache=True, nogil=True, error_model="numpy", pipeline_class=_NoAliasCompiler, **options
-            )
-        )
+        return ParallelKernel(_compile(function, pipeline_class=_NoAliasCompiler, **options))
 
     return decorate
 
@@ -146,9 +230,8 @@ def is_cached(kernel: Any) -> bool:
     compiled = getattr(kernel, "compiled", kernel)
     if compiled.signatures:
         return True
-    # numba has no public interface to the index of its cache; the index is empty if the source is newer.
-    load = getattr(getattr(compiled._cache, "_cache_file", None), "_load_index", None)  # noqa: SLF001
-    return load is not None and bool(load())
+    cache = compiled._cache  # noqa: SLF001  # numba has no public name for it
+    return isinstance(cache, _KernelCache) and not cache.is_empty()
 
 
 def fast_exp2(x: float) -> float:

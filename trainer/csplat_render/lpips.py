@@ -115,7 +115,8 @@ def load_lpips(path: str | Path | None = None) -> Lpips:
         return _read(Path(path))
     if named := os.environ.get(ENVIRONMENT):
         return _read(Path(named))
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "csplat" / "lpips_alex.npz"
+    # Path.home() raises if there is no home; this leaves the ~.
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "csplat", "lpips_alex.npz")  # noqa: PTH111
     if cache.is_file():
         return _read(cache)
     weights = load_torch_lpips()

@@ -13,7 +13,7 @@ from csplat_render import metrics
 from csplat_render.blending import blend
 from csplat_render.camera import Camera
 from csplat_render.conventions import UncheckedSplats
-from csplat_render.kernels import is_cached, on_compiling
+from csplat_render.kernels import cache_failure, is_cached, on_compiling
 from csplat_render.metric_kernels import convolve
 from csplat_render.projection import project
 from csplat_render.pruning_error import measure_pruning_error
@@ -52,7 +52,8 @@ def warm_up(
         nonlocal compiles
         compiles = True
         if announce is not None:
-            announce("compiling a part of the renderer for this machine, once: this takes up to a minute")
+            often = "" if cache_failure() else " for this machine, once"
+            announce(f"compiling a part of the renderer{often}: this takes up to a minute")
 
     with on_compiling(say):
         viewmat = np.eye(4)
@@ -74,7 +75,9 @@ def warm_up(
             call()
     seconds = time.perf_counter() - started
     if announce is not None and compiles:
-        announce(f"the renderer is compiled, in {seconds:.0f} s")
+        why = cache_failure()
+        kept = f", for this run alone ({why}); NUMBA_CACHE_DIR names another folder" if why else ""
+        announce(f"the renderer is compiled, in {seconds:.0f} s{kept}")
     return seconds
 
 

@@ -1,6 +1,6 @@
 # torch may be absent:
 # pyright: reportMissingImports=false
-"""Checkpoints of gsplat's simple_trainer, of nerfstudio's splatfacto and of INRIA's trainer, read as scenes.
+"""Checkpoints of gsplat's simple_trainer, nerfstudio's splatfacto, INRIA's trainer and others, read as scenes.
 
 All are pickles of torch. No code in them is run: `weights_only` admits only tensors, containers and plain numbers. Some
 facts, such as antialiased training, are not in the checkpoint, but in other files of the trainer.
@@ -26,6 +26,7 @@ import numpy as np
 from csplat.archives import DAMAGED, member_refusal, unpacked_limit
 from csplat.detect import detect_content, read_head
 from csplat.errors import InputError, counted, missing_package
+from csplat.file_source import open_binary
 from csplat.formats import Format
 from csplat.interop import from_gsplat
 from csplat.lint import Finding, too_many_bands
@@ -48,6 +49,8 @@ _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto'
 #: gsplat writes a file per GPU with a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
 _FILTER = "filter_3D"
+#: gsplat's names of tensors, by those of gsplat and splatfacto, of Gaussian Splatting Lightning, and of attributes in
+#: INRIA's `GaussianModel`, which trainers derived from it save as a state.
 _NAMES = {
     "means": "means",
     "quats": "quats",
@@ -55,6 +58,15 @@ _NAMES = {
     "opacities": "opacities",
     "features_dc": "sh0",
     "features_rest": "shN",
+    "rotations": "quats",
+    "shs_dc": "sh0",
+    "shs_rest": "shN",
+    "_xyz": "means",
+    "_rotation": "quats",
+    "_scaling": "scales",
+    "_opacity": "opacities",
+    "_features_dc": "sh0",
+    "_features_rest": "shN",
 }
 
 
@@ -172,7 +184,7 @@ def _check_pickles(path: Path) -> None:
             if reason := member_refusal(info, unpacked_limit(info.compress_size)):
                 raise InputError(f"{path.name}: its part {info.filename[:_NAME_SHOWN]} {reason}")
         return
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         begin = io.BytesIO(stream.read(_LARGEST_PICKLE))
     try:
         for _ in range(_LEGACY_PICKLES):
@@ -204,12 +216,13 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
     named = {str(name): value for name, value in holder.items()}
     models = _models_in(named)
     if len(models) > 1:
-        shown = ", ".join(f"{prefix}* ({_count(named[prefix + 'means'])})" for prefix in models[:_NAMED])
+        shown = ", ".join(f"{prefix}* ({_count(means)})" for prefix, means in list(models.items())[:_NAMED])
         raise InputError(f"it holds {len(models)} models of splats, expected one: {shown}; save only one of them")
     if not models:
         names = ", ".join(map(str, list(content)[:_NAMED]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
-    found = {name.removeprefix(models[0]): value for name, value in named.items() if name.startswith(models[0])}
+    (prefix,) = models
+    found = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
     part = _checked_part({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
     if part.model.sh_degree or "features_rest" not in found:
         return part
@@ -226,13 +239,18 @@ def _inria_tensors(content: object) -> dict[str, Any] | None:
     return dict(zip(_INRIA, captured[1:], strict=False))
 
 
-def _models_in(named: Mapping[str, Any]) -> list[str]:
-    """Return the name prefix of the tensors of each model of splats.
+def _models_in(named: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the means of each model of splats, by the prefix of the names of its tensors.
 
-    It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, and empty in a bare state_dict.
+    It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, `gaussian_model.gaussians.` in Gaussian
+    Splatting Lightning, and empty in a bare state_dict.
     """
-    prefixes = [name.removesuffix("means") for name in named if name == "means" or name.endswith(".means")]
-    return [one for one in prefixes if f"{one}scales" in named or f"{one}quats" in named]
+    found: dict[str, dict[str, Any]] = {}
+    for name, value in named.items():
+        prefix, dot, last = name.rpartition(".")
+        if last in _NAMES:
+            found.setdefault(prefix + dot, {})[_NAMES[last]] = value
+    return {prefix: one["means"] for prefix, one in found.items() if "means" in one and {"scales", "quats"} & set(one)}
 
 
 def _count(means: Any) -> str:
@@ -256,6 +274,10 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
     findings = []
     splats = {name: _array(value) if name in _NAMES.values() else value for name, value in splats.items()}
     scales = splats.get("scales")
+    if scales is not None and scales.ndim in (1, 2) and scales.size == len(scales):
+        splats["scales"] = scales = np.repeat(scales.reshape(-1, 1), 3, axis=1)
+        text = "splats have one scale: all axes of a splat have this size"
+        findings.append(Finding("one-scale", 1, text, "note"))
     is_flat = scales is not None and scales.ndim == 2 and scales.shape[1] == 2
     if scales is not None and is_flat:
         third = np.full((len(scales), 1), choose_thickness(scales) if len(scales) else 0.0, np.float32)

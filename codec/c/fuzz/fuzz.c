@@ -226,7 +226,7 @@ static void check_budget_cut(csplat *file, const csplat_node *nodes, uint32_t no
 static void check_pixel_cut(csplat *file, const csplat_node *nodes, uint32_t node_count, double pixel_size)
 {
     const csplat_info *info = csplat_get_info(file);
-    float box[] = {-FLT_MAX, -FLT_MAX, -FLT_MAX, FLT_MAX, FLT_MAX, FLT_MAX};
+    double box[] = {-FLT_MAX, -FLT_MAX, -FLT_MAX, FLT_MAX, FLT_MAX, FLT_MAX};
     csplat_cut cut = {CSPLAT_CUT_PIXEL_SIZE, 0, 0, NULL, 0, box};
     uint32_t *tiles = malloc(((size_t)info->tile_count + info->coarse_tile_count) * sizeof *tiles), count, again;
     double *sizes = malloc(node_count * sizeof *sizes);

@@ -352,11 +352,20 @@ static int answer(const char *path)
     return refused;
 }
 
-/* Parse the text of a cut, a word and its numbers; `sizes` has room for all of them. */
-static csplat_cut read_cut(char *text, double *sizes)
+/* Parse the text of a cut, a word and its numbers, and perhaps `box` and six more; `sizes` has room for all of them. */
+static csplat_cut read_cut(char *text, double *sizes, double box[6])
 {
     csplat_cut cut = {CSPLAT_CUT_LEVEL, 0, 0, NULL, 0, NULL};
-    char *word = strtok(text, " "), *number = strtok(NULL, " ");
+    char *corners = strstr(text, " box "), *word, *number;
+    if (corners) {
+        *corners = '\0';
+        corners += strlen(" box ");
+        for (int i = 0; i < 6; i++)
+            box[i] = strtod(corners, &corners);
+        cut.box = box;
+    }
+    word = strtok(text, " ");
+    number = strtok(NULL, " ");
     if (!word || !number)
         die("a cut without a number");
     if (strcmp(word, "level") == 0)
@@ -383,7 +392,7 @@ static int answer_cuts(const char *path, const char *cuts)
     uint32_t *tiles, count;
     size_t length;
     char *text = (char *)load(cuts, &length);
-    double *sizes = room(length, sizeof *sizes);
+    double *sizes = room(length, sizeof *sizes), box[6];
     int refused = 1;
     data = load(path, &size);
     if (csplat_open_memory(&file, data, size, &options, &error))
@@ -398,7 +407,7 @@ static int answer_cuts(const char *path, const char *cuts)
             end = line + strcspn(line, "\n");
             if (*end)
                 *end++ = '\0';
-            cut = read_cut(line, sizes);
+            cut = read_cut(line, sizes, box);
             code = csplat_select(file, &cut, tiles, &count);
             printf("%s", code ? csplat_code_name(code) : "");
             for (uint32_t i = 0; i < count; i++)

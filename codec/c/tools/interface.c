@@ -207,11 +207,19 @@ static csplat_code select_by(csplat *d, csplat_cut cut, uint32_t *tiles, uint32_
     return code;
 }
 
+static int has(const uint32_t *tiles, uint32_t count, uint32_t tile)
+{
+    for (uint32_t i = 0; i < count; i++)
+        if (tiles[i] == tile)
+            return 1;
+    return 0;
+}
+
 static void cuts_are_checked(const unsigned char *data, size_t size)
 {
     const csplat_cut level_0 = {CSPLAT_CUT_LEVEL, 0, 0, NULL, 0, NULL};
     double *sizes;
-    float box[6];
+    double box[6];
     uint32_t *tiles, count, node_count;
     const csplat_node *nodes, *root, *again;
     const csplat_info *info;
@@ -271,12 +279,21 @@ static void cuts_are_checked(const unsigned char *data, size_t size)
     }
     cut = level_0;
     cut.box = box;
-    box[0] = box[3] = HUGE_VALF;
+    box[0] = box[3] = HUGE_VAL;
     HOLDS(!select_by(d, cut, tiles, &count) && count == 0);
-    box[0] = -HUGE_VALF;
+    box[0] = -HUGE_VAL;
     HOLDS(!select_by(d, cut, tiles, &count) && count > 0);
-    box[4] = nextafterf(box[1], -HUGE_VALF);
-    HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
+    for (int i = 0; i < 6; i++) { /* the corners in another order; numbers between those of binary32 */
+        box[i] = i < 3 ? HUGE_VAL : -HUGE_VAL;
+        HOLDS(i < 5 || (!select_by(d, cut, tiles, &count) && count == info->tile_count));
+    }
+    for (uint32_t i = 0; i < info->tile_count; i++) {
+        HOLDS(!csplat_get_tile(d, i, &tile));
+        box[3] = tile.max[0];
+        HOLDS(!select_by(d, cut, tiles, &count) && has(tiles, count, i));
+        box[3] = nextafter(tile.max[0], HUGE_VAL);
+        HOLDS(!select_by(d, cut, tiles, &count) && !has(tiles, count, i));
+    }
     box[4] = NAN;
     HOLDS(select_by(d, cut, tiles, &count) == CSPLAT_E_INPUT);
 

@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+import numpy as np
+
 from csplat import _spec
 from csplat.errors import FormatError, InputError, UnsupportedError
 from csplat.file_source import File, describe_substitute, map_file
@@ -68,10 +70,14 @@ class Tile:
     codebook_ids: tuple[int, ...]
 
     def corners(self, step: float) -> tuple[list[float], list[float]]:
-        """Return the corners of the box around the centres (spec 4.3.5), scene units; `step` is the file's."""
+        """Return the corners of the box around the centres (spec 4.3.5), scene units; `step` is the file's.
+
+        The numbers are those of binary32, as the centres are, so that no centre is outside.
+        """
         scaled = math.ldexp(step, self.exponent)
-        low = [corner * scaled for corner in self.corner]
-        return low, [(corner + extent) * scaled for corner, extent in zip(self.corner, self.extent, strict=True)]
+        far = [corner + extent for corner, extent in zip(self.corner, self.extent, strict=True)]
+        low, high = ([float(np.float32(n * scaled)) for n in corner] for corner in (self.corner, far))
+        return low, high
 
 
 @dataclass(frozen=True)

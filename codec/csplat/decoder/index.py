@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 STEP_MIN = 2.0**-1022
 #: Smallest normal and largest finite number of binary32 (ATT-10, LAT-1).
 SINGLE_MIN, SINGLE_MAX = 2.0**-126, 2.0**128 - 2.0**104
+_SINGLE_END = 2.0**128 - 2.0**103  # the smallest number that binary32 rounds to infinity (MEA-1)
 
 _CONTROL = frozenset(chr(c) for c in (*range(0x20), 0x7F))  # control characters, forbidden in names (EXR-2)
 #: Record sizes in the index head and their minima, the sizes that this version reads.
@@ -503,9 +504,15 @@ def _check_tile(tile: Tile, means_step: float) -> None:
         if extent >> _spec.AXIS_BITS_MAX:
             at, wanted = tile.offset + offsets["extent"] + 4 * axis, f"below 2^{_spec.AXIS_BITS_MAX}"
             raise FormatError(_spec.ERROR_VALUE, at, "TIL-8", "extent", found=extent, wanted=wanted)
-    if scaled_step(means_step, tile.exponent) is None:
+    scaled = scaled_step(means_step, tile.exponent)
+    if scaled is None:
         detail = f"{means_step} x 2^{tile.exponent} is not positive, finite and at least 2^-1022"
         raise FormatError(_spec.ERROR_VALUE, tile.offset + offsets["exponent"], "TIL-9", detail)
+    for axis, (corner, extent) in enumerate(zip(tile.corner, tile.extent, strict=True)):
+        if not max(abs(corner * scaled), abs((corner + extent) * scaled)) < _SINGLE_END:
+            at, detail = tile.offset + offsets["corner"] + 8 * axis, "the tile's box"
+            ends = f"{corner} to {corner + extent}, times {scaled}"
+            raise FormatError(_spec.ERROR_RANGE, at, "MEA-1", detail, found=ends, wanted="finite numbers of binary32")
 
 
 def _check_codebook_ids(tile: Tile, known: set[int], at: int) -> None:

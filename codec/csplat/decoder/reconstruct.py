@@ -179,10 +179,17 @@ def tile_boxes(header: SceneHeader, tiles: Sequence[Tile]) -> F64:
     """Return the boxes around the centres of the splats of some tiles (spec 4.3.5).
 
     Returns:
-        [T, 2, 3] float64: smallest and largest corner in scene units, relative to the origin.
+        [T, 2, 3] float64: smallest and largest corner in scene units, relative to the origin. The numbers are those
+        of binary32, as the centres are; in float64 they are compared exactly with any query.
     """
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     return np.array([tile.corners(step) for tile in tiles], np.float64).reshape(len(tiles), 2, 3)
+
+
+def boxes_touching(boxes: F64, box: F64) -> NDArray[np.bool_]:
+    """Return which of some boxes, [T, 2, 3], share a point with one box, [2, 3], smallest corner first (spec 5.7)."""
+    touch: NDArray[np.bool_] = np.all((boxes[:, 0] <= box[1]) & (boxes[:, 1] >= box[0]), axis=1)
+    return touch
 
 
 def lattice_rows(
@@ -198,14 +205,14 @@ def lattice_rows(
         count: number of splats in the block.
 
     Raises:
-        FormatError: E_RANGE by LAT-5 or MEA-1: a value is not finite in binary32.
+        FormatError: E_RANGE by LAT-5: a value is not finite in binary32. Means are, by MEA-1 and TIL-10.
     """
     columns = _spec.ATTRIBUTE_COLUMNS[record.attribute]
     colour = record.mapping == _spec.MAPPING_YCOCG
     bound = _bound(block, record)
     dtype = work_dtype(bound)
     step = math.ldexp(record.step, block.exponent)
-    check = not _is_finite(bound, step)
+    check = record.attribute != _spec.ATTRIBUTE_MEANS and not _is_finite(bound, step)
     for start, stop in runs(count, columns):
         rows = block.rows(start, stop, dtype)
         third = columns // 3
@@ -327,9 +334,8 @@ def _scale(integers: Ints, step: float, out: F32, *, wide: bool = False) -> None
 def _check_finite(parts: tuple[Ints, Ints, Ints], step: float, record: _spec.AttributeRecord, at: int) -> None:
     largest = max(max(-int(part.min()), int(part.max())) for part in parts)  # has the largest value
     if not np.isfinite(np.float32(float(largest) * step)):
-        clause = "MEA-1" if record.attribute == _spec.ATTRIBUTE_MEANS else "LAT-5"
         detail = f"{_spec.ATTRIBUTE_NAMES[record.attribute]}: {largest} x {step} is not finite in binary32"
-        raise FormatError(_spec.ERROR_RANGE, at, clause, detail)
+        raise FormatError(_spec.ERROR_RANGE, at, "LAT-5", detail)
 
 
 # Levels: opacities, quats (7.3, 7.5) ---------------------------------------------------------------

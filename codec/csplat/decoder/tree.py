@@ -11,7 +11,7 @@ import numpy as np
 
 from csplat import _spec
 from csplat.decoder.container import SceneHeader, Tile, open_chunk
-from csplat.decoder.reconstruct import tile_boxes
+from csplat.decoder.reconstruct import boxes_touching, tile_boxes
 from csplat.errors import FormatError, InputError, LimitError
 from csplat.types import F64
 
@@ -156,8 +156,8 @@ def select_tiles(
         level: the highest level to use, 0 to 255.
         pixel_size: size of a pixel at each node, scene units, one number or one per node, at least 0.
         max_splats: maximum number of splats. At most one of these three is given; default: level 0.
-        box: [2, 3] corners of a box, smallest first; of level 0, only tiles whose box touches it are selected, and of
-            coarser nodes only those whose region does.
+        box: [2, 3] corners of a box, smallest first, relative to the origin; of level 0, only tiles whose box touches
+            it are selected, and of coarser nodes only those whose region does.
 
     Raises:
         InputError: several of the three are given, or one is out of its range.
@@ -181,10 +181,8 @@ def select_tiles(
         cut = _cut_where(nodes, lambda number: nodes[number].level > most)
     if box is None:
         return [tile for number in cut for tile in nodes[number].tiles]
-    boxes = tile_boxes(header, header.all_tiles)
-    touching = ((boxes[:, 0] <= box[1]) & (boxes[:, 1] >= box[0])).all(axis=1)
-    regions = node_regions(header, nodes)
-    inside = ((regions[:, 0] <= box[1]) & (regions[:, 1] >= box[0])).all(axis=1)
+    touching = boxes_touching(tile_boxes(header, header.all_tiles), box)
+    inside = boxes_touching(node_regions(header, nodes), box)
     return [
         tile for number in cut for tile in nodes[number].tiles
         if (touching[tile.index] if tile.level == 0 else inside[number])

@@ -12,18 +12,19 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory, TemporaryFile
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.byte_store import FileWindow
 from csplat.decoder import read_header
 from csplat.decoder.container import SceneHeader, Tile
 from csplat.decoder.tiles import codebook_references
-from csplat.disk_files import BinaryWriter, open_writer
+from csplat.disk_files import BinaryWriter, open_writer, temporary_file, temporary_folder
+from csplat.editing.transform import DEFAULT_AXES
+from csplat.editing.up_axis import CONTRADICTS, up_of
 from csplat.encoder import EncodeOptions
 from csplat.encoder.container import (
     FileChunk,
@@ -40,7 +41,7 @@ from csplat.encoder.container import (
 )
 from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
-from csplat.file_source import File
+from csplat.file_source import File, open_binary
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene_source import SceneSource
@@ -49,12 +50,7 @@ from csplat.splat_file import open as opened
 from csplat.tile_copy import ChunkPrefetcher, TileCopier, chunk_payload, copy_nodes, scene_fields
 
 #: Fields that must be equal because they determine how all splats of a file are rendered: words for messages, name.
-_SHARED_FIELDS = (
-    ("axes", "coordinate_system"),
-    ("units", "unit_metres"),
-    ("antialiasing", "antialiased"),
-    ("flatness", "flat"),
-)
+_SHARED_FIELDS = (("units", "unit_metres"), ("antialiasing", "antialiased"), ("flatness", "flat"))
 
 
 @dataclass(frozen=True)
@@ -67,6 +63,7 @@ class MergeResult:
         size: size of the file in bytes.
         why: the reason why the scenes were encoded again; "" if tiles were copied.
         dropped: extra columns that were dropped because not all files have them; only if scenes were encoded again.
+        notes: what was assumed of files that leave axes or unit open, and which metadata not all files share.
     """
 
     splat_count: int
@@ -74,6 +71,7 @@ class MergeResult:
     size: int
     why: str = ""
     dropped: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 def merge(
@@ -92,8 +90,10 @@ def merge(
     decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more, and levels of
     detail; `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
-    Metadata and cameras are kept if they are the same in all files. If one file leaves axes or unit open, another may
-    specify them. Merged files of copied tiles declare no error bounds and no options, because nothing is measured.
+    Metadata and cameras are kept if they are the same in all files. Of a file without axes, x right, y down, z forward
+    is assumed, as elsewhere: it can be merged with files of these axes, not of others. Of a file without a unit, that
+    of the others is assumed. `MergeResult.notes` reports all of this. Merged files of copied tiles declare no error
+    bounds and no options, because nothing is measured.
 
     Args:
         files: as in `csplat.open`, two or more.
@@ -110,8 +110,8 @@ def merge(
         ('', True)
 
     Raises:
-        InputError: there are fewer than two files, or they contradict each other in axes, unit, antialiasing or
-            flatness.
+        InputError: there are fewer than two files, or they contradict each other in axes, up direction, unit,
+            antialiasing or flatness.
         FormatError, UnsupportedError, LimitError, StoreError, OSError: as in `csplat.open`, and errors of reading.
     """
     if isinstance(files, (str, bytes, os.PathLike)) or len(files) < 2:
@@ -119,12 +119,13 @@ def merge(
     with ExitStack() as stack:
         scenes = [stack.enter_context(opened(file, storage=storage)) for file in files]
         names = [scene.name or f"file {number}" for number, scene in enumerate(scenes, 1)]
+        _refuse_other_axes(scenes, names)
         for words, field in _SHARED_FIELDS:
             _refuse_contradiction(words, [getattr(scene.header, field) for scene in scenes], names)
         windows = [scene.window() for scene in scenes]
         fields = [scene_fields(one, scene.header, (), ()) for one, scene in zip(windows, scenes, strict=True)]
         why, ids = _difference(fields, names), []
-        spool = PayloadSpool(stack.enter_context(TemporaryFile()))
+        spool = PayloadSpool(stack.enter_context(temporary_file()))
         books = MergedCodebooks(spool)
         if not why:
             ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
@@ -132,7 +133,8 @@ def merge(
                 why = f"they have {len(books.records):,} codebooks together, a file has at most {codebooks_max:,}"
         if why:
             why += "; levels of detail are left out" * any(scene.header.coarse_tiles for scene in scenes)
-            return _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
+            done = _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
+            return replace(done, notes=_notes(scenes, names))
         nodes: list[FileNode] = []
         for one, scene, new in zip(windows, scenes, ids, strict=True):
             copied = renumber_tiles(one, scene.header, new, spool, len(scenes))
@@ -149,18 +151,71 @@ def merge(
             codebooks=books.records,
             chunks=[*tree, *_common_chunks(scenes), *books.chunks],
         )
-        return _write_merged(together, tiles, output)
+        return replace(_write_merged(together, tiles, output), notes=_notes(scenes, names))
 
 
-def _refuse_contradiction(words: str, values: Sequence[Any], names: Sequence[str]) -> None:
-    """Raise `InputError` if two files have different values."""
-    known = [(value, name) for value, name in zip(values, names, strict=True) if value not in (None, UNSPECIFIED)]
-    for value, name in known[1:]:
-        if value != known[0][0]:
+def _refuse_other_axes(scenes: Sequence[SplatFile], names: Sequence[str]) -> None:
+    """Raise `InputError` if two files have different axes or up directions; RDF is assumed of files without axes."""
+    axes = [scene.header.coordinate_system for scene in scenes]
+    if not set(axes) <= {UNSPECIFIED}:
+        known = [DEFAULT_AXES if one == UNSPECIFIED else one for one in axes]
+        texts = [f"none, for which {DEFAULT_AXES} is assumed," if one == UNSPECIFIED else one for one in axes]
+        remedy = "turn one with csplat convert --to-axes, or name the axes of one without with --axes"
+        _refuse_contradiction("axes", known, names, texts, remedy)
+    ups = [up_of(scene.metadata or {}, one) for scene, one in zip(scenes, axes, strict=True)]
+    directions = [(np.array(one), name) for one, name in zip(ups, names, strict=True) if one is not None]
+    for up, name in directions[1:]:
+        first, first_name = directions[0]
+        if float(up @ first) < CONTRADICTS:
+            both = f"{_numbers(first)} in {first_name}, {_numbers(up)} in {name}"
             raise InputError(
-                f"scenes with different {words} cannot be merged: {_text(known[0][0])} in {known[0][1]},"
-                f" {_text(value)} in {name}"
+                f"scenes with different up directions cannot be merged: {both}: set one with csplat convert --up"
             )
+
+
+def _numbers(values: NDArray[Any]) -> str:
+    return ",".join(f"{value:g}" for value in values)
+
+
+def _notes(scenes: Sequence[SplatFile], names: Sequence[str]) -> tuple[str, ...]:
+    """Describe what is assumed of files that leave axes or unit open, and metadata that not all files share."""
+    headers = [scene.header for scene in scenes]
+    notes = []
+    open_axes = [name for one, name in zip(headers, names, strict=True) if one.coordinate_system == UNSPECIFIED]
+    if 0 < len(open_axes) < len(scenes):
+        notes.append(f"{', '.join(open_axes)} without axes: {DEFAULT_AXES} is assumed, as the other files have")
+    open_units = [name for one, name in zip(headers, names, strict=True) if one.unit_metres is None]
+    if 0 < len(open_units) < len(scenes):
+        unit = next(one.unit_metres for one in headers if one.unit_metres is not None)
+        notes.append(f"{', '.join(open_units)} without a unit: {unit:g} m is assumed, as the other files have")
+    metadata = [scene.metadata or {} for scene in scenes]
+    left_out = sorted(set().union(*metadata) - _common_entries(metadata).keys())
+    cameras = [scene.cameras for scene in scenes]
+    if left_out := [*left_out, *(["cameras"] if any(one != cameras[0] for one in cameras) else [])]:
+        notes.append(f"metadata left out, because not all files have the same: {', '.join(left_out)}")
+    return tuple(notes)
+
+
+def _refuse_contradiction(
+    words: str, values: Sequence[Any], names: Sequence[str], texts: Sequence[str] = (), remedy: str = ""
+) -> None:
+    """Raise `InputError` if two files have different values, of which `None` is unknown.
+
+    Args:
+        words: name of the values, for the message.
+        values, names: values and names of the files.
+        texts: descriptions of the values; by default, their own.
+        remedy: advice to the user; "" if there is none.
+    """
+    known = [
+        (value, f"{text} in {name}")
+        for value, text, name in zip(values, texts or map(_text, values), names, strict=True)
+        if value is not None
+    ]
+    for value, text in known[1:]:
+        if value != known[0][0]:
+            advice = f": {remedy}" if remedy else ""
+            raise InputError(f"scenes with different {words} cannot be merged: {known[0][1]}, {text}{advice}")
 
 
 def _text(value: Any) -> str:
@@ -217,10 +272,10 @@ def _encode_again(
     metadata_model = _metadata_model(scenes)
     whole = SceneSource(sum(map(len, scenes)), metadata_model, partial(_blocks, scenes, metadata_model))
     dropped = {column.name for scene in scenes for column in scene.header.extras} - metadata_model.extra.keys()
-    with TemporaryDirectory(prefix="csplat-") as folder:
-        path = Path(folder) / "merged.csplat"
-        encode_scene(whole, path, options, OutOfCoreOptions(folder=Path(folder) / "work"))
-        with path.open("rb") as coded, open_writer(output) as stream:
+    with temporary_folder() as folder:
+        path = folder / "merged.csplat"
+        encode_scene(whole, path, options, OutOfCoreOptions(folder=folder / "work"))
+        with open_binary(path) as coded, open_writer(output) as stream:
             shutil.copyfileobj(coded, stream)
         return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
 

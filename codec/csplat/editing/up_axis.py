@@ -21,7 +21,8 @@ UP = "up"
 
 _DIGITS = 6  # decimals; hides differences in the last bits between machines
 _UNIT = 1e-5  # tolerance for the length of a unit vector of six digits
-_CONTRADICTS = math.cos(math.radians(45.0))  # cosine; at larger angles another axis is closer to up
+#: Cosine of the angle between up directions that contradict each other; at larger angles another axis is closer to up.
+CONTRADICTS = math.cos(math.radians(45.0))
 
 
 def up_of(metadata: Mapping[str, Any], coordinate_system: str = UNSPECIFIED) -> Direction | None:
@@ -92,6 +93,6 @@ def with_up(model: SplatModel, up: Direction | None = None, coordinate_system: s
     if up is not None:
         metadata[UP] = list(unit_up(up))
         before = up_of_axes(letters) if coordinate_system is None else None
-        if before is not None and sum(a * b for a, b in zip(before, metadata[UP], strict=True)) < _CONTRADICTS:
+        if before is not None and sum(a * b for a, b in zip(before, metadata[UP], strict=True)) < CONTRADICTS:
             letters = UNSPECIFIED
     return replace(model, metadata=metadata, coordinate_system=letters)

@@ -46,13 +46,14 @@ class Lattice:
         step: step of the file, scene units, > 0.
         bits: maximum number of bits per axis and tile, 1 to 16; a tile whose box needs more is split or coarsened.
         finest: tiles use all their bits instead of stopping at `step`; set if the caller specified bits.
-        strict: no tile has a coarser step, regardless of the number of tiles.
+        error: largest displacement of a mean, scene units, which tiles are split and made finer to keep, regardless of
+            their number; `None`: as the step gives it.
     """
 
     step: float
     bits: int
     finest: bool = False
-    strict: bool = False
+    error: float | None = None
 
 
 @dataclass(frozen=True)
@@ -278,7 +279,7 @@ def _default_to(chosen: Any, otherwise: Any) -> Any:
 def _lattice(model: SplatModel, options: EncodeOptions, by_quality: float) -> Lattice:
     """Choose the lattice of the means by an option (error, step, or bits over the scene's core) or by the quality."""
     if options.position_error is not None:
-        return Lattice(options.position_error / _HALF_DIAGONAL, _BITS_MAX, strict=True)
+        return Lattice(options.position_error / _HALF_DIAGONAL, _BITS_MAX, error=options.position_error)
     if options.position_step is not None:
         return Lattice(options.position_step, _BITS_MAX)
     if len(model) == 0:

@@ -64,10 +64,15 @@ class FileTile:
     level: int = 0
 
     def corners(self, step: float) -> tuple[list[float], list[float]]:
-        """Return the corners of the box around the centres (spec 4.3.5), scene units; `step` is the file's."""
+        """Return the corners of the box around the centres (spec 4.3.5), scene units, as numbers of binary32.
+
+        Args:
+            step: the file's step of means.
+        """
         scaled = math.ldexp(step, self.exponent)
-        low = [corner * scaled for corner in self.corner]
-        return low, [(corner + extent) * scaled for corner, extent in zip(self.corner, self.extent, strict=True)]
+        far = [corner + extent for corner, extent in zip(self.corner, self.extent, strict=True)]
+        low, high = ([float(np.float32(n * scaled)) for n in corner] for corner in (self.corner, far))
+        return low, high
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,10 @@ class EncodeOptions:
         attribute_psnr: PSNR of renders, dB, if a single attribute were quantised; the file's PSNR is 5 to 12 dB lower.
             Sets all steps, instead of the preset.
         position_bits: bits per axis of a tile's box, 2 to 16; instead of the step chosen by quality.
-        position_step: lattice step of the means, scene units, > 0; overrides `position_bits`.
+        position_step: lattice step of the means, scene units, > 0; overrides `position_bits`. Distant splats may get a
+            coarser one; see the declared errors.
         position_error: maximum displacement of a mean, scene units, > 0; overrides `position_step`. Tiles are split
-            until none needs a coarser step.
+            until none exceeds it; an `InputError` if float32 or the lattices of the format do not allow it.
         means_coding: "auto", "morton" or "axis".
         scale_step: step of the log scales, > 0.
         opacity_levels: M, 1 to 65535.

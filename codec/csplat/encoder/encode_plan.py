@@ -187,7 +187,7 @@ class EncodePlan:
         quats, scales = dequantise_shapes(model.quats, model.scales, tiles, parameters, self.shapes)
         return replace(
             model,
-            means=dequantise_means(model.means, tiles, parameters),
+            means=dequantise_means(model.means, tiles, parameters.lattice),
             quats=quats,
             scales=scales,
             opacities=dequantise_opacities(model.opacities, tiles, parameters),

@@ -22,6 +22,7 @@ Floats = NDArray[Any]
 SCALE_MOST = 88.0  # log scale beyond which a standard deviation leaves binary32
 _BLOCK = 8192  # splats per block; the temporaries of their covariances fit the second-level cache
 _ROUNDING = 2.0**-40  # relative margin for other orders of rounding
+_DECLARED_BITS = 24  # significant bits of a declared bound; SER-5 allows to exceed the error by 1e-4 of it
 
 
 @dataclass(frozen=True)
@@ -38,17 +39,19 @@ class ErrorSums:
         return {name: (self.largest[name], float(np.sqrt(self.squares[name] / count))) for name in self.largest}
 
     def declared(self) -> dict[str, tuple[float, float]]:
-        """Return `bounds()` with a margin for verifiers that round in another order (spec SER-5).
+        """Return `bounds()` with a margin for verifiers that round in another order (spec SER-5), rounded up.
+
+        Sums and exponentials of float64 end in other digits on other processors; rounded up, files are the same there.
 
         Raises:
             InputError: an error is not finite, which a file cannot declare (SER-2).
         """
         result = {}
         for name, (largest, rms) in self.bounds().items():
-            if not (math.isfinite(largest) and math.isfinite(rms)):
-                raise InputError(f"the error of {name} is too large to declare: the step is too coarse for the values")
             floor = _ROUNDING if name == "covariance" else 0.0  # a ratio: its rounding does not shrink with its value
-            result[name] = (largest * (1.0 + _ROUNDING) + floor, rms * (1.0 + _ROUNDING) + floor)
+            result[name] = (with_margin(largest + floor), with_margin(rms + floor))
+            if not (math.isfinite(result[name][0]) and math.isfinite(result[name][1])):
+                raise InputError(f"the error of {name} is too large to declare: the step is too coarse for the values")
         return result
 
     @staticmethod
@@ -61,6 +64,18 @@ class ErrorSums:
                 largest[name] = max(largest.get(name, 0.0), part.largest[name])
                 squares[name] = squares.get(name, 0.0) + part.squares[name]
         return ErrorSums(count, largest, squares)
+
+
+def with_margin(error: float) -> float:
+    """Return an error with a margin for verifiers that round in another order, rounded up to `_DECLARED_BITS`.
+
+    Infinity and NaN, and errors that leave float64 by it, become infinity.
+    """
+    fraction, exponent = math.frexp(error * (1.0 + _ROUNDING))
+    try:
+        return math.ldexp(math.ceil(math.ldexp(fraction, _DECLARED_BITS)), exponent - _DECLARED_BITS)
+    except (OverflowError, ValueError):
+        return math.inf
 
 
 def take_precise_means(model: SplatModel, rows: NDArray[Any]) -> Floats:

@@ -83,7 +83,7 @@ def meet_bounds(
         worst = max(ratios, key=lambda name: ratios[name])
         raise InputError(
             f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best found is"
-            f" {result.largest_error(worst):.3g}"
+            f" {result.largest_error(worst):.3g}; allow a larger error"
         )
     found, options = best
     search = SearchReport(

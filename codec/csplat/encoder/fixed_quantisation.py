@@ -178,12 +178,12 @@ class FixedQuantisation:
         tiles, parameters = self.encode_plan.tiles, self.parameters
         if self.encode_plan.options.threads == 1 or len(self.encode_plan.model) < _THREADED_MIN:
             shN, (quats, scales) = self.dequantise_sh(values.sh), self._dequantise_shapes(values)
-            means, sh0 = dequantise_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
+            means, sh0 = dequantise_means(values.means, tiles, parameters.lattice), self.dequantise_sh0(values.sh0)
         else:
             with ThreadPoolExecutor(2) as pool:  # NumPy releases the GIL; the three parts take about the same time
                 later_sh = pool.submit(self.dequantise_sh, values.sh)
                 later_shapes = pool.submit(self._dequantise_shapes, values)
-                means, sh0 = dequantise_means(values.means, tiles, parameters), self.dequantise_sh0(values.sh0)
+                means, sh0 = dequantise_means(values.means, tiles, parameters.lattice), self.dequantise_sh0(values.sh0)
                 shN, (quats, scales) = later_sh.result(), later_shapes.result()
         opacities = dequantise_opacities(values.opacities, tiles, parameters)
         return DecodedValues(means, quats, scales, opacities, sh0, shN)

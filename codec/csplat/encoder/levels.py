@@ -103,9 +103,10 @@ def encode_coarse(node: LevelNode, plan: EncodePlan, codebooks: FileCodebooks) -
     splats, level = clip_scales(node.splats), node.level
     factors = SAME_STEPS if level == 1 else _COARSE_STEPS
     sh_plan = _assign_coarse(splats, plan, codebooks)
+    lattice = replace(plan.parameters.lattice, error=None)  # is a bound for the scene
     tiles = [
         replace(tile, exponent=tile.exponent + level - 1, factors=factors)
-        for tile in cut_scene(splats, plan.parameters)
+        for tile in cut_scene(splats, replace(plan.parameters, lattice=lattice))
     ]  # fmt: skip
     return [replace(encode_tile(splats, tile, plan.parameters, sh_plan).tile, level=level) for tile in tiles]
 

@@ -225,7 +225,7 @@ class EncodedTiles:
             stream.write(piece)
             size += len(piece)
             progress("writing", min(1.0, size / max(1, payloads)))
-        notes = make_notes(self.tiles, strict=self.plan.parameters.lattice.strict)
+        notes = make_notes(self.tiles, bounded=self.plan.parameters.lattice.error is not None)
         errors = declared_errors(self.errors, self.plan.origin)
         return EncodeReport(settings, errors, self.errors.count, len(tiles), size, notes)
 
@@ -275,11 +275,11 @@ def _encode_all(plan: EncodePlan, sh_plan: ShCodingPlan, progress: Progress | No
         return list(pool.map(encode_one, plan.tiles))
 
 
-def make_notes(tiles: Sequence[EncodedTile], *, strict: bool) -> tuple[str, ...]:
+def make_notes(tiles: Sequence[EncodedTile], *, bounded: bool) -> tuple[str, ...]:
     """Return warnings about outliers that coarsen their neighbours, and about too small a `position_error`."""
     notes = []
     splats = sum(part.tile.splat_count for part in tiles)
-    if strict and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
+    if bounded and len(tiles) > max(_FEW_TILES, splats // _SMALL_TILE):
         notes.append(f"means: such a small error takes {counted(len(tiles), 'tile')}, and each tile costs bytes")
     counts = Counter(name for part in tiles for name in part.coarsened)
     notes += [

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 
 from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, Lattice, StepFactors
 from csplat.encoder.entropy import morton_codes
+from csplat.encoder.error_bounds import distance_errors, take_precise_means, with_margin
 from csplat.encoder.quantisation import largest_exact, lattice_values, opacity_levels, opacity_values, quantise_means
 from csplat.encoder.quantisation_classes import QuantisationClasses
+from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, I64, U8, Mask
 
@@ -21,6 +23,7 @@ Rows = NDArray[np.intp]
 Integers = NDArray[Any]
 
 _OWN_TILE_MIN = 48  # splats; a smaller tile takes more bytes than a coarser lattice would lose
+_FINER_MAX = 3  # halvings of a tile's step; after two, errors are those of rounding to float32
 _FINEST = 2.0**45  # maximum number of steps from zero to a tile's far corner; float32 resolves 2**24
 _OUTLIER_BLOCK = 1 << 14  # splats per block of temporaries
 
@@ -73,6 +76,9 @@ def cut_scene(
         parameters: steps and tile size.
         classes: quantisation classes; `None`: all splats have the same steps.
         buckets: rows of the parts to cut by themselves; default: the whole scene.
+
+    Raises:
+        InputError: no lattice keeps the error of means that `parameters` allow.
     """
     flags = _outlier_flags(model, parameters)
     groups, factors = flags, [SAME_STEPS]
@@ -81,7 +87,7 @@ def cut_scene(
         factors = [*classes.factors]
     tiles: list[TileSplats] = []
     for rows in [np.arange(len(model))] if buckets is None else buckets:
-        tiles += _cut_groups(model.means, rows, None if groups is None else groups[rows], factors, parameters)
+        tiles += _cut_groups(model, rows, None if groups is None else groups[rows], factors, parameters)
     return tiles
 
 
@@ -102,7 +108,7 @@ def cut_tiles(means: F32, lattice: Lattice, tile_splats: int) -> list[TileSplats
         return []
     limit = float((1 << lattice.bits) - 1)
     wide = 4.0 if lattice.finest else 1.0  # with `finest`, steps adapt to the box, and only outliers are separated
-    few = 1 if lattice.strict else _OWN_TILE_MIN
+    few = _OWN_TILE_MIN if lattice.error is None else 1
     tiles: list[TileSplats] = []
     pending = [(np.arange(len(means), dtype=np.intp), np.ascontiguousarray(means.T))]
     while pending:
@@ -161,11 +167,11 @@ def quantise_and_sort(model: SplatModel, tile: TileSplats, parameters: CodingPar
     return QuantisedTile(tile.rows[order], np.take(q, order, axis=1), corner, codes)
 
 
-def dequantise_means(means: F32, tiles: Sequence[TileSplats], parameters: CodingParameters) -> F32:
+def dequantise_means(means: F32, tiles: Sequence[TileSplats], lattice: Lattice) -> F32:
     """Return decoded means, [N, 3]."""
     decoded = np.empty_like(means)
     for tile in tiles:
-        step = math.ldexp(parameters.lattice.step, tile.exponent)
+        step = math.ldexp(lattice.step, tile.exponent)
         decoded[tile.rows] = lattice_values(quantise_means(np.ascontiguousarray(means[tile.rows].T), step), step).T
     return decoded
 
@@ -180,7 +186,7 @@ def dequantise_opacities(opacities: F32, tiles: Sequence[TileSplats], parameters
 
 
 def _cut_groups(
-    means: F32, rows: Rows, groups: U8 | None, factors: Sequence[StepFactors], parameters: CodingParameters
+    model: SplatModel, rows: Rows, groups: U8 | None, factors: Sequence[StepFactors], parameters: CodingParameters
 ) -> list[TileSplats]:
     """Cut each group of the splats `rows` into tiles; the class of a group is its number modulo the classes."""
     tiles: list[TileSplats] = []
@@ -190,9 +196,44 @@ def _cut_groups(
         lattice = replace(parameters.lattice, step=math.ldexp(parameters.lattice.step, shared.means))
         tiles += (
             TileSplats(chosen[tile.rows], tile.exponent + shared.means, shared)
-            for tile in cut_tiles(means[chosen], lattice, parameters.tile_splats)
+            for tile in _cut_within(model, chosen, lattice, parameters.tile_splats)
         )
     return tiles
+
+
+def _cut_within(model: SplatModel, rows: Rows, lattice: Lattice, tile_splats: int) -> list[TileSplats]:
+    """Cut some splats into tiles, finer where means would move by more than the lattice allows.
+
+    Half a step per axis is within the error, but decoded means are rounded to float32, by up to another half.
+    """
+    tiles = cut_tiles(np.take(model.means, rows, axis=0), lattice, tile_splats)
+    if lattice.error is None:
+        return tiles
+    kept, worst, place = list[TileSplats](), lattice.error, 0.0
+    pending = [(tile, 0) for tile in reversed(tiles)]
+    while pending:
+        tile, finer = pending.pop()
+        means = np.take(model.means, rows[tile.rows], axis=0)
+        decoded = dequantise_means(means, [replace(tile, rows=np.arange(len(means)))], lattice)
+        source = take_precise_means(model, rows[tile.rows])
+        error = with_margin(distance_errors(source.T, decoded.T)[0])
+        if error <= lattice.error or finer == _FINER_MAX:
+            kept.append(tile)
+            if error > worst:
+                worst, place = error, float(np.abs(means).max())
+            continue
+        half = replace(lattice, step=math.ldexp(lattice.step, -finer - 1))
+        pending += (
+            (TileSplats(tile.rows[part.rows], part.exponent - finer - 1), finer + 1)
+            for part in reversed(cut_tiles(means, half, tile_splats))
+        )
+    if worst > lattice.error:
+        raise InputError(
+            f"no lattice keeps the error of means within {lattice.error:g}: the best possible is {worst:.3g}, for a"
+            f" splat {place:.3g} from the origin (decoded means are float32); allow a larger error, or remove distant"
+            " splats (csplat convert --drop-floaters)"
+        )
+    return kept
 
 
 def _outlier_flags(model: SplatModel, parameters: CodingParameters) -> U8 | None:

@@ -14,20 +14,25 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from csplat.decoder import decode, open_tiles
 from csplat.decoder.tree import select_tiles
 from csplat.detect import detect_content, detect_name, read_head, refusal
-from csplat.disk_files import local_file
+from csplat.disk_files import local_file, work_folder
 from csplat.editing.transform import DEFAULT_AXES, convert_axes
 from csplat.errors import InputError, counted
 from csplat.file_source import File
-from csplat.formats.format import ARRAYS, Format
+from csplat.formats.format import ARRAYS, Format, ValueRange
 from csplat.lint import Finding, refuse
 from csplat.model import MAX_SH_DEGREE, SplatModel, check_model, check_sh_degree
 from csplat.plugins import load_plugins
 from csplat.ply import lint_ply, open_ply, read_ply, write_scene_ply
+from csplat.ply.columns import HUGE_LOG
 from csplat.scene_source import SceneSource, drop_bands, source_from_model
+
+if TYPE_CHECKING:
+    from csplat.formats.common import ClampStatistics
 
 __all__ = [
     "ARRAYS",
@@ -41,6 +46,7 @@ __all__ = [
     "open_scene",
     "read",
     "read_all",
+    "survey_losses",
     "write",
     "write_levels",
     "write_scene",
@@ -183,7 +189,7 @@ def lint_file(path: Path) -> list[Finding]:
         return scene.findings
 
 
-def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = None) -> None:
+def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = None) -> list[Finding]:
     """Write a scene in any format.
 
     Args:
@@ -191,30 +197,40 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
         model: the scene.
         format: name of the format, if the suffix of the path does not identify it.
 
+    Returns:
+        What the format cannot hold, apart from precision: parts of the scene, values beyond its ranges, positions that
+        are rounded visibly. Empty if that is nothing.
+
     Examples:
         >>> import csplat
         >>> csplat.write("copy.ply", csplat.read("scene.ply"))
+        []
 
     Raises:
         InputError: csplat cannot write the format, or the format cannot store the scene.
         OSError: the file cannot be written.
     """
     check_model("write", model)
-    write_scene(path, source_from_model(model), format)
+    return write_scene(path, source_from_model(model), format)
 
 
-def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | None = None) -> None:
-    """Write a scene block by block; arguments are those of `write`."""
-    write_levels(path, [scene], format)
+def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | None = None) -> list[Finding]:
+    """Write a scene block by block; arguments and result are those of `write`."""
+    return write_levels(path, [scene], format)
 
 
-def write_levels(path: str | os.PathLike[str], levels: Sequence[SceneSource], format: str | None = None) -> None:
+def write_levels(
+    path: str | os.PathLike[str], levels: Sequence[SceneSource], format: str | None = None
+) -> list[Finding]:
     """Write the levels of detail of a scene block by block.
 
     Args:
         path: as in `write`. Only streamed SOG, a file lod-meta.json in a folder of its own, has several levels.
         levels: the scene at each level, finest first.
         format: as in `write`.
+
+    Returns:
+        As in `write`.
 
     Raises:
         InputError: as in `write`, or the format has one level and there are several.
@@ -224,13 +240,50 @@ def write_levels(path: str | os.PathLike[str], levels: Sequence[SceneSource], fo
     found = format_by_suffix(target) if format is None else format_by_name(format)
     if found.write is None:
         raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
-    scenes = [_with_fewer_bands(scene, found.degree) for scene in levels]
+    statistics = _clamp_statistics()
+    scenes = [statistics.watch(_with_fewer_bands(scene, found.degree), found.ranges) for scene in levels]
     if found.write_levels is not None and found.takes_levels(target):
-        found.write_levels(target, scenes)
-        return
-    if len(scenes) != 1:
+        findings = found.write_levels(target, scenes)
+    elif len(scenes) != 1:
         raise InputError(f"{target.name} would be {found.title}, which has one level, found {len(scenes)}")
-    found.write(target, scenes[0])
+    else:
+        findings = found.write(target, scenes[0])
+    return [*_lost_contents(found, levels), *_clamped_values(found, levels, statistics), *(findings or ())]
+
+
+def survey_losses(levels: Sequence[SceneSource], format: str) -> list[Finding]:
+    """Return what `write_levels` returns without writing, except findings that depend on how positions are coded."""
+    found = format_by_name(format)
+    statistics = _clamp_statistics()
+    for scene in levels if found.ranges else ():
+        for _ in statistics.watch(_with_fewer_bands(scene, found.degree), found.ranges).blocks():
+            pass
+    return [*_lost_contents(found, levels), *_clamped_values(found, levels, statistics)]
+
+
+def _clamp_statistics() -> ClampStatistics:
+    from csplat.formats.common import ClampStatistics  # imported lazily: reading does not load the encoder
+
+    return ClampStatistics()
+
+
+def _lost_contents(found: Format, levels: Sequence[SceneSource]) -> list[Finding]:
+    lost = found.losses(levels[0].metadata_model) if levels else ()
+    return [Finding("lost-contents", len(lost), f"{found.title} cannot hold {', '.join(lost)}", "loss")] if lost else []
+
+
+def _clamped_values(found: Format, levels: Sequence[SceneSource], statistics: ClampStatistics) -> list[Finding]:
+    degree = max((scene.metadata_model.sh_degree for scene in levels), default=0)
+
+    def holders(name: str, least: float, most: float) -> list[str]:
+        return [
+            one.name
+            for one in formats()
+            if one.write is not None and (name != "shN" or one.degree >= min(degree, found.degree))
+            if name not in one.ranges or one.ranges[name].holds(least, most)
+        ]
+
+    return statistics.findings(found.title, holders)
 
 
 def detect_format(path: Path) -> Format:
@@ -270,7 +323,9 @@ def format_by_suffix(path: Path) -> Format:
     found = None if kind is None else _find(kind.name)
     if found is None:
         endings = ", ".join(one.suffixes[0] for one in formats() if one.write is not None)
-        raise InputError(f"{path.name}: no format has that ending, expected one of {endings}")
+        what = "a folder, not the name of a file" if path.is_dir() else "no format has that ending"
+        page = "; `csplat export-html` writes pages" if path.suffix.lower() in {".html", ".htm"} else ""
+        raise InputError(f"{path.name or path}: {what}, expected one of {endings}{page}")
     return found
 
 
@@ -319,7 +374,7 @@ def _write_csplat(path: Path, scene: SceneSource) -> None:
     from csplat.encoder import EncodeOptions  # imported lazily: reading does not load the encoder
     from csplat.out_of_core import OutOfCoreOptions, encode_scene
 
-    with tempfile.TemporaryDirectory(prefix=f".{path.name}.", dir=path.parent) as folder:
+    with tempfile.TemporaryDirectory(prefix=".csplat-", dir=work_folder(path)) as folder:
         encode_scene(scene, path, EncodeOptions(keep_extra=True), OutOfCoreOptions(folder=Path(folder) / "work"))
 
 
@@ -340,6 +395,7 @@ _CSPLAT_FORMAT = Format(
     write=_write_csplat,
     degree=MAX_SH_DEGREE,
     splat_bytes=(7.0, 8.0, 9.0, 10.0, 10.3),
+    ranges={"scales": ValueRange(-HUGE_LOG, HUGE_LOG)},
     carries=_PLY_FORMAT.carries | {"cameras"},
 )
 
@@ -394,7 +450,9 @@ def _open(
             raise InputError(f"{path.name}: {which} has {all_bands.count:,} splats, expected at most {max_splats:,}")
         refuse([] if lenient else all_bands.findings, strict=False)
         scene = all_bands if sh_degree is None else _with_fewer_bands(all_bands, sh_degree)
-        yield replace(convert_axes(scene, DEFAULT_AXES) if found.axes else scene, format=found.name)
+        if found.axes:
+            scene = replace(convert_axes(scene, DEFAULT_AXES), file_axes=all_bands.metadata_model.coordinate_system)
+        yield replace(scene, format=found.name)
 
 
 def _with_fewer_bands(scene: SceneSource, sh_degree: int) -> SceneSource:

@@ -1,11 +1,13 @@
-"""Shared steps of the formats: rows to scenes, checks of activated values, quaternion packing, sorting on a Z curve."""
+"""Shared steps of the formats: rows to scenes, checks of values, quaternion packing, sorting on a Z curve."""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import IO, Any
 
@@ -14,10 +16,11 @@ from numpy.typing import NDArray
 
 from csplat.encoder.entropy import morton_codes
 from csplat.errors import InputError, counted
-from csplat.formats.format import ARRAYS
+from csplat.file_source import named_errors
+from csplat.formats.format import ARRAYS, ValueRange
 from csplat.lint import Finding
 from csplat.model import SplatModel, normalise_quats
-from csplat.ply.columns import RowStatistics, count_huge_rows, list_findings
+from csplat.ply.columns import LOG_OF_0, RowStatistics, count_huge_rows, list_findings
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64, I64, U8
@@ -25,7 +28,6 @@ from csplat.types import F32, F64, I64, U8
 Rows = NDArray[Any]
 
 _HUGE = float(np.exp(87.0))  # scene units; huge values are only counted if a standard deviation exceeds this
-_SMALLEST = np.float32(1e-20)  # scene units; replaces a standard deviation of 0
 
 
 def finite_scene(
@@ -54,7 +56,7 @@ def finite_scene(
         scale_range.add(scales, total)
         colours = [found["shN"]] if "shN" in (rows.dtype.names or ()) and found["shN"].dtype.kind == "f" else []
         huge = max(scale_range.most, -scale_range.least) > _HUGE
-        statistics.huge += count_huge_rows(_log_scales(scales.astype(np.float32)) if huge else scales[:0], *colours)
+        statistics.huge += count_huge_rows(log_scales(scales.astype(np.float32)) if huge else scales[:0], *colours)
         empty += _count_empty_rows(rows)
         zero = np.logical_and.reduce([found["quats"][:, part] == zero_quat for part in range(4)])
         statistics.zero_quats += int(np.count_nonzero(zero))
@@ -73,7 +75,7 @@ def finite_scene(
             if good.any():
                 kept = parts if good.all() else tuple(part[good] for part in parts)
                 scales = kept[0]["scales"].astype(np.float32)
-                yield decode(scales if are_logs else _log_scales(scales), *kept)
+                yield decode(scales if are_logs else log_scales(scales), *kept)
 
     return SceneSource(kept, metadata_model, models, findings)
 
@@ -95,9 +97,10 @@ def _finite_rows(rows: Rows) -> NDArray[np.bool_]:
     return good
 
 
-def _log_scales(scales: F32) -> F32:
-    """Return natural logarithms of standard deviations; `_SMALLEST` replaces 0."""
-    logs: F32 = np.log(np.maximum(np.abs(scales), _SMALLEST))
+def log_scales(scales: F32) -> F32:
+    """Return natural logarithms of standard deviations, at least `LOG_OF_0`."""
+    with np.errstate(divide="ignore"):
+        logs: F32 = np.maximum(np.log(np.abs(scales)), np.float32(LOG_OF_0))
     return logs
 
 
@@ -160,6 +163,105 @@ class RangeStatistics:
         if len(rows) and self.first is None:
             value = values.reshape(len(values), -1)[rows[0]][outside[rows[0]]][0]
             self.first = (start + int(rows[0]), float(value))
+
+
+class ClampStatistics:
+    """Counts of the values of some scenes that a writer clamps, by attribute."""
+
+    def __init__(self) -> None:
+        self._scenes: list[dict[str, tuple[ValueRange, RangeStatistics]]] = []
+
+    def watch(self, scene: SceneSource, ranges: Mapping[str, ValueRange]) -> SceneSource:
+        """Return the scene with blocks that are counted; only the last iteration over them counts.
+
+        Args:
+            scene: the scene as it is written.
+            ranges: ranges of the attributes in the file, as in `Format.ranges`.
+        """
+        if not ranges:
+            return scene
+        place = len(self._scenes)
+        self._scenes.append({})
+
+        def blocks() -> Iterator[SplatModel]:
+            found = {
+                name: RangeStatistics(one.low - one.step / 2.0, one.high + one.step / 2.0)
+                for name, one in ranges.items()
+            }
+            self._scenes[place] = {name: (ranges[name], statistics) for name, statistics in found.items()}
+            for rows, model in scene.numbered():
+                for name, statistics in found.items():
+                    statistics.add(getattr(model, name), rows.start)
+                yield model
+
+        return replace(scene, blocks=blocks)
+
+    def findings(self, title: str, holders: Callable[[str, float, float], Sequence[str]]) -> list[Finding]:
+        """Return a finding for each attribute with clamped values.
+
+        Args:
+            title: title of the format.
+            holders: returns the names of other formats that hold values of an attribute from a least to a largest one.
+        """
+        findings = []
+        for name in ARRAYS:
+            found = [scene[name] for scene in self._scenes if name in scene]
+            rows, values = sum(one.rows for _, one in found), sum(one.below + one.above for _, one in found)
+            if not rows:
+                continue
+            # Of several scenes, the text describes the one with the largest error.
+            error, stored, worst = max(
+                ((max(stored.low - one.least, one.most - stored.high), stored, one) for stored, one in found),
+                key=lambda one: one[0],
+            )
+            others = holders(name, min(one.least for _, one in found), max(one.most for _, one in found))
+            text = f"{counted(values, 'value')} of {name} in {counted(rows, 'splat')} outside {stored.low:.4g} to"
+            text += f" {stored.high:.4g}, the range of {title}: clamped, by up to {error:.3g}"
+            text += _clamped_sizes(name, stored, worst)
+            text += f"; {', '.join(others[:-1])}{' and ' * (len(others) > 1)}{others[-1]} hold them" if others else ""
+            findings.append(Finding("clamped-values", rows, text, "loss", attribute=name, largest_error=error))
+        return findings
+
+
+def _clamped_sizes(name: str, stored: ValueRange, found: RangeStatistics) -> str:
+    """Describe clamped logarithms of scales as sizes; return "" for other attributes."""
+    if name != "scales":
+        return ""
+    ends = [(found.most, stored.high)] * bool(found.above) + [(found.least, stored.low)] * bool(found.below)
+    sizes = (f"{np.exp(np.float64(value)):.3g} becomes {np.exp(np.float64(end)):.3g}" for value, end in ends)
+    return f" (a size of {', one of '.join(sizes)} scene units)"
+
+
+_MOVED = 0.125  # fraction of a splat's standard deviation; common rounding moves it by less than a fiftieth
+
+
+@dataclass
+class MovedSplats:
+    """Splats that a writer moves visibly by rounding their positions, updated by `add`.
+
+    Attributes:
+        count: number of splats moved by more than `_MOVED` of their largest standard deviation.
+        largest: largest movement along an axis among these, scene units.
+    """
+
+    count: int = 0
+    largest: float = 0.0
+
+    def add(self, model: SplatModel, written: NDArray[Any]) -> None:
+        """Add splats whose positions are written as `written` [N, 3], scene units."""
+        with np.errstate(over="ignore"):
+            errors = np.abs(written - model.means.astype(np.float64)).max(axis=1, initial=0.0)
+            moved = errors > _MOVED * np.exp(model.scales.max(axis=1, initial=-np.inf).astype(np.float64))
+        self.count += int(np.count_nonzero(moved))
+        self.largest = max(self.largest, float(errors.max(where=moved, initial=0.0)))
+
+    def findings(self, reason: str) -> list[Finding]:
+        """Return the finding, if there are any; `reason` is why the positions are coarse."""
+        if not self.count:
+            return []
+        text = f"{counted(self.count, 'splat')} moved visibly, by up to {self.largest:.3g} scene units: {reason};"
+        text += " --drop-floaters drops splats far from all others, and ply, gltf and csplat hold them"
+        return [Finding("moved-splats", self.count, text, "loss", attribute="means", largest_error=self.largest)]
 
 
 def classify_scales(found: RangeStatistics, name: str, *, strict: bool, writer: str = "") -> tuple[bool, list[Finding]]:
@@ -250,7 +352,10 @@ def decode_smallest_three(largest: NDArray[Any], three: F32) -> F32:
     return normalise_quats(quats)
 
 
-_STEPS = 1 << 21  # cells of the Z curve along each axis
+_STEP_BITS = 19  # bits per axis of a cell of the Z curve; 5 more bits of a code number the shell
+_CURVE_QUANTILES = (0.2, 0.8)  # between which positions spread: a third of the splats of a scene may be its sky
+_CORE, _SHELL_RATIO = 8.0, 16.0  # half the width of the cube around the middle, in spreads; the ratio of two shells
+_SHELL_CODES = np.arange(1, 32) << 3 * _STEP_BITS  # the least code of each shell; 16**31 spreads exceed float32
 _CURVE_SAMPLE = 1 << 16  # number of splats that determine the bounds of the curve and its splits
 _IN_MEMORY = 1 << 24  # bytes; smaller scenes are sorted without a file
 
@@ -271,14 +376,55 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
         OSError: the folder is full.
     """
     curve = _ZCurve.through(scene)
-    with sorted_parts(scene, folder, curve.codes, curve.splits) as (metadata_model, parts):
-        yield replace(scene, metadata_model=metadata_model, blocks=lambda: _fill_blocks(metadata_model, parts()))
+    with sorted_parts(scene, folder, curve.codes, curve.splits) as parts:
+        yield replace(scene, metadata_model=parts.metadata_model, blocks=parts.blocks)
 
 
 @contextmanager
-def sorted_parts(
-    scene: SceneSource, folder: Path, keys: Callable[[F32], I64], splits: I64
-) -> Iterator[tuple[SplatModel, Callable[[], Iterator[Rows]]]]:
+def sorted_shells(scene: SceneSource, folder: Path) -> Iterator[list[SceneSource]]:
+    """Sort a scene like `sorted_along_curve`, and divide it by the distance from its middle.
+
+    Yields:
+        The splats around the middle, then those in shells, each 16 times as wide as the one before, that contain any.
+    """
+    curve = _ZCurve.through(scene)
+    with sorted_parts(scene, folder, curve.codes, curve.splits) as parts:
+        starts = [0, *(np.searchsorted(curve.splits, _SHELL_CODES) + 1), len(parts.counts)]
+        yield [
+            replace(scene, metadata_model=parts.metadata_model, count=count, blocks=partial(parts.blocks, start, stop))
+            for start, stop in pairwise(starts)
+            if (count := int(parts.counts[start:stop].sum()))
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class SortedParts:
+    """A scene that is sorted by keys and divided.
+
+    Attributes:
+        metadata_model: the scene without splats and extra columns.
+        counts: number of splats of each part.
+        rows: returns the parts from one index to another as rows for `scene_of_rows`, one by one.
+    """
+
+    metadata_model: SplatModel
+    counts: I64
+    rows: Callable[[int, int], Iterator[Rows]]
+
+    def blocks(self, start: int = 0, stop: int | None = None) -> Iterator[SplatModel]:
+        """Yield the splats of some parts in blocks, of which all but the last are full."""
+        left: list[Rows] = []
+        for rows in self.rows(start, len(self.counts) if stop is None else stop):
+            left = [np.concatenate([*left, rows])]
+            while len(left[0]) >= BLOCK_SPLATS:
+                yield _model_of_rows(self.metadata_model, left[0][:BLOCK_SPLATS])
+                left = [left[0][BLOCK_SPLATS:]]
+        if left and len(left[0]):
+            yield _model_of_rows(self.metadata_model, left[0])
+
+
+@contextmanager
+def sorted_parts(scene: SceneSource, folder: Path, keys: Callable[[F32], I64], splits: I64) -> Iterator[SortedParts]:
     """Sort a scene by keys of positions, and divide it at some keys; splats with the same key keep their order.
 
     Args:
@@ -287,10 +433,6 @@ def sorted_parts(
             and one part are in memory at a time.
         keys: returns the key of each position [n, 3].
         splits: the least key of each part but the first, ascending.
-
-    Yields:
-        The scene without splats and extra columns; and a function that returns the parts one by one, as rows for
-        `scene_of_rows`.
 
     Raises:
         InputError: raised by the blocks of the scene.
@@ -308,15 +450,23 @@ def sorted_parts(
                 rows[name] = getattr(model, name)[order]
             parts = np.searchsorted(codes[order], splits)
             runs.append(spool.tell() + dtype.itemsize * np.concatenate([[0], parts, [len(model)]]))
-            spool.write(rows.tobytes())
-        yield metadata_model, lambda: _merge_runs(spool, runs, dtype, keys)
+            with named_errors(folder):
+                spool.write(rows.tobytes())
+        counts = np.zeros(len(splits) + 1, np.int64)
+        for run in runs:
+            counts += np.diff(run) // dtype.itemsize
+
+        def rows_of(start: int, stop: int) -> Iterator[Rows]:
+            return _merge_runs(spool, runs, keys, dtype, start, stop)
+
+        yield SortedParts(metadata_model, counts, rows_of)
 
 
 def _merge_runs(
-    spool: IO[bytes], runs: Sequence[I64], dtype: np.dtype[Any], keys: Callable[[F32], I64]
+    spool: IO[bytes], runs: Sequence[I64], keys: Callable[[F32], I64], dtype: np.dtype[Any], start: int, stop: int
 ) -> Iterator[Rows]:
-    """Yield the sorted rows of one part at a time, collected from all runs."""
-    for part in range(len(runs[0]) - 1 if runs else 0):
+    """Yield the sorted rows of one part at a time, from `start` to `stop`, collected from all runs."""
+    for part in range(start, stop if runs else start):
         pieces = []
         for run in runs:
             spool.seek(run[part])
@@ -325,17 +475,6 @@ def _merge_runs(
         pieces.clear()  # a part may be large
         rows = rows[np.argsort(keys(rows["means"]), kind="stable")]
         yield rows
-
-
-def _fill_blocks(metadata_model: SplatModel, parts: Iterator[Rows]) -> Iterator[SplatModel]:
-    left: list[Rows] = []
-    for rows in parts:
-        left = [np.concatenate([*left, rows])]
-        while len(left[0]) >= BLOCK_SPLATS:
-            yield _model_of_rows(metadata_model, left[0][:BLOCK_SPLATS])
-            left = [left[0][BLOCK_SPLATS:]]
-    if left and len(left[0]):
-        yield _model_of_rows(metadata_model, left[0])
 
 
 def scene_of_rows(metadata_model: SplatModel, rows: Rows) -> SceneSource:
@@ -355,15 +494,16 @@ def _model_of_rows(metadata_model: SplatModel, rows: Rows) -> SplatModel:
 
 @dataclass(frozen=True)
 class _ZCurve:
-    """A Z curve through a scene.
+    """A Z curve through a scene: first through a cube around its middle, then through shells around that.
 
     Attributes:
-        low, high: [3], bounds of a sample; positions outside are clipped.
-        splits: codes that divide the scene into blocks of about equal size.
+        middle: [3], scene units.
+        spread: half the width of most of the scene, scene units.
+        splits: codes that divide the scene into shells, and these into blocks of about equal size.
     """
 
-    low: F64
-    high: F64
+    middle: F64
+    spread: float
     splits: I64
 
     @classmethod
@@ -377,14 +517,20 @@ class _ZCurve:
         if at != scene.count:
             raise InputError(f"the scene has {at:,} splats, expected {scene.count:,}")
         if not len(sample):
-            return cls(np.zeros(3), np.ones(3), np.zeros(0, np.int64))
-        low, high = sample.min(0).astype(np.float64), sample.max(0).astype(np.float64)
-        curve = cls(low, np.where(high > low, high, low + 1.0), np.zeros(0, np.int64))
+            return cls(np.zeros(3), 1.0, _SHELL_CODES)
+        most = np.quantile(sample.astype(np.float64), _CURVE_QUANTILES, axis=0)
+        low, high = most if (most[1] > most[0]).any() else (sample.min(0).astype(np.float64), sample.max(0))
+        curve = cls((low + high) / 2.0, float((high - low).max()) / 2.0 or 1.0, _SHELL_CODES)
         codes = np.sort(curve.codes(sample))
         blocks = -(-scene.count // BLOCK_SPLATS)
-        return replace(curve, splits=codes[np.arange(1, blocks) * len(codes) // blocks])
+        return replace(curve, splits=np.union1d(_SHELL_CODES, codes[np.arange(1, blocks) * len(codes) // blocks]))
 
     def codes(self, means: F32) -> I64:
         """Return the Morton codes of positions [N, 3]."""
-        steps = (means - self.low) * (_STEPS / (self.high - self.low))
-        return morton_codes(np.clip(steps, 0, _STEPS - 1).astype(np.int64).T)
+        places = (means - self.middle) / (_CORE * self.spread)  # the cube around the middle is -1 to 1
+        reach = np.abs(places).max(axis=1, initial=1.0)
+        shells = np.minimum(np.ceil(np.log(reach) / np.log(_SHELL_RATIO)), len(_SHELL_CODES))
+        places /= _SHELL_RATIO ** shells[:, None]
+        cells = np.clip((places + 1.0) * 2.0 ** (_STEP_BITS - 1), 0, 2**_STEP_BITS - 1).astype(np.int64)
+        codes: I64 = shells.astype(np.int64) << 3 * _STEP_BITS | morton_codes(cells.T)
+        return codes

@@ -15,10 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.disk_files import atomic_writer
+from csplat.disk_files import atomic_writer, work_folder
 from csplat.errors import InputError, counted
-from csplat.formats.common import crossed_bounds, decode_smallest_three, encode_smallest_three, sorted_along_curve
-from csplat.formats.format import Format
+from csplat.file_source import open_binary
+from csplat.formats.common import (
+    MovedSplats,
+    crossed_bounds,
+    decode_smallest_three,
+    encode_smallest_three,
+    sorted_shells,
+)
+from csplat.formats.format import Format, ValueRange
 from csplat.lint import Finding, trailing_bytes
 from csplat.model import SplatModel
 from csplat.ply.comments import format_comments, parse_comments
@@ -31,6 +38,11 @@ _CHUNK = 256  # splats that share bounds
 _LARGEST_LOG = 20.0  # log scales are clipped to ± this: a larger one would use up the precision of its chunk
 _LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
 _BANDS = (9, 24, 45, 72)  # number of SH columns by degree, 1 to 4
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
 _BOUNDS = [f"{end}_{kind}{axis}" for kind in ("", "scale_") for end in ("min", "max") for axis in "xyz"]
 _COLOUR_BOUNDS = [f"{end}_{channel}" for end in ("min", "max") for channel in "rgb"]
 _PACKED_COLUMNS = ["packed_position", "packed_rotation", "packed_scale", "packed_color"]
@@ -45,7 +57,7 @@ class _Element:
     dtype: np.dtype[Any]
 
     def read(self, path: Path, start: int, stop: int) -> NDArray[Any]:
-        with path.open("rb") as stream:
+        with open_binary(path) as stream:
             stream.seek(self.offset + start * self.dtype.itemsize)
             rows = np.fromfile(stream, self.dtype, stop - start)
         if len(rows) != stop - start:
@@ -69,6 +81,8 @@ def _open(path: Path) -> Iterator[SceneSource]:
             f" expected one per {_CHUNK}"
         )
     kept = 0  # coefficients per channel
+    if sh is not None and not sh.dtype.names:  # gsplat writes the element without SH, too
+        sh = None
     if sh is not None:
         rest = len(sh.dtype.names or ())
         if sh.count != vertex.count or rest not in _BANDS:
@@ -116,19 +130,34 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
     """Return the elements, the comments and findings, after checking that the file has all rows."""
     findings: list[Finding] = []
     header = read_ply_header(path, findings, "compressed-ply")
-    wrong = next((one.text for one in findings if not one.repairable), None)
-    if wrong or header.order != "<":
-        raise InputError(f"{path.name}: {wrong or 'the rows are in another format, expected binary_little_endian'}")
+    findings = [one for one in findings if one.repairable]  # row counts are checked below
+    lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
+    found: list[tuple[str, int, list[tuple[str, str]]]] = []
+    comments, form = [], ""
+    for line in lines[1:]:
+        words = line.split()
+        if words[:1] == ["comment"]:
+            comments.append(line[len("comment ") :])
+        elif words[:1] == ["format"]:
+            form = " ".join(words[1:])
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
+            found.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and found:
+            found[-1][2].append((words[2], _TYPES[words[1]]))
+        elif words and words[0] != "obj_info":
+            raise InputError(f"{path.name}: the header line {line[:80]!r} is not valid in a compressed PLY")
+    if form != "binary_little_endian 1.0":
+        raise InputError(f"{path.name}: the format is {form[:40]!r}, expected binary_little_endian 1.0")
     elements: dict[str, _Element] = {}
     offset, size = header.end, path.stat().st_size
-    for one in header.elements:
-        if one.has_lists:
-            raise InputError(f"{path.name}: the element {one.name[:80]} has lists, which a compressed PLY has not")
-        elements[one.name] = _Element(offset, one.count, one.dtype(header.order))
-        offset += one.count * elements[one.name].dtype.itemsize
+    for name, count, columns in found:
+        if len({column for column, _ in columns}) != len(columns) or name in elements:
+            raise InputError(f"{path.name}: the header declares {name} or one of its columns twice")
+        elements[name] = _Element(offset, count, np.dtype(columns))
+        offset += count * elements[name].dtype.itemsize
     if offset > size:
         raise InputError(f"{path.name} has {size:,} bytes, its header declares {offset:,}: copy or download it again")
-    return elements, header.comments, findings + trailing_bytes(size - offset)
+    return elements, comments, findings + trailing_bytes(size - offset)
 
 
 def _check_columns(path: Path, name: str, element: _Element, wanted: list[str], kind: str) -> None:
@@ -150,9 +179,7 @@ def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, 
     count = len(words)
 
     def between(fractions: NDArray[np.float64], kind: int) -> NDArray[np.float64]:
-        low, high = (np.repeat(bounds[:, kind, end], _CHUNK, 0)[:count] for end in (0, 1))
-        values: NDArray[np.float64] = low * (1.0 - fractions) + high * fractions
-        return values
+        return _between(fractions, bounds[:, kind])
 
     rotation, colour = (words[name] for name in ("packed_rotation", "packed_color"))
     three = np.stack([(rotation >> shift & 1023) for shift in (20, 10, 0)], 1).astype(np.float32)
@@ -167,7 +194,7 @@ def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, 
         columns = [names.index(f"f_rest_{channel * each + index}") for channel in range(3) for index in range(kept)]
         shN = _sh_values()[codes[:, columns].reshape(count, 3, -1).transpose(0, 2, 1)]
     return {
-        "means": between(_split_words(words["packed_position"]), 0).astype(np.float32),
+        "means": _unpack_means(words["packed_position"], bounds[:, 0]).astype(np.float32),
         "scales": between(_split_words(words["packed_scale"]), 1).astype(np.float32),
         "quats": decode_smallest_three(
             rotation >> 30, (three / np.float32(1023) - np.float32(0.5)) * np.float32(2**0.5)
@@ -176,6 +203,17 @@ def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, 
         "sh0": ((channels - 0.5) / SH_C0).astype(np.float32),
         "shN": np.ascontiguousarray(shN),
     }
+
+
+def _between(fractions: NDArray[np.float64], bounds: NDArray[Any]) -> NDArray[np.float64]:
+    """Return values [N, 3] for fractions of the bounds of their chunks, [C, 2, 3]."""
+    low, high = (np.repeat(bounds[:, end].astype(np.float64), _CHUNK, 0)[: len(fractions)] for end in (0, 1))
+    values: NDArray[np.float64] = low * (1.0 - fractions) + high * fractions
+    return values
+
+
+def _unpack_means(words: U32, bounds: NDArray[Any]) -> NDArray[np.float64]:
+    return _between(_split_words(words), bounds)
 
 
 def _split_words(words: U32) -> NDArray[np.float64]:
@@ -189,19 +227,36 @@ def _sh_values() -> F32:
     return values.astype(np.float32)
 
 
-def _write(path: Path, scene: SceneSource) -> None:
-    """Write a scene sorted along a Z curve."""
-    rest = 3 * scene.metadata_model.shN.shape[1]
-    header = _build_header(scene.metadata_model, scene.count, rest)
-    sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-scene.count // _CHUNK), 4 * len(_PACKED_COLUMNS) * scene.count
-    offsets = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
-    with atomic_writer(path) as stream, sorted_along_curve(scene, path.parent) as ordered:
+def _write(path: Path, scene: SceneSource) -> list[Finding]:
+    """Write a scene sorted along a Z curve, so that splats far from the others have chunks of their own.
+
+    A splat far away would make the positions of all splats in its chunk coarse. Invisible splats fill chunks up.
+    """
+    rest, moved = 3 * scene.metadata_model.shN.shape[1], MovedSplats()
+    with atomic_writer(path, seekable=True) as stream, sorted_shells(scene, work_folder(path)) as shells:
+        filling = sum(-shell.count % _CHUNK for shell in shells[:-1])
+        count = scene.count + filling
+        header = _build_header(scene.metadata_model, count, rest)
+        sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-count // _CHUNK), 4 * len(_PACKED_COLUMNS) * count
+        offsets = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
         stream.write(header)
-        for model in ordered.blocks():
-            bounds, words = _pack_words(model)
-            for index, part in enumerate((bounds.astype("<f4"), words, _sh_codes(model))):
-                stream.seek(offsets[index])
-                offsets[index] += stream.write(part.tobytes())
+        for shell in shells:
+            for model in shell.blocks():
+                bounds, words = _pack_words(model)
+                moved.add(model, _unpack_means(words[:, 0], bounds[:, :6].reshape(-1, 2, 3)))
+                if len(model) % _CHUNK and shell is not shells[-1]:
+                    last = words[-1:] & np.array([~0, ~0, ~0, ~255 & 0xFFFFFFFF], np.int64).astype(np.uint32)
+                    words = np.concatenate([words, np.repeat(last, -len(model) % _CHUNK, axis=0)])
+                codes = _sh_codes(model)
+                codes = np.concatenate([codes, np.repeat(codes[-1:], len(words) - len(codes), axis=0)])
+                for index, part in enumerate((bounds.astype("<f4"), words, codes)):
+                    stream.seek(offsets[index])
+                    offsets[index] += stream.write(part.tobytes())
+    findings = moved.findings("it has 11 bits per position within each chunk of 256 splats")
+    if filling:
+        text = f"{counted(filling, 'splat')} with alpha 0 added: splats far from the others get chunks of their own"
+        findings.append(Finding("filling-splats", filling, f"{text}; --drop-floaters drops these", "loss"))
+    return findings
 
 
 def _pack_words(model: SplatModel) -> tuple[F32, U32]:
@@ -262,5 +317,6 @@ FORMAT = Format(
     open=_open,
     splat_bytes=(16.3, 25.3, 40.3, 61.3),
     write=_write,
+    ranges={"scales": ValueRange(-_LARGEST_LOG, _LARGEST_LOG), "shN": ValueRange(-4.0, 4.0, 1 / 32)},
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),
 )

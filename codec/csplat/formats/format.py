@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from csplat.detect import KINDS
+from csplat.lint import Finding
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat.scene_source import SceneSource
 
@@ -22,9 +23,29 @@ OpenScene = Callable[[Path], AbstractContextManager[SceneSource]]
 OpenLevel = Callable[[Path, int, int | None], AbstractContextManager[SceneSource]]
 OpenBands = Callable[[Path, int], AbstractContextManager[SceneSource]]  # highest SH degree to read
 # Writing raises InputError if the format cannot represent the scene (too many splats, positions out of range), OSError
-# if the file cannot be written. The path appears when the file is complete.
-WriteScene = Callable[[Path, SceneSource], None]
-WriteLevels = Callable[[Path, Sequence[SceneSource]], None]  # the levels of detail of a scene, finest first
+# if the file cannot be written. The path appears when the file is complete. Returned are findings about values that the
+# format stores badly, apart from those outside `Format.ranges`; or nothing.
+WriteScene = Callable[[Path, SceneSource], Sequence[Finding] | None]
+WriteLevels = Callable[[Path, Sequence[SceneSource]], Sequence[Finding] | None]  # the levels of a scene, finest first
+
+
+@dataclass(frozen=True)
+class ValueRange:
+    """The range of the values of an attribute that a format stores; its writer clamps others.
+
+    Attributes:
+        low, high: the range, in the units of `SplatModel`.
+        step: difference of neighbouring values at its ends. Values beyond an end by half a step are rounded to it,
+            which is as accurate as elsewhere.
+    """
+
+    low: float
+    high: float
+    step: float = 0.0
+
+    def holds(self, least: float, most: float) -> bool:
+        """Return True if values from `least` to `most` are rounded at worst, not clamped."""
+        return least >= self.low - self.step / 2.0 and most <= self.high + self.step / 2.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +65,7 @@ class Format:
         degree: highest SH degree that the format stores; the writer gets no higher bands.
         axes: directions of +x, +y and +z in every file of this format, and in the scenes that `open` returns; "" if
             files specify their axes or leave them open.
+        ranges: the range of attributes whose values the writer clamps, by name.
         exact: names of the arrays that are stored losslessly; opacities stored as logits come back within an ulp.
         splat_bytes: approximate bytes per splat by SH degree, from 0 to `degree`; empty if that depends on the scene.
         carries: the fields among `antialiased`, `origin`, `extra`, `metadata`, `coordinate_system`, `unit_metres`,
@@ -60,6 +82,7 @@ class Format:
     doubt: Callable[[Path], str] = lambda _path: ""
     degree: int = 3
     axes: str = ""
+    ranges: Mapping[str, ValueRange] = field(default_factory=dict)
     exact: frozenset[str] = frozenset()
     splat_bytes: tuple[float, ...] = ()
     carries: frozenset[str] = frozenset()

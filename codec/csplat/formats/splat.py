@@ -18,8 +18,9 @@ from csplat.disk_files import atomic_writer
 from csplat.errors import InputError, counted
 from csplat.file_source import map_file
 from csplat.formats.common import finite_scene, round_to_bytes, sh0_from_bytes
-from csplat.formats.format import Format
+from csplat.formats.format import Format, ValueRange
 from csplat.model import SplatModel, normalise_quats
+from csplat.ply.columns import LOG_OF_0
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32
@@ -113,6 +114,10 @@ FORMAT = Format(
     write=_write,
     doubt=_doubt,
     degree=0,
+    ranges={
+        "scales": ValueRange(LOG_OF_0, float(_LARGEST_LOG)),
+        "sh0": ValueRange(-0.5 / SH_C0, 0.5 / SH_C0, 1 / (255 * SH_C0)),
+    },
     splat_bytes=(32.0,),
     exact=frozenset({"means"}),
 )

@@ -33,8 +33,9 @@ from csplat.archives import unpacked_limit
 from csplat.disk_files import atomic_writer
 from csplat.editing.transform import convert_axes
 from csplat.errors import InputError
-from csplat.formats.common import decode_smallest_three, encode_smallest_three, round_to_bytes
-from csplat.formats.format import Format
+from csplat.file_source import open_binary
+from csplat.formats.common import MovedSplats, decode_smallest_three, encode_smallest_three, round_to_bytes
+from csplat.formats.format import Format, ValueRange
 from csplat.lint import Finding, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
@@ -239,7 +240,7 @@ _SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
 
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
-    with path.open("rb") as file:
+    with open_binary(path) as file:
         packed = read_spz_file(file, path.name, path.stat().st_size)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
 
@@ -250,26 +251,29 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     yield SceneSource(packed.count, decode_block(packed, slice(0, 0), degree), blocks, packed.findings)
 
 
-def write_spz(path: Path, scene: SceneSource, *, version: int) -> None:
+def write_spz(path: Path, scene: SceneSource, *, version: int) -> list[Finding]:
     """Write version 3 or 4, without extensions (`Format.write`)."""
     scene = convert_axes(scene, SPZ_AXES)
     degree, bits = scene.metadata_model.sh_degree, _choose_fraction_bits(path, scene)
     flags = ANTIALIASED if scene.metadata_model.antialiased else 0
     packed = SpzArrays(path.name, version, scene.count, degree, bits, flags)
-    data = packed.allocate()
+    data, moved = packed.allocate(), MovedSplats()
     for rows, block in scene.numbered():
+        moved.add(block, np.rint(block.means * np.float32(2.0**bits)) * 2.0**-bits)
         for part, codes in zip(packed.parts, _encode_block(block, bits), strict=True):
             part[rows] = codes
     parts = [part for part in packed.parts if part.size] if version > 3 else []
     head = _HEADER.pack(_MAGIC, version, scene.count, degree, bits, flags, len(parts))
+    reason = f"SPZ has 24 bits for positions, and the farthest splat leaves {bits} of them for fractions"
     with atomic_writer(path) as stream:
         if version < 4:
             data[: len(head)] = np.frombuffer(head, np.uint8)
             stream.write(deflate.gzip_compress(data, _GZIP_LEVEL))
-            return
+            return moved.findings(reason)
         streams = [zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part.data) for part in parts]
         table = [_STREAM.pack(len(small), part.size) for small, part in zip(streams, parts, strict=True)]
         stream.writelines([head, _HEADER_REST.pack(_HEADER.size + _HEADER_REST.size), *table, *streams])
+    return moved.findings(reason)
 
 
 def decode_block(packed: SpzArrays, rows: slice, degree: int) -> SplatModel:
@@ -326,7 +330,10 @@ def _choose_fraction_bits(path: Path, scene: SceneSource) -> int:
         reach = max(reach, float(np.abs(block.means).max(initial=0.0)))
         scales += np.bincount(_scale_codes(block.scales).ravel(), minlength=256)
     if reach > _LARGEST_POSITION:
-        raise InputError(f"{path.name}: positions reach {reach:,g}, SPZ stores up to {_LARGEST_POSITION:,}")
+        raise InputError(
+            f"{path.name}: positions reach {reach:,g}, SPZ stores up to {_LARGEST_POSITION:,}:"
+            " --drop-floaters drops splats far from all others, or write another format"
+        )
     middle = int(np.searchsorted(np.cumsum(scales), scales.sum() / 2))
     fine = math.ceil(math.log2(_STEPS) - (middle / 16 - 10) / math.log(2))
     fitting = math.floor(math.log2(_LARGEST_POSITION / reach)) if reach > 2**-8 else MAX_FRACTION_BITS
@@ -365,6 +372,11 @@ FORMAT = Format(
     open_bands=_open,
     write=partial(write_spz, version=3),
     axes=SPZ_AXES,
+    ranges={
+        "scales": ValueRange(-10.0, 5.9375, 1 / 16),
+        "sh0": ValueRange(-0.5 / 0.15, 0.5 / 0.15, 1 / (255 * 0.15)),
+        "shN": ValueRange(-1.0, 127 / 128, _SH_STEP / 128),
+    },
     splat_bytes=(16.5, 19.3, 23.9, 29.7),
     carries=frozenset({"antialiased"}),
 )

@@ -29,6 +29,7 @@ from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tiles
 from csplat.encoder.sh_codebook import FileCodebooks, assign_splats
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import missing_package
+from csplat.file_source import open_binary
 from csplat.model import SplatModel
 from csplat.out_of_core.disk_buckets import Bucket, damaged_file, read_bucket, write_splats
 from csplat.scene_source import join_blocks
@@ -192,7 +193,7 @@ def read_coded(folder: Path, bucket: Bucket) -> tuple[list[EncodedTile], list[Fi
         OSError: it cannot be read.
     """
     path = coded_path(folder, bucket)
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         size, crc = _HEAD.unpack(stream.read(_HEAD.size).ljust(_HEAD.size, b"\0"))
         text = stream.read(min(size, path.stat().st_size))
     if len(text) != size or zlib.crc32(text) != crc:
@@ -219,7 +220,7 @@ def read_coded(folder: Path, bucket: Bucket) -> tuple[list[EncodedTile], list[Fi
 
 
 def _read_payload(path: Path, offset: int, size: int, crc: int) -> bytes:
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         stream.seek(offset)
         data = stream.read(size)
     if len(data) != size or chunk_crc(_spec.CHUNK_TILE, data) != crc:

@@ -25,6 +25,7 @@ from csplat.encoder.buckets import BucketCurve, SceneSurvey, bucket_slices, cont
 from csplat.encoder.coding_parameters import measure_contrast
 from csplat.encoder.sh_codebook import largest_sh
 from csplat.errors import InputError
+from csplat.file_source import open_binary, read_bytes
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource, with_progress
 from csplat.types import Progress
@@ -216,7 +217,7 @@ def _read_state(folder: Path, key: dict[str, Any], *, resume: bool) -> dict[str,
     if not resume:
         raise InputError(f"{folder} is left from an interrupted encoding: continue with `--resume`, or remove it")
     try:
-        state = json.loads(path.read_bytes())
+        state = json.loads(read_bytes(path))
         found = state.pop("key")
     except (ValueError, TypeError, KeyError):
         raise damaged_file(path) from None
@@ -253,7 +254,7 @@ def _survey(scene: SceneSource, folder: Path, bucket_splats: int) -> tuple[Bucke
         first, last = np.searchsorted(rows, (where.start, where.stop))
         sample[first:last] = _records(block, rows[first:last] - where.start, sample.dtype)
         largest = max(largest, largest_sh(block.shN))
-    with (folder / _SAMPLE).open("wb") as stream:
+    with open_binary(folder / _SAMPLE, "w") as stream:
         _write_frames(stream, sample)
     return BucketCurve.through(np.ascontiguousarray(sample["means"]), scene.count, bucket_splats), largest
 
@@ -316,7 +317,7 @@ def _records(model: SplatModel, rows: NDArray[Any], dtype: np.dtype[Any]) -> Rec
 
 
 def _append(path: Path, records: Records) -> None:
-    with path.open("ab") as stream:
+    with open_binary(path, "a") as stream:
         _write_frames(stream, records)
 
 
@@ -331,7 +332,7 @@ def _write_frames(stream: BinaryIO, records: Records) -> None:
 def _frames(path: Path, dtype: np.dtype[Any]) -> Iterator[Records]:
     """Yield the records of each frame of a file."""
     left = path.stat().st_size
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         while left:
             head = stream.read(_FRAME.size)
             count, crc = _FRAME.unpack(head) if len(head) == _FRAME.size else (left, 0)

@@ -45,6 +45,8 @@ _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20
 # arrays, and bytes per splat; size of the file relative to one without.
 _LEVEL_RENDERS, _LEVEL_ROWS, _LEVEL_SPLAT = 200 * _MB, 2.0, 600
 _LEVEL_SIZE = 1.35
+_NAME_BYTES_MAX = 250  # bytes of a file's name with which `.work` fits into the 255 of file systems
+_NAME_PART = 60  # characters of a longer one that are kept: at most 240 bytes
 #: Bytes per splat of a file, by preset and SH degree 0 to 4.
 _FILE_BYTES = {
     "fast": (9.0, 9.5, 10.0, 11.0, 11.3),
@@ -74,8 +76,10 @@ class OutOfCoreOptions:
     always: bool = False
 
     def working_folder(self, target: str | os.PathLike[str]) -> Path:
-        """Return the path of the working folder of a file."""
-        return Path(f"{os.fspath(target)}.work" if self.folder is None else self.folder)
+        """Return the path of the working folder of a file; the name of a file of 251 to 255 bytes is shortened."""
+        path = Path(target)
+        name = path.name if len(os.fsencode(path.name)) <= _NAME_BYTES_MAX else path.name[:_NAME_PART]
+        return path.with_name(f"{name}.work") if self.folder is None else Path(self.folder)
 
 
 @dataclass(frozen=True)

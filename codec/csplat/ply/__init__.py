@@ -2,15 +2,15 @@
 
 | module | contents |
 |---|---|
-| `ply_reader` | `read_ply`, `lint_ply` |
-| `ply_header` | headers |
-| `ply_rows` | rows: binary, or text of any layout |
+| `ply_reader` | `read_ply`, `lint_ply`; the only module that imports plyfile, which is GPL-3.0-or-later |
+| `ply_header` | headers and text rows, rewritten for plyfile if necessary |
+| `ply_rows` | rows and lists that are skipped, so that plyfile sees only what is needed |
 | `column_names` | the columns of a file by their meaning |
 | `columns` | conversion of rows to the arrays of a model, with repairs |
 | `comments` | metadata of a scene in header comments |
 | `ply_writer` | `write_ply` |
 
-Modules are loaded when one of the names below is first used.
+Modules are loaded when one of the names below is first used, so writing a PLY does not load plyfile.
 """
 
 from __future__ import annotations

@@ -18,6 +18,7 @@ _MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
 _SH0 = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
+_SCALE = "scale"  # a column of spheres, in place of `_SCALES`
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _OPACITY = "opacity"
 _FILTER = "filter_3D"
@@ -49,7 +50,8 @@ class ColumnMap:
     """The columns of a PLY by meaning, in the order of the model's last axis.
 
     Attributes:
-        means, scales, quats, sh0: names of the columns; `scales` has two names for discs.
+        means, scales, quats, sh0: names of the columns; `scales` has two names for discs, one for spheres, of which
+            `quats` may have none.
         rest: 3 K names, channel by channel: red, green, blue.
         opacity: name of the column of logits.
         normals: three names, or none.
@@ -94,6 +96,13 @@ def find_columns(
     if flat:
         scales = scales[:2]
         findings.append(Finding("flat-scales", 1, "scale_2 is absent: the splats are discs (2DGS)", "note"))
+    sphere = _sphere_column(names, scales)
+    if sphere:
+        scales = (sphere,)
+        text = f"{sphere} is the only scale: all axes of a splat have this size"
+        if not any(quats):
+            quats, text = (), f"{text}, and no rotation"
+        findings.append(Finding("one-scale", 1, text, "note"))
     colour_range, coefficients = 0.0, sh0
     if not any(sh0):
         colours = next((one for one in _COLOURS if names.has(one)), None)
@@ -102,7 +111,7 @@ def find_columns(
             colour_range, finding = _colour_range(dtype, sh0)
             findings.append(finding)
             coefficients = ()
-    required = (*_MEANS, *_SH0, _OPACITY, *(_SCALES[:2] if flat else _SCALES), *_QUATS)
+    required = (*_MEANS, *_SH0, _OPACITY, *_SCALES[: len(scales)], *_QUATS[: len(quats)])
     missing = [
         name for name, found in zip(required, (*means, *sh0, *opacity, *scales, *quats), strict=True) if not found
     ]
@@ -138,6 +147,13 @@ def find_columns(
         means, scales, quats, sh0, rest, opacity[0], normals, extra, double, colour_range, filter_3d
     )  # fmt: skip
     return columns, findings
+
+
+def _sphere_column(names: _NameIndex, scales: Sequence[str]) -> str:
+    """Return the only column of scales: `scale_0`, or `scale`; "" if there are more or none."""
+    if not any(scales):
+        return names.find((_SCALE,))[0]
+    return scales[0] if not any(scales[1:]) else ""
 
 
 def dropped_columns(names: Sequence[str]) -> Finding:

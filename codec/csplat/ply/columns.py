@@ -27,10 +27,18 @@ Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
 LOGIT_OF_0 = -110.0
 LOGIT_OF_1 = 20.0
 
+#: Natural logarithm of the smallest normal float32, scene units; replaces that of a standard deviation of 0.
+LOG_OF_0 = math.log(np.finfo(np.float32).tiny)
+
+#: Natural logarithm of the largest float32, scene units.
+LOG_OF_LARGEST = math.log(np.finfo(np.float32).max)
+
+#: Log scale beyond which the exponential or its inverse leaves float32; decoders treat larger ones alike (CNF-6).
+HUGE_LOG = 88.0
+
 #: Natural logarithm of 100: the third scale of a disc is a hundredth of the smallest scale in the file.
 _FLAT_SCALE_STEP = 4.605170
 
-_HUGE_LOG = 88.0  # the exponential of larger values overflows float32
 _HUGE_COLOUR = 1e6
 _USUAL_LENGTHS = (1e-3, 1e3)  # lengths of quaternions, which drift during training
 _LARGEST_COLOUR = 16.0  # white is 1 for float colours: larger values are on a scale of 0 to 255
@@ -73,6 +81,7 @@ class RowStatistics:
     unnormalised: int = 0
     quat_lengths: tuple[float, float] = (math.inf, 0.0)  # shortest and longest, except 0
     infinite_logits: int = 0
+    zero_scales: int = 0
     normals: int = 0
     huge: int = 0
     filtered: int = 0
@@ -201,7 +210,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
         quats = np.stack([named.get(f"rot_{axis}", absent) for axis in range(4)])
         lengths = np.sqrt((quats * quats).sum(axis=0))
         odd = (lengths > 0.0) & ~((lengths >= _SANE_LENGTHS[0]) & (lengths <= _SANE_LENGTHS[1]))
-        large = (np.abs(scales) > _HUGE_LOG) & np.isfinite(scales)
+        large = (np.abs(scales) > HUGE_LOG) & np.isfinite(scales)
         return bool(odd.sum() <= 0.1 * len(rows) and large.sum() <= _BAD_SHARE * large.size)
     positions = np.stack([named.get(axis, absent) for axis in _POSITIONS], 1)
     positions = np.abs(positions[np.isfinite(positions).all(axis=1)])
@@ -211,7 +220,7 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
     # Integers read as half floats have magnitudes from tiny to large along every axis.
     if np.median(most / np.maximum(middle, _TINY)) > _MAX_SPREAD:
         return False
-    return math.exp(min(_HUGE_LOG, float(np.median(scales)))) <= 2.0 * float(most.max())
+    return math.exp(min(HUGE_LOG, float(np.median(scales)))) <= 2.0 * float(most.max())
 
 
 def with_colour_range(blocks: Iterable[Rows], columns: ColumnMap, findings: list[Finding]) -> ColumnMap:
@@ -291,6 +300,10 @@ def _copy(rows: Rows, columns: ColumnMap, part: AttributeArrays) -> None:
     _copy_group(rows, columns.means, part.means)
     _copy_group(rows, columns.quats, part.quats)
     _copy_group(rows, columns.scales, part.scales[:, : len(columns.scales)])
+    if len(columns.scales) == 1:
+        part.scales[:, 1:] = part.scales[:, :1]
+        if not columns.quats:
+            part.quats[:] = (1.0, 0.0, 0.0, 0.0)
     part.opacities[:] = rows[columns.opacity]
     _copy_group(rows, columns.sh0, part.sh0)
     coefficients = part.shN.shape[1]
@@ -346,12 +359,14 @@ def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics
     checked += [] if widths is None else [widths]
     sums = [float(array.sum()) for array in (*checked, part.opacities)]
     if not np.isfinite(sum(sums)):  # NaN, infinity, or a sum of large values that overflows
+        zero = flatten_scales(part.scales)
         good = ~np.isnan(part.opacities)
         for array in checked:
             finite = np.isfinite(array.astype(np.float32))  # means may be float64
             good &= finite.reshape(len(good), -1).all(axis=1) if finite.size else True
         kept = int(np.count_nonzero(good))
         statistics.nonfinite += len(good) - kept
+        statistics.zero_scales += int(np.count_nonzero(zero & good))
         for array in (*vars(part).values(), *part.extra.values()):
             if isinstance(array, np.ndarray):
                 array[:kept] = array[good]
@@ -374,6 +389,17 @@ def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics
     _repair_quats(part.quats, statistics)
     statistics.huge += count_huge_rows(part.scales[:, :scale_count], part.sh0, part.shN)
     return len(part.opacities)
+
+
+def flatten_scales(scales: F32) -> NDArray[np.bool_]:
+    """Replace logarithms of standard deviations of 0, which are -infinity, in place; return a mask of their rows.
+
+    Args:
+        scales: [N, C], natural logarithms.
+    """
+    zero = scales == -np.inf
+    scales[zero] = LOG_OF_0
+    return np.asarray(zero.any(axis=1))
 
 
 def _extend_range(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
@@ -413,7 +439,7 @@ def count_huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
         colours: [n, ...], coefficients.
     """
     huge = None
-    for array, limit in ((scales, _HUGE_LOG), *((one, _HUGE_COLOUR) for one in colours)):
+    for array, limit in ((scales, HUGE_LOG), *((one, _HUGE_COLOUR) for one in colours)):
         if max(float(array.max(initial=0.0)), -float(array.min(initial=0.0))) > limit:
             found = np.abs(array).reshape(len(array), -1).max(axis=1) > limit
             huge = found if huge is None else huge | found
@@ -442,9 +468,10 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
     usual = _USUAL_LENGTHS[0] <= shortest and longest <= _USUAL_LENGTHS[1]
     zero = f"{counted(s.zero_quats, 'rotation')} of length 0: set to the identity"
     logits = f"{counted(s.infinite_logits, 'infinite logit')} of opacity: alpha 0 or 1"
+    flat = f"{counted(s.zero_scales, 'splat')} with a log scale of -infinity, a size of 0: read as flat"
     normals = f"{counted(s.normals, 'splat')} with normals, which are not splat attributes: dropped"
     fused = f"the 3D filter of Mip-Splatting: fused into scales and opacities of {counted(s.filtered, 'splat')}"
-    huge = f"log scales beyond ± {_HUGE_LOG:g} or colours beyond ± {_HUGE_COLOUR:g}"
+    huge = f"log scales beyond ± {HUGE_LOG:g} or colours beyond ± {_HUGE_COLOUR:g}"
     findings = [
         Finding("nonfinite-rows", s.nonfinite, f"{nonfinite}: dropped", "repair")
         if s.nonfinite < count
@@ -452,6 +479,7 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
         Finding("zero-quats", s.zero_quats, zero, "repair"),
         Finding("unnormalised-quats", s.unnormalised, quats, "note", usual=usual),
         Finding("infinite-logits", s.infinite_logits, logits, "note"),
+        Finding("zero-scales", s.zero_scales, flat, "note"),
         Finding("nonzero-normals", s.normals, normals, "note"),
         Finding("filter-3d", s.filtered, fused, "note"),
         Finding("huge-values", s.huge, f"{counted(s.huge, 'splat')} with {huge}", "note"),
@@ -469,11 +497,11 @@ def _suspicions(statistics: RowStatistics, kept: int) -> list[Finding]:
     if kept < _FEW:
         return found
     alphas = _lie_in(statistics.opacities, -_ROUNDING, 1.0 + _ROUNDING)
-    if alphas or (_lie_in(statistics.opacities, 0.0, _BYTE) and statistics.opacities[1] > _HUGE_LOG):
+    if alphas or (_lie_in(statistics.opacities, 0.0, _BYTE) and statistics.opacities[1] > HUGE_LOG):
         top = 1 if alphas else 255
         text = f"all {kept} opacities are in 0..{top}, like alphas: read as logits; export them before the sigmoid"
         found.append(Finding("opacities-are-alphas", kept, text, "note"))
-    if _lie_in(statistics.scales, 0.0, _HUGE_LOG) and _are_lengths(statistics):
+    if _lie_in(statistics.scales, 0.0, HUGE_LOG) and _are_lengths(statistics):
         text = f"no scale of {kept} splats is negative, like lengths: read as logarithms; export them before exp"
         found.append(Finding("scales-are-linear", kept, text, "note"))
     if not statistics.colour_range and (

@@ -1,20 +1,22 @@
-"""Read the headers of PLY files.
+"""Rewrite headers and text rows that plyfile does not accept although their meaning is clear.
 
-Headers may have byte order marks, blank lines, keywords in capitals and spaces after `end_header`.
+Headers may have byte order marks, blank lines, keywords in capitals and spaces after `end_header`. Text rows may share
+a line or span several lines, and may have decimal commas and NaN or infinity as other languages write them. Ambiguous
+text is an error that names the number or row.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from csplat.detect import KINDS, detect_content, is_ply, read_head, refusal
 from csplat.errors import InputError, counted
+from csplat.file_source import open_binary
 from csplat.lint import Finding
 
 #: The element of the splats.
@@ -23,33 +25,13 @@ SPLAT_ELEMENT = "vertex"
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", re.IGNORECASE)
 _MAX_SIZE = 1 << 20  # bytes of a header; programs write up to a few kilobytes
 _MAX_DECLARED = 4096  # elements and properties; SH of degree 4 takes 87, and each takes memory in every block of rows
+_MAX_DIGITS = 18  # digits of a count; longer ones exceed every file, and Python converts no more than 4300
+_SHOWN = 80  # maximum number of characters of a word in a message
 _MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
 _LINE_END = re.compile(rb"\r\n|\r|\n")
+_ASCII = bytes(byte if byte < 128 and byte not in range(0x1C, 0x20) else ord("?") for byte in range(256))
 _FREE_TEXT = (b"comment", b"obj_info")  # keywords that are followed by free text
-_SHOWN = 80  # maximum number of characters of a line in a message
-_DIGITS = 18  # digits of a count; longer ones exceed every file
-_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
-    "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float32": "f4", "float64": "f8", **{kind: kind for kind in ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")},
-}  # fmt: skip
-
-
-@dataclass(frozen=True)
-class PlyProperty:
-    """A property as a header declares it.
-
-    Attributes:
-        name: name of the property.
-        kind: type of the values, `f4`.
-        length_kind: type of the length of a list; `None`: a single value.
-    """
-
-    name: str
-    kind: str
-    length_kind: str | None = None
 
 
 @dataclass
@@ -58,46 +40,42 @@ class PlyElement:
 
     Attributes:
         name: name of the element.
-        count: number of rows.
-        properties: its properties.
+        count: number of rows; 0 if the header specifies no number.
+        properties: names of the properties.
+        has_lists: True if a property is a list.
     """
 
     name: str
     count: int
-    properties: list[PlyProperty] = field(default_factory=list)
-
-    @property
-    def has_lists(self) -> bool:
-        """True if a property is a list."""
-        return any(one.length_kind is not None for one in self.properties)
-
-    def dtype(self, order: str) -> np.dtype[Any]:
-        """Return the type of a row without its lists, in this byte order."""
-        return np.dtype([(one.name, order + one.kind) for one in self.properties if one.length_kind is None])
+    properties: list[str] = field(default_factory=list)
+    has_lists: bool = False
 
 
 @dataclass(frozen=True)
 class PlyHeader:
-    """A parsed header.
+    """A header that plyfile can parse.
 
     Attributes:
-        end: offset of the rows in the file.
-        order: byte order of the rows as NumPy writes it; `=` if the rows are numbers in ASCII.
+        start: offset of the header in the file.
+        text: the header up to and including the line `end_header`, with the same length as in the file; ASCII.
+        is_text: True if the rows are numbers in ASCII.
         elements: the declared elements.
-        comments: comments, then other information about the file, then comments on elements.
-        line_end: the characters that end its last line.
     """
 
-    end: int
-    order: str
+    start: int
+    text: bytes
+    is_text: bool
     elements: list[PlyElement]
-    comments: list[str]
-    line_end: bytes
 
     @property
-    def is_text(self) -> bool:
-        """True if the rows are numbers in ASCII."""
-        return self.order == _ORDERS["ascii"]
+    def end(self) -> int:
+        """Offset of the rows in the file."""
+        return self.start + len(self.text)
+
+    def without_rows(self) -> bytes:
+        """Return the header with counts of 0, for a parser that shall read no rows."""
+        lines = (b"element %s 0" % line.split()[1] if _is_element(line.split()) else line for line in _split(self.text))
+        return b"\n".join([*lines, b""])
 
 
 def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> PlyHeader:
@@ -109,7 +87,8 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         kind: name of the expected kind of PLY, a key of `csplat.detect.KINDS`.
 
     Raises:
-        InputError: the file is not a PLY of this kind, or its header has no end, is invalid or beyond the limits.
+        InputError: the file is not a PLY of this kind, or its header has no end, declares too much, or has a count
+            that is no whole number.
         OSError: the file cannot be read.
     """
     head = read_head(path)
@@ -117,7 +96,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         raise InputError(f"{path.name} is a PLY in UTF-16, expected ASCII: save it as UTF-8")
     if detect_content(path, head) not in (KINDS["ply"], KINDS[kind]):
         raise refusal(path, head, wanted=kind)
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         start = len(_MARK) if head.startswith(_MARK) else 0
         stream.seek(start)
         data = stream.read(_MAX_SIZE)
@@ -128,7 +107,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
     raw = data[: end.end()]
     if raw[3:5] not in (b"\r\n", b"\r") and raw[3:4] == b"\r" and raw.endswith(b"\r\n"):
         raw = raw[:-1]  # the lines end with CR, so the LF is the first byte of a row
-    lines, oddities = _normalise_lines(raw)
+    text, oddities = _rewrite_header(raw)
     if start:
         oddities.insert(0, "a byte order mark")
     if oddities:
@@ -137,29 +116,57 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
         count = sum(byte > 127 for byte in raw)
         note = f"{counted(count, 'byte')} of the header are not ASCII: read as question marks"
         findings.append(Finding("non-ascii-header", count, note, "note"))
-    texts = [line.decode("ascii", "replace").replace("\ufffd", "?") for line in lines]
-    try:
-        order, elements, comments = _parse_lines(texts, findings, path.stat().st_size)
-    except InputError as error:
-        raise InputError(f"{path.name}: {error}") from None
-    return PlyHeader(start + len(raw), order, elements, comments, _LINE_END.findall(raw[-2:])[-1])
+    text = text.translate(_ASCII)
+    lines = [line.split() for line in _split(text)]
+    if sum(words[:1] in ([b"element"], [b"property"]) for words in lines) > _MAX_DECLARED:
+        raise InputError(f"{path.name}: the header declares more than {_MAX_DECLARED:,} elements and properties")
+    wrong = next(
+        (words[2] for words in lines if _is_element(words) and not words[2].removeprefix(b"-").isdigit()), None
+    )
+    if wrong is not None:
+        raise InputError(f"{path.name}: the count {wrong[:_SHOWN].decode()!r} of an element is not a whole number")
+    findings += _count_findings(lines, path.stat().st_size)
+    return PlyHeader(start, text, any(words[:2] == [b"format", b"ascii"] for words in lines), _parse_elements(lines))
 
 
-def _normalise_lines(raw: bytes) -> tuple[list[bytes], list[str]]:
-    """Split a header into lines without blank ones, with keywords in lower case, and list its oddities."""
+def _split(text: bytes) -> list[bytes]:
+    """Return the lines of a rewritten header, which end as its first one does."""
+    end = _LINE_END.search(text)
+    assert end is not None, "the line end_header has an end"
+    return text.split(end[0])[:-1]
+
+
+def _is_element(words: Sequence[bytes]) -> bool:
+    return words[:1] == [b"element"] and len(words) == 3
+
+
+def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
+    """Rewrite a header for plyfile with the same length, and list its oddities."""
+    first_end = _LINE_END.search(raw)
+    assert first_end is not None, "the line end_header has an end"
+    end = first_end[0]
+    lines = raw.split(end)[:-1]
+    normalised = [_normalise_line(line) for line in lines]
+    if lines[-1] == b"end_header" and all(lines) and lines == normalised and (end == b"\n" or not _has_line_end(lines)):
+        return raw, []
     lines = _LINE_END.split(raw)[:-1]
     normalised = [_normalise_line(line) for line in lines]
-    changed = [old for old, new in zip(lines, normalised, strict=True) if old is not new and old.split() != new.split()]
+    changed = [old for old, new in zip(lines, normalised, strict=True) if old.split() != new.split()]
     words = dict.fromkeys(word for line in changed for word in line.split() if word != word.lower())
     blank = sum(not line.strip() for line in lines)
+    kinds = {one[0] for one in _LINE_END.finditer(raw)}
     oddities = [f"{blank} blank lines" if blank > 1 else "a blank line"] if blank else []
     oddities += [f"capitals in {' '.join(word.decode('ascii', 'replace') for word in [*words][:3])}"] if words else []
     oddities += ["spaces next to end_header"] if lines[-1].lower() != b"end_header" else []
-    first = _LINE_END.search(raw)
-    assert first is not None, "the line end_header has an end"
-    if sum(map(raw.count, (b"\r", b"\n"))) != len(lines) * len(first[0]) or raw.count(first[0]) != len(lines):
-        oddities.append("line ends of two kinds")
-    return [line for line in normalised if line.strip()], oddities
+    oddities += ["line ends of two kinds"] if len(kinds) > 1 else []
+    kept = [line for line in normalised if line.strip()]
+    text = b"\n".join([*kept, b""])
+    kept[1] += b" " * (len(raw) - len(text))  # keeps the offset of the rows
+    return b"\n".join([*kept, b""]), oddities
+
+
+def _has_line_end(lines: list[bytes]) -> bool:
+    return any(_LINE_END.search(line) for line in lines)
 
 
 def _normalise_line(line: bytes) -> bytes:
@@ -180,76 +187,153 @@ def _normalise_line(line: bytes) -> bytes:
     return line if words == normalised and keyword not in (b"ply", b"end_header") else b" ".join(normalised)
 
 
-def _parse_lines(lines: Sequence[str], findings: list[Finding], size: int) -> tuple[str, list[PlyElement], list[str]]:
-    """Return the byte order, the elements and the comments.
+def _parse_elements(lines: list[list[bytes]]) -> list[PlyElement]:
+    found: list[PlyElement] = []
+    for words in lines:
+        if _is_element(words):
+            found.append(PlyElement(words[1].decode(), _parse_count(words[2])))
+        elif words[:1] == [b"property"] and len(words) > 2 and found:
+            found[-1].properties.append(words[-1].decode())
+            found[-1].has_lists |= words[1] == b"list"
+    return found
+
+
+def _parse_count(word: bytes) -> int:
+    """Return a count; 0 if it is negative, and a number beyond every file if it is longer than `_MAX_DIGITS`."""
+    if word.startswith(b"-"):
+        return 0
+    return int(word) if len(word) <= _MAX_DIGITS else 10**_MAX_DIGITS
+
+
+def _count_findings(lines: list[list[bytes]], size: int) -> list[Finding]:
+    findings = []
+    for words in filter(_is_element, lines):
+        word, count = words[2].decode(), _parse_count(words[2])
+        shown = word if len(word) <= _SHOWN else f"{word[:_MAX_DIGITS]}... ({len(word):,} digits)"
+        if word.startswith("-"):
+            findings.append(Finding("malformed", 1, f"{shown} rows are declared", "error"))
+        elif count > size:  # a row has at least one byte; refuse before anything is allocated
+            text = f"{shown} rows are declared, the file has {size} bytes"
+            findings.append(Finding("truncated", count, text, "error"))
+    return findings
+
+
+_TEXT_LINE_END = re.compile(r"\r\n|\r|\n")
+_NAN = re.compile(r"(?<!\S)[+-]?(?:nan\([a-z]*\)|1\.#(?:ind|[qs]nan)0*)(?!\S)", re.IGNORECASE)
+_INFINITY = re.compile(r"(?<!\S)([+-]?)1\.#inf0*(?!\S)", re.IGNORECASE)
+_EXPONENT = re.compile(r"(?<!\S)([+-]?(?:\d+\.?\d*|\.\d+))d([+-]?\d+)(?!\S)", re.IGNORECASE)
+#: Numbers as other languages write them: description for messages, pattern, Python's spelling.
+_SPELLINGS = {
+    "NaN as Microsoft's C writes it": (_NAN, "nan"),
+    "infinity as Microsoft's C writes it": (_INFINITY, r"\1inf"),
+    "an exponent as Fortran writes it": (_EXPONENT, r"\1e\2"),
+}
+_DECIMAL_COMMA = re.compile(r"(?<=\d),(?=\d)")
+_NO_THOUSANDS = re.compile(r"\d,(?!\d{3}(?!\d))\d")  # not followed by three digits exactly
+
+
+class RowError(ValueError):
+    """Bytes that do not form the declared rows, with a finding about the reason."""
+
+    def __init__(self, finding: Finding) -> None:
+        super().__init__(finding.text)
+        self.finding = finding
+
+
+def parse_text_rows(
+    body: bytes, elements: Sequence[PlyElement], wanted: Sequence[str]
+) -> tuple[dict[str, list[str]], list[Finding]]:
+    """Split text of any layout into rows.
 
     Args:
-        lines: normalised lines without blank ones.
-        findings: findings about the counts are appended to this list.
-        size: size of the file in bytes.
+        body: the file after its header.
+        elements: the declared elements.
+        wanted: names of the elements whose rows are returned.
+
+    Returns:
+        The rows of each wanted element, as lines of words; and findings.
 
     Raises:
-        InputError: a line is invalid, or too many elements and properties are declared.
+        RowError: rows are missing, or a row has another number of values than declared.
     """
-    order, declared = "", 0
-    elements: list[PlyElement] = []
-    comments: list[str] = []
-    names: set[str] = set()  # the last element has these properties
-    remarks: tuple[list[str], list[str]] = [], []  # other information, comments on elements
-    for line in lines[1:-1]:
-        keyword, *words = line.split(None, 1)
-        if keyword in ("comment", "obj_info"):
-            into = remarks[0] if keyword == "obj_info" else remarks[1] if elements else comments
-            into.append(line.strip()[len(keyword) + 1 :])
+    text = body.decode("ascii", "replace")
+    oddities = []
+    for name, (pattern, spelling) in _SPELLINGS.items():
+        text, count = pattern.subn(spelling, text)
+        oddities += [f"{name} ({counted(count, 'number')})"] if count else []
+    first: RowError | None = None
+    for separated, separators in _separations(text):
+        try:
+            rows, layout, rest = _split_rows(_TEXT_LINE_END.split(separated), elements, wanted)
+        except RowError as error:
+            first = first or error
             continue
-        declared += keyword in ("element", "property")
-        if declared > _MAX_DECLARED:
-            raise InputError(f"the header declares more than {_MAX_DECLARED:,} elements and properties")
-        words = words[0].split() if words else []
-        if keyword == "format" and not order and not elements and len(words) == 2 and words[1] == "1.0":
-            order = _ORDERS.get(words[0], "")
-        elif keyword == "element" and order and len(words) == 2:
-            elements.append(PlyElement(words[0], _parse_count(words[1], findings, size)))
-            if any(one.name == words[0] for one in elements[:-1]):
-                raise InputError(f"the header declares two elements with the same name {words[0][:_SHOWN]}")
-            names = set()
-        elif keyword == "property" and elements and (found := _parse_property(words)):
-            elements[-1].properties.append(found)
-            if found.name in names:
-                raise InputError(f"the header declares two properties with the same name {found.name[:_SHOWN]}")
-            names.add(found.name)
-        else:
-            raise InputError(f"the header line {line[:_SHOWN]!r} is not valid in a PLY")
-        if not order:
-            raise InputError(
-                f"the header line {line[:_SHOWN]!r} is not valid, expected format {' or '.join(_ORDERS)} 1.0"
-            )
-    if not order:
-        raise InputError("the header has no line format")
-    return order, elements, [*comments, *remarks[0], *remarks[1]]
+        oddities += [separators] * bool(separators) + layout
+        note = f"the rows have {', '.join(oddities)}"
+        findings = [Finding("unusual-rows", len(oddities), note, "note")] if oddities else []
+        if rest:
+            findings.append(Finding("trailing-bytes", rest, f"{rest} bytes after the last row: ignored", "repair"))
+        return rows, findings
+    assert first is not None, "_separations returns at least one reading"
+    raise first
 
 
-def _parse_property(words: Sequence[str]) -> PlyProperty | None:
-    """Return a property; `None` if its line is invalid."""
-    if len(words) == 2 and words[0] in _TYPES:
-        return PlyProperty(words[1], _TYPES[words[0]])
-    if len(words) != 4 or words[0] != "list" or not {words[1], words[2]} <= set(_TYPES):
-        return None
-    length = _TYPES[words[1]]
-    return None if length[0] == "f" else PlyProperty(words[3], _TYPES[words[2]], length)
+def _separations(text: str) -> Iterator[tuple[str, str]]:
+    """Yield the text with only spaces between numbers, for each possible meaning of its commas."""
+    if "," in text or ";" in text:
+        if "." not in text and _NO_THOUSANDS.search(text):
+            yield _DECIMAL_COMMA.sub(".", text.replace(";", " ")), "decimal commas"
+        yield text.replace(",", " ").replace(";", " "), "commas or semicolons between numbers"
+    yield text, ""
 
 
-def _parse_count(word: str, findings: list[Finding], size: int) -> int:
-    """Return the number of rows of an element, after adding a finding if it is negative or exceeds the file."""
-    digits = word.removeprefix("-")
-    if not digits.isdecimal() or not digits.isascii():
-        raise InputError(f"the count {word[:_SHOWN]!r} is not a whole number")
-    shown = word if len(word) <= _DIGITS + 2 else f"{word[:_DIGITS]}... ({len(word):,} digits)"
-    if digits != word:
-        findings.append(Finding("malformed", 1, f"{shown} rows are declared", "error"))
-        return 0
-    count = int(word) if len(word) <= _DIGITS else 10**_DIGITS
-    if count > size:  # a row has at least one byte; refuse before anything is allocated
-        text = f"{shown} rows are declared, the file has {size} bytes: copy or download it again"
-        findings.append(Finding("truncated", count, text, "error"))
-    return count
+def _split_rows(
+    lines: list[str], elements: Sequence[PlyElement], wanted: Sequence[str]
+) -> tuple[dict[str, list[str]], list[str], int]:
+    """Return the rows of the wanted elements, the oddities of the lines, and the number of bytes after the last row.
+
+    Rows may share a line or continue on the next one, provided that every line end is a row end or every row end is a
+    line end. So a missing value never shifts the values after it. No object is made per word, except of a wanted
+    element whose rows are not on lines of their own.
+    """
+    counts = np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
+    filled = np.flatnonzero(counts)
+    oddities = ["blank lines"] if len(filled) and filled[-1] >= len(filled) else []
+    lines, counts = [line for line in lines if line.strip()], counts[filled]
+    rows: dict[str, list[str]] = {}
+    at = 0
+    for element in elements:
+        width, count = len(element.properties), element.count
+        if not width:
+            raise RowError(Finding("malformed", 1, f"the element {element.name} has no properties", "error"))
+        stop = at + count
+        if element.has_lists or (counts[at:stop] == width).all():
+            if len(lines) < stop:
+                raise RowError(truncated_finding(element.name, count, len(lines) - at))
+            if element.name in wanted:
+                rows[element.name] = lines[at:stop]
+            at = stop
+            continue
+        ends = np.cumsum(counts[at : at + width * count])
+        used = int(np.searchsorted(ends, width * count)) + 1  # lines
+        whole = np.count_nonzero(ends[:used] % width == 0)  # rows that end with a line
+        if used > len(ends) or ends[used - 1] != width * count or whole not in (count, used):
+            row = int((counts[at:] != width).argmax())
+            text = f"row {row} of {element.name} has {counts[at + row]} values, expected {width}"
+            raise RowError(Finding("malformed", 1, text, "error"))
+        if element.name in wanted:
+            words = [word for line in lines[at : at + used] for word in line.split()]
+            rows[element.name] = [" ".join(words[first : first + width]) for first in range(0, len(words), width)]
+        oddities.append(f"{count} of {element.name} in {used} lines" if used > 1 else "all values in one line")
+        at += used
+    rest = int(counts[at:].sum())
+    if rest and at != sum(element.count for element in elements):
+        text = f"found {counted(rest, 'value')} after rows that are not on separate lines"
+        raise RowError(Finding("malformed", rest, text, "error"))
+    return rows, oddities, len(" ".join(" ".join(lines[at:]).split()))
+
+
+def truncated_finding(name: str, declared: int, present: int) -> Finding:
+    """Report missing rows of an element."""
+    text = f"{declared} rows of {name} are declared, {present} are present: copy or download it again"
+    return Finding("truncated", declared - present, text, "error")

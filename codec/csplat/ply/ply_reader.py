@@ -1,21 +1,32 @@
-"""Read PLY files of 3D Gaussian splats."""
+"""Read PLY files of 3D Gaussian splats.
+
+This is the only module that imports plyfile, which is GPL-3.0-or-later, so programs that embed the decoder and never
+read a PLY do not load it.
+"""
 
 from __future__ import annotations
 
+import io
 import math
+import re
 import textwrap
-from collections.abc import Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from tempfile import TemporaryFile
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
+import plyfile
 
 from csplat.disk_files import local_file
-from csplat.errors import InputError
-from csplat.file_source import File
+from csplat.errors import InputError, counted
+from csplat.file_source import File, map_file, open_binary
 from csplat.lint import Finding, refuse
 from csplat.model import SplatModel, check_sh_degree
 from csplat.ply.column_names import ColumnMap, find_columns
@@ -29,8 +40,15 @@ from csplat.ply.columns import (
     with_half_floats,
 )
 from csplat.ply.comments import CommentMetadata, parse_comments, split_origin
-from csplat.ply.ply_header import SPLAT_ELEMENT, read_ply_header
-from csplat.ply.ply_rows import RowError, read_rows
+from csplat.ply.ply_header import (
+    SPLAT_ELEMENT,
+    PlyHeader,
+    RowError,
+    parse_text_rows,
+    read_ply_header,
+    truncated_finding,
+)
+from csplat.ply.ply_rows import is_list, lines_without_lists, row_type, skip_lists
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, F64
 
@@ -40,7 +58,11 @@ _FRAME = "delta_vertex_"  # prefix of Brush's elements with the differences of l
 _SHARP = {"extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space", "version"}
 _COLOUR_SPACE, _SRGB = "color_space", 0
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are converted at a time; they fit in the cache
-_SHOWN = 200  # maximum number of characters of names in a message
+_PACKED_COLOURS = ("colors", "color", "rgb")
+_FORMATS = {"=": "ascii", "<": "binary_little_endian", ">": "binary_big_endian"}  # by plyfile's byte order
+_SHOWN = 40  # maximum number of characters of a word in a message
+_SHOWN_NAMES = 200  # characters of names in a message, which may be a MiB long
+_DAMAGED = (plyfile.PlyParseError, ValueError, OverflowError, MemoryError)  # what plyfile and NumPy raise
 
 
 def read_ply(
@@ -151,12 +173,16 @@ class PlyContent(NamedTuple):
     elements: list[str]
 
 
-def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
-    """Parse the header of a file, and read the rows of its splats.
+def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False) -> PlyContent | None:
+    """Parse a file with plyfile.
+
+    It is shown the header without counts, and then the elements that are needed one by one, without their lists: it
+    makes an object for each list.
 
     Args:
         path: path of the file.
         findings: findings are appended to this list.
+        only_splats: refuse a file that lacks columns of splats before its rows are read.
 
     Returns:
         The content; `None` if the findings contain an error.
@@ -168,22 +194,61 @@ def parse_ply(path: Path, findings: list[Finding]) -> PlyContent | None:
     header = read_ply_header(path, findings)
     if any(not one.repairable for one in findings):
         return None
-    names = [element.name for element in header.elements]
-    if SPLAT_ELEMENT not in names:
-        raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
     try:
-        rows = read_rows(path, header, (SPLAT_ELEMENT, _COLOUR_SPACE), findings)
+        declared = plyfile.PlyData.read(io.BytesIO(header.without_rows()))
+        if packed := _packed_colours(path, header, declared, findings):
+            declared = plyfile.PlyData.read(io.BytesIO(packed))
+    except _DAMAGED as error:
+        raise _input_error(path, error) from None
+    if SPLAT_ELEMENT not in declared:
+        raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
+    others = [element.name for element in declared if element.name != SPLAT_ELEMENT]
+    properties = declared[SPLAT_ELEMENT].properties
+    list_findings = _list_findings([one.name for one in properties if is_list(one)])
+    if only_splats:
+        _, more = find_columns(row_type(properties), elements=others)
+        if any(one.id == "missing-columns" for one in more):
+            findings += [*_other_findings(others), *list_findings, *more]
+            return None
+    try:
+        rows = _read_rows(path, header, declared, findings)
     except RowError as error:
         findings.append(error.finding)
         return None
-    names.remove(SPLAT_ELEMENT)
-    findings += _other_findings(names, rows.get(_COLOUR_SPACE))
-    lists = [one.name for element in header.elements if element.name == SPLAT_ELEMENT
-             for one in element.properties if one.length_kind is not None]  # fmt: skip
-    if lists:
-        text = f"list properties {', '.join(lists)}: dropped"
-        findings.append(Finding("list-columns", len(lists), text, "repair"))
-    return PlyContent(rows[SPLAT_ELEMENT], header.comments, names)
+    except _DAMAGED as error:
+        raise _input_error(path, error) from None
+    findings += [*_other_findings(others, rows.get(_COLOUR_SPACE)), *list_findings]
+    comments = [*declared.comments, *declared.obj_info]
+    for element in declared:
+        comments += element.comments
+    return PlyContent(rows.get(SPLAT_ELEMENT, np.empty(0, [])), comments, others)
+
+
+def _input_error(path: Path, error: Exception) -> InputError:
+    return InputError(f"{path.name}: {str(error)[:_SHOWN_NAMES] or type(error).__name__}")
+
+
+def _packed_colours(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> bytes:
+    """Return the header without counts of a file that declares one byte of colour and has three; b"" for other files.
+
+    nerfstudio's exporter declares `uchar colors` with the option `rgb` (exporter.py, up to 1.1.5).
+    """
+    if header.is_text or [element.name for element in declared] != [SPLAT_ELEMENT]:
+        return b""
+    properties, count = declared[SPLAT_ELEMENT].properties, header.elements[0].count
+    names = {one.name for one in properties}
+    single = [one for one in properties if not is_list(one)]
+    packed = next((one for one in single if one.name in _PACKED_COLOURS and one.val_dtype == "u1"), None)
+    surplus = path.stat().st_size - header.end - count * row_type(properties).itemsize
+    if packed is None or len(single) < len(properties) or count == 0 or surplus != 2 * count:
+        return b""
+    if names & {"red", "green", "blue", "f_dc_0"}:
+        return b""
+    text = f"one uchar {packed.name} is declared, three are in each row: read as red, green and blue"
+    findings.append(Finding("packed-colours", 1, text, "note"))
+    three = b"\n".join(b"property uchar %s" % name for name in (b"red", b"green", b"blue"))
+    line = rb"(?m)^property[ \t]+\S+[ \t]+%s[ \t]*$" % re.escape(packed.name).encode()
+    return re.sub(line, three, header.without_rows(), count=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,7 +269,7 @@ def _open(
 ) -> _OpenPly | None:
     """Parse everything except the values of the rows; return `None` if the findings contain an error."""
     check_sh_degree(sh_degree)
-    content = parse_ply(path, findings)
+    content = parse_ply(path, findings, only_splats=True)
     if content is None:
         return None
     rows = with_half_floats(content.rows, findings)
@@ -326,28 +391,198 @@ def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) 
     )
 
 
-def _other_findings(names: list[str], colour_space: Rows | None) -> list[Finding]:
+def _read_rows(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    """Read the single values of the elements that are needed, by name of the element; all others are skipped.
+
+    Args:
+        path: path of the file.
+        header: its header.
+        declared: the header as plyfile parses it, without counts.
+        findings: findings about the layout of text, and bytes after the last row, are appended to this list.
+
+    Raises:
+        RowError: rows are missing or invalid.
+        plyfile.PlyParseError, ValueError, OverflowError, MemoryError: plyfile cannot read them.
+        OSError: the file cannot be read.
+    """
+    if not header.is_text:
+        return _read_binary(path, header, declared, findings)
+    # NumPy warns about text numbers beyond their type, which become infinite and are dropped later.
+    with np.errstate(over="ignore"), warnings.catch_warnings(action="ignore", category=UserWarning):
+        with suppress(plyfile.PlyElementParseError, RowError):
+            return _read_lines(path, header, declared, findings)
+        return _read_layout(path, header, declared, findings)
+
+
+def _is_needed(element: Any) -> bool:
+    if element.name == _COLOUR_SPACE:
+        return [one.name for one in element.properties if not is_list(one)][:1] == [_COLOUR_SPACE]
+    return element.name == SPLAT_ELEMENT and not all(map(is_list, element.properties))
+
+
+def _read_binary(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    rows: dict[str, Rows] = {}
+    at, size, order = header.end, path.stat().st_size, declared.byte_order
+    for element, count in zip(declared, (one.count for one in header.elements), strict=True):
+        name, properties = element.name, element.properties
+        if any(map(is_list, properties)):
+            data = memoryview(map_file(path))
+            if not _is_needed(element):
+                at = skip_lists(data, at, name, count, properties, order, None)
+                continue
+            with TemporaryFile() as copy:
+                copy.write(_element_header(declared, element, count))
+                at = skip_lists(data, at, name, count, properties, order, copy)
+                copy.seek(0)
+                rows[name] = np.array(plyfile.PlyData.read(copy)[name].data)
+            continue
+        width = row_type(properties).itemsize
+        if width and (size - at) // width < count:
+            raise RowError(truncated_finding(name, count, (size - at) // width))
+        if _is_needed(element):
+            with _StreamWithHeader(path, _element_header(declared, element, count), at) as stream:
+                rows[name] = plyfile.PlyData.read(stream)[name].data
+        at += count * width
+    findings += _trailing_findings(path, header, at)
+    return rows
+
+
+def _read_lines(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    """Read text with a row in each line; raise an error if it has another layout."""
+    rows: dict[str, Rows] = {}
+    with open_binary(path) as file:
+        left = file.seek(0, io.SEEK_END) - header.end
+        file.seek(header.end)
+        stream = io.TextIOWrapper(file, encoding="ascii", errors="replace", newline="")
+        for element, one in zip(declared, header.elements, strict=True):
+            absent = RowError(truncated_finding(one.name, one.count, 0))
+            if one.count * 2 * len(one.properties) > left + 1:  # before memory for the rows is allocated
+                raise absent
+            if _is_needed(element):
+                rows[one.name] = _parse_lines(declared, element, one.count, stream)
+            elif one.count != sum(1 for _ in islice(_scalar_lines(element, stream), one.count)):
+                raise absent
+        rest = len(stream.read().strip())
+    findings += _rest_findings(rest)
+    return rows
+
+
+def _read_layout(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
+    """Read text of any layout."""
+    with open_binary(path) as stream:
+        stream.seek(header.end)
+        needed = [element.name for element in declared if _is_needed(element)]
+        lines, more = parse_text_rows(stream.read(), header.elements, needed)
+    findings += more
+    rows: dict[str, Rows] = {}
+    for name, found in lines.items():
+        try:
+            rows[name] = _parse_lines(declared, declared[name], len(found), found)
+        except plyfile.PlyElementParseError as error:
+            row = next(islice(_scalar_lines(declared[name], found), error.row or 0, None)).split()
+            raise RowError(_row_finding(error, row)) from None
+    return rows
+
+
+def _scalar_lines(element: Any, lines: Iterable[str]) -> Iterator[str]:
+    return lines_without_lists(lines, element.name, element.properties)
+
+
+def _parse_lines(declared: Any, element: Any, count: int, lines: Iterable[str]) -> Rows:
+    """Parse rows of text, one in each line."""
+    if any(map(is_list, element.properties)):
+        lines = _scalar_lines(element, lines)
+    header = io.StringIO(_element_header(declared, element, count).decode())
+    stream = SimpleNamespace(read=header.read, readline=partial(next, iter(lines), ""))
+    rows: Rows = plyfile.PlyData.read(stream)[element.name].data
+    return rows
+
+
+def _element_header(declared: Any, element: Any, count: int) -> bytes:
+    """Return the header of a file that has only this element, without its lists."""
+    single = (one for one in element.properties if not is_list(one))
+    lines = [f"format {_FORMATS[declared.byte_order]} 1.0", f"element {element.name} {count}", *map(str, single)]
+    return "\n".join(["ply", *lines, "end_header", ""]).encode("ascii")
+
+
+def _row_finding(error: Any, words: list[str]) -> Finding:
+    """Report the invalid value of a text row."""
+    name, row, text = error.element.name, error.row or 0, error.message
+    if error.prop is not None:
+        word = words[[one.name for one in error.element.properties].index(error.prop.name)]
+        kind = np.dtype(error.prop.val_dtype)
+        expected = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
+        text = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {expected}"
+    return Finding("malformed", 1, f"row {row} of {name}: {text}", "error")
+
+
+def _list_findings(names: list[str]) -> list[Finding]:
+    """Report lists of splats."""
+    text = f"list properties {textwrap.shorten(', '.join(names), _SHOWN_NAMES)}: dropped"
+    return [Finding("list-columns", len(names), text, "repair")] if names else []
+
+
+def _other_findings(names: list[str], colour_space: Rows | None = None) -> list[Finding]:
     """Report elements that contain no splats.
 
     Args:
         names: their names.
-        colour_space: rows of the element with the colour space; `None` if there is none.
+        colour_space: rows of the element with the colour space, if any.
     """
     if not names:
         return []
-    shown = textwrap.shorten(", ".join(names), _SHOWN)
-    text = f"elements besides {SPLAT_ELEMENT}: {shown}: dropped"
+    text = f"elements besides {SPLAT_ELEMENT}: {textwrap.shorten(', '.join(names), _SHOWN_NAMES)}: dropped"
     if not set(names) <= _SHARP:
         if any(name.startswith(_FRAME) for name in names):
             text += "; they move the splats, of which the first frame is kept"
         return [Finding("other-elements", len(names), text, "repair")]
     findings = [Finding("sharp-elements", len(names), f"{text}; they are the camera of ml-sharp", "note")]
-    if colour_space is not None and (colour_space.dtype.names or ())[:1] == (_COLOUR_SPACE,):
-        linear = colour_space[_COLOUR_SPACE][colour_space[_COLOUR_SPACE] != _SRGB]
-        if len(linear):
-            text = f"{_COLOUR_SPACE} is {linear[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
-            findings.append(Finding("colour-space", 1, text, "error"))
+    if colour_space is None:
+        return findings
+    linear = colour_space[_COLOUR_SPACE][colour_space[_COLOUR_SPACE] != _SRGB]
+    if len(linear):
+        text = f"{_COLOUR_SPACE} is {linear[0]} (linear RGB), expected {_SRGB} (sRGB): export the scene in sRGB"
+        findings.append(Finding("colour-space", 1, text, "error"))
     return findings
+
+
+def _trailing_findings(path: Path, header: PlyHeader, end: int) -> list[Finding]:
+    """Report bytes after the last binary row, which ends at `end`."""
+    count = path.stat().st_size - end
+    if count and _is_changed_as_text(path, header, count):
+        text = (
+            f"{counted(count, 'byte')} after the last row, and a carriage return before each line feed of the rows:"
+            " corrupted by a text-mode transfer (git autocrlf, FTP): copy it again as binary"
+        )
+        return [Finding("malformed", count, text, "error")]
+    return _rest_findings(count)
+
+
+def _rest_findings(count: int) -> list[Finding]:
+    text = f"{counted(count, 'byte')} after the last row: ignored"
+    return [Finding("trailing-bytes", count, text, "repair")] if count else []
+
+
+def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
+    """Return True if a carriage return was inserted before each line feed of binary rows.
+
+    Args:
+        path: path of the file.
+        header: its header.
+        surplus: number of bytes after the last row.
+    """
+    if not header.text.endswith(b"\r\n"):
+        return False
+    feeds, last = 0, b"\n"
+    with open_binary(path) as stream:
+        stream.seek(header.end)
+        while block := stream.read(_BLOCK_SIZE):
+            found = block.count(b"\n")
+            feeds += found
+            if found != (last[-1:] + block).count(b"\r\n"):
+                return False
+            last = block
+    return surplus <= feeds
 
 
 def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator[Rows]:
@@ -362,7 +597,7 @@ def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator
     if not isinstance(rows, np.memmap):
         yield from (rows[start : start + step] for start in range(0, len(rows), step))
         return
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         stream.seek(rows.offset)
         for start in range(0, len(rows), step):
             count = min(step, len(rows) - start)
@@ -370,3 +605,15 @@ def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator
             if len(block) != count:
                 raise InputError(f"{path.name} became shorter while it was read")
             yield block
+
+
+class _StreamWithHeader(io.BufferedReader):
+    """A file at an offset, whose bytes follow a header that is not in the file."""
+
+    def __init__(self, path: Path, header: bytes, offset: int) -> None:
+        super().__init__(io.FileIO(path))
+        self.seek(offset)
+        self._header = io.BytesIO(header)
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        return self._header.read(size) or super().read(size)

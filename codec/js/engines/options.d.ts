@@ -19,7 +19,7 @@ export interface LoadOptions extends Omit<ReaderOptions, 'inflate'> {
 }
 
 /** The source of a scene. */
-export type SceneSource = string | URL | Blob | ArrayBuffer | ByteSource;
+export type SceneSource = string | URL | Blob | ArrayBuffer | ArrayBufferView | ByteSource;
 
 /** The property `csplat` of an engine's object. */
 export interface SceneFacts<T = void> {

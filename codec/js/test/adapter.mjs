@@ -100,7 +100,7 @@ async function once(input, outdir) {
  * Print the tiles of cuts, one a line.
  *
  * @param {string} input
- * @param {string} cuts path of a text with lines such as `level 1`, `pixel_size 0.5`, `splats 100`
+ * @param {string} cuts path of a text of lines for `cutOptions`
  */
 async function cut(input, cuts) {
   try {

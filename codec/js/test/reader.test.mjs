@@ -137,7 +137,7 @@ test('truncated files and files that are too long are refused, with and without 
     for (const size of [0, 10, 64, 300, rich.length - 1]) {
       const { url } = await serve(t, rich.subarray(0, size), { ranges });
       const error = await refusal(async () => {
-        await readAll(await CsplatReader.open(url)); // with ranges the server reports the size of the file
+        await readAll(await CsplatReader.open(url, { retryMs: 0 })); // with ranges the server reports the size of the file
       });
       assert.equal(error.code, 'E_TRUNCATED', `${size} bytes, ranges ${ranges}`);
     }
@@ -190,17 +190,6 @@ test('a missing file and an unreachable server are E_INPUT', async (t) => {
   const { url } = await serve(t, rich);
   assert.equal((await refusal(() => CsplatReader.open(`${url}x`))).code, 'E_INPUT');
   assert.equal((await refusal(() => CsplatReader.open('http://127.0.0.1:1/x'))).code, 'E_INPUT');
-});
-
-test('a file that changes while a reader is open is detected', async (t) => {
-  const { url } = await serve(t, rich);
-  let etag = 0;
-  const changing = async (...request) => {
-    const response = await fetch(...request);
-    return new Response(response.body, { status: response.status, headers: { ETag: `"${etag++}"` } });
-  };
-  const reader = await CsplatReader.open(url, { firstBytes: 64, fetch: changing }).catch((error) => error);
-  assert.equal(reader.code, 'E_INPUT');
 });
 
 test('an abort ends a read with its reason', async (t) => {

@@ -201,6 +201,37 @@ test('a tile touches a box that shares a point with its own', async () => {
   }
 });
 
+test('a box that touches a decoded centre selects its tile, one beside it does not', async () => {
+  for (const name of [
+    'valid/levels_of_boxes',
+    'extreme/levels_of_boxes_at_2_53',
+    'extreme/levels_of_subnormal_boxes',
+  ]) {
+    const reader = await open(name);
+    for (const { index, min, max } of reader.header.tiles) {
+      const { means } = await reader.readTile(index);
+      const column = (axis) => means.filter((_, i) => i % 3 === axis);
+      for (const axis of [0, 1, 2]) {
+        assert.ok(Math.min(...column(axis)) === min[axis] && Math.max(...column(axis)) === max[axis], name);
+        const box = [-Infinity, -Infinity, -Infinity, Infinity, Infinity, Infinity];
+        box[axis] = max[axis];
+        assert.ok((await reader.cut({ box })).includes(index), name);
+        const corners = [...box.slice(3), ...box.slice(0, 3)]; // in any order
+        assert.ok((await reader.cut({ box: corners })).includes(index), name);
+        box[axis] = max[axis] + Math.max(Number.MIN_VALUE, Math.abs(max[axis]) * 2 ** -52);
+        assert.ok(!(await reader.cut({ box })).includes(index), name);
+      }
+    }
+  }
+});
+
+test('a tile of a coarser level beyond binary32 is refused with the index', async () => {
+  for (const name of ['beyond_float32', 'begins_below_float32', 'rounds_to_infinity']) {
+    const error = await refusal(() => open(`invalid/coarse_tile_${name}`));
+    assert.deepEqual([error.code, error.clause], ['E_RANGE', 'MEA-1'], name);
+  }
+});
+
 test('invalid cuts are E_INPUT', async () => {
   const reader = await open('valid/levels_of_three');
   const mistakes = [
@@ -225,7 +256,8 @@ test('invalid cuts are E_INPUT', async () => {
     { box: [0, 0, 0] },
     { box: null },
     { box: [0, 0, 0, 1, 1, NaN] },
-    { box: [0, 0, 2, 1, 1, 1] },
+    { box: [0, 0, 2, 1, 1, 1, 1] },
+    { box: NaN },
     { box: ['0', 0, 0, 1, 1, 1] },
   ];
   for (const mistake of mistakes) {

@@ -82,9 +82,7 @@ def _misplaced_chunks() -> list[Recipe]:
 def _bombs() -> list[Recipe]:
     zeros = Stream(coder="deflate", coded=deflate_fixed(bytes(200_000)))
     bomb = scene(tiles=[tile(changes={OPACITIES: levels([7, 8], zeros)})])
-    runs = (
-        _spec.BUDGET_JSON_BYTES // _spec.JSON_BYTE_COST // _spec.RUN_MAX
-    )  # runs of spaces; each takes 3 bytes in the file
+    runs = _spec.BUDGET_JSON_BYTES // _spec.JSON_BYTE_COST // _spec.RUN_MAX  # runs of spaces, 3 bytes each in the file
     values = b"{}" + b" " * runs
     packed = values + b"\0\0" + b"\xff" * runs + b"\0\0" + b"\xff" * runs
     text = scene(chunks=(Chunk(_spec.CHUNK_METADATA, b"{}", Stream(1, _RUNS, "deflate_fixed", packed=packed)),))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import IO, Any
@@ -11,7 +10,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.disk_files import check_free_space
+from csplat.disk_files import check_free_space, temporary_file, temporary_root
 from csplat.system import read_into
 from csplat.types import I64
 from csplat_conformance.declared_bounds.measurement import Source
@@ -161,6 +160,7 @@ def open_spool(layout: RecordLayout, count: int) -> SplatSpool:
         InputError: the disk has too little free space.
         OSError: the file cannot be created.
     """
-    folder = tempfile.gettempdir()
-    check_free_space(folder, count * layout.dtype.itemsize, "the source is compared: set TMPDIR to another folder")
-    return SplatSpool(tempfile.TemporaryFile(), layout)
+    check_free_space(
+        temporary_root(), count * layout.dtype.itemsize, "the source is compared: set TMPDIR to another folder"
+    )
+    return SplatSpool(temporary_file(), layout)

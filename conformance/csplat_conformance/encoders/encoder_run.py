@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from csplat.disk_files import atomic_writer
+from csplat.disk_files import atomic_writer, temporary_folder
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.encoders.encoder_inputs import EncoderInput
 from csplat_conformance.fields import Field, read_fields
@@ -119,9 +118,9 @@ def run_once(command: str, case: EncoderInput, folder: Path, seconds: float, run
     if run is not None:
         end = run(command, named, seconds)
     else:
-        with tempfile.TemporaryDirectory(prefix="csplat-cwd-") as cwd:
-            end = run_program(command, named, seconds, cwd=Path(cwd))
-            traces += [f"left {name} in its working directory" for name in _names(Path(cwd))]
+        with temporary_folder() as cwd:
+            end = run_program(command, named, seconds, cwd=cwd)
+            traces += [f"left {name} in its working directory" for name in _names(cwd)]
     # A refusal that leaves an output is reported by `check_end`.
     outputs = {_NAMES["ply"], _NAMES["out"]} | ({_NAMES["index"]} if end.returncode == 0 else set())
     left = [name for name in _names(folder) if name not in outputs]

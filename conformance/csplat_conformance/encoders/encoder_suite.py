@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from csplat.decoder import DecodedScene
-from csplat.disk_files import atomic_writer
+from csplat.disk_files import atomic_writer, temporary_folder
 from csplat.errors import InputError
 from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
 from csplat_conformance.encoders.encoder_inputs import PSNR_MIN, EncoderInput, all_inputs
@@ -189,8 +188,8 @@ def _work_folder(keep: Path | None) -> Iterator[Path]:
         keep.mkdir(parents=True, exist_ok=True)
         yield keep.absolute()
         return
-    with tempfile.TemporaryDirectory(prefix="csplat-encoder-") as name:
-        yield Path(name)
+    with temporary_folder() as folder:
+        yield folder
 
 
 def _input_folder(folder: Path, case: EncoderInput) -> Path:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
+import numpy as np
+
 from csplat import _spec
 from csplat_conformance.validator.violation_log import Payload, PlacedRecord, ViolationLog, read_record
 
@@ -77,6 +79,17 @@ def scaled_step(step: float, exponent: int, *, single: bool = False) -> float | 
     product = Fraction(step) * Fraction(2) ** exponent
     low, high = (_SINGLE_MIN, _SINGLE_MAX) if single else (_STEP_MIN, _STEP_MAX)
     return float(product) if low <= product <= high else None
+
+
+def value_bits(n: int, scale: float) -> bytes:
+    """Return float32(float64(n) × s), little-endian (7.2)."""
+    with np.errstate(over="ignore", under="ignore"):
+        return np.array(float(n) * scale, np.float64).astype("<f4").tobytes()
+
+
+def is_finite(n: int, scale: float) -> bool:
+    """Return True if the value of a lattice integer is finite in binary32 (LAT-5, MEA-1)."""
+    return math.isfinite(float(np.frombuffer(value_bits(n, scale), "<f4")[0]))
 
 
 def read_records(view: memoryview, end: int, version_minor: int, log: ViolationLog) -> Index:
@@ -506,14 +519,12 @@ class Tile:
         record: the tile record.
         chunks: TILE chunks in the order of the layer records.
         codebook_ids: ids of the codebooks that the tile lists.
-        box_sound: whether corner, extent and exponent obey TIL-7 to TIL-9.
     """
 
     index: int
     record: PlacedRecord[_spec.TileRecord]
     chunks: list[Chunk] = field(default_factory=list)
     codebook_ids: set[int] = field(default_factory=set)
-    box_sound: bool = True
 
     @property
     def count(self) -> int:
@@ -599,10 +610,17 @@ def _check_tile_box(log: ViolationLog, tile: Tile, index: Index) -> None:
             message = f"axis {axis} is {extent}, expected less than 2^{_spec.AXIS_BITS_MAX}"
             log.add_field("TIL-8", tile.record, "extent", message, within=4 * axis)
     step = index.steps.get(_spec.ATTRIBUTE_MEANS)
-    if step is not None and scaled_step(step, record.exponent) is None:
+    if step is None:
+        return
+    scale = scaled_step(step, record.exponent)
+    if scale is None:
         message = f"{step} x 2^{record.exponent} is not finite and at least 2^-1022"
         log.add_field("TIL-9", tile.record, "exponent", message)
-    tile.box_sound = len(log.violations) == before
+    elif len(log.violations) == before:
+        for axis, (corner, extent) in enumerate(zip(record.corner, record.extent, strict=True)):
+            if not (is_finite(corner, scale) and is_finite(corner + extent, scale)):
+                message = f"axis {axis} is ({corner} to {corner + extent}) x {scale}, expected numbers of binary32"
+                log.add_field("MEA-1", tile.record, "corner", message, within=8 * axis)
 
 
 def _read_layers(view: memoryview, at: int, tile: Tile, index: Index, log: ViolationLog) -> None:

@@ -190,15 +190,7 @@ class TileChecker:
                 rows = None
         if rows is not None:
             record = self.tile.record
-            check_box(
-                self.log,
-                self.index,
-                record.record,
-                rows,
-                (record.at("corner"), record.path("corner")),
-                (stream.head.offset, f"{payload.name}/{name}.stream"),
-                sound=self.tile.box_sound,
-            )
+            check_box(self.log, record.record, rows, (record.at("corner"), record.path("corner")))
 
     def _read_raw(self, payload: Payload, name: str, number: int) -> None:
         params = payload.structure(_spec.RawParams, f"{name}.params")

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 
 from csplat import _spec
 from csplat.types import I64
-from csplat_conformance.validator.index import Index, scaled_step
+from csplat_conformance.validator.index import Index, is_finite, scaled_step, value_bits
 from csplat_conformance.validator.violation_log import ViolationLog
 
 #: Offset in the file and name of a field to report.
@@ -93,45 +90,20 @@ def _lift(rows: I64, chroma_shift: int) -> I64:
     return np.concatenate((blue + co, cg + t, blue))
 
 
-def value_bits(n: int, scale: float) -> bytes:
-    """Return float32(float64(n) × s), little-endian (7.2)."""
-    with np.errstate(over="ignore", under="ignore"):
-        return np.array(float(n) * scale, np.float64).astype("<f4").tobytes()
-
-
-def is_finite(n: int, scale: float) -> bool:
-    """Return True if the value of a lattice integer is finite in binary32 (LAT-5, MEA-1)."""
-    return math.isfinite(float(np.frombuffer(value_bits(n, scale), "<f4")[0]))
-
-
-def check_box(
-    log: ViolationLog, index: Index, record: Any, rows: I64, box: Place, stream: Place, *, sound: bool
-) -> None:
-    """Check TIL-10 and MEA-1.
+def check_box(log: ViolationLog, record: _spec.TileRecord, rows: I64, box: Place) -> None:
+    """Check TIL-10.
 
     Args:
         log: receives the violations.
-        index: index of the file.
         record: the tile record.
         rows: [3, n], the integers q.
         box: the field `corner` of the record.
-        stream: the stream of the means.
-        sound: whether TIL-7 to TIL-9 hold.
     """
     lows, highs = rows.min(axis=1).tolist(), rows.max(axis=1).tolist()
     for axis, (low, high, extent) in enumerate(zip(lows, highs, record.extent, strict=True)):
         if low != 0 or high != extent:
             message = f"axis {axis}: q is {low} to {high}, expected 0 to the extent {extent}"
             log.add("TIL-10", *box, message)
-    step = index.steps.get(_spec.ATTRIBUTE_MEANS)
-    scale = None if step is None or not sound else scaled_step(step, record.exponent)
-    if scale is None:
-        return
-    for corner, low, high in zip(record.corner, lows, highs, strict=True):
-        for n in (corner + low, corner + high):
-            if not is_finite(n, scale):
-                log.add("MEA-1", *stream, f"{n} x {scale} is not finite in binary32")
-                return
 
 
 def check_max_scale(log: ViolationLog, index: Index, largest: int, exponent: int, stored: bytes, where: Place) -> None:

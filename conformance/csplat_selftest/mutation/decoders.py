@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import select
-import shlex
 import signal
 import subprocess
 import sys
@@ -35,6 +34,7 @@ from csplat_selftest.decoder_processes import (
     c_folder,
     compile_c,
     js_folder,
+    select_in_javascript,
 )
 from csplat_selftest.fuzzing.decoder_targets import C_LIMITS, JS_LIMITS, LIMITS
 from csplat_selftest.mutation.mutants import (
@@ -225,7 +225,11 @@ def _line(reading: int, otherwise: str) -> str:
 # JavaScript ----------------------------------------------------------------------------------------
 
 _OPERATORS = Path("test", "operators.mjs")
-_CUTS: Final = ("tree.mjs", "options.mjs")  # modules of cuts; starting a process for each vector takes a second
+_CUTS: Final = (
+    "tree.mjs",
+    "options.mjs",
+    "tile_records.mjs",
+)  # modules of cuts; starting a process for each vector takes a second
 #: Modules that are not part of decoding whole files, WebAssembly, or generated tables.
 _OTHERS: Final = (
     "spec.mjs",
@@ -289,8 +293,7 @@ class JavaScriptDecoder:
             with JsDecoder(folder, timeout=_FILE_SECONDS) as decoder:
                 caught = failing(decoder.ask)
             if not caught and mutant.file in _CUTS:
-                script = shlex.quote(str(js_folder() / "test" / "adapter.mjs"))
-                caught = failing_cuts(_run_cuts(f"env CSPLAT_JS={name} node {script} --cuts {{input}} {{cuts}}"))
+                caught = failing_cuts(lambda vector: select_in_javascript(folder, vector, _FILE_SECONDS))
             if caught:
                 return MutantResult(mutant, Fate.CAUGHT, caught)
             with JsDecoder(folder, JS_LIMITS, _FILE_SECONDS) as decoder:

@@ -12,6 +12,7 @@ from csplat_tools.console import note
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import UnreadDataSet
 from csplat_trainer.data.image_pixels import image_size
+from csplat_trainer.data.set_folder import SetFolder
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 COLMAP, BLENDER, TRANSFORMS = "COLMAP", "Blender", "transforms.json"
@@ -221,16 +222,17 @@ def _with_unique_keys(found: list[SceneFolder]) -> list[SceneFolder]:
 
 
 def _images(folder: SceneFolder, factor: int) -> tuple[str | None, UnreadDataSet]:
+    place = SetFolder(folder.path)
     if folder.kind == BLENDER:
-        return None, read_blender(folder.path)
+        return None, read_blender(place)
     if folder.kind == TRANSFORMS:
-        return None, read_transforms(folder.path / "transforms.json", TEST_EVERY)
+        return None, read_transforms(place, folder.path / "transforms.json", TEST_EVERY)
     images = f"images_{factor}" if (folder.path / f"images_{factor}").is_dir() else "images"
     if not (folder.path / images).is_dir():
         raise InputError(f"{folder.path} has neither images nor images_{factor}")
     model = find_model(folder.path)
     assert model is not None
-    return images, read_colmap(folder.path, model[0], None, images, TEST_EVERY)
+    return images, read_colmap(place, model[0], None, images, TEST_EVERY)
 
 
 def _scale(size: tuple[int, int], divisor: float) -> tuple[int, int]:

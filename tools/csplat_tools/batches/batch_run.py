@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 from uuid import uuid4
 
+from csplat.disk_files import resolve_links
 from csplat.errors import InputError, LimitError, missing_package
 from csplat.remote_store import is_url
 from csplat.system import available_memory_bytes, core_count
@@ -138,7 +139,7 @@ def batch(
         count = min(workers or core_count(), len(tasks))
         threads = max(1, core_count() // count) if "threads" in options and dask is None else None
         resumes = "resume" in options
-        target.mkdir(parents=True, exist_ok=True)
+        resolve_links(target).mkdir(parents=True, exist_ok=True)
         with open_journal(target) as journal:
             jobs = [
                 replace(one, force=force, threads=threads, resumes=resumes, thumbnail=thumbnails)
@@ -222,7 +223,7 @@ def _checked(worker: Worker, words: Sequence[str]) -> Mapping[str, Any]:
 def _jobs(
     tasks: Sequence[Task], command: Sequence[str], folder: Path, records: Mapping[str, Record], pending: set[str]
 ) -> list[SceneJob]:
-    place = str(folder.resolve())
+    place = str(resolve_links(folder))
     return [SceneJob(one, tuple(command), place, records.get(one.output), one.output in pending) for one in tasks]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import os
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -11,7 +12,7 @@ from fnmatch import fnmatch
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any
 
-from csplat.disk_files import parse_json, read_text
+from csplat.disk_files import parse_json, read_text, resolve_links
 from csplat.errors import InputError
 from csplat.formats import formats
 from csplat.remote_store import is_url
@@ -78,7 +79,7 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
         raise InputError(f"{scenes} is not a folder, expected a folder or a manifest: {', '.join(_MANIFESTS)}")
     if not found:
         raise InputError(f"{scenes} has no scenes for `csplat {command}`")
-    named = _named(found, path.resolve().name if path.is_dir() else path.stem, ending)
+    named = _named(found, resolve_links(path).name if path.is_dir() else path.stem, ending)
     output, count = Counter(one.output for one in named).most_common(1)[0]
     if count > 1:
         raise InputError(f"{output} is the output of {count} scenes: name their outputs in a manifest")
@@ -88,6 +89,7 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
 def _names(folder: Path, command: str, match: str, without: Path | None) -> list[str]:
     """Return the relative paths of the scenes within a folder, with slashes."""
     endings = tuple(suffix for one in formats() if one.open is not None for suffix in one.suffixes)
+    away = None if without is None else resolve_links(without)
     names = []
     for one in sorted(folder.rglob("*")):
         name = one.name.lower()
@@ -97,7 +99,7 @@ def _names(folder: Path, command: str, match: str, without: Path | None) -> list
             continue
         relative = one.relative_to(folder).as_posix()
         hidden = any(part.startswith(".") for part in relative.split("/"))
-        ours = without is not None and one.resolve().is_relative_to(without.resolve())
+        ours = away is not None and Path(os.path.realpath(one)).is_relative_to(away)
         if not hidden and not ours and (fnmatch(relative, match) or fnmatch(one.name, match)):
             names.append(relative)
     points = starting_points(folder, names)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from csplat.errors import InputError
+from csplat.file_source import named_errors, open_binary
 from csplat.system import locked_folder
 from csplat_tools.file_streams import write_bytes
 
@@ -82,7 +83,7 @@ class Journal:
         self._path = folder / JOURNAL
         self.records, self.pending = read_journal(folder)
         self._file = self._path.open("ab", buffering=0)
-        with self._path.open("rb") as stream:
+        with open_binary(self._path) as stream:
             if stream.seek(0, os.SEEK_END) and (stream.seek(-1, os.SEEK_END), stream.read())[1] != b"\n":
                 self._write_line(b"")  # ends an incomplete line
 
@@ -107,9 +108,10 @@ class Journal:
 
     def _write_line(self, line: bytes) -> None:
         rest = memoryview(line + b"\n")
-        while rest:  # on a full disk, a write may be partial before one raises
-            rest = rest[self._file.write(rest) :]
-        os.fsync(self._file.fileno())  # so that after a power cut no output exists without its line
+        with named_errors(self._path):
+            while rest:  # on a full disk, a write may be partial before one raises
+                rest = rest[self._file.write(rest) :]
+            os.fsync(self._file.fileno())  # so that after a power cut no output exists without its line
 
 
 @contextmanager
@@ -137,7 +139,7 @@ def read_journal(folder: Path) -> tuple[dict[str, Record], set[str]]:
     """
     records: dict[str, Record] = {}
     pending: set[str] = set()
-    with suppress(FileNotFoundError), (folder / JOURNAL).open("rb") as stream:
+    with suppress(FileNotFoundError), open_binary(folder / JOURNAL) as stream:
         for line in stream:
             try:
                 entry = json.loads(line)

@@ -16,14 +16,14 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
-from tempfile import TemporaryDirectory, TemporaryFile
 from typing import Any
 from urllib.parse import unquote
 
 from csplat import __version__
-from csplat.disk_files import parse_json, path_inside
+from csplat.disk_files import parse_json, path_inside, remove_unfinished, temporary_file, temporary_folder
 from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, InputError, StoreError, counted, missing_package
+from csplat.file_source import open_binary, read_bytes
 from csplat.formats import detect_format
 from csplat.out_of_core import OutOfCoreOptions
 from csplat.remote_store import is_url, open_store
@@ -174,9 +174,10 @@ def run_job(job: SceneJob, worker: Worker, gate: Gate | None = None) -> tuple[Re
     except CsplatError as error:
         return replace(record, code=error.code, error=" ".join(str(error).split())), True
     except OSError as error:
-        return replace(
-            record, code=errno.errorcode.get(error.errno or 0, "E_OS"), error=" ".join(str(error).split())
-        ), True
+        reason = error.strerror or str(error)
+        message = reason if error.filename is None else f"{error.filename}: {reason}"
+        code = errno.errorcode.get(error.errno or 0, "E_OS")
+        return replace(record, code=code, error=" ".join(message.split())), True
 
 
 class CommandLineError(InputError):
@@ -199,7 +200,7 @@ def _ran(job: SceneJob, record: Record, worker: Worker, source: Path, output: Pa
     if output.exists() and not is_url(job.task.output) and not job.force and not _is_ours(job, output):
         raise SceneError(f"{job.task.output} exists, and is not from this batch: --force replaces it", "E_INPUT")
     threads = () if job.threads is None or "--threads" in job.words else ("--threads", str(job.threads))
-    resume = ("--resume",) if job.resumes and output.with_name(f"{output.name}.work").is_dir() else ()
+    resume = ("--resume",) if job.resumes and Path(f"{output}.work").is_dir() else ()  # the name may be too long
     words = (job.command[0], str(source), str(output), *job.words[1:], *threads, *options, *resume)
     thumbnail = str(Path(job.folder) / THUMBNAILS / f"{job.task.output}.jpg")
     try:
@@ -270,9 +271,9 @@ def _local_source(source: str) -> Iterator[Path]:
     if not is_url(source):
         yield Path(source)
         return
-    with TemporaryDirectory(prefix="csplat-") as folder:
-        local = Path(folder) / (PurePosixPath(source.partition("?")[0]).name or "scene")
-        with closing(open_store(source)) as store, local.open("wb") as copy:
+    with temporary_folder() as folder:
+        local = folder / (PurePosixPath(source.partition("?")[0]).name or "scene")
+        with closing(open_store(source)) as store, open_binary(local, "w") as copy:
             for start in range(0, store.size, _PART_BYTES):
                 copy.writelines(store.read([(start, min(start + _PART_BYTES, store.size))]))
         yield local
@@ -284,8 +285,8 @@ def _local_output(job: SceneJob) -> Iterator[Path]:
     if not is_url(job.task.output):
         yield Path(job.folder) / job.task.output
         return
-    with TemporaryDirectory(prefix="csplat-") as folder:
-        local = Path(folder) / PurePosixPath(job.task.output).name
+    with temporary_folder() as folder:
+        local = folder / PurePosixPath(job.task.output).name
         yield local
         if local.exists():
             _upload(local, job.task.output)
@@ -412,7 +413,7 @@ def _files(path: Path) -> list[Path]:
 def _buffer_files(path: Path) -> Iterator[Path]:
     """Yield the buffer files that a glTF names and that exist in its folder; none if the JSON is invalid."""
     try:
-        buffers = parse_json(path.read_bytes()).get("buffers", [])
+        buffers = parse_json(read_bytes(path)).get("buffers", [])
         names = [unquote(one["uri"]) for one in buffers if not one.get("uri", "data:").startswith("data:")]
     except (InputError, TypeError, AttributeError):
         return
@@ -423,7 +424,7 @@ def _buffer_files(path: Path) -> Iterator[Path]:
 
 
 def _hashed(path: Path) -> str:
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -448,7 +449,7 @@ class Worker:
 
     def __init__(self) -> None:
         self._process: Process | None = None
-        self._stderr = TemporaryFile()  # noqa: SIM115  # lives as long as this object
+        self._stderr = temporary_file()
         self._lock = threading.Lock()
         self._closed = False
 
@@ -526,10 +527,3 @@ def _end(process: Process | None) -> None:
         if pipe is not None:
             with suppress(OSError):  # unsent data
                 pipe.close()
-
-
-def remove_unfinished(output: Path, pid: int) -> None:
-    """Remove the temporary files of a lost process for an output; see `atomic_writer`."""
-    for file in output.parent.glob(f".*.{pid}.*.tmp"):
-        if file.name.startswith(f".{output.name}."):
-            file.unlink(missing_ok=True)

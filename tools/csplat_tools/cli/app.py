@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -11,6 +12,7 @@ from typer.core import TyperGroup
 from typer.main import get_group
 
 from csplat_tools import VERSIONS
+from csplat_tools.cli.command_output import TRUSTS_PATHS
 from csplat_tools.cli.error_lines import UsageError, refuse_command_line, report_errors
 from csplat_tools.console import print_data
 
@@ -28,6 +30,9 @@ _PANELS = {
     "View": {"view": "view", "render": "render", "export-html": "view", "export-element": "view"},
     "Test an implementation": {"conformance": "conformance"},
 }  # fmt: skip
+#: Commands that read data sets, and take `--trust-paths` anywhere among their words.
+_OF_DATA_SETS = {"train", "finetune", "encode", "compare", "tradeoff", "sensitivity", "simplify", "render"}
+_TRUST_PATHS = "--trust-paths"
 _PANEL_OF = {name: panel for panel, commands in _PANELS.items() for name in commands}
 
 
@@ -43,6 +48,11 @@ class _Commands(TyperGroup):
             if name not in self.commands:
                 self.commands[name] = _imported(name)
         return self.commands.get(cmd_name)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """Move options of the program from the words of a command to the front, where typer expects them."""
+        options, words = split_program_options(args)
+        return super().parse_args(ctx, [*options, *words])
 
     def invoke(self, ctx: Any) -> Any:
         with report_errors():
@@ -60,6 +70,17 @@ class _Commands(TyperGroup):
         except typer.Exit as error:
             status = error.exit_code
         sys.exit(status)
+
+
+def split_program_options(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return the options of the program among the words of a command, and the other words.
+
+    Args:
+        words: name of the command, its arguments and options.
+    """
+    if not words or words[0] not in _OF_DATA_SETS:
+        return [], list(words)
+    return [word for word in words if word == _TRUST_PATHS], [word for word in words if word != _TRUST_PATHS]
 
 
 def _imported(name: str) -> Any:
@@ -102,6 +123,9 @@ def _version(requested: bool) -> None:
 
 @app.callback()
 def root(
+    trust_paths: Annotated[
+        bool, typer.Option(_TRUST_PATHS, help="Let data sets read files outside of their folders.")
+    ] = False,
     _version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the versions.")
     ] = False,
@@ -116,3 +140,4 @@ def root(
       csplat info scene.csplat
       csplat decode scene.csplat scene.ply
     """
+    TRUSTS_PATHS.set(trust_paths)

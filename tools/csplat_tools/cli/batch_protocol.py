@@ -27,7 +27,7 @@ from typer.main import get_command
 from csplat.system import interrupt_main_thread
 from csplat_tools.batches.batch_page import prepare_thumbnails, write_thumbnail
 from csplat_tools.batches.scene_job import inspect_scene
-from csplat_tools.cli.app import app
+from csplat_tools.cli.app import app, split_program_options
 from csplat_tools.cli.encode import IN_MEMORY
 from csplat_tools.cli.error_lines import (
     EXIT_FAILED,
@@ -88,7 +88,7 @@ def _check(words: Sequence[str]) -> dict[str, Any]:
         `wrong`: the error in one line, or "". Without an error also `ending`: the file name ending of the command's
         outputs, "" if it may have any; `options`: names of the options that the batch may add.
     """
-    name, *rest = words
+    name, *rest = split_program_options(words)[1]
     group: Any = get_command(app)
     command = group.get_command(typer.Context(group), name)
     if command is None or hasattr(command, "commands"):

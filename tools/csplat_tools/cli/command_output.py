@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,9 @@ from csplat.lint import Finding
 from csplat.types import Progress
 from csplat_tools.console import LONG_WORK_SECONDS, format_estimate, note, print_data, print_json, progress_bar
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, check_outputs, write_json
+
+#: True if data sets may read files outside of their folders; set by the program for each command line.
+TRUSTS_PATHS = ContextVar("TRUSTS_PATHS", default=False)
 
 #: File name endings of the outputs of options.
 _ENDINGS = {
@@ -110,14 +114,14 @@ class Output:
             note(f"this takes about {format_estimate(seconds)} here; {faster}")
 
     def print_findings(self, findings: Sequence[Finding], name: str = "") -> None:
-        """Print unusual findings in a file, unless `--quiet` is given; repairs are printed in any case.
+        """Print unusual findings in a file, unless `--quiet` is given; repairs and losses are printed in any case.
 
         Args:
             findings: findings in the file.
             name: name of the file, if a command reads several.
         """
         for one in findings:
-            if one.kind == "repair" or not (self.quiet or one.usual):
+            if one.kind in ("repair", "loss") or not (self.quiet or one.usual):
                 note(f"{name}: {one}" if name else str(one))
 
     def bar(self) -> AbstractContextManager[Progress | None]:

@@ -88,8 +88,8 @@ def decoder(
 
     L1: header and errors. L2: integers. L3: floats, bit for bit, or within
     the tolerance of --class renderer (spec 9.2). L4: images of a command with
-    {camera}. L5: tiles of cuts through the levels of detail, of a command
-    with {cuts}. --cmd can be repeated. Without it, csplat's own decoder is
+    {camera}. L5: tiles of cuts through the levels of detail, and of boxes, of
+    a command with {cuts}. --cmd can be repeated. Without it, csplat's own decoder is
     tested. Otherwise a decoder writes its results to {outdir}, or exits with
     status 1 and a line of JSON with the error code:
     conformance/IMPLEMENTERS.md explains how.

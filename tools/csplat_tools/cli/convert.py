@@ -16,7 +16,7 @@ from csplat.model import UNSPECIFIED
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes, format_table, note
-from csplat_tools.convert_file import Filters, convert_file, format_rows
+from csplat_tools.convert_file import Conversion, Filters, convert_file, format_rows
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.scene_files import FOLDER_NAMES
 
@@ -26,9 +26,9 @@ _COLUMNS = ("format", "endings", "read", "written", "SH degree", "axes", "exact"
 def convert(
     source: Annotated[str, typer.Argument(metavar="IN", help="A scene in any format, a folder, or -.")],
     output: Annotated[str, typer.Argument(metavar="OUT", help="The file to write; its name determines the format.")],
-    rotate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Degrees about x, then y, then z.")] = None,
+    rotate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Degrees about x, then y, then z of IN.")] = None,
     scale: Annotated[float | None, typer.Option(metavar="FACTOR", help="Enlarge by this factor.")] = None,
-    translate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Move, scene units.")] = None,
+    translate: Annotated[str | None, typer.Option(metavar="X,Y,Z", help="Move along IN's axes, scene units.")] = None,
     crop: Annotated[str | None, typer.Option(metavar="NUMBERS", help="Keep a box (6 numbers) or sphere (4).")] = None,
     drop_floaters: Annotated[bool, typer.Option("--drop-floaters", help="Drop splats far from others.")] = False,
     up: shared.Up = None,
@@ -55,8 +55,9 @@ def convert(
     """Convert a scene to another format, and change it.
 
     Changes are made in this order: --to-axes (in --help-all), --rotate,
-    --scale, --translate, --crop, --drop-floaters, --sh-degree. A line reports
-    what the format cannot hold. `csplat formats` lists the formats; for .csplat
+    --scale, --translate, --crop, --drop-floaters, --sh-degree. They are along
+    the axes of IN (those of its format, where these are fixed, as y up in
+    glTF), or of --to-axes. A line reports what the format cannot hold. `csplat formats` lists the formats; for .csplat
     files, `csplat encode` has presets and targets. A new folder with a file
     lod-meta.json gets streamed SOG, with all levels of detail.
 
@@ -82,12 +83,20 @@ def convert(
             filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)
-    if made.losses():
-        note(f"lost on the way: {made.losses()}")
+    if made.source_count and not made.count:
+        cause = " and ".join(["--crop"] * (crop is not None) + ["--drop-floaters"] * drop_floaters)
+        note(f"warning: {cause} keeps none of {counted(made.source_count, 'splat')}: {output} has no splats")
+    if made.lost_words():
+        note(f"lost on the way: {made.lost_words()}")
+    out.print_findings(made.losses)
+    moving = {"--rotate": rotate, "--translate": translate, "--crop": crop}
+    if given := [name for name, value in moving.items() if value is not None]:
+        out.remark(f"{' and '.join(given)}: along {_filter_axes(source, made, chosen=to_axes is not None)}")
     before, after = made.axes
     if before != after:
         known = f"{before} axes" if before != UNSPECIFIED else f"no axes: {DEFAULT_AXES} is assumed, --axes sets others"
-        out.remark(f"turned to {after} axes, as {made.target_format} has them; the source has {known}")
+        which = "as given by --to-axes" if to_axes == after else f"as {made.target_format} has them"
+        out.remark(f"turned to {after} axes, {which}; the source has {known}")
     size = "a size that depends on the scene" if made.size_bytes is None else format_bytes(made.size_bytes)
     in_levels = f" and {counted(len(made.levels) - 1, 'coarser level')}" if len(made.levels) > 1 else ""
     out.remark(
@@ -95,6 +104,14 @@ def convert(
         f" -> {made.target_format}, {'about ' * (dry_run and made.size_bytes is not None)}{size}"
     )
     out.publish(made.as_json())
+
+
+def _filter_axes(source: str, made: Conversion, *, chosen: bool) -> str:
+    """Describe the axes of the filters; `chosen`: by --to-axes."""
+    if chosen:
+        return f"the axes x, y, z = {made.filter_axes} of --to-axes"
+    named = f"x, y, z = {made.filter_axes}" if made.filter_axes != UNSPECIFIED else "which it does not name"
+    return f"the axes of {source}, {named}; --to-axes chooses others"
 
 
 def _filters(

@@ -13,8 +13,10 @@ from typing import Any, NoReturn
 
 import typer
 
-from csplat.errors import CsplatError, InputError
-from csplat_tools.console import note
+from csplat.disk_files import is_temporary, temporary_root
+from csplat.errors import CsplatError, InputError, LimitError
+from csplat.file_source import named_errors
+from csplat_tools.console import STANDARD_OUTPUT, note
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
@@ -42,12 +44,19 @@ _DEFECTS = {
         "`csplat decode` and `csplat verify` take scenes of any size",
     ),
 }
+_LONG_TEXT = (
+    "its metadata or cameras take more memory than is allowed here",
+    "in Python `csplat.decode(file, limits=csplat.decoder.Limits(json_bytes=...))` reads them",
+)
 _LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # a URL read as a path, which loses a slash
-_FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT, errno.EIO)
 _OS_ADVICE = {
     errno.ENOENT: "is the name right?",
     errno.EACCES: "check its permissions",
     errno.EISDIR: "name a file",
+    errno.EIO: "the disk or the connection to it failed; try again, or use a copy elsewhere",
+    errno.ELOOP: "the links lead back to themselves; name another file",
+    errno.ENAMETOOLONG: "choose a shorter name",
+    errno.EROFS: "choose another location",
     errno.ENOSPC: "no partial file was left; free some space, or choose another location",
     errno.EFBIG: "no partial file was left; choose another location",
     errno.EDQUOT: "no partial file was left; free some space, or choose another location",
@@ -133,15 +142,16 @@ def report_errors() -> Iterator[None]:
     """
     try:
         yield
-        sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
+        with named_errors(STANDARD_OUTPUT):
+            sys.stdout.flush()  # a closed pipe shows here, not when the interpreter ends
     except CsplatError as error:
         _fail(_csplat_error(error), error.code)
     except BrokenPipeError:
         _drop_stdout()
         raise typer.Exit(EXIT_FAILED) from None
     except OSError as error:
-        if error.filename is None and error.errno in _FULL:
-            _drop_stdout()  # all other writers name their file
+        if error.filename == STANDARD_OUTPUT:
+            _drop_stdout()
         _fail(_os_error(error), errno.errorcode.get(error.errno or 0, ""))
     except MemoryError:
         _fail("out of memory", "")
@@ -177,6 +187,8 @@ def _fail(message: str, code: str) -> NoReturn:
 def _csplat_error(error: CsplatError) -> str:
     """Return the message of an error: the file, the defect in plain words, the details, and the remedy."""
     what, advice = _DEFECTS.get(error.code, ("", "") if isinstance(error, InputError) else _INVALID)
+    if isinstance(error, LimitError) and error.limit == "json_bytes":
+        what, advice = _LONG_TEXT
     message = str(error)
     parts = [error.path] if error.path is not None and Path(error.path).name not in message else []
     parts += [part for part in (what, message) if part]
@@ -186,11 +198,16 @@ def _csplat_error(error: CsplatError) -> str:
 def _os_error(error: OSError) -> str:
     reason = error.strerror or str(error) or type(error).__name__
     number = error.errno or 0
-    if error.filename is None:
-        return f"standard output: {reason}; the output is incomplete" if number in _FULL else reason
-    if number == errno.ENOENT and (url := _LOST_URL.match(str(error.filename))):
+    name = None if error.filename is None else os.fsdecode(error.filename)
+    if name is None:
+        return reason
+    if name == STANDARD_OUTPUT:
+        return f"{name}: {reason}; the output is incomplete"
+    if is_temporary(name):
+        return f"temporary files in {temporary_root()}: {reason}; TMPDIR names another folder"
+    if number == errno.ENOENT and (url := _LOST_URL.match(name)):
         return f"{url[1]}://{url[2]} is a URL, expected a file: download it first; extract and batch read URLs"
-    return f"{error.filename}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "")
+    return f"{name}: {reason}" + (f"; {_OS_ADVICE[number]}" if number in _OS_ADVICE else "")
 
 
 def _drop_stdout() -> None:

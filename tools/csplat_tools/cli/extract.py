@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from csplat.errors import counted
+from csplat.model import UNSPECIFIED
 from csplat.splat_file import open as opened
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
@@ -30,8 +31,8 @@ def extract(
 
     Tiles that touch the box are copied unchanged, with up to 65,536 splats
     each: some splats around the box are copied, too. `csplat convert --crop`
-    cuts splat by splat. Corners are relative to the origin. Declared errors
-    are left out. Of a URL (https, s3 and others) only the index and the
+    cuts splat by splat. Corners are relative to the origin, along the axes of
+    the file. Declared errors are left out. Of a URL (https, s3 and others) only the index and the
     copied tiles are fetched; that requires the remote extra.
 
     Examples:
@@ -45,7 +46,9 @@ def extract(
     check_name(output, ".csplat", "extract", source)
     with out.bar(), opened(csplat_file(source)) as file, whole_output(output) as stream:
         part = file.extract(corners, stream)
-        size, read, requests = file.size, file.bytes_read, file.requests
+        size, read, requests, axes = file.size, file.bytes_read, file.requests, file.header.coordinate_system
+    which = "which it does not name" if axes == UNSPECIFIED else f"x, y, z = {axes}"
+    out.remark(f"--box: along the axes of {source}, {which}")
     out.remark(
         f"{part.splat_count:,} splats in {counted(len(part.tiles), 'tile')}: {format_bytes(part.size)};"
         f" read {format_bytes(read)} of {format_bytes(size)}, in {counted(requests, 'request')}"
@@ -54,6 +57,7 @@ def extract(
         {
             "splats": part.splat_count,
             "tiles": list(part.tiles),
+            "axes": axes,
             "bytes": part.size,
             "source_bytes": size,
             "bytes_read": read,

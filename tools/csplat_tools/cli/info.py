@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from contextlib import ExitStack
 from typing import Annotated
 
 import typer
@@ -10,7 +10,7 @@ import typer
 from csplat.errors import InputError
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, mapped_csplat
+from csplat_tools.file_streams import is_csplat, local_path, mapped_csplat
 from csplat_tools.inspect.file_description import describe_file, describe_other_format
 from csplat_tools.inspect.text_reports import format_description
 from csplat_tools.optional_packages import prepare_renderer, require_images
@@ -42,16 +42,17 @@ def info(
     out = Output(force, report, as_json, quiet)
     shared.require_one({"--source": original}, {"--page": page})
     out.check(inputs=(source, original), named={"--page": page})
-    with out.bar() as progress:
+    with ExitStack() as stack, out.bar() as progress:
         if original is not None:
             prepare_renderer(quiet=out.quiet, ssim=True)
             require_images()
-        if source != STANDARD_STREAM and not is_csplat(Path(source)):
+        local = stack.enter_context(local_path(source))
+        if not is_csplat(local):
             if page is not None:
                 raise InputError(f"{source} is no .csplat file, which --page describes: `csplat encode` makes one")
-            out.publish(*describe_other_format(source))
+            out.publish(*describe_other_format(local))
             return
-        with mapped_csplat(source) as data:
+        with mapped_csplat(str(local), source) as data:
             description = describe_file(data)
             if page is not None:
                 from csplat_tools.inspect.file_report import write_page

@@ -33,7 +33,8 @@ def merge(
     Tiles are copied unchanged if all files have the same steps, SH degree,
     origin and extra columns, as parts of one scene do. Otherwise the scenes
     are decoded and encoded together with --preset, and a line gives the
-    reason. Files with different axes or units are refused. Metadata that all
+    reason. Files with different axes, up directions or units are refused; of
+    a file without axes, RDF is assumed, with a remark. Metadata that all
     files share is kept; declared errors are left out.
 
     Examples:
@@ -52,6 +53,7 @@ def merge(
         )
     if done.why:
         out.remark(f"decoded and coded again ({preset}): {done.why}")
+    out.remark(*done.notes)
     if done.dropped:
         out.remark(f"not all files have them, left out: {', '.join(done.dropped)}")
     how = "coded again" if done.why else "copied"
@@ -64,5 +66,6 @@ def merge(
             "copied": not done.why,
             "why": done.why,
             "dropped": list(done.dropped),
+            "notes": list(done.notes),
         }
     )

@@ -18,9 +18,8 @@ from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.present.scene_renders import find_cameras, render_film, render_folder
 from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
 from csplat_tools.scene_files import load_model, splats_to_frame
-from csplat_tools.views import DataOptions
 
-_OTHER_VIDEOS = (".avi", ".m4v", ".mkv", ".mov", ".mpg", ".webm")
+_NOT_WRITTEN = (".avi", ".bmp", ".exr", ".hdr", ".m4v", ".mkv", ".mov", ".mpg", ".tif", ".tiff", ".webm")
 
 
 def render(
@@ -70,7 +69,7 @@ def render(
     is_video, views = is_film(output), shared.ViewOptions(cameras, data, background)
     if cameras is None and orbit is None and data is None:
         raise typer.BadParameter("expected cameras: --orbit 120 for a path around the scene, or --cameras, or --data")
-    if output == STANDARD_STREAM or Path(output).suffix.lower() in _OTHER_VIDEOS:
+    if output == STANDARD_STREAM or Path(output).suffix.lower() in _NOT_WRITTEN:
         raise typer.BadParameter(f"OUT is {output}, expected a folder, or a video: NAME.mp4, .webp, .gif or .png")
     if is_video and (depth or alpha):
         raise typer.BadParameter("--depth and --alpha require a folder, not a video")
@@ -90,7 +89,7 @@ def render(
         out.print_findings(read.findings)
         model, notes = overrides.apply(read.model), list[str]()
         to_frame = model if orbit is None else overrides.apply(splats_to_frame(source, read.model))
-        data_set = None if data is None else DataOptions(data, pixels)
+        data_set = None if data is None else shared.open_data(data, size=pixels)
         shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
         if orbit is not None:

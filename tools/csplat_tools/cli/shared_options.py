@@ -11,18 +11,18 @@ import re
 from collections.abc import Callable, Mapping
 from copy import copy
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 import typer
 
+from csplat.disk_files import resolve_links
 from csplat.editing.up_axis import Direction, unit_up
 from csplat.encoder import PresetName, Target
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel, check_axes
 from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
-from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import NUMBER, parse_size_bytes, print_data
 from csplat_tools.encode_file import LEVELS_MAX, Levels
 from csplat_tools.scene_files import MetadataOverrides
@@ -237,6 +237,11 @@ def take_estimated_up(
     return axis
 
 
+def open_data(path: str, **options: Any) -> DataOptions:
+    """Return the options of a data set, with those of the program."""
+    return DataOptions(path, trust_paths=TRUSTS_PATHS.get(), **options)
+
+
 @dataclass(frozen=True)
 class ViewOptions:
     """Views of a camera file or a data set; without either, virtual ones.
@@ -273,7 +278,7 @@ class ViewOptions:
     @property
     def data_options(self) -> DataOptions | None:
         """The options of the data set; `None` without one."""
-        return None if self.data is None else DataOptions(self.data, test_every=self.test_every)
+        return None if self.data is None else open_data(self.data, test_every=self.test_every)
 
     def find(
         self,
@@ -412,7 +417,7 @@ def check_range(option: str, value: N, low: float, high: float) -> N:
 
 def is_same_file(a: str | None, b: str | None) -> bool:
     """Return True if two paths are given and lead to the same place."""
-    return a is not None and b is not None and Path(a).resolve() == Path(b).resolve()
+    return a is not None and b is not None and resolve_links(a) == resolve_links(b)
 
 
 def parse_decibels(text: str | None, option: str) -> float | None:

@@ -12,7 +12,6 @@ from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name
 from csplat_tools.optional_packages import require_trainer
-from csplat_tools.views import DataOptions
 from csplat_trainer.training_options import BACKGROUNDS, Outputs, TrainOptions
 
 _DEFAULT = TrainOptions()
@@ -71,7 +70,7 @@ def train(
     images of the set, or every 8th image, are held out. OUT.csplat is tuned as
     by `csplat finetune`, with --preset, --keep or a target. To make files of
     several sizes, train once with --checkpoint, then use --resume (--help-all
-    shows both).
+    shows both). With --trust-paths, DATA may name files outside of its folder.
 
     Examples:
       csplat train lego lego.ply --max-splats 10000
@@ -87,7 +86,7 @@ def train(
         if value is not None and not to_file:
             raise typer.BadParameter(f"{name} is for files, expected OUT.csplat")
     target, overrides = shared.parse_target(psnr=target_psnr, size=target_size, keep=keep), shared.parse_overrides(up)
-    data = DataOptions(source, None if size is None else shared.parse_size(size), test_every=test_every)
+    data = shared.open_data(source, size=None if size is None else shared.parse_size(size), test_every=test_every)
     require_trainer(plots=page is not None)
     from csplat_tools.training.training_run import (
         plan_training,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 
 from csplat import scene_source as scenes
 from csplat.decoder import DeclaredBounds, decode, open_tiles
-from csplat.disk_files import check_free_space, finite_or_none
+from csplat.disk_files import check_free_space, finite_or_none, temporary_root
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource
@@ -375,7 +374,7 @@ def _measure(
             bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
             raise InputError(f"the memory is {bound:,.0f} MB, expected at least {least:,.0f} MB to draw these scenes")
     check_free_space(
-        tempfile.gettempdir(),
+        temporary_root(),
         max(first.disk_bytes, second.disk_bytes),
         "scenes are rendered: TMPDIR sets another folder",
     )

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from mmap import mmap
+from pathlib import Path
 from typing import Any
 
 from csplat import _spec
@@ -31,7 +32,6 @@ from csplat.formats import format_by_name, open_scene
 from csplat.model import SplatModel
 from csplat.training_record import TRAINING, VIEW, TrainingRecord
 from csplat_tools.console import format_bytes
-from csplat_tools.file_streams import local_path
 from csplat_tools.scene_files import findings_as_json, size_on_disk
 
 _NULLABLE = ("bits_per_splat",)  # values that the JSON contains even if they are `None`
@@ -238,8 +238,8 @@ def describe_file(data: bytes | mmap) -> FileDescription:
     )
 
 
-def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
-    """Describe a scene in any format, or `-`, without reading its splats.
+def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
+    """Describe a scene in any format without reading its splats.
 
     Returns:
         JSON-compatible values, and the same as text.
@@ -248,7 +248,7 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
         InputError: the file is in no readable format, or truncated.
         OSError: the file cannot be read.
     """
-    with local_path(source) as path, open_scene(path) as scene:
+    with open_scene(path) as scene:
         metadata_model, size, count = scene.metadata_model, size_on_disk(path), scene.count
         per_splat = size / count if count else None
         report = {
@@ -259,6 +259,7 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
             "levels": list(scene.levels),
             "sh_degree": metadata_model.sh_degree,
             "coordinate_system": metadata_model.coordinate_system,
+            "file_axes": scene.file_axes or metadata_model.coordinate_system,
             "origin": list(metadata_model.origin),
             "unit_metres": metadata_model.unit_metres,
             "antialiased": metadata_model.antialiased,
@@ -269,6 +270,8 @@ def describe_other_format(source: str) -> tuple[dict[str, Any], str]:
         }
         average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
         words = describe_placement(metadata_model, count, metadata_model.metadata)
+        if scene.file_axes:
+            words["axes"] = f"{scene.file_axes}, read as {metadata_model.coordinate_system}"
         if scene.levels:
             words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
         if metadata_model.extra:

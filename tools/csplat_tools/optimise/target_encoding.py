@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from csplat.encoder import EncodeOptions, EncodeResult, Target, meet_bounds
+from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Target, meet_bounds
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import Progress
@@ -57,6 +57,8 @@ def meet_target(
         raise InputError(f"views is a {type(views).__name__}, expected csplat_tools.find_view_set(...)")
     check_target(source, target, options)
     encodes = 0
+    if options.position_error is not None:
+        EncodePlan.of(source, options)  # refuses an error that cannot be kept before the search
     if target.max_error:
         bounded, options = meet_bounds(source, options, target, importance=importance, progress=progress)
         assert bounded.report.search is not None

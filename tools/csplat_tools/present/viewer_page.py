@@ -72,7 +72,13 @@ const made = [];
 const link = (number) => (made[number] ??= modules[number](link));
 let text = '';
 link.startWorker = () => {
-  text ||= URL.createObjectURL(new Blob([`(${csplat})();`], { type: 'text/javascript' }));
+  if (!text) {
+    const url = URL.createObjectURL(new Blob([`(${csplat})();`], { type: 'text/javascript' }));
+    text = url;
+    try {
+      text = globalThis.trustedTypes?.createPolicy('csplat', { createScriptURL: () => url }).createScriptURL('') ?? url;
+    } catch {}
+  }
   return new Worker(text);
 };
 if (typeof document === 'undefined') link(WORKER);

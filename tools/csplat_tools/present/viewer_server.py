@@ -1,6 +1,7 @@
 """Prepare a scene for the viewer, and serve the page, the decoder and the scene with HTTP Range.
 
-A table lists all paths that are served, so that no other file can be reached.
+A table lists all paths that are served, so that no other file can be reached. Requests for other hosts are refused, see
+`SceneServer.serves`.
 """
 
 from __future__ import annotations
@@ -11,14 +12,16 @@ import json
 import os
 import re
 import socket
+import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from ipaddress import ip_address
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 from urllib.parse import quote, unquote, urlencode, urlsplit
 
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
@@ -26,6 +29,7 @@ from csplat.decoder import SceneHeader, decode, read_header
 from csplat.editing.up_axis import Direction
 from csplat.encoder import EncodeOptions, PresetName, encode_with_report
 from csplat.errors import CsplatError, FormatError, InputError
+from csplat.file_source import open_binary, read_bytes
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
 from csplat.types import Progress
@@ -53,8 +57,10 @@ _HEADERS = {
     "Cache-Control": "no-cache",
 }
 _BLOCK_BYTES = 1 << 20
-_LOOPBACK = ("127.0.0.1", "localhost", "[::1]")
 _SECONDS_IDLE = 60.0
+_DRAINED_BYTES = 1 << 20  # bytes; the part of a request's body that is read before the connection is closed
+_DRAIN_SECONDS = 1.0  # seconds; the time that this may take
+_DIGITS_MAX = 18  # decimal digits; a longer position lies after the end of any file
 
 
 @dataclass(frozen=True)
@@ -96,7 +102,7 @@ class ViewerScene:
 
     def read(self) -> bytes:
         """Return the bytes of the file."""
-        return self.content if isinstance(self.content, bytes) else self.content.read_bytes()
+        return self.content if isinstance(self.content, bytes) else read_bytes(self.content)
 
 
 class SceneServer(ThreadingHTTPServer):
@@ -107,12 +113,30 @@ class SceneServer(ThreadingHTTPServer):
     def __init__(self, host: str, port: int, resources: Mapping[str, _Resource], start: str) -> None:
         self.resources = resources
         self.start = start
-        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        super().__init__((host, port), _Handler)
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
+        self.address_family = family
+        super().__init__(cast("tuple[str, int]", address), _Handler)
         shown = f"[{host}]" if ":" in host else host
         self.url = f"http://{shown}:{self.server_address[1]}/"
-        # Protects from DNS rebinding: a web page whose host name resolves to this machine must not read the scene.
-        self.local_only = shown in _LOOPBACK
+        own = socket.gethostname().lower()
+        names = set() if _is_loopback(str(self.server_address[0])) else {own, f"{own}.local", host.lower().rstrip(".")}
+        self._names = {"localhost", *names}
+
+    def serves(self, host: str) -> bool:
+        """Return True for the host of a request if its page may read the scene.
+
+        Protects from DNS rebinding: the owner of a web page can let its name lead to this machine. An address leads
+        nowhere else, and names of this machine are nobody else's: `localhost`, and for a server that other machines
+        reach its host name, the same with `.local`, and the name that the user gave.
+
+        Args:
+            host: host and port as in the header `Host`.
+        """
+        name = re.sub(r":[0-9]*$", "", host)
+        if name.startswith("["):
+            return name.endswith("]") and _is_address(name[1:-1])
+        return _is_address(name) or name.lower().removesuffix(".") in self._names
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore connections that the browser closes early."""
@@ -135,7 +159,8 @@ def open_viewer_scene(path: str, *, preset: PresetName, progress: Progress | Non
         OSError: the file cannot be read.
     """
     with local_path(path) as local:
-        stem = "scene" if path == STANDARD_STREAM else Path(path).stem or "scene"
+        name = "scene" if path == STANDARD_STREAM else Path(path).stem or "scene"
+        stem = os.fsencode(name).decode("utf-8", "replace")  # a name in another encoding is no part of a URL
         yield _check_scene(local, stem) if is_csplat(local) else _encode_scene(local, stem, preset, progress)
 
 
@@ -157,6 +182,8 @@ def open_server(
     Raises:
         InputError: the port is in use, or the host is not an address of this machine.
     """
+    if not host.strip():  # would be all interfaces
+        raise InputError("the host is empty, expected 127.0.0.1 for local access, 0.0.0.0 for all interfaces")
     place = f"scene/{scene.name}"
     resources = {path: _file(file) for path, file in web_files().items()}
     content = scene.content
@@ -170,6 +197,8 @@ def open_server(
         server = SceneServer(host, port, resources, start)
     except OverflowError:
         raise InputError(f"the port is {port}, expected 1 to 65535, or 0 for any free port") from None
+    except ValueError:  # a name that is none, such as one of 300 letters
+        raise InputError(_NOT_HERE.format(host)) from None
     except OSError as error:
         raise InputError(_refusal(error, host, port)) from None
     with server:
@@ -225,18 +254,39 @@ def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
     match = re.fullmatch(r"bytes=\s*(\d*)-(\d*)\s*", header or "", re.ASCII | re.IGNORECASE)
     if match is None or match[1] == match[2] == "":
         return None
+    first, last = (_position(digits) for digits in match.groups())
     if match[1] == "":
-        length = min(int(match[2]), size)
+        length = min(last, size)
         if length == 0:
             raise ValueError("a range of no bytes")
         return size - length, length
-    first = int(match[1])
-    last = size - 1 if match[2] == "" else int(match[2])
-    if match[2] != "" and last < first:
+    if match[2] == "":
+        last = size - 1
+    elif last < first:
         return None
     if first >= size:
         raise ValueError("a range after the end")
     return first, min(last, size - 1) - first + 1
+
+
+def _position(digits: str) -> int:
+    """Return a number of any length, limited; Python refuses to convert one of 5,000 digits."""
+    digits = digits.lstrip("0")
+    return int(digits or "0") if len(digits) <= _DIGITS_MAX else 10**_DIGITS_MAX
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _is_loopback(address: str) -> bool:
+    """Return True for an address that only programs on this machine reach, also for IPv4 addresses in IPv6."""
+    found = ip_address(address.partition("%")[0])
+    return (getattr(found, "ipv4_mapped", None) or found).is_loopback
 
 
 def _join(up: Direction) -> str:
@@ -277,6 +327,8 @@ class _Handler(BaseHTTPRequestHandler):
     server_version = "csplat"
     sys_version = ""
     timeout = _SECONDS_IDLE
+    default_request_version = "HTTP/1.0"  # with HTTP/0.9, errors in the request line are answered without a status
+    raw_requestline: bytes
 
     def do_GET(self) -> None:
         self._answer(send=True)
@@ -284,16 +336,57 @@ class _Handler(BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
         self._answer(send=False)
 
+    def parse_request(self) -> bool:
+        """Parse a request; refuse one of HTTP/0.9, which has no version and no headers."""
+        if len(self.raw_requestline.split()) == 2:
+            self.requestline, self.request_version, self.command = "", self.default_request_version, ""
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return False
+        return super().parse_request()
+
+    def handle_expect_100(self) -> bool:
+        """Do not ask for the body of a request: none is read."""
+        return True
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:  # noqa: ARG002
+        """Refuse a request that cannot be parsed, or its method, and close the connection."""
+        self.close_connection = True
+        self._refuse(HTTPStatus(code), send=self.command != "HEAD")
+
+    def finish(self) -> None:
+        """Close the connection. Unread bytes would let the system reset it, before the client has read the answer."""
+        super().finish()
+        with suppress(OSError):
+            self.connection.shutdown(socket.SHUT_WR)
+            self.connection.settimeout(_DRAIN_SECONDS)
+            end, left = time.monotonic() + _DRAIN_SECONDS, _DRAINED_BYTES
+            while left > 0 and time.monotonic() < end and (data := self.connection.recv(_BLOCK_BYTES)):
+                left -= len(data)
+
     def log_message(self, format: str, *args: object) -> None:
         """Log nothing: standard error is for messages to the user."""
 
     def _answer(self, *, send: bool) -> None:
         server = self.server
         assert isinstance(server, SceneServer)
-        if server.local_only and self._host() not in _LOOPBACK:
+        if self.headers.get("Content-Length", "0").strip() != "0" or "Transfer-Encoding" in self.headers:
+            self.close_connection = True  # the body is not read, and must not be taken for the next request
+        hosts = self.headers.get_all("Host", [])
+        try:
+            target = urlsplit(self.path)
+        except ValueError:  # "http://["
+            self._refuse(HTTPStatus.BAD_REQUEST, send=send)
+            return
+        is_local = self.path.startswith("/")
+        is_named = len(hosts) == 1 or (not hosts and self.request_version == "HTTP/1.0")
+        if not is_named or not (is_local or target.scheme in ("http", "https")):
+            self._refuse(HTTPStatus.BAD_REQUEST, send=send)
+            return
+        # RFC 9112, 3.2.2: "a server MUST ignore the received Host header field (if any) and instead replace it".
+        if not server.serves("".join(hosts).strip() if is_local else target.netloc):
             self._refuse(HTTPStatus.MISDIRECTED_REQUEST, send=send)
             return
-        path = unquote(urlsplit(self.path).path).removeprefix("/")
+        path = unquote(target.path).removeprefix("/")
         if path == "":
             self._start(HTTPStatus.FOUND, {"Location": server.start, "Content-Length": "0"})
             return
@@ -308,10 +401,6 @@ class _Handler(BaseHTTPRequestHandler):
             return
         with stream:
             self._send(resource, stream, size, send=send)
-
-    def _host(self) -> str:
-        host = self.headers.get("Host", "")
-        return host if host.endswith("]") else re.sub(r":\d*$", "", host)
 
     def _send(self, resource: _Resource, stream: BinaryIO, size: int, *, send: bool) -> None:
         tag = resource.tag(stream)
@@ -349,6 +438,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _start(self, status: HTTPStatus, headers: Mapping[str, str]) -> None:
         self.send_response(status)
+        if self.close_connection:
+            self.send_header("Connection", "close")
         for name, value in {**_HEADERS, **headers}.items():
             self.send_header(name, value)
         self.end_headers()
@@ -356,7 +447,7 @@ class _Handler(BaseHTTPRequestHandler):
 
 def _file(path: Path, ending: str = "") -> _Resource:
     def open_file() -> tuple[BinaryIO, int]:
-        stream = path.open("rb")
+        stream = open_binary(path)
         return stream, os.fstat(stream.fileno()).st_size
 
     def tag(stream: BinaryIO) -> str:
@@ -371,11 +462,14 @@ def _bytes(data: bytes, ending: str) -> _Resource:
     return _Resource(lambda: (io.BytesIO(data), len(data)), _TYPES[ending], lambda _stream: tag)
 
 
+_NOT_HERE = "{} is not an address of this machine: use 127.0.0.1 for local access, 0.0.0.0 for all interfaces"
+
+
 def _refusal(error: OSError, host: str, port: int) -> str:
     if error.errno == errno.EADDRINUSE:
         return f"port {port} is in use: --port 0 finds a free port"
     if error.errno == errno.EACCES:
         return f"port {port} requires more rights: --port 0 finds a free port"
     if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
-        return f"{host} is not an address of this machine: use 127.0.0.1 for local access, 0.0.0.0 for all interfaces"
+        return _NOT_HERE.format(host)
     return f"{host}:{port}: {error.strerror or error}"

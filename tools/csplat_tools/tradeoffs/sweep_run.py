@@ -444,6 +444,7 @@ def _view_words(setting: SweepSetting) -> list[str]:
         words += ["--cameras", setting.cameras]
     if data is not None:
         words += ["--data", data.path if data.images is None else str(PurePath(data.path, data.images))]
+        words += ["--trust-paths"] if data.trust_paths else []
     if setting.background is not None:
         words += ["--background", ",".join(repr(one) for one in setting.background)]
     return words
@@ -456,7 +457,8 @@ def _view_arguments(setting: SweepSetting) -> str:
         words.append(f"cameras={_literal(setting.cameras)}")
     if data is not None:
         images = None if data.images is None else _literal(data.images)
-        words.append(f"data=DataOptions({_literal(data.path)}, {data.size}, {images}, {data.test_every})")
+        trust = ", trust_paths=True" if data.trust_paths else ""
+        words.append(f"data=DataOptions({_literal(data.path)}, {data.size}, {images}, {data.test_every}{trust})")
     if setting.background is not None:
         words.append(f"background={setting.background}")
     return "".join(f", {word}" for word in words)

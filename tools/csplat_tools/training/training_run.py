@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import csplat_trainer
+from csplat.disk_files import resolve_links
 from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError, counted
 from csplat.training_record import TrainingRecord
@@ -192,7 +193,7 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
     outputs = Outputs(checkpoint, files.checkpoint_every)
     if files.resume is None or checkpoint is None or not checkpoint.exists():
         return outputs
-    is_same = Path(str(files.checkpoint)).resolve() == Path(files.resume).resolve()
+    is_same = resolve_links(str(files.checkpoint)) == resolve_links(files.resume)
     has_ended = load_checkpoint(files.resume).iteration >= options.iterations
     return replace(outputs, resume=checkpoint) if is_same and has_ended else outputs
 
@@ -220,7 +221,9 @@ def _load(data: DataOptions, options: TrainOptions, files: Outputs) -> DataSet:
     """Check the other inputs, and open the data set."""
     _check_inputs(options, files)
     every = 8 if data.test_every is None else data.test_every
-    return load(data.path, data.size, images=data.images, test_every=every, near=data.near)
+    return load(
+        data.path, data.size, images=data.images, test_every=every, near=data.near, trust_paths=data.trust_paths
+    )
 
 
 def _check_inputs(options: TrainOptions, files: Outputs) -> None:

@@ -16,12 +16,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, fields, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.disk_files import resolve_links
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
 from csplat.training_record import TrainingRecord
@@ -203,6 +203,7 @@ class DataOptions:
         images: folder of images of a COLMAP set; default: chosen by the reader.
         test_every: every Nth image is a test image if the set does not specify any; default: 8.
         near: near plane of the cameras, scene units; default: chosen by the reader.
+        trust_paths: read files outside of the set's folder that it names or links to.
     """
 
     path: str
@@ -210,6 +211,7 @@ class DataOptions:
     images: str | None = None
     test_every: int | None = None
     near: float | None = None
+    trust_paths: bool = False
 
 
 def comparison_cameras(source: SplatModel, every: int = 1) -> list[Camera]:
@@ -403,12 +405,18 @@ def _open_data_set(data: DataOptions, record: TrainingRecord | None) -> tuple[st
     require_data_sets()
     from csplat_trainer.data.loader import find_image_folder, load
 
-    folder, images = find_image_folder(data.path)
+    named = data.path
+    folder, images = find_image_folder(named)
     if images is not None:
         data = replace(data, path=str(folder), images=images)
     options, notes = _complete_options(data, record)
     every = _HOLD_OUT_EVERY if options.test_every is None else options.test_every
-    found = load(options.path, options.size, images=options.images, test_every=every, near=options.near)
+    if images is not None:  # the user named the folder of images, which may therefore be a link to anywhere
+        options = replace(options, path=named, images=None)
+    found = load(
+        options.path, options.size, images=options.images, test_every=every, near=options.near,
+        trust_paths=options.trust_paths,
+    )  # fmt: skip
     return _set_name(data.path), found, notes
 
 
@@ -440,7 +448,7 @@ def _choose_background(
 
 def _set_name(path: str) -> str:
     """Return the name of a file or folder, changed if it equals that of virtual views."""
-    name = Path(path).resolve().name
+    name = resolve_links(path).name
     return f"./{name}" if name == VIRTUAL else name
 
 

@@ -1,5 +1,6 @@
 // The parameters of the address, and the error messages.
 import assert from 'node:assert/strict';
+import { readdirSync } from 'node:fs';
 import { test } from 'node:test';
 
 import * as spec from '../../../codec/js/spec.mjs';
@@ -148,6 +149,36 @@ test('an error has its code, offset and clause once', () => {
   const { title, facts } = explain({ code: 'E_CRC', message, offset: 12345, clause: 'CHK-1' });
   assert.equal(facts, 'E_CRC at byte 12,345 (CHK-1): the chunk has another CRC');
   assert.match(title, /damaged/);
+});
+
+test('advice follows what failed, not only the code', () => {
+  const fetching = (facts) => explain({ code: 'E_INPUT', message: 'x', ...facts });
+  const expected = [
+    [{ reason: 'connection' }, /could not be read/, /connection/],
+    [{ reason: 'server' }, /server does not send/, /server/],
+    [{ reason: 'busy', status: 503 }, /cannot send the file now/, /later/],
+    [{ reason: 'refused', status: 403 }, /access/, /expired/],
+    [{ reason: 'refused', status: 401 }, /access/, /Sign in/],
+    [{ reason: 'refused', status: 404 }, /could not be read/, /no file at this address/],
+    [{ reason: 'refused', status: 418 }, /could not be read/, /address/],
+    [{ reason: 'replaced' }, /was replaced on the server/, /Reload/],
+    [{ reason: 'local' }, /from disk/, /csplat export-html.*local server/],
+    [{}, /could not be read/, /address/],
+  ];
+  for (const [facts, title, advice] of expected) {
+    assert.match(fetching(facts).title, title, JSON.stringify(facts));
+    assert.match(fetching(facts).advice, advice, JSON.stringify(facts));
+  }
+  assert.match(explain({ code: 'E_CRC', message: 'x' }).advice, /^Reload the page/);
+});
+
+test('all modules but the one of the page can be imported where no document is', async () => {
+  const folder = new URL('../', import.meta.url);
+  const listen = globalThis.onmessage;
+  for (const name of readdirSync(folder)) {
+    if (name.endsWith('.mjs') && name !== 'main.mjs') await import(new URL(name, folder));
+  }
+  globalThis.onmessage = listen; // of the worker's module
 });
 
 test('a PLY is recognised by its name', () => {

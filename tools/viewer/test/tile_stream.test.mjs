@@ -134,37 +134,28 @@ test('weighted quantiles', () => {
   assert.deepEqual([0, 0.25, 0.5, 0.75, 1].map(at), [1, 1, 2, 2, 3]);
 });
 
-/** A server that sends ranges of a file, of the first request only header and index; `requests` lists them. */
+/** A server that sends ranges of a file; `requests` lists them, `options` requests only header and index first. */
 function served(data, { fails = () => false } = {}) {
   const { indexSize } = readHeader(data);
   const requests = [];
   const fetch = async (_, { headers, signal }) => {
-    const [start, last] = /bytes=(\d+)-(\d+)/.exec(headers.get('Range')).slice(1).map(Number);
-    const end = requests.length === 0 ? HEADER_SIZE + indexSize : last + 1;
+    const range = /bytes=(\d+)-(\d+)/.exec(headers.get('Range') ?? '');
+    const [start, last] = range ? range.slice(1).map(Number) : [0, data.length];
+    const end = last + 1;
     requests.push({ start, end });
     await new Promise((resolve) => setTimeout(resolve, 1));
     signal?.throwIfAborted();
     if (fails(requests.length)) throw new TypeError('failed to fetch');
     const body = data.subarray(start, end);
-    const range = `bytes ${start}-${start + body.length - 1}/${data.length}`;
-    return new Response(body, { status: 206, headers: { 'content-range': range } });
+    if (!range) return new Response(data);
+    const sent = `bytes ${start}-${start + body.length - 1}/${data.length}`;
+    return new Response(body, { status: 206, headers: { 'content-range': sent } });
   };
-  return { requests, fetch };
+  return { requests, fetch, options: { fetch, firstBytes: HEADER_SIZE + indexSize, retryMs: 0 } };
 }
 
 async function until(holds) {
   while (!holds()) await new Promise((resolve) => setTimeout(resolve, 1));
-}
-
-/** Run with another `fetch`. */
-async function withFetch(fetch, run) {
-  const own = globalThis.fetch;
-  globalThis.fetch = fetch;
-  try {
-    return await run();
-  } finally {
-    globalThis.fetch = own;
-  }
 }
 
 const LEVELS = bytes('valid/levels_of_the_rich_scene');
@@ -198,39 +189,37 @@ test('a view from far away requires the coarsest version alone', async () => {
 });
 
 test('no part is requested twice, and what is seen later is requested then', async () => {
-  const { fetch } = served(LEVELS);
-  await withFetch(fetch, async () => {
-    const sink = collector();
-    const aims = { ...AIMS, around: false };
-    const stream = await TileStream.open('http://example.test/a', sink, aims, new AbortController().signal);
-    const parts = [];
-    const { prefetch } = stream.reader;
-    stream.reader.prefetch = (wanted, options) => {
-      parts.push(...wanted.map(({ tile, layer }) => `${tile}.${layer}`));
-      prefetch.call(stream.reader, wanted, options);
-    };
-    await seen(stream, viewFrom(1e6)); // behind the camera
-    const before = parts.length;
-    await seen(stream, viewFrom(-300));
-    assert.ok(0 < before && before < parts.length);
-    assert.equal(parts.length, new Set(parts).size);
-  });
+  const { options } = served(LEVELS);
+  const sink = collector();
+  const aims = { ...AIMS, around: false };
+  const { signal } = new AbortController();
+  const stream = await TileStream.open('http://example.test/a', sink, aims, signal, options);
+  const parts = [];
+  const { prefetch } = stream.reader;
+  stream.reader.prefetch = (wanted, options) => {
+    parts.push(...wanted.map(({ tile, layer }) => `${tile}.${layer}`));
+    prefetch.call(stream.reader, wanted, options);
+  };
+  await seen(stream, viewFrom(1e6)); // behind the camera
+  const before = parts.length;
+  await seen(stream, viewFrom(-300));
+  assert.ok(0 < before && before < parts.length);
+  assert.equal(parts.length, new Set(parts).size);
 });
 
 test('what is not required any more is cancelled', async () => {
-  const { requests, fetch } = served(LEVELS);
-  await withFetch(fetch, async () => {
-    const aims = { ...AIMS, around: false };
-    const stream = await TileStream.open('http://example.test/a', collector(), aims, new AbortController().signal);
-    await seen(stream, viewFrom(1e6));
-    const before = requests.length;
-    stream.setView(viewFrom(-300));
-    const inFlight = [...stream.pending.values()];
-    stream.setView(viewFrom(1e6));
-    assert.ok(before < requests.length);
-    assert.ok(inFlight.length > 0);
-    assert.ok(inFlight.every(({ signal }) => signal.aborted));
-  });
+  const { requests, options } = served(LEVELS);
+  const aims = { ...AIMS, around: false };
+  const { signal } = new AbortController();
+  const stream = await TileStream.open('http://example.test/a', collector(), aims, signal, options);
+  await seen(stream, viewFrom(1e6));
+  const before = requests.length;
+  stream.setView(viewFrom(-300));
+  const inFlight = [...stream.pending.values()];
+  stream.setView(viewFrom(1e6));
+  assert.ok(before < requests.length);
+  assert.ok(inFlight.length > 0);
+  assert.ok(inFlight.every(({ signal }) => signal.aborted));
 });
 
 test('a damaged tile is reported, and the node above it stays', async () => {
@@ -253,27 +242,53 @@ test('a damaged root is an error', async () => {
   await assert.rejects(loaded(new Blob([damaged])), { code: 'E_CRC' });
 });
 
-test('a lost connection is reported once and tried again', async () => {
+test('a lost connection is reported once and tried again, without end once the scene is open', async () => {
   let isOnline = true;
-  const { fetch } = served(LEVELS, { fails: () => !isOnline });
-  await withFetch(fetch, async () => {
-    const sink = collector();
-    const stream = await TileStream.open('http://example.test/a', sink, AIMS, new AbortController().signal);
-    isOnline = false;
-    const done = seen(stream, viewFrom(-300));
-    await until(() => stream.isLost);
-    stream.retry();
-    await until(() => stream.isLost);
-    isOnline = true;
-    stream.retry(); // as when the browser is online again
-    await done;
-    assert.equal(tilesIn(sink.events).length, levelOf.size);
-    const warnings = sink.events.filter(({ type }) => type === 'warn');
-    assert.deepEqual(
-      warnings.map(({ error }) => error.code),
-      ['E_INPUT'],
-    );
+  let failures = 0;
+  const { options } = served(LEVELS, { fails: () => !isOnline && failures++ < 30 });
+  const sink = collector();
+  const { signal } = new AbortController();
+  const stream = await TileStream.open('http://example.test/a', sink, AIMS, signal, options);
+  isOnline = false;
+  await seen(stream, viewFrom(-300));
+  assert.ok(failures >= 30);
+  assert.equal(tilesIn(sink.events).length, levelOf.size);
+  const warnings = sink.events.filter(({ type }) => type === 'warn');
+  assert.deepEqual(
+    warnings.map(({ error }) => [error.code, error.reason]),
+    [['E_INPUT', 'connection']],
+  );
+});
+
+test('the first request is tried again, too, but not without end', async () => {
+  const { options, requests } = served(LEVELS, { fails: (n) => n < 3 });
+  const { signal } = new AbortController();
+  const sink = collector();
+  await TileStream.open('http://example.test/a', sink, AIMS, signal, { ...options, retries: 2 });
+  assert.ok(requests.length >= 3);
+  assert.equal(sink.events.filter(({ type }) => type === 'warn').length, 1);
+  const never = served(LEVELS, { fails: () => true });
+  const opening = TileStream.open('http://example.test/a', collector(), AIMS, signal, never.options);
+  await assert.rejects(opening, { code: 'E_INPUT', reason: 'connection' });
+});
+
+test('a file that is replaced while it is read ends the reading with that', async () => {
+  let isReplaced = false;
+  const { fetch, options } = served(LEVELS);
+  const later = async (...request) => {
+    const response = await fetch(...request);
+    const headers = { ...Object.fromEntries(response.headers), etag: isReplaced ? '"b"' : '"a"' };
+    const bytes = new Uint8Array(await response.arrayBuffer());
+    const sent = isReplaced ? bytes.map((byte) => byte ^ 1) : bytes;
+    return new Response(sent, { status: 206, headers });
+  };
+  const { signal } = new AbortController();
+  const stream = await TileStream.open('http://example.test/a', collector(), AIMS, signal, {
+    ...options,
+    fetch: later,
   });
+  isReplaced = true;
+  await assert.rejects(seen(stream, viewFrom(-300)), { code: 'E_INPUT', isReplaced: true });
 });
 
 test('a hidden page reads the coarsest version alone, and goes on when it is seen', async () => {

@@ -11,9 +11,8 @@ from __future__ import annotations
 
 import re
 import struct
-import textwrap
 from array import array
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 
 from csplat.disk_files import read_text
 from csplat.errors import InputError, counted
-from csplat.file_source import describe_substitute
+from csplat.file_source import describe_substitute, read_bytes
 from csplat.types import F32, F64
 from csplat_trainer.data.dataset import (
     Shot,
@@ -33,8 +32,17 @@ from csplat_trainer.data.dataset import (
     split_every,
     split_listed,
 )
-from csplat_trainer.data.image_files import abbreviate, describe_masks_among, describe_missing, find_images, find_masks
-from csplat_trainer.data.lens import UNDISTORTER, Lens
+from csplat_trainer.data.image_files import (
+    FoundImages,
+    abbreviate,
+    describe_masks_among,
+    describe_missing,
+    find_images,
+    find_masks,
+    printable,
+)
+from csplat_trainer.data.lens import SPLIT_PANORAMAS, UNDISTORTER, Lens, is_panorama
+from csplat_trainer.data.set_folder import SetFolder
 
 #: Folders with models in numbered subfolders, or with a model; the last one only if there is no other.
 _MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))
@@ -57,12 +65,12 @@ def find_model(folder: Path) -> tuple[Path, list[str]] | None:
 
 
 def read_colmap(
-    folder: Path, model: Path, size: tuple[int, int] | None, images: str | None, test_every: int
+    place: SetFolder, model: Path, size: tuple[int, int] | None, images: str | None, test_every: int
 ) -> UnreadDataSet:
     """Read a COLMAP set without the pixels.
 
     Args:
-        folder: folder of the set.
+        place: folder of the set.
         model: folder of the sparse model.
         size: requested size of the images; determines the folder of images.
         images: name of the folder of images; `None`: the smallest that is large enough.
@@ -71,17 +79,19 @@ def read_colmap(
     Raises:
         InputError: a file is damaged, or no image exists.
     """
+    folder = place.path
     cameras_path, images_path = _file(model, "cameras"), _file(model, "images")
     assert cameras_path is not None
     assert images_path is not None
+    same, other = images_path.with_suffix(".txt"), cameras_path.with_suffix(".txt")
+    for path in (cameras_path, images_path, same, other):
+        place.checked(path)
     registered, report = read_images(images_path)
     used = {image.camera for image in registered}
-    cameras = read_cameras(cameras_path, used)
-    same = images_path.with_suffix(".txt")
+    cameras = read_cameras(cameras_path, used, report)
     if same != images_path and same.is_file() and (there := count_images(same)) != len(registered):
         what = f"{same.name} has {counted(there, 'image')}, {images_path.name} {len(registered)}"
         report.append(f"{what}: {images_path.name} is read")
-    other = cameras_path.with_suffix(".txt")
     if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other, used)):
         report.append(f"{other.name} has other cameras than {cameras_path.name}, which is read")
     if not registered:
@@ -91,23 +101,34 @@ def read_colmap(
             raise InputError(f"{images_path}: {image.name} has camera {image.camera}, which {cameras_path} lacks")
     registered = _each_once(registered, images_path, report)
     names = [image.name for image in registered]
-    found = find_images(folder, names, images_path.name, _folders(folder, model, images), size)
+    found = find_images(place, names, images_path.name, _folders(place, model, images), size)
     report.append("images from " + ("the folder itself" if found.folder == folder else _relative(found.folder, folder)))
     report += found.notes
     report += describe_missing([name for name in names if name not in found.files], len(names), images_path.name)
-    masks = _masks(folder, found.files, report)
+    masks = _masks(place, found.files, report)
     shots = [
-        Shot(image.name, found.files[image.name], cameras[image.camera], image.viewmat, masks.get(image.name))
+        Shot(
+            _shown_name(image.name, found),
+            found.files[image.name],
+            cameras[image.camera],
+            image.viewmat,
+            masks.get(image.name),
+        )
         for image in registered
         if image.name in found.files
     ]
-    points, colours = _points(model, report)
-    lists, files = read_split_lists((model, model.parent, folder))
+    points, colours = _points(place, model, report)
+    lists, files = read_split_lists(place, (model, model.parent, folder))
     if lists:
         train, val, test = split_listed(shots, lists, files, report)
         return UnreadDataSet("COLMAP set", train, test, points, colours, report, val=val)
     train, test = split_every(shots, test_every, report)
     return UnreadDataSet("COLMAP set", train, test, points, colours, report, test_every)
+
+
+def _shown_name(name: str, found: FoundImages) -> str:
+    """Return the name of an image, or that of its file if the name is not UTF-8."""
+    return name if name == printable(name) else printable(_relative(found.files[name], found.folder))
 
 
 def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> list[ColmapImage]:
@@ -163,14 +184,16 @@ def _count(model: Path) -> int:
         return -1
 
 
-def _folders(folder: Path, model: Path, images: str | None) -> tuple[str, ...]:
+def _folders(place: SetFolder, model: Path, images: str | None) -> tuple[str, ...]:
     """Return the folders to search for images."""
     if images is not None:
-        if not (folder / images).is_dir():
-            raise InputError(f"{folder} has no folder {images}")
+        if not place.holds(place.path / images):
+            raise place.refusal(Path(images))
+        if not (place.path / images).is_dir():
+            raise InputError(f"{place.path} has no folder {images}")
         return (images,)
     first, second, *others = _IMAGE_FOLDERS
-    return (second, first, *others) if _UNDISTORTED_FIRST in _relative(model, folder).split("/") else _IMAGE_FOLDERS
+    return (second, first, *others) if _UNDISTORTED_FIRST in _relative(model, place.path).split("/") else _IMAGE_FOLDERS
 
 
 def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
@@ -182,10 +205,10 @@ def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
     return len(cameras) == len(others) and np.allclose(numbers(cameras), numbers(others), rtol=1e-4)
 
 
-def _masks(folder: Path, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
+def _masks(place: SetFolder, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
     """Find the masks of images, and report images without one."""
     names = list(images)
-    masks = find_masks(folder, names)
+    masks = find_masks(place, images)
     if masks is None:
         report += describe_masks_among(list(images.values()))
         return {}
@@ -197,14 +220,14 @@ def _masks(folder: Path, images: dict[str, Path], report: list[str]) -> dict[str
     return masks.files
 
 
-def _points(model: Path, report: list[str]) -> tuple[F64, F32] | tuple[None, None]:
+def _points(place: SetFolder, model: Path, report: list[str]) -> tuple[F64, F32] | tuple[None, None]:
     """Read the points of a model, or of the PLY that 3DGS writes."""
     path = _file(model, "points3D")
     if path is not None:
-        return read_points(path)
+        return read_points(place.checked(path), report)
     if (model / "points3D.ply").is_file():
         report.append("points from points3D.ply")
-        return read_point_cloud(model / "points3D.ply")
+        return read_point_cloud(place.checked(model / "points3D.ply"))
     return None, None
 
 
@@ -254,7 +277,8 @@ _LAYOUTS = {
 }
 
 
-_ID_DIGITS = 20  # maximum digits of an id or a size; COLMAP counts in 64 bits
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?$")
+_ID_DIGITS = 20  # digits of the longest id or size; COLMAP counts in 64 bits
 _SHOWN = 80  # maximum number of characters of a word in a message
 _NO_NUMBER = re.compile(r"^[+-]?(nan\(.*\)|1\.#(ind|qnan|snan|inf)0*)$", re.IGNORECASE)
 
@@ -274,19 +298,22 @@ class ColmapImage:
     viewmat: F64
 
 
-def read_cameras(path: Path, used: Collection[int] | None = None) -> dict[int, Lens]:
+def read_cameras(path: Path, used: Collection[int] | None = None, report: list[str] | None = None) -> dict[int, Lens]:
     """Read cameras.bin or cameras.txt.
 
     Args:
         path: the file; its suffix determines the form.
         used: ids of the cameras to read; lenses of others are ignored. `None`: all.
+        report: a line is appended if numbers have decimal commas.
 
     Raises:
         InputError: the file is damaged, or has a lens that is not supported.
     """
     cameras = {}
     if path.suffix == ".txt":
-        for words, where in _lines(path):
+        rows = list(_lines(path))
+        _check_commas(path, [(words[2:], where) for words, where in rows], report)
+        for words, where in rows:
             number = _integer(words[0], where)
             if used is not None and number not in used:
                 continue
@@ -322,6 +349,7 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     notes: list[str] = []
     if path.suffix == ".txt":
         lines, notes = _image_lines(path)
+        _check_commas(path, [(line.split(None, 9)[1:8], where) for line, where in lines], notes)
         for line, where in lines:
             words = line.split(None, 9)
             if len(words) < 10:
@@ -353,8 +381,12 @@ def count_images(path: Path) -> int:
     return len(_image_lines(path)[0]) if path.suffix == ".txt" else _BinaryFile(path).count(73)
 
 
-def read_points(path: Path) -> tuple[F64, F32]:
+def read_points(path: Path, report: list[str] | None = None) -> tuple[F64, F32]:
     """Read points3D.bin or points3D.txt.
+
+    Args:
+        path: the file; its suffix determines the form.
+        report: a line is appended if numbers have decimal commas.
 
     Returns:
         Points, [P, 3] float64, and their colours, [P, 3] float32 in 0..1. Points that are not finite, or overflow
@@ -362,7 +394,9 @@ def read_points(path: Path) -> tuple[F64, F32]:
     """
     points: list[tuple[float, ...]] = []
     if path.suffix == ".txt":
-        for words, where in _lines(path):
+        rows = list(_lines(path))
+        _check_commas(path, [(words[1:8], where) for words, where in rows], report)
+        for words, where in rows:
             if len(words) < 7:
                 raise InputError(f"{where}: expected id, position and colour")
             points.append(tuple(_numbers(words[1:7], where)))
@@ -382,7 +416,7 @@ class _BinaryFile:
 
     def __init__(self, path: Path) -> None:
         try:
-            self._data = path.read_bytes()
+            self._data = read_bytes(path)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror or error}") from error
         instead = describe_substitute(self._data[:64])
@@ -412,10 +446,7 @@ class _BinaryFile:
         if any(byte < ord(" ") for byte in name):
             raise InputError(f"{self._path}: the name at byte {self._at} has control characters")
         self._at = end + 1
-        try:
-            return name.decode("utf-8")
-        except UnicodeDecodeError:
-            return name.decode("cp1252", "replace")  # COLMAP on Windows writes in the system's code page
+        return name.decode("utf-8", "surrogateescape")  # COLMAP on Windows writes in the system's code page
 
     def skip(self, size: int) -> None:
         self._need(size)
@@ -446,7 +477,7 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     Returns:
         The lines of poses, each with its place in the file; and a line for the report if a second line is missing.
     """
-    lines = read_text(path).split("\n")
+    lines = read_text(path, any_bytes=True).split("\n")
     first = next((number for number, line in enumerate(lines) if line.strip() and not _is_comment(line)), len(lines))
     numbers = array("q", (number for number in range(first, len(lines)) if not _is_comment(lines[number])))
 
@@ -486,7 +517,7 @@ def _is_keypoints(words: list[str]) -> bool:
     if len(words) % 3:
         return False
     try:
-        return all(float(_NO_NUMBER.sub("nan", word)) is not None for word in words)
+        return all(_parse_number(word) is not None for word in words)
     except ValueError:
         return False
 
@@ -497,12 +528,46 @@ def _is_pose(line: str) -> bool:
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
-    """Parse numbers, including NaN, which C++ programs on Windows write as `-nan(ind)` and `1.#IND`."""
-    words = [_NO_NUMBER.sub("nan", word) for word in words]
-    try:
-        return [float(word) for word in words]
-    except ValueError as error:
-        raise InputError(f"{where}: {textwrap.shorten(str(error), _SHOWN)}") from None
+    """Parse numbers, as `_parse_number` does."""
+    values = []
+    for word in words:
+        try:
+            values.append(_parse_number(word))
+        except ValueError:
+            raise InputError(f"{where}: {printable(word[:_SHOWN])!r} is not a number") from None
+    return values
+
+
+def _parse_number(word: str) -> float:
+    """Parse a number with a point or comma, or NaN, which C++ programs on Windows write as `-nan(ind)` and `1.#IND`."""
+    if "_" in word:  # Python's separator of digits
+        raise ValueError
+    return float(_NO_NUMBER.sub("nan", word.replace(",", ".") if _DECIMAL_COMMA.match(word) else word))
+
+
+def _check_commas(path: Path, rows: Iterable[tuple[list[str], str]], report: list[str] | None) -> None:
+    """Report decimal commas, as programs write in some languages.
+
+    Raises:
+        InputError: the file has other commas, or commas as well as points, so that either may separate thousands.
+    """
+    comma = point = None
+    for words, where in rows:
+        for word in words:
+            if "," in word:
+                if not _DECIMAL_COMMA.match(word):
+                    shown = printable(word[:_SHOWN])
+                    raise InputError(f"{where}: {shown!r} has a comma, expected a number such as 0.5")
+                comma = comma or (word, where)
+            elif "." in word and not _NO_NUMBER.match(word):
+                point = point or (word, where)
+    if comma and point:
+        raise InputError(
+            f"{comma[1]}: {comma[0]} has a comma, but {point[0]} in {point[1].rpartition(', ')[2]} a point: expected "
+            "points, and no separators of thousands"
+        )
+    if comma and report is not None:
+        report.append(f"{path.name}: decimal commas are read as points: {comma[0]} is {_parse_number(comma[0]):g}, …")
 
 
 def _integer(word: str, where: str) -> int:
@@ -514,7 +579,8 @@ def _integer(word: str, where: str) -> int:
 def _lens(model: str, width: float, height: float, values: list[float], where: str) -> Lens:
     layout = _LAYOUTS.get(model, "").split()
     if not layout:
-        raise InputError(f"{where}: the lens is {model}, expected one of {', '.join(_LAYOUTS)}: use {UNDISTORTER}")
+        remedy = SPLIT_PANORAMAS if is_panorama(model) else f"use {UNDISTORTER}"
+        raise InputError(f"{where}: the lens is {model}, expected one of {', '.join(_LAYOUTS)}: {remedy}")
     if len(values) != len(layout):
         raise InputError(f"{where}: the lens {model} has {len(values)} parameters, expected {' '.join(layout)}")
     named = dict(zip(layout, values, strict=True))

@@ -14,15 +14,17 @@ from scipy.ndimage import map_coordinates
 from csplat.disk_files import read_json, read_text
 from csplat.editing.up_axis import Direction
 from csplat.errors import InputError, counted
+from csplat.image_opener import open_image
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED
 from csplat.ply.ply_reader import parse_ply
 from csplat.training_record import TrainingRecord
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import DEFAULT_NEAR, Camera, camera_outliers, nearest_point
-from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name
-from csplat_trainer.data.image_pixels import MASK_THRESHOLD, ImageHeader, mask_values, open_image, rgb_pixels
+from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name, printable
+from csplat_trainer.data.image_pixels import MASK_THRESHOLD, ImageHeader, mask_values, rgb_pixels
 from csplat_trainer.data.lens import Lens, distorted, undistorted_lens
+from csplat_trainer.data.set_folder import SetFolder
 from csplat_trainer.posed_images import PosedImage, UnreadMask, UnreadPixels
 
 _BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -163,33 +165,35 @@ _SCANNET = "train_test_lists.json"  # split file of ScanNet++
 ROLES = {"train": "training", "val": "validation", "test": "test"}
 
 
-def read_split_lists(folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
+def read_split_lists(place: SetFolder, folders: Sequence[Path]) -> tuple[dict[str, list[str]], str]:
     """Read the files that list images: ScanNet++'s `train_test_lists.json`, or text files with a name per line.
 
     Text files are called `test.txt` or `test_list.txt`, and likewise for `val` and `train`.
 
     Args:
+        place: the folder of the set.
         folders: folders to search; the first with lists is used.
 
     Returns:
         Lines by `train`, `val` and `test`, and the files' names.
 
     Raises:
-        InputError: a file is not UTF-8 text.
+        InputError: a file is not text, or is a link that leads out of the folder of the set.
     """
     for folder in folders:
         document = folder / _SCANNET
         if document.is_file():
-            return _read_scannet_lists(document), document.name
+            return _read_scannet_lists(place.checked(document)), document.name
         files = {role: path for role in ROLES for path in _list_files(folder, role)[:1]}
         if files:
-            lists = {role: read_text(path).splitlines() for role, path in files.items()}
+            texts = {role: read_text(place.checked(path), any_bytes=True) for role, path in files.items()}
+            lists = {role: text.split("\n") for role, text in texts.items()}
             return lists, ", ".join(path.name for path in files.values())
     return {}, ""
 
 
 def _read_scannet_lists(path: Path) -> dict[str, list[str]]:
-    document = read_json(path)
+    document = read_json(path, any_bytes=True)
     lists = {role: document.get(role) for role in ROLES} if isinstance(document, dict) else {}
     found = {role: names for role, names in lists.items() if isinstance(names, list)}
     if not found or not all(isinstance(name, str) for names in found.values() for name in names):
@@ -198,7 +202,7 @@ def _read_scannet_lists(path: Path) -> dict[str, list[str]]:
 
 
 def _list_files(folder: Path, role: str) -> list[Path]:
-    names = {path.name.casefold(): path for path in folder.glob("*.[tT][xX][tT]")}
+    names = {path.name.casefold(): path for path in folder.glob("*.[tT][xX][tT]") if path.is_file()}
     return [names[name] for name in (f"{role}.txt", f"{role}_list.txt") if name in names]
 
 
@@ -267,6 +271,12 @@ def split_listed(
         found, notes = match_names(names, by_name, where)
         report += notes
         missing = [name for name in names if name not in found]
+        unread = next((name for name in missing if name != printable(name)), None)
+        if unread is not None:
+            raise InputError(
+                f"{where} is not a text file in UTF-8 ({printable(unread)} is no image in any code page): save it as "
+                "UTF-8"
+            )
         line = f"{where} names {counted(len(names), f'{word} image')}"
         report.append(f"{line}, found {len(found)}; missing: {abbreviate(missing)}" if missing else line)
         heeded += [role] if found else []
@@ -373,7 +383,7 @@ def _read_pixels(
 def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> Mask:
     """Return the pixels of an image that count, those with a mask brighter than half; the mask's size may differ."""
     sides = int(lens.width), int(lens.height)
-    with open_image(path) as stored:
+    with open_image(path, budget=False) as stored:  # compared with the size of its image before
         values = mask_values(stored, path).values
         if _is_turned(stored, lens):
             values = _turn_upright(values, stored)

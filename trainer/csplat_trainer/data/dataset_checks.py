@@ -12,14 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.errors import InputError, counted
+from csplat.image_opener import open_image
 from csplat_render.camera import camera_outliers, convergence, nearest_point
 from csplat_render.camera_files import check_intrinsics
 from csplat_trainer.data.dataset import Shot, shown_size
-from csplat_trainer.data.image_pixels import ImageHeader, image_size, mask_values, open_image, value_range
+from csplat_trainer.data.image_pixels import ImageHeader, mask_values, value_range
 from csplat_trainer.data.lens import Lens, undistorted_lens
 
 _ROUNDING = 1.0  # pixels by which each side of a scaled-down image may be rounded
 _NEARLY = 0.02  # relative difference of both scales, beyond which an image is turned or a mask belongs to another
+_LARGER = 16  # pixels of an image per pixel of its camera, at most: four times its width and height
+_FREE_PIXELS = 1 << 22  # images of at most this many pixels are read whatever the size of their camera
 _MIDDLE = (0.25, 0.75)  # fractions of the image; principal points outside this range are reported
 _SMALL_RANGE = 1.0 / 8.0  # fraction of the 16-bit range; 12-bit images use less
 _SAME = 1e-9  # relative difference of positions; coordinates of maps are a million times the distance of cameras
@@ -49,8 +52,12 @@ def check_shots(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) -> Non
             source = f"given by {lens.source}" if lens.source else "that of its camera"
             remedy = "the sides are swapped: turn the images, or compute poses of the images as stored"
             raise _aspect_error(shot.path, size, expected, source, remedy)
+        _check_size(shot.path, size, expected, "its camera")
         if shot.mask is not None:
-            mask_size = shown_size(shot.mask, image_size(shot.mask), lens)
+            with open_image(shot.mask, budget=False) as image:
+                mask_size = image.size
+            _check_size(shot.mask, mask_size, size, f"its image ({shot.name})")
+            mask_size = shown_size(shot.mask, mask_size, lens)
             if _aspect_mismatch(mask_size, size) > _NEARLY:
                 remedy = "it is the mask of another image"
                 raise _aspect_error(shot.mask, mask_size, size, f"that of its image ({shot.name})", remedy)
@@ -69,10 +76,10 @@ def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) ->
         line = f"{counted(len(files), 'image')} of {stored_as}: 0 to {white:g} is read as black to white"
         line += f"; the first, {files[0].name}, has {low:g} to {high:g}"
         notes.append(line + (": scale them if that is too dark" if high < _SMALL_RANGE * white else ""))
-    several = [head for head in heads.values() if head.frame_count > 1]
+    several = [head for head in heads.values() if head.has_others]
     if several:
         what = f"{counted(len(several), 'file')} with several images: the first of each is read"
-        notes.append(f"{what} ({several[0].path.name} has {several[0].frame_count})")
+        notes.append(f"{what} (such as {several[0].path.name})")
     sizes = {shot.path: shown_size(shot.path, heads[shot.path].size, shot.lens) for shot in shots}
     misfits = [shot for shot in shots if _aspect_mismatch(sizes[shot.path], (shot.lens.width, shot.lens.height)) > 0.0]
     if misfits:
@@ -94,7 +101,7 @@ def describe_images(shots: Sequence[Shot], heads: Mapping[Path, ImageHeader]) ->
         )
     mask = next((shot.mask for shot in shots if shot.mask is not None), None)
     if mask is not None:
-        with open_image(mask) as image:
+        with open_image(mask, budget=False) as image:
             taken_as = mask_values(image, mask).taken_as
         if taken_as:
             notes.append(f"masks such as {mask.name}: {taken_as}")
@@ -175,6 +182,15 @@ def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
     lens = shot.lens
     across, down = np.abs(x) * lens.fx <= lens.width * z, np.abs(y) * lens.fy <= lens.height * z
     return bool(((z > 0.0) & across & down).any())
+
+
+def _check_size(path: Path, size: tuple[int, int], expected: tuple[float, float], of: str) -> None:
+    """Refuse an image that is much larger than expected, before it is decoded: a few bytes can be a billion pixels."""
+    most = max(_FREE_PIXELS, _LARGER * expected[0] * expected[1])
+    if size[0] * size[1] > most:
+        raise InputError(
+            f"{path} has {size[0]}×{size[1]} pixels, expected about {expected[0]:g}×{expected[1]:g} as {of}: scale it"
+        )
 
 
 def _aspect_error(

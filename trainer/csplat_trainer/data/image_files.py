@@ -6,13 +6,16 @@ matched by these rules in order, and every rule but the first is reported when i
 1. as written;
 2. `\` as `/`, without a drive letter and surrounding spaces;
 3. as a URL: without `file:`, `%20` as a space;
-4. in another case or Unicode form;
+4. in another Unicode form, or in another case;
 5. with another image suffix, or with one if there is none (Blender's names), in any case;
 6. without its leading folders, if rules 1 to 5 match no name at all;
-7. in a folder below, if rule 6 matches none either.
+7. in a folder below, if rule 6 matches none either;
+8. under another code page, by all the rules above: bytes that are not UTF-8, or letters that result from reading a name
+   in a wrong code page; if one code page explains most of the names that are left.
 
 Rules 4 to 7 also apply rules 2 and 3. A name that matches two files is an error, and so are two names that match one
-file.
+file. Names that lead out of the folder of the set are matched by rules 6 and 7 alone, unless the set is trusted
+(`SetFolder`).
 """
 
 from __future__ import annotations
@@ -20,18 +23,36 @@ from __future__ import annotations
 import os
 import re
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote
 
 from csplat.errors import InputError, counted
 from csplat_trainer.data.image_pixels import image_size
+from csplat_trainer.data.set_folder import SetFolder
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".avif", ".tif", ".tiff", ".bmp", ".jp2")
+#: Suffixes of images; files of the last ones are found, and refused by name.
+IMAGE_ENDINGS = (
+    *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp"),
+    *(".avif", ".heic", ".heif", ".jp2", ".jxl", ".gif", ".exr"),
+)
 _SHOWN = 5  # largest number of names in a message
+_SHOWN_MAX = 200  # characters of each
 
 _FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
+_MASK_FOLDERS = ("masks", "mask", "_masks", "_mask")
+_MASK_AFFIX = re.compile(r"^masks?[_.-]|[_. -]masks?$", re.IGNORECASE)
+
+#: Code pages of file names, by Python's names: Chinese, Japanese, Korean, European, Cyrillic, and those of zips.
+_CODE_PAGES = {
+    "gb18030": "GBK", "cp932": "Shift-JIS", "cp950": "Big5", "cp949": "EUC-KR", "euc_jp": "EUC-JP",
+    "cp1252": "Windows-1252", "cp1250": "Windows-1250", "cp1251": "Windows-1251", "cp437": "CP437", "cp850": "CP850",
+    "utf-8": "UTF-8",
+}  # fmt: skip
+_MISREAD_AS = ("cp437", "cp850", "cp1252", "gb18030", "cp932", "cp950", "cp949")  # by programs that unpack archives
+_MOST = 0.5  # least fraction of the names that a code page has to explain
 
 _Key = Callable[[str], str]
 
@@ -68,64 +89,96 @@ def describe_missing(missing: Sequence[str], count: int, where: str) -> list[str
 
 
 def find_images(
-    root: Path, names: Sequence[str], where: str, folders: Sequence[str], size: tuple[int, int] | None = None
+    place: SetFolder, names: Sequence[str], where: str, folders: Sequence[str], size: tuple[int, int] | None = None
 ) -> FoundImages:
     """Find the images that a set names, in the first of some folders that has any of them.
 
     Args:
-        root: the folder of the set.
+        place: the folder of the set.
         names: names in the set, at least one.
         where: the file that names them, for messages.
-        folders: folders to try in this order, relative to `root`. `.` is `root` itself; it comes last when leading
-            folders of names are ignored. Each includes folders of smaller images next to it: `images` includes
-            `images_2`, `images_4`, …
+        folders: folders to try in this order, relative to that of the set. `.` is that folder itself; it comes last
+            when leading folders of names are ignored. Each includes folders of smaller images next to it: `images`
+            includes `images_2`, `images_4`, …
         size: requested width and height, for which the smallest sufficient of such folders is used; `None`: the first.
 
     Raises:
         NoImagesError: none of the images exists.
-        InputError: as for `match_names`.
+        InputError: as for `match_names`; or an image exists, but outside of the folder.
     """
-    groups = {folder: _size_folders(root, folder) for folder in dict.fromkeys(folders)}
+    root = place.path
+    groups = {folder: _size_folders(place, folder) for folder in dict.fromkeys(folders)}
     for loose in (False, True):
         for folder in sorted(groups, key=lambda one: loose and one == "."):
-            found = [one for path in groups[folder] if (one := _find_in(path, names, where, loose=loose)).files]
+            found = [one for path in groups[folder] if (one := _find_in(place, path, names, where, loose=loose)).files]
             if found:
                 large = [one for one in found[1:] if size is not None and _is_large(one, size)]
-                return large[-1] if large else found[0]
+                chosen = large[-1] if large else found[0]
+                _refuse_outside(place, [chosen.folder], [name for name in names if name not in chosen.files], where)
+                return chosen
+    _refuse_outside(place, [path for paths in groups.values() for path in paths], names, where)
     tried = ", ".join(f"{root}/{folder}" if folder != "." else f"{root} itself" for folder in groups)
     others = next((name for paths in groups.values() for path in paths for name in _images_below(path)), None)
-    hint = f"; there are other images, such as {others}" if others else ""
+    hint = f"; there are other images, such as {printable(others)}" if others else ""
+    if any(name != printable(name) for name in names):
+        hint += f"; names are not UTF-8, and match no file under {', '.join(_CODE_PAGES.values())}"
     raise NoImagesError(
         f"{where}: none of its {len(names)} images exists ({abbreviate(names[:1])}, …): searched {tried}{hint}"
     )
 
 
-def find_masks(root: Path, names: Sequence[str]) -> FoundImages | None:
-    """Find the masks of images in a folder `masks` or `mask`: `1.png`, `1.jpg.png`, `1_mask.png` or `mask_1.png`.
+def _refuse_outside(place: SetFolder, folders: Sequence[Path], names: Iterable[str], where: str) -> None:
+    for name in names:
+        path = next((folder / name for folder in folders if place.finds_outside(folder / name)), None)
+        if path is not None:
+            raise place.refusal(Path(printable(name)), where)
+
+
+def find_masks(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | None:
+    """Find the masks of images in a folder `masks` or `mask`, or those of RealityScan next to the images.
+
+    In a folder, the masks of `1.jpg` are called `1.png`, `1.jpg.png`, `1_mask.png`, `mask_1.png` or `1.jpg.mask.png`.
+    Next to the images, `1.jpg.mask.png` is accepted, which cannot be an image.
 
     Args:
-        root: the folder of the set.
-        names: names of the images in the set.
+        place: the folder of the set.
+        images: images by their names in the set.
 
     Returns:
-        The masks by names of images; `None` if there is no such folder.
+        The masks by names of images; `None` if there are none.
 
     Raises:
-        InputError: as for `match_names`.
+        InputError: as for `match_names`; or a mask is a link that leads out of the folder.
     """
-    folder = next((folder for name in ("masks", "mask") for folder in _size_folders(root, name)[:1]), None)
+    folder = next((folder for name in _MASK_FOLDERS for folder in _size_folders(place, name)[:1]), None)
     if folder is None:
-        return None
+        return _masks_next_to(place, images)
     known, where = list(_images_below(folder)), f"{folder.name}/"
-    longer = {f"{name}.png": name for name in names}
+    longer = {f"{name}.png": name for name in images}
     files = {longer[name]: folder / name for name in known if name in longer}
-    left = [name for name in names if name not in files]
+    left = [name for name in images if name not in files]
     matched, notes = match_names(left, known, where)
     if not matched:
         shorter = {_without_affix(name): name for name in known}
         matched, notes = match_names(left, shorter, where)
         matched = {name: shorter[to] for name, to in matched.items()}
-    return FoundImages(folder, files | {name: folder / to for name, to in matched.items()}, notes)
+    files |= {name: folder / to for name, to in matched.items()}
+    return FoundImages(folder, {name: place.checked(path) for name, path in files.items()}, notes)
+
+
+def _masks_next_to(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | None:
+    """Find masks whose names are those of images, followed by `.mask` and a suffix, in any case."""
+    folders = {path.parent: {one.name.casefold(): one for one in path.parent.iterdir()} for path in images.values()}
+    files = {}
+    for name, path in images.items():
+        masks = (folders[path.parent].get(f"{path.name}.mask{ending}".casefold()) for ending in IMAGE_ENDINGS)
+        mask = next((mask for mask in masks if mask is not None), None)
+        if mask is not None:
+            files[name] = place.checked(mask)
+    if not files:
+        return None
+    first = next(iter(files.values()))
+    return FoundImages(first.parent, files, [f"masks next to the images, such as {first.name}"])
 
 
 def describe_masks_among(images: Sequence[Path]) -> list[str]:
@@ -139,9 +192,13 @@ def describe_masks_among(images: Sequence[Path]) -> list[str]:
 
 
 def _without_affix(name: str) -> str:
+    """Return the name of a mask without its affix: `1.png` for `1_mask.png`, and `1.jpg` for `1.jpg.mask.png`."""
     path = PurePosixPath(name)
-    stem = re.sub(r"^mask[_.-]|[_.-]mask$", "", path.stem, flags=re.IGNORECASE)
-    return path.with_name(stem + path.suffix).as_posix() if stem else name
+    stem = _MASK_AFFIX.sub("", path.stem)
+    if not stem:
+        return name
+    whole = PurePosixPath(stem).suffix.lower() in IMAGE_ENDINGS
+    return path.with_name(stem if whole else stem + path.suffix).as_posix()
 
 
 def match_names(
@@ -159,8 +216,20 @@ def match_names(
         Existing names by listed ones, without missing ones; and a line for each rule that was used.
 
     Raises:
-        InputError: a name matches two existing ones, or two names match one.
+        InputError: a name matches two existing ones, or two names match one; or code pages contradict each other.
     """
+    left, free = dict.fromkeys(names), dict.fromkeys(known)
+    matched, notes = _match_by_rules(left, free, where, folders=folders)
+    left = {name: None for name in left if name not in matched}
+    taken = set(matched.values())
+    more, line = _match_code_pages(left, [name for name in free if name not in taken], where, folders=folders)
+    return matched | more, notes + line
+
+
+def _match_by_rules(
+    names: Iterable[str], known: Iterable[str], where: str, *, folders: bool
+) -> tuple[dict[str, str], list[str]]:
+    """Match names by rules 1 to 7; arguments and result are those of `match_names`."""
     left, free = dict.fromkeys(names), dict.fromkeys(known)
     matched: dict[str, str] = {}
     notes: list[str] = []
@@ -177,8 +246,76 @@ def match_names(
         if loose:
             name, to = next(iter(loose.items()))
             more = ", …" if len(loose) > 1 else ""
-            notes.append(f"{counted(len(loose), 'name')} of {where} found {words}: {name} is {to}{more}")
+            text = f"{counted(len(loose), 'name')} of {where} found {words}: {printable(name)} is {printable(to)}{more}"
+            notes.append(text)
     return matched, notes
+
+
+def _match_code_pages(
+    names: Iterable[str], known: Sequence[str], where: str, *, folders: bool
+) -> tuple[dict[str, str], list[str]]:
+    """Match names by rule 8; arguments and result are those of `match_names`."""
+    listed, other = ([name for name in some if not name.isascii()] for some in (names, known))
+    best: dict[str, tuple[dict[str, str], str]] = {}  # by the mapping, which several code pages may give
+    most = max(1.0, _MOST * len(listed))
+    stems = {_stem(name) for name in known}, {_stem(name) for name in listed}
+    for translate, title in _translations() if listed else ():
+        for forwards in (True, False):
+            ours, theirs = ({name: name for name in some} for some in (listed, known if forwards else other))
+            given = ours if forwards else theirs
+            given = {read: name for name in given if (read := translate(name)) is not None and read != name}
+            if sum(_stem(name) in stems[not forwards] for name in given) < most:
+                continue
+            ours, theirs = (given, theirs) if forwards else (ours, given)
+            try:
+                found, _ = _match_by_rules(ours, theirs, where, folders=folders)
+            except InputError:
+                continue
+            found = {ours[name]: theirs[to] for name, to in found.items()}
+            if len(found) >= most:
+                if len(found) > most:
+                    best = {key: value for key, value in best.items() if len(value[0]) >= len(found)}
+                most = max(most, float(len(found)))
+                best.setdefault(repr(sorted(found.items())), (found, title))
+    if not best:
+        return {}, []
+    if len(best) > 1:
+        titles = " and ".join(title for _, title in list(best.values())[:2])
+        raise InputError(f"{where}: names match different files in {titles}: rename the files, or write UTF-8")
+    ((found, title),) = best.values()
+    name, to = next(iter(found.items()))
+    text = f"{counted(len(found), 'name')} of {where} found in the code page {title}: {printable(name)} is"
+    return found, [f"{text} {printable(to)}" + (", …" if len(found) > 1 else "")]
+
+
+def _stem(name: str) -> str:
+    """Return the part of a name that all rules leave unchanged."""
+    stem = PurePosixPath(name.replace("\\", "/")).name.partition(".")[0]
+    return unicodedata.normalize("NFC", stem).casefold().strip()
+
+
+def _translations() -> Iterator[tuple[Callable[[str], str | None], str]]:
+    """Yield functions that read a name in another code page, or return `None`; and the titles of the code pages."""
+
+    def read(name: str, wrong: str, right: str) -> str | None:
+        try:
+            data = name.encode(wrong, "surrogateescape" if wrong == "utf-8" else "strict")
+            return data.decode(right)
+        except UnicodeError:
+            return None
+
+    for wrong in ("utf-8", *_MISREAD_AS):
+        for right, title in _CODE_PAGES.items():
+            if wrong != right:
+                yield partial(read, wrong=wrong, right=right), title
+
+
+def printable(name: str) -> str:
+    """Return a name with bytes that are not UTF-8 (lone surrogates) as escapes."""
+    try:
+        return name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    except UnicodeEncodeError:  # surrogates that are no bytes, from JSON
+        return name.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
 def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[tuple[_Key, _Key]]]]:
@@ -187,8 +324,11 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
     def decode(name: str) -> str:
         return normalise_name(unquote(re.sub(r"^file:(//)?(?=/)", "", name)))
 
+    def compose(name: str) -> str:
+        return unicodedata.normalize("NFC", decode(name))
+
     def fold(name: str) -> str:
-        return unicodedata.normalize("NFC", decode(name)).casefold()
+        return compose(name).casefold()
 
     def strip_ending(name: str) -> str:
         path = PurePosixPath(decode(name))
@@ -213,6 +353,7 @@ def _rules(names: Iterable[str], *, folders: bool) -> Iterator[tuple[str, list[t
     yield "", [(_as_written, _as_written)]
     yield "with / for \\, without surrounding spaces", [(normalise_name, normalise_name)]
     yield "as a URL", [(decode, normalise_name)]
+    yield "in another Unicode form", [(compose, compose)]
     yield "in another case", [(fold, fold)]
     yield "with another ending", [(strip_ending, strip_ending), (lambda name: fold(strip_ending(name)),) * 2]
     if not folders:
@@ -258,12 +399,14 @@ def _only_lacks_ending(name: str, known: str) -> bool:
 
 def abbreviate(names: Sequence[str]) -> str:
     """Return the first few names, for a message."""
-    return ", ".join(names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
+    return ", ".join(printable(name)[:_SHOWN_MAX] for name in names[:_SHOWN]) + (", …" if len(names) > _SHOWN else "")
 
 
-def _size_folders(root: Path, folder: str) -> list[Path]:
+def _size_folders(place: SetFolder, folder: str) -> list[Path]:
     """Find a folder, in any case, and those of smaller images next to it, the largest images first."""
-    path = root / folder
+    path = place.path / folder
+    if not place.holds(path):
+        return []
     if folder == "." or not path.parent.is_dir():
         return [path] if path.is_dir() else []
     names = sorted(one.name for one in path.parent.iterdir() if one.is_dir())
@@ -276,15 +419,16 @@ def _size_folders(root: Path, folder: str) -> list[Path]:
     return []
 
 
-def _find_in(folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
-    files = {name: path for name in names if (path := folder / name).is_file()}
+def _find_in(place: SetFolder, folder: Path, names: Sequence[str], where: str, *, loose: bool) -> FoundImages:
+    files = {name: path for name in names if place.finds(path := folder / name)}
     left = [name for name in names if name not in files]
-    if not left or (loose and files):
-        return FoundImages(folder, files)
-    taken = set(files.values())
-    known = [name for name in _images_below(folder) if folder / name not in taken]
-    matched, notes = match_names(left, known, where, folders=loose)
-    return FoundImages(folder, files | {name: folder / to for name, to in matched.items()}, notes)
+    notes: list[str] = []
+    if left and not (loose and files):
+        taken = set(files.values())
+        known = [name for name in _images_below(folder) if folder / name not in taken]
+        matched, notes = match_names(left, known, where, folders=loose)
+        files |= {name: folder / to for name, to in matched.items()}
+    return FoundImages(folder, {name: place.checked(path, where) for name, path in files.items()}, notes)
 
 
 def _is_large(found: FoundImages, size: tuple[int, int]) -> bool:
@@ -298,5 +442,5 @@ def _images_below(folder: Path) -> Iterator[str]:
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
         for name in sorted(files):
             is_image = name.lower().endswith(IMAGE_ENDINGS) and not name.startswith(".")
-            if is_image and Path(place, name).exists():  # not a dangling link
+            if is_image and Path(place, name).is_file():  # neither a dangling link nor a pipe
                 yield Path(place, name).relative_to(folder).as_posix()

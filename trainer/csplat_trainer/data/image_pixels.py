@@ -1,6 +1,6 @@
 """Image files: headers, pixels as RGB or RGBA in 8 bits, and values of masks.
 
-Every pixel format that pillow opens is converted, or refused by name:
+Every pixel format of the files that `open_image` opens is converted, or refused by name:
 
 | stored as | read as |
 |---|---|
@@ -14,16 +14,15 @@ Every pixel format that pillow opens is converted, or refused by name:
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from PIL import ExifTags, Image, ImageFile, TiffImagePlugin, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageFile, TiffImagePlugin
 
 from csplat.errors import InputError
-from csplat.file_source import describe_substitute
+from csplat.image_opener import open_image
 from csplat.types import F64, U8
 
 #: Least value of a mask for pixels that count.
@@ -32,27 +31,12 @@ MASK_THRESHOLD = 128
 _WITH_ALPHA = ("RGBA", "LA", "PA", "RGBa", "La")
 _CONVERTED = (*_WITH_ALPHA, "1", "L", "P", "RGB", "RGBX", "CMYK", "YCbCr", "LAB", "HSV")
 _GREY_16 = ("I;16", "I;16L", "I;16B", "I;16N")
-_GREY_16_IN_32 = ("PNG", "PPM")  # formats whose 16-bit grey pillow stores in 32 bits
+_GREY_16_IN_32 = "PNG"  # the format whose 16-bit grey pillow stores in 32 bits
 _FLOAT = "F"
 _DEEP = ";16"  # in pillow's names of raw data, of which it keeps the upper 8 bits
 _FLOAT_TOLERANCE = 1e-3  # excess over the range of 0 to 1, for resampled files
 _WHITE_IS_ZERO, _IN_PLANES = 0, 2  # TIFF 6.0: PhotometricInterpretation, PlanarConfiguration
 _OPAQUE = 250  # least alpha that counts as 1
-_HEAD_SIZE = 64
-
-# Common image formats that pillow does not open: offset and value of their magic numbers.
-_UNREAD = (
-    (0, b"\x76\x2f\x31\x01", "an OpenEXR file, which is not read"),
-    (0, b"#?", "a Radiance HDR file, which is not read"),
-    (4, b"ftyphe", "a HEIC file, which is not read"),
-    (4, b"ftypmif1", "a HEIC file, which is not read"),
-    (4, b"ftypavif", "an AVIF file, which this pillow does not read"),
-    (0, b"\xff\x0a", "a JPEG XL file, which is not read"),
-    (4, b"JXL ", "a JPEG XL file, which is not read"),
-    (0, b"II*\0", "a TIFF that is damaged, or not of 8 or 16 bits or of floats in one channel"),
-    (0, b"MM\0*", "a TIFF that is damaged, or not of 8 or 16 bits or of floats in one channel"),
-)
-_RAW = (".arw", ".cr2", ".cr3", ".dng", ".nef", ".orf", ".raf", ".rw2")  # pillow takes the thumbnail in some of them
 
 
 @dataclass(frozen=True)
@@ -65,7 +49,8 @@ class ImageHeader:
         stored_as: pixel format if its meaning is ambiguous: `16-bit grey`, `16-bit colours`, `floats`; else "".
         has_alpha: True if there is transparency.
         orientation: EXIF orientation, 1 to 8; 1 is upright. Always 1 for a TIFF, which pillow turns.
-        frame_count: number of images in the file; the first is read.
+        has_others: True if the file has several images, of which the first is read; False for a JPEG, to which phones
+            append images of depth or brightness.
     """
 
     path: Path
@@ -73,7 +58,7 @@ class ImageHeader:
     stored_as: str
     has_alpha: bool
     orientation: int
-    frame_count: int
+    has_others: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,24 +74,6 @@ class MaskValues:
     taken_as: str = ""
 
 
-@contextmanager
-def open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image and read its header; errors of pillow within the context are converted.
-
-    Raises:
-        InputError: the file is not an image, or is damaged or not supported.
-    """
-    if path.suffix.lower() in _RAW:
-        raise InputError(f"{path} is a camera's raw file, expected an image: develop it to PNG or JPEG")
-    try:
-        with Image.open(path) as image:
-            yield image
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        if isinstance(error, UnidentifiedImageError):
-            _refuse_by_name(path)
-        raise InputError(f"{path} is not an image that can be read: {error}") from error
-
-
 def read_image_header(path: Path) -> ImageHeader:
     """Read the header of an image file; pixels are not decoded.
 
@@ -119,9 +86,7 @@ def read_image_header(path: Path) -> ImageHeader:
         orientation = 1
         if image.format != "TIFF":
             orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
-        # Phones append images for depth or brightness to a JPEG ("MPO"); they are ignored.
-        frame_count = 1 if image.format == "MPO" else int(getattr(image, "n_frames", 1))
-        return ImageHeader(path, image.size, stored_as, has_alpha, orientation, frame_count)
+        return ImageHeader(path, image.size, stored_as, has_alpha, orientation, _has_others(image))
 
 
 def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
@@ -215,6 +180,16 @@ def value_range(path: Path) -> tuple[float, float, float]:
         return float(stored.min()), float(stored.max()), white
 
 
+def _has_others(image: ImageFile.ImageFile) -> bool:
+    if image.format != "TIFF":
+        return int(getattr(image, "n_frames", 1)) > 1
+    try:
+        image.seek(1)  # to count the images of a TIFF takes a time that is quadratic in their number
+    except EOFError:
+        return False
+    return True
+
+
 def _has_alpha(image: Image.Image) -> bool:
     return image.mode in _WITH_ALPHA or "transparency" in image.info
 
@@ -232,7 +207,7 @@ def _stored_as(image: Image.Image, path: Path) -> str:
     if image.mode in _CONVERTED:
         tiles = image.tile if isinstance(image, ImageFile.ImageFile) else []
         return "16-bit colours" if any(_DEEP in str(tile[3]) for tile in tiles) else ""
-    if image.mode in _GREY_16 or (image.mode == "I" and image.format in _GREY_16_IN_32):
+    if image.mode in _GREY_16 or (image.mode == "I" and image.format == _GREY_16_IN_32):
         return "16-bit grey"
     if image.mode == _FLOAT:
         return "floats"
@@ -264,18 +239,3 @@ def _grey_mask(image: Image.Image, path: Path) -> U8:
         return values
     _stored_as(image, path)
     return np.rint(255.0 * _unit_grey(image, path)).astype(np.uint8)
-
-
-def _refuse_by_name(path: Path) -> None:
-    """Refuse a file that pillow does not open; name its format if its first bytes identify it."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_SIZE)
-    except OSError:
-        return
-    instead = "empty" if not head else describe_substitute(head)
-    if instead:
-        raise InputError(f"{path} is {instead}")
-    name = next((name for at, magic, name in _UNREAD if head[at:].startswith(magic)), None)
-    if name is not None:
-        raise InputError(f"{path} is {name}: convert it to PNG or JPEG")

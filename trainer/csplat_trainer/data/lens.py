@@ -26,6 +26,12 @@ _RAYS = 9  # rays to each side
 #: Command that undistorts images of every lens that COLMAP supports.
 UNDISTORTER = "`colmap image_undistorter --image_path IMAGES --input_path SPARSE --output_path OUT`"
 
+#: Advice on images that show all directions, which no undistortion turns into one perspective image.
+SPLIT_PANORAMAS = (
+    "split panoramas into perspective images first, with panorama_sfm.py of COLMAP or `ns-process-data images"
+    " --camera-type equirectangular`"
+)
+
 _SMALL = 1e-8  # radius below which a projection is its limit
 
 
@@ -70,6 +76,11 @@ class Lens:
         """True if the lens is more than a pinhole."""
         factors = (*self.radial, *self.tangential, *self.divisor, *self.prism)
         return self.projection != "perspective" or any(value != 0.0 for value in factors)
+
+
+def is_panorama(model: str) -> bool:
+    """Return True for the name of a camera model whose images show all directions."""
+    return model.upper() in {"EQUIRECTANGULAR", "SPHERICAL", "PANORAMA"}
 
 
 @lru_cache(maxsize=64)  # images of a set share a few lenses

@@ -18,8 +18,10 @@ from csplat_render.camera import MAX_IMAGE_SIZE, camera_outliers, nearest_point
 from csplat_trainer.data.colmap import find_model, read_colmap
 from csplat_trainer.data.dataset import DataSet, Shot, UnreadDataSet, near_plane, open_shot
 from csplat_trainer.data.dataset_checks import check_shots, describe_images, describe_lenses, describe_poses
+from csplat_trainer.data.foreign_sets import describe_foreign
 from csplat_trainer.data.image_files import IMAGE_ENDINGS, abbreviate
 from csplat_trainer.data.image_pixels import opaque_images, read_image_header
+from csplat_trainer.data.set_folder import SetFolder
 from csplat_trainer.data.transforms import read_blender, read_transforms
 
 _SET_LEVELS = 2  # how far the data set may be above its folder of images
@@ -35,6 +37,7 @@ def load(
     images: str | None = None,
     test_every: int = 8,
     near: float | None = None,
+    trust_paths: bool = False,
 ) -> DataSet:
     """Find the posed images of a data set. Their pixels are read on first access, or by `DataSet.read`.
 
@@ -44,7 +47,8 @@ def load(
     | `transforms.json` | instant-ngp, nerfstudio |
     | `sparse/0/cameras.bin` or `.txt` | COLMAP, such as Mip-NeRF 360, Tanks and Temples, Deep Blending |
 
-    Files are checked for consistency (`dataset_checks`), and images are undistorted (`lens`).
+    Files are checked for consistency (`dataset_checks`), and images are undistorted (`lens`). Images, masks, points and
+    lists outside of the folder of the set are refused, whether by `..`, an absolute path or a link.
 
     Args:
         path: its folder, its `transforms.json`, or a folder of images in it, such as `garden/images_4`.
@@ -53,23 +57,27 @@ def load(
             smallest that is large enough.
         test_every: every Nth image is a test image if the set specifies none; 0: no test images.
         near: near plane of the cameras, scene units; `None`: derived from the set.
+        trust_paths: read files outside of the folder, too.
 
     Returns:
         All images, undistorted, with their cameras.
 
     Raises:
-        InputError: there is no data set, it is damaged, or it has no images.
+        InputError: there is no data set, it is damaged, has no images, or names files outside of its folder.
     """
-    path = Path(path)
+    path, named = Path(path), None
     if images is None:
+        named = path
         path, images = find_image_folder(path)
+    place = SetFolder(path if path.is_dir() else path.parent, trust_paths, None if images is None else named)
     if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
         raise InputError(f"size is {size[0]}×{size[1]}, expected 1 to {MAX_IMAGE_SIZE} pixels per side")
-    found = _read(path, size, images, test_every)
+    found = _read(place, path, size, images, test_every)
     if not found.train:
         raise InputError(f"{path} has no training images")
     doubts = describe_poses([*found.train, *found.test], found.points)
     found, origin = choose_origin(found)
+    found = _settle(found, place)
     shots = [*found.train, *found.test]
     heads = {shot.path: read_image_header(shot.path) for shot in (*shots, *found.val)}
     check_shots([*shots, *found.val], heads)
@@ -103,7 +111,7 @@ def load(
         report.append(
             f"{counted(both, 'test image')} used for training, too: scores do not show the quality of new views"
         )
-    if found.points is None and not any(image.has_alpha for image in train):
+    if (found.points is None or not len(found.points)) and not any(image.has_alpha for image in train):
         report.append("there are no points: splats start anywhere in view")
     colours = found.points_rgb
     if colours is not None and len(colours) and (colours == colours[0]).all():
@@ -169,27 +177,45 @@ def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | N
     return custom, usual, ""
 
 
-def _read(path: Path, size: tuple[int, int] | None, images: str | None, test_every: int) -> UnreadDataSet:
+def _settle(found: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
+    """Resolve the links of images and masks: what is read later is what was checked."""
+    train, test, val = (
+        [
+            replace(shot, path=place.settled(shot.path), mask=None if shot.mask is None else place.settled(shot.mask))
+            for shot in part
+        ]
+        for part in (found.train, found.test, found.val)
+    )
+    return replace(found, train=train, test=test, val=val)
+
+
+def _read(
+    place: SetFolder, path: Path, size: tuple[int, int] | None, images: str | None, test_every: int
+) -> UnreadDataSet:
+    if path.is_file() and (foreign := describe_foreign(path)):
+        raise InputError(foreign)
     if path.is_file() and path.suffix.lower() == ".json":
         if path.name == "transforms_train.json":
-            return read_blender(path.parent, images)
-        return read_transforms(path, test_every, images)
+            return read_blender(place, images)
+        return read_transforms(place, path, test_every, images)
     if not path.is_dir():
         zipped = path.suffix.lower() == ".zip" and path.is_file()
         remedy = ": unpack it, and name the folder" if zipped else ""
         raise InputError(f"{path} is neither a folder nor a transforms.json{remedy or _suggest_images(path)}")
     model = find_model(path)
     if (path / "transforms_train.json").is_file():
-        found = read_blender(path, images)
+        found = read_blender(place, images)
     elif (path / "transforms.json").is_file():
-        found = read_transforms(path / "transforms.json", test_every, images)
+        found = read_transforms(place, path / "transforms.json", test_every, images)
     elif model is not None:
-        found = read_colmap(path, model[0], size, images, test_every)
+        found = read_colmap(place, model[0], size, images, test_every)
         return replace(found, report=[*model[1], *found.report])
+    elif not (place_hint := _suggest_place(path)) and (foreign := describe_foreign(path)):
+        raise InputError(foreign)
     else:
         raise InputError(
             f"{path} is not a data set: expected transforms_train.json (Blender), transforms.json (instant-ngp) "
-            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{_suggest_place(path)}"
+            f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{place_hint}"
         )
     if model is not None:
         found = replace(found, report=[*found.report, "there is also a COLMAP model, which is ignored"])

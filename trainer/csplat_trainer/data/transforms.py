@@ -39,63 +39,69 @@ from csplat_trainer.data.image_files import (
     describe_missing,
     find_images,
     normalise_name,
+    printable,
 )
 from csplat_trainer.data.image_pixels import image_size, read_image_header
-from csplat_trainer.data.lens import UNDISTORTER, Lens
+from csplat_trainer.data.lens import SPLIT_PANORAMAS, UNDISTORTER, Lens, is_panorama
+from csplat_trainer.data.set_folder import SetFolder
 
-_POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply")
+_POINT_CLOUDS = ("sparse_pc.ply", "points3d.ply", "points3D.ply", "pointcloud.ply")
 _BLENDER_AXES = "RFU"  # seen from the front: x to the right, y away, z up
 _RATIONAL = "FULL_OPENCV"
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
-def read_blender(folder: Path, images: str | None = None) -> UnreadDataSet:
+def read_blender(place: SetFolder, images: str | None = None) -> UnreadDataSet:
     """Read a set with `transforms_train.json` and, usually, `transforms_test.json` and `transforms_val.json`.
 
     Args:
-        folder: the folder of the files.
+        place: the folder of the files.
         images: name of the folder of images; `None`: from the files.
 
     Raises:
         InputError: a file has unexpected contents, or no image is found.
     """
     report: list[str] = []
+    folder = place.path
     train_path = folder / "transforms_train.json"
-    train = _shots(_load(train_path), train_path, images, report)
+    train = _shots(place, _load(place, train_path), train_path, images, report)
     test_path = folder / "transforms_test.json"
     if test_path.is_file():
-        test = _shots(_load(test_path), test_path, images, report, needed=False)
+        test = _shots(place, _load(place, test_path), test_path, images, report, needed=False)
     else:
         test = []
         report.append("there is no transforms_test.json: no test images")
     val_path = folder / "transforms_val.json"
-    val = _shots(_load(val_path), val_path, images, report, needed=False) if val_path.is_file() else []
+    val = []
+    if val_path.is_file():
+        val = _shots(place, _load(place, val_path), val_path, images, report, needed=False)
     _check_distinct([*train, *test, *val], folder)
-    points, colours = _points_next_to(train, folder, report)
+    points, colours = _points_next_to(train, place, report)
     return UnreadDataSet("Blender set", train, test, points, colours, report, coordinate_system=_BLENDER_AXES, val=val)
 
 
-def read_transforms(path: Path, test_every: int, images: str | None = None) -> UnreadDataSet:
+def read_transforms(place: SetFolder, path: Path, test_every: int, images: str | None = None) -> UnreadDataSet:
     """Read instant-ngp's `transforms.json`, or nerfstudio's, which may list a split and name a point cloud.
 
     Args:
-        path: the file.
+        place: the folder of the set.
+        path: the file, in this folder.
         test_every: see `split_every`; used if the file lists neither training, validation nor test images.
         images: name of the folder of images; `None`: from the file.
 
     Raises:
         InputError: the file has unexpected contents, or no image is found.
     """
-    document, report = _load(path), list[str]()
-    shots = _shots(document, path, images, report)
-    points, colours = _points(document, shots, path, report)
+    document, report = _load(place, path), list[str]()
+    shots = _shots(place, document, path, images, report)
+    points, colours = _points(place, document, shots, path, report)
     if "test_frames" in document:  # ScanNet++
-        test = _shots(document, path, images, report, key="test_frames", needed=False)
+        test = _shots(place, document, path, images, report, key="test_frames", needed=False)
         return UnreadDataSet("transforms.json set", shots, test, points, colours, report)
     lists = {role: names for role in ROLES if (names := _read_list(document, f"{role}_filenames", path))}
     files = path.name
     if not lists:
-        lists, files = read_split_lists((path.parent,))
+        lists, files = read_split_lists(place, (path.parent,))
     if lists:
         train, val, test = split_listed(shots, lists, files, report)
         return UnreadDataSet("transforms.json set", train, test, points, colours, report, val=val)
@@ -128,6 +134,7 @@ class _Frame:
 
 
 def _shots(
+    place: SetFolder,
     document: Mapping[str, Any],
     path: Path,
     images: str | None,
@@ -141,7 +148,9 @@ def _shots(
     frames = _frames(document, key, path, report, needed=needed)
     names = [frame.name for frame in frames]
     try:
-        found = find_images(folder, names, path.name, _folders(names, images)) if names else FoundImages(folder, {})
+        if images is not None and not place.holds(folder / images):
+            raise place.refusal(Path(images))
+        found = find_images(place, names, path.name, _folders(names, images)) if names else FoundImages(folder, {})
     except NoImagesError:
         if needed:
             raise
@@ -150,14 +159,14 @@ def _shots(
         report.append(f"images from {found.folder.relative_to(folder).as_posix()}")
     report += found.notes
     report += describe_missing([name for name in names if name not in found.files], len(names), path.name)
-    masks = _masks(frames, path, report)
+    masks = _masks(place, frames, path, report)
     shots = []
     for frame in frames:
         if frame.name in found.files:
             image, where = found.files[frame.name], f"{path}, frame {frame.number}"
             lens = _lens(frame_values(document, frame.values), image, where)
             viewmat = viewmat_of_opengl(frame.values.get("transform_matrix"), "transform_matrix", where)
-            shots.append(Shot(_plain(frame.name, image), image, lens, viewmat, masks.get(frame.name)))
+            shots.append(Shot(_plain(frame.name, image, place.path), image, lens, viewmat, masks.get(frame.name)))
     report += describe_scales(
         [frame.values["transform_matrix"] for frame in frames if frame.name in found.files], path.name
     )
@@ -222,7 +231,7 @@ def _folders(names: Sequence[str], images: str | None) -> list[str]:
     return [".", *([] if own.is_absolute() else [str(own)]), own.name or ".", "images", "input"]
 
 
-def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str, Path]:
+def _masks(place: SetFolder, frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str, Path]:
     """Find the masks of frames in `mask_path`, as in nerfstudio: black for pixels that do not count."""
     named: dict[str, str] = {}
     for frame in frames:
@@ -237,23 +246,23 @@ def _masks(frames: Sequence[_Frame], path: Path, report: list[str]) -> dict[str,
         return {}
     try:
         masks = list(dict.fromkeys(named.values()))
-        found = find_images(path.parent, masks, path.name, _folders(masks, None))
+        found = find_images(place, masks, path.name, _folders(masks, None))
     except NoImagesError:
         found = FoundImages(path.parent, {})
     report += found.notes
     missing = next(((name, mask) for name, mask in named.items() if mask not in found.files), None)
     if missing is not None:
-        raise InputError(f"{path}: the mask {missing[1]!r} of {missing[0]} does not exist")
+        raise InputError(f"{path}: the mask {missing[1][:200]!r} of {abbreviate([missing[0]])} does not exist")
     return {name: found.files[mask] for name, mask in named.items()}
 
 
 def _points(
-    document: Mapping[str, Any], shots: Sequence[Shot], path: Path, report: list[str]
+    place: SetFolder, document: Mapping[str, Any], shots: Sequence[Shot], path: Path, report: list[str]
 ) -> tuple[F64 | None, F32 | None]:
     """Read the point cloud of nerfstudio's `ply_file_path`, in the coordinates of the cameras."""
     name = document.get("ply_file_path")
     if name is None:
-        return _points_next_to(shots, path.parent, report)
+        return _points_next_to(shots, place, report)
     if not isinstance(name, str):
         raise InputError(f"{path}: ply_file_path is {name!r}, expected a name")
     candidates = (
@@ -261,27 +270,29 @@ def _points(
         path.parent / normalise_name(name),
         path.parent / PurePosixPath(normalise_name(name)).name,
     )
-    cloud = next((candidate for candidate in candidates if candidate.is_file()), None)
+    cloud = next((one for one in candidates if place.finds(one)), None)
+    if cloud is None and place.finds_outside(candidates[0]):
+        raise place.refusal(Path(name), f"{path.name}, ply_file_path")
     if cloud is None:
-        report.append(f"{path.name}: ply_file_path {name} does not exist: no points")
+        report.append(f"{path.name}: ply_file_path {abbreviate([name])} does not exist: no points")
         return None, None
     report.append(f"points from {cloud.name}")
-    return read_point_cloud(cloud)
+    return read_point_cloud(place.checked(cloud, path.name))
 
 
-def _points_next_to(train: Sequence[Shot], folder: Path, report: list[str]) -> tuple[F64 | None, F32 | None]:
+def _points_next_to(train: Sequence[Shot], place: SetFolder, report: list[str]) -> tuple[F64 | None, F32 | None]:
     """Read the points that 3DGS and similar programs write next to a Blender set.
 
     If images have transparency, points are ignored: they are often random, and the visual hull is better.
     """
-    cloud = next((path for name in _POINT_CLOUDS if (path := folder / name).is_file()), None)
+    cloud = next((path for name in _POINT_CLOUDS if (path := place.path / name).is_file()), None)
     if cloud is None:
         return None, None
     if train and read_image_header(train[0].path).has_alpha:
         report.append(f"{cloud.name} is ignored: the images' transparency determines where splats start")
         return None, None
     report.append(f"points from {cloud.name}")
-    return read_point_cloud(cloud)
+    return read_point_cloud(place.checked(cloud))
 
 
 def _read_list(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
@@ -293,13 +304,15 @@ def _read_list(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
     return names
 
 
-def _plain(name: str, image: Path) -> str:
-    """Return the name of an image without `./`, with the ending that Blender's sets omit."""
-    return PurePosixPath(normalise_name(name)).with_name(image.name).as_posix()
+def _plain(name: str, image: Path, folder: Path) -> str:
+    """Return the name of an image without `./`, with the ending that Blender's sets omit; that on disk if not UTF-8."""
+    if name != printable(name) and image.is_relative_to(folder):
+        return printable(image.relative_to(folder).as_posix())
+    return printable(PurePosixPath(normalise_name(name)).with_name(image.name).as_posix())
 
 
-def _load(path: Path) -> dict[str, Any]:
-    document = read_json(path)
+def _load(place: SetFolder, path: Path) -> dict[str, Any]:
+    document = read_json(place.checked(path), any_bytes=True)
     if not isinstance(document, dict):
         raise InputError(f"{path} is not a set of posed images: expected an object with frames")
     return document
@@ -310,9 +323,10 @@ def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
     model = str(values.get("camera_model") or "").strip()
     fisheye = model.upper() in _FISHEYES or bool(values.get("is_fisheye"))
     if not fisheye and model.upper() not in PERSPECTIVES:
+        remedy = f"use {UNDISTORTER}, or undistort images in the program that computed the poses"
         raise InputError(
             f"{where}: camera_model is {model}, expected one of {', '.join(PERSPECTIVES[1:] + _FISHEYES)}: "
-            f"use {UNDISTORTER}, or undistort images in the program that computed the poses"
+            f"{SPLIT_PANORAMAS if is_panorama(model) else remedy}"
         )
     if "w" in values and "h" in values:
         width, height = finite_number(values, "w", where), finite_number(values, "h", where)

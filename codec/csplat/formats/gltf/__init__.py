@@ -6,9 +6,10 @@ member is stored in `asset.extras.csplat` as the comment lines of a PLY. The ori
 
 from __future__ import annotations
 
-from csplat.formats.format import Format
+from csplat.formats.format import Format, ValueRange
 from csplat.formats.gltf.gltf_reader import AXES, open_gltf
 from csplat.formats.gltf.gltf_writer import write_gltf
+from csplat.ply.columns import LOG_OF_0, LOG_OF_LARGEST
 
 FORMAT = Format(
     name="gltf",
@@ -16,6 +17,7 @@ FORMAT = Format(
     open_bands=open_gltf,
     write=write_gltf,
     axes=AXES,
+    ranges={"scales": ValueRange(LOG_OF_0, LOG_OF_LARGEST)},
     exact=frozenset({"means", "quats", "opacities", "sh0", "shN"}),
     splat_bytes=(60.0, 96.0, 156.0, 240.0),
     carries=frozenset({"antialiased", "origin", "coordinate_system", "unit_metres", "flat", "metadata"}),

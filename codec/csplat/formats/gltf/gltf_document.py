@@ -386,7 +386,8 @@ def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview 
     if not found or found[0][0] != JSON:
         raise InputError(f"{path.name}: the first chunk is not JSON")
     binary = found[1][1] if len(found) > 1 and found[1][0] == BIN else None
-    return found[0][1], binary, len(data) - size
+    text = bytes(found[0][1]).rstrip(b"\0")  # some exporters pad with zeros instead of spaces
+    return memoryview(text), binary, len(data) - size
 
 
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:

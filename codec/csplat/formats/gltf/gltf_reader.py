@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from csplat.editing.transform import axes_rotation, rotate_scene, sphere_lattice, stretch_scene
 from csplat.errors import InputError, counted
-from csplat.formats.common import RangeStatistics, classify_opacities, classify_scales
+from csplat.formats.common import RangeStatistics, classify_opacities, classify_scales, log_scales
 from csplat.formats.gltf.gltf_document import Accessor, GltfDocument, JsonPath, PlacedPrimitive, open_document
 from csplat.formats.spz import ANTIALIASED, SpzArrays, decode_block, decode_means, read_spz_file
 from csplat.lint import Finding, too_many_bands, trailing_bytes
@@ -53,7 +53,6 @@ _SPZ = (
 _WROTE_LOGS = re.compile(r"splat-transform v?([01]\.|2\.[0-3](\.|$))")  # fixed in its pull request 268
 #: Extensions of primitives that do not affect splats: materials and feature ids.
 _HARMLESS = {"KHR_materials_variants", "EXT_mesh_features", "EXT_structural_metadata", "KHR_mesh_quantization"}
-_THINNEST = np.float32(np.finfo(np.float32).tiny)  # replaces a scale of 0, so that its logarithm is finite
 _LARGE = 1e6  # huge values are only counted in primitives with a value above this
 _FAR = 4096.0  # scene units; a larger translation becomes the origin: float32 resolves it to 0.0005 at best
 _ALIKE = 0.1  # fraction of the scene's extent by which equivalent bounds may differ
@@ -226,7 +225,7 @@ class _GltfReading:
 
     def _huge(self, arrays: dict[str, Accessor], rows: slice, good: NDArray[np.bool_] | None) -> int:
         kept = slice(None) if good is None else good
-        scales = np.log(np.maximum(np.abs(arrays["SCALE"].values(rows)[kept]), _THINNEST))
+        scales = log_scales(arrays["SCALE"].values(rows)[kept])
         return count_huge_rows(
             scales, *(one.values(rows)[kept] for name, one in arrays.items() if name.startswith("SH_"))
         )
@@ -404,7 +403,7 @@ def _decode_block(reading: _GltfReading, arrays: dict[str, Accessor], degree: in
         shN[:, index] = values[name]
     scales, opacities = values["SCALE"], values["OPACITY"][:, 0]
     if not reading.are_logs:
-        scales = np.log(np.maximum(scales, _THINNEST))
+        scales = log_scales(scales)
     return SplatModel(
         means=values["POSITION"],
         quats=normalise_quats(quats),

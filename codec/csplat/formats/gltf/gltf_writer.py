@@ -32,7 +32,7 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
     if path.suffix.lower() == ".gltf":
         raise InputError(f"{path.name}: glTF is written as a single file, name it {path.with_suffix('.glb').name}")
     if not scene.count:
-        raise InputError(f"{path.name}: the scene has no splats, and glTF has no empty meshes")
+        raise InputError(f"{path.name}: no splats are left to write, and glTF has no empty meshes")
     unit = scene.metadata_model.unit_metres
     if unit not in (None, 1.0):
         before, metres = scene, float(unit)
@@ -57,7 +57,7 @@ def write_gltf(path: Path, scene: SceneSource) -> None:
             f"{path.name} would have {start + offsets[-1]:,} bytes, a .glb has at most {_LARGEST_FILE:,}:"
             f" write fewer splats or fewer SH bands"
         )
-    with atomic_writer(path) as stream:
+    with atomic_writer(path, seekable=True) as stream:
         stream.write(GLB_HEAD.pack(MAGIC, 2, start + offsets[-1]) + struct.pack("<I4s", len(text), JSON) + text)
         stream.write(struct.pack("<I4s", offsets[-1], BIN))
         done = 0

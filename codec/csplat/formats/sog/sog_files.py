@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
@@ -16,8 +15,9 @@ from numpy.typing import NDArray
 
 from csplat.archives import DAMAGED, member_refusal, scenes_of
 from csplat.disk_files import parse_json, path_inside
-from csplat.errors import InputError, missing_package
-from csplat.file_source import describe_substitute
+from csplat.errors import InputError
+from csplat.file_source import describe_substitute, open_binary
+from csplat.image_opener import open_image
 from csplat.lint import Finding
 
 _LARGEST_JSON = 1 << 25  # bytes
@@ -79,7 +79,9 @@ class _ZipDirectory:
             return zipfile.ZipFile(self._path)
         except DAMAGED as error:
             reason = " ".join(str(error).split())[:120] or type(error).__name__
-            raise InputError(f"{self._title}: a damaged zip: {reason}") from None
+            if "not a zip file" in reason:  # it begins like one
+                reason = "its end is missing, where its list of files is"
+            raise InputError(f"{self._title}: a damaged zip: {reason}: copy or download it again") from None
 
 
 def use_slashes(name: str) -> str:
@@ -140,7 +142,7 @@ class SogParts:
         if self.folder is not None:
             data = self._unzip(str(self.folder / self._inside(name)), most)
         else:
-            with self.file(name).open("rb") as stream:
+            with open_binary(self.file(name)) as stream:
                 data = stream.read(most + 1)
             if len(data) > most:
                 self.refuse(f"{name[:80]} has more than {most:,} bytes")
@@ -261,7 +263,7 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
         if not found:
             SogParts(path, title).refuse(f"a folder without {_ONE}, not a SOG")
         return SogParts(path, title), str(_only_scene(SogParts(path, title), found))
-    with path.open("rb") as stream:
+    with open_binary(path) as stream:
         zipped = stream.read(2) == b"PK"
     if not zipped:
         return SogParts(path.parent, title), path.name
@@ -336,22 +338,14 @@ def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[n
     Raises:
         InputError: the image is damaged, lossy or of another size; or Pillow is not installed.
     """
-    try:
-        from PIL.Image import DecompressionBombError
-        from PIL.WebPImagePlugin import WebPImageFile  # Image.open would load the plugins of all formats
-    except ModuleNotFoundError as error:
-        raise missing_package(error, "Pillow") from None
     if _is_lossy(data):
         parts.refuse(
             f"{name} is a lossy WebP, expected a lossless one: its codes are changed; use the file as exported"
         )
-    try:
-        with WebPImageFile(io.BytesIO(data)) as image:
-            if not fits(*image.size):
-                parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which does not match the metadata")
-            return np.asarray(image.convert("RGBA"))
-    except (*DAMAGED, DecompressionBombError) as error:
-        parts.refuse(f"{name} is not a complete WebP: {' '.join(str(error).split())[:80] or type(error).__name__}")
+    with open_image(data, f"{parts.title}: {name}", formats=("WebP",), budget=False) as image:
+        if not fits(*image.size):
+            parts.refuse(f"{name} has {image.size[0]} x {image.size[1]} pixels, which does not match the metadata")
+        return np.asarray(image.convert("RGBA"))
 
 
 def _is_lossy(data: bytes) -> bool:

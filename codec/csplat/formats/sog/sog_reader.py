@@ -266,6 +266,11 @@ def read_meta(parts: SogParts, name: str) -> SogMeta:
     if version not in (1, 2):
         parts.refuse(f"it is version {version} of SOG, expected 1 or 2")
     old = version == 1
+    if old and "shape" in meta["means"] and "files" not in meta["means"]:
+        parts.refuse(
+            "it is gsplat's PNG compression, which csplat does not read:"
+            " csplat.from_gsplat(gsplat.PngCompression().decompress(FOLDER)) does"
+        )
     if old and not meta["means"]["shape"].list():
         parts.refuse(f"{name} means shape is empty")
     count = (meta["means"]["shape"].list()[0] if old else meta["count"]).whole(_MAX_SPLATS)

@@ -8,6 +8,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.disk_files import atomic_writer
+from csplat.disk_files import atomic_writer, work_folder
 from csplat.encoder.kmeans import assign, cluster
 from csplat.errors import InputError, missing_package
-from csplat.formats.common import encode_smallest_three, sorted_along_curve
+from csplat.formats.common import ClampStatistics, MovedSplats, encode_smallest_three, sorted_along_curve
+from csplat.formats.format import ValueRange
 from csplat.formats.sog.sog_reader import ENTRIES, LEAST_TAG
+from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource, join_blocks
 from csplat.types import F32, F64, U8, U32
@@ -28,6 +31,7 @@ _LEAST_WEIGHT = 1e-3  # relative to a splat of opacity 1 and median area
 _LARGEST_SIDE = 16383  # pixels, limit of WebP
 _CODES = 256
 _LLOYD_STEPS = 40
+_COARSE = 0.25  # fraction of the range of a codebook beyond which values count as clamped
 _DATE = (1980, 1, 1, 0, 0, 0)  # date of zip members: fixed, so the same scene gives the same bytes
 _NORM = 1000  # lattice steps of a long SH vector; searches are exact up to twice that
 _NEAR = 4  # groups of palette entries that are searched, out of 181 for 60,000 splats
@@ -38,7 +42,7 @@ _SAMPLE = 1 << 20  # number of splats from which codebooks and palette are compu
 _CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
 
 
-def write_sog(path: Path, scene: SceneSource) -> None:
+def write_sog(path: Path, scene: SceneSource) -> list[Finding]:
     """Write a zip or, if the path ends in meta.json, files next to it (`Format.write`).
 
     Raises:
@@ -46,20 +50,37 @@ def write_sog(path: Path, scene: SceneSource) -> None:
         OSError: a file cannot be written.
     """
     is_folder = path.name.lower().endswith("meta.json")
+    losses = SogLosses()
     if is_folder:
         path.parent.mkdir(exist_ok=True)
-    with sorted_along_curve(scene, path.parent) as ordered:
+    with sorted_along_curve(scene, work_folder(path)) as ordered:
         if is_folder:
-            for name, data in encode_files(ordered):  # meta.json comes last
+            for name, data in encode_files(ordered, losses):  # meta.json comes last
                 with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
                     stream.write(data)
-            return
+            return losses.findings(scene.metadata_model)
         with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
-            for name, data in encode_files(ordered):
+            for name, data in encode_files(ordered, losses):
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
+    return losses.findings(scene.metadata_model)
 
 
-def encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
+@dataclass(frozen=True)
+class SogLosses:
+    """Values that SOG stores badly, collected by `encode_files`."""
+
+    clamped: ClampStatistics = field(default_factory=ClampStatistics)
+    moved: MovedSplats = field(default_factory=MovedSplats)
+
+    def findings(self, metadata_model: SplatModel) -> list[Finding]:
+        """Return the findings; `metadata_model` is that of the scene."""
+        both = metadata_model.antialiased and metadata_model.flat
+        lost = [Finding("lost-contents", 1, "SOG cannot hold that splats are discs and antialiased", "loss")] * both
+        found = self.clamped.findings("the 256 codes of SOG", lambda *_: ("ply", "gltf", "csplat"))
+        return [*lost, *found, *self.moved.findings("SOG has 16 bits for the logarithms of positions")]
+
+
+def encode_files(scene: SceneSource, losses: SogLosses) -> Iterator[tuple[str, bytes]]:
     """Yield the name and bytes of each file of a SOG. Takes 17 bytes of memory per splat, 21 with SH."""
     count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
@@ -88,8 +109,12 @@ def encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
         return pixels.reshape(height, width, 4)
 
     codes = {name: np.empty((count, channels), np.uint8) for name, channels in _CHANNELS.items()}
-    for rows, model in scene.numbered():
-        quantised = np.rint((_signed_logs(model.means) - low) * (65535 / np.where(high > low, high - low, 1.0)))
+    steps = np.where(high > low, high - low, 1.0) / 65535
+    ranges = {"scales": _range_of(scales), "sh0": _range_of(colours)}
+    for rows, model in losses.clamped.watch(scene, ranges).numbered():
+        quantised = np.rint((_signed_logs(model.means) - low) / steps)
+        logs = low + quantised * steps
+        losses.moved.add(model, np.sign(logs) * np.expm1(np.abs(logs)))
         largest, three = encode_smallest_three(model.quats)
         codes["means_l.webp"][rows], codes["means_u.webp"][rows] = quantised % 256, quantised // 256
         codes["quats.webp"][rows, :3] = np.clip(np.rint((three * np.float32(2**0.5) + 1) * np.float32(127.5)), 0, 255)
@@ -110,6 +135,12 @@ def encode_files(scene: SceneSource) -> Iterator[tuple[str, bytes]]:
     with ThreadPoolExecutor(max(1, min(len(codes), _PIXELS_AT_ONCE // (width * height)))) as pool:
         yield from zip(codes, pool.map(lambda name: _encode_webp(square(codes[name])), codes), strict=True)
     yield "meta.json", json.dumps(meta, separators=(",", ":")).encode()
+
+
+def _range_of(codebook: F32) -> ValueRange:
+    """Return the range of a codebook; rounding to its outermost codes, which are means of rare values, is coarse."""
+    low, high = float(codebook[0]), float(codebook[-1])
+    return ValueRange(low, high, 2.0 * max(float(np.diff(codebook)[[0, -1]].max()), _COARSE * (high - low)))
 
 
 def _sample(scene: SceneSource) -> tuple[F64, F64, SplatModel]:

@@ -19,12 +19,14 @@ from typing import Any
 
 import numpy as np
 
-from csplat.disk_files import atomic_folder, read_json
+from csplat.disk_files import atomic_folder, read_json, resolve_links
 from csplat.encoder import covariance_entries
 from csplat.encoder.entropy import morton_codes
 from csplat.errors import InputError
+from csplat.file_source import write_file
 from csplat.formats.common import scene_of_rows, sorted_parts
-from csplat.formats.sog.sog_writer import encode_files
+from csplat.formats.sog.sog_writer import SogLosses, encode_files
+from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource
 from csplat.types import F32, F64, I64
@@ -72,7 +74,7 @@ class _LevelStatistics:
     chunks: I64
 
 
-def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> None:
+def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> list[Finding]:
     """Write a folder of streamed SOG (`Format.write_levels`).
 
     Takes about 430 MB of memory for chunks of 500,000 splats without SH, 640 MB with degree 3, for scenes of any size;
@@ -87,20 +89,20 @@ def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> None:
         InputError: there are no splats, the folder contains other files, or Pillow is not installed.
         OSError: a file cannot be written.
     """
-    folder = path.parent.resolve()
+    folder = resolve_links(path.parent)
     _check_folder(folder)
     levels = list(takewhile(lambda level: level.count, levels))
     if not levels:
         raise InputError(f"{path}: the scene has no splats, and streamed SOG has no empty leaves")
     tree, leaf_count = _cut_space(levels[0])
     found = [_survey(level, tree, leaf_count) for level in levels]
-    filenames: list[str] = []
+    filenames, losses = list[str](), SogLosses()
     leaves: list[dict[str, dict[str, int]]] = [{} for _ in range(leaf_count)]
-    with atomic_folder(folder) as temporary:
+    with atomic_folder(path.parent) as temporary:
         for number, (level, statistics) in enumerate(zip(levels, found, strict=True)):
             _list_runs(leaves, number, statistics, len(filenames))
             names = [f"{number}_{chunk}" for chunk in range(int(statistics.chunks[-1]) + 1)]
-            _write_chunks([temporary / name for name in names], level, tree, statistics)
+            _write_chunks([temporary / name for name in names], level, tree, statistics, losses)
             filenames += [f"{name}/meta.json" for name in names]
         extents = np.stack([one.extents for one in found])
         bounds = np.stack([extents[:, :, 0].min(0), extents[:, :, 1].max(0)], axis=1)
@@ -110,7 +112,8 @@ def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> None:
             "lodLevels": len(levels), "lodErrors": False, "filenames": filenames,
             "tree": _describe_node(tree, bounds, leaves)[0],
         }  # fmt: skip
-        (temporary / LEVELS_NAME).write_text(json.dumps(meta, separators=(",", ":")), encoding="ascii")
+        write_file(temporary / LEVELS_NAME, json.dumps(meta, separators=(",", ":")).encode("ascii"))
+    return losses.findings(levels[0].metadata_model)
 
 
 def _check_folder(folder: Path) -> None:
@@ -205,7 +208,9 @@ def _list_runs(
         }
 
 
-def _write_chunks(folders: Sequence[Path], scene: SceneSource, tree: _Cut | int, statistics: _LevelStatistics) -> None:
+def _write_chunks(
+    folders: Sequence[Path], scene: SceneSource, tree: _Cut | int, statistics: _LevelStatistics, losses: SogLosses
+) -> None:
     low, high = statistics.centres[:, 0], statistics.centres[:, 1]
     scales = np.divide(2**_CELL_BITS - 1, high - low, out=np.zeros_like(low), where=high > low)
 
@@ -216,11 +221,11 @@ def _write_chunks(folders: Sequence[Path], scene: SceneSource, tree: _Cut | int,
 
     first_leaves = np.searchsorted(statistics.chunks, np.arange(1, len(folders)))
     splits = first_leaves.astype(np.int64) << 3 * _CELL_BITS
-    with sorted_parts(scene, folders[0].parent, keys, splits) as (metadata_model, parts):
-        for folder, rows in zip(folders, parts(), strict=True):
+    with sorted_parts(scene, folders[0].parent, keys, splits) as parts:
+        for folder, rows in zip(folders, parts.rows(0, len(folders)), strict=True):
             folder.mkdir()
-            for name, data in encode_files(scene_of_rows(metadata_model, rows)):
-                (folder / name).write_bytes(data)
+            for name, data in encode_files(scene_of_rows(parts.metadata_model, rows), losses):
+                write_file(folder / name, data)
 
 
 def _describe_node(

@@ -14,7 +14,6 @@ Images are written to the work folder. Option `webgpu`: engines draw by WebGPU. 
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -26,6 +25,7 @@ from csplat.editing.transform import DEFAULT_AXES
 from csplat.editing.up_axis import up_of_axes
 from csplat.formats import format_by_name, read, write
 from csplat.formats.format import Format
+from csplat.image_opener import open_image
 from csplat.model import UNSPECIFIED, SplatModel
 from csplat_bench.engine_stage import ENGINES, Image, chosen_view, opened_page, pinhole, placed_in, screen_render
 from csplat_bench.protocol import AbsentError, Measure, Setup
@@ -114,12 +114,11 @@ def _draw(
 
 def settled_image(page: Any, pause: float = _PAUSE_SECONDS) -> Image:
     """Return the image that no longer changes: loaders return before splats are sorted and shaders compiled."""
-    from PIL import Image as Images
-
     end, last, same = time.monotonic() + _TIMEOUT_SECONDS, np.zeros((1, 1, 3), np.uint8), 0
     while same < _SAME and time.monotonic() < end:
         time.sleep(pause)
-        image = np.asarray(Images.open(io.BytesIO(page.screenshot())).convert("RGB"))
+        with open_image(page.screenshot()) as shot:
+            image = np.asarray(shot.convert("RGB"))
         same = same + 1 if image.any() and np.array_equal(image, last) else 0
         last = image
     return last.astype(np.float32) / 255.0
