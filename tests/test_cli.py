@@ -30,6 +30,7 @@ import csplat
 from csplat import _spec, decode, read_ply, write_ply
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat_conformance.manifest import VECTORS
 from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
 from csplat_tools.cli.error_lines import RENAMED_OPTIONS
@@ -1092,3 +1093,9 @@ def test_a_scene_keeps_its_extremes(tmp_path):
 def test_numbers_of_any_length_are_refused(ply, tmp_path, digits):
     for words in (("encode", ply, tmp_path / "b.csplat", "--levels"), ("convert", ply, tmp_path / "b.ply", "--level")):
         refused(*words, digits, status=2)
+
+
+def test_a_file_with_too_much_metadata_is_not_called_a_large_scene():
+    line = refused("info", VECTORS / "invalid" / "json_values_beyond_budget.csplat")
+    assert "its metadata or cameras take more memory than is allowed here" in line
+    assert "Limits(json_bytes=...)" in line

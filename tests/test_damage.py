@@ -327,7 +327,7 @@ def test_inflating_stops_at_the_announced_size():
 
 def test_a_text_beyond_the_budget_is_refused():
     with pytest.raises(LimitError, match=r"E_LIMIT at byte 12 \(STR-8\)"):
-        read(count=2**32 - 1, packed=2**32 - 1, expected=None, json_bytes=10)
+        read(count=2**32 - 1, packed=2**32 - 1, expected=None, json_bytes=80)
 
 
 def test_the_longest_runs_are_read():

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 import typer
 
 from csplat.disk_files import is_temporary, temporary_root
-from csplat.errors import CsplatError, InputError
+from csplat.errors import CsplatError, InputError, LimitError
 from csplat.file_source import named_errors
 from csplat_tools.console import STANDARD_OUTPUT, note
 
@@ -44,6 +44,10 @@ _DEFECTS = {
         "`csplat decode` and `csplat verify` take scenes of any size",
     ),
 }
+_LONG_TEXT = (
+    "its metadata or cameras take more memory than is allowed here",
+    "in Python `csplat.decode(file, limits=csplat.decoder.Limits(json_bytes=...))` reads them",
+)
 _LOST_URL = re.compile(r"([a-z][a-z0-9+]+):/+(.+)")  # a URL read as a path, which loses a slash
 _OS_ADVICE = {
     errno.ENOENT: "is the name right?",
@@ -183,6 +187,8 @@ def _fail(message: str, code: str) -> NoReturn:
 def _csplat_error(error: CsplatError) -> str:
     """Return the message of an error: the file, the defect in plain words, the details, and the remedy."""
     what, advice = _DEFECTS.get(error.code, ("", "") if isinstance(error, InputError) else _INVALID)
+    if isinstance(error, LimitError) and error.limit == "json_bytes":
+        what, advice = _LONG_TEXT
     message = str(error)
     parts = [error.path] if error.path is not None and Path(error.path).name not in message else []
     parts += [part for part in (what, message) if part]
