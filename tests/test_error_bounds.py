@@ -232,7 +232,7 @@ def test_rows_with_non_finite_values_are_no_splats():
     rows = rows_of()
     rows.means[0, 1] = 1e39  # finite only in binary64
     rows.quats[1, 2] = np.nan
-    rows.scales[2, 0] = -np.inf
+    rows.scales[2, 0], rows.scales[7, 1] = np.inf, -np.inf  # the latter is flat
     rows.logits[3], rows.logits[4], rows.logits[5] = np.nan, np.inf, -np.inf
     rows.shN[6, 2, 1] = np.inf
     assert [False, False, False, False, True, True, False, True] == is_splat(rows).tolist()

@@ -38,6 +38,7 @@ export class InflateError extends Error {
 
 /** @param {unknown} error error from the platform, or whatever a caller's inflate throws */
 function refused(error) {
+  if (error instanceof InflateError) return error;
   const { message } = /** @type {{message?: unknown}} */ (error ?? {});
   const text = typeof message === 'string' ? message : typeof error === 'string' ? error : `it threw ${typeof error}`;
   const [last] = /[\w-]*(?=\W*$)/.exec(text) ?? [''];

@@ -180,9 +180,8 @@ FAULTS = {
         "nasty/zero_quaternion", ply=keep_rows(lambda columns: columns["rot_0"] != 0)),
     "infinite_logits_dropped": EncoderFault("all rows with infinite numbers are dropped", Harm.PICTURE,
         ("L2", "SRC-1"), "nasty/infinite_logits", ply=keep_rows(lambda columns: np.isfinite(columns["opacity"]))),
-    "infinite_scales_kept": EncoderFault("a scale of -inf is a very small scale", Harm.FACTS, ("L2", "SRC-1"),
-        "nasty/*inf*scale*,nasty/*scale*inf*,nasty/flat*",
-        ply=change_columns("scale_", lambda column: np.maximum(column, -88))),
+    "flat_splats_dropped": EncoderFault("a row with a scale of -inf is no splat", Harm.PICTURE, ("L2", "SRC-1"),
+        "nasty/infinite_scales", ply=keep_rows(lambda columns: np.isfinite(columns["scale_2"]))),
     "trailing_bytes_read": EncoderFault("the number of splats follows from the size of the file", Harm.FACTS,
         ("L2", "CNF-6"), "*/*trailing*", ply=change_header(counted_by_size)),
     # numbers

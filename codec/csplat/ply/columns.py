@@ -27,8 +27,8 @@ Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
 LOGIT_OF_0 = -110.0
 LOGIT_OF_1 = 20.0
 
-#: Natural logarithm of the smallest normal float32, scene units; replaces that of a standard deviation of 0.
-LOG_OF_0 = math.log(np.finfo(np.float32).tiny)
+#: Natural logarithm that replaces that of a standard deviation of 0; errors count smaller ones as this one (SER-5).
+LOG_OF_0 = -88.0
 
 #: Natural logarithm of the largest float32, scene units.
 LOG_OF_LARGEST = math.log(np.finfo(np.float32).max)

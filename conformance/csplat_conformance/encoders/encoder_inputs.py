@@ -281,7 +281,9 @@ def unusual_value_inputs() -> list[EncoderInput]:
         rows_input(
             "nasty/infinities", "infinite centres, rotations and colours: four rows are not splats", _infinities
         ),
-        rows_input("nasty/infinite_scales", "scales of ±infinity: four rows are not splats", _infinite_scales),
+        rows_input(
+            "nasty/infinite_scales", "scales of ±infinity: three rows are flat, one is no splat", _infinite_scales
+        ),
         rows_input(
             "nasty/beyond_float", "doubles beyond binary32: two rows are not splats", _beyond, PlyLayout(dtype="f8")
         ),

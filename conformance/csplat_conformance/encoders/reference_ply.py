@@ -59,10 +59,11 @@ class PlyRows:
 
 
 def is_splat(splats: PlyRows) -> NDArray[np.bool_]:
-    """Return a mask of the rows that are splats of the source (SRC-1): finite in binary32, except for logits."""
+    """Return a mask of the rows that are splats of the source (SRC-1): finite, except for logits and scales of 0."""
     good: NDArray[np.bool_] = ~np.isnan(splats.logits)
     with np.errstate(over="ignore"):
-        for array in (splats.means, splats.quats, splats.scales, splats.sh0, splats.shN):
+        flat = np.where(np.isneginf(splats.scales), 0.0, splats.scales)
+        for array in (splats.means, splats.quats, flat, splats.sh0, splats.shN):
             good &= np.isfinite(array.astype(np.float32)).all(axis=tuple(range(1, array.ndim)))
     return good
 
