@@ -21,7 +21,7 @@ from csplat.model import SplatModel, normalise_quats
 
 ROOT = Path(__file__).resolve().parent.parent
 NOBODY = "65534"  # user without a home
-SECONDS = 600  # for a command
+SECONDS = 600  # wall time after which a command counts as hanging; kernels are compiled in each run
 
 #: By command: its arguments, in a folder with a scene, a file of it, and a data set.
 COMMANDS = {
