@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import csplat
 import csplat_render
 import csplat_tools
-import csplat_tools.encode_file
+import csplat_tools.level_builder
 import csplat_trainer
 from csplat import errors
 from csplat.errors import CsplatError, InputError
@@ -322,7 +322,7 @@ def test_commands_call_the_public_functions(files, monkeypatch, words, name, giv
 def test_encode_calls_the_encoder_with_its_target(files, monkeypatch, words, target):
     monkeypatch.chdir(files[1].parent)
     words = ["encode", "scene.ply", "o", *words]
-    (scene, _), named = arguments_of(monkeypatch, csplat_tools.encode_file, "encode_with_report", words)
+    (scene, _), named = arguments_of(monkeypatch, csplat_tools.level_builder, "encode_with_report", words)
     assert_same(csplat.read_ply(files[1]), scene)
     assert csplat.Target(**target) == named["target"]
     assert ("max_error" in target) == (named["views"] is None)

@@ -20,11 +20,11 @@ from csplat import open as csplat_open
 from csplat.encoder import LevelNode, buckets, encode_plan, encode_tiles
 from csplat.encoder.buckets import BucketCurve, bucket_rows
 from csplat.formats import open_scene
-from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.out_of_core import OutOfCoreOptions, encode_scene, estimate_cost
 from csplat.scene_source import join_blocks, source_from_model
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
-from csplat_tools.encode_file import encode_file, estimate_file_cost, may_exceed_memory
+from csplat_tools.encode_file import encode_file, may_exceed_memory
 
 WHOLE = 600  # splats per bucket
 COUNT = 6 * WHOLE
@@ -420,7 +420,8 @@ def ply(model, tmp_path):
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
-    cost = estimate_file_cost(ply, options, limits)
+    with open_scene(ply) as scene:
+        cost = estimate_cost(scene, options, limits)
     assert (COUNT, 1, False) == (cost.splats, cost.sh_degree, cost.in_memory)
     assert 0 < cost.memory_bytes <= 300e6
     stages = []
@@ -452,6 +453,30 @@ def test_the_command_passes_out_of_core_options(ply, tmp_path, monkeypatch):
     assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == limits
     refused = run(app, ["encode", str(ply), str(target), "--resume", "--target-psnr", "40", "--force"])
     assert 2 == refused.exit_code
+
+
+def test_a_large_scene_needs_little_memory_unless_levels_are_requested(model, tmp_path):
+    """The splats of this file are a hole in it; an estimate does not read them."""
+    ply = tmp_path / "large.ply"
+    write_ply(ply, replace(model.select(slice(1)), extra={}, metadata={}))
+    header, _, splat = ply.read_bytes().partition(b"end_header\n")
+    header = header.replace(b"element vertex 1\n", b"element vertex 3000000\n") + b"end_header\n"
+    ply.write_bytes(header)
+    os.truncate(ply, len(header) + 3_000_000 * len(splat))
+    words = ["encode", str(ply), "--dry-run", "--json", "--memory"]
+    small, large = (CliRunner().invoke(app, [*words, size]) for size in ("500MB", "8GB"))
+    assert (0, 0) == (small.exit_code, large.exit_code), small.output
+    assert 400_000_000 < json.loads(small.stdout)["memory_bytes"] <= 500_000_000
+    assert "" == small.stderr  # the levels do not fit
+    with_levels = CliRunner().invoke(app, [*words, "8GB", "--levels", "auto"])
+    cost, more = json.loads(large.stdout), json.loads(with_levels.stdout)
+    assert 1.35 == pytest.approx(more["file_bytes"] / cost["file_bytes"], abs=0.001)
+    assert more["seconds"] > cost["seconds"]
+    assert large.stderr.startswith(
+        "viewers show a scene of 3,000,000 splats sooner with levels of detail: --levels auto"
+    )
+    assert large.stderr.endswith(" more, 35 % more bytes)\n")
+    assert "" == with_levels.stderr == CliRunner().invoke(app, [*words, "8GB", "--quiet"]).stderr
 
 
 def test_only_large_files_may_exceed_the_memory(ply, tmp_path):

@@ -42,7 +42,7 @@ from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.cli.app import app
 from csplat_tools.cli.shared_options import parse_level
 from csplat_tools.convert_file import convert_file
-from csplat_tools.encode_file import AUTO_LEVEL_SPLATS, choose_levels, encode_file
+from csplat_tools.encode_file import choose_levels, encode_file
 from csplat_tools.level_builder import LevelBuilder, encode_with_levels, kd_groups
 from csplat_tools.level_errors import measure_errors
 from csplat_tools.level_fitting import SCENE_WORK, LevelFitter
@@ -59,7 +59,7 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 def few_steps(monkeypatch):
     """Fit the small scenes of these tests in fewer steps."""
     work = replace(SCENE_WORK, steps=(100, 200))
-    monkeypatch.setattr("csplat_tools.level_builder.LevelFitter", partial(LevelFitter, work=work))
+    monkeypatch.setattr("csplat_tools.level_fitting.LevelFitter", partial(LevelFitter, work=work))
 
 
 @pytest.fixture(scope="module")
@@ -669,29 +669,32 @@ def test_encode_writes_levels(tmp_path, sample_path):
     assert {0, 1, 2} == {tile.level for tile in read_header(data).all_tiles}
     recorded = json.loads(result.stdout)["options"]["levels"]
     assert {"count": 2, "leaf_splats": 1 << 14, "splats": "fitted"} == recorded
-    for word in ("17", "some", "-1"):
+    for word in ("17", "none", "0", "-1"):
         refused = CliRunner().invoke(app, ["encode", str(sample_path), str(out), "--force", f"--levels={word}"])
         assert 2 == refused.exit_code
-        assert "expected auto, none or 0 to 16" in " ".join(refused.output.split())
+        assert "expected auto or 1 to 16" in " ".join(refused.output.split())
 
 
-def test_small_scenes_have_levels_on_request_only(tmp_path, sample_path):
-    out = tmp_path / "plain.csplat"
-    for levels in ("auto", None, 0):
-        encode_file(str(sample_path), str(out), EncodeOptions(), levels=levels)
-        assert csplat.encode(csplat.read_ply(sample_path)) == out.read_bytes()
-    assert choose_levels(AUTO_LEVEL_SPLATS - 1, EncodeOptions(), "auto") is None
-    assert choose_levels(AUTO_LEVEL_SPLATS, EncodeOptions(), "auto") == LevelBuilder()
+def test_scenes_have_levels_on_request_only(tmp_path, model):
+    ply, out = tmp_path / "scene.ply", tmp_path / "plain.csplat"
+    csplat.write_ply(ply, model)
+    for levels in ({}, {"levels": "auto"}):  # one node of 4,096 splats has no coarser one
+        encode_file(str(ply), str(out), EncodeOptions(), **levels)
+        assert csplat.encode(csplat.read_ply(ply)) == out.read_bytes()
+    assert choose_levels(10**9, EncodeOptions(), None) is None
+    assert choose_levels(4096, EncodeOptions(), "auto") is None
+    assert choose_levels(4097, EncodeOptions(), "auto") == LevelBuilder()
     assert choose_levels(9, EncodeOptions(), 2) == LevelBuilder(2)
-    with pytest.raises(InputError, match="levels is 17, expected 0 to 16, or auto"):
-        choose_levels(9, EncodeOptions(), 17)
+    for levels in (0, 17):
+        with pytest.raises(InputError, match=f"levels is {levels}, expected 1 to 16, or auto"):
+            choose_levels(9, EncodeOptions(), levels)
 
 
 def test_levels_without_the_renderer_are_an_error_that_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "numba", None)
-    assert choose_levels(AUTO_LEVEL_SPLATS - 1, EncodeOptions(), "auto") is None
-    with pytest.raises(InputError, match=r"1,000,000 splats, .* 'csplat\[render\]', or encode with `--levels none`"):
-        choose_levels(AUTO_LEVEL_SPLATS, EncodeOptions(), "auto")
+    assert choose_levels(10**6, EncodeOptions(), None) is None
+    with pytest.raises(InputError, match=r"numba: pip install 'csplat\[render\]'"):
+        choose_levels(10**6, EncodeOptions(), "auto")
 
 
 # Scenes of several buckets ---------------------------------------------------------------------------

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 from csplat._spec import MEASURE_NAMES
-from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target, encode_with_report
+from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target
 from csplat.errors import InputError, counted
 from csplat.formats import detect_format, open_scene
 from csplat.lint import Finding, refuse
@@ -22,6 +22,7 @@ from csplat.system import default_memory_bytes
 from csplat.types import Progress
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
+from csplat_tools.level_builder import LevelBuilder, encode_with_levels, read_streamed_levels
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import (
     CHEAP_TO_REOPEN,
@@ -32,16 +33,11 @@ from csplat_tools.scene_files import (
     size_on_disk,
 )
 
-if TYPE_CHECKING:
-    from csplat_tools.level_builder import LevelBuilder
-
 _MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
 _LEVELS_FACTOR = 4  # memory with levels of detail divided by that without: renders, and splats in several forms
 _SMALL = 4 << 20  # bytes; smaller files of any format always fit in memory
 
-#: Number of splats from which "auto" adds levels of detail. Such a file has 8 MB, which take ten seconds to arrive
-#: at 6 Mbit/s; with levels the whole scene is shown after about 70 kB (suite `arrival`), and encoding takes minutes.
-AUTO_LEVEL_SPLATS = 1_000_000
+_MANY_SPLATS = 1_000_000  # a file of these has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
 #: Largest number of levels to ask for: 4^16 splats are more than a scene can have.
 LEVELS_MAX = 16
 
@@ -57,43 +53,41 @@ def read_degree(options: EncodeOptions) -> int | None:
     return None if options.sh_degree is None else MAX_SH_DEGREE
 
 
-def estimate_file_cost(
-    local: Path, options: EncodeOptions, limits: OutOfCoreOptions, levels: Levels = None
-) -> EncodingCost:
-    """Estimate the cost of encoding a scene file, without reading its splats.
-
-    Args:
-        local: path of the scene.
-        options, limits, levels: as for `encode_file`.
-
-    Raises:
-        CsplatError: the scene is not valid, there is too little memory, or levels require the extra `render`.
-        OSError: the scene cannot be read.
-    """
-    with open_scene(local, sh_degree=read_degree(options)) as reader:
-        return estimate_cost(reader, options, limits, choose_levels(reader.count, options, levels))
-
-
 def choose_levels(count: int, options: EncodeOptions, levels: Levels) -> LevelBuilder | None:
     """Return the builder of the levels of detail of a scene of `count` splats; `None`: the file has none.
 
     Raises:
         InputError: the number of levels is out of range, or the extra `render` is not installed.
     """
-    if isinstance(levels, int) and not 0 <= levels <= LEVELS_MAX:
-        raise InputError(f"levels is {levels}, expected 0 to {LEVELS_MAX}, or auto")
-    if not levels or not count or (levels == "auto" and count < AUTO_LEVEL_SPLATS):
+    if isinstance(levels, int) and not 1 <= levels <= LEVELS_MAX:
+        raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, or auto")
+    builder = LevelBuilder(None if levels == "auto" else levels, bucket_splats=options.bucket_splats)
+    if levels is None or not count or (levels == "auto" and count <= builder.root_splats):
         return None
-    try:
-        require_renderer()
-    except InputError:
-        raise InputError(
-            f"the scene has {count:,} splats, and its levels of detail require numba: pip install 'csplat[render]', or "
-            "encode with `--levels none`"
-        ) from None
-    from csplat_tools.level_builder import LevelBuilder  # imports the renderer
+    require_renderer()
+    return builder
 
-    return LevelBuilder(None if levels == "auto" else levels, bucket_splats=options.bucket_splats)
+
+def describe_levels(scene: SceneSource, options: EncodeOptions, limits: OutOfCoreOptions) -> list[str]:
+    """Format the use and the cost of levels of detail as a line, for a scene that is encoded without.
+
+    Args:
+        scene: the scene; its blocks are not read.
+        options, limits: as for `encode_file`.
+
+    Returns:
+        The line, in a list; nothing for fewer than a million splats, or if the levels require more memory.
+    """
+    if scene.count < _MANY_SPLATS:
+        return []
+    try:
+        cost = estimate_cost(scene, options, limits)
+        more = estimate_cost(scene, options, limits, LevelBuilder(bucket_splats=options.bucket_splats))
+    except InputError:
+        return []
+    seconds, growth = more.seconds - cost.seconds, more.file_bytes / cost.file_bytes - 1.0
+    price = f"about {format_estimate(seconds)} more, {100.0 * growth:.0f} % more bytes"
+    return [f"viewers show a scene of {scene.count:,} splats sooner with levels of detail: --levels auto ({price})"]
 
 
 @dataclass(frozen=True)
@@ -148,7 +142,7 @@ def encode_file(
     importance: str | None = None,
     prune_unseen: bool = False,
     source_index: str | None = None,
-    levels: Levels = "auto",
+    levels: Levels = None,
     out_of_core: OutOfCoreOptions | None = None,
     progress: Progress | None = None,
 ) -> EncodedFile:
@@ -166,8 +160,8 @@ def encode_file(
         importance: a .npy file with one weight per splat of the source, or a file of `csplat sensitivity`.
         prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
-        levels: number of levels of detail above the scene; "auto": until the coarsest has 4,096 splats, for scenes of
-            `AUTO_LEVEL_SPLATS` or more, otherwise none; `None` or 0: none. Streamed SOG has its own, which are taken.
+        levels: number of levels of detail above the scene, 1 to 16; "auto": until the coarsest has 4,096 splats;
+            `None`: none. Those of streamed SOG are taken instead.
         out_of_core: memory, disk and workers.
         progress: progress callback.
 
@@ -192,7 +186,7 @@ def encode_file(
         with source_path(source) as local, ExitStack() as stack:
             opened: SceneSource | None = None
             # A target or an importance may prune splats, whose levels are built anew.
-            if levels and target is None and importance is None and detect_format(local).name == "sog":
+            if levels is not None and target is None and importance is None and detect_format(local).name == "sog":
                 builder = _levels_of_source(local, options, levels, limits)
             if not in_memory and builder is None and may_exceed_memory(local, limits, levels):
                 if progress is not None:
@@ -219,12 +213,8 @@ def encode_file(
             read.model, options, importance, target=target, views=views, prune_unseen=prune_unseen, levels=builder,
             progress=progress,
         )  # fmt: skip
-    elif builder is not None:
-        from csplat_tools.level_builder import encode_with_levels  # imports the renderer
-
-        result = encode_with_levels(read.model, options, builder, target=target, views=views, progress=progress)
     else:
-        result = encode_with_report(read.model, options, target=target, views=views, progress=progress)
+        result = encode_with_levels(read.model, options, builder, target=target, views=views, progress=progress)
     write_bytes(output, result.data)
     if source_index is not None:
         write_array(source_index, result.source_index)
@@ -246,11 +236,9 @@ def _levels_of_source(
         return None
     if limits != OutOfCoreOptions():
         raise InputError(
-            "taking the levels of detail of the source requires the scene in memory: use `--levels none`, or encode a "
-            "PLY of its finest level"
+            "taking the levels of detail of the source requires the scene in memory: encode without levels, or encode a"
+            " PLY of its finest level"
         )
-    from csplat_tools.level_builder import read_streamed_levels
-
     return replace(builder, nodes=read_streamed_levels(local, builder.count))
 
 
@@ -260,7 +248,7 @@ def may_exceed_memory(path: Path, limits: OutOfCoreOptions, levels: Levels = Non
         return True
     bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
     size = size_on_disk(path)
-    factor = _MEMORY_FACTOR * (_LEVELS_FACTOR if levels else 1)
+    factor = _MEMORY_FACTOR * (1 if levels is None else _LEVELS_FACTOR)
     return size > _SMALL and (detect_format(path).name != "ply" or size * factor > bound)
 
 
@@ -316,12 +304,11 @@ def format_declared_errors(errors: Mapping[str, tuple[float, float]]) -> list[st
     return [format_table(("declared error", "max", "rms"), rows)]
 
 
-def format_encoding(encoded: EncodedFile, psnr: float | None, source: str, output: str) -> str:
-    """Format counts, time, sizes and quality of an encoding as a line.
+def format_encoding(encoded: EncodedFile, source: str, output: str) -> str:
+    """Format counts, time, sizes and the PSNR, if it was measured, of an encoding as a line.
 
     Args:
         encoded: the written file.
-        psnr: PSNR of small renders, dB; `None`: not measured.
         source, output: names of the files.
     """
     report = encoded.report
@@ -330,9 +317,7 @@ def format_encoding(encoded: EncodedFile, psnr: float | None, source: str, outpu
     splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
     sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
     quality, found = "", None if encoded.result is None else encoded.result.psnr
-    if psnr is not None:
-        quality = f", about {psnr:.1f} dB (PSNR of eight small renders)"
-    elif found is not None:
+    if found is not None:
         quality = f", PSNR {found:.2f} dB"
     elif encoded.result is not None and len(encoded.source) and "-" not in (source, output):
         quality = f"; `csplat compare {source} {output}` shows how it looks"

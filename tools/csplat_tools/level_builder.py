@@ -40,9 +40,8 @@ from csplat.model import SplatModel
 from csplat.plugins import load_plugins
 from csplat.scene_source import join_blocks
 from csplat.types import F32, I64, Progress, null_progress
-from csplat_tools.level_errors import measure_errors
-from csplat_tools.level_fitting import PART_WORK, LevelFitter
-from csplat_tools.level_merging import merge_neighbours
+
+# Modules that render are imported where they are used: the cost of levels can be estimated without them.
 
 _KEPT = 4  # splats of a level, divided by those of the coarser one
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
@@ -124,6 +123,8 @@ class LevelBuilder:
         if not len(model):
             return []
         if len(model) <= self.whole_splats:
+            from csplat_tools.level_fitting import LevelFitter
+
             return self._build_leaves(
                 model, LevelFitter(_plain(model), threads=threads, progress=progress).fit, self.count
             )
@@ -149,6 +150,8 @@ class LevelBuilder:
             scene_count: number of splats of the scene.
             threads: number of threads; `None`: all. No node depends on it.
         """
+        from csplat_tools.level_fitting import PART_WORK, LevelFitter
+
         fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, threads=threads)
         return self._build_leaves(
             splats, fitter.fit if scene_count <= self.fitted_splats else _merge, self._part_levels
@@ -169,6 +172,8 @@ class LevelBuilder:
         """
         if self.count is not None and self.count <= self._part_levels:
             return [], []
+        from csplat_tools.level_fitting import LevelFitter
+
         parts = list(roots)
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
@@ -182,6 +187,8 @@ class LevelBuilder:
         self, encoded: EncodedTiles, threads: int | None = None, progress: Progress = null_progress
     ) -> EncodedTiles:
         """Return the same tiles with errors of the nodes that have none yet."""
+        from csplat_tools.level_errors import measure_errors
+
         return measure_errors(encoded, threads=threads, progress=progress)
 
     @property
@@ -305,6 +312,8 @@ def kd_groups(points: F32, count: int) -> list[NDArray[np.intp]]:
 
 
 def _merge(finer: SplatModel, nodes: I64, count: int, _level: int) -> tuple[I64, SplatModel]:
+    from csplat_tools.level_merging import merge_neighbours
+
     return merge_neighbours(finer, nodes, count)
 
 

@@ -129,13 +129,6 @@ class _KernelCache(caching.FunctionCache):  # type: ignore[misc]  # numba's type
         except Exception as error:  # noqa: BLE001  # the kernel works without
             self._give_up(error)
 
-    def is_empty(self) -> bool:
-        """Return True if no compiled version is on disk, or none that can be read."""
-        try:
-            return not self._cache_file._load_index()  # noqa: SLF001  # there is no public interface
-        except Exception:  # noqa: BLE001  # as in `load_overload`
-            return True
-
     def _repair(self) -> None:
         """Replace a damaged index by an empty one, so that compiled versions can be saved again."""
         try:
@@ -223,15 +216,6 @@ def on_compiling(call: Callable[[], object]) -> Iterator[None]:
     """Within the context, call a function when a kernel is first compiled rather than loaded from numba's cache."""
     with event.install_listener("numba:compile", _FirstCompilation(call)):
         yield
-
-
-def is_cached(kernel: Any) -> bool:
-    """Return True if the kernel is compiled, in this process or in numba's cache."""
-    compiled = getattr(kernel, "compiled", kernel)
-    if compiled.signatures:
-        return True
-    cache = compiled._cache  # noqa: SLF001  # numba has no public name for it
-    return isinstance(cache, _KernelCache) and not cache.is_empty()
 
 
 def fast_exp2(x: float) -> float:

@@ -10,12 +10,10 @@ import numpy as np
 
 from csplat.model import SplatModel
 from csplat_render import metrics
-from csplat_render.blending import blend
 from csplat_render.camera import Camera
 from csplat_render.conventions import UncheckedSplats
-from csplat_render.kernels import cache_failure, is_cached, on_compiling
+from csplat_render.kernels import cache_failure, on_compiling
 from csplat_render.metric_kernels import convolve
-from csplat_render.projection import project
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.rasteriser import Rasteriser
 
@@ -79,11 +77,6 @@ def warm_up(
         kept = f", for this run alone ({why}); NUMBA_CACHE_DIR names another folder" if why else ""
         announce(f"the renderer is compiled, in {seconds:.0f} s{kept}")
     return seconds
-
-
-def is_compiled() -> bool:
-    """Return True if the kernels that project and blend splats are compiled, so a render starts at once."""
-    return all(map(is_cached, (project, blend)))
 
 
 def _one_splat(dtype: Any) -> UncheckedSplats:

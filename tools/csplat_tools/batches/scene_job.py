@@ -24,14 +24,13 @@ from csplat.disk_files import parse_json, path_inside, remove_unfinished, tempor
 from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError, InputError, StoreError, counted, missing_package
 from csplat.file_source import open_binary, read_bytes
-from csplat.formats import detect_format
-from csplat.out_of_core import OutOfCoreOptions
+from csplat.formats import detect_format, open_scene
+from csplat.out_of_core import OutOfCoreOptions, estimate_cost
 from csplat.remote_store import is_url, open_store
 from csplat.system import NEW_GROUP_FLAGS, interrupt_process
 from csplat_tools.batches.batch_scenes import Task
 from csplat_tools.batches.journal import Record
 from csplat_tools.console import format_bytes, format_estimate, format_seconds, format_table
-from csplat_tools.encode_file import estimate_file_cost
 from csplat_tools.scene_files import FOLDER_NAMES, size_on_disk
 
 THUMBNAILS = "thumbnails"
@@ -370,7 +369,8 @@ def inspect_scene(path: Path) -> SceneFile:
     size, content = size_on_disk(path), content_hash(path)
     try:
         name = detect_format(path).name
-        found = estimate_file_cost(path, EncodeOptions(), OutOfCoreOptions(memory_bytes=_UNBOUNDED))
+        with open_scene(path) as scene:
+            found = estimate_cost(scene, EncodeOptions(), OutOfCoreOptions(memory_bytes=_UNBOUNDED))
     except (CsplatError, ValueError, MemoryError):  # no prediction for such a file
         return SceneFile(content, size, None, "")
     return SceneFile(content, size, found.splats, name, found.seconds, found.memory_bytes)

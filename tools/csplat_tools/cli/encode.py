@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib.util import find_spec
 from typing import Annotated
 
 import typer
 
 from csplat.encoder import EncodeOptions, Target
-from csplat.formats import assume_format
+from csplat.formats import assume_format, open_scene
 from csplat.model import SplatModel
-from csplat.out_of_core import OutOfCoreOptions
-from csplat.types import Progress
+from csplat.out_of_core import OutOfCoreOptions, estimate_cost
+from csplat.scene_source import source_from_model
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output, default_output
@@ -20,19 +19,20 @@ from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
     Levels,
+    choose_levels,
+    describe_levels,
     encode_file,
-    estimate_file_cost,
     format_cost,
     format_declared_errors,
     format_encoding,
     read_degree,
 )
 from csplat_tools.file_streams import check_name, source_path
-from csplat_tools.inspect.comparison import ESTIMATE_SIZE, ESTIMATE_SPLATS_MAX, estimate_psnr
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import LoadedModel, read_source
 from csplat_tools.views import ViewSet
 
+_UP_SPLATS = 50_000  # splats for an estimate of the up direction, about; all of a million would take 1.4 CPU s
 #: Parameters that require the whole scene in memory.
 IN_MEMORY = (
     "target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index",
@@ -53,8 +53,8 @@ def encode(
     no_prune: Annotated[bool, typer.Option("--no-prune", help="Targets keep all splats unchanged.")] = False,
     data: shared.Data = None,
     levels: Annotated[
-        str, typer.Option(metavar="LEVELS", show_default=False, help="N, none, auto. Default: auto, from 1M on.")
-    ] = "auto",
+        str | None, typer.Option(metavar="LEVELS", help="Levels: auto, or 1 to 16. Default: none.")
+    ] = None,
     up: shared.HiddenUp = None,
     attribute_psnr: Annotated[
         float | None, typer.Option(metavar="DB", hidden=True, help="PSNR of each attribute. Default: by preset.")
@@ -158,20 +158,14 @@ def encode(
             scene, output, options, target=target, views=around, overrides=overrides, importance=importance,
             source_index=source_index, levels=level_count, out_of_core=limits, progress=progress,
         )  # fmt: skip
-        _publish(encoded, source, output, threads, out, up=up, progress=progress)
+        _publish(encoded, source, output, out, up=up)
+        if level_count is None:
+            written = replace(source_from_model(encoded.source), count=encoded.report.splat_count)
+            out.remark(*describe_levels(written, options, limits))
 
 
-def _publish(
-    encoded: EncodedFile,
-    source: str,
-    output: str,
-    threads: int | None,
-    out: Output,
-    *,
-    up: str | None,
-    progress: Progress | None,
-) -> None:
-    """Publish the result, with an estimate of its PSNR if that is quick."""
+def _publish(encoded: EncodedFile, source: str, output: str, out: Output, *, up: str | None) -> None:
+    """Publish the result."""
     out.print_findings(encoded.findings)
     for line in encoded.report.notes:
         note(line)
@@ -180,23 +174,23 @@ def _publish(
 
         out.remark(*format_search(encoded.report.search))
     out.remark(*format_declared_errors(encoded.report.errors))
-    if progress is not None:
-        progress("eight small renders", 0.0)
-    psnr = None if out.quiet else _psnr(encoded, threads)
-    about = {} if psnr is None else {"psnr": round(psnr, 2), "size": list(ESTIMATE_SIZE)}
-    if not out.quiet and encoded.result is not None and len(encoded.source) <= ESTIMATE_SPLATS_MAX:
-        shared.take_estimated_up(estimate_up(encoded.source), out, given=up, shown=False)
-    out.remark(format_encoding(encoded, psnr, source, output))
-    out.publish({**encoded.as_json(), "about": about} if about else encoded.as_json())
+    if not out.quiet and encoded.result is not None:
+        every = max(1, len(encoded.source) // _UP_SPLATS)
+        axis = estimate_up(encoded.source.select(slice(None, None, every)), every)
+        shared.take_estimated_up(axis, out, given=up, shown=False)
+    out.remark(format_encoding(encoded, source, output))
+    out.publish(encoded.as_json())
 
 
 def _publish_estimate(
     source: str, options: EncodeOptions, limits: OutOfCoreOptions, levels: Levels, out: Output
 ) -> None:
     """Report memory, disk space and time that an encoding would take."""
-    with source_path(source) as local:
-        found = estimate_file_cost(local, options, limits, levels)
+    with source_path(source) as local, open_scene(local, sh_degree=read_degree(options)) as scene:
+        found = estimate_cost(scene, options, limits, choose_levels(scene.count, options, levels))
+        lines = describe_levels(scene, options, limits) if levels is None else []
     out.publish(found.as_json(), format_cost(found))
+    out.remark(*lines)
 
 
 def _find_views(
@@ -214,11 +208,3 @@ def _find_views(
             "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
         )
     return found
-
-
-def _psnr(encoded: EncodedFile, threads: int | None) -> float | None:
-    """Return an approximate PSNR in dB; `None` if it is known already, or if measuring it would take long."""
-    result = encoded.result
-    if result is None or result.psnr is not None or find_spec("numba") is None:
-        return None
-    return estimate_psnr(encoded.source, result.data, threads=threads)

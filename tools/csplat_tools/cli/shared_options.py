@@ -461,12 +461,12 @@ def parse_target(
     )  # fmt: skip
 
 
-def parse_levels(text: str) -> Levels:
-    """Parse a number of levels of detail, `auto` or `none`."""
-    if text in ("auto", "none"):
-        return "auto" if text == "auto" else None
-    if not re.fullmatch(r"[0-9]{1,9}", text) or int(text) > LEVELS_MAX:
-        raise typer.BadParameter(f"--levels is {text}, expected auto, none or 0 to {LEVELS_MAX}")
+def parse_levels(text: str | None) -> Levels:
+    """Parse a number of levels of detail, or `auto`; return `None` for `None`."""
+    if text is None or text == "auto":
+        return None if text is None else "auto"
+    if not re.fullmatch(r"[0-9]{1,9}", text) or not 1 <= int(text) <= LEVELS_MAX:
+        raise typer.BadParameter(f"--levels is {text}, expected auto or 1 to {LEVELS_MAX}")
     return int(text)
 
 

@@ -12,16 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import scene_source as scenes
-from csplat.decoder import DeclaredBounds, decode, open_tiles
+from csplat.decoder import DeclaredBounds, open_tiles
 from csplat.disk_files import check_free_space, finite_or_none, temporary_root
-from csplat.errors import CsplatError, InputError
+from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource
 from csplat.types import F32, Progress, null_progress
 from csplat_conformance.declared_bounds import Source, find_partners, lattice_radii, measure_pairs, verify_out_of_core
 from csplat_conformance.declared_bounds.measurement import merge_errors
 from csplat_render import Backend, Mode
-from csplat_render.camera import Camera, resized
+from csplat_render.camera import Camera
 from csplat_render.gpu.device import Device, find_device
 from csplat_render.gpu.renderer import GpuScene
 from csplat_render.gpu.scoring import compare_scenes
@@ -32,7 +32,7 @@ from csplat_tools.file_streams import is_csplat
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
 from csplat_tools.scene_files import LoadedModel, OpenedScene, SceneLike, open_scenes
-from csplat_tools.views import Colour, ViewSet, comparison_cameras, find_view_set
+from csplat_tools.views import Colour, ViewSet, find_view_set
 from csplat_tools.views.sliced_renderer import SlicedScene
 
 Pairing = Literal["index", "order", "search"]
@@ -40,11 +40,6 @@ _NEAR = 0.01  # fraction of the scene's spread; largest median distance of splat
 #: Name that searches LPIPS weights in the usual places, instead of a file.
 AUTO_WEIGHTS = "auto"
 _PIXEL_BYTES = 13  # bytes per pixel of the renders of the source, which are kept in memory
-#: Width and height of renders for an estimate, pixels. Small renders average errors away: 320×240 gives 0.4 dB too
-#: much, this size at most 0.2 dB.
-ESTIMATE_SIZE = (480, 360)
-#: Largest number of splats to render for an estimate; more take too long.
-ESTIMATE_SPLATS_MAX = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -290,32 +285,6 @@ def attribute_errors_out_of_core(
     ]
     found = {name: (one.max, one.rms) for name, one in merge_errors(parts).items()}
     return AttributeErrors("order", other.count, 0, found)
-
-
-def estimate_psnr(
-    source: SplatModel, data: bytes, *, threads: int | None = None, splats_max: int = ESTIMATE_SPLATS_MAX
-) -> float | None:
-    """Estimate the PSNR of `csplat compare` in a second, from smaller renders.
-
-    Args:
-        source: the source.
-        data: the file.
-        threads: number of threads; `None` for all.
-        splats_max: scenes of more splats are not rendered.
-
-    Returns:
-        PSNR in dB; `None` if there are no splats or too many, if rendering fails, or if the renderer is not compiled
-        yet, which takes longer than encoding.
-    """
-    from csplat_render.warmup import is_compiled  # requires numba
-
-    if not 0 < len(source) <= splats_max or not is_compiled():
-        return None
-    try:
-        cameras = [resized(camera, *ESTIMATE_SIZE) for camera in comparison_cameras(source)]
-        return Scorer.of_source(source, cameras, threads=threads).psnr(decode(data, threads=threads))
-    except (CsplatError, MemoryError):  # the estimate is optional
-        return None
 
 
 def _paired_blocks(

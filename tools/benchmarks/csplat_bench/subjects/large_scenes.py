@@ -28,7 +28,7 @@ def measure_commands(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Mea
     def measure(case: Case) -> Mapping[str, Any]:
         words = [argument.format(**paths) for argument in shlex.split(case["command"])]
         if "{file}" in case["command"] and case.get("output") != "file" and not paths["file"].exists():
-            fast = ["--preset", "fast", "--levels", "none", "--quiet"]
+            fast = ["--preset", "fast", "--quiet"]
             run_program([*setup.csplat, "encode", scene.path, paths["file"], *fast])
         force = ["--force"] if "output" in case.settings else []
         used = run_program([*setup.csplat, *words, *force, "--quiet"], sample_tree=True)
