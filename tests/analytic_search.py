@@ -113,6 +113,7 @@ class AnalyticScene:
         jump: dB that every other step of 0.6 dB of quality loses.
         packing: factor of the bytes of a file with fast compression.
         preset_saving: a preset, and the share by which its own file is smaller than others of its quality.
+        file_seconds: CPU seconds of making a file.
     """
 
     splats: int = 8000
@@ -138,6 +139,7 @@ class AnalyticScene:
     jump: float = 0.0
     packing: float = 1.008
     preset_saving: tuple[str, float] = ("", 0.0)
+    file_seconds: float = 0.0
 
     def model(self) -> SplatModel:
         """Return a model with this number of splats; their values do not matter."""
@@ -305,7 +307,7 @@ def search(
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
     pool = CandidatePool(encoding, validation_scorer, decode=lambda data: data)
     removal = None if no_prune else analytic_removal(scene, grades=grades)
-    whole = _Splats(scene, model, refits=False, classifiable=grades)
+    whole = _Splats(scene, model, refits=False, classifiable=grades, file_seconds=scene.file_seconds)
     goal, work = Goal.of(asked, model, judge, photographs), SimplifyOptions(effort=effort).work
     try:
         best = TargetSearch(goal, pool, whole, removal, work).best()
@@ -357,6 +359,7 @@ class _Splats:
     model: SplatModel
     refits: bool
     classifiable: bool
+    file_seconds: float
 
     def encode(self, options, *, use_classes, draft):
         use_classes = use_classes and self.classifiable and options.max_classes != 1 and self.scene.grading != 1.0
@@ -403,4 +406,6 @@ class _Removal(Pruner):
     def refit(self, kept_count):
         model = self.source.select(self.order.kept(kept_count))
         model = replace(model, sh0=np.ones_like(model.sh0))
-        return _Splats(self.scene, model, refits=True, classifiable=self.use_classes)
+        return _Splats(
+            self.scene, model, refits=True, classifiable=self.use_classes, file_seconds=self.scene.file_seconds
+        )

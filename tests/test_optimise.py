@@ -141,6 +141,17 @@ def test_a_small_size_is_met_with_fewer_splats(search_at_size):
     assert search_at_size.report.search.psnr > 24.0
 
 
+@pytest.mark.parametrize("no_prune", [True, False])
+def test_a_size_that_no_file_needs_gives_the_finest_file_at_once(many, no_prune):
+    found = search(many, judged_by(cameras(40)), size_bytes=10**6, no_prune=no_prune).report.search
+    assert (1, 0, 0) == (found.encodes, found.removal_views, found.sensitivity_views)
+    assert (900, 80.0) == (found.splats, found.chosen["attribute_psnr"])
+    assert found.psnr > 50.0
+    kept = f"{found.size_bytes / 1000:.1f} kB hold all splats at the finest precision"
+    assert f"the target is larger than this scene can use: {kept}" == found.why[-1]
+    assert found.size_bytes < 60 * 900
+
+
 @pytest.mark.slow
 def test_a_psnr_drop_against_images_prunes_splats(many, photographs, search_at_loss):
     decoded, scores = decode(search_at_loss.data), search_at_loss.report.search.photographs

@@ -112,8 +112,8 @@ def test_views_are_added_until_others_agree(source):
     many = find_sufficient_views(source, views, size=(24, 18))
     assert len(many.used) in (40, 80, 100)
     positions = {tuple(camera.position) for camera in many.used}
-    assert not positions & {tuple(camera.position) for camera in many.check}
-    assert len(many.check) == 16
+    assert not positions & {tuple(camera.position) for camera in many.check.cameras}
+    assert len(many.check.cameras) == 16
 
 
 # Pruning order.

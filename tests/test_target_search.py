@@ -104,6 +104,16 @@ def test_a_psnr_below_all_files_is_exceeded_with_a_note(no_prune):
     assert not any("no smaller file" in line for line in met.report.why)
 
 
+def test_a_search_stops_where_files_take_longer_than_their_saving_is_worth():
+    def files(found):
+        return [file for file in found.tried if not file.contents.draft]
+
+    quick, slow = (search(replace(PLAIN, mended=12.0, file_seconds=seconds), psnr=34.0) for seconds in (0.0, 20.0))
+    assert len(files(slow)) < len(files(quick))
+    assert 34.0 <= slow.file.psnr()
+    assert len(quick.file) < len(slow.file) <= 1.02 * len(quick.file)
+
+
 def test_a_plateau_is_crossed():
     # Between 42 and 55 dB of quality more bytes gain nothing.
     scene = replace(WITHOUT_SH, plateau=(42.0, 55.0))

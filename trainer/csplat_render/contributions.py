@@ -199,7 +199,7 @@ class Contributions(Rasteriser):
         seen: Array,
         *,
         background: Array,
-    ) -> None:
+    ) -> Array:
         """Measure one view, and add to the sums of a scene.
 
         Args:
@@ -207,6 +207,9 @@ class Contributions(Rasteriser):
             error: [N] float64, |d|² summed over pixels is added, with d the change of the render without the splat.
             seen: [N] bool, set for splats that are visible.
             background: [3].
+
+        Returns:
+            [H, W, 3], the render.
         """
         size, tiles_x = (drawn.height, drawn.width), -(-drawn.width // TILE)
         records = self._buffer("sums", (len(drawn.ids), PRUNING_SUMS), self.dtype)
@@ -224,6 +227,7 @@ class Contributions(Rasteriser):
                 transmittance, last, records,
             )  # fmt: skip
             add_pruning_sums(drawn.rows, drawn.first, records, error, seen)
+        return rgb
 
     def backproject(
         self,

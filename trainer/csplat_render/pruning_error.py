@@ -7,7 +7,7 @@ clipped to 0..1. The equations are in `contributions`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -54,6 +54,7 @@ def measure_pruning_error(
     transmittance_min: float = TRANSMITTANCE_MIN,
     threads: int | None = None,
     progress: Progress | None = None,
+    on_render: Callable[[Array], None] | None = None,
 ) -> PruningError:
     """Measure the effect of pruning each splat alone on the renders of a scene.
 
@@ -65,6 +66,7 @@ def measure_pruning_error(
         transmittance_min: transmittance at which a pixel is finished; 0: never.
         threads: number of threads; `None`: all. The result does not depend on it.
         progress: called with the stage and the completed fraction.
+        on_render: called with the render of each view, [H, W, 3].
 
     Raises:
         InputError: there is no camera.
@@ -76,7 +78,9 @@ def measure_pruning_error(
     error, seen, behind = np.zeros(len(model)), np.zeros(len(model), np.bool_), np.asarray(background, np.float64)
     for number, camera in enumerate(cameras):
         view = contributions.project_view(model, camera, antialiased=model.antialiased, basis=False)
-        contributions.measure_pruning(view, error, seen, background=behind)
+        render = contributions.measure_pruning(view, error, seen, background=behind)
+        if on_render is not None:
+            on_render(render)
         if progress is not None:
             progress("measuring splats", (number + 1) / len(cameras))
     return PruningError(error, seen, sum(3 * camera.W * camera.H for camera in cameras))

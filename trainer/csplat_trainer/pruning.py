@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.model import SplatModel
-from csplat.types import F64, I64, Mask, Progress
+from csplat.types import F32, F64, I64, Mask, Progress
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
@@ -32,10 +32,12 @@ class MeasuredViews:
     Attributes:
         cameras: the views.
         pruning_error: errors of removing each splat that is left, as last measured in these views.
+        renders: [H, W, 3], the render of each view; empty if they were not kept.
     """
 
     cameras: Sequence[Camera]
     pruning_error: PruningError
+    renders: Sequence[F32] = ()
 
     @classmethod
     def of(
@@ -44,15 +46,22 @@ class MeasuredViews:
         cameras: Sequence[Camera],
         background: ArrayLike,
         *,
+        keep_renders: bool = False,
         threads: int | None = None,
         progress: Progress | None = None,
     ) -> MeasuredViews:
-        """Measure the pruning errors of a scene; arguments as for `measure_pruning_error`."""
-        found = measure_pruning_error(model, cameras, background=background, threads=threads, progress=progress)
-        return cls(cameras, found)
+        """Measure the pruning errors of a scene; other arguments as for `measure_pruning_error`."""
+        renders = list[F32]()
+        found = measure_pruning_error(
+            model, cameras, background=background, threads=threads, progress=progress,
+            on_render=renders.append if keep_renders else None,
+        )  # fmt: skip
+        return cls(cameras, found, renders)
 
     def __add__(self, other: MeasuredViews) -> MeasuredViews:
-        return MeasuredViews([*self.cameras, *other.cameras], self.pruning_error + other.pruning_error)
+        return MeasuredViews(
+            [*self.cameras, *other.cameras], self.pruning_error + other.pruning_error, [*self.renders, *other.renders]
+        )
 
 
 @dataclass(eq=False)

@@ -78,10 +78,16 @@ class Subset(Protocol):
         model: the splats.
         refits: encoding refits the splats through the quantisers, which requires rendering; drafts skip that.
         classifiable: the splats may be sorted into quantisation classes.
+        file_seconds: typical CPU seconds of making a file at the default effort; a guess, so that no result depends on
+            the machine.
     """
 
     @property
     def model(self) -> SplatModel:  # noqa: D102
+        ...
+
+    @property
+    def file_seconds(self) -> float:  # noqa: D102
         ...
 
     @property
@@ -122,6 +128,11 @@ class WholeScene:
     def classifiable(self) -> bool:
         """True if importance was measured."""
         return self.measured is not None
+
+    @property
+    def file_seconds(self) -> float:
+        """Typical CPU seconds of encoding and scoring."""
+        return 4e-5 * len(self.model)
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:  # noqa: ARG002  # the protocol's
         """Quantise and code the splats."""

@@ -29,7 +29,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, F64, I64, Progress
 from csplat_render import Camera
-from csplat_render.scorer import Scorer, renderer
+from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_tools.optimise.rate_distortion import NOTHING, error_of_psnr
 from csplat_tools.optimise.scene_sensitivity import importance_views, measure_importance
 from csplat_tools.views import ViewSet, camera_sequence
@@ -39,6 +39,7 @@ from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
 _STEPS = 1280  # steps of a refit; half from other values and through quantisers, where fewer cost 8 % of the bytes
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
+_PIXEL_SECONDS, _SPLAT_SECONDS = 5e-7, 1.2e-6  # CPU seconds of a step by pixel and splat
 _POWERS = (0.5, 2.0)  # range of the power p if two refits show errors after ∝ (error before)^p
 
 
@@ -77,41 +78,50 @@ class Pruner:
         )
 
     @cached_property
-    def order(self) -> PruningOrder:
-        """The pruning order; if views are virtual, in twice the views, against overfitting."""
+    def measured(self) -> list[MeasuredViews]:
+        """Groups of views of the source; if views are virtual, twice the sufficient ones, against overfitting."""
         batches = self.sufficient.batches
         groups = [functools.reduce(operator.add, batches[start::2]) for start in range(min(2, len(batches)))]
         if self.views.virtual:
             cameras = camera_sequence(self.source, len(self.sufficient.used), self.size, seed=self.seed + 1)
             for part in (cameras[::2], cameras[1::2]):
                 found = MeasuredViews.of(
-                    self.source, part, self.views.background, threads=self.threads, progress=self.progress
-                )
+                    self.source, part, self.views.background, keep_renders=True, threads=self.threads,
+                    progress=self.progress,
+                )  # fmt: skip
                 groups.append(found)
-        return PruningOrder(self.source, groups, self.views.background, threads=self.threads, progress=self.progress)
+        return groups
+
+    @cached_property
+    def order(self) -> PruningOrder:
+        """The pruning order."""
+        return PruningOrder(
+            self.source, [*self.measured], self.views.background, threads=self.threads, progress=self.progress
+        )
 
     @cached_property
     def cameras(self) -> Sequence[Camera]:
         """The views that splats are fitted to, those of the pruning order."""
-        return [camera for group in self.order.groups for camera in group.cameras]
+        return [camera for group in self.measured for camera in group.cameras]
 
     @cached_property
     def references(self) -> list[F32]:
         """[H, W, 3], the source's render of each view."""
-        draw = renderer(self.source, self.views.background, threads=self.threads)
-        return [draw(camera).rgb for camera in self.cameras]
+        return [render for group in self.measured for render in group.renders]
 
     @cached_property
     def check_scorer(self) -> Scorer:
         """Scorer on held-out views, against which refits are checked."""
-        return Scorer.of_source(self.source, self.sufficient.check, self.views.background, threads=self.threads)
+        check = self.sufficient.check
+        references = [ReferenceImage(render) for render in check.renders]
+        return Scorer(check.cameras, references, self.views.background, threads=self.threads)
 
     @property
     def view_count(self) -> int:
         """Number of small renders in which pruning errors were measured, over all rounds."""
         groups = self.order.groups
         later = sum(len(groups[turn % len(groups)].cameras) for turn in range(len(self.order.rounds) - 1))
-        return len(self.cameras) + len(self.sufficient.check) + later
+        return len(self.cameras) + len(self.sufficient.check.cameras) + later
 
     def errors(self, allowed: float, known: Mapping[int, float] | None = None) -> tuple[F64, F64]:
         """Predict the error of pruning after a refit, in proportion to that before it until two refits show a power.
@@ -183,6 +193,7 @@ class PrunedSubset:
     check_psnr_pruned: float
     check_psnr: float
     refit_refused: bool
+    _tuned: dict[tuple[EncodeOptions, bool], SplatModel] = field(default_factory=dict, init=False)
 
     @property
     def refits(self) -> bool:
@@ -194,23 +205,45 @@ class PrunedSubset:
         """True if the splats may be sorted into quantisation classes."""
         return self.pruner.use_classes
 
+    @property
+    def file_seconds(self) -> float:
+        """Typical CPU seconds of a refit."""
+        width, height = self.pruner.size
+        return _STEPS // 2 * (_PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows))
+
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:
         """Quantise and code the splats, after a refit through the quantisers unless `draft`."""
         pruner, refits = self.pruner, self.refits
+        kind = replace(options, attribute_psnr=None), use_classes
+        tuned = None if draft else self._tuned.get(kind)
         plan = EncodePlan.of(
-            self.model, options, importance=self._weights(options, use_classes=use_classes),
+            self.model if tuned is None else tuned, options, importance=self._weights(options, use_classes=use_classes),
             origin=Origin(len(pruner.source), self.rows, refitted=refits, adjusted=refits), progress=pruner.progress,
         )  # fmt: skip
         if draft or not refits:
             return encode_tiles(plan, progress=pruner.progress)
         fixed = fix_quantisation(plan, pruner.source, pruner.progress)
         values = quantisation_aware_refit(
-            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_STEPS // 2),
-            background=pruner.views.background, seed=pruner.seed, threads=pruner.threads, progress=pruner.progress,
+            fixed, pruner.cameras, pruner.references, steps=pruner.steps(_STEPS // (2 if tuned is None else 4)),
+            before=self.model, background=pruner.views.background, seed=pruner.seed, threads=pruner.threads,
+            progress=pruner.progress,
         )  # fmt: skip
         start = fixed.start()
         before, after = (pruner.check_scorer.psnr(self._decoded(fixed, one)) for one in (start, values))
-        return fixed.encode(values if after >= before else start, pruner.progress)  # a refit of few splats may overfit
+        values = values if after >= before else start  # a refit of few splats may overfit
+        self._tuned[kind] = self._with_values(fixed, values)
+        return fixed.encode(values, pruner.progress)
+
+    def _with_values(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
+        """Return the splats with tuned values before rounding, or decoded ones if splats share them."""
+        decoded, here = fixed.dequantise(values), np.argsort(fixed.source_index)
+        shape = decoded if fixed.shapes is not None else values
+        shN = np.zeros_like(self.model.shN)
+        shN[:, : decoded.shN.shape[1]] = (decoded.shN if fixed.book is not None else values.sh)[here]
+        return replace(
+            self.model, opacities=values.opacities[here], quats=shape.quats[here], scales=shape.scales[here],
+            sh0=values.sh0[here], shN=shN,
+        )  # fmt: skip
 
     def _decoded(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
         return replace(self.model, **vars(fixed.dequantise(values)), means_double=None)
@@ -232,7 +265,7 @@ class PrunedSubset:
     def _importance(self) -> Importance | None:
         """The importance of the splats; `None` if no view shows any."""
         pruner = self.pruner
-        cameras = importance_views(replace(pruner.views, training=pruner.sufficient.used))
+        cameras = importance_views(replace(pruner.views, training=pruner.sufficient.used), len(self.model))
         try:
             return measure_importance(
                 self.model, cameras, pruner.views.background, threads=pruner.threads, progress=pruner.progress

@@ -23,6 +23,7 @@ from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sen
 
 _NOTHING = "a scene without splats has no sensitivities"
 _VIEWS = (40, 80)  # number of views that suffice, if cameras are given and of small virtual ones
+_MANY = 150_000  # splats; of more, half of the views show enough, and take long enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +93,7 @@ def measure_scene(
     if views.virtual and views.training:
         size = (views.training[0].W, views.training[0].H)
         found = find_sufficient_views(model, views, size=size, threads=threads, progress=progress)
-        cameras, check, source = found.used, found.check, "virtual"
+        cameras, check, source = found.used, found.check.cameras, "virtual"
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
     if check:
@@ -163,13 +164,13 @@ def measure_importance(
     return replace(weights, sh=apply_weight_floor(weights.sh, model))
 
 
-def importance_views(views: ViewSet) -> Sequence[Camera]:
-    """Return the training views in which the importance of splats is measured.
+def importance_views(views: ViewSet, splats: int) -> Sequence[Camera]:
+    """Return the training views in which the importance of N splats is measured.
 
     Virtual training views have various distances and directions. Cameras like the test views generalise less: plane3
     with quantisation classes from 40 of them has 42 dB on them and 39 on others; from these views, 41 and 40.
     """
-    return evenly_spaced(views.training, _VIEWS[views.virtual])
+    return evenly_spaced(views.training, _VIEWS[views.virtual] // (1 + (splats > _MANY)))
 
 
 def complete_importance(
@@ -201,7 +202,7 @@ def complete_importance(
     quick = encoding.preset == "fast" and encoding.max_classes is None
     if inside or quick or not (several or has_sh):
         return None, 0
-    seen_from = importance_views(views)
+    seen_from = importance_views(views, len(source))
     try:
         found = measure_importance(source, seen_from, views.background, threads=encoding.threads, progress=progress)
     except InputError:

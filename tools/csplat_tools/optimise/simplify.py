@@ -232,7 +232,7 @@ def _report(pruner: Pruner, subset: PrunedSubset, target: Target) -> dict[str, A
         "unseen_share": float(np.mean(unseen)),
         "views": {
             "used": len(views.used),
-            "check": len(views.check),
+            "check": len(views.check.cameras),
             "gap_db": round(views.gap, 3),
             "size": [views.used[0].W, views.used[0].H],
         },

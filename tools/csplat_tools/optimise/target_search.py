@@ -38,6 +38,7 @@ from csplat.types import Progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
+from csplat_tools.console import format_bytes
 from csplat_tools.level_builder import LevelBuilder
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, Coding, Subset, Weights, WholeScene
 from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
@@ -71,6 +72,10 @@ _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the q
 
 # What is tried.
 _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
+_FINEST = 80.0  # dB of precision; from 70 dB on, opacities and quats have all their levels, and finer means cut tiles
+_AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
+_HIGH, _BEYOND_REACH = 55.0, 3.0  # dB: a PSNR that may be out of reach; it is if the finest file misses it by more
+_MANY = 150_000  # splats; if more are all kept, files take too long to compare codings, and the encoder chooses one
 _MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
 _ROUNDS = 3  # most rounds of the first prediction of the count, most splat counts, most drafts of one coding
 _TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
@@ -80,8 +85,10 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 # What is near, and what is worth another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
+_SECONDS_PER_PERCENT = 10.0  # CPU seconds that a percent of the bytes is worth at the default effort
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 
+_AMPLE_REMARK = "the target is larger than this scene can use: {} hold all splats at the finest precision"
 _INSIDE_REMARK = (
     "splats were pruned by virtual views, which may show less than cameras inside of the surroundings do:"
     " use --data, or --cameras with at least 40 cameras, or keep all splats with --no-prune"
@@ -156,9 +163,10 @@ class TargetSearch:
             InputError: no file meets the goal.
         """
         if self.pruner is None:
-            coding = self._choose_coding(self.whole)
+            coding = self._choose_coding(self.whole, self._most_codings(self.whole))
             self._finish(self.whole, coding)
-            self._try_presets(coding)
+            if not (coding.use_classes and self.whole.classifiable):  # the presets' own files have no classes
+                self._try_presets(coding)
         else:
             subset, coding, larger = self._choose_splats(self.pruner)
             while not self._finish(subset, coding):
@@ -174,6 +182,27 @@ class TargetSearch:
         if not met:
             raise InputError(self._out_of_reach())
         return min(met, key=lambda one: one.size_bytes if self.goal.size_bytes is None else one.error)
+
+    def finest(self) -> Candidate | None:
+        """Return the file of all splats at the finest precision if it meets the target size, otherwise `None`.
+
+        It is made only if the size may be that large, or a PSNR that high.
+
+        Raises:
+            InputError: the PSNR is out of reach by far.
+        """
+        size_bytes = self.goal.size_bytes
+        if size_bytes is None and (self.goal.is_drop or self.goal.error > error_of_psnr(_HIGH)):
+            return None
+        if size_bytes is not None and size_bytes < _AMPLE * len(self.whole.model):
+            return None
+        found = self.pool.make(self.whole, self._first_codings(self.whole)[0], _FINEST, draft=False)
+        self._score(found)
+        if size_bytes is None:
+            if (found.goal_error or 0.0) > self.goal.error * error_of_psnr(-_BEYOND_REACH):
+                raise InputError(self._out_of_reach())
+            return None
+        return found if self._is_met(found) else None
 
     def best_draft(self) -> tuple[Candidate, float]:
         """Return the draft of the best splats, coding and precision, and its expected error after another refit."""
@@ -197,10 +226,10 @@ class TargetSearch:
             if left and self.work >= 1.0 and self._took_too_much(subset, usual):
                 kept_count = self._next_count(pruner, subset, usual)[0]
                 continue
-            coding = self._choose_coding(subset)
+            coding = self._choose_coding(subset, len(self._first_codings(subset)))
             tried.append((self._predict(subset, coding)[1], subset, coding))
             kept_count, saved = self._next_count(pruner, subset, coding)
-            if self.work < 1.0 or saved < _WORTH:
+            if self.work < 1.0 or saved < _WORTH or not self._is_worth(saved, subset):
                 break
             if any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
                 break
@@ -210,7 +239,8 @@ class TargetSearch:
             if cost < tried[best][0] - _WORTH:
                 best = number
         larger = [(subset, coding) for _, subset, coding in tried[:best] if self.goal.size_bytes is None]
-        return *tried[best][1:], larger
+        subset = tried[best][1]
+        return subset, self._choose_coding(subset, self._most_codings(subset)), larger
 
     def _took_too_much(self, subset: Subset, coding: Coding) -> bool:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
@@ -277,12 +307,16 @@ class TargetSearch:
 
     # The coding
 
-    def _choose_coding(self, subset: Subset) -> Coding:
-        """Return the coding with the least expected cost.
+    def _most_codings(self, subset: Subset) -> int:
+        """Return the number of codings to try."""
+        return 1 if not subset.refits and len(subset.model) > _MANY else max(2, round(_TRIES * self.work))
+
+    def _choose_coding(self, subset: Subset, most: int) -> Coding:
+        """Return the coding with the least expected cost of `most` ones.
 
         A coding of each kind is tried; then codebooks of other sizes, and neighbours of the best coding.
         """
-        costs, most = dict[Coding, float](), max(2, round(_TRIES * self.work))
+        costs = dict[Coding, float]()
         waiting = self._first_codings(subset)
         while waiting and len(costs) < most:
             coding = waiting.pop(0)
@@ -332,6 +366,8 @@ class TargetSearch:
         encoding, degree = self.pool.encoding, self.whole.model.sh_degree
         if encoding.sh_coding == "none" or not degree or encoding.sh_degree == 0:
             return [Coding("none")]
+        if not subset.refits and len(subset.model) > _MANY:
+            return [Coding(None, _USUAL.codebook_share)]
         coarse = subset.classifiable and not subset.refits and encoding.adaptive is None
         scalar = Coding("scalar", adaptive=1.0 if coarse else None)
         book = Coding("codebook", _USUAL.codebook_share)
@@ -394,7 +430,8 @@ class TargetSearch:
                 beyond = [other for other in made if safer * other < safer * met]
                 if len(beyond) > 1:  # the last missed the goal, although the model expected it to meet it
                     quality = 0.5 * (met + max(beyond, key=lambda other: safer * other))
-                if safer * (met - quality) < 0.5 * APART:
+                saved = self._cost(best) - self._cost_at(subset, coding, quality)
+                if safer * (met - quality) < 0.5 * APART or not self._is_worth(saved, subset):
                     break
             if not _QUALITIES[0] <= quality <= _QUALITIES[1]:
                 break
@@ -415,10 +452,20 @@ class TargetSearch:
         line = self._line(subset, coding)
         if self.goal.size_bytes is not None:
             quality = _clipped(line.quality_at_size(self.goal.size_bytes * (1.0 - self._bytes_per_db * AIM)))
-            error = self._unquantised(subset, coding) + line.error_at(quality)
-            return quality, self._exponent * math.log(error)
-        quality = line.quality_at_error(self._rest(subset, coding))
-        return _clipped(quality), line.log_bytes_at(quality)
+        else:
+            quality = line.quality_at_error(self._rest(subset, coding))
+        return _clipped(quality), self._cost_at(subset, coding, quality)
+
+    def _cost_at(self, subset: Subset, coding: Coding, quality: float) -> float:
+        """Return the expected cost in log bytes at a precision."""
+        line = self._line(subset, coding)
+        if self.goal.size_bytes is None:
+            return line.log_bytes_at(quality)
+        return self._exponent * math.log(self._unquantised(subset, coding) + line.error_at(quality))
+
+    def _is_worth(self, saved: float, subset: Subset) -> bool:
+        """Return True if the fraction of the bytes that another refit or file is expected to save is worth its time."""
+        return 100.0 * saved * _SECONDS_PER_PERCENT >= subset.file_seconds
 
     def _cost(self, file: Candidate) -> float:
         """Return the cost of a file on the goal, as in `_predict`."""
@@ -601,27 +648,32 @@ def search_target(
     if target.max_psnr_drop is not None and not views.images:
         raise InputError("a largest drop of PSNR requires images (--data), against which it is measured")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
-    options, pruner = replace(options, threads=encoding.threads), None
-    if not _keeps_all(target, encoding):
-        pruner = options.pruner(source, views, use_classes=not inside, progress=progress)
+    options, pruner, sensitivity_views = replace(options, threads=encoding.threads), None, 0
     pool = CandidatePool(encoding, views.validation_scorer(source, threads=encoding.threads), progress)
-    sensitivity_views = 0
-    if pruner is not None and target.keep is not None:
+    images = None if target.max_psnr_drop is None else views.image_validation_scorer(threads=encoding.threads)
+    goal, whole = Goal.of(target, source, test_scorer, images), WholeScene(source, importance, None, progress)
+    finest = None if levels is not None else TargetSearch(goal, pool, whole, None).finest()
+    if finest is None and not _keeps_all(target, encoding):
+        pruner = options.pruner(source, views, use_classes=not inside, progress=progress)
+    if finest is not None:
+        found = finest
+    elif pruner is not None and target.keep is not None:
         found = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
         found = found if levels is None else found.with_levels(levels, progress)
     else:
-        images = None if target.max_psnr_drop is None else views.image_validation_scorer(threads=encoding.threads)
-        goal, measured = Goal.of(target, source, test_scorer, images), None
         if pruner is None:
             measured, sensitivity_views = complete_importance(
                 source, views, encoding, importance, inside=inside, progress=progress
             )
-        whole = WholeScene(source, importance, measured, progress)
+            whole = replace(whole, measured=measured)
         search = TargetSearch(goal, pool, whole, pruner, options.work)
         found = search.best() if levels is None else _best_with_levels(search, levels, progress)
+    remarks = [_INSIDE_REMARK] * (inside and found.splats < len(source))
+    if finest is not None:
+        remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
     report = make_report(
-        target, found, pool, test_scorer, splats_before=len(source), views_of=views.name,
-        remarks=[_INSIDE_REMARK] * (inside and found.splats < len(source)), encodes=len(pool.made), seconds=0.0,
+        target, found, pool, test_scorer, splats_before=len(source), views_of=views.name, remarks=remarks,
+        encodes=len(pool.made), seconds=0.0,
         photographs=_image_psnr(source, found, views, encoding.threads) if views.images else {},
         sensitivity_views=sensitivity_views, removal_views=0 if pruner is None else pruner.view_count,
         elsewhere=_psnr_elsewhere(source, found, views, encoding.threads),

@@ -33,13 +33,13 @@ class SufficientViews:
     """Training views, held-out views, and the pruning errors of a source.
 
     Attributes:
-        batches: the training views, with pruning errors of the source.
-        check: the held-out views.
+        batches: the training views, with pruning errors and renders of the source.
+        check: the held-out views, likewise.
         gap: dB by which the predicted error of the splats to prune is larger in `check` than in the training views.
     """
 
     batches: list[MeasuredViews]
-    check: list[Camera]
+    check: MeasuredViews
     gap: float
 
     @property
@@ -72,7 +72,7 @@ def find_sufficient_views(
     """
 
     def measure(cameras: Sequence[Camera]) -> MeasuredViews:
-        return MeasuredViews.of(model, cameras, views.background, threads=threads, progress=progress)
+        return MeasuredViews.of(model, cameras, views.background, keep_renders=True, threads=threads, progress=progress)
 
     if not views.training or not views.validation:
         found = len(views.training) + len(views.validation)
@@ -80,7 +80,8 @@ def find_sufficient_views(
     every, check = shrink_cameras(views.training, size), shrink_cameras(views.validation, size)
     if views.virtual:
         every, check = _hold_out(every)  # views of the same kind
-    check_errors = measure(check).pruning_error
+    held_out = measure(check)
+    check_errors = held_out.pruning_error
     count = min(_BATCH, len(every)) if views.virtual else len(every)
     batches = [measure(every[:count])]
     while count < len(every):
@@ -90,7 +91,7 @@ def find_sufficient_views(
             break
         batches.append(measure(every[count : count + _BATCH]))
         count = min(count + _BATCH, len(every))
-    return SufficientViews(batches, check, _gap(model, total_error(batches), check_errors))
+    return SufficientViews(batches, held_out, _gap(model, total_error(batches), check_errors))
 
 
 def _hold_out(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
