@@ -97,7 +97,7 @@ def ulps(expected, found):
 @pytest.mark.parametrize("reach", [1e-8, 1.0, 40.0, 708.0])
 def test_exp_is_within_an_ulp(reach):
     x = np.random.default_rng(0).uniform(-reach, reach, 20_000)
-    assert ulps(np.array([math.exp(value) for value in x]), exp(x)) <= 1.5  # of two results within an ulp
+    assert ulps(np.array([math.exp(value) for value in x]), exp(x)) <= 1.5  # both results are within an ulp
 
 
 @pytest.mark.parametrize(("low", "high"), [(-1e-8, 1e-8), (-0.5, 0.5), (-1020.0, 1020.0)])

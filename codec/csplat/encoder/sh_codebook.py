@@ -148,7 +148,9 @@ class _ErrorWeights:
         """Return the weighted squared errors [n] of differences [n, 3K]."""
         if self.metric is not None:
             return self.metric.errors(difference.reshape(len(difference), -1, 3), rows)
-        squares = np.square(difference, dtype=np.float64).sum(axis=1)
+        squares = np.empty(len(difference))
+        for at in range(0, len(difference), _BLOCK):
+            squares[at : at + _BLOCK] = np.square(difference[at : at + _BLOCK], dtype=np.float64).sum(axis=1)
         return np.asarray(squares * self.weights[rows])
 
 
@@ -359,8 +361,9 @@ class _BandSums:
             return
         flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
         span = slice(first, first + difference.shape[1])
-        squares = np.square(flat, dtype=np.float64).sum(axis=0)
-        self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
+        for at in range(0, len(flat), _BLOCK):
+            squares = np.square(flat[at : at + _BLOCK], dtype=np.float64).sum(axis=0)
+            self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
         np.abs(flat, out=flat)
         np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
 
