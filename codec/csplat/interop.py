@@ -24,6 +24,7 @@ import numpy as np
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model, normalise_quats
 from csplat.ply.columns import alpha_of_logits, flatten_scales, logits_of_alpha
+from csplat.portable_math import log
 from csplat.types import F32
 
 if TYPE_CHECKING:
@@ -83,8 +84,7 @@ def from_gsplat(splats: Mapping[str, Any], *, form: Form = "parameters") -> Spla
     if form == "parameters":
         opacities = alpha_of_logits(opacities)
     elif (scales >= 0.0).all():
-        with np.errstate(divide="ignore"):
-            scales = np.log(scales.astype(np.float64)).astype(np.float32)
+        scales = log(scales).astype(np.float32)
     else:
         raise InputError('scales are not all at least 0: use form="parameters" for logarithms')
     flatten_scales(scales.reshape(-1, 1))  # a view

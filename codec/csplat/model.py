@@ -187,6 +187,13 @@ def sh_degree_of(coefficient_count: int) -> int:
     raise InputError(f"shN has {coefficient_count} coefficients per channel, expected 0, 3, 8, 15 or 24")
 
 
+def squared_lengths(quats: NDArray[Any]) -> NDArray[Any]:
+    """Return the squared lengths, [N], of quaternions [N, 4], added in a fixed order."""
+    w, x, y, z = quats.T
+    squared: NDArray[Any] = w * w + x * x + y * y + z * z
+    return squared
+
+
 def normalise_quats(quats: NDArray[Any]) -> F32:
     """Normalise quaternions; a zero quaternion becomes the identity.
 
@@ -200,7 +207,7 @@ def normalise_quats(quats: NDArray[Any]) -> F32:
     """
     # In float64, huge and denormal values need no special case.
     wide = quats.astype(np.float64)
-    squared = np.einsum("ij,ij->i", wide, wide)
+    squared = squared_lengths(wide)
     zero = squared == 0.0
     length = np.sqrt(squared)
     length[zero] = 1.0
@@ -247,7 +254,7 @@ def _check_opacities(opacities: F32) -> None:
 
 def _check_quats(quats: F32) -> None:
     with np.errstate(over="ignore"):
-        squared = np.einsum("ij,ij->i", quats, quats)
+        squared = squared_lengths(quats)
     low, high = (1.0 - QUAT_LENGTH_TOLERANCE) ** 2, (1.0 + QUAT_LENGTH_TOLERANCE) ** 2
     bad = int(np.count_nonzero((squared < low) | (squared > high)))
     if bad:

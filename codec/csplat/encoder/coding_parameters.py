@@ -20,6 +20,7 @@ from csplat import _spec
 from csplat.encoder.encode_options import PRESETS, EncodeOptions
 from csplat.encoder.entropy import DeflateSettings, deflate_library, morton_codes
 from csplat.model import SplatModel
+from csplat.portable_math import ceil_log2, exp, log
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -223,7 +224,7 @@ def scene_statistics(model: SplatModel, contrast: float | None = None) -> SceneS
         return SceneStatistics(0.0, 0.2, 0.01)
     points, reach = _reach(model.means)
     largest = np.take(model.scales, _sample_rows(len(model)), axis=0).max(axis=1)
-    size = float(np.exp(np.clip(np.median(largest), -80, 80))) / reach if reach else 1.0
+    size = float(exp(float(np.clip(np.median(largest), -80, 80)))) / reach if reach else 1.0
     if contrast is None:
         contrast = _rms(*_contrast(model, points, reach))
     return SceneStatistics(reach, float(np.clip(contrast, 0.02, 1.0)), float(np.clip(size, 1e-4, 1.0)))
@@ -258,10 +259,10 @@ def _steps(statistics: SceneStatistics, quality: float, sh_quality: float, *, ha
     for_quats, for_sh0 = (0.0, -2.0) if has_sh else (-1.5, 2.5)
 
     def coarse(decibels: float) -> float:
-        return float(10.0 ** ((50.0 - decibels) / 20.0))
+        return float(exp(log(10.0) * (50.0 - decibels) / 20.0))
 
     opacities = contrast / (0.012 * coarse(quality + for_quats))
-    quats = contrast * statistics.size**0.75 * 2090.0 / coarse(quality + for_quats)
+    quats = contrast * math.sqrt(statistics.size * math.sqrt(statistics.size)) * 2090.0 / coarse(quality + for_quats)
     return _AttributeSteps(
         means=2.2e-4 * coarse(quality) * statistics.reach / contrast,
         scales=min(0.5, 0.04 * coarse(quality) / contrast),
@@ -309,7 +310,7 @@ def _source_step(values: F32, step: float) -> float:
     """
     if not (step > _STEP_MIN and values.any()):
         return step
-    grid = 2.0 ** math.ceil(math.log2(_GRID_MIN * step))
+    grid = math.ldexp(1.0, ceil_log2(_GRID_MIN * step))
     if not (_on_grid(values[:_GRID_TRIAL], grid) and _on_grid(values, grid)):
         return step
     while _on_grid(values, 2.0 * grid):

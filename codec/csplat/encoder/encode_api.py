@@ -40,7 +40,7 @@ def encode(
 
     Returns:
         The bytes of a `.csplat` file. They depend only on the model, options, target, views and the versions of the
-        libraries.
+        libraries and, with a target or a shape codebook, on the processor.
 
     Examples:
         >>> import csplat

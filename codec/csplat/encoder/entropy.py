@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.errors import InputError
+from csplat.portable_math import log2
 from csplat.types import I64
 
 Integers = NDArray[Any]
@@ -176,7 +177,7 @@ def signed_or_sparse_block(attribute: int, integers: Integers, exponent: int, de
 def order_0_entropy(counts: NDArray[np.integer]) -> float:
     """Return the entropy, bits per symbol, of symbols with these counts, all positive."""
     shares = counts / max(1, counts.sum())
-    return -float((shares * np.log2(shares)).sum())
+    return -float((shares * log2(shares)).sum())
 
 
 def codebook_block(

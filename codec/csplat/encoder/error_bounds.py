@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.portable_math import exp
 from csplat.types import F64
 
 Floats = NDArray[Any]
@@ -40,8 +41,6 @@ class ErrorSums:
 
     def declared(self) -> dict[str, tuple[float, float]]:
         """Return `bounds()` with a margin for verifiers that round in another order (spec SER-5), rounded up.
-
-        Sums and exponentials of float64 end in other digits on other processors; rounded up, files are the same there.
 
         Raises:
             InputError: an error is not finite, which a file cannot declare (SER-2).
@@ -94,7 +93,7 @@ def distance_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
     if largest == 0.0:
         return 0.0, 0.0
     difference /= largest  # keeps squares of distances such as 1e-200 or 1e200 within float64
-    squares = np.einsum("ij,ij->j", difference, difference)
+    squares = np.square(difference, out=difference).sum(axis=0)
     return largest * float(np.sqrt(squares.max())), largest * largest * float(squares.sum())
 
 
@@ -105,9 +104,8 @@ def value_errors(source: Floats, decoded: Floats) -> tuple[float, float]:
     for at in range(0, source.size, 8 * _BLOCK):
         difference = decoded[at : at + 8 * _BLOCK].astype(np.float64)
         difference -= source[at : at + 8 * _BLOCK]
-        squares += float(np.einsum("i,i->", difference, difference))  # a sum by BLAS would depend on threads
-        np.abs(difference, out=difference)
-        largest = max(largest, float(difference.max()))
+        largest = max(largest, float(difference.max()), -float(difference.min()))
+        squares += float(np.square(difference, out=difference).sum())
     return largest, squares
 
 
@@ -127,8 +125,8 @@ def covariance_errors(
         reference = np.clip(source_scales[:, part], -SCALE_MOST, SCALE_MOST).astype(np.float64)
         top = reference.max(axis=0)
         reference -= top
-        variances = np.exp(2.0 * reference)
-        decoded = np.exp(2.0 * (np.clip(scales[:, part], -SCALE_MOST, SCALE_MOST) - top))
+        variances = exp(2.0 * reference)
+        decoded = exp(2.0 * (np.clip(scales[:, part], -SCALE_MOST, SCALE_MOST) - top))
         difference = covariance_entries(quats[:, part], decoded)
         difference -= covariance_entries(source_quats[:, part], variances)
         with np.errstate(over="ignore"):  # `declared` refuses infinity

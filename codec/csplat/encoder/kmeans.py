@@ -342,7 +342,10 @@ def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64,
 
 def _largest(keys: F64, count: int) -> I64:
     """Return the rows of the `count` largest keys, ascending."""
-    return np.sort(np.argpartition(keys, len(keys) - count)[len(keys) - count :])
+    limit = np.partition(keys, len(keys) - count)[len(keys) - count]
+    rows = np.flatnonzero(keys >= limit)
+    same = np.flatnonzero(keys[rows] == limit)  # `argpartition` would choose others of these on other processors
+    return np.delete(rows, same[: len(rows) - count])
 
 
 def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from csplat import _spec
 from csplat.encoder.coding_parameters import CodingParameters
 from csplat.errors import InputError
+from csplat.portable_math import ceil_log2
 from csplat.types import F32, I32, I64
 
 Floats = NDArray[Any]
@@ -30,7 +31,7 @@ Quaternion = tuple[F32, F32, F32, F32]
 def lattice_exponent(largest: float, step: float) -> int:
     """Return the smallest exponent >= 0 at which scales or colours of this largest magnitude satisfy LAT-4."""
     ratio = largest / step
-    return 0 if ratio < _WIDE else math.ceil(math.log2(ratio / _WIDE)) + 1
+    return 0 if ratio < _WIDE else ceil_log2(ratio / _WIDE) + 1
 
 
 def largest_exact(step: float) -> float:

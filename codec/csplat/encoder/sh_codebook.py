@@ -6,7 +6,6 @@ trained on a sample, and an `AssignmentRule` assigns the other splats.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -25,6 +24,7 @@ from csplat.encoder.quantisation import colour_integers, largest_exact, lattice_
 from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.portable_math import log2
 from csplat.types import F32, F64, I16, I32, U32, Progress
 
 Rows = NDArray[np.intp]
@@ -148,7 +148,9 @@ class _ErrorWeights:
         """Return the weighted squared errors [n] of differences [n, 3K]."""
         if self.metric is not None:
             return self.metric.errors(difference.reshape(len(difference), -1, 3), rows)
-        squares = np.einsum("ij,ij->i", difference, difference, dtype=np.float64)
+        squares = np.empty(len(difference))
+        for at in range(0, len(difference), _BLOCK):
+            squares[at : at + _BLOCK] = np.square(difference[at : at + _BLOCK], dtype=np.float64).sum(axis=1)
         return np.asarray(squares * self.weights[rows])
 
 
@@ -277,7 +279,7 @@ def sh_coarseness(rows: Rows, parameters: CodingParameters, sh_plan: ShCodingPla
     if sh_plan.weights is None or parameters.adaptive == 0.0:
         return None
     with np.errstate(divide="ignore"):
-        ratio = np.log2(sh_plan.reference / sh_plan.weights[rows].astype(np.float64))
+        ratio = log2(sh_plan.reference / sh_plan.weights[rows].astype(np.float64))
     return np.clip(np.rint(0.5 * parameters.adaptive * ratio), 0, _COARSEST).astype(np.int32)
 
 
@@ -359,8 +361,9 @@ class _BandSums:
             return
         flat = difference.reshape(len(difference), -1)  # reductions over whole rows are ten times faster
         span = slice(first, first + difference.shape[1])
-        squares = np.einsum("ij,ij->j", flat, flat, dtype=np.float64)
-        self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
+        for at in range(0, len(flat), _BLOCK):
+            squares = np.square(flat[at : at + _BLOCK], dtype=np.float64).sum(axis=0)
+            self._squares[span] += squares.reshape(-1, 3).sum(axis=1)
         np.abs(flat, out=flat)
         np.maximum(self._largest[span], flat.max(axis=0).reshape(-1, 3).max(axis=1), out=self._largest[span])
 
@@ -455,7 +458,7 @@ def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOpti
         return options.codebook_size
     share = parameters.codebook_share
     size = max(count * share, min(_FULL_SHARE_SPLATS * share, count / _USERS_MIN))
-    return min(1 << max(round(math.log2(max(1.0, size))), 4), parameters.codebook_most)
+    return min(1 << max(round(float(log2(max(1.0, size)))), 4), parameters.codebook_most)
 
 
 def _errors(
@@ -504,7 +507,7 @@ def _codebook_rate(codebooks: FileCodebooks, book: ShCodebook) -> float:
     """Estimate the bytes per splat of the entries and, by their entropy, of the indices."""
     entries = sum(len(chunk.payload) for chunk in codebooks.chunks) / len(book.index)
     shares = np.bincount(book.index) / len(book.index)
-    return entries - float((shares * np.log2(np.maximum(shares, 1e-12))).sum()) / 8
+    return entries - float((shares * log2(np.maximum(shares, 1e-12))).sum()) / 8
 
 
 def _codebook_pays(
@@ -531,8 +534,8 @@ def _codebook_pays(
         coarse_rate, coarse_distortion = _try_scalar(model, error_weights, trial, coarser)
         codebook_rate = rate + share * scalar_rate
         if 0.0 < fine_distortion < coarse_distortion:
-            slope = (scalar_rate - coarse_rate) / math.log2(coarse_distortion / fine_distortion)
-            codebook_rate += slope * math.log2(max(distortion, 1e-30) / fine_distortion)
+            slope = (scalar_rate - coarse_rate) / float(log2(coarse_distortion / fine_distortion))
+            codebook_rate += slope * float(log2(max(distortion, 1e-30) / fine_distortion))
         if deflate == parameters.deflate or abs(codebook_rate - scalar_rate) > _CLEAR * scalar_rate:
             break
     return codebook_rate < scalar_rate

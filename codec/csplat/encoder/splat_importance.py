@@ -18,6 +18,7 @@ from csplat.encoder.coding_parameters import CodingParameters
 from csplat.encoder.error_bounds import rotation_rows
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.portable_math import exp
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -176,7 +177,7 @@ def splat_weights(model: SplatModel, importance: Floats | Importance | None) -> 
             with np.errstate(over="ignore"):  # infinity is clipped
                 size = (scales.sum(axis=1) - scales.min(axis=1)) * np.float32(0.5)
             np.clip(size, -_LOG_SIZE_MAX, _LOG_SIZE_MAX, out=size)
-            weights[part] = model.opacities[part] * np.exp(size)
+            weights[part] = model.opacities[part] * exp(size)
         return weights
     given = np.asarray(importance)
     if given.shape != (len(model),):

@@ -17,6 +17,7 @@ from csplat.encoder.quantisation import largest_exact, lattice_values, opacity_l
 from csplat.encoder.quantisation_classes import QuantisationClasses
 from csplat.errors import InputError
 from csplat.model import SplatModel
+from csplat.portable_math import ceil_log2
 from csplat.types import F32, I64, U8, Mask
 
 Rows = NDArray[np.intp]
@@ -143,7 +144,7 @@ def tile_exponent(extent: float, reach: float, lattice: Lattice) -> int:
     floor = _log2(reach / lattice.step / _FINEST)
     if not lattice.finest:
         return max(0, needed, floor)
-    lowest = math.ceil(-1021 - math.log2(lattice.step))
+    lowest = -1020 - math.frexp(lattice.step)[1]
     if reach == 0.0:
         return 0
     return max(lowest, floor) if extent == 0.0 else max(lowest, needed, floor)
@@ -276,9 +277,12 @@ def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
     """Split at a multiple of the tile size, so that tiles are full; the first half is last, to be popped first."""
     parts = math.ceil(len(coordinate) / tile_splats)
     share = len(coordinate) * (parts // 2) // parts
-    order = np.argpartition(coordinate, share)
-    return [order[share:], order[:share]]
+    limit = np.partition(coordinate, share)[share]
+    near = coordinate < limit
+    same = np.flatnonzero(coordinate == limit)  # `argpartition` would choose others of these on other processors
+    near[same[: share - np.count_nonzero(near)]] = True
+    return [np.flatnonzero(~near), np.flatnonzero(near)]
 
 
 def _log2(ratio: float) -> int:
-    return -(1 << 12) if ratio <= 0.0 else math.ceil(math.log2(ratio))
+    return -(1 << 12) if ratio <= 0.0 else ceil_log2(ratio)

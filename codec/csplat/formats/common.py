@@ -21,6 +21,7 @@ from csplat.formats.format import ARRAYS, ValueRange
 from csplat.lint import Finding
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import LOG_OF_0, RowStatistics, count_huge_rows, list_findings
+from csplat.portable_math import log
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64, I64, U8
@@ -99,8 +100,7 @@ def _finite_rows(rows: Rows) -> NDArray[np.bool_]:
 
 def log_scales(scales: F32) -> F32:
     """Return natural logarithms of standard deviations, at least `LOG_OF_0`."""
-    with np.errstate(divide="ignore"):
-        logs: F32 = np.maximum(np.log(np.abs(scales)), np.float32(LOG_OF_0))
+    logs: F32 = np.maximum(log(np.abs(scales)).astype(np.float32), np.float32(LOG_OF_0))
     return logs
 
 
@@ -343,7 +343,7 @@ def decode_smallest_three(largest: NDArray[Any], three: F32) -> F32:
         [N, 4] float32, unit.
     """
     quats = np.empty((len(three), 4), np.float32)
-    left = 1.0 - np.einsum("nd,nd->n", three, three)
+    left = 1.0 - np.square(three).sum(axis=1)
     np.sqrt(np.maximum(left, 0.0, out=left), out=left)
     for index, others in enumerate(_OTHERS):
         here = np.flatnonzero(largest == index)

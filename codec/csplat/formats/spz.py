@@ -310,7 +310,7 @@ def _decode_first_three(rotations: U8) -> F32:
     """Decode rotations of versions 1 and 2: x, y and z are bytes, w >= 0 follows from them."""
     quats = np.empty((len(rotations), 4), np.float32)
     quats[:, 1:] = np.divide(rotations, 127.5, dtype=np.float32) - np.float32(1)
-    quats[:, 0] = np.sqrt(np.maximum(0, 1 - np.einsum("ij,ij->i", quats[:, 1:], quats[:, 1:])))
+    quats[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(quats[:, 1:]).sum(axis=1)))
     return normalise_quats(quats)
 
 

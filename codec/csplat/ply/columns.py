@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from csplat.errors import counted
 from csplat.lint import Finding
-from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats
+from csplat.model import QUAT_LENGTH_TOLERANCE, normalise_quats, squared_lengths
 from csplat.ply.column_names import ColumnMap, colour_finding, float_columns, plain_name
+from csplat.portable_math import exp, log
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -257,8 +258,7 @@ def alpha_of_logits(logits: NDArray[Any]) -> F32:
 
 
 def _alphas(logits: NDArray[Any]) -> F64:
-    with np.errstate(over="ignore"):
-        alphas: F64 = 1.0 / (1.0 + np.exp(-logits.astype(np.float64)))
+    alphas: F64 = 1.0 / (1.0 + exp(-logits.astype(np.float64)))
     return alphas
 
 
@@ -426,8 +426,10 @@ def _fuse_filter(scales: F32, alphas: F64, widths: F64) -> None:
     """
     rows = np.flatnonzero(widths)
     before = scales[rows].astype(np.float64)
-    after = 0.5 * np.logaddexp(2.0 * before, 2.0 * np.log(np.abs(widths[rows, None])))
-    alphas[rows] *= np.exp((before - after).sum(axis=1))
+    width = log(np.abs(widths[rows, None]))
+    larger = np.maximum(before, width)
+    after = larger + 0.5 * log(1.0 + exp(2.0 * (np.minimum(before, width) - larger)))
+    alphas[rows] *= exp((before - after).sum(axis=1))
     scales[rows] = after
 
 
@@ -448,7 +450,7 @@ def count_huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
 
 def _repair_quats(quats: F32, statistics: RowStatistics) -> None:
     wide = quats.astype(np.float64)
-    squared = np.einsum("ij,ij->i", wide, wide)
+    squared = squared_lengths(wide)
     zero = int(np.count_nonzero(squared == 0.0))
     other = int(np.count_nonzero(np.abs(squared - 1.0) > 2.0 * QUAT_LENGTH_TOLERANCE))
     statistics.zero_quats += zero

@@ -287,7 +287,7 @@ def _choose_origin(positions: F64) -> tuple[float, float, float]:
     if np.abs(centre).max() <= _NEAR_SPREADS * spread:
         return (0.0, 0.0, 0.0)
     if spread > 0.0:
-        step = 2.0 ** np.floor(np.log2(spread))
+        step = math.ldexp(0.5, math.frexp(spread)[1])
         centre = np.round(centre / step) * step
     x, y, z = centre.tolist()
     return x, y, z

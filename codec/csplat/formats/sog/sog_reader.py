@@ -22,6 +22,7 @@ from csplat.formats.sog.sog_files import JsonValue, SogParts, decode_webp, find_
 from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply.columns import alpha_of_logits
+from csplat.portable_math import exp
 from csplat.scene_source import BLOCK_SPLATS, SceneSource
 from csplat.types import F32, I64, U8, U16
 
@@ -410,7 +411,7 @@ class SogImages:
         logs = sog.bounds[0] + (sog.bounds[1] - sog.bounds[0]) * (self.means[part] / 65535.0)
         shN = np.take(self.palette, self.labels[part], 0)
         return {
-            "means": (np.sign(logs) * np.expm1(np.abs(logs))).astype(np.float32),
+            "means": (np.sign(logs) * (exp(np.abs(logs)) - 1.0)).astype(np.float32),
             "quats": quats,
             "scales": _look_up(sog.scales, self.scales[part]),
             "opacities": sog.alpha[self.sh0[part, 3]],
