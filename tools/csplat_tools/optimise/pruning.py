@@ -231,7 +231,8 @@ class PrunedSubset:
         start = fixed.start()
         before, after = (pruner.check_scorer.psnr(self._decoded(fixed, one)) for one in (start, values))
         values = values if after >= before else start  # a refit of few splats may overfit
-        self._tuned[kind] = self._with_values(fixed, values)
+        if tuned is None:  # longer chains of refits overfit
+            self._tuned[kind] = self._with_values(fixed, values)
         return fixed.encode(values, pruner.progress)
 
     def _with_values(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:

@@ -341,6 +341,9 @@ class TargetSearch:
         if best is not None:  # its codebook may be too small for any precision
             quality = min(self._predict(subset, best)[0], quality + _FAR)
         cost = math.inf
+        for draft in self.pool.of(subset, coding, draft=subset.refits):  # of the choice of the number of splats
+            if abs(quality - (draft.quality or 0.0)) < _NEAR:
+                return self._predict(subset, coding)[1]
         for _ in range(_ROUNDS):
             made = self.pool.make(subset, coding, quality, draft=True)
             if not costs:
