@@ -23,7 +23,7 @@ from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sen
 
 _NOTHING = "a scene without splats has no sensitivities"
 _VIEWS = (40, 80)  # number of views that suffice, if cameras are given and of small virtual ones
-_MANY = 150_000  # splats; of more, half of the views show enough, and take long enough
+MANY_SPLATS = 150_000  #: of more splats, half of the views show enough, and take long enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ def importance_views(views: ViewSet, splats: int) -> Sequence[Camera]:
     Virtual training views have various distances and directions. Cameras like the test views generalise less: plane3
     with quantisation classes from 40 of them has 42 dB on them and 39 on others; from these views, 41 and 40.
     """
-    return evenly_spaced(views.training, _VIEWS[views.virtual] // (1 + (splats > _MANY)))
+    return evenly_spaced(views.training, _VIEWS[views.virtual] // (1 + (splats > MANY_SPLATS)))
 
 
 def complete_importance(

@@ -2,23 +2,25 @@
 
 How a target is met:
 
-1. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
+1. A size that no file of the scene needs, and a PSNR that none reaches, are recognised by one file (`finest`).
+2. The pruning order predicts the error of pruning for every number of kept splats. With typical bytes per decibel this
    gives the first number of splats; for a size, typical bytes per splat do (`_first_count`). These splats are refitted
    to renders of the source.
-2. Drafts of these splats, which are files without a refit through their quantisers, are encoded with one coding of SH
-   after another: each neighbour of the best coding, up to `_TRIES` codings (`_choose_coding`). Drafts of a coding give
-   its bytes and error as functions of the precision (`RateLine`), and so its bytes on the goal (`_predict`).
-3. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
-   save enough, it is tried as well (`_next_count`). For a PSNR or a drop, splats whose pruning takes too much of the
-   error get no drafts, unless they are the last.
-4. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
-   goal, which corrects the prediction of the precision, until another file would hardly be smaller (`_finish`). If none
-   meets the goal, more splats are taken: those of step 3, or others; for a size, fewer. Of all that meet it, drafts
-   included, the smallest is written, or the best one of a size.
+3. Drafts of these splats, which are files without a refit through their quantisers, are encoded with a coding of SH of
+   each kind. They give its bytes and error as functions of the precision (`RateLine`), and so its bytes on the goal
+   (`_predict`).
+4. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
+   save enough for its time (`_is_worth`), it is tried as well (`_next_count`). For a PSNR or a drop, splats whose
+   pruning takes too much of the error get no drafts, unless they are the last. For the final number, drafts of one
+   coding after another are made: each neighbour of the best, up to `_TRIES` codings (`_choose_coding`).
+5. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
+   goal, which corrects the prediction of the precision, until another is not expected to save enough (`_finish`). If
+   none meets the goal, more splats are taken: those of step 4, or others; for a size, fewer. Of all that meet it,
+   drafts included, the smallest is written, or the best one of a size.
 
 Drafts are compared by their error on validation views. The views of the goal, which are the test views for a PSNR,
 only tell how much error is left there (`_allowed`): they settle precision and number of splats. With all splats kept,
-steps 1 and 3 are left out, and the presets' own files are candidates.
+steps 2 and 4 are left out, and the presets' own files are candidates unless the best has quantisation classes.
 """
 
 from __future__ import annotations
@@ -57,7 +59,7 @@ from csplat_tools.optimise.rate_distortion import (
     log_bytes_at_size,
     rate_exponent,
 )
-from csplat_tools.optimise.scene_sensitivity import complete_importance
+from csplat_tools.optimise.scene_sensitivity import MANY_SPLATS, complete_importance
 from csplat_tools.optimise.search_report import make_report
 from csplat_tools.optimise.simplify import SimplifyOptions
 from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_validation_views
@@ -68,6 +70,7 @@ _RENDERS = (520.0, 2480.0)  # cost of a target in renders of a test view: a fixe
 _USUAL = PRESETS["small"]  # whose precision and codebook the first drafts have
 _USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat of a file of a size
 _PSNR_PER_PRECISION = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
+_MISSED_GAIN = 0.03  # log bytes that the refit of a file gains less without quantisation classes (horse, plane3: 4 %)
 _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the quantisers; 1.5 to 2.6 in five scenes
 
 # What is tried.
@@ -75,7 +78,6 @@ _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alo
 _FINEST = 80.0  # dB of precision; from 70 dB on, opacities and quats have all their levels, and finer means cut tiles
 _AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
 _HIGH, _BEYOND_REACH = 55.0, 3.0  # dB: a PSNR that may be out of reach; it is if the finest file misses it by more
-_MANY = 150_000  # splats; if more are all kept, files take too long to compare codings, and the encoder chooses one
 _MOST_ENTRIES = 1 / 4  # largest number of codebook entries per splat
 _ROUNDS = 3  # most rounds of the first prediction of the count, most splat counts, most drafts of one coding
 _TRIES = 8  # most codings of some splats at the default effort, and most files of a coding
@@ -85,6 +87,9 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 # What is near, and what is worth another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
+_TOLERANCE = (
+    0.1  # of the error that pruning may take: predicted with less, accepted with more than another refit is worth
+)
 _SECONDS_PER_PERCENT = 10.0  # CPU seconds that a percent of the bytes is worth at the default effort
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 
@@ -246,7 +251,8 @@ class TargetSearch:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
         if self.goal.size_bytes is not None:
             return False
-        return self._unquantised(subset, coding, on_goal=True) > self._most_left_out * self._allowed_in_renders
+        most = (1.0 + _TOLERANCE) * self._most_left_out
+        return self._unquantised(subset, coding, on_goal=True) > most * self._allowed_in_renders
 
     def _first_count(self, pruner: Pruner) -> int:
         """Return the number of splats to begin with."""
@@ -272,7 +278,8 @@ class TargetSearch:
         pruned = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
         if size_bytes is None:
             counts, errors = pruner.errors(allowed, {count: pruned})
-            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
+            most = (1.0 - _TOLERANCE) * self._most_left_out
+            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, most)
         else:
             line = self._line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
@@ -308,8 +315,8 @@ class TargetSearch:
     # The coding
 
     def _most_codings(self, subset: Subset) -> int:
-        """Return the number of codings to try."""
-        return 1 if not subset.refits and len(subset.model) > _MANY else max(2, round(_TRIES * self.work))
+        """Return the number of codings to try; one, the encoder's choice, if many splats are all kept."""
+        return 1 if not subset.refits and len(subset.model) > MANY_SPLATS else max(2, round(_TRIES * self.work))
 
     def _choose_coding(self, subset: Subset, most: int) -> Coding:
         """Return the coding with the least expected cost of `most` ones.
@@ -340,16 +347,18 @@ class TargetSearch:
         best, quality = min(costs, key=costs.__getitem__, default=None), self._start(subset, coding)
         if best is not None:  # its codebook may be too small for any precision
             quality = min(self._predict(subset, best)[0], quality + _FAR)
+        missed = _MISSED_GAIN if subset.refits and subset.classifiable and not coding.use_classes else 0.0
+        made = self.pool.of(subset, coding, draft=subset.refits)  # for the choice of the number of splats
+        if any(abs(quality - (one.quality or 0.0)) < _NEAR for one in made):
+            return self._predict(subset, coding)[1] + missed
         cost = math.inf
-        for draft in self.pool.of(subset, coding, draft=subset.refits):  # of the choice of the number of splats
-            if abs(quality - (draft.quality or 0.0)) < _NEAR:
-                return self._predict(subset, coding)[1]
         for _ in range(_ROUNDS):
-            made = self.pool.make(subset, coding, quality, draft=True)
+            draft = self.pool.make(subset, coding, quality, draft=True)
             if not costs:
-                self._score(made)
+                self._score(draft)
             quality, cost = self._predict(subset, coding)
-            if abs(quality - (made.quality or 0.0)) < _NEAR or (best is not None and cost > costs[best] + _WORTH):
+            cost += missed
+            if abs(quality - (draft.quality or 0.0)) < _NEAR or (best is not None and cost > costs[best] + _WORTH):
                 break
         return cost
 
@@ -369,7 +378,7 @@ class TargetSearch:
         encoding, degree = self.pool.encoding, self.whole.model.sh_degree
         if encoding.sh_coding == "none" or not degree or encoding.sh_degree == 0:
             return [Coding("none")]
-        if not subset.refits and len(subset.model) > _MANY:
+        if not subset.refits and len(subset.model) > MANY_SPLATS:
             return [Coding(None, _USUAL.codebook_share)]
         coarse = subset.classifiable and not subset.refits and encoding.adaptive is None
         scalar = Coding("scalar", adaptive=1.0 if coarse else None)
