@@ -78,8 +78,8 @@ class Subset(Protocol):
         model: the splats.
         refits: encoding refits the splats through the quantisers, which requires rendering; drafts skip that.
         classifiable: the splats may be sorted into quantisation classes.
-        file_seconds: typical CPU seconds of making a file at the default effort; a guess, so that no result depends on
-            the machine.
+        file_seconds: typical CPU seconds of making another file at the default effort; a guess, so that no result
+            depends on the machine.
     """
 
     @property

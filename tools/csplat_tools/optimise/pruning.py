@@ -207,9 +207,9 @@ class PrunedSubset:
 
     @property
     def file_seconds(self) -> float:
-        """Typical CPU seconds of a refit."""
+        """Typical CPU seconds of the refit of another file."""
         width, height = self.pruner.size
-        return _STEPS // 2 * (_PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows))
+        return _STEPS // 4 * (_PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows))
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:
         """Quantise and code the splats, after a refit through the quantisers unless `draft`."""

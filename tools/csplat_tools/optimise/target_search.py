@@ -87,9 +87,7 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 # What is near, and what is worth another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
-_TOLERANCE = (
-    0.1  # of the error that pruning may take: predicted with less, accepted with more than another refit is worth
-)
+_TOLERANCE = 1.1  # factor by which pruning may take more of the error than it should, before it takes too much
 _SECONDS_PER_PERCENT = 10.0  # CPU seconds that a percent of the bytes is worth at the default effort
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
 
@@ -234,7 +232,7 @@ class TargetSearch:
             coding = self._choose_coding(subset, len(self._first_codings(subset)))
             tried.append((self._predict(subset, coding)[1], subset, coding))
             kept_count, saved = self._next_count(pruner, subset, coding)
-            if self.work < 1.0 or saved < _WORTH or not self._is_worth(saved, subset):
+            if self.work < 1.0 or saved < _WORTH or not self._is_worth(0.5 * saved, subset):
                 break
             if any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
                 break
@@ -251,7 +249,7 @@ class TargetSearch:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
         if self.goal.size_bytes is not None:
             return False
-        most = (1.0 + _TOLERANCE) * self._most_left_out
+        most = _TOLERANCE * self._most_left_out
         return self._unquantised(subset, coding, on_goal=True) > most * self._allowed_in_renders
 
     def _first_count(self, pruner: Pruner) -> int:
@@ -278,8 +276,7 @@ class TargetSearch:
         pruned = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
         if size_bytes is None:
             counts, errors = pruner.errors(allowed, {count: pruned})
-            most = (1.0 - _TOLERANCE) * self._most_left_out
-            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, most)
+            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
         else:
             line = self._line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
@@ -476,7 +473,7 @@ class TargetSearch:
         return self._exponent * math.log(self._unquantised(subset, coding) + line.error_at(quality))
 
     def _is_worth(self, saved: float, subset: Subset) -> bool:
-        """Return True if the fraction of the bytes that another refit or file is expected to save is worth its time."""
+        """Return True if the fraction of the bytes that another file is expected to save is worth its time."""
         return 100.0 * saved * _SECONDS_PER_PERCENT >= subset.file_seconds
 
     def _cost(self, file: Candidate) -> float:
