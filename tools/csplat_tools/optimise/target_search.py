@@ -276,13 +276,14 @@ class TargetSearch:
         pruned = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
         if size_bytes is None:
             counts, errors = pruner.errors(allowed, {count: pruned})
-            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
+            costs = log_bytes_at_error(counts, errors, allowed, self._exponent, _TOLERANCE * self._most_left_out)
         else:
             line = self._line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
             counts, errors = pruner.errors(quantised, {count: pruned})
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
-        best = int(np.argmin(costs))
+        fits = costs if size_bytes is not None else np.where(errors <= self._most_left_out * allowed, costs, np.inf)
+        best = int(np.argmin(fits))
         return self._rounded(counts[best]), float(costs[np.searchsorted(-counts, -count)] - costs[best])
 
     @property
