@@ -53,7 +53,8 @@ class Pruner:
         size: width and height of training renders, pixels.
         steps_factor: factor of the number of steps of a refit.
         refits: fit colours, opacities, scales and rotations of the kept splats to renders of the source.
-        use_classes: kept splats may be sorted into quantisation classes.
+        use_classes: kept splats may be sorted into quantisation classes, and later files start from tuned values; False
+            for surroundings, of which virtual views show too little.
         seed: seed of further virtual views, and of the order in which views are used.
         threads: number of threads; `None` for all. No result depends on it.
         progress: progress callback.
@@ -209,7 +210,11 @@ class PrunedSubset:
     def file_seconds(self) -> float:
         """Typical CPU seconds of the refit of another file."""
         width, height = self.pruner.size
-        return _STEPS // 4 * (_PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows))
+        return (
+            _STEPS
+            // (4 if self.pruner.use_classes else 2)
+            * (_PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows))
+        )
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:
         """Quantise and code the splats, after a refit through the quantisers unless `draft`."""
@@ -231,7 +236,8 @@ class PrunedSubset:
         start = fixed.start()
         before, after = (pruner.check_scorer.psnr(self._decoded(fixed, one)) for one in (start, values))
         values = values if after >= before else start  # a refit of few splats may overfit
-        if tuned is None:  # longer chains of refits overfit
+        # Longer chains overfit, and in surroundings the rate term moves what few views show (fox120k: 1 to 3 dB less).
+        if tuned is None and pruner.use_classes:
             self._tuned[kind] = self._with_values(fixed, values)
         return fixed.encode(values, pruner.progress)
 
