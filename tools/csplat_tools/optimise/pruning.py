@@ -210,11 +210,8 @@ class PrunedSubset:
     def file_seconds(self) -> float:
         """Typical CPU seconds of the refit of another file."""
         width, height = self.pruner.size
-        return (
-            _STEPS
-            // (4 if self.pruner.use_classes else 2)
-            * (_PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows))
-        )
+        step_seconds = _PIXEL_SECONDS * width * height + _SPLAT_SECONDS * len(self.rows)
+        return _STEPS // (4 if self.pruner.use_classes else 2) * step_seconds
 
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:
         """Quantise and code the splats, after a refit through the quantisers unless `draft`."""
