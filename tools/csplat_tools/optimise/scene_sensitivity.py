@@ -93,7 +93,7 @@ def measure_scene(
     if views.virtual and views.training:
         size = (views.training[0].W, views.training[0].H)
         found = find_sufficient_views(model, views, size=size, threads=threads, progress=progress)
-        cameras, check, source = found.used, found.check.cameras, "virtual"
+        cameras, check, source = found.used, [*found.check.cameras], "virtual"
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
     if check:

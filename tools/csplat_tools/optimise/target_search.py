@@ -11,8 +11,8 @@ How a target is met:
    (`_predict`).
 4. The measured error of the refitted splats corrects the order's prediction. If another number of splats promises to
    save enough for its time (`_is_worth`), it is tried as well (`_next_count`). For a PSNR or a drop, splats whose
-   pruning takes too much of the error get no drafts, unless they are the last. For the final number, drafts of one
-   coding after another are made: each neighbour of the best, up to `_TRIES` codings (`_choose_coding`).
+   pruning takes too much of the error get no drafts, unless they are the last. For the final number, and for a size,
+   drafts of one coding after another are made: each neighbour of the best, up to `_TRIES` codings (`_choose_coding`).
 5. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
    goal, which corrects the prediction of the precision, until another is not expected to save enough (`_finish`). If
    none meets the goal, more splats are taken: those of step 4, or others; for a size, fewer. Of all that meet it,
@@ -229,7 +229,8 @@ class TargetSearch:
             if left and self.work >= 1.0 and self._took_too_much(subset, usual):
                 kept_count = self._next_count(pruner, subset, usual)[0]
                 continue
-            coding = self._choose_coding(subset, len(self._first_codings(subset)))
+            codings = len(self._first_codings(subset)) if self.goal.size_bytes is None else self._most_codings(subset)
+            coding = self._choose_coding(subset, codings)
             tried.append((self._predict(subset, coding)[1], subset, coding))
             kept_count, saved = self._next_count(pruner, subset, coding)
             if self.work < 1.0 or saved < _WORTH or not self._is_worth(0.5 * saved, subset):
@@ -242,8 +243,8 @@ class TargetSearch:
             if cost < tried[best][0] - _WORTH:
                 best = number
         larger = [(subset, coding) for _, subset, coding in tried[:best] if self.goal.size_bytes is None]
-        subset = tried[best][1]
-        return subset, self._choose_coding(subset, self._most_codings(subset)), larger
+        chosen = tried[best][1]
+        return chosen, self._choose_coding(chosen, self._most_codings(chosen)), larger
 
     def _took_too_much(self, subset: Subset, coding: Coding) -> bool:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
