@@ -82,7 +82,7 @@ def quantisation_aware_refit(
     references: Sequence[F32],
     *,
     steps: int,
-    before: SplatModel | None = None,
+    before: SplatModel,
     background: ArrayLike = (0.0, 0.0, 0.0),
     seed: int = 0,
     threads: int | None = None,
@@ -93,8 +93,7 @@ def quantisation_aware_refit(
     Args:
         fixed: the encoder's quantisation.
         cameras, references, steps, background, seed, threads, progress: as for `refit_splats`.
-        before: the same splats before any refit through quantisers, whose error is not due to quantisation; `None`:
-            those of `fixed`.
+        before: the same splats before any refit through quantisers; their error is not due to quantisation.
 
     Returns:
         Values for `FixedQuantisation.encode`.
@@ -102,7 +101,7 @@ def quantisation_aware_refit(
     model = fixed.encode_plan.model
     views = _TrainingViews(cameras, references, background, model.antialiased, threads)
     refit = _QuantisedRefit(views, steps, seed, progress, fixed)
-    rms, pruning_rms = views.rms(refit.scene.dequantise()[0]), views.rms(model if before is None else before)
+    rms, pruning_rms = views.rms(refit.scene.dequantise()[0]), views.rms(before)
     quantised = max(rms**2 - pruning_rms**2, _LEAST_QUANTISED * rms**2)
     if math.isfinite(quantised):
         value_count = sum(image.size for image in references) / len(references)

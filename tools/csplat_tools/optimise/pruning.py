@@ -39,7 +39,8 @@ from csplat_trainer.splat_refit import quantisation_aware_refit, refit_splats
 
 _STEPS = 1280  # steps of a refit; half from other values and through quantisers, where fewer cost 8 % of the bytes
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
-_PIXEL_SECONDS, _SPLAT_SECONDS = 5e-7, 1.2e-6  # CPU seconds of a step by pixel and splat
+# CPU seconds of a step by pixel and splat. With 240×180 pixels and SH 3, plane3 (5,000 splats) takes 25 ms.
+_PIXEL_SECONDS, _SPLAT_SECONDS = 5e-7, 1.2e-6
 _POWERS = (0.5, 2.0)  # range of the power p if two refits show errors after ∝ (error before)^p
 
 

@@ -314,8 +314,13 @@ class TargetSearch:
     # The coding
 
     def _most_codings(self, subset: Subset) -> int:
-        """Return the number of codings to try; one, the encoder's choice, if many splats are all kept."""
-        return 1 if not subset.refits and len(subset.model) > MANY_SPLATS else max(2, round(_TRIES * self.work))
+        """Return the number of codings to try."""
+        return 1 if self._leaves_coding_open(subset) else max(2, round(_TRIES * self.work))
+
+    @staticmethod
+    def _leaves_coding_open(subset: Subset) -> bool:
+        """Return True if many splats are all kept: files take too long to compare codings, and the encoder chooses."""
+        return not subset.refits and len(subset.model) > MANY_SPLATS
 
     def _choose_coding(self, subset: Subset, most: int) -> Coding:
         """Return the coding with the least expected cost of `most` ones.
@@ -347,7 +352,7 @@ class TargetSearch:
         if best is not None:  # its codebook may be too small for any precision
             quality = min(self._predict(subset, best)[0], quality + _FAR)
         missed = _MISSED_GAIN if subset.refits and subset.classifiable and not coding.use_classes else 0.0
-        made = self.pool.of(subset, coding, draft=subset.refits)  # for the choice of the number of splats
+        made = self.pool.of(subset, coding, draft=subset.refits)  # when the number of splats was chosen
         if any(abs(quality - (one.quality or 0.0)) < _NEAR for one in made):
             return self._predict(subset, coding)[1] + missed
         cost = math.inf
@@ -377,7 +382,7 @@ class TargetSearch:
         encoding, degree = self.pool.encoding, self.whole.model.sh_degree
         if encoding.sh_coding == "none" or not degree or encoding.sh_degree == 0:
             return [Coding("none")]
-        if not subset.refits and len(subset.model) > MANY_SPLATS:
+        if self._leaves_coding_open(subset):
             return [Coding(None, _USUAL.codebook_share)]
         coarse = subset.classifiable and not subset.refits and encoding.adaptive is None
         scalar = Coding("scalar", adaptive=1.0 if coarse else None)
