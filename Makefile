@@ -18,10 +18,10 @@ SAMPLE := tools/csplat_tools/data/sample.ply
 
 .DEFAULT_GOAL := help
 
-.PHONY: help demo examples check test test-all dist test-dist lint format spec sample docs bench wasm fuzz fuzz-c clean
+.PHONY: help demo examples check test lab-test test-all dist test-dist lint format spec sample docs bench wasm fuzz fuzz-c clean
 
 help: ## this list
-	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
+	@grep -E '^[a-z%-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## */\t/' | expand -t 12
 
 demo: $(CORE) ## set up, then encode, verify and decode the sample scene
 	@mkdir -p out
@@ -37,14 +37,21 @@ examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in each engi
 	$(BIN)/csplat export-element tools/examples/public/csplat-view.js --force
 	cd tools/examples && npm install --silent --no-audit --no-fund && npm start
 
-check: $(VENV)/.dev ## a minute: style, types, import contracts, generated files, fast tests, on the checkout
+check: $(VENV)/.dev ## a minute: style, types, import contracts, generated files, unmarked tests, on the checkout
 	tests/run.sh check
 
 test: $(VENV)/.dev ## everything that an ordinary change can break, on the built wheel; .ci/run calls it
 	tests/run.sh test
 
-test-all: $(VENV)/.all ## the same and all areas: engines, torch, S3, Dask, peers, benchmarks, long fuzzing
+lab-test: $(VENV)/.dev ## the laboratories: authoring, planted faults, fuzzing, benchmarks
+	tests/run.sh lab
+
+test-all: $(VENV)/.all ## all of these with every marker: browsers, engines, peers, torch, GPU, S3, Dask, long fuzzing
 	tests/run.sh all
+
+part-lab: lab-test
+part-%: $(VENV)/.all ## the tests of one marker: make part-browser
+	tests/run.sh part $*
 
 lint: $(VENV)/.dev ## style, types and import contracts alone
 	$(BIN)/ruff check .
@@ -60,7 +67,7 @@ spec: $(VENV)/.dev ## write constants and tables from the registry
 	$(BIN)/python spec/generate.py
 
 sample: $(VENV)/.dev ## make the sample scene again: photograph the garden, train; some minutes
-	$(BIN)/python tools/sample/make_sample.py
+	$(BIN)/python tools/lab/sample/make_sample.py
 
 docs: $(VENV)/.core ## the documentation, as a site in out/site
 	$(INSTALL) --editable '.[docs]'
@@ -79,7 +86,7 @@ test-dist: ## install out/dist/*.whl in an environment of its own, and run the c
 	$(MAKE) --no-print-directory demo BIN=out/fresh/$(notdir $(BIN)) CORE=
 
 bench: $(VENV)/.dev ## measure what is missing in out/bench, suite by suite; a day or more
-	$(BIN)/pytest -m "area(name='benchmarks')"
+	$(BIN)/pytest tools/lab/tests
 	for suite in codec formats file_parts decoder_agreement decoders targets rendering training viewer; do \
 		$(BENCH) run $$suite || exit 1; \
 	done
@@ -88,7 +95,7 @@ wasm: ## compile the decoder in C for the JavaScript one; needs Debian 12's clan
 	codec/js/wasm/build.sh codec/js/wasm_binary.mjs
 
 fuzz: $(VENV)/.dev ## forty minutes of malformed files: decoders, validator, readers
-	$(BIN)/python tests/fuzz.py --target all --seconds 2400
+	$(BIN)/python conformance/lab/fuzz.py --target all --seconds 2400
 
 fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what it finds for the others; needs clang
 	@mkdir -p out/fuzz/c/corpus
@@ -98,7 +105,7 @@ fuzz-c: $(VENV)/.core ## ten minutes of the same for the decoder in C, and what 
 	@mkdir -p out/fuzz/inflate
 	$(CLANG) $(FUZZED) codec/c/fuzz/inflate.c -lz -o out/fuzz/inflate/fuzz
 	out/fuzz/inflate/fuzz -max_total_time=60 -max_len=4000 -artifact_prefix=out/fuzz/inflate/
-	$(BIN)/python tests/fuzz.py --target others --replay out/fuzz/c/corpus
+	$(BIN)/python conformance/lab/fuzz.py --target others --replay out/fuzz/c/corpus
 
 clean: ## remove what the commands above made
 	rm -rf $(VENV) out dist build .mypy_cache .ruff_cache .pytest_cache .hypothesis \

@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 REGISTRY = ROOT / "spec" / "registry.toml"
 FORMAT = ROOT / "spec" / "format.md"
 PYTHON = ROOT / "codec" / "csplat" / "_spec.py"
-RULES = ROOT / "conformance" / "csplat_authoring" / "_rules.py"
+RULES = ROOT / "conformance" / "lab" / "csplat_authoring" / "_rules.py"
 JAVASCRIPT = ROOT / "codec" / "js" / "spec.mjs"
 TYPES = ROOT / "codec" / "js" / "decoder.d.ts"
 WGSL = ROOT / "codec" / "wgsl"
@@ -283,7 +283,7 @@ def field_offsets(fields: list[Field]) -> list[int]:
 
 
 def rules_module(registry: Registry) -> str:
-    """Return the text of conformance/csplat_authoring/_rules.py: the allowed values of fields, for boundary tests."""
+    """Return the text of csplat_authoring/_rules.py: the allowed values of fields, for boundary tests."""
     ranges, choices, masks = [], [], []
     for structure, (name, base, _), rule in rules_of(registry):
         where = f'"{structure}", "{name}", "{rule.get("of", "")}"'

@@ -45,7 +45,7 @@ from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import TrainOptions, TrainResult
 from csplat_trainer.tuning import FinetuneOptions, TuningResult, TuningViews, renders_of, split_views, tune
 
-RESULTS = Path(__file__).resolve().parent.parent / "tools" / "benchmarks" / "results" / "extremes.json"
+RESULTS = Path(__file__).resolve().parent.parent / "tools" / "lab" / "results" / "extremes.json"
 #: Bytes per splat, PSNR and the like of each condition, as `python tests/extremes.py` measured them.
 EXPECTED = {row["scene"]: row for row in json.loads(RESULTS.read_text("utf-8"))["rows"]}
 COUNT = 300

@@ -1,9 +1,11 @@
 #!/usr/bin/env bash
-# The three tiers of tests; `make check`, `make test` and `make test-all` set up .venv and call this.
+# The tiers of tests; `make check`, `make test`, `make lab-test` and `make test-all` set up .venv and call this.
 #
-#   tests/run.sh check   the checkout: style, types, import contracts, generated files, fast tests; a minute
+#   tests/run.sh check   the checkout: style, types, import contracts, generated files, unmarked tests; a minute
 #   tests/run.sh test    the built wheel: everything that an ordinary change can break; minutes
-#   tests/run.sh all     the same, and every area of tests/areas.toml, pyright, long fuzzing
+#   tests/run.sh lab     the laboratories: authoring, planted faults, fuzzing, benchmarks
+#   tests/run.sh part M  the tests with marker M
+#   tests/run.sh all     all of these, with every marker, pyright and long fuzzing
 #
 # Further words go to pytest. With CI=true in the environment nothing may be skipped because a program is absent.
 # Each step prints its seconds of wall time and of CPU time, children included; a table at the end repeats them.
@@ -13,39 +15,44 @@ cd "$(dirname "$0")/.."
 BIN=$PWD/.venv/bin
 [ -d "$BIN" ] || BIN=$PWD/.venv/Scripts # Windows
 WHEEL=out/wheel
-# Unguided: few cases reach the same lines without coverage, at a third of the time. `make fuzz` is guided.
-FUZZING=(--target others --target ply --target formats --count 200)
 TIER=${1:-test}
 shift || true
 
+PYTEST=("$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorder)
+# CONTRIBUTING.md has a table of what each marker guards.
+EVERYDAY="not (browser or engines or peers or torch or gpu or remote or long)"
+
 check_tier() {
     static_checks
-    step "fast tests" "$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorder \
-        --maxfail 25 -m "$("$BIN/python" tests/areas.py expression --fast)" "$@"
+    step "unmarked tests" "${PYTEST[@]}" --maxfail 25 -m "$EVERYDAY and not slow and not shared_data" "$@"
 }
 
-# test_tier EXPRESSION [WORDS...]: EXPRESSION selects Python tests by their markers.
+# test_tier EXPRESSION [WORDS...]: EXPRESSION selects tests by their markers.
 test_tier() {
     step "wheel" build_wheel
     use_wheel
     # Kernels are compiled once, here, and not by each worker of pytest; meanwhile other steps use the other core.
-    background "kernels, behaviour snapshot" "$BIN/python" -m pytest -q tests/test_behaviour.py -m "not area"
+    background "kernels, behaviour snapshot" "$BIN/python" -m pytest -q tests/test_behaviour.py -m "$1"
     static_checks
+    step "vectors equal their recipes" "$BIN/python" -m csplat_authoring --check
     javascript
-    # Every vector by the command, as an author of a decoder runs it.
+    # By the command, as an author of a decoder or encoder runs it; tests run every level and input in their own process.
     step "conformance of the decoder" "$BIN/csplat" conformance decoder --level 4
-    # One input, by processes: tests/test_conformance_encoder.py takes them all, in its own process.
     step "conformance of the encoder" "$BIN/csplat" conformance encoder --level 3 --filter '*/duplicates'
-    step "fuzzing" "$BIN/python" tests/fuzz.py "${FUZZING[@]}" --jobs 1 --plain
     joined
-    step "Python tests" "$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorder -m "$1" --deselect tests/test_behaviour.py "${@:2}"
+    step "Python tests" "${PYTEST[@]}" -m "$1" --deselect tests/test_behaviour.py "${@:2}"
+}
+
+# lab_tier CASES: fuzz each target with so many cases. Unguided: without coverage cases take a third of the time.
+lab_tier() {
+    step "fuzzing" "$BIN/python" conformance/lab/fuzz.py --target all --count "$1" --jobs 1 --plain
+    step "tests of the laboratories" "${PYTEST[@]}" conformance/lab/tests tools/lab/tests "${@:2}"
 }
 
 all_tier() {
     step "types (pyright)" "$BIN/pyright"
-    FUZZING=(--target all --count 1500)
     test_tier "" "$@"
-    "$BIN/python" tests/areas.py record
+    lab_tier 1500
 }
 
 static_checks() {
@@ -158,18 +165,12 @@ mkdir -p out
 BEGAN=$SECONDS
 case $TIER in
 check) check_tier "$@" ;;
-test)
-    changed=$("$BIN/python" tests/areas.py changed)
-    extras=$("$BIN/python" tests/areas.py extras)
-    [ -z "$changed" ] || printf 'changed areas, whose tests run too: %s\n' "$changed"
-    [ -z "$extras" ] || step "extras of changed areas" "$BIN/python" -m pip install --quiet --editable ".[$extras]"
-    test_tier "$("$BIN/python" tests/areas.py expression)" "$@"
-    # What has passed is recorded, to be committed with the change.
-    [ -z "$changed" ] || "$BIN/python" tests/areas.py record $changed
-    ;;
+test) test_tier "$EVERYDAY" "$@" ;;
+lab) lab_tier 200 "$@" ;;
+part) step "marker $1" "${PYTEST[@]}" -m "$1" "${@:2}" ;;
 all) all_tier "$@" ;;
 *)
-    echo "usage: tests/run.sh check|test|all [words for pytest]" >&2
+    echo "usage: tests/run.sh check|test|lab|part|all [words for pytest]" >&2
     exit 2
     ;;
 esac

@@ -231,7 +231,7 @@ def test_other_commands_are_run(scenes, tmp_path):
     assert ["a.splat"] == [one.output for one in done.records]
 
 
-@pytest.mark.area(name="remote")
+@pytest.mark.remote
 @pytest.mark.usefixtures("here")
 def test_scenes_may_be_read_from_and_written_to_urls(scenes, tmp_path):
     fsspec = pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
@@ -368,7 +368,7 @@ def test_an_interrupted_batch_is_continued(scenes, tmp_path, make_model):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="dask")
+@pytest.mark.remote
 def test_a_cluster_reassigns_the_scenes_of_a_lost_worker(scenes, tmp_path, make_model):
     distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     stuck, whole = scenes / "stuck.ply", tmp_path / "whole.ply"

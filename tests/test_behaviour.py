@@ -28,7 +28,7 @@ def test_every_command_reports_what_is_recorded(record_property):
     check("report", record_property)
 
 
-@pytest.mark.area(name="shared")
+@pytest.mark.long
 def test_files_of_shared_scenes_are_the_recorded_ones(data_dir, record_property):  # noqa: ARG001  # skips if absent
     check("shared", record_property)
 

@@ -82,7 +82,7 @@ def asked(adapter):
 
 
 #: With sanitizers, or another compiler: it runs when a source in C changes.
-in_depth = pytest.mark.area(name="native")
+in_depth = pytest.mark.long
 
 
 def assert_passes(adapter):

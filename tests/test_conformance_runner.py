@@ -6,18 +6,12 @@ import json
 import re
 import sys
 import xml.etree.ElementTree as ET  # only our own output is parsed
-from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
-from unittest import mock
 
 import pytest
 from tables import failures
 from typer.testing import CliRunner
 
-from csplat import _spec
-from csplat.decoder import decode_api
-from csplat.decoder.container import open_chunk
 from csplat.errors import FormatError, InputError
 from csplat_conformance import adapter
 from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
@@ -25,19 +19,6 @@ from csplat_conformance.conformance_report import Status
 from csplat_conformance.decoder_suite import DecoderSuiteOptions, parse_levels, run_builtin, run_command
 from csplat_conformance.encoders.encoder_inputs import all_inputs
 from csplat_conformance.manifest import VECTORS, load, select_names
-from csplat_conformance.single_precision import GPUS
-from csplat_conformance.tolerance import EXACT, RENDERER
-from csplat_selftest.decoder_faults import (
-    DecoderFault,
-    ModuleEdit,
-    all_faults,
-    edited,
-    edited_module,
-    find,
-    off_by,
-    single_precision,
-    table,
-)
 from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
 from csplat_tools.cli.app import app
 
@@ -48,7 +29,7 @@ JS_ADAPTER = f"node '{ROOT / 'codec' / 'js' / 'test' / 'adapter.mjs'}' {{input}}
 
 needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 #: Tests of the suite itself: they run when it changes.
-in_depth = pytest.mark.area(name="suite")
+in_depth = pytest.mark.long
 
 VECTOR_LIST = load()
 
@@ -589,148 +570,3 @@ def test_reports_for_one_place_are_refused_before_anything_runs(tmp_path, monkey
     assert 1 == result.exit_code
     assert "is given for two outputs" in result.stderr
     assert [] == list(tmp_path.iterdir())
-
-
-PYTHON = [fault for fault in all_faults() if fault.language == "Python"]
-JAVASCRIPT = [fault for fault in all_faults() if fault.language == "JavaScript"]
-
-
-def covering(*clauses):
-    return [vector for vector in VECTOR_LIST if {*clauses} & {*vector.clauses}]
-
-
-def named(name):
-    return next(vector for vector in VECTOR_LIST if vector.name == name)
-
-
-#: Clauses of one fault in frames, texts, streams, codings, values and floats each.
-REPRESENTATIVES = ("HDR-6", "CHK-1", "JSN-1", "STR-3", "CBK-3", "TIL-7", "CNF-8")
-
-
-def failing(faults):
-    """Return the faults that no vector of their clause reveals, or that leave the decoder changed."""
-    rich = named("valid/rich")
-    before = adapter.answer(rich.data)
-
-    def check(fault):
-        finding = find(fault, covering(fault.clause))
-        assert finding.vectors
-        assert fault.clause in finding.clauses
-        assert before.arrays == adapter.answer(rich.data).arrays
-
-    assert Status.PASSED is before.status
-    return failures({f"{fault.clause} {fault.name}": fault for fault in faults}, check)
-
-
-def test_a_wrong_decoder_fails_a_vector_that_names_the_clause_and_is_right_again_afterwards():
-    first = {fault.clause: fault for fault in reversed(PYTHON)}
-
-    assert [] == failing([first[clause] for clause in REPRESENTATIVES])
-
-
-@in_depth
-@pytest.mark.slow
-def test_every_wrong_decoder_fails_a_vector_that_names_the_clause_and_is_right_again_afterwards():
-    assert [] == failing(PYTHON)
-
-
-def test_every_fault_finds_the_functions_that_it_replaces():
-    def check(fault):
-        with ExitStack() as stack:
-            fault.plant(stack)
-
-    assert [] == failures({f"{fault.clause} {fault.name}": fault for fault in PYTHON}, check)
-
-
-def test_a_right_decoder_is_not_caught():
-    # The built-in run in test_conformance.py tries every vector.
-    nothing = DecoderFault("none", "", "CHK-1", lambda _: None)
-
-    assert [] == list(find(nothing, covering("CHK-1", "HDR-2", "QUA-2")).failed)
-
-
-@in_depth
-@pytest.mark.parametrize("gpu", [gpu for gpus in GPUS.values() for gpu in gpus], ids=str)
-def test_a_decoder_in_single_precision_is_a_renderer_and_not_exact(gpu):
-    vectors = covering("CNF-7", "CNF-8", "QUA-2", "LEV-1")
-    decoder = DecoderFault("none", "", "CNF-7", single_precision(gpu), RENDERER)
-
-    assert [] == list(find(decoder, vectors).failed)
-    assert "CNF-7" in find(replace(decoder, by=EXACT), vectors).clauses
-
-
-@pytest.mark.parametrize(("ulps", "by", "failed"), [(2, RENDERER, False), (3, RENDERER, True), (2, EXACT, True)])
-def test_a_renderer_may_be_off_by_2_ulp_and_an_exact_decoder_by_none(ulps, by, failed):
-    finding = find(DecoderFault("off", "", "CNF-7", off_by(ulps), by), [named("extreme/means_cancelling")])
-
-    assert (["extreme/means_cancelling"] if failed else []) == finding.vectors
-    assert {"L3"} >= {outcome.level for outcome in finding.failed}
-
-
-@in_depth
-def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector_on_chunks():
-    # CHK-6: frame and CRC of these chunks are checked all the same.
-    def frames(view, header, kind=_spec.CHUNK_STATED_ERRORS, *_):
-        if record := header.chunk(kind):
-            open_chunk(view, record, record.type, record.flags, "CHK-6")
-
-    def apply(stack):
-        for name in ("json_chunk", "bounds_chunk"):
-            stack.enter_context(mock.patch.object(decode_api, name, frames))
-
-    about_chunks = [one for one in VECTOR_LIST if {"CHK", "JSN", "SER"} & {name[:3] for name in one.clauses}]
-
-    assert [] == list(find(DecoderFault("none", "", "CHK-6", apply), about_chunks).failed)
-
-
-@needs_node
-def test_a_wrong_javascript_decoder_is_caught():
-    (fault,) = [fault for fault in JAVASCRIPT if fault.name == "quats, sign of w"]
-
-    assert "QUA-2" in find(fault, [named("valid/quats")]).clauses
-
-
-@needs_node
-@in_depth
-@pytest.mark.slow
-def test_every_wrong_javascript_decoder_fails_a_vector_that_names_the_clause():
-    def check(fault):
-        assert fault.clause in find(fault, covering(fault.clause)).clauses
-
-    assert [] == failures({f"{fault.clause} {fault.name}": fault for fault in JAVASCRIPT}, check)
-
-
-def test_every_edit_finds_its_target():
-    def check(fault):
-        edited_module(fault.plant)
-
-    assert [] == failures({f"{fault.clause} {fault.name}": fault for fault in JAVASCRIPT}, check)
-
-
-def test_an_edit_without_a_target_is_an_error():
-    with pytest.raises(ValueError, match="expected once"):
-        edited_module(ModuleEdit("container.mjs", {"another text": ""}))
-
-
-def test_clauses_that_0_2_added_or_changed_have_wrong_decoders_of_their_own():
-    wanted = """HDR-2 HDR-12 ATT-10 LAT-1 LAT-3 LAT-4 SPA-1 SPA-2 SPA-3 CHK-1 CHK-2 CBK-2 CBK-4 CBK-7 COD-5 COD-6 COD-7
-    COD-8 EXR-2 JSN-1 CNF-7 CNF-8"""
-
-    assert set() == {*wanted.split()} - {fault.clause for fault in PYTHON}
-
-
-def test_words_that_a_function_lacks_are_an_error():
-    with ExitStack() as stack, pytest.raises(ValueError, match="expected once"):
-        edited("read_sparse", {"another text": ""})(stack)
-
-
-def test_there_are_at_least_twenty_faults_of_different_names():
-    assert len(PYTHON) >= 20
-    assert len({fault.name for fault in PYTHON}) == len(PYTHON)
-
-
-def test_the_table_names_fault_vectors_and_clauses():
-    fault = next(fault for fault in PYTHON if fault.clause == "HDR-6")
-
-    row = table([find(fault, [named("invalid/trailing")])]).splitlines()[-1]
-    assert "| Python | trailing bytes | trailing bytes are accepted | 1 | `invalid/trailing` | HDR-6 |" == row

@@ -18,7 +18,7 @@ from csplat_conformance.manifest import VECTORS, load
 from csplat_conformance.reference_renders import PSNR_CAP, psnr, read_png, write_png
 
 #: `make test` renders these pictures with our decoder and rasteriser, by the command.
-pytestmark = pytest.mark.area(name="suite")
+pytestmark = pytest.mark.long
 
 RENDERED = [vector for vector in load() if vector.views]
 

@@ -109,8 +109,7 @@ def test_the_navigation_contains_every_page(site):
     assert sorted({*site.pages(), "commands.md", "python.md"}) == sorted(named)
 
 
-def test_the_readme_is_short_and_its_images_are_small():
-    assert len(README.splitlines()) <= 100
+def test_the_images_of_the_readme_are_small():
     assert sum(path.stat().st_size for path in (DOCS / "pictures").iterdir()) < 300_000
 
 
@@ -196,11 +195,11 @@ def test_the_tutorial_runs(tmp_path, monkeypatch):
     """Its commands run in order, with fewer and smaller images of a square, and fewer steps."""
     pytest.importorskip("numba", reason="training needs numba: pip install 'csplat[render]'")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.syspath_prepend(ROOT / "tools" / "sample")
+    monkeypatch.syspath_prepend(ROOT / "tools" / "lab" / "sample")
     text = (DOCS / "guide" / "tutorial.md").read_text("utf-8")
     lines = list(itertools.chain.from_iterable(block.splitlines() for block in blocks(text, "sh")))
     first, *others = [shlex.split(line) for line in lines]
-    assert ["python", "tools/sample/make_sample.py"] == first[:2]
+    assert ["python", "tools/lab/sample/make_sample.py"] == first[:2]
     import make_sample
 
     monkeypatch.setattr(make_sample, "photograph", square)

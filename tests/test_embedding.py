@@ -98,7 +98,7 @@ def model(request):
     params=[
         "copied",
         # The package for users: npm alone decides which files it contains, and takes seconds.
-        pytest.param("installed", marks=pytest.mark.area(name="engines")),
+        pytest.param("installed", marks=pytest.mark.engines),
     ]
 )
 def results(request, site, tmp_path, model):
@@ -212,7 +212,7 @@ def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
     assert f"{len(model)} [(0, 0.0)]\n" == said[2]
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 @pytest.mark.slow
 def test_the_engine_without_a_page(tab, site, model):
     (sample,) = (text for text in samples("js") if text.startswith("// show.mjs"))
@@ -296,7 +296,7 @@ def shown(page, element="csplat-view"):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_scenes_are_shown_replaced_and_removed(tab, blog):
     page = blog('<csplat-view alt="A garden"></csplat-view>')
     page.evaluate("globalThis.view = document.querySelector('csplat-view')")
@@ -329,7 +329,7 @@ def test_scenes_are_shown_replaced_and_removed(tab, blog):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_they_are_near(tab, site, blog):
     scenes = [
         f'<csplat-view id="{name}" src="/{file}.csplat"></csplat-view>'
@@ -364,7 +364,7 @@ def test_the_wheel_is_the_pages_until_a_scene_is_clicked_and_scenes_load_when_th
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_errors_are_shown_as_text(tab, site, blog):
     site.add("/cut.csplat", site._files["/scene.csplat"][:-20])
     cases = [
@@ -398,7 +398,7 @@ def rights(data):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_properties_count_that_were_set_before_the_script_had_run(tab, blog):
     before = """
     <csplat-view src="/none.csplat"></csplat-view><script>
@@ -421,7 +421,7 @@ def test_properties_count_that_were_set_before_the_script_had_run(tab, blog):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_an_address_is_another_try_after_an_error_and_a_script_may_run_twice(tab, site, blog):
     page = blog('<csplat-view src="/late.csplat"></csplat-view>' + ONE_FILE)
     for again in ("view.src = view.src", "view.setAttribute('src', view.getAttribute('src'))"):
@@ -439,7 +439,7 @@ def test_an_address_is_another_try_after_an_error_and_a_script_may_run_twice(tab
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_requests_of_an_element_are_the_pages(tab, site, blog):
     data = site._files["/scene.csplat"]
     right = rights(data)
@@ -471,7 +471,7 @@ def test_requests_of_an_element_are_the_pages(tab, site, blog):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_a_file_that_is_replaced_while_it_is_read_is_opened_anew(tab, site, blog, make_model):
     old, new = (
         encode(make_model(count, 3, scales=np.full((count, 3), -2, "f")), replace(FAST, tile_splats=2000))
@@ -496,7 +496,7 @@ def test_a_file_that_is_replaced_while_it_is_read_is_opened_anew(tab, site, blog
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_servers_that_fail_once_or_send_coded_bodies_suffice(tab, site, blog):
     data = site._files["/scene.csplat"]
     right = rights(data)
@@ -523,7 +523,7 @@ def test_servers_that_fail_once_or_send_coded_bodies_suffice(tab, site, blog):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_a_blob_may_be_revoked_at_once(tab, blog):
     page = blog('<br style="line-height:300vh"><csplat-view></csplat-view>', policy="")
     page.evaluate(
@@ -539,7 +539,7 @@ def test_a_blob_may_be_revoked_at_once(tab, blog):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_a_policy_of_trusted_types_allows_the_worker_by_its_name(tab, blog):
     types = "; require-trusted-types-for 'script'; trusted-types"
     blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{POLICY}{types} csplat")
@@ -551,7 +551,7 @@ def test_a_policy_of_trusted_types_allows_the_worker_by_its_name(tab, blog):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_a_page_from_disk_says_what_to_do(tab, tmp_path):
     (tmp_path / "csplat-view.js").write_bytes(export_element())
     (tmp_path / "page.html").write_text(
@@ -566,7 +566,7 @@ def test_a_page_from_disk_says_what_to_do(tab, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_the_script_is_written_once(tmp_path):
     out = tmp_path / "csplat-view.js"
     call("export-element", out)

@@ -32,7 +32,7 @@ from csplat_conformance.encoders.render_checks import peer_figures
 from csplat_conformance.protocol import ProcessEnd, run_program
 from csplat_tools.cli.app import app
 
-pytestmark = pytest.mark.area(name="suite")
+pytestmark = pytest.mark.long
 
 INPUTS = {one.name: one for one in all_inputs()}
 COMMAND = "encoder {ply} {out} {index}"

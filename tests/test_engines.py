@@ -24,7 +24,7 @@ from csplat_bench.subjects.engine_loaders import Trial
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.metrics import psnr
 
-pytestmark = [pytest.mark.slow, pytest.mark.area(name="engines")]
+pytestmark = [pytest.mark.slow, pytest.mark.engines]
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")

@@ -71,7 +71,7 @@ def cameras(tmp_path):
     return tmp_path / "cameras.json"
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 @pytest.mark.slow
 def test_a_page_has_its_cameras_axes_and_any_name_and_is_forbidden_the_network(tab, site, make_model, cameras):
     name = "</script><script>alert('é')</script>&.csplat"

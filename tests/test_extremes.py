@@ -45,11 +45,11 @@ from csplat_render.camera import intrinsics, look_at
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.cli.app import app
 
-pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.usefixtures("small_views")]
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_views")]
 
 QUALITIES = {10.0: 12.0, 120.0: 44.0}  # attribute_psnr, and the least PSNR of renders, dB
 QUICK = ("needles", "half the rows NaN")  # crossed with presets and qualities outside the area, too
-LONG = pytest.mark.area(name="extremes")
+LONG = pytest.mark.long
 EACH = [pytest.param(name, marks=() if name in QUICK else LONG) for name in DRAWN]
 
 

@@ -41,8 +41,8 @@ from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
 from csplat_trainer.training_loop import fit_to_options, train
 
-pytestmark = [pytest.mark.extremes, pytest.mark.slow, pytest.mark.usefixtures("small_views")]
-LONG = pytest.mark.area(name="extremes")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_views")]
+LONG = pytest.mark.long
 
 
 # Simplification

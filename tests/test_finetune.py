@@ -198,7 +198,7 @@ def test_a_run_with_too_large_files_does_not_end_early(fine, monkeypatch):
 
 
 # Gradients.
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_the_gradient_of_an_entry_is_the_sum_over_its_users(source, views):
     # The sum over users, against finite differences of the loss by an entry's values.
     encoding = EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16)

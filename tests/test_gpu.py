@@ -32,7 +32,7 @@ from csplat_render.virtual_cameras import virtual_cameras
 
 def area(test):
     """Mark a test that needs an adapter."""
-    return pytest.mark.area(name="gpu")(pytest.mark.usefixtures("device")(test))
+    return pytest.mark.gpu(pytest.mark.usefixtures("device")(test))
 
 
 _LEAST_PSNR = 74.0  # dB, of any scene against the rasteriser on the CPU

@@ -41,7 +41,7 @@ from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
 from csplat_trainer.tuning.gsplat_tuning import GsplatTuning
 from csplat_trainer.tuning.tuning_engine import CpuTuning
 
-pytestmark = pytest.mark.area(name="torch")
+pytestmark = pytest.mark.torch
 
 CPU, BLACK = torch.device("cpu"), np.zeros(3, np.float32)
 

@@ -320,14 +320,14 @@ def test_without_torch_the_extra_is_named(monkeypatch, name):
 
 
 # with torch
-@pytest.mark.area(name="torch")
+@pytest.mark.torch
 @pytest.mark.usefixtures("torch")
 @pytest.mark.parametrize("name", STORED)
 def test_torch_reads_a_stored_checkpoint_as_the_plain_reader_does(name):
     of_checkpoint(STORED[name])
 
 
-@pytest.mark.area(name="torch")
+@pytest.mark.torch
 @pytest.mark.parametrize("degree", [0, 3])
 def test_checkpoints_of_all_programs_are_read(torch, make_model, degree):
     model = make_model(20, degree)
@@ -345,7 +345,7 @@ def test_checkpoints_of_all_programs_are_read(torch, make_model, degree):
         assert np.allclose(1.0 / (1.0 + np.exp(-model.sh0)), colours, atol=1e-6)
 
 
-@pytest.mark.area(name="torch")
+@pytest.mark.torch
 def test_learning_rates_may_be_scalars_of_numpy_1_or_2(torch, make_model):
     splats = to_gsplat(make_model(5, 0), device="cpu")
     whole = saved(torch, {"schedulers": {"last": [np.float64(0.1), np.float32(0.2)]}, "splats": splats})
@@ -356,7 +356,7 @@ def test_learning_rates_may_be_scalars_of_numpy_1_or_2(torch, make_model):
     assert len(csplat.read(whole)) == len(csplat.read(old.getvalue())) == 5
 
 
-@pytest.mark.area(name="torch")
+@pytest.mark.torch
 def test_invalid_tensors_are_refused(torch, make_model, tmp_path):
     splats = to_gsplat(make_model(5, 0), device="cpu")
     for values, message in (
@@ -370,7 +370,7 @@ def test_invalid_tensors_are_refused(torch, make_model, tmp_path):
             csplat.read(tmp_path / "a.pt")
 
 
-@pytest.mark.area(name="torch")
+@pytest.mark.torch
 def test_a_damaged_checkpoint_is_refused_or_read(torch, make_model, tmp_path):
     whole, path = saved(torch, {"splats": to_gsplat(make_model(3, 0), device="cpu")}), tmp_path / "a.ckpt"
     assert [""] == refusals(path, [whole])

@@ -316,7 +316,7 @@ def assert_nothing_was_compiled(before, after):
     assert {} == {name: count for name, count in after.items() if count != before.get(name, 0)}
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
 def test_warming_up_compiles_all_kernels_of_simplify(versions):
     plain, before, after = versions[0]
@@ -324,7 +324,7 @@ def test_warming_up_compiles_all_kernels_of_simplify(versions):
     assert "csplat_render.contributions.sum_pruning" in {name for name in after if after[name] > plain.get(name, 0)}
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
 def test_warming_up_compiles_all_kernels_of_compare(versions):
     _, before, after = versions[1]

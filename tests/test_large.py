@@ -378,7 +378,7 @@ def test_a_small_scene_has_one_bucket():
 
 
 @pytest.mark.slow
-@pytest.mark.area(name="dask")
+@pytest.mark.remote
 def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, with_levels, tmp_path):
     distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     target = tmp_path / "out.csplat"
@@ -399,7 +399,7 @@ def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, with_
     assert with_levels == target.read_bytes()
 
 
-@pytest.mark.area(name="dask")
+@pytest.mark.remote
 def test_an_unreachable_cluster_is_reported(model, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))

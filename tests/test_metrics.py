@@ -205,7 +205,7 @@ def random_weights():
     )
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_lpips_of_the_published_images_agrees(data_dir):
     Image = pytest.importorskip("PIL.Image", reason="reading PNG files needs pillow: pip install 'csplat[render]'")
     folder = data_dir / "lpips"
@@ -221,7 +221,7 @@ def test_lpips_of_the_published_images_agrees(data_dir):
     assert 0.0 == distance(reference, reference)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_lpips_is_symmetric_and_positive_and_grows(random_weights):
     rng = np.random.default_rng(1)
     a = rng.random((48, 40, 3))
@@ -263,7 +263,7 @@ def test_without_torch_its_cache_is_ignored(monkeypatch):
     assert load_torch_lpips() is None
 
 
-@pytest.mark.area(name="torch")
+@pytest.mark.torch
 def test_weights_of_torch_files_are_equal(tmp_path, random_weights):
     torch = pytest.importorskip("torch", reason="reading its cache needs torch: pip install 'csplat[train]'")
     checkpoints = tmp_path / "checkpoints"
@@ -321,7 +321,7 @@ def convolution_case(picture, kernel, seed=0):
     return (array.astype(np.float32) for array in arrays)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize(("picture", "kernel", "stride", "padding"), SHAPES_AND_STRIDES)
 def test_the_convolution_equals_its_twin(picture, kernel, stride, padding):
     x, weights, bias = convolution_case(picture, kernel)
@@ -332,7 +332,7 @@ def test_the_convolution_equals_its_twin(picture, kernel, stride, padding):
     np.testing.assert_allclose(found, wanted, atol=2e-5)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize(("stride", "padding"), [(1, 2), (4, 2), (2, 0)])
 def test_the_twin_agrees_with_explicit_sums(stride, padding):
     x, kernel, bias = convolution_case((13, 11, 3), (5, 3, 3, 4))
@@ -343,7 +343,7 @@ def test_the_twin_agrees_with_explicit_sums(stride, padding):
     np.testing.assert_allclose(convolve_twin(x, kernel, bias, stride, padding), expected + bias, atol=1e-12)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_the_number_of_threads_does_not_change_a_convolution():
     x, weights, bias = convolution_case((33, 20, 8), (3, 3, 8, 24))
     np.testing.assert_array_equal(*in_threads(lambda: convolve(x, weights, bias, 1, 1)))

@@ -212,7 +212,7 @@ def test_impossible_bounds_are_refused(scene):
     [
         ("one splat", judged_by(cameras(40))),
         *(
-            pytest.param(name, None, marks=pytest.mark.area(name="extremes"))
+            pytest.param(name, None, marks=pytest.mark.long)
             for name in ("one splat", "exploded", "all transparent", "float32 limits")
         ),
     ],

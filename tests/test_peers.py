@@ -20,7 +20,7 @@ from csplat.formats import write_levels
 from csplat.model import SplatModel, normalise_quats
 from csplat.scene_source import source_from_model
 
-pytestmark = [pytest.mark.slow, pytest.mark.area(name="peers")]
+pytestmark = [pytest.mark.slow, pytest.mark.peers]
 
 
 def made(degree, reach, antialiased):

@@ -29,7 +29,6 @@ from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.protocol import run_program
 from csplat_selftest.decoder_processes import DecoderProcess
-from csplat_selftest.mutation import __main__ as mutation
 from csplat_tools.batches.batch_scenes import leads_out
 from csplat_tools.batches.journal import JOURNAL, Record, open_journal, read_journal
 from csplat_tools.batches.scene_job import Worker, WorkerLostError
@@ -228,13 +227,6 @@ def test_a_decoder_answers_without_poll_and_select(monkeypatch):
         assert Status.CRASHED is served.ask(b"gone\n").status
     with _Echo([sys.executable, "-S", "-c", "import time; time.sleep(60)"], timeout=0.3) as served:
         assert Status.HUNG is served.ask(b"silent\n").status
-
-
-@pytest.mark.usefixtures("elsewhere")
-def test_mutants_are_refused_without_fork(monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["mutation", "--count", "1"])
-    assert mutation.main() == 1
-    assert "use Linux or macOS" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("elsewhere")

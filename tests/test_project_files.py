@@ -1,8 +1,7 @@
-"""Files that other programs read: workflows, hooks, attributes, metadata of packages."""
+"""Files that other programs read: attributes, metadata of packages."""
 
 import importlib.util
 import json
-import os
 import re
 import subprocess
 import tomllib
@@ -13,59 +12,6 @@ import pytest
 import csplat
 
 ROOT = Path(__file__).resolve().parent.parent
-WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
-PUBLISHING = ("npm publish ", "gh release create ")  # commands of a release after everything was built and tested
-
-
-def make_targets():
-    return set(re.findall(r"(?m)^([a-z][a-z-]*):", (ROOT / "Makefile").read_text("utf-8")))
-
-
-def commands(text):
-    """Return the commands of a workflow's steps; blocks of several lines are given as `|`."""
-    return re.findall(r"(?m)^ *(?:- )?run: *(.+)$", text)
-
-
-def problem(command, targets):
-    """Return the problem of a step; nothing if it runs existing make targets, or publishes."""
-    program, *words = command.split()
-    if command.startswith(PUBLISHING):
-        return ""
-    if program == ".ci/run":
-        program, words = "make", words or ["test"]
-        if not os.access(ROOT / ".ci" / "run", os.X_OK):
-            return f"{command}: not executable"
-    if program != "make":
-        return f"{command}: neither make nor .ci/run"
-    unknown = [word for word in words if "=" not in word and word not in targets]
-    return f"{command}: no such target" if unknown or not words else ""
-
-
-def test_steps_of_workflows_run_targets_that_exist():
-    targets = make_targets()
-    steps = [(path.name, one) for path in WORKFLOWS for one in commands(path.read_text("utf-8"))]
-    assert {"check.yml", "nightly.yml", "release.yml", "test.yml"} == {name for name, _ in steps}
-    assert [] == [(name, said) for name, one in steps if (said := problem(one, targets))]
-
-
-@pytest.mark.parametrize("command", ["make tset", "make", "|", "pip install csplat", ".ci/run tset"])
-def test_a_step_that_runs_anything_else_is_reported(command):
-    assert problem(command, make_targets())
-
-
-def test_workflows_have_few_rights_and_a_time_limit():
-    for path in WORKFLOWS:
-        text = path.read_text("utf-8")
-        jobs = text[text.index("\njobs:") :].count("    runs-on:")
-        assert re.search(r"(?m)^permissions:( \{\}|\n  contents: read)$", text), path.name
-        assert re.search(r"(?m)^concurrency:$", text), path.name
-        assert jobs == text.count("    timeout-minutes:"), path.name
-        assert text.count("actions/checkout@") == text.count("persist-credentials: false"), path.name
-        assert "secrets." not in text, path.name
-        for command in commands(text):
-            assert "${{" not in command, f"{path.name}: {command}: hand it over by env"
-
-
 def test_attributes_of_git_know_binary_files():
     if not (ROOT / ".git").exists():
         pytest.skip("not a checkout: git knows nothing of these files")
@@ -78,13 +24,6 @@ def test_attributes_of_git_know_binary_files():
         if (is_text and content not in ("i/lf", "i/none")) or (is_text and path.endswith((".csplat", ".ply"))):
             wrong.append(line)
     assert [] == wrong
-
-
-def test_generated_files_that_attributes_name_exist():
-    text = (ROOT / ".gitattributes").read_text("utf-8")
-    patterns = re.findall(r"(?m)^(\S+) linguist-generated", text)
-    assert len(patterns) > 5
-    assert [] == [one for one in patterns if not any(ROOT.glob(one))]
 
 
 @pytest.mark.parametrize(("page", "least"), [("ARCHITECTURE.md", 50), ("CONTRIBUTING.md", 20)])

@@ -322,7 +322,7 @@ def assert_gradients_agree(found):
         assert np.linalg.norm(found[0][1][name] - wanted) <= 1e-2 * size + 1e-30, name
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize(
     "scales",
@@ -334,13 +334,13 @@ def test_splats_with_an_anisotropy_of_a_million_survive(scales, antialiased):
     assert_gradients_agree(assert_survives(arrays, facing(), antialiased=antialiased))
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_splats_around_the_camera_survive():
     arrays = extreme_splats(scales=(1.0, 0.5, 0.2))
     assert_gradients_agree(assert_survives(arrays, facing(distance=0.0)))
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("near", [1e-30, 1e-6, 0.2, 3.0])
 def test_splats_at_and_behind_the_near_plane_survive(near):
     arrays = extreme_splats(count=80)
@@ -349,7 +349,7 @@ def test_splats_at_and_behind_the_near_plane_survive(near):
     assert 0 < found[0][0].drawn < 80
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("log_scale", [-60.0, 60.0, 88.0, -88.0, 3e38, -3e38])
 def test_extreme_log_scales_survive(log_scale):
     for axes in ((1, 1, 1), (1, 0, 0), (1, 1, 0)):
@@ -361,7 +361,7 @@ def test_extreme_log_scales_survive(log_scale):
     assert_survives(mixed, facing(), antialiased=True)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("alpha", [0.0, 1.0])
 def test_alphas_of_0_and_1_survive(alpha):
     found = assert_survives(extreme_splats(opacities=alpha), facing())
@@ -369,13 +369,13 @@ def test_alphas_of_0_and_1_survive(alpha):
     assert_gradients_agree(found)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("focal", [1e-6, 1e-2, 1e4, 1e9])
 def test_tiny_and_huge_focal_lengths_survive(focal):
     assert_survives(extreme_splats(), facing(focal=focal))
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("distance", [1e-20, 1e20, 1e37])
 def test_scenes_of_any_size_survive(distance):
     arrays = extreme_splats()
@@ -384,7 +384,7 @@ def test_scenes_of_any_size_survive(distance):
     assert_survives(arrays, facing(near=distance * 1e-3, distance=3 * distance))
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_quaternions_of_any_length_survive():
     arrays = extreme_splats()
     arrays["quats"][::3] = 0.0
@@ -397,7 +397,7 @@ def test_quaternions_of_any_length_survive():
     np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**plain), facing()).rgb)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
 def test_non_finite_rows_are_ignored_and_counted(name, bad):
@@ -410,7 +410,7 @@ def test_non_finite_rows_are_ignored_and_counted(name, bad):
     np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**clean), facing()).rgb)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_an_empty_scene_renders_as_the_background():
     for degree in (0, 3):
         arrays = extreme_splats(count=0, degree=degree)
@@ -419,13 +419,13 @@ def test_an_empty_scene_renders_as_the_background():
         np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (H, W, 3)))
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (1, 100), (333, 1)])
 def test_renders_of_any_size_survive(width, height):
     assert_survives(extreme_splats(), facing(width=width, height=height))
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_gradients_beyond_float32_are_clamped():
     rasteriser = Rasteriser()
     picture = rasteriser.forward(UncheckedSplats(**extreme_splats(scales=2.0)), facing(focal=1e6))
@@ -433,14 +433,14 @@ def test_gradients_beyond_float32_are_clamped():
     assert all(np.isfinite(value).all() for value in vars(g).values())
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_too_many_intersections_are_refused(monkeypatch):
     monkeypatch.setattr(rasteriser, "MAX_INTERSECTIONS", 100)
     with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
         render(UncheckedSplats(**extreme_splats(scales=2.0)), facing())
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_warming_up_again_is_silent():
     warm_up()
     messages = []
@@ -455,7 +455,7 @@ def most(errors):
     return error
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize(("degree", "antialiased"), [(0, False), (1, True), (2, False), (3, False), (4, True)])
 def test_gradients_agree_with_finite_differences_of_the_twin(degree, antialiased):
     arrays, weights = random_splats(3, degree, seed=degree), random_gradients(VIEW, seed=1)
@@ -467,8 +467,8 @@ def test_gradients_agree_with_finite_differences_of_the_twin(degree, antialiased
     assert most(errors) <= 1e-6, errors
 
 
-@pytest.mark.area(name="rasteriser")
-@pytest.mark.area(name="torch")
+@pytest.mark.long
+@pytest.mark.torch
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
 def test_gradients_agree_with_autograd(degree, antialiased):
@@ -484,7 +484,7 @@ def test_gradients_agree_with_autograd(degree, antialiased):
     assert most(errors) <= 1e-6, errors
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_float32_gradients_agree_with_float64_on_the_sample(sample_path):
     model = read_ply(sample_path)
     assert_gradients_agree_with_float64(model, virtual_cameras(model, 1, 160, 120)[0])
@@ -496,14 +496,14 @@ def assert_gradients_agree_with_float64(model, view):
     assert most(errors) <= 1e-4, errors
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["donut", "lego60k", "fox120k"])
 def test_float32_gradients_agree_with_float64_on_shared_scenes(data_dir, name):
     model, views = shared_scene(data_dir, name)
     assert_gradients_agree_with_float64(model, views[0])
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "case"), [pytest.param(*pair, id=pair[0]) for pair in adversarial()])
 def test_float32_gradients_survive_adversarial_splats(name, case):
     splats, weights = UncheckedSplats(**case.arrays), random_gradients(case.view, seed=1)
@@ -517,7 +517,7 @@ def test_float32_gradients_survive_adversarial_splats(name, case):
     assert most(errors) <= 1e-2, (name, errors)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_clamped_capped_or_invisible_values_have_no_gradient():
     arrays = random_splats(4, 0, seed=3)
     arrays["means"][:] = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.5], [0.0, 0.0, -50.0], [90.0, 0.0, 0.0]]
@@ -535,7 +535,7 @@ def test_clamped_capped_or_invisible_values_have_no_gradient():
     assert g.means2d[2:].max() == 0.0
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_gradients_ignore_the_length_of_a_quaternion():
     arrays = random_splats(6, 0, seed=4)
     weights = random_gradients(VIEW, seed=4)
@@ -549,7 +549,7 @@ def test_gradients_ignore_the_length_of_a_quaternion():
     np.testing.assert_allclose(radial, 0.0, atol=1e-9)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_ignored_sh_bands_have_no_gradient():
     arrays = random_splats(6, 3, seed=5)
     rasteriser = Rasteriser(dtype=np.float64)
@@ -559,7 +559,7 @@ def test_ignored_sh_bands_have_no_gradient():
     assert (g.shN[:, 3:] == 0.0).all()
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_colour_fits_of_degree_4_have_the_gradients_of_the_rasteriser():
     arrays = random_splats(20, 4, seed=5)
     splats, count = UncheckedSplats(**arrays), 20

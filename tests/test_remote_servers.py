@@ -17,7 +17,7 @@ from csplat.remote_store import RemoteStore
 from csplat_conformance.validator import validate
 from csplat_tools.cli.app import app
 
-pytestmark = pytest.mark.area(name="remote")
+pytestmark = pytest.mark.remote
 pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
 aiohttp = pytest.importorskip("aiohttp", reason="URLs require the extra [remote]")
 

@@ -93,7 +93,7 @@ def bend(splats, row, i, j, step):
 ENTRIES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_shape_and_opacity_agree_with_finite_differences(antialiased):
     model, views = small_scene(3, antialiased=antialiased), cameras()
@@ -120,7 +120,7 @@ def test_shape_and_opacity_agree_with_finite_differences(antialiased):
         np.testing.assert_allclose(sum((s**2).sum() for s in slopes) / pixels, found.opacity_squares[row], rtol=2e-5)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_the_matrix_of_a_shape_predicts_the_error_of_a_small_change(antialiased):
     model, view = small_scene(antialiased=antialiased), cameras(1)
@@ -140,7 +140,7 @@ def test_the_matrix_of_a_shape_predicts_the_error_of_a_small_change(antialiased)
         np.testing.assert_allclose(expected, (direction * roots) @ matrix @ (direction * roots), rtol=1e-4)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_colour_agrees_with_finite_differences():
     model, views = small_scene(3), cameras()
     found = measure_sensitivity(model, views, dtype=np.float64, metric=True)
@@ -165,7 +165,7 @@ def test_colour_agrees_with_finite_differences():
     np.testing.assert_allclose(found.colour_squares, sums, rtol=1e-5)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 def test_means_agree_roughly_with_finite_differences():
     model, views = small_scene(degree=0), cameras()
     found = measure_sensitivity(model, views, dtype=np.float64)
@@ -452,7 +452,7 @@ def relative(found, expected):
 
 
 # Pruning errors.
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_pruning_errors_agree_with_removing_splats_one_by_one(antialiased):
     model = replace(scene(30), antialiased=antialiased)
@@ -517,7 +517,7 @@ def test_the_number_of_threads_does_not_change_pruning_errors(threads):
     np.testing.assert_array_equal(found.error, other.error)
 
 
-@pytest.mark.area(name="rasteriser")
+@pytest.mark.long
 @pytest.mark.parametrize("antialiased", [False, True])
 def test_slanted_needles_lose_no_row(antialiased):
     model = scene(count=30, seed=4)

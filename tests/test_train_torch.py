@@ -12,7 +12,7 @@ from csplat_render.camera import Camera
 from csplat_trainer import torch_rasteriser
 from csplat_trainer.losses import PerceptualLoss
 
-pytestmark = pytest.mark.area(name="torch")
+pytestmark = pytest.mark.torch
 
 
 @pytest.fixture

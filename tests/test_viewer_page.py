@@ -123,7 +123,7 @@ def test_an_absent_file_is_explained(viewer):
     viewer.tab.problems.clear()  # a browser may report the status on its console, too
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_a_browser_without_webgl_shows_an_error(tab, site, sample):
     tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     viewer = ViewerPage(tab, site)
@@ -146,7 +146,7 @@ DROP = """async ([text, name]) => {
 }"""
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_a_page_without_a_scene_shows_an_error_and_accepts_files(tab, site, model, sample):
     viewer = ViewerPage(tab, site)
     viewer.load("?size=big&axes=RRR&camera=[{}]")
@@ -214,7 +214,7 @@ def test_mouse_and_keys_move_the_camera(viewer, light):
     assert viewer.home == viewer.pose  # at once: the user prefers no motion
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_fingers_move_the_camera(viewer, light):
     viewer.show(light)
     viewer.settle()
@@ -290,7 +290,7 @@ def test_the_file_gives_the_first_view(viewer, make_model):
     assert "CC0" in viewer.page.locator("#statistics dd").all_inner_texts()
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_the_address_has_precedence_over_the_file(tab, site, make_model):
     views = [look_at([0.0, 0.0, -4.0]), look_at([3.0, 0.0, -4.0])]
     site.add("/cameras.json", json.dumps(views).encode())
@@ -316,7 +316,7 @@ def test_the_address_has_precedence_over_the_file(tab, site, make_model):
     assert tab.page.title().startswith("a scene.csplat")
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_a_scene_of_unknown_axes_can_be_turned(viewer, make_model):
     viewer.page.emulate_media(reduced_motion="reduce")
     viewer.show(encode(make_model(100, 0)))
@@ -415,7 +415,7 @@ def test_all_controls_have_a_name_and_can_be_reached_by_keys(viewer, make_model)
     assert {"canvas", "reset", "details", "open", "help"} <= reached
 
 
-@pytest.mark.area(name="chromium")
+@pytest.mark.browser
 def test_the_page_measures_itself(viewer, make_model, tmp_path):
     model = make_model(100, 0)
     viewer.show(encode(model), "balls.csplat")

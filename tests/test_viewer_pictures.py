@@ -25,7 +25,7 @@ from csplat_render.camera_files import load_cameras
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.level_builder import LevelBuilder
 
-pytestmark = [pytest.mark.slow, pytest.mark.area(name="chromium")]
+pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
 #: Well above the required 38 dB: leaving out all SH gives 33, 8-bit rounding alone 59.
 GOOD = 50.0

@@ -1,0 +1,142 @@
+"""Write the vectors, the manifest, and annexes A and C of the spec.
+
+Usage:
+    python -m csplat_authoring           # write outdated files, remove files without a recipe
+    python -m csplat_authoring --check   # write nothing, list outdated files and exit with 1
+
+Reference pictures need the packages of the extra `render`. Without them, existing pictures are kept. A picture is only
+outdated if it differs visibly, because exponentials may round differently on another machine.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from csplat import _spec
+from csplat_authoring.annexes import annex, clause_map, replace_generated
+from csplat_authoring.recipe import Recipe
+from csplat_authoring.recipes import all_recipes
+from csplat_authoring.reference import expected
+from csplat_conformance.manifest import VECTORS, Vector, load, picture_name, summarise, to_json
+from csplat_conformance.reference_renders import can_render, psnr, read_png, reference_render, write_png
+
+#: The text of the specification.
+FORMAT = Path(__file__).parents[3] / "spec" / "format.md"
+
+_SAME_PICTURE = 60.0  # dB; one of 16 values differs by 1
+
+
+def main() -> int:
+    """Write or compare the generated files; return exit status 1 if --check finds a difference."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--check", action="store_true", help="write nothing, fail if a file is outdated")
+    check = parser.parse_args().check
+    generated = files()
+    stale = [path for path, data in generated.items() if not path.exists() or path.read_bytes() != data]
+    found = sorted([*VECTORS.rglob("*.csplat"), *VECTORS.rglob("*.png")])
+    extra = [path for path in found if path not in generated]
+    if not can_render():
+        sys.stderr.write("SKIPPED: reference pictures, which need the packages of the extra render\n")
+    if not check:
+        for path in stale:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(generated[path])
+        for path in extra:
+            path.unlink()
+    if stale or extra:
+        names = ", ".join(path.name for path in [*stale, *extra][:20])
+        sys.stderr.write(f"{'out of date' if check else 'written'}: {len(stale) + len(extra)} files: {names}\n")
+    return 1 if check and (stale or extra) else 0
+
+
+def files() -> dict[Path, bytes]:
+    """Return every generated file: the vectors, the manifest, the spec with its annexes."""
+    result: dict[Path, bytes] = {}
+    vectors = []
+    for recipe in all_recipes():
+        data = recipe.data()
+        pictures = _pictures(recipe)
+        vector = describe(recipe, data, list(pictures.values()))
+        result |= pictures
+        path = VECTORS / vector.file
+        if path in result:
+            raise SystemExit(f"two recipes have the name {vector.file}")
+        result[path] = data
+        vectors.append(vector)
+    result[VECTORS / "manifest.json"] = to_json(vectors).encode()
+    if FORMAT.exists():
+        text = FORMAT.read_text(encoding="utf-8")
+        text = replace_generated(text, "worked example", annex())
+        text = replace_generated(text, "clause map", clause_map(text, vectors))
+        result[FORMAT] = text.encode()
+    return result
+
+
+def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vector:
+    """Return the manifest entry of a recipe.
+
+    Args:
+        recipe: the recipe of the entry.
+        data: the file.
+        pictures: a PNG for each of the recipe's views.
+    """
+    known = {vector.name: vector.since for vector in load()}
+    expect: dict[str, Any] = {}
+    error: dict[str, Any] = {}
+    if recipe.scene is not None:
+        result = expected(recipe.scene)
+        expect = {"header": result.header}
+        for key in ("integers", "floats", "extra"):
+            expect[key] = summarise(getattr(result, key))
+        if result.cuts:
+            expect["cuts"] = result.cuts
+    else:
+        error = {"code": recipe.code, "clause": recipe.clauses[0], "offset": recipe.offset}
+        error |= {"also": list(recipe.also), "optional": recipe.optional}
+    views = [
+        {
+            "camera": view.camera,
+            "picture": picture_name(recipe.name, number),
+            "sha256": hashlib.sha256(picture).hexdigest(),
+            "psnr": view.psnr,
+        }
+        for number, (view, picture) in enumerate(zip(recipe.views, pictures, strict=True))
+    ]
+    return Vector(
+        name=recipe.name,
+        file=f"{recipe.name}.csplat",
+        sha256=hashlib.sha256(data).hexdigest(),
+        why=recipe.why,
+        clauses=list(recipe.clauses),
+        since=known.get(recipe.name, f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}"),
+        expect=expect,
+        error=error,
+        views=views,
+    )
+
+
+def _pictures(recipe: Recipe) -> dict[Path, bytes]:
+    """Return the reference pictures of a recipe: the existing ones, unless they are missing or outdated."""
+    result = {}
+    for number, view in enumerate(recipe.views):
+        path = VECTORS / picture_name(recipe.name, number)
+        old = path.read_bytes() if path.exists() else b""
+        if can_render() and recipe.scene is not None:
+            made = expected(recipe.scene)
+            flags = made.header["scene_flags"]
+            picture = reference_render(made.floats, view.camera, "antialiased" in flags)
+            if not old or psnr(picture, read_png(old)) < _SAME_PICTURE:
+                old = write_png(picture)
+        if not old:
+            raise SystemExit(f"{path.name} is missing: install the packages of the extra render to create it")
+        result[path] = old
+    return result
+
+
+if __name__ == "__main__":
+    sys.exit(main())
