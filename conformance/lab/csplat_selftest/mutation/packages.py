@@ -1,8 +1,8 @@
 """Mutants of a package, judged by the tests that reach them.
 
 Coverage lists once which tests reach which lines, function by function. Each mutant is written into a copy of the
-checkout, where the tests that reach its statement run, unmarked tests first and among these the smallest ones, until a
-test fails. For changes that coverage cannot see (kernels, constants of a module), tests that reach any line of the
+checkout, where the tests that reach its statement run, unmarked tests first and among these the quickest, until a test
+fails. For changes that coverage cannot see (kernels, constants of a module), tests that reach any line of the
 module take their place.
 """
 
@@ -15,7 +15,7 @@ import random
 import shutil
 import subprocess
 import sys
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
@@ -23,6 +23,7 @@ from functools import cached_property
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
+from xml.etree import ElementTree as ET
 
 from csplat.errors import InputError
 from csplat_selftest.mutation.mutants import Mutant
@@ -35,7 +36,8 @@ ROOTS = {
 _PATH = ("tests", "codec", "conformance", "conformance/lab", "tools", "tools/lab", "trainer")
 _EVERYDAY = "not (browser or engines or peers or torch or gpu or remote or long)"
 _UNMARKED = f"{_EVERYDAY} and not slow and not shared_data"
-_TESTS_MAX = 150  # tests per mutant
+_TESTS_MAX = 120  # tests per mutant
+_FIRST = 25  # tests that run first, alone: most mutants fail one of them, and fewer files are imported
 _SECONDS = 300.0  # time limit of a mutant's tests; a mutant beyond it counts as caught
 _SKIPPED = (".git", ".venv", "out", "node_modules", "__pycache__", ".mypy_cache", ".ruff_cache", ".hypothesis")
 
@@ -90,6 +92,7 @@ class Checkout:
 
     def __init__(self, root: Path, work: Path) -> None:
         self.root, self.work = root, work
+        self._seconds: dict[str, float] = {}
 
     def files(self, package: str) -> list[str]:
         """Return the paths of a package's modules, relative to the root.
@@ -137,7 +140,8 @@ class Checkout:
         if not saved.exists():
             self._run_all(saved)
         raw = json.loads(saved.read_text("utf-8"))
-        names = raw["tests"]
+        names = list(raw["seconds"])
+        self._seconds = raw["seconds"]
         return {
             file: {int(line): [names[one] for one in tests] for line, tests in lines.items()}
             for file, lines in raw["lines"].items()
@@ -154,10 +158,11 @@ class Checkout:
             "utf-8",
         )
         words = ["-m", "coverage", "run", f"--rcfile={settings}", "-m", "pytest", "-q", "-n", "auto"]
-        self._python(self.root, [*words, "--dist", "loadfile", "-m", _EVERYDAY], None)
+        report = self.work / "report.xml"
+        self._python(self.root, [*words, "--dist", "loadfile", "-m", _EVERYDAY, f"--junitxml={report}"], None)
         measured = coverage.Coverage(data_file=str(data), config_file=str(settings))
         measured.combine(keep=True)
-        save_reached(measured.get_data(), self.root, saved)
+        save_reached(measured.get_data(), report, self.root, saved)
 
     @cached_property
     def unmarked(self) -> frozenset[str]:
@@ -166,10 +171,6 @@ class Checkout:
         listed = self._python(self.root, words, None).stdout
         return frozenset(line.split("[")[0] for line in listed.splitlines() if "::" in line)
 
-    @cached_property
-    def _sizes(self) -> Counter[str]:
-        return Counter(test for lines in self.reached.values() for tests in lines.values() for test in tests)
-
     def tests_of(self, mutant: JudgedMutant, line: int) -> list[str]:
         """Return the ids of tests that reach a mutant, in the order in which they run."""
         text, lines = self.text(mutant.file), self.reached.get(mutant.file, {})
@@ -177,7 +178,7 @@ class Checkout:
         tests = {test for number in range(begin, end + 1) for test in lines.get(number, ())}
         if not tests:  # a kernel, or a constant
             tests = {test for reached in lines.values() for test in reached}
-        return sorted(tests, key=lambda test: (test not in self.unmarked, self._sizes[test], test))
+        return sorted(tests, key=lambda test: (test not in self.unmarked, self._seconds[test], test))
 
     def judge(self, mutants: Sequence[JudgedMutant], jobs: int) -> Iterator[JudgedMutant]:
         """Yield mutants with their verdicts, several at a time, each in a copy of the checkout."""
@@ -187,8 +188,8 @@ class Checkout:
             shutil.rmtree(copy, ignore_errors=True)
             shutil.copytree(self.root, copy, ignore=shutil.ignore_patterns(*_SKIPPED))
             copies.put(copy)
-        assert self.unmarked is not None
-        assert self._sizes is not None
+        assert self.unmarked  # computed here, by one thread
+        assert self.reached
         with ThreadPoolExecutor(jobs) as pool:
             yield from pool.map(lambda one: self._judged(one, copies), mutants)
 
@@ -204,7 +205,10 @@ class Checkout:
         path, start = copy / mutant.file, place[1]
         try:
             path.write_text(text[:start] + mutant.new + text[start + len(mutant.old) :], "utf-8")
-            by = self._failed(copy, tests[:_TESTS_MAX], "njit" in text or "jit(" in text)
+            is_kernel = "jit(" in text or "njit" in text
+            by = self._failed(copy, tests[:_FIRST], is_kernel)
+            if not by and len(tests) > _FIRST:
+                by = self._failed(copy, tests[_FIRST:_TESTS_MAX], is_kernel)
         finally:
             path.write_text(text, "utf-8")
             copies.put(copy)
@@ -232,8 +236,8 @@ class Checkout:
         return subprocess.run(command, cwd=folder, env=environment, timeout=limit, capture_output=True, text=True)  # noqa: PLW1510, S603
 
 
-def save_reached(data: Any, root: Path, saved: Path) -> None:
-    """Write the names of tests by line and file as JSON, from the data of coverage."""
+def save_reached(data: Any, report: Path, root: Path, saved: Path) -> None:
+    """Write the tests that reach each line, and their seconds, as JSON, from coverage and a JUnit report."""
     names = {f"{path.relative_to(root).with_suffix('').as_posix().replace('/', '.')}": path.relative_to(root).as_posix()
              for path in (root / "tests").rglob("test_*.py")}  # fmt: skip
     names |= {name.rpartition(".")[2]: path for name, path in names.items()}
@@ -242,6 +246,9 @@ def save_reached(data: Any, root: Path, saved: Path) -> None:
         module, _, function = context.rpartition(".")
         return f"{names[module]}::{function}" if module in names else ""
 
+    seconds: dict[str, float] = defaultdict(float)
+    for case in ET.parse(report).getroot().iter("testcase"):  # noqa: S314 - written by our own run
+        seconds[test(f"{case.get('classname')}.{case.get('name', '').split('[')[0]}")] += float(case.get("time", "0"))
     numbers: dict[str, int] = {}
     reached = {}
     for file in data.measured_files():
@@ -250,7 +257,7 @@ def save_reached(data: Any, root: Path, saved: Path) -> None:
             reached[file.removeprefix(f"{root}/")] = {
                 n: sorted(numbers.setdefault(one, len(numbers)) for one in tests) for n, tests in lines.items() if tests
             }
-    saved.write_text(json.dumps({"tests": list(numbers), "lines": reached}), "utf-8")
+    saved.write_text(json.dumps({"seconds": {one: seconds[one] for one in numbers}, "lines": reached}), "utf-8")
 
 
 def read_mutants(path: Path) -> list[JudgedMutant]:
