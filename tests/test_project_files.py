@@ -12,6 +12,8 @@ import pytest
 import csplat
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
 def test_attributes_of_git_know_binary_files():
     if not (ROOT / ".git").exists():
         pytest.skip("not a checkout: git knows nothing of these files")

@@ -1,6 +1,6 @@
 """Run every command as a user without a home, with a read-only package and a full /tmp, and print a table.
 
-For Linux, as root, by hand: `python tests/other_user.py [COMMAND…]`. The commands run in a mount namespace of their
+For Linux, as root, by hand: `python tools/lab/other_user.py [COMMAND…]`. The commands run in a mount namespace of their
 own, so nothing is left on the machine. A command passes if it ends with status 0, or with an error in one line; a
 traceback, a raw message of a library or a file of an unexpected name fails. Without a cache every command that renders
 compiles its kernels, so all take a quarter of an hour.
@@ -14,12 +14,14 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import posed_sets
 
 import csplat
 from csplat.model import SplatModel, normalise_quats
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "tests" / "helpers"))
+import posed_sets  # noqa: E402
+
 NOBODY = "65534"  # user without a home
 SECONDS = 600  # wall time after which a command counts as hanging; kernels are compiled in each run
 
