@@ -41,7 +41,6 @@ T = TypeVar("T")
 #: Files with the longest tests: pytest-xdist starts them first, so that no worker is left with one at the end.
 LONGEST = (
     "test_finetune",
-    "test_tradeoff",
     "test_conformance_encoder",
     "test_viewer_page",
     "test_cli",

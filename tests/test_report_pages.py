@@ -22,7 +22,7 @@ pytest.importorskip("matplotlib", reason="plots require the extra [render]")
 
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_tools.cli.app import app
-from csplat_tools.html_report import Bar, HardestPlaceSearch, draw_bars
+from csplat_tools.html_report import HardestPlaceSearch, attribute_figure
 from csplat_tools.inspect.file_description import describe_file
 from csplat_tools.views import comparison_cameras, display_cameras, find_view_set
 from csplat_tools.views.view_sets import ViewSet
@@ -154,7 +154,7 @@ for words in ((f"{folder}/a.html",), (f"{folder}/b.html", "--source", source)):
 
 @pytest.mark.usefixtures("small_views")
 def test_bars_are_proportional_to_bytes():
-    text = draw_bars([Bar("a", {"means": 100, "sh0": 300}, "400"), Bar("b", {"means": 50}, "50")], key=True)
+    text = attribute_figure({"means": 100, "sh0": 300, "sh1": 50})
     widths = [float(one) for one in re.findall(r'width="([\d.]+)" height="17"', text)]
     assert 3 == len(widths)
     np.testing.assert_allclose(np.array(widths) / widths[0], [1.0, 3.0, 0.5], atol=1e-3)

@@ -183,7 +183,6 @@ def made(monkeypatch):
 
 @pytest.mark.slow
 def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, made, tmp_path, monkeypatch):
-    # test_tradeoff.py tests the validation views of a sweep.
     ply, own = sets["rgba"] / "scene.ply", ("--data", sets["rgba"])
     change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", size=(24, 20), test_every=5)
     change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", effort=1)
@@ -210,7 +209,7 @@ def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, 
     run("sensitivity", ply, tmp_path / "s.npz")
     words = ("--iterations", "2", "--keep", "0.7")
     found["finetune"] = run("finetune", ply, tmp_path / "s.csplat", *words)["scores"]["source"]["psnr"]
-    found["tradeoff"] = run("tradeoff", ply, "--what", "precision=40")["source"]["photographs"]["psnr"]
+    found["tradeoff"] = run("tradeoff", ply, "--what", "precision=40")["points"][0]["photographs"]["a"]["psnr"]
     model = read_ply(ply)
     views = find_view_set(model, data=DataOptions(str(sets["rgba"]), (24, 20), test_every=5))
     draw = renderer(model, views.background)
@@ -292,7 +291,7 @@ SCORES = {
     "compare": (("PLY", "PLY"), ("photographs", "a")),
     "finetune": (("PLY", "OUT/t.csplat", "--iterations", 1), ("scores", "source")),
     "simplify": (("PLY", "OUT/less.ply", "--keep", 0.9), ("photographs", "source")),
-    "tradeoff": (("PLY", "--what", "presets"), ("source", "photographs")),
+    "tradeoff": (("PLY", "--what", "presets"), ("points", 0, "photographs", "a")),
     "encode": (
         ("PLY", "OUT/e.csplat", "--max-psnr-drop", 3, "--no-prune", "--preset", "fast"),
         ("target", "photographs", "source"),

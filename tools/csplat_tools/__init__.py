@@ -21,8 +21,7 @@ if TYPE_CHECKING:
     from csplat_tools.inspect.comparison import Comparison, compare
     from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
     from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
-    from csplat_tools.tradeoffs.sweep_options import SweepOptions
-    from csplat_tools.tradeoffs.sweep_run import Tradeoff, tradeoff
+    from csplat_tools.tradeoffs import Tradeoff, parse_grid, tradeoff
     from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
 __all__ = [
@@ -34,13 +33,13 @@ __all__ = [
     "SceneLike",
     "Simplified",
     "SimplifyOptions",
-    "SweepOptions",
     "Tradeoff",
     "ViewSet",
     "batch",
     "compare",
     "find_view_set",
     "load_model",
+    "parse_grid",
     "simplify",
     "tradeoff",
 ]
@@ -56,15 +55,15 @@ _MODULE_OF = {
     "SceneLike": "csplat_tools.scene_files",
     "Simplified": "csplat_tools.optimise.simplify",
     "SimplifyOptions": "csplat_tools.optimise.simplify",
-    "Tradeoff": "csplat_tools.tradeoffs.sweep_run",
+    "Tradeoff": "csplat_tools.tradeoffs",
     "ViewSet": "csplat_tools.views",
-    "SweepOptions": "csplat_tools.tradeoffs.sweep_options",
     "batch": "csplat_tools.batches.batch_run",
     "compare": "csplat_tools.inspect.comparison",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.scene_files",
+    "parse_grid": "csplat_tools.tradeoffs",
     "simplify": "csplat_tools.optimise.simplify",
-    "tradeoff": "csplat_tools.tradeoffs.sweep_run",
+    "tradeoff": "csplat_tools.tradeoffs",
 }
 _export, __dir__ = lazy_exports(__name__, _MODULE_OF)
 

@@ -62,29 +62,17 @@ thead button:hover, thead button:focus-visible { color: var(--accent); text-deco
 th[aria-sort='ascending'] button::after { content: ' \\25b2'; }
 th[aria-sort='descending'] button::after { content: ' \\25bc'; }
 tr.front td { background: var(--front); }
-.copy {
-  display: none; font: inherit; font-size: 12px; line-height: 1.4; padding: 0 7px; color: var(--accent);
-  background: var(--raised); border: 1px solid var(--line); border-radius: 4px; cursor: pointer;
-}
-.live .copy { display: inline-block; }
-.copy:hover, .copy:focus-visible { border-color: var(--accent); }
-.legend { display: block; columns: 2 420px; column-gap: 36px; font-size: 13px; margin-top: 12px; }
-.legend div { break-inside: avoid; padding-bottom: 4px; }
-.legend dt, .legend dd { display: inline; }
-.legend dt { font-weight: 600; color: var(--text); }
-.commands div { padding: 6px 0; border-bottom: 1px solid var(--line); }
-code { font: 12.5px/1.5 ui-monospace, 'SF Mono', Consolas, monospace; overflow-wrap: anywhere; }
+code { font: 12.5px/1.5 ui-monospace, 'SF Mono', Consolas, monospace; }
+td code { display: block; text-align: left; }
 .pictures { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(45%, 150px), 1fr)); gap: 6px; }
 .pictures img { display: block; width: 100%; height: auto; background: #000; border-radius: 4px; }
 dl { display: grid; grid-template-columns: fit-content(28ch) 1fr; gap: 3px 18px; margin: 0; }
 @media (max-width: 640px) { dl { grid-template-columns: 1fr; } dd { padding-bottom: 6px; } }
 dt { color: var(--quiet); }
 dd { margin: 0; overflow-wrap: anywhere; }
-summary { cursor: pointer; margin-top: 12px; }
 """
 
 _SCRIPT = """
-document.documentElement.classList.add('live');
 for (const table of document.querySelectorAll('table.sortable')) {
   const heads = [...table.tHead.rows[0].cells];
   heads.forEach((head, column) => head.querySelector('button')?.addEventListener('click', () => {
@@ -100,33 +88,6 @@ for (const table of document.querySelectorAll('table.sortable')) {
     head.setAttribute('aria-sort', rising ? 'ascending' : 'descending');
     table.tBodies[0].append(...[...table.tBodies[0].rows].sort(order));
   }));
-}
-const copy = async (text) => {
-  try {
-    await navigator.clipboard.writeText(text);
-    return true;
-  } catch {
-    const area = document.createElement('textarea');
-    area.value = text;
-    document.body.append(area);
-    area.select();
-    const done = document.execCommand('copy');
-    area.remove();
-    return done;
-  }
-};
-for (const button of document.querySelectorAll('button.copy')) {
-  const said = button.textContent;
-  button.addEventListener('click', async () => {
-    const code = document.getElementById(button.dataset.from);
-    const done = await copy(code.textContent);
-    if (!done) {
-      code.closest('details')?.setAttribute('open', '');
-      getSelection().selectAllChildren(code);
-    }
-    button.textContent = done ? 'copied' : 'press Ctrl+C';
-    setTimeout(() => { button.textContent = said; }, 1500);
-  });
 }
 """
 
@@ -162,15 +123,9 @@ def paragraph(text: str) -> str:
     return f"<p>{escape(text)}</p>"
 
 
-def details(summary: str, *parts: str) -> str:
-    """Return parts that a click on a summary shows."""
-    return f"<details><summary>{escape(summary)}</summary>\n{''.join(parts)}\n</details>"
-
-
-def figure(svg: str, caption: str = "") -> str:
+def figure(svg: str) -> str:
     """Return an inline SVG as a figure that scrolls sideways on narrow screens."""
-    text = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f'<figure class="plot"><div class="scroll">{svg}</div>{text}</figure>\n'
+    return f'<figure class="plot"><div class="scroll">{svg}</div></figure>\n'
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: Collection[int] = ()) -> str:
@@ -197,20 +152,17 @@ class Head:
 
     Attributes:
         title: title of the column.
-        hint: text that appears when the mouse rests on it.
         kind: `number` or `name`, which a click on the heading sorts; or `html`, which is not sorted.
     """
 
     title: str
-    hint: str = ""
     kind: Literal["number", "name", "html"] = "number"
 
     def html(self) -> str:
         """Return the cell of the heading."""
         kind = ' class="name" data-kind="text"' if self.kind == "name" else ""
-        hint = f' title="{escape(self.hint)}"' if self.hint else ""
         title = escape(self.title)
-        return f'<th scope="col"{kind}{hint}>' + (
+        return f'<th scope="col"{kind}>' + (
             f"{title}</th>" if self.kind == "html" else f'<button type="button">{title}</button></th>'
         )
 
@@ -248,21 +200,10 @@ def _table(heads: str, rows: Sequence[str], kind: str = "") -> str:
     return f'<div class="scroll"><table{kind}><thead><tr>{heads}</tr></thead><tbody>\n{body}\n</tbody></table></div>'
 
 
-def definitions(entries: Mapping[str, str], kind: str = "") -> str:
-    """Return a list of terms and their meanings; of kind `legend` it is laid out in columns."""
-    mark = f' class="{kind}"' if kind else ""
+def definitions(entries: Mapping[str, str]) -> str:
+    """Return a list of terms and their meanings."""
     lines = [f"<dt>{escape(key)}</dt> <dd>{escape(value)}</dd>" for key, value in entries.items()]
-    return f"<dl{mark}>\n" + "\n".join(f"<div>{line}</div>" if kind else line for line in lines) + "\n</dl>"
-
-
-def copy_button(name: str, text: str) -> str:
-    """Return a button that copies the text of the `command_line` of this name; it is shown only if scripts run."""
-    return f'<button type="button" class="copy" data-from="{name}" title="{escape(text)}">copy</button>'
-
-
-def command_line(name: str, text: str) -> str:
-    """Return a command as an element that `copy_button` finds by its name."""
-    return f'<code id="{name}">{escape(text)}</code>'
+    return "<dl>\n" + "\n".join(lines) + "\n</dl>"
 
 
 def _policy() -> str:
@@ -296,89 +237,24 @@ _WIDTH, _ROW, _BAR = 820, 24, 17  # width of the figure, height of a row and of 
 _LETTER, _SIZE = 7.2, 13  # approximate width of a letter, and the font size, pixels
 _GAP = 10  # pixels between text and bar
 
-#: Style and background of an SVG that is a file: light or dark, by the reader's setting.
-STANDALONE = (
-    "<style>svg{color:#1d2126}.ground{fill:#ffffff}"
-    "@media (prefers-color-scheme:dark){svg{color:#e4e8ed}.ground{fill:#14171b}}</style>"
-    '<rect class="ground" x="-5%" y="-5%" width="110%" height="110%" fill="#ffffff"/>'
-)
-
-
-@dataclass(frozen=True)
-class Bar:
-    """A row of the figure.
-
-    Attributes:
-        label: text before the bar.
-        parts: bytes by attribute, in this order from left to right.
-        text: text after the bar.
-    """
-
-    label: str
-    parts: Mapping[str, int]
-    text: str
-
-
-def draw_bars(bars: Sequence[Bar], *, key: bool, inline: bool = True) -> str:
-    """Draw bars below each other, to one scale.
-
-    Args:
-        bars: the rows, at least one.
-        key: write a key of the colours above the bars.
-        inline: for a page, in its text colour; else with a background of its own.
-    """
-    names = [name for name in _COLOURS if any(bar.parts.get(name) for bar in bars)]
-    names += sorted({name for bar in bars for name in bar.parts if bar.parts[name]} - set(names))
-    left = _GAP + _LETTER * max(len(bar.label) for bar in bars)
-    room = _WIDTH - left - _GAP - _LETTER * max(len(bar.text) for bar in bars)
-    scale = room / max(1, *(sum(bar.parts.values()) for bar in bars))
-    parts, top = _key(names) if key else ([], 0)
-    for bar in bars:
-        parts += _row(bar, left, scale, top)
-        top += _ROW
-    ground = "" if inline else STANDALONE
-    mark = "" if inline else ' font-family="sans-serif" color="#1d2126"'
-    air = 0 if inline else _GAP
-    box = f"{-air} {-air} {_WIDTH + 2 * air} {top + 2 * air}"
-    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="{box}" role="img" font-size="{_SIZE}"'
-    return f'{head} fill="currentColor"{mark}>{ground}{"".join(parts)}</svg>'
-
 
 def attribute_figure(sizes: Mapping[str, int]) -> str:
-    """Return a figure with the bytes of each attribute, whose sum is the size of the file."""
+    """Return a figure with the bytes of each attribute as bars to one scale; their sum is the size of the file."""
     whole = sum(sizes.values())
-    bars = [
-        Bar(name, {name: size}, f"{format_bytes(size)}, {100.0 * size / whole:.1f} %") for name, size in sizes.items()
-    ]
-    return figure(draw_bars(bars, key=False))
-
-
-def _row(bar: Bar, left: float, scale: float, top: float) -> list[str]:
-    base = top + _BAR - 4
-    parts = [f'<text x="{left - _GAP:.1f}" y="{base}" text-anchor="end">{escape(bar.label)}</text>']
-    at = left
-    for name, size in bar.parts.items():
-        if size:
-            width = scale * size
-            parts.append(
-                f'<rect x="{at:.2f}" y="{top}" width="{width:.2f}" height="{_BAR}" fill="{_COLOURS.get(name, _OTHER)}">'
-                f"<title>{escape(f'{bar.label}: {name} {size:,} bytes')}</title></rect>"
-            )
-            at += width
-    return [*parts, f'<text x="{at + _GAP / 2:.1f}" y="{base}">{escape(bar.text)}</text>']
-
-
-def _key(names: Sequence[str]) -> tuple[list[str], int]:
-    """Return the key, coloured squares with their names, and its height in pixels."""
-    parts, across, top = list[str](), 0.0, 0
-    for name in names:
-        width = _ROW + _LETTER * len(name) + _GAP
-        if across + width > _WIDTH:
-            across, top = 0.0, top + _ROW
-        parts.append(f'<rect x="{across:.1f}" y="{top}" width="13" height="13" fill="{_COLOURS.get(name, _OTHER)}"/>')
-        parts.append(f'<text x="{across + 18:.1f}" y="{top + 11}">{escape(name)}</text>')
-        across += width
-    return parts, top + _ROW + 4
+    texts = {name: f"{format_bytes(size)}, {100.0 * size / whole:.1f} %" for name, size in sizes.items()}
+    left = _GAP + _LETTER * max(map(len, sizes))
+    scale = (_WIDTH - left - _GAP - _LETTER * max(map(len, texts.values()))) / max(1, *sizes.values())
+    parts = list[str]()
+    for place, (name, size) in enumerate(sizes.items()):
+        top, width = place * _ROW, scale * size
+        base = top + _BAR - 4
+        parts += [
+            f'<text x="{left - _GAP:.1f}" y="{base}" text-anchor="end">{escape(name)}</text>',
+            f'<rect x="{left:.2f}" y="{top}" width="{width:.2f}" height="{_BAR}" fill="{_COLOURS.get(name, _OTHER)}"/>',
+            f'<text x="{left + width + _GAP / 2:.1f}" y="{base}">{escape(texts[name])}</text>',
+        ]
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {_ROW * len(sizes)}" role="img"'
+    return figure(f'{head} font-size="{_SIZE}" fill="currentColor">{"".join(parts)}</svg>')
 
 
 #: Placeholder for the colour of text until the SVG is written: no other colour is exactly this.
@@ -386,7 +262,6 @@ INK = "#123457"
 
 _SVG = "{http://www.w3.org/2000/svg}"
 _XLINK = "{http://www.w3.org/1999/xlink}"
-_BLACK = "#1d2126"  # colour of text for readers that do not support styles
 # Older versions of matplotlib write font sizes in `font`, which is not an attribute of SVG.
 _FONT = re.compile(r"^(?:\S+\s+)*?(?P<size>[0-9.]+px)\s")
 _SETTINGS: dict[Any, Any] = {  # matplotlib's types list every key
@@ -406,32 +281,16 @@ _SETTINGS: dict[Any, Any] = {  # matplotlib's types list every key
     "grid.alpha": 0.25,
     "grid.color": INK,
     "font.size": 11.0,
-    "text.parse_math": False,  # names of points may hold any character
 }
 
 
-def hover_id(plot: str, name: str) -> str:
-    """Return the id of a point's mark in a plot: `point-` and hexadecimal digits, whatever the names contain."""
-    return f"point-{hashlib.sha256(f'{plot}/{name}'.encode()).hexdigest()[:12]}"
-
-
-def draw_svg(
-    draw: Callable[[Figure], None],
-    size: tuple[float, float],
-    name: str,
-    *,
-    inline: bool,
-    titles: Mapping[str, str] | None = None,
-) -> str:
-    """Draw a figure.
+def draw_svg(draw: Callable[[Figure], None], size: tuple[float, float], name: str) -> str:
+    """Draw a figure for a page, in its text colour.
 
     Args:
         draw: called with an empty figure.
         size: width and height, inches.
         name: name of the plot: ids inside begin with it, so that several plots can share a page.
-        inline: for a page, in its text colour; else with an XML prologue and a background, light or dark by the
-            reader's setting.
-        titles: texts that appear when the mouse rests on a mark, by its id.
 
     Returns:
         The SVG, the same for the same figure and version of matplotlib.
@@ -448,24 +307,12 @@ def draw_svg(
         nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
         canvas.savefig(buffer, format="svg", metadata=nothing, transparent=True)
     root = ET.fromstring(buffer.getvalue())  # noqa: S314 -- matplotlib has just written it
-    _clean(root, name, titles or {})
-    if inline:
-        root.attrib.pop("height", None)
-        root.attrib.pop("width", None)
-        return _text(root)
-    root.set("font-family", "sans-serif")
-    root.set("color", _BLACK)
-    for place, child in enumerate(ET.fromstring(f"<g>{STANDALONE}</g>")):  # noqa: S314 -- our own text
-        root.insert(place, child)
-    return f'<?xml version="1.0" encoding="utf-8"?>\n{_text(root)}\n'
-
-
-def _text(root: ET.Element) -> str:
+    _clean(root, name)
     return ET.tostring(root, encoding="unicode").replace(INK, "currentColor")
 
 
-def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:
-    """Turn styles into attributes, prefix ids with the plot's name, and add the titles of points."""
+def _clean(root: ET.Element, name: str) -> None:
+    """Turn styles into attributes, and prefix ids with the plot's name."""
     for element in list(root.iter()):
         element.tag = element.tag.removeprefix(_SVG)
         for child in list(element):
@@ -475,12 +322,8 @@ def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:
         element.attrib.clear()
         for key, value in attributes.items():
             plain = "href" if key == f"{_XLINK}href" else key
-            element.set(plain, _own_id(plain, value, name, titles))
-        title = titles.get(element.get("id", ""))
-        if title is not None:
-            label = ET.Element("title")
-            label.text = title
-            element.insert(0, label)
+            element.set(plain, _own_id(plain, value, name))
+    del root.attrib["height"], root.attrib["width"]
     # The content of matplotlib's own style element, for this SVG alone.
     root.set("stroke-linejoin", "round")
     root.set("stroke-linecap", "butt")
@@ -488,8 +331,8 @@ def _clean(root: ET.Element, name: str, titles: Mapping[str, str]) -> None:
     root.set("xmlns", _SVG.strip("{}"))
 
 
-def _own_id(key: str, value: str, name: str, titles: Mapping[str, str]) -> str:
-    if key == "id" and value not in titles:
+def _own_id(key: str, value: str, name: str) -> str:
+    if key == "id":
         return f"{name}-{value}"
     if key == "href":
         return value.replace("#", f"#{name}-", 1)

@@ -75,7 +75,6 @@ RENAMED_OPTIONS = {
         ("--views", "--view-size", "--validation-count", "--split", "--background"),
         _IN_PYTHON.format("csplat_tools.find_view_set"),
     ),
-    **dict.fromkeys(("--modes", "--iterations"), _IN_PYTHON.format("csplat_tools.SweepOptions")),
     **dict.fromkeys(("--amplify", "--memory"), _IN_PYTHON.format("csplat_tools.compare")),
     **dict.fromkeys(("--thumbnails", "--no-thumbnails"), _IN_PYTHON.format("csplat_tools.batch")),
     **dict.fromkeys(("--previews", "--preview-every", "--lpips-weights"), _IN_PYTHON.format("csplat_trainer.Outputs")),

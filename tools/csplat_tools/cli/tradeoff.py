@@ -7,12 +7,10 @@ from typing import Annotated
 import typer
 
 from csplat_tools.cli import shared_options as shared
-from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import note
-from csplat_tools.optional_packages import prepare_renderer, require_images, require_plots, require_renderer
-from csplat_tools.tradeoffs.sweep_options import SweepOptions, parse_sweep
-
-_SLOW = {"strategies", "targets", "simplify", "finetune"}
+from csplat_tools.file_streams import write_bytes
+from csplat_tools.optional_packages import prepare_renderer, require_plots
 
 
 def tradeoff(
@@ -20,10 +18,8 @@ def tradeoff(
     page: Annotated[
         str | None, typer.Option("--output", "-o", metavar="PAGE.html", help="Write an HTML report.")
     ] = None,
-    what: Annotated[
-        str, typer.Option(metavar="GROUPS", show_default=False, help="Files to make, see above. Default: usual.")
-    ] = "usual",
-    preset: shared.Preset = SweepOptions.preset,
+    what: Annotated[str | None, typer.Option(metavar="GROUPS", help="Settings, see above. Default: all.")] = None,
+    preset: shared.Preset = "balanced",
     cameras: shared.Cameras = None,
     data: shared.Data = None,
     force: shared.Force = False,
@@ -32,40 +28,50 @@ def tradeoff(
     quiet: shared.Quiet = False,
     _all: shared.HelpAll = False,
 ) -> None:
-    """Measure size against quality of many encodings.
+    """Measure size, quality and time of many encodings.
 
     Groups of --what, with values after `=` and colons between them:
-      presets, strategies
+      presets=fast:small
       precision=36:44     PSNR of attributes, dB
       targets=38:1MB      PSNR of renders, or sizes; slow
-      simplify=0.5        fractions of the splats
-      finetune            takes minutes; not part of `usual`
-    PSNR is measured against the source's renders, as by `csplat compare`,
-    and against the images of --data. Requires the render extra.
+      simplify=0.7:0.5    fractions of the splats; slow
+    A group without `=` has default values. PSNR is measured against the
+    source's renders, as by `csplat compare`, and against the images of --data.
+    Requires the render extra.
 
     Examples:
       csplat tradeoff scene.ply
       csplat tradeoff scene.ply -o report.html --report report.json
       csplat tradeoff scene.ply --what presets,precision=36:44:52
-      csplat tradeoff scene.ply --data capture --what usual,finetune
+      csplat tradeoff scene.ply --data capture --what presets,targets=30:32
     """
-    out = Output(force, report, as_json, quiet)
-    options, views = shared.checked(parse_sweep, what, preset=preset), shared.ViewOptions(cameras, data)
+    import csplat_tools
+    from csplat_tools.optimise.target_encoding import expected_search_seconds
+    from csplat_tools.scene_files import read_source
+    from csplat_tools.tradeoffs import GROUPS, format_tradeoff, make_tradeoff_page, parse_grid
+
+    out, views = Output(force, report, as_json, quiet), shared.ViewOptions(cameras, data)
+    grid = shared.checked(parse_grid, ",".join(GROUPS) if what is None else what, preset)
+    searches = [(setting.options, setting.target) for setting in grid if setting.target is not None]
     out.check(inputs=(source, *views.inputs), named={"-o": page})
     if page is not None:
         require_plots()
-    require_renderer()
-    require_images()
-    import csplat_tools
-    from csplat_tools.tradeoffs.sweep_options import read_setting
-    from csplat_tools.tradeoffs.tradeoff_report import format_tradeoff, write_tradeoff_page
-
     with out.bar() as progress:
-        setting = read_setting(source, cameras=views.cameras, data=views.data_options)
-        prepare_renderer(quiet=out.quiet, simplify=bool(_SLOW & set(options.what)), ssim=True)
-        out.print_findings(setting.findings)
-        out.remark(*setting.views.notes)
-        measured = csplat_tools.tradeoff(setting, options, say=None if out.quiet else note, progress=progress)
+        read = read_source(source)
+        out.print_findings(read.findings)
+        prepare_renderer(quiet=out.quiet, simplify=bool(searches), ssim=True)
+        around = views.find(read.model, out)
+        if len(read.model):
+            out.announce_time(
+                lambda: sum(expected_search_seconds(read.model, *search, around) for search in searches),
+                "--what presets,precision takes less",
+            )
+        words = [*(["--cameras", cameras] if cameras else []), *(["--data", data] if data else [])]
+        words += ["--trust-paths"] if TRUSTS_PATHS.get() else []
+        measured = csplat_tools.tradeoff(
+            read, grid, views=around, path=source, view_words=words, say=None if out.quiet else note,
+            progress=progress,
+        )  # fmt: skip
         if page is not None:
-            write_tradeoff_page(page, measured)
+            write_bytes(page, make_tradeoff_page(measured).encode())
     out.publish(measured.as_json(), format_tradeoff(measured))

@@ -331,7 +331,7 @@ def _training_plot(training: Mapping[str, Any] | None) -> str:
 
     small = training["options"]["half_size"]
     note = html.paragraph(f"The first {small:.0%} of the steps used images of half the size.") if small else ""
-    return html.section("Training", note, html.figure(draw_svg(draw, (_WIDE, _HIGH), "training", inline=True)))
+    return html.section("Training", note, html.figure(draw_svg(draw, (_WIDE, _HIGH), "training")))
 
 
 def _tuning_plot(file: Mapping[str, Any] | None) -> str:
@@ -350,7 +350,7 @@ def _tuning_plot(file: Mapping[str, Any] | None) -> str:
         right.grid(visible=False)
 
     text = "Values are optimised through the encoder's quantisers; the step with the best loss was kept."
-    plot = html.figure(draw_svg(draw, (_WIDE, _HIGH), "tuning", inline=True))
+    plot = html.figure(draw_svg(draw, (_WIDE, _HIGH), "tuning"))
     return html.section("Tuning", html.paragraph(text), plot)
 
 

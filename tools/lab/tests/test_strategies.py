@@ -13,8 +13,8 @@ from csplat.decoder import decode_scene
 from csplat.encoder.error_bounds import covariance_errors
 from csplat.errors import InputError
 from csplat.scene_source import drop_bands
+from csplat_bench.reductions import ATTRIBUTES, Reduction, cluster_attributes, encode_reduced, prune_opacity
 from csplat_conformance.declared_bounds import Source, verify_bounds
-from csplat_tools.study import ATTRIBUTES, Reduction, cluster_attributes, encode_reduced, prune_opacity
 
 
 @pytest.fixture
@@ -247,7 +247,7 @@ def test_impossible_reductions_are_refused(make_model):
 @pytest.mark.slow
 def test_pruning_and_clustering_need_no_renderer():
     code = (
-        "import sys, json; import csplat_tools.study;"
+        "import sys, json; import csplat_bench.reductions;"
         "print(json.dumps([name for name in ('numba', 'torch', 'matplotlib') if name in sys.modules]))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)

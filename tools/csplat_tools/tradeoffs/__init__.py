@@ -1,1 +1,0 @@
-"""Measure size, quality and time of a scene over many encoder settings, as `csplat tradeoff` does."""
