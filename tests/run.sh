@@ -32,7 +32,7 @@ test_tier() {
     step "wheel" build_wheel
     use_wheel
     # Kernels are compiled once, here, and not by each worker of pytest; meanwhile other steps use the other core.
-    background "kernels, behaviour snapshot" "$BIN/python" -m pytest -q tests/test_behaviour.py -m "$1"
+    background "kernels, behaviour snapshot" "$BIN/python" -m pytest -q tests/system/test_behaviour.py -m "$1"
     static_checks
     step "vectors equal their recipes" "$BIN/python" -m csplat_authoring --check
     javascript
@@ -40,7 +40,7 @@ test_tier() {
     step "conformance of the decoder" "$BIN/csplat" conformance decoder --level 4
     step "conformance of the encoder" "$BIN/csplat" conformance encoder --level 3 --filter '*/duplicates'
     joined
-    step "Python tests" "${PYTEST[@]}" -m "$1" --deselect tests/test_behaviour.py "${@:2}"
+    step "Python tests" "${PYTEST[@]}" -m "$1" --deselect tests/system/test_behaviour.py "${@:2}"
 }
 
 # lab_tier CASES: fuzz each target with so many cases. Unguided: without coverage cases take a third of the time.
@@ -154,7 +154,7 @@ build_wheel() {
 
 # The wheel's files go before the checkout on the path of every process: what is tested is what users install.
 use_wheel() {
-    NUMBA_CACHE_DIR=$("$BIN/python" tests/wheel.py out/dist/csplat-*.whl "$WHEEL")
+    NUMBA_CACHE_DIR=$("$BIN/python" tests/helpers/wheel.py out/dist/csplat-*.whl "$WHEEL")
     export NUMBA_CACHE_DIR PYTHONPATH=$PWD/$WHEEL${PYTHONPATH:+:$PYTHONPATH}
     "$BIN/python" -c 'import csplat; print("testing", csplat.__file__); assert "wheel" in csplat.__file__'
 }

@@ -503,15 +503,6 @@ LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
 
 
 @pytest.fixture(scope="module")
-def spec():
-    """The spec's pseudo-code."""
-    names = {"float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "floor": math.floor}
-    for block in re.findall(r"```python spec-test\n(.*?)```", TEXT, re.DOTALL):
-        exec(block, names)  # noqa: S102 - the text is the project's own
-    return SimpleNamespace(**names)
-
-
-@pytest.fixture(scope="module")
 def row():
     """Return a function for the numbers in the row of the example with a given beginning, a list for each splat."""
     part = GUIDE.split("### Stating errors")[1].split("So SERR states")[0]

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import zstandard
 from checked import checked, flipped, refusals
-from conftest import of_peers
+from shared_fixtures import of_peers
 
 import csplat
 from csplat.editing.transform import convert_axes

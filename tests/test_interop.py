@@ -19,7 +19,7 @@ from csplat.interop import to_gsplat
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
-STORED = {name: Path(__file__).parent / "checkpoints" / name for name in ("gsplat.pt", "splatfacto.ckpt")}
+STORED = {name: Path(__file__).parent / "helpers" / "checkpoints" / name for name in ("gsplat.pt", "splatfacto.ckpt")}
 
 
 class PlainTensor(np.ndarray):

@@ -15,8 +15,6 @@ import pytest
 import typer
 from hypothesis import given
 from hypothesis import strategies as st
-from test_editing import extract
-from test_spec_pseudocode import spec  # noqa: F401 - a fixture
 from typer.testing import CliRunner
 
 import csplat
@@ -136,7 +134,7 @@ def header_of(nodes) -> SceneHeader:
 
 
 @given(nodes=trees(), level=st.integers(0, 5), budget=st.integers(0, 40), seed=st.integers(0, 9))
-def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):  # noqa: F811 - a fixture
+def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):
     header = header_of(nodes)
     plain = [replace(node, parent=_spec.NO_PARENT if node.parent is None else node.parent) for node in nodes]
     sizes = np.random.default_rng(seed).choice([0.0, 0.25, 0.5, 1.0, math.inf], len(nodes)).tolist()
@@ -155,7 +153,7 @@ def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):  #
 
 
 @given(nodes=trees(), level=st.integers(0, 5), low=st.floats(-0.06, 0.06), near=st.integers(-2, 2), data=st.data())
-def test_the_tiles_of_a_box_are_those_of_the_pseudo_code(spec, nodes, level, low, near, data):  # noqa: F811 - a fixture
+def test_the_tiles_of_a_box_are_those_of_the_pseudo_code(spec, nodes, level, low, near, data):
     header = header_of(nodes)
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
 
@@ -383,6 +381,11 @@ def test_info_lists_the_levels(data, tmp_path):
 
 
 # Copying -------------------------------------------------------------------------------------------
+
+
+def extract(data, box):
+    stream = io.BytesIO()
+    return csplat.extract(data, box, stream), stream.getvalue()
 
 
 def test_a_part_has_whole_leaves_and_the_nodes_above_them(data):

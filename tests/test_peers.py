@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from checked import checked
 from chromium import absent
-from conftest import PEERS, of_peers
+from shared_fixtures import PEERS, of_peers
 
 import csplat
 from csplat.editing.transform import rotate_scene

@@ -1,10 +1,8 @@
 """The unmodified pseudo-code of the spec against the decoder's vectorised functions."""
 
 import math
-import re
 import zlib
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,21 +17,6 @@ from csplat_conformance.tolerance import describe_deviation, is_valid_bound
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAIN, DELTA, ZIGZAG, PLANES = b"\0\0\0\0", b"\1\0\0\0", b"\2\0\0\0", b"\3\0\0\0"
-
-
-@pytest.fixture(scope="module")
-def spec() -> SimpleNamespace:
-    text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
-    names = {
-        "float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "isfinite": np.isfinite,
-        "floor": math.floor, "NO_PARENT": _spec.NO_PARENT,
-    }  # fmt: skip
-    names |= {"bits": lambda x: int(np.float32(x).view(np.uint32))}
-    blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
-    assert blocks
-    for block in blocks:
-        exec(block, names)  # noqa: S102 - the text is the project's own
-    return SimpleNamespace(**names)
 
 
 def elements(width: int) -> list[int]:

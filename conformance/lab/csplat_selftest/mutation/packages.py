@@ -33,7 +33,7 @@ ROOTS = {
     "csplat": "codec", "csplat_render": "trainer", "csplat_trainer": "trainer", "csplat_tools": "tools",
     "csplat_conformance": "conformance",
 }  # fmt: skip
-_PATH = ("tests", "codec", "conformance", "conformance/lab", "tools", "tools/lab", "trainer")
+_PATH = ("tests/helpers", "codec", "conformance", "conformance/lab", "tools", "tools/lab", "trainer")
 _EVERYDAY = "not (browser or engines or peers or torch or gpu or remote or long)"
 _UNMARKED = f"{_EVERYDAY} and not slow and not shared_data"
 _TESTS_MAX = 120  # tests per mutant

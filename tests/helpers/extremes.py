@@ -2,7 +2,7 @@
 
 All are variants of one object, a shell of 300 overlapping splats about two units across. `CONDITIONS` names them;
 `tools/docs/results/extremes.md` describes the results, whose figures are `EXPECTED`.
-`python tests/extremes.py` writes the figures. Requires the extra [render].
+`python tests/helpers/extremes.py` writes the figures. Requires the extra [render].
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import TrainOptions, TrainResult
 from csplat_trainer.tuning import FinetuneOptions, TuningResult, TuningViews, renders_of, split_views, tune
 
-RESULTS = Path(__file__).resolve().parent.parent / "tools" / "lab" / "results" / "extremes.json"
-#: Bytes per splat, PSNR and the like of each condition, as `python tests/extremes.py` measured them.
+RESULTS = Path(__file__).resolve().parents[2] / "tools" / "lab" / "results" / "extremes.json"
+#: Bytes per splat, PSNR and the like of each condition, as `python tests/helpers/extremes.py` measured them.
 EXPECTED = {row["scene"]: row for row in json.loads(RESULTS.read_text("utf-8"))["rows"]}
 COUNT = 300
 FAR = 10_000.0

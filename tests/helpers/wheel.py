@@ -1,4 +1,4 @@
-"""Unpack a wheel for tests: `python tests/wheel.py out/dist/csplat-0.1.0-py3-none-any.whl out/wheel`.
+"""Unpack a wheel for tests: `python tests/helpers/wheel.py out/dist/csplat-0.1.0-py3-none-any.whl out/wheel`.
 
 The folder then comes first on PYTHONPATH, so that tests see what users install, in the one environment that there is.
 A file's modification time follows from its content, so that bytecode stays valid as long as the source is the same.

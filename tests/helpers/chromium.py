@@ -263,7 +263,7 @@ class EnginePage(_ServedPage):
         return self.page.evaluate("engine.stats")
 
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 SERVED = ("tools/viewer", "codec/js", "conformance/csplat_conformance/vectors")
 
 #: WebGL2, with float render targets and float blending, and WebGPU on the CPU; deterministic pictures at one pixel per

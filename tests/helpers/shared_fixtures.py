@@ -1,0 +1,221 @@
+"""Fixtures and hooks shared by several test files."""
+
+import math
+import os
+import pickle
+import re
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import TypeVar
+
+import filelock
+import hypothesis
+import numpy as np
+import pytest
+
+from csplat import _spec
+from csplat.model import SplatModel, normalise_quats
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# The machine may be busy, and a failure has to come again.
+hypothesis.settings.register_profile("csplat", deadline=None, derandomize=True)
+hypothesis.settings.load_profile("csplat")
+
+SHARED = Path(os.environ.get("CSPLAT_DATA", ROOT.parent / "shared" / "data"))
+
+#: External programs and files; CONTRIBUTING.md describes how to fill the folder.
+PEERS = Path(os.environ.get("CSPLAT_PEERS", ROOT / "out" / "peers")).absolute()
+
+
+def of_peers(name: str) -> Path:
+    """An external file or folder; a test is skipped if it is absent."""
+    if not (PEERS / name).exists():
+        pytest.skip(f"{name} is absent ({PEERS}); CSPLAT_PEERS names the folder of others, see CONTRIBUTING.md")
+    return PEERS / name
+
+
+T = TypeVar("T")
+
+#: Files with the longest tests: pytest-xdist starts them first, so that no worker is left with one at the end.
+LONGEST = (
+    "test_finetune",
+    "test_conformance_encoder",
+    "test_viewer_page",
+    "test_cli",
+    "test_viewer_pictures",
+)
+
+
+#: The marker of a file whose tests all have it.
+OF_A_FILE = re.compile(r"^pytestmark = .*?\bpytest\.mark\.(\w+)", re.MULTILINE)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out files whose marker is not selected: importing them takes two seconds, and torch as much again."""
+    match = re.fullmatch(r"not \(([\w ]+)\).*", config.option.markexpr)
+    if match is None or collection_path.suffix != ".py":
+        return None
+    marker = OF_A_FILE.search(collection_path.read_text(encoding="utf-8"))
+    return True if marker and marker[1] in match[1].split(" or ") else None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests with `data_dir` as shared_data, and put the longest files first."""
+    for item in items:
+        if "data_dir" in getattr(item, "fixturenames", ()):
+            item.add_marker("shared_data")
+    ranks = {name: rank for rank, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: ranks.get(item.path.stem, len(ranks)))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Report tests without shared scenes."""
+    skipped = [
+        one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in getattr(one, "keywords", ())
+    ]
+    if skipped:
+        terminalreporter.section(f"{len(skipped)} tests skipped for lack of shared scenes", sep="=")
+        terminalreporter.line(
+            f"They are absent ({SHARED}); CSPLAT_DATA names their folder. What they say of scenes that"
+        )
+        terminalreporter.line("were trained by others, other tests say of the sample and of scenes that are made.")
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> Path:
+    """The folder of shared scenes, which are never part of the project."""
+    if not SHARED.is_dir():
+        pytest.skip(f"shared scenes are absent ({SHARED}); CSPLAT_DATA names their folder")
+    return SHARED
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[], T]], T]:
+    """Compute an expensive value once for all workers: `once("trained scene", make)`; the value must pickle."""
+    folder = tmp_path_factory.getbasetemp()
+    folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
+
+    def get(name: str, make: Callable[[], T]) -> T:
+        file = folder / f"{name.replace(' ', '-')}.pickle"
+        with filelock.FileLock(f"{file}.lock"):
+            if not file.exists():
+                file.write_bytes(pickle.dumps(make()))
+            return pickle.loads(file.read_bytes())  # noqa: S301  # written by a worker of the same run
+
+    return get
+
+
+@pytest.fixture(scope="session")
+def sample_path() -> Path:
+    """The sample PLY that ships with the project."""
+    return ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
+
+
+@pytest.fixture(scope="session")
+def spec() -> SimpleNamespace:
+    """The pseudo-code of the specification, as functions."""
+    text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
+    names = {
+        "float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "isfinite": np.isfinite,
+        "floor": math.floor, "NO_PARENT": _spec.NO_PARENT,
+    }  # fmt: skip
+    names |= {"bits": lambda x: int(np.float32(x).view(np.uint32))}
+    blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
+    assert blocks
+    for block in blocks:
+        exec(block, names)  # noqa: S102 - the text is the project's own
+    return SimpleNamespace(**names)
+
+
+@pytest.fixture(scope="module")
+def small_views():
+    """Make virtual validation and test views small, for searches and reports whose figures are not asserted."""
+    from csplat_tools.views.virtual_views import VirtualViewSizes
+
+    small = VirtualViewSizes(test=(8, 160, 120), validation=(12, 80, 60), extra=(12, 80, 60))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("csplat_tools.views.virtual_views.VIRTUAL_SIZES", small)
+        yield
+
+
+@pytest.fixture
+def make_model():
+    """Return a function for small random models: `make_model(count, degree, **fields)`."""
+
+    def make(count: int = 10, degree: int = 3, seed: int = 0, **fields: object) -> SplatModel:
+        rng = np.random.default_rng(seed)
+
+        def normal(*shape: int) -> np.ndarray:
+            return rng.standard_normal((count, *shape)).astype(np.float32)
+
+        arrays = {
+            "means": normal(3),
+            "quats": normalise_quats(normal(4)),
+            "scales": normal(3) - 4,
+            "opacities": rng.random(count).astype(np.float32),
+            "sh0": normal(3),
+            "shN": normal((degree + 1) ** 2 - 1, 3),
+        }
+        return SplatModel(**{**arrays, **fields})
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def trained_scene(once, tmp_path_factory):
+    """A scene trained for 300 steps on small photographs, see captures.py; all workers share its files."""
+    pytest.importorskip("numba", reason="training requires the extra [render]")
+    pytest.importorskip("scipy", reason="data sets require the extra [render]")
+    from captures import make_trained
+
+    return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained")))
+
+
+@pytest.fixture(scope="session")
+def tuned_file(once, trained_scene, tmp_path_factory):
+    """A file of the trained scene, tuned for 100 steps; all workers share its files."""
+    from captures import make_tuned
+
+    return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene))
+
+
+@pytest.fixture(scope="session")
+def search_at_psnr(once):
+    """The smallest file of `captures.crowded()` at 30 dB, by a real search."""
+    return _searched(once, "psnr", psnr=30.0)
+
+
+@pytest.fixture(scope="session")
+def search_at_size(once):
+    """The best file of `captures.crowded()` within 1,500 bytes, by a real search."""
+    return _searched(once, "size", size_bytes=1500)
+
+
+@pytest.fixture(scope="session")
+def search_at_loss(once):
+    """The smallest file of `captures.crowded()` that loses 0.5 dB against photographs of it."""
+    return _searched(once, "loss", max_psnr_drop=0.5)
+
+
+def _searched(once, name: str, **goal: float):
+    pytest.importorskip("numba", reason="targets require the extra [render]")
+    import captures
+
+    def find():
+        scene = captures.crowded()
+        views = captures.photographed(scene) if name == "loss" else None
+        return captures.found_within(scene, views, **goal)
+
+    return once(f"search at a {name}", find)
+
+
+@pytest.fixture(scope="session")
+def file_runs(once, tmp_path_factory):
+    """Runs of `csplat train` to files, see captures.py."""
+    pytest.importorskip("numba", reason="training requires the extra [render]")
+    pytest.importorskip("scipy", reason="data sets require the extra [render]")
+    from captures import FileRuns
+
+    return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))

@@ -1,0 +1,3 @@
+"""Shared fixtures and hooks: helpers/shared_fixtures.py, and `browser`, `tab` and `site` of helpers/chromium.py."""
+
+pytest_plugins = ["shared_fixtures", "chromium"]
