@@ -165,7 +165,6 @@ def python_module(registry: Registry) -> str:
         "",
         f"VERSION_MAJOR: Final = {form['version_major']}",
         f"VERSION_MINOR: Final = {form['version_minor']}",
-        f"VERSION_MINOR_OLDEST: Final = {form['version_minor_oldest']}",
         f'MEDIA_TYPE: Final = "{form["media_type"]}"',
         f'EXTENSION: Final = "{form["extension"]}"',
         'MAGIC: Final = b"' + "".join(f"\\x{byte:02x}" for byte in form["magic"]) + '"',
@@ -396,7 +395,6 @@ def javascript_module(registry: Registry) -> str:
         "",
         f"export const VERSION_MAJOR = {form['version_major']};",
         f"export const VERSION_MINOR = {form['version_minor']};",
-        f"export const VERSION_MINOR_OLDEST = {form['version_minor_oldest']};",
         f"export const MEDIA_TYPE = '{form['media_type']}';",
         f"export const MAGIC = Object.freeze({json.dumps(form['magic'])});",
         "",
@@ -485,7 +483,6 @@ def with_c_numbers(text: str, registry: Registry) -> str:
         f"/* {NOTICE} */",
         f"#define SPEC_VERSION_MAJOR {form['version_major']}",
         f"#define SPEC_VERSION_MINOR {form['version_minor']}",
-        f"#define SPEC_VERSION_MINOR_OLDEST {form['version_minor_oldest']}",
         f'#define SPEC_MAGIC "{magic}"',
         *(f"#define SPEC_{c['name'].upper()} {c_value(c['value'])}" for c in registry["constant"]),
     ]

@@ -85,7 +85,6 @@ def test_extra_columns_come_along(sample_path):
 
 COPIED = [
     "rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed", "codebook_sh_1_4_escape",
-    "version_0_2",
 ]  # fmt: skip
 
 

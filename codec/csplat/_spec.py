@@ -9,7 +9,6 @@ from typing import Final, NamedTuple
 
 VERSION_MAJOR: Final = 0
 VERSION_MINOR: Final = 3
-VERSION_MINOR_OLDEST: Final = 2
 MEDIA_TYPE: Final = "model/vnd.csplat"
 EXTENSION: Final = ".csplat"
 MAGIC: Final = b"\x93\x43\x53\x50\x0d\x0a\x1a\x0a"

@@ -2,7 +2,7 @@
 
 import { fault } from './errors.mjs';
 import { Payload } from './payload.mjs';
-import { nameOf, shDegreeMax } from './registry.mjs';
+import { nameOf } from './registry.mjs';
 import * as spec from './spec.mjs';
 import { readJson } from './streams.mjs';
 
@@ -25,13 +25,13 @@ export const emptyDescription = () => ({ metadata: null, cameras: null, options:
  * @param {Description} into
  * @param {DirectoryRecord} record
  * @param {Uint8Array<ArrayBuffer>} bytes payload
- * @param {{version: string, splatCount: number, jsonBytes: number, inflate: Inflate}} scene
+ * @param {{splatCount: number, jsonBytes: number, inflate: Inflate}} scene
  */
-export async function describe(into, record, bytes, { version, splatCount, jsonBytes, inflate }) {
+export async function describe(into, record, bytes, { splatCount, jsonBytes, inflate }) {
   const { type } = record;
   const base = record.offset + spec.CHUNK_HEADER_SIZE;
   if (type === spec.CHUNK_STATED_ERRORS) {
-    into.statedErrors = readStatedErrors(new Payload(bytes, base, 'SER-3'), version, splatCount);
+    into.statedErrors = readStatedErrors(new Payload(bytes, base, 'SER-3'), splatCount);
     return;
   }
   const { value, offset } = await readJson(new Payload(bytes, base, 'JSN-2'), jsonBytes, inflate);
@@ -53,11 +53,10 @@ const isObject = (value) => typeof value === 'object' && value !== null && !Arra
 
 /**
  * @param {Payload} payload
- * @param {string} version
  * @param {number} splatCount
  * @returns {StatedErrors}
  */
-function readStatedErrors(payload, version, splatCount) {
+function readStatedErrors(payload, splatCount) {
   const { fields: head, offset } = payload.read(
     spec.unpackStatedErrorsHead,
     spec.STATED_ERRORS_HEAD_SIZE,
@@ -86,8 +85,7 @@ function readStatedErrors(payload, version, splatCount) {
     errors: {},
   };
   let last = 0;
-  const most = spec.MEASURE_SH0 + shDegreeMax(version);
-  for (let i = 0; i < head.record_count; i++) last = readStatedError(payload, last, most, stated);
+  for (let i = 0; i < head.record_count; i++) last = readStatedError(payload, last, stated);
   payload.finish();
   return stated;
 }
@@ -95,11 +93,10 @@ function readStatedErrors(payload, version, splatCount) {
 /**
  * @param {Payload} payload
  * @param {number} last measure of the previous record
- * @param {number} most highest measure of the file's version
  * @param {StatedErrors} stated
  * @returns {number} measure of this record
  */
-function readStatedError(payload, last, most, stated) {
+function readStatedError(payload, last, stated) {
   const { fields, offset } = payload.read(
     spec.unpackStatedErrorRecord,
     spec.STATED_ERROR_RECORD_SIZE,
@@ -108,7 +105,7 @@ function readStatedError(payload, last, most, stated) {
   );
   const { measure, max, rms } = fields;
   const name = nameOf(spec.MEASURE_NAMES, measure);
-  if (name === undefined || measure <= last || measure > most)
+  if (name === undefined || measure <= last)
     throw fault(ERROR_VALUE, offset, 'SER-1', `measure ${measure} after ${last}`);
   const components = Math.sqrt(measureComponents(measure));
   const room = 1 + 2 ** -20; // SER-2: the product from left to right

@@ -54,15 +54,10 @@ export function readFileHeader(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const header = spec.unpackHeader(view, 0);
   const { version_major: major, version_minor: minor, profile, index_size: indexSize } = header;
-  const { VERSION_MAJOR, VERSION_MINOR_OLDEST, VERSION_MINOR } = spec;
-  if (major !== VERSION_MAJOR || minor < VERSION_MINOR_OLDEST || minor > VERSION_MINOR) {
-    const ours = `${VERSION_MAJOR}.${VERSION_MINOR_OLDEST} to ${VERSION_MAJOR}.${VERSION_MINOR}`;
-    throw fault(
-      spec.ERROR_VERSION,
-      AT.version_major,
-      'HDR-2',
-      `the file has version ${major}.${minor}, this decoder reads ${ours}`,
-    );
+  if (major !== spec.VERSION_MAJOR || minor !== spec.VERSION_MINOR) {
+    const ours = `${spec.VERSION_MAJOR}.${spec.VERSION_MINOR}`;
+    const detail = `the file has version ${major}.${minor}, this decoder reads ${ours}`;
+    throw fault(spec.ERROR_VERSION, AT.version_major, 'HDR-2', detail);
   }
   checkCrc(bytes.subarray(0, AT.header_crc), header.header_crc, AT.header_crc, 'HDR-3');
   checkReserved(header, 0, spec.HEADER_RESERVED, 'the header');

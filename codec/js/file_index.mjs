@@ -5,7 +5,7 @@ import { fault } from './errors.mjs';
 import { checkIndexCrc, typeName } from './container.mjs';
 import { SINGLE_MIN, STEP_MIN } from './lattice.mjs';
 import { Payload } from './payload.mjs';
-import { nameOf, registeredFlags, shDegreeMax } from './registry.mjs';
+import { nameOf, registeredFlags } from './registry.mjs';
 import * as spec from './spec.mjs';
 import { checkCoverage, checkTables, readTile } from './tile_records.mjs';
 
@@ -57,7 +57,7 @@ export function readIndex(bytes, file, limits) {
     'the head of the index',
   );
   checkSizes(head);
-  const scene = readScene(head, file);
+  const scene = readScene(head);
   checkCounts(head, index, limits);
   index.claim(head.head_size - spec.INDEX_HEAD_SIZE, 'the tail of the head');
 
@@ -120,15 +120,11 @@ function checkSizes(head) {
   }
 }
 
-/**
- * @param {IndexHead} head
- * @param {FileHeader} file
- */
-function readScene(head, { version }) {
+/** @param {IndexHead} head */
+function readScene(head) {
   const at = spec.HEADER_SIZE;
-  const most = shDegreeMax(version);
-  if (head.sh_degree > most) {
-    const detail = `SH degree ${head.sh_degree}, version ${version} ends at ${most}`;
+  if (head.sh_degree > spec.SH_DEGREE_MAX) {
+    const detail = `SH degree ${head.sh_degree}, this decoder reads 0 to ${spec.SH_DEGREE_MAX}`;
     throw fault(ERROR_UNSUPPORTED, at + AT_HEAD.sh_degree, 'IDX-3', detail);
   }
   const flags = spec.SCENE_FLAG_ANTIALIASED | spec.SCENE_FLAG_FLAT | spec.ANCILLARY_SCENE_FLAGS;

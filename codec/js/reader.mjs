@@ -386,8 +386,7 @@ export class Reader {
   /** @param {AbortSignal} [signal] */
   async describeFile(signal) {
     const description = emptyDescription();
-    const { version, splatCount } = this.header;
-    const scene = { version, splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
+    const scene = { splatCount: this.header.splatCount, jsonBytes: this.limits.jsonBytes, inflate: this.inflate };
     const records = this.header.directory.filter(
       ({ type }) => type !== spec.CHUNK_CODEBOOK && type !== spec.CHUNK_TREE && Object.hasOwn(spec.CHUNK_NAMES, type),
     );

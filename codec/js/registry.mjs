@@ -15,20 +15,6 @@ export const LEVEL_MAX = 255;
 export const nameOf = (names, id) => (Object.hasOwn(names, id) ? names[id] : undefined);
 
 /**
- * Return the largest SH degree in files of a version.
- *
- * @param {string} version
- */
-export const shDegreeMax = (version) => (version === '0.2' ? spec.LAYER_SH3 : spec.SH_DEGREE_MAX);
-
-/**
- * Return the highest level of detail in files of a version.
- *
- * @param {string} version
- */
-export const levelMax = (version) => (version === '0.2' ? 0 : LEVEL_MAX);
-
-/**
  * Return the flags that the registry assigns to a chunk type.
  *
  * @param {string} type a known type

@@ -2,7 +2,6 @@
 
 export const VERSION_MAJOR = 0;
 export const VERSION_MINOR = 3;
-export const VERSION_MINOR_OLDEST = 2;
 export const MEDIA_TYPE = 'model/vnd.csplat';
 export const MAGIC = Object.freeze([147, 67, 83, 80, 13, 10, 26, 10]);
 

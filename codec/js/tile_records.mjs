@@ -2,7 +2,7 @@
 
 import { fault } from './errors.mjs';
 import { ldexp } from './lattice.mjs';
-import { levelMax, nameOf, registeredFlags } from './registry.mjs';
+import { nameOf, registeredFlags } from './registry.mjs';
 import * as spec from './spec.mjs';
 
 const { ERROR_INDEX, ERROR_RANGE, ERROR_UNSUPPORTED, ERROR_VALUE } = spec;
@@ -33,7 +33,7 @@ export const allTiles = ({ tiles, coarseTiles }) => [...tiles, ...coarseTiles];
  *
  * @param {Payload} index at the record
  * @param {RecordSizes} sizes
- * @param {Header} header with version, attributes and extras
+ * @param {Header} header with attributes and extras
  * @param {TileRecord} [before] the tile before it
  * @returns {TileRecord}
  */
@@ -46,9 +46,8 @@ export function readTile(index, sizes, header, before) {
   );
   const { splat_count: splatCount, level, exponent, extent, layer_count, table_count } = fields;
   const least = before?.level ?? 0;
-  const most = levelMax(header.version);
-  if (level < least || level > most)
-    throw fault(ERROR_INDEX, offset + AT.level, 'TIL-12', `level ${level}, expected ${least} to ${most}`);
+  if (level < least)
+    throw fault(ERROR_INDEX, offset + AT.level, 'TIL-12', `level ${level}, expected at least ${least}`);
   if (splatCount < 1 || splatCount > spec.TILE_SPLATS_MAX) {
     throw fault(ERROR_VALUE, offset, 'TIL-1', `a tile of ${splatCount} splats`);
   }

@@ -224,11 +224,10 @@ def read_file_header(view: memoryview) -> _spec.Header:
         instead = describe_substitute(bytes(view[:_SUBSTITUTE_SIZE]))
         detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
-    major, oldest, newest = _spec.VERSION_MAJOR, _spec.VERSION_MINOR_OLDEST, _spec.VERSION_MINOR
-    if header.version_major != major or not oldest <= header.version_minor <= newest:
+    if (header.version_major, header.version_minor) != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR):
         raise UnsupportedError(
             f"version {header.version_major}.{header.version_minor}"
-            f" (this decoder reads {major}.{oldest} to {major}.{newest})",
+            f" (this decoder reads {_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR})",
             _spec.ERROR_VERSION,
             offsets["version_major"],
             "HDR-2",
@@ -242,11 +241,6 @@ def read_file_header(view: memoryview) -> _spec.Header:
     if not least <= header.index_size <= most:
         refuse_field(_spec.ERROR_VALUE, "HDR-7", header, 0, offsets, "index_size", f"{least} to {most}")
     return header
-
-
-def sh_degree_max(version_minor: int) -> int:
-    """Return the largest SH degree of files of a version (IDX-3, SER-1)."""
-    return 3 if version_minor == 2 else _spec.SH_DEGREE_MAX
 
 
 def check_length(view: memoryview, file_size: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NoReturn
 
 from csplat import _spec
@@ -18,7 +19,6 @@ from csplat.decoder.container import (
     read_file_header,
     refuse_field,
     refuse_length,
-    sh_degree_max,
     view_of,
 )
 from csplat.errors import FormatError, UnsupportedError
@@ -78,7 +78,7 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
         refuse_length(_spec.ERROR_TRUNCATED, "HDR-5", "the data ends within the index", view, end)
     check_index_crc(view, start, file.index_size)
     head = _spec.unpack_index_head(view, start)
-    _check_head(head, start, file.version_minor)
+    _check_head(head, start)
     _check_room(head, file.index_size)
     at = start + head.head_size
     attributes = _read_attributes(view, at, head)
@@ -91,7 +91,7 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
     directory = read_directory(view, directory_at)
     check_codebook_chunks(directory, directory_at, codebooks)
     tiles = read_tiles(view, directory_at.stop, end - 4, head, attributes[_spec.ATTRIBUTE_MEANS - 1].step, codebooks)
-    _check_levels(tiles, directory, directory_at, file.version_minor)
+    _check_levels(tiles, directory, directory_at)
     check_coverage(directory, directory_at, tiles, head, end, file.file_size)
     letters = "".join(_spec.DIRECTION_LETTER[direction] for direction in head.axes)
     return SceneHeader(
@@ -115,15 +115,14 @@ def parse_header(view: memoryview, *, whole: bool) -> SceneHeader:
     )
 
 
-def _check_head(head: _spec.IndexHead, at: int, version_minor: int) -> None:
+def _check_head(head: _spec.IndexHead, at: int) -> None:
     offsets = _spec.INDEX_HEAD_OFFSETS
     check_reserved(head, at, offsets)
     for name, least in _RECORD_SIZES.items():
         if getattr(head, name) < least:
             refuse_field(_spec.ERROR_VALUE, "IDX-8", head, at, offsets, name, f"at least {least}")
-    most = sh_degree_max(version_minor)
-    if head.sh_degree > most:
-        subject = f"SH degree {head.sh_degree} in version 0.{version_minor}, which ends at {most},"
+    if head.sh_degree > _spec.SH_DEGREE_MAX:
+        subject = f"SH degree {head.sh_degree} (this decoder reads 0 to {_spec.SH_DEGREE_MAX})"
         raise UnsupportedError(subject, offset=at + offsets["sh_degree"], clause="IDX-3")
     if head.scene_flags & ~(sum(_spec.SCENE_FLAG_NAMES) | _spec.ANCILLARY_SCENE_FLAGS):
         raise FormatError(
@@ -386,15 +385,13 @@ def read_tiles(
     return tuple(tiles)
 
 
-def _check_levels(
-    tiles: Sequence[Tile], directory: Sequence[_spec.DirectoryRecord], directory_at: range, version_minor: int
-) -> None:
+def _check_levels(tiles: Sequence[Tile], directory: Sequence[_spec.DirectoryRecord], directory_at: range) -> None:
     """Check TIL-12 and TRE-1; directory records are at `directory_at`."""
     offsets = _spec.TILE_RECORD_OFFSETS
-    for before, tile in zip([0, *(tile.level for tile in tiles)], tiles, strict=False):
-        most = 0 if version_minor == 2 else 255
-        if not before <= tile.level <= most:
-            refuse_field(_spec.ERROR_INDEX, "TIL-12", tile, tile.offset, offsets, "level", f"{before} to {most}")
+    for before, tile in pairwise(tiles):
+        if tile.level < before.level:
+            wanted = f"at least {before.level}"
+            refuse_field(_spec.ERROR_INDEX, "TIL-12", tile, tile.offset, offsets, "level", wanted)
     coarse = next((tile for tile in tiles if tile.level > 0), None)
     tree_at = next((at for at, one in zip(directory_at, directory, strict=True) if one.type == _spec.CHUNK_TREE), None)
     if coarse is not None and tree_at is None:

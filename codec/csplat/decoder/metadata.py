@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from csplat import _spec
-from csplat.decoder.container import SceneHeader, check_reserved, open_chunk, refuse_field, sh_degree_max, view_of
+from csplat.decoder.container import SceneHeader, check_reserved, open_chunk, refuse_field, view_of
 from csplat.decoder.entropy import read_stream
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits
@@ -161,7 +161,7 @@ def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None
     for _ in range(head.record_count):
         at = cursor.take(_spec.STATED_ERROR_RECORD_SIZE)
         item = _spec.unpack_stated_error_record(view, at)
-        last = _check_bound_record(item, at, last, header.version[1])
+        last = _check_bound_record(item, at, last)
         records.append(DeclaredBound(_spec.MEASURE_NAMES[item.measure], item.max, item.rms))
     cursor.finish()
     return DeclaredBounds(
@@ -224,12 +224,11 @@ def _check_tree(value: Any) -> None:
         level = nested
 
 
-def _check_bound_record(record: _spec.StatedErrorRecord, at: int, last: int, version_minor: int) -> int:
+def _check_bound_record(record: _spec.StatedErrorRecord, at: int, last: int) -> int:
     """Check SER-1 and SER-2; return the measure."""
     offsets = _spec.STATED_ERROR_RECORD_OFFSETS
     check_reserved(record, at, offsets)
-    highest = _spec.MEASURE_SH0 + sh_degree_max(version_minor)
-    if record.measure not in _spec.MEASURE_NAMES or not last < record.measure <= highest:
+    if record.measure not in _spec.MEASURE_NAMES or record.measure <= last:
         refuse_field(_spec.ERROR_VALUE, "SER-1", record, at, offsets, "measure", "registered ids, ascending")
     bound = record.max * math.sqrt(_BOUND_COMPONENTS[record.measure]) * _SLACK
     if not (0.0 <= record.max < math.inf and 0.0 <= record.rms < math.inf and record.rms <= bound):

@@ -219,8 +219,7 @@ def verify_with(
             failures=("the file states no errors",), clauses=("SER-6",), unverified=tuple(scenes.names)
         )
     bounds = {record.measure: (record.max, record.rms) for record in stated.records}
-    stateable = [name for name in scenes.names if name != "sh4" or header.version != (0, 2)]
-    unverified = tuple(name for name in stateable if name not in bounds) if header.splat_count else ()
+    unverified = tuple(name for name in scenes.names if name not in bounds) if header.splat_count else ()
     wrong = [("SER-5", line) for line in _different_scenes(scenes, stated)]
     if not stated.refitted:
         wrong += [("SER-6", f"the file states no error of {name}") for name in unverified]

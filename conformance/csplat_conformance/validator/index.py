@@ -27,7 +27,6 @@ _SIZES_MIN = {
 _STEP_MIN = Fraction(1, 2**1022)
 _SINGLE_MIN, _SINGLE_MAX = Fraction(1, 2**126), Fraction(2**128 - 2**104)
 _STEP_MAX = Fraction((2**53 - 1) * 2**971)  # the largest finite binary64
-_LEVEL_MAX = 255  # the largest value of a u8
 _AXIS_OF_DIRECTION = {"R": 0, "L": 0, "U": 1, "D": 1, "F": 2, "B": 2}
 
 Head = PlacedRecord[_spec.IndexHead]
@@ -41,9 +40,7 @@ class Index:
 
     Attributes:
         head: the index head.
-        degree_max: largest SH degree of the file's version.
-        level_max: highest level of detail of the file's version.
-        degree: `sh_degree`; `None` if that version does not support it.
+        degree: `sh_degree`; `None` if it is beyond SH_DEGREE_MAX.
         attributes: attribute records by registry value.
         steps: steps that obey ATT-6, by registry value.
         levels: levels that obey ATT-3 or ATT-4, by registry value.
@@ -55,8 +52,6 @@ class Index:
     """
 
     head: Head
-    degree_max: int
-    level_max: int
     degree: int | None
     attributes: dict[int, AttributeAt] = field(default_factory=dict)
     steps: dict[int, float] = field(default_factory=dict)
@@ -92,26 +87,23 @@ def is_finite(n: int, scale: float) -> bool:
     return math.isfinite(float(np.frombuffer(value_bits(n, scale), "<f4")[0]))
 
 
-def read_records(view: memoryview, end: int, version_minor: int, log: ViolationLog) -> Index:
+def read_records(view: memoryview, end: int, log: ViolationLog) -> Index:
     """Read the records of the index before the directory.
 
     Args:
         view: the file.
         end: offset of the index's CRC according to the header, not beyond the data.
-        version_minor: minor version of the file.
         log: receives the violations.
     """
     start = _spec.HEADER_SIZE
     head = read_record(view, _spec.IndexHead, start, "index")
     record = head.record
-    degree_max = 3 if version_minor == 2 else _spec.SH_DEGREE_MAX  # IDX-3
-    level_max = 0 if version_minor == 2 else _LEVEL_MAX  # TIL-12
-    index = Index(head, degree_max, level_max, record.sh_degree if record.sh_degree <= degree_max else None)
+    index = Index(head, record.sh_degree if record.sh_degree <= _spec.SH_DEGREE_MAX else None)
     kinds = ("attribute", "codebook", "extra", "directory", "tile")
     needed = index.size_of("head") + sum(getattr(record, f"{kind}_count") * index.size_of(kind) for kind in kinds)
     if start + needed > end:
         log.add("IDX-2", start, "index", f"its counts require at least {needed} bytes, it has {end - start}")
-    _check_head(log, head, degree_max)
+    _check_head(log, head)
     at = start + index.size_of("head")
     at = _read_attributes(view, at, end, index, log)
     at = _read_codebooks(view, at, end, index, log)
@@ -126,15 +118,15 @@ def _count_fitting(index: Index, at: int, end: int, count: int, size: int) -> in
     return fitting
 
 
-def _check_head(log: ViolationLog, head: Head, degree_max: int) -> None:
+def _check_head(log: ViolationLog, head: Head) -> None:
     record = head.record
     log.check_reserved(head)
     for kind, least in _SIZES_MIN.items():
         size = getattr(record, f"{kind}_size")
         if size < least:
             log.add_field("IDX-8", head, f"{kind}_size", f"{size}, expected at least {least}")
-    if record.sh_degree > degree_max:
-        log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {degree_max}")
+    if record.sh_degree > _spec.SH_DEGREE_MAX:
+        log.add_field("IDX-3", head, "sh_degree", f"{record.sh_degree}, expected at most {_spec.SH_DEGREE_MAX}")
     unlisted = record.scene_flags & 0x0F & ~sum(_spec.SCENE_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", head, "scene_flags", f"bits {unlisted:#04x} are reserved")
@@ -252,7 +244,7 @@ def _is_sound_codebook(log: ViolationLog, placed: CodebookAt, index: Index) -> b
     if record.kind not in _spec.CODEBOOK_KIND_NAMES:
         log.add_field("RES-2", placed, "kind", f"{record.kind} is not a kind of this version")
     elif record.kind == _spec.CODEBOOK_KIND_SH:
-        highest = index.degree_max if index.degree is None else index.degree
+        highest = _spec.SH_DEGREE_MAX if index.degree is None else index.degree
         if not 1 <= first <= last <= highest:
             log.add_field("CBR-2", placed, "band_first", f"bands {first} to {last}, expected 1 to {highest}, ascending")
     elif first or last:
@@ -559,7 +551,7 @@ def read_tiles(view: memoryview, at: int, end: int, index: Index, log: Violation
             log.skip(f"tile[{len(tiles)}] and later tiles", "the index ends before them")
             return tiles
         tiles.append(_read_tile(view, at, len(tiles), index, log))
-        _check_level(log, tiles[-1], tiles[-2].level if len(tiles) > 1 else 0, index)
+        _check_level(log, tiles[-1], tiles[-2].level if len(tiles) > 1 else 0)
         at += size
     if at != end:
         log.add("IDX-2", at, "index.rest", f"{end - at} bytes follow the last tile")
@@ -591,12 +583,9 @@ def _read_tile(view: memoryview, at: int, number: int, index: Index, log: Violat
     return tile
 
 
-def _check_level(log: ViolationLog, tile: Tile, lowest: int, index: Index) -> None:
+def _check_level(log: ViolationLog, tile: Tile, lowest: int) -> None:
     """Check TIL-12, given the level of the tile before."""
-    if tile.level > index.level_max:
-        message = f"{tile.level}, expected at most {index.level_max} in the file's version"
-        log.add_field("TIL-12", tile.record, "level", message)
-    elif tile.level < lowest:
+    if tile.level < lowest:
         log.add_field("TIL-12", tile.record, "level", f"{tile.level} after {lowest}, expected ascending levels")
 
 

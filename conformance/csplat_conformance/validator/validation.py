@@ -108,7 +108,7 @@ def _check(
     if end is None:
         log.skip("index and chunks", "the index is incomplete")
         return
-    index = read_records(view, end - _CRC_SIZE, header.record.version_minor, log)
+    index = read_records(view, end - _CRC_SIZE, log)
     counts.splats = index.head.record.splat_count
     directory = read_directory(view, index.end, end - _CRC_SIZE, index, log) if index.complete else []
     tiles: list[Tile] = []
@@ -149,9 +149,8 @@ def _read_header(view: memoryview, log: ViolationLog) -> Header | None:
     if magic != _spec.MAGIC:
         log.add_field("HDR-1", header, "magic", f"{magic.hex(' ')}, expected {_spec.MAGIC.hex(' ')}")
         return None
-    readable = range(_spec.VERSION_MINOR_OLDEST, _spec.VERSION_MINOR + 1)
-    if record.version_major != _spec.VERSION_MAJOR or record.version_minor not in readable:
-        expected = " or ".join(f"{_spec.VERSION_MAJOR}.{minor}" for minor in readable)
+    if record.version_major != _spec.VERSION_MAJOR or record.version_minor != _spec.VERSION_MINOR:
+        expected = f"{_spec.VERSION_MAJOR}.{_spec.VERSION_MINOR}"
         message = f"{record.version_major}.{record.version_minor}, expected {expected}"
         log.add_field("HDR-2", header, "version_major", message)
         return None

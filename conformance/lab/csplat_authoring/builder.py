@@ -84,7 +84,7 @@ def build(scene: Scene) -> Built:
         at += len(chunks[name].data)
 
     file = Writer()
-    file.structure("header", "header", _header(scene, index_size, at))
+    file.structure("header", "header", _header(index_size, at))
     index = _index(scene, chunks, offsets)
     file.append(index)
     file.value("index.crc", "I", 0)
@@ -97,9 +97,8 @@ def build(scene: Scene) -> Built:
     return replace(unsealed, data=unsealed.patched({}))
 
 
-def _header(scene: Scene, index_size: int, file_size: int) -> list[Any]:
-    version = (_spec.VERSION_MAJOR, scene.version_minor)
-    return [_spec.MAGIC, *version, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0]
+def _header(index_size: int, file_size: int) -> list[Any]:
+    return [_spec.MAGIC, _spec.VERSION_MAJOR, _spec.VERSION_MINOR, _spec.PROFILE_BASE, 0, 0, index_size, file_size, 0]
 
 
 # Index ---------------------------------------------------------------------------------------------

@@ -202,7 +202,6 @@ class Scene:
     Attributes:
         attributes: records by attribute (registry value), in the order of the file.
         nodes: nodes of the TREE chunk, which exists if there are any.
-        version_minor: minor version in the header.
         order: names of the chunks in their order; None: the order that the spec recommends.
         directory: names in the order of the directory; None: the order of the chunks.
         gap: bytes between the index and the first chunk.
@@ -226,7 +225,6 @@ class Scene:
     gap: bytes = b""
     trailing: bytes = b""
     tails: tuple[tuple[str, bytes], ...] = ()
-    version_minor: int = _spec.VERSION_MINOR
 
     @property
     def finest(self) -> Scene:
