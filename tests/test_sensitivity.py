@@ -17,6 +17,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats, sh_degree_of
 from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import read_ply, write_ply
+from csplat_bench.colour_refit import ColourOperator, fit_colours
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import load_cameras
@@ -24,7 +25,6 @@ from csplat_render.contributions import Contributions
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.pruning_error import measure_pruning_error, pruning_error_exact
 from csplat_render.reference_rasteriser import Decisions, render_exact
-from csplat_render.refit import ColourOperator, fit_colours
 from csplat_render.scene_frame import scene_frame
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.encode_file import encode_file

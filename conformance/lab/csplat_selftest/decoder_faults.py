@@ -47,10 +47,10 @@ from csplat_conformance.answers import (
 )
 from csplat_conformance.conformance_report import Outcome, Status
 from csplat_conformance.manifest import Vector, load
-from csplat_conformance.single_precision import GPUS, GpuArithmetic, lattice_values, opacities, quats
 from csplat_conformance.tolerance import EXACT, RENDERER
 from csplat_conformance.validator.inflate import CodedError, Inflater
 from csplat_selftest.decoder_processes import JsDecoder, js_folder, select_in_javascript
+from csplat_selftest.single_precision import GPUS, GpuArithmetic, lattice_values, opacities, quats
 
 _EDITS: Final = Path(__file__).with_suffix(".toml")
 #: A faulty function; called with the original function and then the arguments.

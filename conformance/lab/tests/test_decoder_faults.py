@@ -13,7 +13,6 @@ from csplat.decoder.container import open_chunk
 from csplat_conformance import adapter
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.manifest import load
-from csplat_conformance.single_precision import GPUS
 from csplat_conformance.tolerance import EXACT, RENDERER
 from csplat_selftest.decoder_faults import (
     DecoderFault,
@@ -27,6 +26,7 @@ from csplat_selftest.decoder_faults import (
     table,
 )
 from csplat_selftest.decoder_processes import missing_javascript
+from csplat_selftest.single_precision import GPUS
 
 needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 

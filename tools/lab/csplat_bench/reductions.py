@@ -200,7 +200,7 @@ class SourceRenders:
 
     def distilled(self, model: SplatModel, sh_degree: int, progress: Progress | None = None) -> SplatModel:
         """Return the geometry of a model with SH up to a degree, fitted to the source's renders."""
-        from csplat_render.refit import fit_colours  # requires numba, unlike the other steps
+        from csplat_bench.colour_refit import fit_colours  # requires numba, unlike the other steps
 
         low = drop_bands(model, sh_degree)
         found, _ = fit_colours(

@@ -1,8 +1,8 @@
 """Reconstruct values in single precision as a GPU does (spec 7), and measure their distance from exact values.
 
 Usage:
-    python -m csplat_conformance.single_precision                # all valid vectors, and seeded integers
-    python -m csplat_conformance.single_precision FILE.csplat... # files
+    python -m csplat_selftest.single_precision                # all valid vectors, and seeded integers
+    python -m csplat_selftest.single_precision FILE.csplat... # files
 
 The table lists the largest distance for each array and accuracy of arithmetic. WGSL and GLSL ES permit a product to be
 either neighbour of the exact one, errors of 2.5 ulp for quotients and 4.5 ulp for square roots (as 1 / inverseSqrt),
@@ -213,7 +213,7 @@ def _seeded_values(seed: int = 1, count: int = 20000) -> Iterator[tuple[str, str
 def main() -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(
-        prog="csplat_conformance.single_precision",
+        prog="csplat_selftest.single_precision",
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
