@@ -188,7 +188,6 @@ def test_degree_4_is_converted_and_encoded(tmp_path, ply):
         ((".",), ".: a folder, not the name of a file"), (("-",), "standard output"),
         (("a.ply", "--to", "zzz"), "expected one of "), (("a.ply", "--rotate", "1,2"), "expected 3 numbers"),
         (("a.ply", "--crop", "0,0,0,-1"), "radius"), (("a.ply", "--crop", "0,0,0,1,2"), "expected 6 or 4 numbers"),
-        (("a.ply", "--crop-sphere", "0,0,0,1"), "--crop-sphere is part of --crop now"),
         (("a.ply", "--scale", "0"), "above 0"), (("a.ply", "--to-axes", "XYZ"), "axes are"),
         (("in.ply", "--force"), "is the input"),
     ],
