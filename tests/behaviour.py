@@ -342,7 +342,6 @@ def report_group(folder: Path) -> Iterator[tuple[str, Json]]:
         "extract": ("extract", file, folder / "part.csplat", "--box", box),
         "merge": ("merge", file, other, "-o", folder / "merged.csplat"),
         "convert": ("convert", SAMPLE, folder / "sample.spz"),
-        "formats": ("formats",),
         "compare": ("compare", SAMPLE, file, "--cameras", views),
         "tradeoff": ("tradeoff", small, "--cameras", views, "--what", "presets"),
         "render": ("render", small, folder / "renders", "--cameras", views),

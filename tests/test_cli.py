@@ -992,7 +992,7 @@ def test_a_full_folder_of_temporary_files_is_named(tmp_path, ply, csplat_file, m
 @pytest.mark.usefixtures("ply")
 def test_a_closed_standard_stream_is_an_error_of_one_line(tmp_path):
     cases = {
-        "formats >&-": "error: standard output: Bad file descriptor; the output is incomplete (EBADF)\n",
+        "info scene.ply >&-": "error: standard output: Bad file descriptor; the output is incomplete (EBADF)\n",
         "lint - <&-": "error: standard input: Bad file descriptor (EBADF)\n",
         "encode scene.ply new.csplat <&- >&- 2>&-": "",
         "lint absent.ply 2>/dev/full": "",
@@ -1046,7 +1046,7 @@ def test_an_interrupt_while_the_program_loads_is_no_traceback(tmp_path):
         )
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
         with subprocess.Popen(
-            [sys.executable, "-c", script, "formats"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [sys.executable, "-c", script, "info"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
         ) as running:  # fmt: skip
             assert running.stdout is not None
