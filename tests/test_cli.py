@@ -33,7 +33,6 @@ from csplat.model import SplatModel
 from csplat_conformance.manifest import VECTORS
 from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
-from csplat_tools.cli.error_lines import RENAMED_OPTIONS
 from csplat_tools.file_streams import check_output, write_bytes
 
 PROGRAM = [sys.executable, "-m", "csplat_tools"]
@@ -239,16 +238,6 @@ def test_the_report_is_what_json_prints(tmp_path, csplat_file, ply, name):
     printed = call(name, *words, "--json", "--report", tmp_path / "report.json")
     assert json.loads(printed) == json.loads((tmp_path / "report.json").read_text())
     assert "exists: --force replaces it" in refused(name, *words, "--report", tmp_path / "report.json")
-
-
-def test_options_that_went_are_refused_with_what_replaces_them(tmp_path, ply):
-    for name, command in commands():
-        spelt = {word for one in options_of(command) for word in (*one.opts, *one.secondary_opts)}
-        for old in sorted(RENAMED_OPTIONS.keys() - spelt) if len(name) == 1 else ():
-            line = refused(*name, old, "1", status=2)
-            assert line.startswith(f"error: csplat {name[0]}: {old} {RENAMED_OPTIONS[old]}; "), line
-    line = refused("encode", ply, tmp_path / "out", "--keep-all", status=2)
-    assert line.startswith("error: csplat encode: --keep-all is called --no-prune now; ")
 
 
 @pytest.mark.parametrize(
@@ -1003,7 +992,7 @@ def test_a_full_folder_of_temporary_files_is_named(tmp_path, ply, csplat_file, m
 @pytest.mark.usefixtures("ply")
 def test_a_closed_standard_stream_is_an_error_of_one_line(tmp_path):
     cases = {
-        "formats >&-": "error: standard output: Bad file descriptor; the output is incomplete (EBADF)\n",
+        "info scene.ply >&-": "error: standard output: Bad file descriptor; the output is incomplete (EBADF)\n",
         "lint - <&-": "error: standard input: Bad file descriptor (EBADF)\n",
         "encode scene.ply new.csplat <&- >&- 2>&-": "",
         "lint absent.ply 2>/dev/full": "",
@@ -1057,7 +1046,7 @@ def test_an_interrupt_while_the_program_loads_is_no_traceback(tmp_path):
         )
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
         with subprocess.Popen(
-            [sys.executable, "-c", script, "formats"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            [sys.executable, "-c", script, "info"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
             preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
         ) as running:  # fmt: skip
             assert running.stdout is not None

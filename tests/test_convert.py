@@ -1,12 +1,14 @@
-"""`csplat convert` and `csplat formats`: conversion between all formats, filters, reports of losses."""
+"""`csplat convert`: conversion between all formats, filters, reports of losses."""
 
 import json
 import os
+import re
 import sys
 import tempfile
 import threading
 from contextlib import contextmanager
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ from csplat.editing.transform import convert_axes
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.formats import spz
+from csplat.formats.format import ARRAYS
 from csplat.model import SplatModel, normalise_quats
 from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import read_ply, write_ply
@@ -188,7 +191,6 @@ def test_degree_4_is_converted_and_encoded(tmp_path, ply):
         ((".",), ".: a folder, not the name of a file"), (("-",), "standard output"),
         (("a.ply", "--to", "zzz"), "expected one of "), (("a.ply", "--rotate", "1,2"), "expected 3 numbers"),
         (("a.ply", "--crop", "0,0,0,-1"), "radius"), (("a.ply", "--crop", "0,0,0,1,2"), "expected 6 or 4 numbers"),
-        (("a.ply", "--crop-sphere", "0,0,0,1"), "--crop-sphere is part of --crop now"),
         (("a.ply", "--scale", "0"), "above 0"), (("a.ply", "--to-axes", "XYZ"), "axes are"),
         (("in.ply", "--force"), "is the input"),
     ],
@@ -395,10 +397,44 @@ def test_streamed_sog_is_written_to_a_folder_of_its_own(tmp_path, ply):
     assert not (tmp_path / "no").exists()
 
 
-def test_formats_are_listed():
-    rows = json.loads(call("formats", "--json").stdout)
-    assert {"ply", "csplat"} <= {row["format"] for row in rows}
-    assert ".ply" in call("formats").stdout
+#: Contents that the help and the guide call `header`, and the short words for them.
+HEADER = {
+    "coordinate_system": "axes", "origin": "origin", "unit_metres": "unit", "metadata": "metadata",
+    "antialiased": "antialiased", "flat": "flat",
+}  # fmt: skip
+
+
+def words_of(found):
+    """Return the table's words for contents of a format: a set."""
+    short = {HEADER.get(name, name) for name in found}
+    return short - set(HEADER.values()) | {"header"} if short >= set(HEADER.values()) else short
+
+
+def test_the_help_and_the_guide_list_all_formats(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    helped = call("convert", "--help").stdout.partition("Formats, ")[2].partition("Examples:")[0].splitlines()
+    of_help = [re.split(r" {2,}", line.strip()) for line in helped[2:] if line.strip()]
+    guide = (Path(__file__).parent.parent / "tools" / "docs" / "guide" / "formats.md").read_text("utf-8")
+    of_guide = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in guide.partition("also holds |\n|---")[2].partition("\n\n")[0].splitlines()[1:]
+    ]
+    expected = [
+        (
+            one.name, ", ".join(one.suffixes), "read, write" if one.write else "read", str(one.degree), one.axes,
+            set(ARRAYS) if one.exact >= set(ARRAYS) else set(one.exact), words_of(one.carries),
+        )
+        for one in formats.formats()
+    ]  # fmt: skip
+
+    def split(text):
+        return set(ARRAYS) if text == "all" else {word for word in text.split(", ") if word}
+
+    expected.sort(key=itemgetter(0))
+    assert expected == sorted(((*row[:5], split(row[5]), split(row[6])) for row in of_guide), key=itemgetter(0))
+    columns = [(row[0], row[2], row[3], split("".join(row[4:]))) for row in of_help]
+    columns.sort(key=itemgetter(0))
+    assert columns == [(name, use, degree, holds) for name, _, use, degree, _, _, holds in expected]
 
 
 def test_info_and_lint_accept_any_format(tmp_path, ply):

@@ -874,7 +874,6 @@ def test_the_command_resumes(capture, tmp_path, monkeypatch):
         (("--data", "x", "--cameras", "y"), "--cameras and --data: give one of them"),
         (("--self", "--keep", "1.5"), "the kept fraction is 1.5"),
         (("--self", "--background", "white"), "--background requires --cameras or --data"),
-        (("--self", "--lr-factor", "1e9"), "--lr-factor is FinetuneOptions.scaled in Python now"),
         (("--self", "--lambda", "0", "--target-size", "1MB"), "--lambda and --target-size: give one of them"),
         (("--self", "--keep", "0.5", "--target-size", "1MB"), "--target-size and --keep: give one of them"),
         (("--self", "--lambda", "2"), "byte_cost is 2.0, expected 0 to 1"),

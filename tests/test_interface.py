@@ -255,13 +255,6 @@ def test_arguments_that_contradict_a_target_are_refused(files, named, message):
         csplat.encode_with_report(files[0], **named)
 
 
-def test_old_names_name_their_successors():
-    with pytest.raises(InputError, match=r"csplat\.Target\(psnr=38\)"):
-        csplat_tools.encode_to("scene.ply", psnr=38.0)
-    with pytest.raises(AttributeError, match=r"csplat\.EncodeResult"):
-        csplat_tools.Optimised  # noqa: B018 -- the access is the test
-
-
 # Commands.
 @pytest.fixture(scope="module")
 def views_once():

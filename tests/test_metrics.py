@@ -1,8 +1,7 @@
-"""Metrics of images: PSNR, SSIM and LPIPS with their kernels, FLIP."""
+"""Metrics of images: PSNR, SSIM and LPIPS with their kernels."""
 
 from __future__ import annotations
 
-import importlib
 import importlib.util
 import math
 
@@ -29,7 +28,7 @@ from csplat_render.metric_kernels import (
     mean_ssim,
     mean_ssim_twin,
 )
-from csplat_render.metrics import Scores, flip, psnr, score_view, ssim
+from csplat_render.metrics import Scores, psnr, score_view, ssim
 
 
 def two_images(seed=0, height=30, width=41, noise=0.1):
@@ -168,29 +167,6 @@ def test_the_number_of_threads_does_not_change_ssim():
     x, y = noise_pair(61, 80)
     one, two = in_threads(lambda: mean_ssim(x, y))
     assert one == two
-
-
-def test_flip_is_0_for_equal_images_and_grows_to_1():
-    pytest.importorskip("flip_evaluator", reason="an optional package: pip install 'csplat[flip]'")
-    a = np.random.default_rng(0).random((40, 50, 3)).astype(np.float32)
-    assert 0.0 == flip(a, a)
-    assert 0.0 < flip(a, 0.95 * a) < flip(a, 0.7 * a) <= 1.0
-    assert flip(a, 0.95 * a) == flip(a.astype(np.float64), (0.95 * a).astype(np.float64))
-    assert flip(np.zeros((30, 30, 3)), np.ones((30, 30, 3))) > 0.9
-
-
-def test_flip_refuses_images_of_different_shapes():
-    with pytest.raises(InputError, match="cannot be compared"):
-        flip(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
-
-
-def test_an_absent_flip_package_is_named(monkeypatch):
-    def absent(name):
-        raise ImportError(name)
-
-    monkeypatch.setattr(importlib, "import_module", absent)
-    with pytest.raises(InputError, match="flip-evaluator"):
-        flip(np.zeros((4, 4, 3)), np.zeros((4, 4, 3)))
 
 
 @pytest.fixture

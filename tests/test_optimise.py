@@ -144,7 +144,7 @@ def test_a_small_size_is_met_with_fewer_splats(search_at_size):
 @pytest.mark.parametrize("no_prune", [True, False])
 def test_a_size_that_no_file_needs_gives_the_finest_file_at_once(many, no_prune):
     found = search(many, judged_by(cameras(40)), size_bytes=10**6, no_prune=no_prune).report.search
-    assert (1, 0, 0) == (found.encodes, found.removal_views, found.sensitivity_views)
+    assert (1, 0, 0) == (found.encodes, found.pruning_views, found.sensitivity_views)
     assert (900, 80.0) == (found.splats, found.chosen["attribute_psnr"])
     assert found.psnr > 50.0
     kept = f"{found.size_bytes / 1000:.1f} kB hold all splats at the finest precision"
@@ -180,7 +180,7 @@ def test_the_report_has_goal_reasons_and_spread(search_at_psnr):
     assert {"beside", "nearer", "farther"} == set(report.elsewhere)
     assert "10 views of cameras" in report.sure
     assert any("pruned, the others" in line for line in report.why)
-    assert report.removal_views > 0
+    assert report.pruning_views > 0
     json.dumps(report.as_json(), allow_nan=False)
 
 
@@ -347,7 +347,7 @@ def test_virtual_views_in_surroundings_cause_a_warning(surroundings):
     assert "cameras inside of the surroundings" in fewer.why[-1]
     assert "--no-prune" in fewer.why[-1]
     kept = search(surroundings, views, psnr=22.0, no_prune=True).report.search
-    assert (100, 0, 0) == (kept.splats, kept.removal_views, kept.sensitivity_views)
+    assert (100, 0, 0) == (kept.splats, kept.pruning_views, kept.sensitivity_views)
     assert not any("surroundings" in line for line in kept.why)
 
 

@@ -187,7 +187,7 @@ def test_spawned_processes_share_the_work(monkeypatch):
     starts, context = [], multiprocessing.get_context
     monkeypatch.setattr(system, "CAN_FORK", False)
     monkeypatch.setattr(multiprocessing, "get_context", lambda start: (starts.append(start), context(start))[1])
-    done = dict(system.map_in_processes(operator.mul, 3, [1, 2, 3], workers=2, copied=True))
+    done = dict(system.map_in_processes(operator.mul, 3, [1, 2, 3], workers=2))
     assert {1: 3, 2: 6, 3: 9} == done
     assert ["spawn"] == starts
 

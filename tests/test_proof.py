@@ -1,12 +1,7 @@
-"""Verification of declared errors, in memory and out of core, and descriptions of files."""
+"""Verification of declared errors, in memory and tile by tile, and descriptions of files."""
 
 import json
-import multiprocessing
-import os
-import shutil
-import signal
-import tempfile
-from collections import namedtuple
+import re
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -26,11 +21,9 @@ from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.errors import CsplatError, InputError
 from csplat.ply import write_ply
 from csplat.scene_source import source_from_model
-from csplat.system import CAN_FORK
-from csplat_conformance.declared_bounds import PartSizes, Source, check_source_index, verify_bounds, verify_out_of_core
+from csplat_conformance.declared_bounds import Source, check_source_index, verify_bounds, verify_bounds_by_tile
 from csplat_conformance.declared_bounds.measurement import measure_pairs as measured
 from csplat_conformance.declared_bounds.measurement import pair_differences as differences_of
-from csplat_conformance.declared_bounds.out_of_core_verification import CellTree
 from csplat_conformance.declared_bounds.partners import UNDECIDED, UNMATCHED
 from csplat_conformance.declared_bounds.partners import find_partners as match_source
 from csplat_tools.cli.app import app
@@ -345,19 +338,20 @@ def test_damaged_files_are_described_or_refused(make_model):
 
 
 OPTIONS = EncodeOptions(preset="fast", tile_splats=300, keep_extra=True)
-PARTS = PartSizes(least=200, most=200)  # small scenes have several
 
 
-def both(source, data, stated=None, index=None):
-    """Verify in memory and out of core, with equal results; return them as JSON, numbers rounded to nine digits."""
+def both(source, data, index):
+    """Verify in memory and tile by tile, with equal results; return them as JSON, numbers rounded to nine digits."""
     opened = open_tiles(data)
-    opened = replace(opened, declared_bounds=stated or opened.declared_bounds)
+
+    def blocks():
+        return (source.select(slice(start, start + 170)) for start in range(0, len(source), 170))
+
     at_once = verify_bounds(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
-    in_parts = verify_out_of_core(source_from_model(source), opened, index, memory_bytes=1, sizes=PARTS)
-    assert at_once.failures == in_parts.failures
-    assert at_once.clauses == in_parts.clauses
+    by_tile = verify_bounds_by_tile(replace(source_from_model(source), blocks=blocks), opened, index, 400)
+    assert at_once.clauses == by_tile.clauses
     found = rounded(at_once.as_json())
-    assert found == rounded(in_parts.as_json())
+    assert found == rounded(by_tile.as_json())
     return found
 
 
@@ -367,104 +361,40 @@ def rounded(value):
     return float(f"{value:.9g}") if isinstance(value, float) else value
 
 
-def states(stated, **changes):
-    records = tuple(replace(one, **changes.get(one.measure, {})) for one in stated.records)
-    return replace(stated, records=records)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("indexed", [True, False])
-def test_both_paths_verify_correct_files(make_model, indexed):
+def test_files_are_verified_tile_by_tile(make_model):
     model, origin = make_model(500, 0), (5e5, 4e6, 30.0)
     doubles = model.means.astype(np.float64) + np.array(origin)
     near = (doubles - origin).astype(np.float32)
     scenes = {
-        "ordinary": make_model(450, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(450, dtype=np.int32)}),
+        "ordinary": make_model(950, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(950, dtype=np.int32)}),
         "means in doubles": replace(model, means_double=doubles, means=near, origin=origin),
         "empty": make_model(0, 1),
-        "one large part of splats at one place": make_model(900, 0, means=np.full((900, 3), 0.5, np.float32)),
     }
 
     def check(source):
         result = encode_with_report(source, OPTIONS)
-        found = both(source, result.data, index=result.source_index if indexed else None)
+        found = both(source, result.data, result.source_index)
         assert not found["failures"]
-        assert indexed == found["rms_and_counts_proved"]
+        assert found["rms_and_counts_proved"] == bool(found["measures"])
 
     assert [] == failures(scenes, check)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("indexed", [True, False])
-@pytest.mark.parametrize("attribute", ["means", "sh0", "extra"])
-def test_both_paths_report_the_same_failures(make_model, indexed, attribute):
+@pytest.mark.parametrize("attribute", ["means", "sh0", "extra", "count"])
+def test_failures_are_reported_tile_by_tile(make_model, attribute):
     source = make_model(450, 1, extra={"label": np.arange(450, dtype=np.int32)})
     result = encode_with_report(source, OPTIONS)
     if attribute == "extra":
         changed = replace(source, extra={"label": source.extra["label"] // 2})
+    elif attribute == "count":
+        changed = make_model(451, 0)
     else:
         array = getattr(source, attribute).copy()
         array[[3, 200, 449]] += np.float32(0.7)
         changed = replace(source, **{attribute: array})
-    found = both(changed, result.data, index=result.source_index if indexed else None)
-    assert bool(found["failures"]) == (indexed or attribute != "extra")
-
-
-@pytest.mark.slow
-def test_partners_are_searched_within_the_declared_error(make_model):
-    source = make_model(500, 0)
-    result = encode_with_report(source, OPTIONS)
-    moved = replace(source, means=source.means + np.float32(0.04))
-    stated = open_tiles(result.data).declared_bounds
-    for most in (0.2, 0.06):
-        found = both(moved, result.data, states(stated, means={"max": most}))
-        assert bool(found["failures"]) == (most < 0.07)
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not CAN_FORK, reason="processes are no copies of each other here")
-def test_several_processes_find_the_same(make_model, monkeypatch):
-    source = make_model(600, 1)
-    opened = open_tiles(encode_with_report(source, OPTIONS).data)
-    far = np.where(np.arange(600) % 50, np.float32(0.04), np.float32(0.5))
-    moved = replace(source, means=source.means + far[:, None])
-    opened = replace(opened, declared_bounds=states(opened.declared_bounds, means={"max": 0.07}))
-    alone = verify_out_of_core(source_from_model(moved), opened, memory_bytes=1, sizes=PARTS)
-    assert alone.failures
-    monkeypatch.setattr(os, "cpu_count", lambda: 3)
-    memory, sizes, seen = 10**9, replace(PARTS, worth_a_process=1), []
-
-    def count(_stage, _done):
-        seen.append(len(multiprocessing.active_children()))
-
-    def kill(_stage, _done):
-        for child in multiprocessing.active_children():
-            os.kill(child.pid, signal.SIGKILL)
-
-    assert alone == verify_out_of_core(
-        source_from_model(moved), opened, memory_bytes=memory, sizes=sizes, progress=count
-    )
-    assert max(seen) == 3
-    with pytest.raises(OSError, match="a worker process was killed"):
-        verify_out_of_core(source_from_model(moved), opened, memory_bytes=memory, sizes=sizes, progress=kill)
-
-
-@pytest.mark.slow
-def test_another_scene_is_reported_without_any_splat(make_model):
-    result = encode_with_report(make_model(400, 1), OPTIONS)
-    found = both(make_model(401, 0), result.data)
-    assert len(found["failures"]) == 2
-
-
-@pytest.mark.slow
-def test_cells_have_similar_numbers_of_splats(make_model):
-    source = make_model(4000, 0)
-    opened = open_tiles(encode_with_report(source, OPTIONS).data)
-    places = CellTree.of(opened.header, 4000, 500).place(source.means)
-    counts = np.bincount(places)
-    assert len(counts) == 8
-    assert counts.min() > 100
-    assert counts.max() < 1200
+    assert both(changed, result.data, result.source_index)["failures"]
 
 
 @pytest.mark.slow
@@ -480,42 +410,32 @@ def test_invalid_source_indices_are_found_in_blocks(index, message):
 
 
 @pytest.mark.slow
-def test_too_little_disk_space_is_an_error_and_no_files_are_left(make_model, tmp_path, monkeypatch):
-    source = make_model(450, 1)
-    result = encode_with_report(source, OPTIONS)
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    both(source, result.data)
-    assert [] == list(tmp_path.iterdir())
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: namedtuple("usage", "free")(1000))  # noqa: PYI024  # a stand-in
-    with pytest.raises(InputError, match=r"0 MB free, 0 MB are needed .*TMPDIR"):
-        both(source, result.data)
-
-
-@pytest.mark.slow
 def test_a_source_index_may_be_memory_mapped(make_model, tmp_path):
     source = make_model(500, 1)
     result = encode_with_report(source, OPTIONS)
     np.save(tmp_path / "index.npy", result.source_index)
     mapped = read_array(str(tmp_path / "index.npy"), most_bytes=0)
     assert isinstance(mapped.base, mmap)
-    assert both(source, result.data, index=result.source_index) == both(source, result.data, index=mapped)
+    assert both(source, result.data, result.source_index) == both(source, result.data, mapped)
 
 
 @pytest.mark.slow
-def test_the_command_reports_the_same_with_a_memory_limit(make_model, tmp_path):
+def test_a_scene_beyond_the_memory_is_verified_with_an_index_alone(make_model, tmp_path):
     ply, file, index = tmp_path / "scene.ply", tmp_path / "scene.csplat", tmp_path / "index.npy"
     source = make_model(700, 1)
     result = encode_with_report(source, OPTIONS)
     write_ply(ply, source)
     file.write_bytes(result.data)
     np.save(index, result.source_index)
-    for words in ([], ["--source-index", str(index)]):
-        found = []
-        for most in (None, 100_000):
-            command = ["verify", str(file), "--source", str(ply), "--json", "--quiet", *words]
-            with pytest.MonkeyPatch.context() as patch:
-                patch.setattr("csplat_tools.cli.verify.verify_file", partial(verify_file, memory_bytes=most))
-                result = CliRunner().invoke(app, command)
-            assert result.exit_code == 0, result.output
-            found.append(rounded(json.loads(result.stdout)))
-        assert found[0] == found[1]
+    command = ["verify", str(file), "--source", str(ply), "--json", "--quiet"]
+    indexed = [*command, "--source-index", str(index)]
+    assert 0 == CliRunner().invoke(app, command).exit_code
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("csplat_tools.cli.verify.verify_file", partial(verify_file, memory_bytes=100_000))
+        alone, by_tile = (CliRunner().invoke(app, words) for words in (command, indexed))
+    assert 1 == alone.exit_code
+    assert re.search(
+        r"not checked: this takes 0 MB of memory, expected at most 0 MB; give --source-index", alone.stderr
+    )
+    assert 0 == by_tile.exit_code, by_tile.output
+    assert rounded(json.loads(CliRunner().invoke(app, indexed).stdout)) == rounded(json.loads(by_tile.stdout))

@@ -40,7 +40,7 @@ class FileKind:
     """A kind of file.
 
     Attributes:
-        name: id of the kind; for a format that csplat reads, its id in `csplat formats`.
+        name: id of the kind; for a format that csplat reads, the name of its `csplat.formats.format.Format`.
         title: name in prose: `SPZ 4`.
         suffixes: file name suffixes in lower case with their dots, the usual one first.
         matches: returns True if the path and the first bytes (empty for a folder) are of this kind.

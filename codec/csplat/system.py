@@ -254,7 +254,7 @@ def _free_machine_bytes() -> int:
 
 
 def map_in_processes(
-    work: Callable[[Shared, Item], Result], shared: Shared, items: Sequence[Item], workers: int, *, copied: bool = False
+    work: Callable[[Shared, Item], Result], shared: Shared, items: Sequence[Item], workers: int
 ) -> Iterator[tuple[Item, Result]]:
     """Call a function for each item in worker processes; yield (item, result) in order of completion.
 
@@ -263,8 +263,6 @@ def map_in_processes(
         shared: a value for all calls, not to be modified.
         items: arguments; items and results must be picklable.
         workers: number of processes; 1 runs everything in this process.
-        copied: fork this process if `CAN_FORK`, so that `shared` is neither pickled nor copied. `work` must not use
-            a lock that another thread of this process may hold, such as a stream's.
 
     Raises:
         OSError: a worker process was killed.
@@ -273,7 +271,7 @@ def map_in_processes(
         for item in items:
             yield item, work(shared, item)
         return
-    start = ("fork" if copied else "forkserver") if CAN_FORK else "spawn"
+    start = "forkserver" if CAN_FORK else "spawn"
     workers = min(workers, _SPAWNED_MAX) if start == "spawn" else workers
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context(start), _begin, (work, shared))
     try:

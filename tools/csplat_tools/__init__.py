@@ -11,7 +11,7 @@ load their modules when first used.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING
 
 from csplat import __version__, lazy_exports
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
@@ -65,19 +65,4 @@ _MODULE_OF = {
     "simplify": "csplat_tools.optimise.simplify",
     "tradeoff": "csplat_tools.tradeoffs",
 }
-_export, __dir__ = lazy_exports(__name__, _MODULE_OF)
-
-
-def __getattr__(name: str) -> object:
-    if name == "Optimised":
-        raise AttributeError(
-            "csplat_tools.Optimised has moved: csplat.encode_with_report returns a csplat.EncodeResult"
-        )
-    return _export(name)
-
-
-def encode_to(*_arguments: object, **_named: object) -> NoReturn:
-    """Refuse, naming the successor."""
-    from csplat.errors import InputError
-
-    raise InputError("encode_to has moved: csplat.encode_with_report(model, options, target=csplat.Target(psnr=38))")
+__getattr__, __dir__ = lazy_exports(__name__, _MODULE_OF)

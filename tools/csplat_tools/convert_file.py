@@ -16,7 +16,7 @@ from csplat.disk_files import resolve_links
 from csplat.editing.transform import axes_rotation, convert_axes, rotate_scene, scale_scene, translate_scene
 from csplat.editing.up_axis import UP
 from csplat.errors import InputError
-from csplat.formats import Format, format_by_name, format_by_suffix, formats, open_scene, survey_losses, write_levels
+from csplat.formats import format_by_name, format_by_suffix, open_scene, survey_losses, write_levels
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
 from csplat.model import UNSPECIFIED, SplatModel
@@ -383,24 +383,3 @@ def decode_file(
                 pass
         write_model(target, with_progress(scene, "decoding", progress), absolute=absolute)
     return scene.count, scene.metadata_model.sh_degree
-
-
-def format_rows() -> list[tuple[str, ...]]:
-    """Return a row for each format: name, endings, readable, writable, SH degree, axes, exact and carried contents."""
-    return [
-        (
-            one.name,
-            " ".join(one.suffixes) or "-",
-            "yes" if one.open is not None else "no",
-            "yes" if one.write is not None else "no",
-            str(one.degree),
-            one.axes or "-",
-            _exactness(one),
-            ", ".join(sorted(name.replace("_", " ") for name in one.carries)) or "-",
-        )
-        for one in formats()
-    ]
-
-
-def _exactness(one: Format) -> str:
-    return "all" if set(ARRAYS) <= one.exact else ", ".join(name for name in ARRAYS if name in one.exact) or "-"

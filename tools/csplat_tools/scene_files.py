@@ -156,7 +156,7 @@ SceneLike = SplatModel | LoadedModel | File
 def load_model(
     scene: SceneLike, *, level: int = 0, max_splats: int | None = None, sh_degree: int | None = None
 ) -> LoadedModel:
-    """Read a scene in any format (`csplat formats`), detected by its content.
+    """Read a scene in any format (`csplat.formats.formats()`), detected by its content.
 
     Args:
         scene: a path, an open binary file, or bytes; the path `-` is standard input. A model or a `LoadedModel` is

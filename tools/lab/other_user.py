@@ -52,7 +52,6 @@ COMMANDS = {
     "convert streamed": "convert scene.ply streamed/lod-meta.json",
     "convert gltf": "convert scene.ply convert.glb",
     "convert spz": "convert scene.ply convert.spz",
-    "formats": "formats",
     "simplify": "simplify scene.ply simplify.ply --keep 0.9",
     "extract": "extract scene.csplat extract.csplat --box -9,-9,-9,9,9,9",
     "extract a pipe": "extract scene.csplat - --box -9,-9,-9,9,9,9",

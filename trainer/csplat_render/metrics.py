@@ -1,4 +1,4 @@
-"""Similarity of two images: PSNR and SSIM, pooled over views; FLIP if `flip-evaluator` is installed.
+"""Similarity of two images: PSNR and SSIM, pooled over views.
 
 Conventions:
 
@@ -15,7 +15,6 @@ Published results for Blender scenes use a white background; photographs have no
 
 from __future__ import annotations
 
-import importlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -221,24 +220,3 @@ def _clip(reference: NDArray[Any], image: NDArray[Any]) -> tuple[F64, F64]:
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise InputError("an image contains NaN")
     return a, b
-
-
-def flip(reference: NDArray[Any], image: NDArray[Any]) -> float:
-    """Return the mean FLIP error (Andersson et al. 2020) of two sRGB images, 0 to 1, with NVIDIA's `flip-evaluator`.
-
-    `pip install csplat[flip]` installs the package. This is LDR-FLIP at its default viewing distance: 0.7 m from a
-    0.7 m wide screen of 3840 pixels, 67 pixels per degree.
-
-    Args:
-        reference, image: [H, W, 3] floating, clipped to [0, 1].
-
-    Raises:
-        InputError: the images cannot be compared, or the package is not installed.
-    """
-    a, b = (array.astype(np.float32) for array in _clip(reference, image))
-    try:
-        package: Any = importlib.import_module("flip_evaluator")
-    except ImportError as error:
-        raise InputError("FLIP requires flip-evaluator: pip install 'csplat[flip]'") from error
-    _, mean, _ = package.evaluate(a, b, "LDR", applyMagma=False)
-    return float(mean)

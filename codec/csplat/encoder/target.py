@@ -140,7 +140,7 @@ class SearchReport:
         views: number of test views.
         views_of: source of the views: `virtual`, or a name.
         renders: number of scored renders.
-        removal_views, sensitivity_views: number of small renders for measuring pruning errors, and sensitivities.
+        pruning_views, sensitivity_views: number of small renders for measuring pruning errors, and sensitivities.
         chosen, tried: the chosen file and all candidates.
         why, sure: explanations of the choice, and of the accuracy of the PSNR.
     """
@@ -160,7 +160,7 @@ class SearchReport:
     views: int = 0
     views_of: str = ""
     renders: int = 0
-    removal_views: int = 0
+    pruning_views: int = 0
     sensitivity_views: int = 0
     chosen: dict[str, Any] = field(default_factory=dict)
     tried: tuple[dict[str, Any], ...] = ()

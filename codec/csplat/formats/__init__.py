@@ -74,7 +74,7 @@ def read(
 
     Args:
         file: path of a file or folder, an open binary file, or bytes.
-        format: name of the format as `csplat formats` lists it, if neither content nor name identify it.
+        format: name of the format, as in `formats()`, if neither content nor name identify it.
         strict: refuse files that need repairs.
         keep_extra: keep columns that are not splat attributes.
         sh_degree: drop the SH bands above this degree, 0 to 4; the file's own degree may exceed 4. `None`: keep all.

@@ -53,7 +53,7 @@ class Format:
     """A file format.
 
     Attributes:
-        name: name for `csplat formats` and `--from`, a key of `csplat.detect.KINDS`, for example `spz`.
+        name: name for `--from` and `--to`, a key of `csplat.detect.KINDS`, for example `spz`.
         open: opens a file; `None`: csplat does not read the format.
         open_level: opens a level of detail; `None`: scenes have one level.
         open_bands: opens a file without the SH bands above a degree; `None`: `open` reads all bands.

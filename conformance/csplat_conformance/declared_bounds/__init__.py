@@ -14,23 +14,25 @@ from csplat_conformance.declared_bounds.bounds_verification import (
     MeasureVerification,
     WorstSplat,
     verify_bounds,
+    verify_bounds_by_tile,
 )
 from csplat_conformance.declared_bounds.measurement import Source, check_source_index, find_wrong_extras, measure_pairs
-from csplat_conformance.declared_bounds.out_of_core_verification import PartSizes, fits_memory, verify_out_of_core
 from csplat_conformance.declared_bounds.partners import find_partners, lattice_radii
+from csplat_conformance.declared_bounds.tile_pairs import comparison_bytes, measure_pairs_by_tile, splats_in_memory
 
 __all__ = [
     "BoundsVerification",
     "MeasureVerification",
-    "PartSizes",
     "Source",
     "WorstSplat",
     "check_source_index",
+    "comparison_bytes",
     "find_partners",
     "find_wrong_extras",
-    "fits_memory",
     "lattice_radii",
     "measure_pairs",
+    "measure_pairs_by_tile",
+    "splats_in_memory",
     "verify_bounds",
-    "verify_out_of_core",
+    "verify_bounds_by_tile",
 ]

@@ -6,19 +6,20 @@ source within the declared maxima; rms and counts are then not verified.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.decoder import DeclaredBounds, SceneHeader
+from csplat.decoder import DeclaredBounds, SceneHeader, TileReader
 from csplat.disk_files import finite_or_none
 from csplat.model import SplatModel
+from csplat.scene_source import SceneSource
 from csplat.types import I64, Progress
 from csplat_conformance.declared_bounds.measurement import (
-    MeasuredError,
+    PairErrors,
     Source,
     check_source_index,
     find_wrong_extras,
@@ -27,6 +28,7 @@ from csplat_conformance.declared_bounds.measurement import (
     pair_differences,
 )
 from csplat_conformance.declared_bounds.partners import UNDECIDED, UNMATCHED, find_partners, lattice_radii
+from csplat_conformance.declared_bounds.tile_pairs import measure_pairs_by_tile
 from csplat_conformance.tolerance import bound_tolerance, is_valid_bound
 
 #: Errors by measure that a file declares: (max, rms).
@@ -155,104 +157,96 @@ def verify_bounds(
     Raises:
         InputError: `source_index` does not contain one index of a source splat for each splat of the file.
     """
-    return verify_with(_InMemoryComparison(source, decoded, header, progress), header, stated, source_index)
+    claims = _read_claims(measure_names(source, decoded), len(source), source.sh_degree, header, stated)
+    if claims.wrong:
+        return _outcome(claims)
+    if source_index is not None:
+        check_source_index(source_index, len(source), len(decoded))
+        pairs = PairErrors(
+            measure_pairs(source, decoded, source_index),
+            find_wrong_extras(source, decoded, source_index),
+            source.reach(decoded.origin),
+        )
+        return _judge_pairs(claims, header, pairs, source_index)
+    if "means" not in claims.bounds:  # there is no search radius
+        return _outcome(replace(claims, unverified=claims.names if header.splat_count else ()))
+    return _search_partners(claims, source, decoded, header, progress)
 
 
-class PairErrors(NamedTuple):
-    """The errors of known pairs of splats.
+def verify_bounds_by_tile(
+    scene: SceneSource,
+    opened: TileReader,
+    source_index: NDArray[Any],
+    splats_max: int,
+    *,
+    progress: Progress | None = None,
+) -> BoundsVerification:
+    """Verify the error bounds of a file in bounded memory, with the result of `verify_bounds`.
+
+    The arguments and errors are those of `measure_pairs_by_tile`.
+    """
+    names = measure_names(scene.metadata_model, opened.metadata_model)
+    degree = scene.metadata_model.sh_degree
+    claims = _read_claims(names, scene.count, degree, opened.header, opened.declared_bounds)
+    if claims.wrong:
+        return _outcome(claims)
+    pairs = measure_pairs_by_tile(scene, opened, source_index, splats_max, progress=progress)
+    return _judge_pairs(claims, opened.header, pairs, source_index)
+
+
+@dataclass(frozen=True)
+class _Claims:
+    """The declared errors of a file.
 
     Attributes:
-        measured: errors by measure.
-        extras: a line for each extra column that differs.
-        reach: see `bound_tolerance`.
+        names: measures that apply to file and source, in the order of the registry.
+        bounds: (max, rms) by measure.
+        unverified: measures without a declared bound.
+        wrong: contradictions that show without a comparison of splats.
     """
 
-    measured: dict[str, MeasuredError]
-    extras: list[str]
-    reach: float
+    names: tuple[str, ...]
+    bounds: _Bounds
+    unverified: tuple[str, ...]
+    wrong: _Contradictions
 
 
-class SplatComparison(Protocol):
-    """A comparison of the splats of a file with those of their source."""
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the measures, in the order of the registry."""
-        ...
-
-    @property
-    def source_count(self) -> int:
-        """Splats of the source."""
-        ...
-
-    @property
-    def source_degree(self) -> int:
-        """SH degree of the source."""
-        ...
-
-    def pairs(self, source_index: NDArray[Any]) -> PairErrors:
-        """Measure the pairs of a source index.
-
-        Raises:
-            InputError: `source_index` does not contain one index of a source splat for each splat of the file.
-        """
-        ...
-
-    def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
-        """Return `UNMATCHED`, `UNDECIDED`, or another number for a partner, for each splat of the file."""
-        ...
-
-    def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, WorstSplat]:
-        """Return by measure the splat that exceeds its bound most, of the given splats without a partner."""
-        ...
-
-
-def verify_with(
-    scenes: SplatComparison,
-    header: SceneHeader,
-    stated: DeclaredBounds | None,
-    source_index: NDArray[Any] | None = None,
-) -> BoundsVerification:
-    """Verify error bounds like `verify_bounds`, with any `SplatComparison`."""
+def _read_claims(
+    names: Sequence[str], source_count: int, source_degree: int, header: SceneHeader, stated: DeclaredBounds | None
+) -> _Claims:
     if stated is None:
-        return BoundsVerification(
-            failures=("the file states no errors",), clauses=("SER-6",), unverified=tuple(scenes.names)
-        )
+        return _Claims(tuple(names), {}, tuple(names), [("SER-6", "the file states no errors")])
     bounds = {record.measure: (record.max, record.rms) for record in stated.records}
-    unverified = tuple(name for name in scenes.names if name not in bounds) if header.splat_count else ()
-    wrong = [("SER-5", line) for line in _different_scenes(scenes, stated)]
+    unverified = tuple(name for name in names if name not in bounds) if header.splat_count else ()
+    wrong = []
+    if source_count != stated.source_count:
+        wrong.append(("SER-5", f"the source has {source_count} splats, the file states {stated.source_count}"))
+    if source_degree != stated.source_sh_degree:
+        wrong.append(("SER-5", f"the source has SH degree {source_degree}, the file states {stated.source_sh_degree}"))
     if not stated.refitted:
         wrong += [("SER-6", f"the file states no error of {name}") for name in unverified]
-    measures: list[MeasureVerification] = []
-    if not wrong and source_index is not None:
-        measures, wrong = _verify_pairs(scenes, header, bounds, source_index)
-    elif not wrong and "means" in bounds:
-        measures, wrong = _verify_partners(scenes, bounds)
-    elif not wrong:  # without a bound of means there is no search radius
-        unverified = tuple(scenes.names) if header.splat_count else ()
-    measures.sort(key=lambda one: scenes.names.index(one.name))
+    return _Claims(tuple(names), bounds, unverified, wrong)
+
+
+def _outcome(
+    claims: _Claims,
+    measures: Sequence[MeasureVerification] = (),
+    wrong: _Contradictions | None = None,
+    *,
+    rms_verified: bool = False,
+) -> BoundsVerification:
+    wrong = claims.wrong if wrong is None else wrong
     clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
-    verified = source_index is not None and bool(measures)
-    return BoundsVerification(
-        tuple(measures), tuple(line for _, line in wrong), clauses, unverified, rms_verified=verified
-    )
+    ordered = tuple(sorted(measures, key=lambda one: claims.names.index(one.name)))
+    return BoundsVerification(ordered, tuple(line for _, line in wrong), clauses, claims.unverified, rms_verified)
 
 
-def _different_scenes(scenes: SplatComparison, stated: DeclaredBounds) -> Iterator[str]:
-    """Yield differences that rule out a comparison: splat count, SH degree."""
-    count, degree = scenes.source_count, scenes.source_degree
-    if count != stated.source_count:
-        yield f"the source has {count} splats, the file states {stated.source_count}"
-    if degree != stated.source_sh_degree:
-        yield f"the source has SH degree {degree}, the file states {stated.source_sh_degree}"
-
-
-def _verify_pairs(
-    scenes: SplatComparison, header: SceneHeader, bounds: _Bounds, source_index: NDArray[Any]
-) -> tuple[list[MeasureVerification], _Contradictions]:
-    found_pairs, measures = scenes.pairs(source_index), []
-    failures = [("SRC-3", line) for line in found_pairs.extras]
-    for name, found in found_pairs.measured.items():
+def _judge_pairs(
+    claims: _Claims, header: SceneHeader, pairs: PairErrors, source_index: NDArray[Any]
+) -> BoundsVerification:
+    bounds, measures = claims.bounds, []
+    failures = [("SRC-3", line) for line in pairs.extras]
+    for name, found in pairs.measured.items():
         worst = None
         if header.splat_count:
             splat = found.worst
@@ -260,10 +254,10 @@ def _verify_pairs(
         if name not in bounds:
             measures.append(MeasureVerification(name, None, None, found.max, found.rms, None, worst))
             continue
-        wrong = find_contradictions(name, found[:2], bounds[name], found_pairs.reach, worst)
+        wrong = find_contradictions(name, found[:2], bounds[name], pairs.reach, worst)
         failures += [("SER-5", line) for line in wrong]
         measures.append(MeasureVerification(name, *bounds[name], found.max, found.rms, not wrong, worst))
-    return measures, failures
+    return _outcome(claims, measures, failures, rms_verified=bool(measures))
 
 
 def find_contradictions(
@@ -298,18 +292,21 @@ def tile_of(header: SceneHeader, splat: int) -> int:
 # Without a source index ----------------------------------------------------------------------------
 
 
-def _verify_partners(scenes: SplatComparison, bounds: _Bounds) -> tuple[list[MeasureVerification], _Contradictions]:
+def _search_partners(
+    claims: _Claims, source: Source, decoded: SplatModel, header: SceneHeader, progress: Progress | None
+) -> BoundsVerification:
+    bounds = claims.bounds
     largest = {name: pair[0] for name, pair in bounds.items()}
-    found = scenes.matches(largest)
+    found = find_partners(source, decoded, largest, lattice_radii(decoded, header), progress=progress)
     alone = np.flatnonzero(found == UNMATCHED)
     undecided = int(np.count_nonzero(found == UNDECIDED))
     lines = []
     if undecided:
         lines.append(f"{undecided} splats have too many similar splats in the source: specify a source index")
     worst: dict[str, WorstSplat] = {}
-    some = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, scenes.source_count)))
+    some = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, len(source))))
     if len(alone):
-        worst = scenes.farthest(largest, alone[:some])
+        worst = _find_worst(source, decoded, header, largest, alone[:some], progress)
         many = f"{len(alone)} splats of the file have" if len(alone) > 1 else "1 splat of the file has"
         lines.append(f"{many} no splat of the source within the stated maxima")
         lines += [
@@ -330,54 +327,15 @@ def _verify_partners(scenes: SplatComparison, bounds: _Bounds) -> tuple[list[Mea
         )
         for name in bounds
     ]
-    return measures, [("SER-5", line) for line in lines]
+    return _outcome(claims, measures, [("SER-5", line) for line in lines])
 
 
-@dataclass(frozen=True, eq=False)
-class _InMemoryComparison:
-    """A `SplatComparison` of scenes in memory."""
-
-    source: Source
-    decoded: SplatModel
-    header: SceneHeader
-    progress: Progress | None
-
-    @property
-    def names(self) -> list[str]:
-        return measure_names(self.source, self.decoded)
-
-    @property
-    def source_count(self) -> int:
-        return len(self.source)
-
-    @property
-    def source_degree(self) -> int:
-        return self.source.sh_degree
-
-    def pairs(self, source_index: NDArray[Any]) -> PairErrors:
-        check_source_index(source_index, len(self.source), len(self.decoded))
-        return PairErrors(
-            measure_pairs(self.source, self.decoded, source_index),
-            find_wrong_extras(self.source, self.decoded, source_index),
-            self.source.reach(self.decoded.origin),
-        )
-
-    def matches(self, bounds: Mapping[str, float]) -> NDArray[Any]:
-        radii = lattice_radii(self.decoded, self.header)
-        return find_partners(self.source, self.decoded, bounds, radii, progress=self.progress)
-
-    def farthest(self, bounds: Mapping[str, float], rows: I64) -> dict[str, WorstSplat]:
-        reach = self.source.reach(self.decoded.origin)
-        return find_worst(self.source, self.decoded, self.header, bounds, rows, reach, self.progress)
-
-
-def find_worst(
+def _find_worst(
     source: Source,
     decoded: SplatModel,
     header: SceneHeader,
     bounds: Mapping[str, float],
     rows: I64,
-    reach: float,
     progress: Progress | None,
 ) -> dict[str, WorstSplat]:
     """Return by measure the splat of `rows` that exceeds its bound most.
@@ -387,12 +345,12 @@ def find_worst(
     worst: dict[str, WorstSplat] = {}
     if not len(source):
         return worst
-    source = source.about(decoded.origin)
+    reach, source = source.reach(decoded.origin), source.about(decoded.origin)
     means = source.means.astype(np.float64)
     for done, row in enumerate(rows.tolist()):
         if progress is not None:
             progress("searching the nearest splats", done / len(rows))
-        near = nearest_points(means, decoded.means[row])
+        near = _nearest_points(means, decoded.means[row])
         errors = pair_differences(source, decoded, near, np.full(len(near), row))
         largest = {name: np.abs(errors[name]).max(axis=1) for name in bounds if name in errors}
         beyond = np.stack(
@@ -406,7 +364,7 @@ def find_worst(
     return worst
 
 
-def nearest_points(means: NDArray[np.float64], point: NDArray[np.float32]) -> I64:
+def _nearest_points(means: NDArray[np.float64], point: NDArray[np.float32]) -> I64:
     """Return the indices of the centres nearest to a point, the nearest first."""
     with np.errstate(over="ignore"):
         distances = np.square(means - point).sum(axis=1)

@@ -135,6 +135,20 @@ class MeasuredError(NamedTuple):
     worst: int
 
 
+class PairErrors(NamedTuple):
+    """The errors of known pairs of splats.
+
+    Attributes:
+        measured: errors by measure.
+        extras: a line for each extra column that differs.
+        reach: see `bound_tolerance`.
+    """
+
+    measured: dict[str, MeasuredError]
+    extras: list[str]
+    reach: float
+
+
 def measure_names(source: Source | SplatModel, decoded: SplatModel) -> list[str]:
     """Return the measures that apply to a source and a decoded file, in the order of the registry."""
     return ["means", "covariance", "opacities", "sh0", *(f"sh{band}" for band in _bands(source, decoded))]

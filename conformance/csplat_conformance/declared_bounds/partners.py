@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
-from csplat.decoder import SceneHeader, Tile
+from csplat.decoder import SceneHeader
 from csplat.model import SplatModel
 from csplat.types import F64, I64, U64, Progress
 from csplat_conformance.declared_bounds.measurement import Source, pair_differences
@@ -43,8 +43,6 @@ def find_partners(
     bounds: Mapping[str, float],
     radii: F64,
     *,
-    far: bool = True,
-    reach: float | None = None,
     candidates_max: int = _CANDIDATES_MAX,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -56,9 +54,7 @@ def find_partners(
         decoded: N splats; their origin may differ.
         bounds: largest error by measure, `means` among them, without the tolerance of SER-7. Other measures are not
             compared.
-        radii: [N], distance within which the partner's centre is expected.
-        far: continue up to the bound of `means` if there is no partner within the radius.
-        reach: `Source.reach` of the whole scene, if these splats are a part of it.
+        radii: [N], distance within which the partner's centre is expected; the search goes on up to the bound.
         candidates_max: largest number of splats of one cell to compare with one splat.
         threads: number of threads, one per core by default. The result does not depend on it.
         progress: called with the fraction of the splats that have a partner.
@@ -69,13 +65,13 @@ def find_partners(
     found = np.full(len(decoded), UNMATCHED, np.int64)
     if not len(source):
         return found
-    reach = source.reach(decoded.origin) if reach is None else reach
+    reach = source.reach(decoded.origin)
     source = source.about(decoded.origin)
     bounds = {name: bound + bound_tolerance(name, bound, reach) for name, bound in bounds.items()}
     bounds = {"opacities": math.inf, "sh0": math.inf, **bounds}
     bound = bounds["means"]
     levels = _radius_levels(radii, bound)
-    for radius in np.unique(np.append(levels, bound) if far else levels):
+    for radius in np.unique(np.append(levels, bound)):
         rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
         if not len(rows):
             continue
@@ -192,15 +188,10 @@ def lattice_radii(decoded: SplatModel, header: SceneHeader) -> F64:
     This is half the diagonal of the splat's lattice cell, plus the error of rounding to float32.
     """
     radii = np.empty(len(decoded))
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     for tile in header.tiles:
         rows = slice(tile.start, tile.start + tile.splat_count)
-        radii[rows] = tile_radii(decoded.means[rows], header, tile)
-    return radii
-
-
-def tile_radii(means: NDArray[np.float32], header: SceneHeader, tile: Tile) -> F64:
-    """Return `lattice_radii` of the given centres of one tile."""
-    cell = 0.87 * math.ldexp(header.attribute(_spec.ATTRIBUTE_MEANS).step, tile.exponent)
-    x, y, z = np.abs(means.T)  # NumPy is slow along an axis of three
-    radii: F64 = cell + np.maximum(np.maximum(x, y), z).astype(np.float64) * 2.0**-22
+        x, y, z = np.abs(decoded.means[rows].T)  # NumPy is slow along an axis of three
+        largest = np.maximum(np.maximum(x, y), z).astype(np.float64)
+        radii[rows] = 0.87 * math.ldexp(step, tile.exponent) + largest * 2.0**-22
     return radii

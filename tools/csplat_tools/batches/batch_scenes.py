@@ -57,8 +57,8 @@ def find_tasks(scenes: str, command: str, ending: str, *, match: str = "*", with
     """Return the scenes of a folder, sorted, or those of a manifest in its order.
 
     Args:
-        scenes: a folder, searched with its subfolders for the endings that `csplat formats` lists, without the
-            input.ply of INRIA's trainer; or a manifest: lines of JSON (.jsonl), or of path, output and options (.csv,
+        scenes: a folder, searched with its subfolders for the endings of all formats, without the input.ply of
+            INRIA's trainer; or a manifest: lines of JSON (.jsonl), or of path, output and options (.csv,
             .txt), separated by commas or, as some spreadsheets write them, by semicolons or tabs.
         command: the command for the scenes: `encode` skips .csplat files, `decode` skips all others.
         ending: file name ending of outputs without a name.

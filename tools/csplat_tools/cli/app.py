@@ -24,7 +24,7 @@ _PANELS = {
         "sensitivity": "sensitivity",
     },
     "Edit and convert": {
-        "convert": "convert", "formats": "convert", "simplify": "simplify", "extract": "extract", "merge": "merge",
+        "convert": "convert", "simplify": "simplify", "extract": "extract", "merge": "merge",
     },
     "Train": {"train": "train"},
     "View": {"view": "view", "render": "render", "export-html": "view", "export-element": "view"},

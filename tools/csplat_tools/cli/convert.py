@@ -1,4 +1,4 @@
-"""`csplat convert` and `csplat formats`."""
+"""`csplat convert`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,10 @@ from csplat.formats import assume_format
 from csplat.model import UNSPECIFIED
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
-from csplat_tools.console import format_bytes, format_table, note
-from csplat_tools.convert_file import Conversion, Filters, convert_file, format_rows
+from csplat_tools.console import format_bytes, note
+from csplat_tools.convert_file import Conversion, Filters, convert_file
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.scene_files import FOLDER_NAMES
-
-_COLUMNS = ("format", "endings", "read", "written", "SH degree", "axes", "exact", "has a place for")
 
 
 def convert(
@@ -57,9 +55,22 @@ def convert(
     Changes are made in this order: --to-axes (in --help-all), --rotate,
     --scale, --translate, --crop, --drop-floaters, --sh-degree. They are along
     the axes of IN (those of its format, where these are fixed, as y up in
-    glTF), or of --to-axes. A line reports what the format cannot hold. `csplat formats` lists the formats; for .csplat
-    files, `csplat encode` has presets and targets. A new folder with a file
-    lod-meta.json gets streamed SOG, with all levels of detail.
+    glTF), or of --to-axes. A line reports what the format cannot hold. For
+    .csplat files, `csplat encode` has presets and targets. A new folder with
+    a file lod-meta.json gets streamed SOG, with all levels of detail.
+
+    Formats, their highest SH degree, and what else they hold (header: axes,
+    origin, unit, metadata, antialiased, flat):
+      ply             .ply             read, write  4  header, extra
+      compressed-ply  .compressed.ply  read, write  3  header
+      csplat          .csplat          read, write  4  header, extra, cameras
+      spz             .spz             read, write  3  antialiased
+      spz4            .v4.spz          read, write  4  antialiased
+      splat           .splat           read, write  0
+      ksplat          .ksplat          read         2
+      sog             .sog, meta.json  read, write  3  antialiased, flat
+      gltf            .glb, .gltf      read, write  3  header
+      checkpoint      .pt, .ckpt       read         4
 
     Examples:
       csplat convert scene.spz scene.ply
@@ -137,26 +148,3 @@ def _filters(
         crop_box=region if is_box else None,
         crop_sphere=None if is_box else region,
     )
-
-
-def formats(
-    force: shared.Force = False,
-    report: shared.Report = None,
-    as_json: shared.Json = False,
-    quiet: shared.Quiet = False,
-    _all: shared.HelpAll = False,
-) -> None:
-    """List the formats that are read and written.
-
-    `exact`: attributes that are kept bit for bit. `axes`: directions of +x,
-    +y, +z in all files of a format. The last column lists what else a
-    format can hold.
-
-    Examples:
-      csplat formats
-      csplat formats --json
-    """
-    out = Output(force, report, as_json, quiet)
-    rows = format_rows()
-    table = format_table(_COLUMNS, rows, left=len(_COLUMNS))
-    out.publish([dict(zip(_COLUMNS, row, strict=True)) for row in rows], table)

@@ -40,7 +40,7 @@ IN_MEMORY = (
 
 
 def encode(
-    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, another of `csplat formats`, or -.")],
+    source: Annotated[str, typer.Argument(metavar="IN.ply", help="A PLY, another format of `convert`, or -.")],
     output: Annotated[
         str | None, typer.Argument(metavar="OUT.csplat", help="The file to write, or -. Default: IN.csplat.")
     ] = None,

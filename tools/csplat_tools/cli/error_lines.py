@@ -63,57 +63,6 @@ _OS_ADVICE = {
 }
 _EMPTY_PHRASES = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in typer's messages
 
-_IN_PYTHON = "is an argument of {} in Python now"
-#: Removed options, and what replaces them. They are refused with this message for one version.
-RENAMED_OPTIONS = {
-    **dict.fromkeys(
-        ("--max-classes", "--deflate-level", "--attribute-psnr", "--threads", "--seed"),
-        _IN_PYTHON.format("csplat.EncodeOptions"),
-    ),
-    **dict.fromkeys(("--size", "--test-every", "--near"), _IN_PYTHON.format("csplat_tools.DataOptions")),
-    **dict.fromkeys(
-        ("--views", "--view-size", "--validation-count", "--split", "--background"),
-        _IN_PYTHON.format("csplat_tools.find_view_set"),
-    ),
-    **dict.fromkeys(("--amplify", "--memory"), _IN_PYTHON.format("csplat_tools.compare")),
-    **dict.fromkeys(("--thumbnails", "--no-thumbnails"), _IN_PYTHON.format("csplat_tools.batch")),
-    **dict.fromkeys(("--previews", "--preview-every", "--lpips-weights"), _IN_PYTHON.format("csplat_trainer.Outputs")),
-    **dict.fromkeys(
-        ("--matrices", "--no-matrices"), _IN_PYTHON.format("csplat_tools.optimise.scene_sensitivity.measure_scene")
-    ),
-    "--plot": _IN_PYTHON.format("csplat_tools.training.training_run.run_training"),
-    "--keep-unseen": _IN_PYTHON.format("csplat_tools.training.tuning_run.run_finetuning"),
-    "--prune-unseen": _IN_PYTHON.format("csplat_tools.encode_file.encode_file"),
-    **dict.fromkeys(("-o", "--output"), "is gone: the output is the last argument, as in `csplat encode IN OUT`"),
-    **dict.fromkeys(("--crop-box", "--crop-sphere"), "is part of --crop now: six numbers are a box, four a sphere"),
-    **dict.fromkeys(("--verbose", "-v"), "is gone: --json and --junit have a result for each check"),
-    "-j": "is called --jobs now",
-    "--aside": "is validation_count of csplat_tools.find_view_set in Python now",
-    "--axes": "is an option of `csplat convert`, and coordinate_system of scenes in Python",
-    "--checkpoint-every": "is gone: checkpoints are written every 1,000 steps",
-    "--clause": "is part of --filter now, as in --filter 'HDR-*'",
-    "--exact": "is exact of csplat_conformance.decoder_suite.DecoderSuiteOptions in Python now",
-    "--from": "is an option of encode and convert: convert the scene first",
-    "--grades": "is max_classes of csplat.EncodeOptions in Python now",
-    "--images": "is part of the data set's path now, as in SET/images_4",
-    "--importance": "is an option of `csplat encode`, and an argument of run_finetuning in Python",
-    "--keep-all": "is called --no-prune now",
-    "--lambda": "is an option of `csplat finetune`, and byte_cost of FinetuneOptions in Python",
-    "--lpips": "is an option of `csplat compare`, and an argument of read_setting and run_finetuning in Python",
-    "--lr-factor": "is FinetuneOptions.scaled in Python now",
-    "--mode": "is called --backend now: cpu, exact, fast, gpu or auto",
-    "--max-loss": "is called --max-psnr-drop now",
-    "--no-antialiased": "is antialiased of scenes in Python now",
-    "--plots": "is gone: -o PAGE.html has the plots",
-    "--preset": "is an option of `csplat encode`: encode the scene first",
-    "--set": "is gone: EncodeOptions, FinetuneOptions, SimplifyOptions and TrainOptions take such settings in Python",
-    "--render-cmd": "is part of --cmd now: a command with {camera} is a renderer",
-    "--sh-degree": "is gone here: `csplat convert --sh-degree` writes a scene with fewer bands",
-    "--source-index": "is an option of encode, finetune, verify and compare",
-    "--strict": "is an argument of csplat.read in Python now; `csplat lint` lists defects",
-    "--work": "is gone: the working folder is OUT.work",
-}
-
 
 class ReportedError(typer.Exit):
     """The exit with status 1 after an error was printed.
@@ -160,10 +109,7 @@ def report_errors() -> Iterator[None]:
 
 
 def usage_message(error: Any) -> str:
-    """Return the message of an error in a command line, in one line; for a removed option, its replacement."""
-    option = getattr(error, "option_name", None) or ""
-    if option in RENAMED_OPTIONS and "No such option" in error.format_message():
-        return f"{option} {RENAMED_OPTIONS[option]}"
+    """Return the message of an error in a command line, in one line."""
     return " ".join(_EMPTY_PHRASES.sub("", error.format_message()).split())
 
 

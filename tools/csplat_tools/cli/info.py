@@ -17,7 +17,7 @@ from csplat_tools.optional_packages import prepare_renderer, require_images
 
 
 def info(
-    source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file, or another of `csplat formats`.")],
+    source: Annotated[str, typer.Argument(metavar="SCENE", help="A .csplat file, or another format of `convert`.")],
     page: Annotated[str | None, typer.Option(metavar="FILE.html", help="Write an HTML report.")] = None,
     original: Annotated[
         str | None, typer.Option("--source", metavar="SCENE", help="Scene to compare with, in the report.")

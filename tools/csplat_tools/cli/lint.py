@@ -18,7 +18,7 @@ from csplat_tools.scene_files import findings_as_json, without_extra_columns
 
 
 def lint(
-    source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, another of `csplat formats`, or -.")],
+    source: Annotated[str, typer.Argument(metavar="SCENE", help="A PLY, another format of `convert`, or -.")],
     fix: Annotated[str | None, typer.Option(metavar="OUT.ply", help="Write a repaired PLY if that is safe.")] = None,
     keep_extra: shared.KeepExtra = False,
     force: shared.Force = False,

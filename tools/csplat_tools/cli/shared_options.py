@@ -65,7 +65,7 @@ HelpAll = Annotated[
 
 # Scenes
 SceneArgument = Annotated[
-    str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another of `csplat formats`, or -.")
+    str, typer.Argument(metavar="SCENE", help="A PLY, a .csplat file, another format of `convert`, or -.")
 ]
 ReadAs = Annotated[
     str | None, typer.Option("--from", metavar="FORMAT", hidden=True, help="Format of IN. Default: by its content.")

@@ -33,8 +33,7 @@ def verify(
     Lists all violations: clause, error code, byte, field. With --source,
     each splat of the file must have a splat of the PLY within the declared
     maxima. With --source-index the pairs are known, and RMS errors and
-    counts are verified as well. Large scenes are verified on the disk, in a
-    temporary file of the size of the PLY (TMPDIR).
+    counts are verified as well, in bounded memory.
 
     Examples:
       csplat verify scene.csplat

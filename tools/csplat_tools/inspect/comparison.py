@@ -5,20 +5,27 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat import scene_source as scenes
-from csplat.decoder import DeclaredBounds, open_tiles
+from csplat.decoder import open_tiles
 from csplat.disk_files import check_free_space, finite_or_none, temporary_root
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene_source import SceneSource
 from csplat.types import F32, Progress, null_progress
-from csplat_conformance.declared_bounds import Source, find_partners, lattice_radii, measure_pairs, verify_out_of_core
+from csplat_conformance.declared_bounds import (
+    Source,
+    find_partners,
+    lattice_radii,
+    measure_pairs,
+    measure_pairs_by_tile,
+    splats_in_memory,
+)
 from csplat_conformance.declared_bounds.measurement import merge_errors
 from csplat_render import Backend, Mode
 from csplat_render.camera import Camera
@@ -269,13 +276,10 @@ def attribute_errors_out_of_core(
     if source_index is not None:
         if not is_csplat(other.path):
             return None
-        # All errors are measured for a file that was refitted and declares no bounds.
-        nothing = DeclaredBounds(source.count, 0, source.metadata_model.sh_degree, refitted=True, records=())
-        opened = replace(open_tiles(other.path), declared_bounds=nothing)
-        proof = verify_out_of_core(
-            source.scene, opened, source_index, memory_bytes=source.memory_bytes, progress=progress
-        )
-        found = {one.name: (one.measured_max or 0.0, one.measured_rms or 0.0) for one in proof.measures}
+        opened = open_tiles(other.path)
+        most = splats_in_memory(opened, source.memory_bytes)
+        pairs = measure_pairs_by_tile(source.scene, opened, source_index, most, progress=progress)
+        found = {name: (one.max, one.rms) for name, one in pairs.measured.items()}
         return AttributeErrors("index", other.count, 0, found)
     if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
         return None

@@ -11,14 +11,17 @@ from numpy.typing import NDArray
 from csplat import formats
 from csplat.decoder import decode, open_tiles
 from csplat.disk_files import read_array
+from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE
+from csplat.system import available_memory_bytes, default_memory_bytes
 from csplat.types import Progress
 from csplat_conformance.declared_bounds import (
     BoundsVerification,
     Source,
-    fits_memory,
+    comparison_bytes,
+    splats_in_memory,
     verify_bounds,
-    verify_out_of_core,
+    verify_bounds_by_tile,
 )
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.file_streams import mapped_csplat, source_path
@@ -79,11 +82,12 @@ def verify_file(
         source: its source.
         source_index: the .npy file that the encoder wrote.
         max_splats: refuse a scene of more splats (LIM-1); `None`: no limit.
-        memory_bytes: limit of the memory; larger scenes are verified out of core. `None`: half of the free memory.
+        memory_bytes: approximate limit of the memory; larger scenes are verified tile by tile, which requires a source
+            index. `None`: half of the free memory, or all of it without an index.
         progress: progress callback for validating and matching.
 
     Raises:
-        CsplatError: source or index are not valid; or the disk is full.
+        CsplatError: source or index are not valid, or too large without an index.
         OSError: a file cannot be read.
     """
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
@@ -100,9 +104,18 @@ def _verify_bounds(
     opened = open_tiles(data)
     header, bounds = opened.header, opened.declared_bounds
     degree = MAX_SH_DEGREE  # bands above have not been read by the encoder
+    if memory_bytes is None:
+        memory_bytes = available_memory_bytes() if rows is None else default_memory_bytes()
     with source_path(source) as local:
-        if fits_memory(opened, bounds.source_count if bounds else 0, size_on_disk(local), memory_bytes):
+        needed = comparison_bytes(opened, bounds.source_count if bounds else 0, size_on_disk(local))
+        if needed <= memory_bytes:
             model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)
             return verify_bounds(Source.of(model), decode(data), header, bounds, rows, progress=progress)
+        if rows is None:
+            raise InputError(
+                f"the declared errors were not checked: this takes {needed / 1e6:,.0f} MB of memory, expected at most "
+                f"{memory_bytes / 1e6:,.0f} MB; give --source-index, which takes less, or free more memory"
+            )
         with formats.open_scene(local, sh_degree=degree) as scene:
-            return verify_out_of_core(scene, opened, rows, memory_bytes=memory_bytes, progress=progress)
+            most = splats_in_memory(opened, memory_bytes)
+            return verify_bounds_by_tile(scene, opened, rows, most, progress=progress)

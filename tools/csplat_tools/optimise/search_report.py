@@ -46,8 +46,8 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
         cost += f", {counted(report.renders, 'render')} scored"
     if report.sensitivity_views:
         cost += f", sensitivity measured in {counted(report.sensitivity_views, 'render')}"
-    if report.removal_views:
-        cost += f", pruning error measured in {counted(report.removal_views, 'small render')}"
+    if report.pruning_views:
+        cost += f", pruning error measured in {counted(report.pruning_views, 'small render')}"
     return (*lines, cost)
 
 

@@ -691,7 +691,7 @@ def search_target(
         target, found, pool, test_scorer, splats_before=len(source), views_of=views.name, remarks=remarks,
         encodes=len(pool.made), seconds=0.0,
         photographs=_image_psnr(source, found, views, encoding.threads) if views.images else {},
-        sensitivity_views=sensitivity_views, removal_views=0 if pruner is None else pruner.view_count,
+        sensitivity_views=sensitivity_views, pruning_views=0 if pruner is None else pruner.view_count,
         elsewhere=_psnr_elsewhere(source, found, views, encoding.threads),
         reached={name: found.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip

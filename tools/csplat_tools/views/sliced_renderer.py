@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,9 +21,9 @@ from csplat.model import SplatModel
 from csplat.scene_source import BLOCK_SPLATS, SceneSource, source_from_model
 from csplat.types import F32, F64, Progress
 from csplat_conformance.declared_bounds import Source
-from csplat_conformance.declared_bounds.splat_spool import RecordLayout, SplatSpool, open_spool
 from csplat_render import Camera, Mode
 from csplat_render.conventions import HasSplats, RenderResult
+from csplat_tools.views.splat_spool import open_spool, record_type
 
 STAGE = "drawing one picture by way of the disk"
 _SAMPLED = 1 << 19  # approximate number of splats to sample when a slice is cut again
@@ -65,17 +66,17 @@ class SlicedScene:
     @property
     def disk_bytes(self) -> int:
         """Bytes of disk space that a render may take."""
-        return self.scene.count * self.layout.dtype.itemsize
+        return self.scene.count * self.record.itemsize
 
     @property
-    def layout(self) -> RecordLayout:
-        """Layout of splats on the disk."""
-        return RecordLayout.of(_source(self.scene.metadata_model), ())
+    def record(self) -> np.dtype[Any]:
+        """Type of a splat's record on the disk."""
+        return record_type(_source(self.scene.metadata_model))
 
     @property
     def splat_bytes(self) -> float:
         """Bytes of memory of a drawn splat, without its pairs with tiles."""
-        return _FOLDS * self.layout.dtype.itemsize + _SPLAT_BYTES
+        return _FOLDS * self.record.itemsize + _SPLAT_BYTES
 
     @property
     def least_bytes(self) -> int:
@@ -89,7 +90,7 @@ class SlicedScene:
 
     @property
     def _fixed_bytes(self) -> int:
-        return _BASE_BYTES + _BLOCKS * BLOCK_SPLATS * self.layout.dtype.itemsize
+        return _BASE_BYTES + _BLOCKS * BLOCK_SPLATS * self.record.itemsize
 
     def renderer(
         self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
@@ -115,7 +116,7 @@ class _SlicedRender:
         self._scene, self._camera, self._background = scene, camera, background
         self._rasteriser = Rasteriser(mode, gradients=False, threads=threads)
         self._state = self._rasteriser.initial_state(camera)
-        self._layout, self._splat_bytes = scene.layout, scene.splat_bytes
+        self._record, self._splat_bytes = scene.record, scene.splat_bytes
         self._ignored, self._visible, self._done, self._pairs = 0, 0, 0, 0
         self._last: RenderResult | None = None
 
@@ -160,7 +161,7 @@ class _SlicedRender:
             limits: limits of the slices, see `slice_limits`.
             first: count splats, as in the first pass over the scene.
         """
-        spool = open_spool(self._layout, count)
+        spool = open_spool(self._record, count)
         with closing(spool.stream):
             sizes = np.zeros(len(limits) + 1)
             for block in blocks():
@@ -168,14 +169,14 @@ class _SlicedRender:
                 rows = np.flatnonzero(near)
                 keys = np.searchsorted(limits, near[rows], "right")
                 sizes += np.bincount(keys, taken[rows], len(sizes))
-                spool.add(block, rows, keys, rows)
+                spool.add(block, rows, keys)
                 if first:
                     self._ignored, self._visible = self._ignored + ignored, self._visible + len(rows)
             spool.flush()
             for key, number in spool.counts().items():
                 if not (self._state[..., 0] > 0.0).any():
                     return
-                read = partial(self._read, spool, key)
+                read = partial(spool.sources, key)
                 if sizes[key] <= self._scene.room_bytes or number == 1:
                     self._draw(next(read(number)))
                 elif 0 < key < len(limits) and np.nextafter(limits[key - 1], np.float32(np.inf)) == limits[key]:
@@ -186,9 +187,6 @@ class _SlicedRender:
                     self._sort_and_draw(
                         partial(read, BLOCK_SPLATS), number, self._limits(read(BLOCK_SPLATS), every, every, least=2)
                     )
-
-    def _read(self, spool: SplatSpool, key: int, most: int) -> Iterator[Source]:
-        return (source for source, _ in spool.sources(key, most))
 
     def _limits(self, blocks: Iterator[Source], every: int, share: int, *, least: int = 1) -> F32:
         """Return limits as `slice_limits` does, from every Nth splat of blocks, each of which represents `share`."""

@@ -59,7 +59,7 @@ class Engine:
 
     Attributes:
         title: its name.
-        reads: formats, as `csplat formats` names them.
+        reads: formats, by their names in `csplat.formats.formats()`.
         clips: it clips the colour of a splat to 0..1, that of degree 0 as well before adding the other bands.
         thin: it dilates splats half as far as we do.
         antialiased: it compensates opacity for the dilation, whatever a file declares.

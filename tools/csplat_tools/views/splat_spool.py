@@ -1,4 +1,4 @@
-"""Store splats of a source in a temporary file, sorted by integer keys: cells of space, or groups of tiles."""
+"""Store splats in a temporary file, sorted by integer keys: slices of depth."""
 
 from __future__ import annotations
 
@@ -21,43 +21,10 @@ _PENDING_BYTES_MAX = 1 << 25  # size of the write buffer; small parts of the fil
 _ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
-@dataclass(frozen=True)
-class RecordLayout:
-    """The layout of splats as records.
-
-    Attributes:
-        dtype: type of a record: the arrays of a `Source`, its extra columns, and an integer `number`.
-        origin: origin of the source.
-        names: names of the extra columns.
-    """
-
-    dtype: np.dtype[Any]
-    origin: tuple[float, float, float]
-    names: tuple[str, ...]
-
-    @classmethod
-    def of(cls, source: Source, names: tuple[str, ...]) -> RecordLayout:
-        """Return the layout of a source's splats with the given extra columns."""
-        columns = [(name, getattr(source, name)) for name in _ARRAYS]
-        columns += [(f"extra {name}", source.extra[name]) for name in names]
-        fields = [(name, array.dtype, array.shape[1:]) for name, array in columns]
-        return cls(np.dtype([*fields, ("number", np.int64)]), source.origin, names)
-
-    def pack(self, source: Source, rows: NDArray[Any], numbers: I64) -> RecordArray:
-        """Return records of the given splats of a source of this layout."""
-        records = np.empty(len(rows), self.dtype)
-        for name in _ARRAYS:
-            records[name] = getattr(source, name)[rows]
-        for name in self.names:
-            records[f"extra {name}"] = source.extra[name][rows]
-        records["number"] = numbers
-        return records
-
-    def unpack(self, records: RecordArray) -> Source:
-        """Return the splats of records."""
-        arrays = {name: np.ascontiguousarray(records[name]) for name in _ARRAYS}
-        extra = {name: np.ascontiguousarray(records[f"extra {name}"]) for name in self.names}
-        return Source(**arrays, origin=self.origin, extra=extra)
+def record_type(source: Source) -> np.dtype[Any]:
+    """Return the type of a record: the arrays of a source's splat, without extra columns."""
+    columns = [(name, getattr(source, name)) for name in _ARRAYS]
+    return np.dtype([(name, array.dtype, array.shape[1:]) for name, array in columns])
 
 
 @dataclass(eq=False)
@@ -66,24 +33,23 @@ class SplatSpool:
 
     Attributes:
         stream: the file, which has no name.
-        layout: layout of the splats.
+        dtype: type of its records.
     """
 
     stream: IO[bytes]
-    layout: RecordLayout
+    dtype: np.dtype[Any]
     _parts: dict[int, list[tuple[int, int]]] = field(default_factory=dict)  # by key: offset in the file, record count
     _pending: dict[int, list[RecordArray]] = field(default_factory=dict)
     _pending_bytes: int = 0
     _size: int = 0
 
-    def add(self, source: Source, rows: NDArray[Any], keys: I64, numbers: I64) -> None:
+    def add(self, source: Source, rows: NDArray[Any], keys: I64) -> None:
         """Add splats. Splats of one key keep the order of addition.
 
         Args:
-            source: a source of this layout.
+            source: a source with arrays of these types.
             rows: [n] indices of splats of the source.
             keys: [n] keys of these splats.
-            numbers: [n] numbers to store with them.
 
         Raises:
             OSError: the file cannot be written.
@@ -91,7 +57,9 @@ class SplatSpool:
         if not len(rows):
             return
         order = np.argsort(keys, kind="stable")
-        keys, records = keys[order], self.layout.pack(source, rows[order], numbers[order])
+        keys, records = keys[order], np.empty(len(rows), self.dtype)
+        for name in _ARRAYS:
+            records[name] = getattr(source, name)[rows[order]]
         starts = np.flatnonzero(np.diff(keys, prepend=-1))
         for start, end in zip(starts, [*starts[1:], len(keys)], strict=True):
             self._pending.setdefault(int(keys[start]), []).append(records[start:end])
@@ -111,7 +79,7 @@ class SplatSpool:
                 self.stream.write(records.view(np.uint8).data)
             count = sum(map(len, waiting))
             self._parts.setdefault(key, []).append((self._size, count))
-            self._size += count * self.layout.dtype.itemsize
+            self._size += count * self.dtype.itemsize
         self.stream.flush()
         self._pending, self._pending_bytes = {}, 0
 
@@ -119,14 +87,14 @@ class SplatSpool:
         """Return the number of splats of each key."""
         return {key: sum(count for _, count in parts) for key, parts in sorted(self._parts.items())}
 
-    def sources(self, key: int, most: int) -> Iterator[tuple[Source, I64]]:
-        """Yield the splats of a key and their numbers, `most` at a time; several processes may read at once.
+    def sources(self, key: int, most: int) -> Iterator[Source]:
+        """Yield the splats of a key, `most` at a time.
 
         Raises:
             OSError: the file cannot be read.
         """
-        left, size = self.counts().get(key, 0), self.layout.dtype.itemsize
-        block, filled = np.empty(min(most, left), self.layout.dtype), 0
+        left, size = self.counts().get(key, 0), self.dtype.itemsize
+        block, filled = np.empty(min(most, left), self.dtype), 0
         for at, count in self._parts.get(key, ()):
             done = 0
             while done < count:
@@ -134,10 +102,15 @@ class SplatSpool:
                 _read_at(self.stream, at + done * size, block[filled : filled + step].view(np.uint8).data)
                 done, filled = done + step, filled + step
                 if filled == len(block):
-                    yield self.layout.unpack(block), block["number"].copy()
+                    yield _unpack(block)
                     filled = 0
         if filled:
-            yield self.layout.unpack(block[:filled]), block["number"][:filled].copy()
+            yield _unpack(block[:filled])
+
+
+def _unpack(records: RecordArray) -> Source:
+    arrays: dict[str, Any] = {name: np.ascontiguousarray(records[name]) for name in _ARRAYS}
+    return Source(**arrays)
 
 
 def _read_at(stream: IO[bytes], at: int, buffer: memoryview) -> None:
@@ -149,18 +122,16 @@ def _read_at(stream: IO[bytes], at: int, buffer: memoryview) -> None:
         buffer, at = buffer[count:], at + count
 
 
-def open_spool(layout: RecordLayout, count: int) -> SplatSpool:
+def open_spool(dtype: np.dtype[Any], count: int) -> SplatSpool:
     """Open a spool in the folder for temporary files (TMPDIR).
 
     Args:
-        layout: layout of the splats.
+        dtype: type of the records.
         count: largest number of splats.
 
     Raises:
         InputError: the disk has too little free space.
         OSError: the file cannot be created.
     """
-    check_free_space(
-        temporary_root(), count * layout.dtype.itemsize, "the source is compared: set TMPDIR to another folder"
-    )
-    return SplatSpool(temporary_file(), layout)
+    check_free_space(temporary_root(), count * dtype.itemsize, "a scene is rendered: set TMPDIR to another folder")
+    return SplatSpool(temporary_file(), dtype)

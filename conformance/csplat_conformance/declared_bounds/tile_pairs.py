@@ -1,0 +1,122 @@
+"""Measure the pairs of a source index tile by tile, if file and source do not fit in memory together.
+
+The source is read in order, once for each group of tiles whose source splats fit in memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from csplat.decoder import SceneHeader, Tile, TileReader
+from csplat.scene_source import BLOCK_SPLATS, SceneSource, with_progress
+from csplat.types import Progress, null_progress
+from csplat_conformance.declared_bounds.measurement import (
+    PairErrors,
+    Source,
+    check_source_index,
+    find_wrong_extras,
+    measure_pairs,
+    merge_errors,
+)
+
+_COMPARE_FACTOR = 2.2  # memory to compare two scenes, as a multiple of their arrays
+_SPLAT_BYTES = 80  # bytes per source splat in addition to its arrays: keys, order, centres in doubles
+_BASE_BYTES = 200_000_000  # bytes of the program, of blocks of the source, and of tiles during decoding
+
+
+def comparison_bytes(opened: TileReader, source_count: int, source_bytes: int) -> int:
+    """Estimate the memory in which a file and its source can be compared as a whole, bytes.
+
+    Args:
+        opened: the file.
+        source_count: splats of the source.
+        source_bytes: size of its file.
+    """
+    splat_bytes = _COMPARE_FACTOR * _splat_bytes(opened)
+    source = max(source_count * (splat_bytes + _SPLAT_BYTES), source_bytes)
+    return int(source + opened.header.splat_count * splat_bytes)
+
+
+def splats_in_memory(opened: TileReader, memory_bytes: int) -> int:
+    """Return how many source splats `measure_pairs_by_tile` may hold at once within a limit of the memory."""
+    row_bytes = _COMPARE_FACTOR * _splat_bytes(opened) + _SPLAT_BYTES
+    return max(BLOCK_SPLATS, int((memory_bytes - _BASE_BYTES) / row_bytes))
+
+
+def _splat_bytes(opened: TileReader) -> int:
+    metadata_model = opened.metadata_model
+    return 4 * (11 + 3 * (metadata_model.sh_degree + 1) ** 2) + sum(
+        column.itemsize for column in metadata_model.extra.values()
+    )
+
+
+def measure_pairs_by_tile(
+    scene: SceneSource,
+    opened: TileReader,
+    source_index: NDArray[Any],
+    splats_max: int,
+    *,
+    progress: Progress | None = None,
+) -> PairErrors:
+    """Measure the errors of a file's splats, as `measure_pairs` does in memory.
+
+    Args:
+        scene: the source.
+        opened: the file.
+        source_index: [N] integers, the source splat of each splat of the file; may be memory-mapped.
+        splats_max: largest number of source splats to hold at once, if no tile has more.
+        progress: called with the progress of the comparison.
+
+    Raises:
+        InputError: `source_index` does not contain one index of a source splat for each splat of the file, or the
+            source is incomplete.
+        OSError: a file cannot be read.
+    """
+    check_source_index(source_index, scene.count, opened.header.splat_count)
+    names = [name for name in opened.metadata_model.extra if name in scene.metadata_model.extra]
+    groups = list(_groups(opened.header, splats_max)) or [[]]
+    parts, lines, reach = [], {}, 0.0
+    for number, tiles in enumerate(groups):
+        report = partial(_report_part, progress or null_progress, number, len(groups))
+        start = tiles[0].start if tiles else 0
+        rows = source_index[start : start + sum(tile.splat_count for tile in tiles)]
+        order = np.argsort(rows)
+        ascending, found = rows[order], []
+        for place, model in with_progress(scene, "measuring splats", report).numbered():
+            block = Source.of(model)
+            reach = max(reach, block.reach(opened.metadata_model.origin))
+            first, end = np.searchsorted(ascending, (place.start, place.stop))
+            block = replace(block, extra={name: block.extra[name] for name in names})
+            found.append(block.select(ascending[first:end] - place.start))
+        source = Source.concatenate(found) if found else Source.of(scene.metadata_model)
+        positions = np.empty(len(order), np.int64)
+        positions[order] = np.arange(len(order))
+        models = opened.models([tile.index for tile in tiles]) if tiles else [opened.metadata_model]
+        for decoded in models:
+            own, positions = np.split(positions, [len(decoded)])
+            parts.append((start, len(decoded), measure_pairs(source, decoded, own)))
+            lines.update(dict.fromkeys(find_wrong_extras(source, decoded, own)))
+            start += len(decoded)
+    return PairErrors(merge_errors(parts), list(lines), reach)
+
+
+def _report_part(progress: Progress, number: int, count: int, stage: str, share: float) -> None:
+    progress(stage, (number + share) / count)
+
+
+def _groups(header: SceneHeader, splats_max: int) -> Iterator[list[Tile]]:
+    """Yield groups of successive tiles with at most this many splats, or with one tile."""
+    group: list[Tile] = []
+    for tile in header.tiles:
+        if group and sum(one.splat_count for one in group) + tile.splat_count > splats_max:
+            yield group
+            group = []
+        group.append(tile)
+    if group:
+        yield group
