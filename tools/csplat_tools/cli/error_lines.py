@@ -77,7 +77,6 @@ RENAMED_OPTIONS = {
     ),
     **dict.fromkeys(("--modes", "--iterations"), _IN_PYTHON.format("csplat_tools.SweepOptions")),
     **dict.fromkeys(("--amplify", "--memory"), _IN_PYTHON.format("csplat_tools.compare")),
-    **dict.fromkeys(("--thumbnails", "--no-thumbnails"), _IN_PYTHON.format("csplat_tools.batch")),
     **dict.fromkeys(("--previews", "--preview-every", "--lpips-weights"), _IN_PYTHON.format("csplat_trainer.Outputs")),
     **dict.fromkeys(
         ("--matrices", "--no-matrices"), _IN_PYTHON.format("csplat_tools.optimise.scene_sensitivity.measure_scene")
@@ -116,20 +115,6 @@ RENAMED_OPTIONS = {
 }
 
 
-class ReportedError(typer.Exit):
-    """The exit with status 1 after an error was printed.
-
-    Attributes:
-        message: the error in one line, without its code.
-        code: error code of the format or of the system; "": none.
-    """
-
-    def __init__(self, message: str, code: str) -> None:
-        super().__init__(EXIT_FAILED)
-        self.message = message
-        self.code = code
-
-
 @contextmanager
 def report_errors() -> Iterator[None]:
     """Turn expected errors into one line on standard error and status 1.
@@ -137,8 +122,7 @@ def report_errors() -> Iterator[None]:
     Defects of csplat itself still end in a traceback: a bug report needs it.
 
     Raises:
-        ReportedError: an error was printed.
-        typer.Exit: the command was interrupted, or standard output was closed.
+        typer.Exit: an error was printed, the command was interrupted, or standard output was closed.
     """
     try:
         yield
@@ -181,7 +165,7 @@ def refuse_command_line(error: Any) -> NoReturn:
 def _fail(message: str, code: str) -> NoReturn:
     message = " ".join(message.split())
     note(f"error: {message}" + (f" ({code})" if code and not re.search(rf"\b{code}\b", message) else ""))
-    raise ReportedError(message, code) from None
+    raise typer.Exit(EXIT_FAILED) from None
 
 
 def _csplat_error(error: CsplatError) -> str:
