@@ -392,10 +392,10 @@ def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, with_
                 os.kill(victims.pop(), signal.SIGKILL)
                 victims.clear()
 
-        encode_large(source_from_model(model), target, FAST, cluster=cluster.scheduler_address, progress=kill)
+        encode_large(source_from_model(model), target, FAST, scheduler=cluster.scheduler_address, progress=kill)
         assert not victims
         assert whole == target.read_bytes()
-        encode_large(source_from_model(model), target, FAST, cluster=cluster.scheduler_address, levels=EveryFourth())
+        encode_large(source_from_model(model), target, FAST, scheduler=cluster.scheduler_address, levels=EveryFourth())
     assert with_levels == target.read_bytes()
 
 
@@ -404,7 +404,7 @@ def test_an_unreachable_cluster_is_reported(model, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))
     with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
-        encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, cluster="tcp://127.0.0.1:9")
+        encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, scheduler="tcp://127.0.0.1:9")
 
 
 def partial_client(client):

@@ -11,7 +11,6 @@ import re
 import select
 import signal
 import sys
-import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PureWindowsPath
@@ -29,9 +28,7 @@ from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.protocol import run_program
 from csplat_selftest.decoder_processes import DecoderProcess
-from csplat_tools.batches.batch_scenes import leads_out
-from csplat_tools.batches.journal import JOURNAL, Record, open_journal, read_journal
-from csplat_tools.batches.scene_job import Worker, WorkerLostError
+from csplat_tools.batch import leads_out
 from csplat_trainer.training_report import peak_memory
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -229,58 +226,21 @@ def test_a_decoder_answers_without_poll_and_select(monkeypatch):
         assert Status.HUNG is served.ask(b"silent\n").status
 
 
-@pytest.mark.usefixtures("elsewhere")
-def test_the_main_thread_is_interrupted_without_signals_to_threads():
-    def wait():
-        threading.Thread(target=system.interrupt_main_thread).start()
-        for _ in range(1000):
-            time.sleep(0.01)
+def test_interrupts_are_held_back_if_the_system_can(monkeypatch):
+    passed, before = [], signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    def interrupt():
+        with system.interrupts_held():
+            signal.raise_signal(signal.SIGINT)
+            passed.append("held")
+        passed.append("lost")
+
     try:
         with pytest.raises(KeyboardInterrupt):
-            wait()
+            interrupt()
+        assert ["held"] == passed
+        monkeypatch.delattr(signal, "pthread_sigmask")
+        with system.interrupts_held():
+            pass
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-# Batches.
-@pytest.mark.usefixtures("elsewhere")
-def test_one_program_at_a_time_writes_a_journal_without_fcntl(tmp_path):
-    with open_journal(tmp_path), pytest.raises(InputError, match="another batch writes to"), open_journal(tmp_path):
-        pass
-    with open_journal(tmp_path) as journal:
-        journal.add(Record("a.ply", "a.csplat", ("encode",), "0", "done"))
-    assert ["a.csplat"] == list(read_journal(tmp_path)[0])
-    assert [JOURNAL] == [path.name for path in tmp_path.iterdir()]
-
-
-def test_a_journal_is_closed_before_it_is_replaced(tmp_path, monkeypatch):
-    replaced, replace = [], Path.replace
-
-    def watched(self, target):
-        with pytest.raises(ValueError, match="closed"):  # Windows replaces no open file
-            journal.begin([])
-        replaced.append(Path(target).name)
-        return replace(self, target)
-
-    monkeypatch.setattr(Path, "replace", watched)
-    with open_journal(tmp_path) as journal:
-        journal.add(Record("a.ply", "a.csplat", ("encode",), "0", "done"))
-        journal.end()
-    assert [JOURNAL] == replaced
-    assert ["a.csplat"] == list(read_journal(tmp_path)[0])
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("elsewhere")
-def test_a_worker_ends_without_signals():
-    worker = Worker()
-    try:
-        assert worker.ask("check", words=["encode", "--preset", "fast"])["ending"] == ".csplat"
-        begun = time.monotonic()
-    finally:
-        worker.close()
-    assert time.monotonic() - begun < 8  # it is killed after ten seconds
-    with pytest.raises(WorkerLostError):
-        worker.ask("check", words=["encode"])

@@ -25,7 +25,6 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
-from csplat_tools.cli.batch_protocol import answer
 from csplat_trainer.data import load
 from csplat_trainer.data.set_folder import SetFolder
 
@@ -271,8 +270,3 @@ def test_the_option_is_taken_anywhere_on_the_command_line(tmp_path):
     assert 1 == CliRunner().invoke(app, views).exit_code
     assert 0 == CliRunner().invoke(app, ["--trust-paths", *views]).exit_code
     assert 2 == CliRunner().invoke(app, ["info", str(tmp_path / "o.ply"), "--trust-paths"]).exit_code
-
-
-def test_a_batch_takes_the_option_for_commands_with_data_sets():
-    wrong = {name: answer({"ask": "check", "words": [name, "--trust-paths"]})["wrong"] for name in ("train", "convert")}
-    assert {"train": "", "convert": "csplat convert: No such option: --trust-paths"} == wrong

@@ -25,9 +25,6 @@ from typing import Any, BinaryIO, TypeVar
 #: True if a process may be forked. On macOS, system libraries are unsafe after a fork.
 CAN_FORK = sys.platform == "linux" and hasattr(os, "fork")
 
-#: `creationflags` that shield a process from interrupts at the terminal; POSIX has `start_new_session` instead.
-NEW_GROUP_FLAGS: int = getattr(subprocess, "CREATE_NEW_PROCESS_GROUP", 0)
-
 _SHARE = 0.5  # fraction of the free memory that a command uses; the rest is for other programs
 _UNKNOWN = 4 << 30  # bytes assumed if the system does not report its memory
 #: Files with limit and usage of the control group, versions 2 and 1.
@@ -138,54 +135,6 @@ class Pages:
             self.buffer.madvise(mmap.MADV_DONTNEED)
 
 
-@contextmanager
-def locked_folder(folder: Path, name: str) -> Iterator[bool]:
-    """Lock a folder against other processes that use this function; yield True if the lock was acquired.
-
-    File systems without locks yield True. The system releases the lock when the process ends, even if it is killed.
-
-    Args:
-        folder: an existing folder.
-        name: name of the lock file that is created in it on systems that cannot lock a folder (Windows).
-
-    Raises:
-        OSError: the folder cannot be read, or the lock file cannot be created.
-    """
-    try:
-        import fcntl
-    except ImportError:
-        with _lock_file(folder / name) as is_held:
-            yield is_held
-        return
-    held, is_held = os.open(folder, os.O_RDONLY), True
-    try:
-        if sys.platform != "win32":
-            try:
-                fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                is_held = False
-            except OSError:
-                pass  # a file system without locks
-        yield is_held
-    finally:
-        os.close(held)
-
-
-@contextmanager
-def _lock_file(path: Path) -> Iterator[bool]:
-    """Lock by creating a file, which Windows deletes when the process ends."""
-    try:
-        held = os.open(path, os.O_CREAT | os.O_EXCL | os.O_RDWR | getattr(os, "O_TEMPORARY", 0))
-    except FileExistsError:
-        yield False
-        return
-    try:
-        yield True
-    finally:
-        os.close(held)
-        path.unlink(missing_ok=True)
-
-
 def split_words(command: str, *, is_posix: bool = os.sep == "/") -> list[str]:
     """Split a command line into words as a shell does. On Windows the backslash is not an escape character.
 
@@ -209,23 +158,17 @@ def kill_group(process: subprocess.Popen[Any]) -> None:
     process.wait()
 
 
-def interrupt_process(process: subprocess.Popen[Any]) -> None:
-    """Ask a process to end: by SIGINT, or on Windows, which has no such signals, by closing its standard input."""
-    if sys.platform != "win32" and hasattr(signal, "pthread_kill"):
-        process.send_signal(signal.SIGINT)
-    elif process.stdin is not None:
-        with suppress(OSError):  # buffered bytes that can no longer be written
-            process.stdin.close()
-
-
-def interrupt_main_thread() -> None:
-    """Raise KeyboardInterrupt in the main thread from another thread; on POSIX this also interrupts system calls."""
-    if sys.platform != "win32" and hasattr(signal, "pthread_kill"):
-        main = threading.main_thread().ident
-        assert main is not None
-        signal.pthread_kill(main, signal.SIGINT)
-    else:
-        signal.raise_signal(signal.SIGINT)
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Hold back SIGINT in this thread. Processes started within the context never receive it, except on Windows."""
+    if sys.platform == "win32" or not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def available_memory_bytes() -> int:

@@ -1,10 +1,9 @@
-"""The command line in the process of the tests, a batch worker without a process, and SIGINT in child processes."""
+"""The command line in the process of the tests, batches without processes, and SIGINT in child processes."""
 
 from __future__ import annotations
 
-import json
 import signal
-import threading
+from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
 from importlib import import_module
@@ -14,7 +13,6 @@ import pytest
 from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
-from csplat_tools.cli.batch_protocol import answer
 from csplat_tools.views import find_view_set
 
 
@@ -64,20 +62,21 @@ def change_views(patch: pytest.MonkeyPatch, count: int, size: tuple[int, int]) -
     patch.setattr("csplat_tools.cli.shared_options.find_view_set", partial(find, few=count, small=size))
 
 
-class InThisProcess:
-    """A worker of `csplat batch` without a process, which counts its runs."""
+class InThisProcess(Executor):
+    """An executor of `csplat batch` without a process."""
 
-    ran = 0
-    pid = None
-    lock = threading.Lock()  # commands replace standard output while they run
-
-    def ask(self, what, **values):
-        with InThisProcess.lock:
-            InThisProcess.ran += what == "run"
-            return answer({"ask": what, **json.loads(json.dumps(values))})
-
-    def close(self):
+    def __init__(self, *_):
         pass
+
+    def submit(self, function, *args):
+        """Call a function at once, and return its result as a future."""
+        future, before = Future(), signal.getsignal(signal.SIGINT)
+        try:
+            future.set_result(function(*args))
+        except Exception as error:  # noqa: BLE001  # as in a process
+            future.set_exception(error)
+        signal.signal(signal.SIGINT, before)  # the program has its own handler
+        return future
 
 
 def heed_interrupts():

@@ -17,7 +17,7 @@ from csplat import __version__, lazy_exports
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
 
 if TYPE_CHECKING:
-    from csplat_tools.batches.batch_run import Batch, batch
+    from csplat_tools.batch import Batch, run_batch
     from csplat_tools.inspect.comparison import Comparison, compare
     from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
     from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
@@ -35,11 +35,11 @@ __all__ = [
     "SimplifyOptions",
     "Tradeoff",
     "ViewSet",
-    "batch",
     "compare",
     "find_view_set",
     "load_model",
     "parse_grid",
+    "run_batch",
     "simplify",
     "tradeoff",
 ]
@@ -48,7 +48,7 @@ __all__ = [
 VERSIONS = f"csplat {__version__}, format {VERSION_MAJOR}.{VERSION_MINOR}"
 
 _MODULE_OF = {
-    "Batch": "csplat_tools.batches.batch_run",
+    "Batch": "csplat_tools.batch",
     "Comparison": "csplat_tools.inspect.comparison",
     "DataOptions": "csplat_tools.views",
     "LoadedModel": "csplat_tools.scene_files",
@@ -57,11 +57,11 @@ _MODULE_OF = {
     "SimplifyOptions": "csplat_tools.optimise.simplify",
     "Tradeoff": "csplat_tools.tradeoffs",
     "ViewSet": "csplat_tools.views",
-    "batch": "csplat_tools.batches.batch_run",
     "compare": "csplat_tools.inspect.comparison",
     "find_view_set": "csplat_tools.views",
     "load_model": "csplat_tools.scene_files",
     "parse_grid": "csplat_tools.tradeoffs",
+    "run_batch": "csplat_tools.batch",
     "simplify": "csplat_tools.optimise.simplify",
     "tradeoff": "csplat_tools.tradeoffs",
 }

@@ -244,7 +244,7 @@ def _levels_of_source(
 
 def may_exceed_memory(path: Path, limits: OutOfCoreOptions, levels: Levels = None) -> bool:
     """Return True if a scene may not fit in memory, which can only be decided after opening it."""
-    if limits.cluster is not None or limits.resume or limits.always:
+    if limits.scheduler is not None or limits.resume or limits.always:
         return True
     bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
     size = size_on_disk(path)

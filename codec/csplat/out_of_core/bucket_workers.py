@@ -111,7 +111,7 @@ def roots_path(folder: Path, bucket: Bucket) -> Path:
 
 
 def code_buckets(
-    coding: BucketCoding, buckets: Sequence[Bucket], workers: int, cluster: str | None
+    coding: BucketCoding, buckets: Sequence[Bucket], workers: int, scheduler: str | None
 ) -> Iterator[Bucket]:
     """Code buckets, and yield each when it is done.
 
@@ -119,27 +119,40 @@ def code_buckets(
         coding: parameters of all buckets.
         buckets: the buckets to code.
         workers: number of processes; 1: only this one.
-        cluster: address of a Dask scheduler, whose workers code instead, and access the working folder under the same
-            path; Dask repeats the work of a lost worker.
+        scheduler: address of a Dask scheduler, whose workers code instead, and access the working folder under the
+            same path; Dask repeats the work of a lost worker.
 
     Raises:
         InputError: a value does not fit on the lattice, a file is damaged, or `dask.distributed` is not installed.
         OSError: a file cannot be read or written; a process was killed; the scheduler does not respond.
     """
-    if cluster is None:
+    if scheduler is None:
         for bucket, _ in map_in_processes(_code_bucket, coding, buckets, workers):
             yield bucket
         return
+    with open_client(scheduler) as client, client.as_current():
+        shared = client.scatter(coding, broadcast=True)
+        futures = {client.submit(_code_bucket, shared, bucket, pure=False): bucket for bucket in buckets}
+        for future in import_module("distributed").as_completed(list(futures)):
+            future.result()
+            yield futures[future]
+
+
+def open_client(scheduler: str) -> Any:
+    """Open the client of a Dask cluster, a context manager.
+
+    Args:
+        scheduler: the address of its scheduler, such as `tcp://host:8786`.
+
+    Raises:
+        InputError: `dask.distributed` is not installed.
+        OSError: the scheduler does not respond.
+    """
     try:
         distributed: Any = import_module("distributed")  # has no type annotations
     except ModuleNotFoundError as error:
-        raise missing_package(error, extra="scale") from None
-    with distributed.Client(cluster, set_as_default=False) as client, client.as_current():
-        shared = client.scatter(coding, broadcast=True)
-        futures = {client.submit(_code_bucket, shared, bucket, pure=False): bucket for bucket in buckets}
-        for future in distributed.as_completed(list(futures)):
-            future.result()
-            yield futures[future]
+        raise missing_package(error, "dask[distributed]", extra="scale") from None
+    return distributed.Client(scheduler, set_as_default=False)
 
 
 def _code_bucket(coding: BucketCoding, bucket: Bucket) -> None:

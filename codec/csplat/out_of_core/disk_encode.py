@@ -64,7 +64,7 @@ class OutOfCoreOptions:
             depend on it.
         folder: working folder; `None`: the path of the file with the suffix `.work`.
         resume: continue an interrupted encoding if the working folder exists.
-        cluster: address of a Dask scheduler whose workers code the buckets; they access the working folder under the
+        scheduler: address of a Dask scheduler whose workers code the buckets; they access the working folder under the
             same path.
         always: encode scenes of several buckets on disk, even if they fit in memory.
     """
@@ -72,7 +72,7 @@ class OutOfCoreOptions:
     memory_bytes: int | None = None
     folder: str | os.PathLike[str] | None = None
     resume: bool = False
-    cluster: str | None = None
+    scheduler: str | None = None
     always: bool = False
 
     def working_folder(self, target: str | os.PathLike[str]) -> Path:
@@ -137,7 +137,7 @@ def estimate_cost(
     building = 0 if levels is None else _building_bytes(count if is_one else per_bucket, row)
     memory = least = _PROGRAM + int(count * row * _WHOLE_ROW) + building
     # Building levels takes most of the time, and processes share it better than threads.
-    in_memory = is_one or (levels is None and memory <= bound and not limits.always and limits.cluster is None)
+    in_memory = is_one or (levels is None and memory <= bound and not limits.always and limits.scheduler is None)
     if not in_memory:
         if options.shape_codebook_size:
             raise InputError(f"a codebook of shapes requires the scene in memory, about {memory / _MB:,.0f} MB")
@@ -223,7 +223,7 @@ def encode_scene(
         scene, folder, key, bucket_splats=options.bucket_splats, resume=limits.resume, disk_bytes=cost.disk_bytes,
         progress=progress,
     )  # fmt: skip
-    encoded = _encode_buckets(store, options, cost.workers, limits.cluster, levels, progress)
+    encoded = _encode_buckets(store, options, cost.workers, limits.scheduler, levels, progress)
     with atomic_writer(target) as stream:
         report = encoded.write_to(stream, settings, progress=progress)
     store.remove()
@@ -239,7 +239,7 @@ def _encode_buckets(
     store: DiskBuckets,
     options: EncodeOptions,
     workers: int,
-    cluster: str | None,
+    scheduler: str | None,
     levels: LevelMaker | None,
     progress: Progress,
 ) -> EncodedTiles:
@@ -252,9 +252,9 @@ def _encode_buckets(
     for section in set(range(len(store.counts))) - set(uncoded):
         store.remove_section(section)
     done = count - sum(one.stop - one.start for one in left)
-    threads = options.threads if workers == 1 and cluster is None else 1
+    threads = options.threads if workers == 1 and scheduler is None else 1
     coding = BucketCoding(store.folder, replace(plan, options=replace(options, threads=threads)), codebooks, levels)
-    for bucket in code_buckets(coding, left, workers, cluster):
+    for bucket in code_buckets(coding, left, workers, scheduler):
         uncoded[bucket.section] -= 1
         if not uncoded[bucket.section]:
             store.remove_section(bucket.section)

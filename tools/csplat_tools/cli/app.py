@@ -51,7 +51,7 @@ class _Commands(TyperGroup):
 
     def parse_args(self, ctx: Any, args: list[str]) -> Any:
         """Move options of the program from the words of a command to the front, where typer expects them."""
-        options, words = split_program_options(args)
+        options, words = _split_program_options(args)
         return super().parse_args(ctx, [*options, *words])
 
     def invoke(self, ctx: Any) -> Any:
@@ -72,7 +72,7 @@ class _Commands(TyperGroup):
         sys.exit(status)
 
 
-def split_program_options(words: Sequence[str]) -> tuple[list[str], list[str]]:
+def _split_program_options(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Return the options of the program among the words of a command, and the other words.
 
     Args:

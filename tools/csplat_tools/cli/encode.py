@@ -33,10 +33,6 @@ from csplat_tools.scene_files import LoadedModel, read_source
 from csplat_tools.views import ViewSet
 
 _UP_SPLATS = 50_000  # splats for an estimate of the up direction, about; all of a million would take 1.4 CPU s
-#: Parameters that require the whole scene in memory.
-IN_MEMORY = (
-    "target_psnr", "target_size", "max_psnr_drop", "keep", "max_error", "importance", "source_index",
-)  # fmt: skip
 
 
 def encode(
@@ -69,7 +65,7 @@ def encode(
     source_index: shared.SourceIndexOutput = None,
     memory: shared.HiddenMemory = None,
     resume: Annotated[bool, typer.Option("--resume", hidden=True, help="Go on from OUT.csplat.work.")] = False,
-    dask: shared.HiddenDask = None,
+    scheduler: shared.HiddenScheduler = None,
     dry_run: shared.HiddenDryRun = False,
     keep_extra: shared.HiddenKeepExtra = False,
     unit_metres: Annotated[
@@ -115,7 +111,7 @@ def encode(
     rendered = {**precision, "--keep": keep}
     targets = {**rendered, "--max-error": max_error}
     whole = {**targets, "--importance": importance, "--source-index": source_index}
-    out_of_core = {"--memory": memory, "--resume": resume, "--dask": dask, "--dry-run": dry_run}
+    out_of_core = {"--memory": memory, "--resume": resume, "--scheduler": scheduler, "--dry-run": dry_run}
     shared.refuse_together(rendered)
     shared.refuse_together({"--attribute-psnr": attribute_psnr}, precision)
     shared.refuse_together({"--keep": keep}, {"--no-prune": no_prune, "--importance": importance})
@@ -136,7 +132,7 @@ def encode(
     )  # fmt: skip
     level_count = shared.parse_levels(levels)
     overrides = shared.parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased or None, licence=licence)
-    limits = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, cluster=dask)
+    limits = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, scheduler=scheduler)
     with out.bar() as progress, assume_format(read_as):
         if dry_run:
             _publish_estimate(source, options, limits, level_count, out)

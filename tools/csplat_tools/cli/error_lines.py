@@ -64,20 +64,6 @@ _OS_ADVICE = {
 _EMPTY_PHRASES = re.compile(r"^Invalid value: |(?<=: )Value error, |\.$")  # in typer's messages
 
 
-class ReportedError(typer.Exit):
-    """The exit with status 1 after an error was printed.
-
-    Attributes:
-        message: the error in one line, without its code.
-        code: error code of the format or of the system; "": none.
-    """
-
-    def __init__(self, message: str, code: str) -> None:
-        super().__init__(EXIT_FAILED)
-        self.message = message
-        self.code = code
-
-
 @contextmanager
 def report_errors() -> Iterator[None]:
     """Turn expected errors into one line on standard error and status 1.
@@ -85,8 +71,7 @@ def report_errors() -> Iterator[None]:
     Defects of csplat itself still end in a traceback: a bug report needs it.
 
     Raises:
-        ReportedError: an error was printed.
-        typer.Exit: the command was interrupted, or standard output was closed.
+        typer.Exit: an error was printed, the command was interrupted, or standard output was closed.
     """
     try:
         yield
@@ -126,7 +111,7 @@ def refuse_command_line(error: Any) -> NoReturn:
 def _fail(message: str, code: str) -> NoReturn:
     message = " ".join(message.split())
     note(f"error: {message}" + (f" ({code})" if code and not re.search(rf"\b{code}\b", message) else ""))
-    raise ReportedError(message, code) from None
+    raise typer.Exit(EXIT_FAILED) from None
 
 
 def _csplat_error(error: CsplatError) -> str:

@@ -126,15 +126,13 @@ Checkpoint = Annotated[
 Resume = Annotated[
     str | None, typer.Option(metavar="FILE.npz", hidden=True, help="Go on from a checkpoint. Default: none.")
 ]
-_memory = typer.Option("--memory", metavar="BYTES", help="E.g. 8GB. Default: the free memory.")
-Memory = Annotated[str | None, _memory]
-HiddenMemory = Annotated[str | None, hidden(_memory)]
-_dask = typer.Option("--dask", metavar="ADDRESS", help="Dask cluster, tcp://host:8786. Default: none.")
-Dask = Annotated[str | None, _dask]
-HiddenDask = Annotated[str | None, hidden(_dask)]
-_dry_run = typer.Option("--dry-run", help="Estimate size, time and memory only.")
-DryRun = Annotated[bool, _dry_run]
-HiddenDryRun = Annotated[bool, hidden(_dry_run)]
+HiddenMemory = Annotated[
+    str | None, typer.Option("--memory", metavar="BYTES", hidden=True, help="E.g. 8GB. Default: the free memory.")
+]
+_scheduler = typer.Option("--scheduler", metavar="ADDRESS", help="Dask cluster, tcp://host:8786. Default: none.")
+Scheduler = Annotated[str | None, _scheduler]
+HiddenScheduler = Annotated[str | None, hidden(_scheduler)]
+HiddenDryRun = Annotated[bool, typer.Option("--dry-run", hidden=True, help="Estimate size, time and memory only.")]
 _keep_extra = typer.Option("--keep-extra", help="Keep columns that splats do not have.")
 KeepExtra = Annotated[bool, _keep_extra]
 HiddenKeepExtra = Annotated[bool, hidden(_keep_extra)]

@@ -30,7 +30,7 @@ from csplat_bench.protocol import Measure, Setup
 from csplat_bench.scenes import find_scene
 from csplat_bench.suites import Case
 
-_POLL_SECONDS = 0.02  # from one look at the journal to the next
+_POLL_SECONDS = 0.02  # from one look at the outputs to the next
 
 _ENDS: dict[str, Callable[[subprocess.Popen[str]], None]] = {
     "interrupt": lambda process: process.send_signal(signal.SIGINT),
@@ -103,7 +103,7 @@ def _loop(csplat: Sequence[str], scenes: Path, out: Path, processes: int) -> dic
 
 
 def _batch(csplat: Sequence[str], scenes: Path, out: Path, workers: int, end: str | None, half: int) -> dict[str, Any]:
-    """Run `csplat batch`; `repeated` counts scenes that it did again although its journal had them as done."""
+    """Run `csplat batch`; `repeated` counts scenes that it did again although their outputs existed."""
     before, begun = _done(out), time.perf_counter()
     words = [*csplat, "batch", str(scenes), str(out), "--workers", str(workers), "--json", "--quiet"]
     process = subprocess.Popen(
@@ -129,18 +129,8 @@ def _heed_interrupts() -> None:
 
 
 def _done(out: Path) -> set[str]:
-    """Return the outputs that the journal has as done."""
-    if not (out / "batch.jsonl").exists():
-        return set()
-    found = set()
-    for line in (out / "batch.jsonl").read_text().splitlines():
-        try:
-            entry = json.loads(line)
-        except ValueError:  # the line is being written
-            continue
-        if entry["state"] == "done":
-            found.add(entry["output"])
-    return found
+    """Return the names of the outputs, which appear when they are complete."""
+    return {one.name for one in out.glob("*.csplat")}
 
 
 def _children(pid: int) -> list[int]:

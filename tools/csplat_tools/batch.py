@@ -1,0 +1,467 @@
+"""Run one command on many scenes, in processes of this machine or on a Dask cluster.
+
+Nothing is recorded between runs. An output that exists, is newer than its scene and passes its checks is not made
+again. Any other file in its place is kept, and the scene fails, unless `force` is given.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import multiprocessing
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+import zlib
+from collections import Counter, deque
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout, suppress
+from dataclasses import asdict, dataclass, replace
+from fnmatch import fnmatch
+from functools import partial
+from importlib.metadata import entry_points
+from io import StringIO
+from pathlib import Path, PurePath, PurePosixPath
+from typing import Any, Literal
+
+from csplat.decoder import open_tiles
+from csplat.disk_files import parse_json, read_text, remove_unfinished, resolve_links, temporary_folder
+from csplat.errors import CsplatError, InputError, missing_package
+from csplat.file_source import read_bytes
+from csplat.formats import formats, open_scene
+from csplat.out_of_core.bucket_workers import open_client
+from csplat.remote_store import is_url
+from csplat.system import core_count, interrupts_held, split_words
+from csplat.types import Progress, null_progress
+from csplat_tools import html_report as html
+from csplat_tools.console import format_bytes
+from csplat_tools.file_streams import is_csplat, write_bytes
+from csplat_tools.scene_files import FOLDER_NAMES, size_on_disk
+
+PAGE = "index.html"
+_MARK = "<!-- csplat batch -->"  # in our pages; a page without it is somebody else's, and is kept
+_MANIFESTS, _COLUMNS = (".jsonl", ".csv", ".txt"), ("path", "output", "options")
+_ONE_LEVEL, _LEVELS = FOLDER_NAMES
+_OTHER_GPU = re.compile(r"_rank[1-9]\d*\.pt$")  # gsplat's checkpoints, which are read with that of rank 0
+#: Commands that take IN and OUT: the ending of OUT, "" if there are several; and if they take only the .csplat files of
+#: a folder (True), all other scenes (False), or both (`None`).
+_COMMANDS: dict[str, tuple[str, bool | None]] = {
+    "encode": (".csplat", False), "decode": (".ply", True), "convert": ("", None), "extract": (".csplat", True),
+    "simplify": (".ply", None), "finetune": (".csplat", None), "train": ("", None), "render": ("", None),
+    "export-html": (".html", None), "sensitivity": (".npz", None),
+}  # fmt: skip
+_STATUS_USAGE, _STATUS_ENDED = 2, 130  # exit status: a wrong command line; a worker that ended on request
+_POLL_SECONDS, _CLEANUP_SECONDS = 0.1, 1.0  # between looks for an interrupt; for a worker to remove unfinished files
+
+
+class CommandLineError(InputError):
+    """The command of a batch does not exist, or its options are invalid."""
+
+    code = "E_USAGE"
+
+
+@dataclass(frozen=True)
+class Task:
+    """A scene, its output within the folder of outputs, and options for it alone. Both may be URLs."""
+
+    source: str
+    output: str
+    options: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """The outcome of one scene: the files of its `Task`, the error in one line, other messages of the command."""
+
+    path: str
+    output: str
+    state: Literal["done", "done_before", "failed"] = "failed"
+    error: str = ""
+    remarks: tuple[str, ...] = ()
+    source_bytes: int | None = None
+    output_bytes: int | None = None
+    splats: int | None = None
+    seconds: float | None = None
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The outcome of a batch. It has no page if another program's file has that name."""
+
+    folder: Path
+    command: tuple[str, ...]
+    results: tuple[SceneResult, ...]
+    has_page: bool = True
+
+    def select(self, *states: str) -> list[SceneResult]:
+        """Return the scenes in these states."""
+        return [one for one in self.results if one.state in states]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return totals and results as JSON-compatible values."""
+        counts = {state: len(self.select(state)) for state in ("done", "done_before", "failed")}
+        return {"scenes": len(self.results), **counts, "results": [asdict(one) for one in self.results]}
+
+
+def run_batch(
+    scenes: str | os.PathLike[str],
+    folder: str | os.PathLike[str],
+    command: Sequence[str] = ("encode",),
+    *,
+    ending: str | None = None,
+    match: str = "*",
+    workers: int | None = None,
+    scheduler: str | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Batch:
+    """Run one command on many scenes, as `csplat batch` does.
+
+    Scripts must guard their own code by `if __name__ == "__main__":`, because worker processes import it.
+
+    Args:
+        scenes: a folder, searched with its subfolders for the endings that `csplat formats` lists; or a manifest: lines
+            of JSON (.jsonl), or of path, output and options (.csv, .txt) with commas, semicolons or tabs between them.
+        folder: the folder for outputs and the page of results; it is made if missing.
+        command: the command with its options: `encode` skips .csplat files, `decode` and `extract` skip all others.
+        ending: file name ending of outputs without a name; `None`: that of the command.
+        match: shell pattern of names within a folder, such as `*.ply`.
+        workers: number of processes, which share the cores; `None`: one per core.
+        scheduler: address of a Dask scheduler, whose workers see the same files and run the scenes instead.
+        force: repeat all scenes, and replace existing files.
+        progress: called with the fraction of the scenes that are finished.
+
+    Raises:
+        CommandLineError, InputError, OSError: command, scenes, folder or scheduler cannot be used.
+    """
+    target, words = Path(folder).absolute(), tuple(command)
+    tasks = find_tasks(Path(scenes).absolute() if scheduler else Path(scenes), words, ending, match, without=target)
+    count, others = min(workers or core_count(), len(tasks)), set(multiprocessing.active_children())
+    threads = max(1, core_count() // count) if scheduler is None else 1
+    make = partial(run_scene, target, words, threads, apart=scheduler is not None, force=force)
+    ended, lost, processes = dict[str, SceneResult](), list[Task](), set(others)
+    sizes = {task: path.stat().st_size for task in tasks if (path := Path(task.source)).is_file()}
+    todo = deque(sorted(tasks, key=lambda task: -sizes.get(task, 0)))  # the largest first
+    running: dict[Future[SceneResult], tuple[Any, Task]] = {}
+    with nullcontext() if scheduler is None else open_client(scheduler) as client, _interrupts_noted() as interrupts:
+        new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker, (threads,))
+        idle = [new() for _ in range(count)] if client is None else [client.get_executor(pure=False)] * len(tasks)
+        try:
+            while (todo or running) and not interrupts:
+                while todo and idle:
+                    executor, task = idle.pop(), todo.popleft()
+                    with interrupts_held():
+                        running[executor.submit(make, task)] = executor, task
+                    processes.update(multiprocessing.active_children())
+                for future in wait(running, _POLL_SECONDS, FIRST_COMPLETED).done:
+                    executor, task = running.pop(future)
+                    if not future.cancelled() and isinstance(future.exception(), BrokenExecutor):
+                        executor.shutdown()
+                        executor, lost = new(), [*lost, task]
+                    idle.append(executor)
+                    ended[task.output] = _result(future, task)
+                    (progress or null_progress)("scenes", len(ended) / len(tasks))
+        finally:
+            lost += [task for _, task in running.values()]
+            _end_processes(processes - others, [target / task.output for task in lost])
+            for executor in {*idle, *(executor for executor, _ in running.values())}:
+                executor.shutdown(wait=client is None)
+    done = Batch(Path(folder), words, tuple(ended[one.output] for one in tasks))
+    page = target / PAGE
+    if page.exists() and not force and _MARK.encode() not in read_bytes(page):
+        return replace(done, has_page=False)
+    target.mkdir(parents=True, exist_ok=True)
+    write_bytes(str(page), make_page(done).encode())
+    return done
+
+
+def _result(future: Future[SceneResult], task: Task) -> SceneResult:
+    """Return the result of a task; if its process was killed or its cluster gave up, its failure."""
+    try:
+        return future.result()
+    except CommandLineError:
+        raise
+    except BrokenExecutor:
+        error = "its process was killed, perhaps for lack of memory: try fewer --workers"
+    except Exception as unexpected:  # noqa: BLE001  # a defect, or of a cluster or a store
+        error = repr(unexpected)
+    return SceneResult(task.source, task.output, error=error)
+
+
+def _end_processes(processes: Collection[Any], outputs: Sequence[Path]) -> None:
+    """End worker processes, and remove what they have left of unfinished outputs."""
+    deadline = time.monotonic() + _CLEANUP_SECONDS
+    for process in processes:
+        process.terminate()
+    for process in processes:
+        process.join(max(0.0, deadline - time.monotonic()))
+        process.kill()
+        process.join()
+        for output in outputs:
+            remove_unfinished(output, process.pid or 0)
+
+
+@contextmanager
+def _interrupts_noted() -> Iterator[list[int]]:
+    """Note interrupts in a list, and raise KeyboardInterrupt only at the end: callbacks and destructors swallow it."""
+    noted, before = list[int](), signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or before in (None, signal.SIG_IGN):
+        yield noted
+        return
+    signal.signal(signal.SIGINT, lambda number, _: noted.append(number))
+    try:
+        yield noted
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if noted:
+        raise KeyboardInterrupt
+
+
+def _begin_worker(threads: int) -> None:
+    """Prepare a worker process: it ends on request, or when this program was killed."""
+
+    def end_with(parent: Any) -> None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(_CLEANUP_SECONDS)
+        os._exit(_STATUS_ENDED)
+
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it, too
+    threading.Thread(target=end_with, args=[multiprocessing.parent_process()], daemon=True).start()
+
+
+def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: str, without: Path) -> list[Task]:
+    """Return the scenes of a folder but one within it, sorted, or those of a manifest; the rest as for `run_batch`."""
+    if not command or command[0] not in _COMMANDS:
+        raise CommandLineError(f"expected a command that can run in batch: {', '.join(_COMMANDS)}")
+    ending = _COMMANDS[command[0]][0] or None if ending is None else ending
+    if ending is None:
+        raise CommandLineError(f"csplat {command[0]} writes several formats: choose one with --ending, such as .spz")
+    path.stat()  # raises an OSError that names it
+    if path.is_dir():
+        found = [(Task(str(path / name), ""), name) for name in _names(path, command[0], match, without)]
+    elif path.suffix.lower() in _MANIFESTS:
+        found = list(_listed(path))
+    else:
+        raise InputError(f"{path} is not a folder, expected a folder or a manifest: {', '.join(_MANIFESTS)}")
+    if not found:
+        raise InputError(f"{path} has no scenes for `csplat {command[0]}`")
+    root = resolve_links(path).name if path.is_dir() else path.stem
+    short = [task.output or _output_name(within, root, ending) for task, within in found]
+    uses = Counter(short)  # outputs that would have one name keep the endings of their sources
+    tasks = [
+        replace(task, output=name if task.output or uses[name] == 1 else _output_name(within, root, ending, whole=True))
+        for (task, within), name in zip(found, short, strict=True)
+    ]
+    output, count = Counter(task.output for task in tasks).most_common(1)[0]
+    if count > 1:
+        raise InputError(f"{output} is the output of {count} scenes: name their outputs in a manifest")
+    return tasks
+
+
+def _names(folder: Path, command: str, match: str, without: Path) -> list[str]:
+    """Return the relative paths of the scenes within a folder, with slashes."""
+    endings = tuple(end for one in formats() if one.open for end in one.suffixes if end.startswith("."))
+    own, found, away = _COMMANDS[command][1], set[Path](), resolve_links(without)
+    for one in folder.rglob("*"):
+        name, relative = one.name.lower(), one.relative_to(folder)
+        is_scene = (name in FOLDER_NAMES or name.endswith(endings)) and own in (None, name.endswith(".csplat"))
+        is_hidden = any(part.startswith(".") for part in relative.parts)
+        if is_scene and not (is_hidden or one.is_dir() or Path(os.path.realpath(one)).is_relative_to(away)):
+            found.add(relative)
+    names = [one.as_posix() for one in sorted(found) if not _is_part(folder, one, found)]
+    return [name for name in names if fnmatch(name, match) or fnmatch(PurePosixPath(name).name, match)]
+
+
+def _is_part(folder: Path, name: Path, names: set[Path]) -> bool:
+    """Return True for one level of a scene, another GPU's part of a checkpoint, or the initial points of a training."""
+    if name.name == "input.ply" and (folder / name).with_name("point_cloud").is_dir():  # INRIA's trainer
+        return True
+    if (gpu := _OTHER_GPU.search(name.name)) and name.with_name(f"{name.name[: gpu.start()]}_rank0.pt") in names:
+        return True
+    return name.name == _ONE_LEVEL and any(above / _LEVELS in names for above in name.parents)
+
+
+def _listed(manifest: Path) -> Iterator[tuple[Task, str]]:
+    """Yield the scenes of a manifest, with paths relative to its folder, and the paths that name their outputs."""
+    lines, is_json = read_text(manifest).splitlines(), manifest.suffix.lower() == ".jsonl"
+    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    separator = next((one for one in ";\t" if one in first and "," not in first), ",")  # as some spreadsheets write
+    columns = list(_COLUMNS)
+    for number, line in enumerate(lines, 1):
+        try:
+            row = [line] if is_json else next(csv.reader([line], skipinitialspace=True, delimiter=separator))
+            cells = [cell.strip() for cell in row]
+            heads = [cell.casefold() for cell in cells]
+            columns = heads if "path" in heads else columns  # a row of names
+            if "path" in heads or not any(cells) or cells[0].startswith(("#", "sep=")):
+                continue
+            fields = parse_json(line) if is_json else dict(zip(columns, cells, strict=False))
+            source, output, options = (fields.get(name) or "" for name in _COLUMNS)
+            words = tuple(split_words(options) if isinstance(options, str) else map(str, options))
+            if not source or (leads_out(output) and not is_url(output)):
+                raise ValueError
+            within = PurePosixPath(source.partition("?")[0]).name if is_url(source) or leads_out(source) else source
+        except (InputError, AttributeError, TypeError, ValueError, csv.Error):
+            where = f"{manifest.name}, line {number}"
+            raise InputError(f"{where}: expected a path, an output inside of OUT, words as options") from None
+        yield Task(source if is_url(source) else str(manifest.parent / source), output, words), within
+
+
+def leads_out(name: str, flavour: type[PurePath] = PurePath) -> bool:
+    """Return True if a relative path leads out of its folder, read as a POSIX path or as one of this system."""
+    return any(path.anchor or ".." in path.parts for path in (PurePosixPath(name), flavour(name)))
+
+
+def _output_name(within: str, root: str, ending: str, *, whole: bool = False) -> str:
+    """Return the source's name with another ending; if `whole`, with one appended."""
+    path = PurePosixPath(within)
+    if path.name in FOLDER_NAMES:
+        return f"{path.parent if path.parent.name else root}{ending}"
+    known = [end for one in formats() for end in one.suffixes if path.name.lower().endswith(end)]
+    stem = path.name if whole or not known else path.name[: -len(max(known, key=len))]
+    return str(path.with_name(stem + ending))
+
+
+def run_scene(folder: Path, command: Sequence[str], threads: int, task: Task, apart: bool, force: bool) -> SceneResult:
+    """Run a command on a scene, unless an earlier run has made the output; if `apart`, in a process of its own.
+
+    Raises:
+        CommandLineError: options of all scenes are invalid.
+    """
+    result, is_remote = SceneResult(task.source, task.output), is_url(task.source) or is_url(task.output)
+    try:
+        with _local(task.source, Path()) as source, _local(task.output, folder) as output:
+            result = replace(result, source_bytes=size_on_disk(source))
+            if output.exists() and not force:
+                splats = _check_existing(output, None if is_remote else source)
+                return replace(result, state="done_before", output_bytes=size_on_disk(output), splats=splats)
+            output.parent.mkdir(parents=True, exist_ok=True)
+            words = [*command, *task.options, "--json", "--quiet", *(["--force"] if force else [])]
+            if command[0] == "encode":
+                words += [] if "--threads" in words else ["--threads", str(threads)]
+                words += ["--resume"] if Path(f"{output}.work").is_dir() else []  # an earlier run was interrupted
+            begun, words = time.perf_counter(), [*words, "--", str(source), str(output)]
+            if apart:
+                program = [sys.executable, "-m", "csplat_tools"]
+                done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)  # noqa: S603
+                status, out, err = done.returncode, done.stdout, done.stderr
+            else:
+                status, out, err = _run_here(words)
+            lines = [line for line in err.splitlines() if line.strip()]
+            result = replace(result, seconds=round(time.perf_counter() - begun, 3), remarks=tuple(lines))
+            if status:
+                error = (lines or [f"status {status}"])[-1].removeprefix("error: ")
+                if status == _STATUS_USAGE and not task.options:
+                    raise CommandLineError(error.partition("; `csplat")[0])
+                error = error.replace(str(source), task.source).replace(str(output), task.output)
+                return replace(result, error=error.removeprefix(f"{task.source}: "), remarks=tuple(lines[:-1]))
+            with suppress(ValueError, TypeError, KeyError):  # commands with another result
+                result = replace(result, splats=json.loads(out)["splats"])
+            return replace(result, state="done", output_bytes=size_on_disk(output))
+    except SystemExit:
+        os._exit(_STATUS_ENDED)  # the pool would catch it, and go on
+    except CommandLineError:
+        raise
+    except CsplatError as error:
+        return replace(result, error=str(error))
+    except OSError as error:
+        name = task.source if is_remote else error.filename or task.source
+        return replace(result, error=f"{name}: {error.strerror or error}")
+
+
+def _run_here(words: list[str]) -> tuple[int, str, str]:
+    """Run a command line in this process; return its status and what it printed on standard output and error."""
+    [program] = entry_points(group="console_scripts", name="csplat")
+    out, err, status, arguments = StringIO(), StringIO(), 0, sys.argv
+    sys.argv, before = ["csplat", *words], signal.signal(signal.SIGTERM, _end)
+    try:
+        with redirect_stdout(out), redirect_stderr(err):
+            program.load()()
+    except SystemExit as end:
+        status = int(end.code or 0)
+        if status == _STATUS_ENDED:
+            raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
+        sys.argv = arguments
+    return status, out.getvalue(), err.getvalue()
+
+
+def _end(*_: object) -> None:
+    for process in multiprocessing.active_children():
+        process.kill()
+    sys.exit(_STATUS_ENDED)  # removes unfinished files
+
+
+def _check_existing(output: Path, source: Path | None) -> int | None:
+    """Return the number of splats of an output, if it is a scene. Its source is `None` if its age is not known.
+
+    Raises:
+        InputError: the output is damaged, or older than its source.
+    """
+    splats = None  # another kind of file, which was complete when it appeared
+    try:
+        if output.is_file() and is_csplat(output):
+            request = open_tiles(output).request  # checks all but the tiles
+            splats = request.header.splat_count
+            for layer in (layer for tile in request.header.all_tiles for layer in tile.layers.values()):
+                if zlib.crc32(request.view[layer.offset : layer.offset + layer.size]) != layer.crc:
+                    raise InputError(f"the chunk at byte {layer.offset} is damaged")
+        elif output.is_dir() or output.name.lower().endswith(tuple(end for one in formats() for end in one.suffixes)):
+            with open_scene(output) as scene:
+                splats = scene.count
+    except (CsplatError, OSError) as error:
+        raise InputError(f"the output exists, and is invalid: {error}; --force replaces it") from None
+    made = output.stat().st_mtime
+    if source is not None and max(one.stat().st_mtime for one in (source, *source.rglob("*"))) > made:
+        raise InputError("the output exists, and is older than the scene: --force replaces it")
+    return splats
+
+
+@contextmanager
+def _local(place: str, folder: Path) -> Iterator[Path]:
+    """Yield the path of a file; one at a URL is downloaded if it exists, and uploaded if it was replaced."""
+    if not is_url(place):
+        yield folder / place
+        return
+    try:
+        from fsspec.core import url_to_fs
+    except ModuleNotFoundError as error:
+        raise missing_package(error, extra="remote") from None
+    with temporary_folder() as temporary:
+        files, path = url_to_fs(place)
+        local = temporary / PurePosixPath(path).name
+        if files.exists(path):
+            files.get_file(path, str(local))
+        before = local.exists() and local.stat().st_ino
+        yield local
+        if local.exists() and local.stat().st_ino != before:
+            files.put_file(str(local), path)
+
+
+def make_page(batch: Batch) -> str:
+    """Return the HTML report: totals, failed scenes, and a table of the others."""
+    done, failed = batch.select("done", "done_before"), batch.select("failed")
+    source, output = (sum(getattr(one, name) or 0 for one in done) for name in ("source_bytes", "output_bytes"))
+    totals = {
+        "command": " ".join(("csplat", *batch.command)),
+        "done": f"{len(done):,} of {len(batch.results):,}",
+        "bytes": f"{format_bytes(source)} -> {format_bytes(output)}",
+    }
+    heads = [html.Head("scene", kind="name"), *map(html.Head, ("splats", "source, kB", "output, kB", "seconds"))]
+    rows = []
+    for one in done:
+        values = one.splats, (one.source_bytes or 0) / 1e3, (one.output_bytes or 0) / 1e3, one.seconds
+        texts = ("" if value is None else f"{value:,.1f}".removesuffix(".0") for value in values)
+        rows.append([(one.output, one.path), *zip(texts, values, strict=True)])
+    errors = html.table(("scene", "error"), [(one.path, one.error) for one in failed], words=(1,)) if failed else ""
+    table = html.sortable_table(heads, rows) if rows else ""
+    parts = [_MARK, html.definitions(totals), html.section("Failed", errors), html.section("Done", table)]
+    return html.document(f"{batch.folder.resolve().name}: {len(batch.results):,} scenes", parts)

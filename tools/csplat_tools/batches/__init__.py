@@ -1,1 +1,0 @@
-"""Many scenes, one command: `csplat batch`."""
