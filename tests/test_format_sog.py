@@ -209,36 +209,48 @@ def test_the_finest_level_is_read_by_default(tmp_path):
         csplat.read(path)
 
 
-def zipped_folder(path, folder, within="", more=()):
-    """Zip all files of a folder and some more."""
-    files = {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
-    return zipped(path, {**{within + name: data for name, data in files.items()}, **dict(more)})
+def all_of(folder):
+    """Return all files of a folder by name."""
+    return {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
 
 
 @pytest.mark.parametrize("within", ["", "a/b/"])
 def test_levels_in_a_zip_equal_those_in_a_folder(tmp_path, within):
     folder = levels(tmp_path)
     junk = {"__MACOSX/meta.json": b"", "__MACOSX/0_0/._meta.json": b""}
-    path = zipped_folder(tmp_path / "a.zip", folder, within, junk)
+    path = zipped(tmp_path / "a.zip", {within + name: data for name, data in all_of(folder).items()} | junk)
     for level in (0, 1):
         with open_scene(path, level=level) as scene, open_scene(folder, level=level) as expected:
             assert (expected.count, expected.levels) == (scene.count, scene.levels)
             assert np.array_equal(expected.model().means, scene.model().means)
 
 
-def test_a_zip_of_several_scenes_is_refused(tmp_path):
+def test_zips_of_several_scenes_and_of_other_programs_are_refused(tmp_path):
     folder, other = levels(tmp_path), files_of(*splats())
-    two = {f"{folder}/{name}": data for folder in ("one", "two") for name, data in other.items()}
-    more = {f"b/{name}": data for name, data in other.items()}
-    bundle = {"lod-meta.json": (folder / "lod-meta.json").read_bytes().replace(b"0_0/meta.json", b"0_0.sog")}
-    for path, message in (
-        (zipped(tmp_path / "b.zip", two), r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
-        (zipped_folder(tmp_path / "c.zip", folder, more=more), r"2 scenes, .*b/meta.json, lod-meta.json"),
-        (zipped_folder(tmp_path / "d.zip", folder, more=bundle), r"0_0/meta.json, lod-meta.json"),
-        (zipped(tmp_path / "e.sog", {"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}), "2 scenes"),
-    ):
+    first = (folder / "lod-meta.json").read_bytes()
+    foreign = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
+    not_sog = "meta.json is not the one of SOG, which has means, quats, scales, sh0; .*"
+    within = {"lod-meta.json": first.replace(b"0_0/meta.json", b"0_0.sog"), "0_0/meta.json": None}
+    scene = {f"a/{name}": data for name, data in other.items()}
+    for files, message in (
+        ({f"{one}/{name}": data for one in ("one", "two") for name, data in other.items()},
+            r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
+        ({f"b/{name}": data for name, data in other.items()} | all_of(folder), r"2 scenes, .*b/meta.json, lod-meta"),
+        (all_of(folder) | {"lod-meta.json": within["lod-meta.json"]}, r"0_0/meta.json, lod-meta.json"),
+        (all_of(folder) | within, r"0_0.sog is a zip within a zip: unpack a.zip"),
+        ({"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}, "2 scenes"),
+        (scene | {"scene.ply": b"ply"}, r"it contains 2 scenes, expected one \(a/meta.json, scene.ply\)"),
+        (foreign, not_sog + r"a zip that contains room\.ply: unzip it"),
+    ):  # fmt: skip
         with pytest.raises(InputError, match=message):
-            csplat.read(path)
+            csplat.read(zipped(tmp_path / "a.zip", {name: data for name, data in files.items() if data is not None}))
+    report = []
+    assert COUNT == len(csplat.read(zipped(tmp_path / "a.zip", {**scene, "a/b/scene.PLY": b"ply"}), report=report))
+    assert [("other-scenes", "note", "the zip also holds a/b/scene.PLY: not read")] == [
+        (one.id, one.kind, one.text) for one in report
+    ]
+    with pytest.raises(InputError, match=not_sog + r"a folder, not a scene: name room\.ply"):
+        csplat.read(foldered(tmp_path / "foreign", foreign))
     foldered(folder, other)
     with pytest.raises(InputError, match=r"lod-meta.json, meta.json\): name one of these files"):
         csplat.read(folder)
@@ -246,25 +258,12 @@ def test_a_zip_of_several_scenes_is_refused(tmp_path):
     assert 13 == len(csplat.read(folder / "lod-meta.json"))
 
 
-def test_other_scenes_in_a_zip_are_reported(tmp_path):
-    files = {f"a/{name}": data for name, data in files_of(*splats()).items()}
-    report = []
-    assert 5 == len(csplat.read(zipped(tmp_path / "a.zip", {**files, "a/b/scene.PLY": b"ply"}), report=report))
-    assert [("other-scenes", "note")] == [(one.id, one.kind) for one in report]
-    assert "the zip also holds a/b/scene.PLY: not read" == report[0].text
-    with pytest.raises(InputError, match=r"it contains 2 scenes, expected one \(a/meta.json, scene.ply\)"):
-        csplat.read(zipped(tmp_path / "a.zip", {**files, "scene.ply": b"ply"}))
-
-
-def test_the_list_of_files_may_contain_backslashes(tmp_path):
+def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     folder = levels(tmp_path, filenames=[rf"{name}\meta.json" for name in ("0_0", "0_1", "1_0")])
-    for path in (folder, zipped_folder(tmp_path / "a.zip", folder)):
+    for path in (folder, zipped(tmp_path / "a.zip", all_of(folder))):
         report = []
         assert 13 == len(csplat.read(path, report=report))
         assert ["backslashes in filenames, read as slashes"] == [one.text for one in report]
-
-
-def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     files = files_of(*splats())
     expected = csplat.read(zipped(tmp_path / "a.sog", files))
     loud = {name.upper() if name == "meta.json" else name: data for name, data in files.items()}
@@ -282,22 +281,6 @@ def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     two = {**{name: data for name, data in files.items() if name != "sh0.webp"}, "SH0.webp": b"", "Sh0.webp": b""}
     with pytest.raises(InputError, match=r"SH0\.webp and Sh0\.webp would both be sh0\.webp"):
         csplat.read(zipped(tmp_path / "f.sog", two))
-
-
-def test_a_meta_json_of_another_program_is_refused(tmp_path):
-    files = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
-    message = "meta.json is not the one of SOG, which has means, quats, scales, sh0; .*"
-    with pytest.raises(InputError, match=message + r"a zip that contains room\.ply: unzip it"):
-        csplat.read(zipped(tmp_path / "a.zip", files))
-    with pytest.raises(InputError, match=message + r"a folder, not a scene: name room\.ply"):
-        csplat.read(foldered(tmp_path / "a", files))
-
-
-def test_a_zip_within_a_zip_is_refused(tmp_path):
-    path = levels(tmp_path, filenames=["0_0.sog", "0_1/meta.json", "1_0/meta.json"])
-    (path / "0_0" / "meta.json").unlink()
-    with pytest.raises(InputError, match=r"0_0.sog is a zip within a zip: unpack a.zip"):
-        csplat.read(zipped_folder(tmp_path / "a.zip", path))
 
 
 @pytest.mark.parametrize(("changes", "message"), [

@@ -100,19 +100,58 @@ def assert_refused(path, cases):
     assert [] == failures(cases, check)
 
 
-def test_a_good_file_has_no_findings(path):
-    put(path, good_rows())
-    assert [] == lint_ply(path)
-    assert 5 == len(read_ply(path, strict=True))
+def retyped(kind, names, **columns):
+    rows = good_rows().astype([(name, kind if name in names else "<f4") for name in NAMES])
+    for name, values in columns.items():
+        rows[name] = values
+    return rows
+
+
+GOOD_SH = np.stack([good_rows()[f"f_dc_{channel}"] for channel in range(3)], 1)
+BAD_VALUES = [("x", np.nan), ("x", -np.inf), ("f_dc_1", np.inf), ("f_rest_8", np.nan), ("f_rest_8", -np.inf),
+    ("scale_2", np.nan), ("scale_2", np.inf), ("rot_3", np.nan), ("rot_3", np.inf)]  # fmt: skip
+VALUES = {  # rows, findings, and an array of the model that is read
+    "good": (good_rows(), {}, "sh0", GOOD_SH),
+    "normals": (good_rows(ny=[np.nan, 1, 1, 0, 0]), {"nonzero-normals": 3}, "sh0", GOOD_SH),
+    "large means": (good_rows(x=3e38, y=0, z=0), {}, "means", [[3e38, 0, 0]] * 5),
+    "opacities": (good_rows(opacity=[np.nan, np.inf, -np.inf, 0, 0]), {"nonfinite-rows": 1, "infinite-logits": 2},
+        "opacities", [1, 0, 0.5, 0.5]),
+    "large doubles": (retyped("<f8", ["x", "f_dc_0"], x=[0, 1e300, 2, 3, 4], f_dc_0=[0, 1, -1e300, 3, 4]),
+        {"nonfinite-rows": 2, "double-means": 3}, "opacities", alpha_of_logits(good_rows()["opacity"][[0, 3, 4]])),
+    "integers": (retyped("<i4", "xyz"), {"double-means": 5}, "means", [[x] * 3 for x in range(5)]),
+    "zero rotations": (good_rows(rot_0=[0, 0, 1, 1, 1]), {"zero-quats": 2}, "quats", [[1, 0, 0, 0]] * 5),
+    **{f"rotations of {length}": (good_rows(rot_0=0, rot_2=-length), {"unnormalised-quats": 5},
+        "quats", [[0, 0, -1, 0]] * 5) for length in (1e-40, 0.006, 2.0, 1e30)},
+    **{f"{name} of {value}": (good_rows(**{name: [0, value, 0, value, 0]}), {"nonfinite-rows": 2},
+        "opacities", alpha_of_logits(good_rows()["opacity"][::2])) for name, value in BAD_VALUES},
+}  # fmt: skip
+
+
+def test_unusual_values_are_counted_and_repaired_unless_reading_is_strict(path):
+    def check(case):
+        rows, findings, name, values = case
+        put(path, rows)
+        assert findings == counts(path)
+        assert np.array_equal(np.asarray(values, np.float32), getattr(read_ply(path), name))
+        repaired = [one for one in ("nonfinite-rows", "zero-quats") if one in findings]
+        assert repaired == [one.id for one in lint_ply(path) if one.kind == "repair"]
+        if not repaired:
+            assert 5 == len(read_ply(path, strict=True))
+        for one in repaired:
+            with pytest.raises(InputError, match=f"{one}: {findings[one]} (splats?|rotations) "):
+                read_ply(path, strict=True)
+
+    assert [] == failures(VALUES, check)
 
 
 def test_trailing_bytes_are_ignored_and_counted(path):
-    put(path, good_rows(), bytes(14))
-    (finding,) = lint_ply(path)
-    assert ("trailing-bytes", 14, "repair", True) == (finding.id, finding.count, finding.kind, finding.repairable)
-    assert 5 == len(read_ply(path))
+    put(path, good_rows(x=[np.nan, 1, 2, 3, 4]), bytes(14))
+    assert ("repair", True) == (found(path)["trailing-bytes"].kind, found(path)["trailing-bytes"].repairable)
+    assert 4 == len(read_ply(path))
+    report = []
     with pytest.raises(InputError, match="trailing-bytes: 14 bytes"):
-        read_ply(path, strict=True)
+        read_ply(path, strict=True, report=report)
+    assert {"trailing-bytes", "nonfinite-rows"} >= {one.id for one in report} >= {"trailing-bytes"}
 
 
 def test_rows_damaged_by_a_text_mode_transfer_are_refused(path):
@@ -139,20 +178,6 @@ def test_lines_after_and_before_the_declared_count_are_counted(path, text, count
     assert findings == {name: one for name, one in counts(path).items() if name != "unusual-rows"}
     if "truncated" not in findings:
         assert 4 == len(read_ply(path))
-
-
-@pytest.mark.parametrize(("name", "value"), [
-    ("x", np.nan), ("x", -np.inf), ("f_dc_1", np.inf), ("f_rest_8", np.nan), ("f_rest_8", -np.inf),
-    ("scale_2", np.nan), ("scale_2", np.inf), ("rot_3", np.nan), ("rot_3", np.inf),
-])  # fmt: skip
-def test_rows_that_are_not_finite_are_dropped_and_counted(path, name, value):
-    rows = good_rows()
-    rows[name][[1, 3]] = value
-    put(path, rows)
-    assert 2 == counts(path)["nonfinite-rows"]
-    assert [0.0, 2.0, 4.0] == read_ply(path).means[:, 0].tolist()
-    with pytest.raises(InputError, match="nonfinite-rows: 2 splats"):
-        read_ply(path, strict=True)
 
 
 def test_non_finite_rows_are_dropped_in_every_block(path):
@@ -192,41 +217,6 @@ def test_sizes_of_0_are_read_from_arrays(make_model):
     sizes["scales"][0, 0] = -1
     with pytest.raises(InputError, match="at least 0"):
         csplat.from_gsplat(sizes, form="activated")
-
-
-def test_a_nan_opacity_is_a_defect_and_an_infinite_one_is_not(path):
-    put(path, good_rows(opacity=[np.nan, np.inf, -np.inf, 0, 0]))
-    assert {"nonfinite-rows": 1, "infinite-logits": 2} == counts(path)
-    assert "note" == found(path)["infinite-logits"].kind
-    assert [1.0, 0.0, 0.5, 0.5] == read_ply(path).opacities.tolist()
-
-
-@pytest.mark.parametrize("value", [1, np.nan])
-def test_normals_are_noted_and_dropped(path, value):
-    put(path, good_rows(ny=[value] * 3 + [0] * 2))
-    assert {"nonzero-normals": 3} == counts(path)
-    assert 5 == len(read_ply(path, strict=True))
-
-
-def test_large_finite_values_are_accepted(path):
-    put(path, good_rows(x=3e38))
-    assert [] == lint_ply(path)
-    assert [float(np.float32(3e38))] * 5 == read_ply(path).means[:, 0].tolist()
-
-
-def test_zero_rotations_become_the_identity(path):
-    put(path, good_rows(rot_0=[0, 0, 1, 1, 1]))
-    assert {"zero-quats": 2} == counts(path)
-    assert [[1, 0, 0, 0]] * 5 == read_ply(path).quats.tolist()
-    with pytest.raises(InputError, match="zero-quats: 2 rotations"):
-        read_ply(path, strict=True)
-
-
-@pytest.mark.parametrize("length", [1e-40, 0.006, 2.0, 1e30])
-def test_rotations_of_any_length_are_normalised(path, length):
-    put(path, good_rows(rot_0=0, rot_2=-length))
-    assert {"unnormalised-quats": 5} == counts(path)
-    assert [[0, 0, -1, 0]] * 5 == read_ply(path, strict=True).quats.tolist()
 
 
 def test_two_scales_are_read_as_discs(path):
@@ -398,11 +388,6 @@ def test_extreme_filters_stay_finite(path):
     np.testing.assert_allclose(model.scales[:, 0], [np.log(1e38), 80, np.log(1e-30), np.log(2) / 2], rtol=1e-6)
     assert (0, alpha_of_logits(rows["opacity"])[1]) == (model.opacities[0], model.opacities[1])
     np.testing.assert_allclose(model.opacities[3], alpha_of_logits(rows["opacity"])[3] / 2**1.5, rtol=1e-6)
-
-
-def test_integer_positions_are_reported(path):
-    put(path, good_rows().astype([(name, "<i4" if name in "xyz" else "<f4") for name in NAMES]))
-    assert "positions are integers: 5 means are float32" in found(path)["double-means"].text
 
 
 @pytest.mark.parametrize(("changes", "noted"), [
@@ -597,22 +582,6 @@ def test_other_elements_are_named_and_dropped(path):
     assert np.array_equal(read_ply(path).means[:, 0], rows["x"])
     with pytest.raises(InputError, match=r"other-elements: .* face"):
         read_ply(path, strict=True)
-
-
-def test_doubles_beyond_float32_are_dropped(path):
-    rows = good_rows().astype([(name, "<f8" if name in ("x", "f_dc_0") else "<f4") for name in NAMES])
-    rows["x"][1], rows["f_dc_0"][2] = 1e300, -1e300
-    put(path, rows)
-    assert 2 == counts(path)["nonfinite-rows"]
-    assert 3 == len(read_ply(path))
-
-
-def test_the_report_names_repairs_even_if_strict_reading_fails(path):
-    put(path, good_rows(x=[np.nan, 1, 2, 3, 4]), b"!")
-    report = []
-    with pytest.raises(InputError):
-        read_ply(path, strict=True, report=report)
-    assert "trailing-bytes" in {one.id for one in report}
 
 
 FACES = ["element face 0", "property list uchar int vertex_indices"]

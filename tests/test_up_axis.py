@@ -33,7 +33,6 @@ pytest.importorskip("scipy", reason="the trainer needs scipy: pip install 'cspla
 pytest.importorskip("PIL", reason="pictures need pillow: pip install 'csplat[render]'")
 
 
-from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.up_estimate import estimate_up, with_estimated_up
@@ -379,15 +378,3 @@ def upright(cameras, up):
     for camera in cameras:
         assert abs(camera.viewmat[0, :3] @ direction) < 1e-6
         assert -camera.viewmat[1, :3] @ direction > 0.5
-
-
-@pytest.mark.slow
-def test_a_rotated_scene_with_its_up_has_the_same_orbit(make_model):
-    model = make_model(60, 1, scales=np.full((60, 3), -0.7, np.float32) - np.arange(3, dtype=np.float32))
-    lying = rotate_scene(model, TURN)
-    marked = [replace(one, metadata={"up": up}) for one, up in ((model, [0, -1, 0]), (lying, [0, 0, 1]))]
-    films = [[render(one, camera).rgb for camera in orbit_cameras(one, 3, 64, 48)] for one in (*marked, lying)]
-    for before, after, guessed in zip(*films, strict=True):
-        # A loose bound: the orbit goes around points that are drawn along the axes of the splats, which have changed.
-        assert np.abs(after - before).mean() < 0.15 * np.abs(before).mean()
-        assert np.abs(guessed - before).mean() > 0.3 * np.abs(before).mean()
