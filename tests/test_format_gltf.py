@@ -15,7 +15,6 @@ from csplat.editing.transform import rotate_scene
 from csplat.errors import InputError
 from csplat.formats import formats, lint_file
 from csplat.formats.gltf import gltf_document
-from csplat.model import SplatModel
 
 ARRAYS = ("means", "quats", "opacities", "sh0", "shN")
 PREFIX = "KHR_gaussian_splatting"
@@ -147,20 +146,14 @@ def test_a_written_scene_reads_back(tmp_path, make_model, degree):
     csplat.write(tmp_path / "b.glb", back)
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
     assert set(ARRAYS) <= set(FORMAT.exact)
+    colours = (np.float32([0.0, 0.5, 1.0]) - 0.5) / np.float32(0.28209479)  # as of points, for other programs
+    csplat.write(tmp_path / "c.glb", replace(model, sh0=np.tile(colours, (50, 1)), opacities=np.full(50, 0.2, "f4")))
+    assert bytes([0, 55, 255, 51]) * 50 in (tmp_path / "c.glb").read_bytes()
     csplat.write(tmp_path / "a.glb", replace(model, unit_metres=0.5, coordinate_system="LUF", origin=(0.0, 0.0, 0.0)))
     metres = checked(tmp_path / "a.glb")
     assert 1.0 == metres.unit_metres
     assert (model.means * np.float32(0.5) == metres.means).all()
     assert np.abs(model.scales + np.log(0.5) - metres.scales).max() < 1e-6
-
-
-def test_colours_of_points_are_those_of_their_splats(tmp_path):
-    sh0 = (np.float32([[0.0, 0.5, 1.0]]) - 0.5) / np.float32(0.28209479)
-    one = SplatModel(
-        np.zeros((1, 3), np.float32), np.float32([[1, 0, 0, 0]]), np.zeros((1, 3), np.float32), np.float32([0.2]), sh0
-    )
-    csplat.write(tmp_path / "a.glb", one)
-    assert bytes([0, 55, 255, 51]) in (tmp_path / "a.glb").read_bytes()
 
 
 def test_buffers_may_be_text_or_files_next_to_it(tmp_path):
@@ -325,34 +318,27 @@ def many(count=40, **changed):
 
 
 def test_logarithms_of_scales_are_recognised_by_their_sign(tmp_path):
-    arrays = many()
+    path, arrays = tmp_path / "a.glb", many()
     right = checked(glb(*document(arrays)))
     logs = np.log(arrays[f"{PREFIX}:SCALE"])
-    said, data = document(many(SCALE=logs), asset={"version": "2.0", "generator": "writer 1"})
-    found, model = linted(tmp_path / "a.glb", said, data)
+    found, model = linted(path, *document(many(SCALE=logs), asset={"version": "2.0", "generator": "writer 1"}))
     assert ("repair", 40) == (found["log-scales"].kind, found["log-scales"].count)
     assert "written by writer 1" in found["log-scales"].text
     np.testing.assert_allclose(right.scales, model.scales, atol=1e-6)
     with pytest.raises(InputError, match="log-scales"):
-        csplat.read(tmp_path / "a.glb", strict=True)
-
-
-@pytest.mark.parametrize("values", [[-0.5], [-40.0] * 39])
-def test_negative_scales_other_than_logarithms_are_refused(tmp_path, values):
-    scales = many()[f"{PREFIX}:SCALE"]
-    scales[1 : 1 + len(values), 2] = values
-    (tmp_path / "a.glb").write_bytes(glb(*document(many(SCALE=scales))))
-    with pytest.raises(InputError, match=rf"SCALE of splat 1 is {values[0]:g}, expected"):
-        csplat.read(tmp_path / "a.glb")
-    assert ["error"] == [one.kind for one in lint_file(tmp_path / "a.glb") if one.id == "negative-scales"]
-
-
-def test_scales_of_large_splats_are_no_logarithms(tmp_path):
+        csplat.read(path, strict=True)
     for writer, findings in (("other", []), ("splat-transform 2.3.1", ["unclear-scales"])):
         asset = {"version": "2.0", "generator": writer}
-        found, model = linted(tmp_path / "a.glb", *document(many(SCALE=np.full((40, 3), 5, "<f4")), asset=asset))
+        found, model = linted(path, *document(many(SCALE=np.full((40, 3), 5, "<f4")), asset=asset))
         assert findings == list(found)
         np.testing.assert_allclose(np.log(5), model.scales, rtol=1e-6)
+    for values in ([-0.5], [-40.0] * 39):  # neither sizes nor logarithms
+        scales = many()[f"{PREFIX}:SCALE"]
+        scales[1 : 1 + len(values), 2] = values
+        path.write_bytes(glb(*document(many(SCALE=scales))))
+        with pytest.raises(InputError, match=rf"SCALE of splat 1 is {values[0]:g}, expected"):
+            csplat.read(path)
+        assert ["error"] == [one.kind for one in lint_file(path) if one.id == "negative-scales"]
 
 
 def test_opacities_out_of_range_are_clipped_read_as_logits_or_refused(tmp_path):

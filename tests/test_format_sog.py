@@ -168,6 +168,7 @@ def test_leaves_are_numbered_in_the_order_of_the_splats(tmp_path):
         read_leaf_numbers(foldered(tmp_path / "b", files_of(*splats())))
 
 
+@pytest.mark.slow
 def test_levels_of_streamed_sog_become_nodes_of_a_file(tmp_path):
     path, out = levels(tmp_path), tmp_path / "out.csplat"
     encode_file(str(path), str(out), csplat.EncodeOptions(), levels=1)

@@ -153,29 +153,27 @@ def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path, make_model)
 def test_scenes_of_other_programs_are_named_with_the_way_out(tmp_path, make_model):
     png = {"shape": [50, 3], "dtype": "float32", "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
     meta = json.dumps({"means": png, "scales": png, "opacities": {**png, "mins": 0}, "sh0": png})
-    for folder, name, text in (
-        ("png", "meta.json", meta), ("lcc", "scene.lcc", '{"version": "1", "cellLengthX": 30, "fileType": "Quality"}'),
-        ("lcc", "data.bin", "\1" * 64), ("lcc2", "scene.lcc2", '{"version": "2.0", "splatType": "sog", "root": {}}'),
-        ("bare", "renamed.json", '{"version": "1.1", "cellLengthX": 30}'), ("bare", "a.drc", "DRACO\2\2"),
-        ("bare", "a.splatv", "Kg\0\0\1\2\3"),
-    ):  # fmt: skip
-        (tmp_path / folder).mkdir(exist_ok=True)
-        (tmp_path / folder / name).write_text(text)
-    with zipfile.ZipFile(tmp_path / "png.zip", "w") as archive:
-        archive.writestr("compression/meta.json", meta)
-    wanted = {
-        "png": "PNG compression, .*PngCompr", "png/meta.json": "PNG compression", "png.zip": "PNG compression",
-        "lcc": "is LCC, .*splat-transform", "lcc/scene.lcc": "is LCC, ", "lcc/data.bin": ".* takes the .lcc file",
-        "lcc2": "is LCC2, .* in data/3dgs", "lcc2/scene.lcc2": "is LCC2, ", "bare/renamed.json": "is LCC, ",
-        "bare/a.drc": "is Draco, a mesh", "bare/a.splatv": "splats that move",
+    cases = {  # a file and its text, and what is said of it; an empty name stands for the folder
+        "png/meta.json": (meta, "PNG compression"), "png/": (None, "PNG compression, .*PngCompr"),
+        "png.zip": (zip_of([("compression/meta.json", meta)]), "PNG compression"),
+        "lcc/scene.lcc": ('{"version": "1", "cellLengthX": 30, "fileType": "Quality"}', "is LCC, "),
+        "lcc/data.bin": ("\1" * 64, ".* takes the .lcc file"), "lcc/": (None, "is LCC, .*splat-transform"),
+        "lcc2/scene.lcc2": ('{"version": "2.0", "splatType": "sog", "root": {}}', "is LCC2, "),
+        "lcc2/": (None, "is LCC2, .* in data/3dgs"),
+        "bare/renamed.json": ('{"version": "1.1", "cellLengthX": 30}', "is LCC, "),
+        "bare/a.drc": ("DRACO\2\2", "is Draco, a mesh"), "bare/a.splatv": ("Kg\0\0\1\2\3", "splats that move"),
     }  # fmt: skip
+    for name, (text, _) in cases.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        if text is not None:
+            (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
 
     def check(case):
         name, message = case
         with pytest.raises(InputError, match=message):
             csplat.read(tmp_path / name)
 
-    assert not failures({one[0]: one for one in wanted.items()}, check)
+    assert [] == failures({name: (name, message) for name, (_, message) in cases.items()}, check)
     csplat.write(tmp_path / "sog" / "meta.json", make_model(5, 0))
     assert "sog" == detect_format(tmp_path / "sog").name
 
@@ -203,10 +201,10 @@ def test_a_zip_is_recognised_by_its_contents(tmp_path):
         csplat.read(tmp_path / "c.npz")
 
 
-def test_insisting_counts_where_the_content_is_that_of_no_format(tmp_path, make_model):
+def test_a_given_format_counts_where_the_content_is_that_of_none(tmp_path, make_model):
     model = make_model(9, 0)
-    csplat.write(tmp_path / "a.splat", model)
-    csplat.write(tmp_path / "a.ply", model)
+    for name in ("a.splat", "a.ply"):
+        csplat.write(tmp_path / name, model)
     (tmp_path / "b").write_bytes((tmp_path / "a.splat").read_bytes())
     with pytest.raises(InputError, match="--from splat reads it"):
         csplat.read(tmp_path / "b")
@@ -215,15 +213,10 @@ def test_insisting_counts_where_the_content_is_that_of_no_format(tmp_path, make_
         assert len(csplat.read(tmp_path / "a.ply")) == 9
     with pytest.raises(InputError, match="the format is 'xyz'"), assume_format("xyz"):
         pass
-
-
-def test_names_that_no_format_has_are_refused(tmp_path, make_model):
-    with pytest.raises(InputError, match=r"expected one of .*\.ply"):
-        csplat.write(tmp_path / "a.xyz", make_model(3, 0))
     with pytest.raises(InputError, match=r"expected one of .*\bply\b"):
         csplat.read(tmp_path, format="xyz")
-    with pytest.raises(InputError, match="not a scene"):
-        csplat.read(tmp_path)
+    with pytest.raises(InputError, match=r"expected one of .*\.ply"):
+        csplat.write(tmp_path / "a.xyz", model)
 
 
 def test_a_scene_in_memory_is_read_in_blocks(large):
@@ -286,6 +279,7 @@ def installed(tmp_path):
     return run
 
 
+@pytest.mark.slow
 def test_a_format_of_another_package_is_loaded_only_when_it_is_needed(installed, tmp_path, make_model):
     (tmp_path / "a.lcc").write_bytes(bytes(32))
     csplat.write(tmp_path / "a.ply", make_model(3, 0))
@@ -295,15 +289,15 @@ def test_a_format_of_another_package_is_loaded_only_when_it_is_needed(installed,
     assert "False\n1\nTrue" == installed(statement, formats="lcc = other_plugin:FORMAT")
 
 
+@pytest.mark.slow
 def test_a_plug_in_that_cannot_be_loaded_is_left_out_with_a_warning(installed):
     statement = "import warnings\nwith warnings.catch_warnings(record=True) as seen:\n"
     statement += "    names = [one.name for one in csplat.formats.formats()]\nprint(names[0], seen[-1].message)"
-    found = installed(statement, formats="lcc = other_plugin:NOTHING")
-    assert found.startswith(
-        "compressed-ply other_plugin:NOTHING, installed as 'lcc' of csplat.formats, cannot be loaded: module"
-    )
+    message = "compressed-ply other_plugin:NOTHING, installed as 'lcc' of csplat.formats, cannot be loaded: module"
+    assert installed(statement, formats="lcc = other_plugin:NOTHING").startswith(message)
 
 
+@pytest.mark.slow
 def test_notebooks_use_the_display_that_is_installed(installed):
     model = "csplat.SplatModel(np.zeros((2, 3), np.float32), np.array([[1, 0, 0, 0]] * 2, np.float32), "
     model += "np.zeros((2, 3), np.float32), np.ones(2, np.float32), np.zeros((2, 3), np.float32))"
@@ -333,12 +327,12 @@ def test_a_model_and_an_opened_file_show_themselves(make_model, tmp_path, monkey
 
 
 def test_a_large_scene_is_reduced_to_the_largest_splats_with_a_note(make_model):
-    model = make_model(3000, 0)
+    model = make_model(1200, 0)
     model.opacities[::3] = 0.0
-    shown = scene_html(model, most_splats=1000)
-    assert 1000 == len(scene_in(shown))
-    assert "1,000 of 3,000 splats, the most visible ones" in shown
-    kept = most_visible(model, 1000)
+    shown = scene_html(model, most_splats=200)
+    assert 200 == len(scene_in(shown))
+    assert "200 of 1,200 splats, the most visible ones" in shown
+    kept = most_visible(model, 200)
     assert kept.opacities.min() > 0.0
     areas = np.exp(np.sort(kept.scales, axis=1)[:, 1:].sum(axis=1))
     assert np.median(areas) > np.median(np.exp(np.sort(model.scales, axis=1)[:, 1:].sum(axis=1)))
@@ -381,16 +375,6 @@ def test_an_archive_has_arrays_and_facts(tmp_path):
         read_archive(tmp_path / "absent.npz", KIND)
 
 
-def test_damage_of_a_deflated_file_is_named(tmp_path):
-    np.save(tmp_path / "a.npy", np.random.default_rng(1).normal(size=400))
-    path, member = tmp_path / "a.npz", ("facts.npy", (tmp_path / "a.npy").read_bytes())
-    data = zip_of([member], zipfile.ZIP_DEFLATED)
-    for place in range(60, 1000, 37):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
-        with pytest.raises(InputError, match=r"a\.npz is not a file of tests"):
-            read_archive(path, KIND)
-
-
 def npy(header, data=b"", version=1):
     size = struct.pack("<H" if version == 1 else "<I", len(header))
     return b"\x93NUMPY" + bytes([version, 0]) + size + header + data
@@ -421,9 +405,13 @@ def npz_of(array):
     return out.getvalue()
 
 
+DEFLATED = zip_of([("a.npy", npy(header_of("'<f8'", "(400,)"), np.random.default_rng(1).normal(size=400).tobytes()))],
+    zipfile.ZIP_DEFLATED)  # fmt: skip
 LARGE = zip_of([("a.npy", npy(header_of(shape="(300000000,)"), bytes(1000)))], zipfile.ZIP_DEFLATED)
 HOSTILE_ARCHIVES = {
     "no array": (zip_of([("facts.npy", b"hello")]), "facts is not an array"),
+    **{f"damage at {place}": (DEFLATED[:place] + bytes([DEFLATED[place] ^ 0x55]) + DEFLATED[place + 1 :], "")
+        for place in range(60, 1000, 74)},
     "an open bracket": (zip_of([("a.npy", BROKEN.ljust(128, b" "))]), ""),
     "a later version": (zip_of([("a.npy", b"\x93NUMPY\x09\x09")]), ""),
     "no bytes": (zip_of([("a.npy", b"")]), ""),
