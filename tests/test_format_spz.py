@@ -189,9 +189,9 @@ def test_written_files_read_back_within_half_a_step(tmp_path, make_model, name, 
 
 
 def test_values_beyond_the_range_are_clipped(tmp_path, make_model):
-    model = make_model(2, 1, sh0=np.array([[9, -9, 0]] * 2, "f4"), shN=np.full((2, 3, 3), [2, -2, 0.99], "f4"))
+    sh0, shN = np.array([[9, -9, 0]] * 2, "f4"), np.full((2, 3, 3), [2, -2, 0.99], "f4")
     scales, opacities = np.array([[-30, 30, 0]] * 2, "f4"), np.array([0, 1], "f4")
-    model = csplat.SplatModel(**{**vars(model), "scales": scales, "opacities": opacities, "coordinate_system": "RUB"})
+    model = make_model(2, 1, sh0=sh0, shN=shN, scales=scales, opacities=opacities, coordinate_system="RUB")
     csplat.write(tmp_path / "a.spz", model)
     found = checked(tmp_path / "a.spz")
     assert [-10, 5.9375, 0] == found.scales[0].tolist()
