@@ -51,6 +51,20 @@ def test_packed_words_are_read(tmp_path):
     assert {"comments": ["made by hand"]} == model.metadata
 
 
+def test_old_and_empty_elements_and_rounded_bounds_are_read(tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(built([ROW[:12]], [WORD], colours=False))  # without bounds of colours
+    np.testing.assert_allclose(csplat.read(path).sh0[0] * 0.28209479 + 0.5, [1, 0, 1], atol=1e-6)
+    data = built([ROW], [WORD], [()], rest=0)  # as gsplat writes it
+    assert b"element sh 1\nend_header\n" in data
+    path.write_bytes(data)
+    model = csplat.read(path)
+    assert (1, 0) == (len(model), model.sh_degree)
+    above = float(np.nextafter(np.float32(4), np.float32(9)))
+    path.write_bytes(built([[above, *ROW[1:]]], [WORD]))
+    assert [] == lint_file(path)
+
+
 def test_splats_far_away_do_not_make_others_coarse(tmp_path, make_model):
     near = make_model(300, 0)
     for far in ([[5e5, 0, 0]], [[300, 0, 0], [0, -3e4, 0], [0, 0, 1e30]], np.full((60, 3), 4000) * [[1, -1, 1]]):
@@ -68,19 +82,6 @@ def test_splats_far_away_do_not_make_others_coarse(tmp_path, make_model):
         assert [] == [one for one in csplat.write(tmp_path / "b.compressed.ply", read) if one.id == "filling-splats"]
 
 
-def test_old_files_without_bounds_of_colours_are_read(tmp_path):
-    (tmp_path / "a.ply").write_bytes(built([ROW[:12]], [WORD], colours=False))
-    np.testing.assert_allclose(csplat.read(tmp_path / "a.ply").sh0[0] * 0.28209479 + 0.5, [1, 0, 1], atol=1e-6)
-
-
-def test_an_element_without_sh_coefficients_is_degree_0(tmp_path):
-    data = built([ROW], [WORD], [()], rest=0)  # as gsplat writes it
-    assert b"element sh 1\nend_header\n" in data
-    (tmp_path / "a.ply").write_bytes(data)
-    model = csplat.read(tmp_path / "a.ply")
-    assert (1, 0) == (len(model), model.sh_degree)
-
-
 def test_written_files_read_back_within_a_step(tmp_path, make_model):
     model = make_model(700, 3, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
     csplat.write(tmp_path / "a.compressed.ply", model)
@@ -93,21 +94,14 @@ def test_written_files_read_back_within_a_step(tmp_path, make_model):
         wanted = getattr(model, name)[rows].clip(-4 if name == "shN" else None, 4)
         assert np.abs(wanted - getattr(back, name)).max() < error
     assert np.abs((model.quats[rows] * back.quats).sum(1)).min() > 1 - 5e-6
-
-
-def test_blocks_consist_of_whole_chunks(tmp_path, make_model):
-    model = make_model(300, 1)
-    large = model.select(np.arange(BLOCK_SPLATS + 300) % 300)
+    large = model.select(np.arange(BLOCK_SPLATS + 300) % 300)  # blocks consist of whole chunks
     csplat.write(tmp_path / "a.compressed.ply", large)
     with open_scene(tmp_path / "a.compressed.ply") as scene:
         assert [BLOCK_SPLATS, 300] == [len(one) for one in scene.blocks()]
         assert np.abs(np.sort(large.means[:, 0]) - np.sort(scene.model().means[:, 0])).max() < 0.01
-
-
-def test_an_empty_scene_is_written_and_read(tmp_path, make_model):
     csplat.write(tmp_path / "a.compressed.ply", make_model(0, 2))
-    model = csplat.read(tmp_path / "a.compressed.ply")
-    assert (0, 2) == (len(model), model.sh_degree)
+    empty = csplat.read(tmp_path / "a.compressed.ply")
+    assert (0, 2) == (len(empty), empty.sh_degree)
 
 
 def test_the_packed_columns_distinguish_it_from_a_plain_ply(tmp_path):
@@ -141,13 +135,7 @@ def test_inconsistent_files_are_refused(tmp_path, data, message):
         csplat.read(tmp_path / "a.ply", "compressed-ply")
 
 
-def test_bounds_that_differ_by_rounding_are_read(tmp_path):
-    above = float(np.nextafter(np.float32(4), np.float32(9)))
-    (tmp_path / "a.ply").write_bytes(built([[above, *ROW[1:]]], [WORD]))
-    assert [] == lint_file(tmp_path / "a.ply")
-
-
-@pytest.mark.parametrize("degree", [0, 1, 3, 4])
+@pytest.mark.parametrize("degree", [0, 1, 4])
 def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path, degree):
     (tmp_path / "a.ply").write_bytes(built([ROW], [WORD], [range(100, 172)], rest=72))
     model = csplat.read(tmp_path / "a.ply", sh_degree=degree)
@@ -170,12 +158,8 @@ def test_unusual_files_are_read_and_reported(tmp_path, data, found):
 
 
 def test_damage_is_refused_or_read(tmp_path):
-    damaged = [SMALL[:size] for size in range(0, len(SMALL), 17)] + [*flipped(SMALL, range(0, len(SMALL), 3))]
+    damaged = [SMALL[:size] for size in range(0, len(SMALL), 29)] + [*flipped(SMALL, range(0, len(SMALL), 7))]
     messages = refusals(tmp_path / "a.ply", damaged, lambda path: csplat.read(path, "compressed-ply"))
     messages = [one for one in messages if one]
-    assert len(messages) > 150
+    assert len(messages) > 60
     assert all(one.startswith("a.ply") for one in messages)
-
-
-def test_real_files_are_read(data_dir):
-    assert 90_854 == len(csplat.read(data_dir / "other" / "guitar.compressed.ply"))

@@ -15,7 +15,6 @@ from csplat.editing.transform import rotate_scene
 from csplat.errors import InputError
 from csplat.formats import formats, lint_file
 from csplat.formats.gltf import gltf_document
-from csplat.model import SplatModel
 
 ARRAYS = ("means", "quats", "opacities", "sh0", "shN")
 PREFIX = "KHR_gaussian_splatting"
@@ -56,9 +55,9 @@ def document(arrays, **root):
     return {**whole, **root}, data
 
 
-def glb(said, data):
+def glb(said, data, padding=b" "):
     text = json.dumps(said, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
+    text += padding * (-len(text) % 4 + 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
@@ -67,19 +66,9 @@ def read(said, data):
     return checked(glb(said, data))
 
 
-def test_json_may_be_padded_with_zeros():
-    data = glb(*document({**TWO}))
-    start = data.index(b"JSON") + 4
-    (size,) = struct.unpack_from("<I", data, start - 8)
-    text = data[start : start + size].rstrip()
-    padded = text + b"\0" * (4 + -len(text) % 4)
-    chunks = struct.pack("<I4s", len(padded), b"JSON") + padded + data[start + size :]
-    model = checked(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
-    assert TWO["POSITION"].tolist() == model.means.tolist()
-
-
 def test_attributes_are_read():
-    model = read(*document(TWO | BAND))
+    said, data = document(TWO | BAND)
+    model = read(said, data)
     assert "LUF" == model.coordinate_system
     assert TWO["POSITION"].tolist() == model.means.tolist()
     assert [[1, 0, 0, 0], [0, 1, 0, 0]] == model.quats.tolist()
@@ -88,6 +77,13 @@ def test_attributes_are_read():
     assert [0.25, 1] == model.opacities.tolist()
     assert TWO[f"{PREFIX}:SH_DEGREE_0_COEF_0"].tolist() == model.sh0.tolist()
     assert [[[1] * 3, [2] * 3, [3] * 3]] * 2 == model.shN.tolist()
+    assert model.means.tolist() == checked(glb(said, data, padding=b"\0")).means.tolist()
+    apart = np.zeros((2, 5), "<f4")  # rows may have a stride
+    apart[:, 1:4] = TWO["POSITION"]
+    said["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 40, "byteStride": 20})
+    said["accessors"][0] |= {"bufferView": len(said["bufferViews"]) - 1, "byteOffset": 4}
+    said["buffers"][0]["byteLength"] += 40
+    assert TWO["POSITION"].tolist() == read(said, data + apart.tobytes()).means.tolist()
 
 
 def test_normalised_integers_are_read():
@@ -108,16 +104,6 @@ def test_normalised_integers_are_read():
     assert [-32768, -32767, 0] == read(said, data).means[0].tolist()
 
 
-def test_rows_may_have_a_stride():
-    apart = np.zeros((2, 5), "<f4")
-    apart[:, 1:4] = TWO["POSITION"]
-    said, data = document(TWO)
-    said["bufferViews"].append({"buffer": 0, "byteOffset": len(data), "byteLength": 40, "byteStride": 20})
-    said["accessors"][0] |= {"bufferView": len(said["bufferViews"]) - 1, "byteOffset": 4}
-    said["buffers"][0]["byteLength"] += 40
-    assert TWO["POSITION"].tolist() == read(said, data + apart.tobytes()).means.tolist()
-
-
 def test_transforms_of_nodes_are_applied():
     nodes = [
         {"children": [1], "translation": [10, 0, 0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]},
@@ -130,21 +116,24 @@ def test_transforms_of_nodes_are_applied():
     assert np.allclose(np.stack([10 - y, x + 2, 2 * z], 1), model.means[2:])
     assert np.allclose([[2, 4, 1], [1, 2, 1]], np.sort(np.exp(model.scales[[0, 2]]), axis=1)[:, [1, 2, 0]])
     assert np.allclose([3, 2, -1], model.shN[0, :, 0])  # -y z -x of the colours turn with them
+    far = read(*document(TWO, nodes=[{"mesh": 0, "translation": [4e6, 1.25, -3e5]}]))
+    assert (4e6, 1.25, -3e5) == far.origin
+    assert TWO["POSITION"].tolist() == far.means.tolist()
 
 
-def test_without_scenes_all_nodes_are_read():
+def test_nodes_that_are_shown_are_read_whatever_the_file_requires():
     said, data = document(TWO, nodes=[{"mesh": 0}, {"children": [0], "translation": [1, 0, 0]}])
-    del said["scenes"]
-    assert [2, 0] == read(said, data).means[:, 0].tolist()
+    said["extensionsRequired"] = ["KHR_materials_unlit", "KHR_texture_basisu", "KHR_draco_mesh_compression", "X_y"]
+    said["meshes"].append({"primitives": [{"extensions": {"KHR_draco_mesh_compression": {"bufferView": 9}}}]})
+    said["nodes"] += [{"mesh": 1}, {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}]
+    for scenes in ([{"nodes": [1, 2, 3]}], None):
+        said |= {"scenes": scenes}
+        if scenes is None:
+            del said["scenes"]  # all nodes are read
+        assert [2, 0] == read(said, data).means[:, 0].tolist()
 
 
-def test_a_far_translation_becomes_the_origin():
-    model = read(*document(TWO, nodes=[{"mesh": 0, "translation": [4e6, 1.25, -3e5]}]))
-    assert (4e6, 1.25, -3e5) == model.origin
-    assert TWO["POSITION"].tolist() == model.means.tolist()
-
-
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 3])
 def test_a_written_scene_reads_back(tmp_path, make_model, degree):
     model = make_model(50, degree, origin=(1.5, -2.0, 0.1), antialiased=True, metadata={"licence": "CC0"})
     csplat.write(tmp_path / "a.glb", model)
@@ -156,25 +145,15 @@ def test_a_written_scene_reads_back(tmp_path, make_model, degree):
     assert np.abs(model.scales - flipped.scales).max() < 1e-6
     csplat.write(tmp_path / "b.glb", back)
     assert (tmp_path / "a.glb").read_bytes() == (tmp_path / "b.glb").read_bytes()
-    assert ARRAYS == tuple(name for name in ARRAYS if name in FORMAT.exact)
-
-
-def test_lengths_are_written_in_metres(tmp_path, make_model):
-    model = make_model(5, 0, unit_metres=0.5, coordinate_system="LUF")
-    csplat.write(tmp_path / "a.glb", model)
-    back = checked(tmp_path / "a.glb")
-    assert 1.0 == back.unit_metres
-    assert (model.means * np.float32(0.5) == back.means).all()
-    assert np.abs(model.scales + np.log(0.5) - back.scales).max() < 1e-6
-
-
-def test_colours_of_points_are_those_of_their_splats(tmp_path):
-    sh0 = (np.float32([[0.0, 0.5, 1.0]]) - 0.5) / np.float32(0.28209479)
-    one = SplatModel(
-        np.zeros((1, 3), np.float32), np.float32([[1, 0, 0, 0]]), np.zeros((1, 3), np.float32), np.float32([0.2]), sh0
-    )
-    csplat.write(tmp_path / "a.glb", one)
-    assert bytes([0, 55, 255, 51]) in (tmp_path / "a.glb").read_bytes()
+    assert set(ARRAYS) <= set(FORMAT.exact)
+    colours = (np.float32([0.0, 0.5, 1.0]) - 0.5) / np.float32(0.28209479)  # as of points, for other programs
+    csplat.write(tmp_path / "c.glb", replace(model, sh0=np.tile(colours, (50, 1)), opacities=np.full(50, 0.2, "f4")))
+    assert bytes([0, 55, 255, 51]) * 50 in (tmp_path / "c.glb").read_bytes()
+    csplat.write(tmp_path / "a.glb", replace(model, unit_metres=0.5, coordinate_system="LUF", origin=(0.0, 0.0, 0.0)))
+    metres = checked(tmp_path / "a.glb")
+    assert 1.0 == metres.unit_metres
+    assert (model.means * np.float32(0.5) == metres.means).all()
+    assert np.abs(model.scales + np.log(0.5) - metres.scales).max() < 1e-6
 
 
 def test_buffers_may_be_text_or_files_next_to_it(tmp_path):
@@ -263,12 +242,15 @@ def test_invalid_documents_are_refused_with_the_path(place, value, message):
         holder[int(key)] = value
     else:
         holder[key] = value
-    with pytest.raises(InputError, match=rf"^data.*{message}") as caught:
+    with pytest.raises(InputError, match=rf"^data.*{message}[^\n]*$"):
         read(said, data)
-    assert "\n" not in str(caught.value)
 
 
-def test_too_many_instances_of_a_mesh_are_refused():
+def test_drafts_and_too_many_instances_are_refused():
+    said, data = document({name.replace(f"{PREFIX}:", "_"): array for name, array in TWO.items()})
+    said["meshes"][0]["primitives"][0]["extensions"][PREFIX] = {}
+    with pytest.raises(InputError, match="an early draft of KHR_gaussian_splatting"):
+        read(said, data)
     said, data = document(TWO)
     said["meshes"].append({"primitives": [{}] * 200})
     said |= {"nodes": [{"mesh": 1}] * 200, "scenes": [{"nodes": list(range(200))}]}
@@ -276,8 +258,7 @@ def test_too_many_instances_of_a_mesh_are_refused():
         read(said, data)
 
 
-@pytest.mark.parametrize("name", list(TWO))
-@pytest.mark.parametrize("value", [np.nan, np.inf])
+@pytest.mark.parametrize(("name", "value"), [*((name, np.nan) for name in TWO), ("POSITION", np.inf)])
 def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path, name, value):
     arrays = many()
     whole = checked(glb(*document(arrays)))
@@ -291,14 +272,6 @@ def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path, name, valu
     (tmp_path / "a.glb").write_bytes(glb(*document(arrays)))
     with pytest.raises(InputError, match="40 splats with NaN or infinity: none is left"):
         csplat.read(tmp_path / "a.glb")
-
-
-def test_infinite_logits_are_opacities_of_0_and_1(tmp_path):
-    logits = np.linspace(-6, 6, 40, dtype="<f4")[:, None]
-    logits[[4, 5], 0] = np.inf, -np.inf
-    found, model = linted(tmp_path / "a.glb", *document(many(OPACITY=logits)))
-    assert {"logit-opacities", "infinite-logits"} == set(found)
-    assert [1, 0] == model.opacities[4:6].tolist()
 
 
 def test_huge_values_trailing_bytes_and_other_scenes_are_reported(tmp_path):
@@ -317,6 +290,18 @@ def test_huge_values_trailing_bytes_and_other_scenes_are_reported(tmp_path):
     assert ["huge-values"] == [one.id for one in lint_file(path)]
 
 
+def test_short_buffers_and_rotations_of_length_0_are_reported(tmp_path):
+    said, data = document(TWO | {f"{PREFIX}:ROTATION": np.zeros((2, 4), "<f4")})
+    said["buffers"][0]["byteLength"] += 1000
+    found, model = linted(tmp_path / "a.glb", said, data)
+    assert {"short-buffer", "zero-quats"} == set(found)
+    assert 2 == found["zero-quats"].count
+    assert [[1, 0, 0, 0]] * 2 == model.quats.tolist()
+    assert TWO["POSITION"].tolist() == model.means.tolist()
+    with pytest.raises(InputError, match="truncated"):
+        read(said, data[:-8])
+
+
 def linted(path, said, data):
     """Lint a file; return the findings by id, and the model along the axes of the file."""
     path.write_bytes(glb(said, data))
@@ -333,34 +318,27 @@ def many(count=40, **changed):
 
 
 def test_logarithms_of_scales_are_recognised_by_their_sign(tmp_path):
-    arrays = many()
+    path, arrays = tmp_path / "a.glb", many()
     right = checked(glb(*document(arrays)))
     logs = np.log(arrays[f"{PREFIX}:SCALE"])
-    said, data = document(many(SCALE=logs), asset={"version": "2.0", "generator": "writer 1"})
-    found, model = linted(tmp_path / "a.glb", said, data)
+    found, model = linted(path, *document(many(SCALE=logs), asset={"version": "2.0", "generator": "writer 1"}))
     assert ("repair", 40) == (found["log-scales"].kind, found["log-scales"].count)
     assert "written by writer 1" in found["log-scales"].text
     np.testing.assert_allclose(right.scales, model.scales, atol=1e-6)
     with pytest.raises(InputError, match="log-scales"):
-        csplat.read(tmp_path / "a.glb", strict=True)
-
-
-@pytest.mark.parametrize("values", [[-0.5], [-40.0] * 39])
-def test_negative_scales_other_than_logarithms_are_refused(tmp_path, values):
-    scales = many()[f"{PREFIX}:SCALE"]
-    scales[1 : 1 + len(values), 2] = values
-    (tmp_path / "a.glb").write_bytes(glb(*document(many(SCALE=scales))))
-    with pytest.raises(InputError, match=rf"SCALE of splat 1 is {values[0]:g}, expected"):
-        csplat.read(tmp_path / "a.glb")
-    assert ["error"] == [one.kind for one in lint_file(tmp_path / "a.glb") if one.id == "negative-scales"]
-
-
-def test_scales_of_large_splats_are_no_logarithms(tmp_path):
+        csplat.read(path, strict=True)
     for writer, findings in (("other", []), ("splat-transform 2.3.1", ["unclear-scales"])):
         asset = {"version": "2.0", "generator": writer}
-        found, model = linted(tmp_path / "a.glb", *document(many(SCALE=np.full((40, 3), 5, "<f4")), asset=asset))
+        found, model = linted(path, *document(many(SCALE=np.full((40, 3), 5, "<f4")), asset=asset))
         assert findings == list(found)
         np.testing.assert_allclose(np.log(5), model.scales, rtol=1e-6)
+    for values in ([-0.5], [-40.0] * 39):  # neither sizes nor logarithms
+        scales = many()[f"{PREFIX}:SCALE"]
+        scales[1 : 1 + len(values), 2] = values
+        path.write_bytes(glb(*document(many(SCALE=scales))))
+        with pytest.raises(InputError, match=rf"SCALE of splat 1 is {values[0]:g}, expected"):
+            csplat.read(path)
+        assert ["error"] == [one.kind for one in lint_file(path) if one.id == "negative-scales"]
 
 
 def test_opacities_out_of_range_are_clipped_read_as_logits_or_refused(tmp_path):
@@ -370,17 +348,15 @@ def test_opacities_out_of_range_are_clipped_read_as_logits_or_refused(tmp_path):
     assert np.minimum(opacities[:, 0], 1).tolist() == model.opacities.tolist()
     logits = np.linspace(-6, 6, 40, dtype="<f4")[:, None]
     found, model = linted(tmp_path / "a.glb", *document(many(OPACITY=logits)))
-    assert "repair" == found["logit-opacities"].kind
+    assert {"logit-opacities": "repair"} == {name: one.kind for name, one in found.items()}
     np.testing.assert_allclose(1 / (1 + np.exp(-logits[:, 0])), model.opacities, atol=1e-6)
+    logits[[4, 5], 0] = np.inf, -np.inf
+    found, model = linted(tmp_path / "a.glb", *document(many(OPACITY=logits)))
+    assert {"logit-opacities", "infinite-logits"} == set(found)
+    assert [1, 0] == model.opacities[4:6].tolist()
     (tmp_path / "a.glb").write_bytes(glb(*document(many(OPACITY=np.linspace(0, 255, 40, dtype="<f4")[:, None]))))
     with pytest.raises(InputError, match=r"OPACITY of splat 1 is 6\.53846, expected 0 to 1"):
         csplat.read(tmp_path / "a.glb")
-
-
-def test_rotations_of_length_0_are_reported(tmp_path):
-    found, model = linted(tmp_path / "a.glb", *document(TWO | {f"{PREFIX}:ROTATION": np.zeros((2, 4), "<f4")}))
-    assert 2 == found["zero-quats"].count
-    assert [[1, 0, 0, 0]] * 2 == model.quats.tolist()
 
 
 @pytest.mark.parametrize("bands", [{}, BAND])
@@ -411,22 +387,6 @@ def test_bands_above_the_requested_degree_are_left_out():
     assert [4, 1] == [csplat.read(data, sh_degree=degree).sh_degree for degree in (4, 1)]
 
 
-def test_required_extensions_that_splats_do_not_use_are_ignored():
-    said, data = document(TWO)
-    said["extensionsRequired"] = ["KHR_materials_unlit", "KHR_texture_basisu", "KHR_draco_mesh_compression", "X_y"]
-    said["meshes"].append({"primitives": [{"extensions": {"KHR_draco_mesh_compression": {"bufferView": 9}}}]})
-    said["nodes"].append({"mesh": 1})
-    said["scenes"][0]["nodes"].append(1)
-    assert TWO["POSITION"].tolist() == read(said, data).means.tolist()
-
-
-def test_hidden_nodes_are_not_read():
-    said, data = document(TWO)
-    said["nodes"].append({"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}})
-    said["scenes"][0]["nodes"].append(1)
-    assert 2 == len(read(said, data))
-
-
 def test_every_instance_is_read():
     offsets, sizes = np.diag([1, 5, 9]).astype("<f4"), np.repeat(np.float32([[1], [2], [1]]), 3, 1)
     arrays = TWO | {"T": offsets, "S": sizes}
@@ -438,14 +398,6 @@ def test_every_instance_is_read():
     assert np.allclose(np.tile(TWO["POSITION"], (3, 1)) * sizes.repeat(2, 0) + offsets.repeat(2, 0), model.means)
     said["accessors"][6]["count"] = 2
     with pytest.raises(InputError, match=r"rows, expected one number of instances"):
-        read(said, data)
-
-
-def test_an_early_draft_is_refused():
-    arrays = {name.replace(f"{PREFIX}:", "_"): array for name, array in TWO.items()}
-    said, data = document(arrays)
-    said["meshes"][0]["primitives"][0]["extensions"][PREFIX] = {}
-    with pytest.raises(InputError, match="an early draft of KHR_gaussian_splatting"):
         read(said, data)
 
 
@@ -486,6 +438,11 @@ def test_spz_in_a_glb_is_read(tmp_path, make_model, name, degree):
     assert np.allclose(alone.means + np.array([10, 20, 30]), back.means, atol=1e-5)
     assert (alone.shN == back.shN).all()
     assert (alone.scales == back.scales).all()
+    with pytest.raises(InputError, match=r"data, bufferViews/0 is not SPZ"):
+        read(said, b"x" * len(data))
+    said["accessors"][0]["count"] = 49
+    with pytest.raises(InputError, match="POSITION: 49 rows, its SPZ has 50"):
+        read(said, data)
 
 
 def test_spz_in_a_glb_is_turned_if_its_bounds_allow_it(tmp_path, make_model):
@@ -504,26 +461,6 @@ def test_spz_in_a_glb_is_turned_if_its_bounds_allow_it(tmp_path, make_model):
     assert "CesiumJS" in found["spz-axes"].text
 
 
-def test_inconsistent_spz_in_a_glb_is_refused(tmp_path, make_model):
-    said, data = packed(tmp_path, make_model(50, 0), OLD)
-    said["accessors"][0]["count"] = 49
-    with pytest.raises(InputError, match="POSITION: 49 rows, its SPZ has 50"):
-        read(said, data)
-    said["accessors"][0]["count"] = 50
-    with pytest.raises(InputError, match=r"data, bufferViews/0 is not SPZ"):
-        read(said, b"x" * len(data))
-
-
-def test_a_short_buffer_is_reported(tmp_path):
-    said, data = document(TWO)
-    said["buffers"][0]["byteLength"] += 1000
-    found, model = linted(tmp_path / "a.glb", said, data)
-    assert ["short-buffer"] == list(found)
-    assert TWO["POSITION"].tolist() == model.means.tolist()
-    with pytest.raises(InputError, match="truncated"):
-        read(said, data[:-8])
-
-
 @pytest.mark.slow
 def test_damage_is_refused_or_read(monkeypatch):
     whole = glb(*document(TWO))
@@ -538,7 +475,7 @@ def test_damage_is_refused_or_read(monkeypatch):
         return False
 
     assert not refused(whole)
-    assert all(refused(whole[:size]) for size in range(len(whole)))
+    assert all(refused(whole[:size]) for size in range(0, len(whole), 3))
     for at in range(len(whole)):
         refused(whole[:at] + bytes([whole[at] ^ (1 << at % 8)]) + whole[at + 1 :])
     for text in (b"[" * 100_000, b"{}", b"null", b'{"asset":{"version":"2.0"}}', b"9" * 5000, b"\xff"):

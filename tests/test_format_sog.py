@@ -15,6 +15,7 @@ import csplat
 from csplat.errors import InputError
 from csplat.formats import detect_format, open_scene, write_levels
 from csplat.formats.sog.sog_reader import read_leaf_numbers
+from csplat.model import SplatModel, normalise_quats
 from csplat.scene_source import source_from_model
 from csplat_conformance.manifest import VECTORS
 from csplat_conformance.validator import validate
@@ -93,31 +94,28 @@ def means_of(pictures):
     return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
 
 
-def test_version_2_is_read(tmp_path):
-    meta, pictures = splats()
+@pytest.mark.parametrize("version", [1, 2])
+def test_both_versions_are_read(tmp_path, version):
+    meta, pictures = splats(version)
     model = csplat.read(zipped(tmp_path / "a.sog", files_of(meta, pictures)))
     flat = {name: one.reshape(-1, 4)[:COUNT].astype(int) for name, one in pictures.items() if name != "palette.webp"}
+    scales, colours, palette = flat["scales.webp"][:, :3], flat["sh0.webp"], pictures["palette.webp"][0, -3:, :3]
+    if version == 2:
+        scales, sh0, shN = scales / 16 - 12, colours[:, :3] / 64 - 2, palette / 128 - 1
+        opacities = colours[:, 3] / 255
+    else:
+        scales, shN = scales / 255 * 6 + [-9, -8, -7], palette / 255 - 0.5
+        sh0 = colours[:, :3] / 255 * [4, 2, 3] - [2, 1, 0]
+        opacities = 1 / (1 + np.exp(5 - colours[:, 3] / 25.5))
     np.testing.assert_allclose(model.means, means_of(pictures), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(model.scales, flat["scales.webp"][:, :3] / 16 - 12)
-    np.testing.assert_allclose(model.sh0, flat["sh0.webp"][:, :3] / 64 - 2)
-    np.testing.assert_allclose(model.opacities, flat["sh0.webp"][:, 3] / 255, rtol=1e-6)
-    np.testing.assert_allclose(model.shN[0], pictures["palette.webp"][0, -3:, :3] / 128 - 1)
+    np.testing.assert_allclose(model.scales, scales, rtol=1e-6)
+    np.testing.assert_allclose(model.sh0, sh0, atol=1e-6)
+    np.testing.assert_allclose(model.opacities, opacities, rtol=1e-5)
+    np.testing.assert_allclose(model.shN[[0, 4]], [shN, shN], atol=1e-6)
     three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # x of splat 1 is omitted
     quat = np.array([three[0], np.sqrt(max(0, 1 - (three**2).sum())), *three[1:]])
     np.testing.assert_allclose(model.quats[1], quat / np.linalg.norm(quat), atol=1e-6)
-    assert model.antialiased
-    assert not model.flat
-
-
-def test_version_1_is_read(tmp_path):
-    meta, pictures = splats(1)
-    model = csplat.read(foldered(tmp_path / "a", files_of(meta, pictures)))
-    flat = {name: one.reshape(-1, 4)[:COUNT].astype(int) for name, one in pictures.items() if name != "palette.webp"}
-    np.testing.assert_allclose(model.means, means_of(pictures), rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(model.scales, flat["scales.webp"][:, :3] / 255 * 6 + [-9, -8, -7], rtol=1e-6)
-    np.testing.assert_allclose(model.sh0, flat["sh0.webp"][:, :3] / 255 * [4, 2, 3] - [2, 1, 0], atol=1e-6)
-    np.testing.assert_allclose(model.opacities, 1 / (1 + np.exp(5 - flat["sh0.webp"][:, 3] / 25.5)), rtol=1e-5)
-    np.testing.assert_allclose(model.shN[4], pictures["palette.webp"][0, -3:, :3] / 255 - 0.5, atol=1e-6)
+    assert (version == 2, False) == (model.antialiased, model.flat)
 
 
 def test_folder_json_and_zip_give_the_same_scene(tmp_path):
@@ -129,20 +127,15 @@ def test_folder_json_and_zip_give_the_same_scene(tmp_path):
     assert all((one.means == models[0].means).all() and (one.shN == models[0].shN).all() for one in models)
 
 
-def test_rotations_without_a_tag_become_the_identity_and_are_reported(tmp_path):
+def test_tags_of_rotations_and_the_first_entry_of_a_codebook_may_be_missing(tmp_path):
     meta, pictures = splats()
     pictures["quats.webp"][0, 0, 3] = 17
+    meta["scales"]["codebook"][0] = None
+    pictures["scales.webp"][:] = 0
     with open_scene(zipped(tmp_path / "a.sog", files_of(meta, pictures))) as scene:
         assert [1, 0, 0, 0] == scene.model().quats[0].tolist()
         assert [("zero-quats", 1)] == [(one.id, one.count) for one in scene.findings]
-
-
-def test_a_missing_first_entry_of_a_codebook_is_extrapolated(tmp_path):
-    meta, pictures = splats(sh=False)
-    meta["scales"]["codebook"][0] = None
-    pictures["scales.webp"][:] = 0
-    model = csplat.read(zipped(tmp_path / "a.sog", files_of(meta, pictures)))
-    np.testing.assert_allclose(model.scales, 1 / 16 - 12 - 254 / 16 / 255, rtol=1e-6)
+        np.testing.assert_allclose(scene.model().scales, 1 / 16 - 12 - 254 / 16 / 255, rtol=1e-6)  # extrapolated
 
 
 def levels(tmp_path, **changes):
@@ -170,6 +163,7 @@ def test_leaves_are_numbered_in_the_order_of_the_splats(tmp_path):
         read_leaf_numbers(foldered(tmp_path / "b", files_of(*splats())))
 
 
+@pytest.mark.slow
 def test_levels_of_streamed_sog_become_nodes_of_a_file(tmp_path):
     path, out = levels(tmp_path), tmp_path / "out.csplat"
     encode_file(str(path), str(out), csplat.EncodeOptions(), levels=1)
@@ -211,36 +205,48 @@ def test_the_finest_level_is_read_by_default(tmp_path):
         csplat.read(path)
 
 
-def zipped_folder(path, folder, within="", more=()):
-    """Zip all files of a folder and some more."""
-    files = {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
-    return zipped(path, {**{within + name: data for name, data in files.items()}, **dict(more)})
+def all_of(folder):
+    """Return all files of a folder by name."""
+    return {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
 
 
 @pytest.mark.parametrize("within", ["", "a/b/"])
 def test_levels_in_a_zip_equal_those_in_a_folder(tmp_path, within):
     folder = levels(tmp_path)
     junk = {"__MACOSX/meta.json": b"", "__MACOSX/0_0/._meta.json": b""}
-    path = zipped_folder(tmp_path / "a.zip", folder, within, junk)
+    path = zipped(tmp_path / "a.zip", {within + name: data for name, data in all_of(folder).items()} | junk)
     for level in (0, 1):
         with open_scene(path, level=level) as scene, open_scene(folder, level=level) as expected:
             assert (expected.count, expected.levels) == (scene.count, scene.levels)
             assert np.array_equal(expected.model().means, scene.model().means)
 
 
-def test_a_zip_of_several_scenes_is_refused(tmp_path):
+def test_zips_of_several_scenes_and_of_other_programs_are_refused(tmp_path):
     folder, other = levels(tmp_path), files_of(*splats())
-    two = {f"{folder}/{name}": data for folder in ("one", "two") for name, data in other.items()}
-    more = {f"b/{name}": data for name, data in other.items()}
-    bundle = {"lod-meta.json": (folder / "lod-meta.json").read_bytes().replace(b"0_0/meta.json", b"0_0.sog")}
-    for path, message in (
-        (zipped(tmp_path / "b.zip", two), r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
-        (zipped_folder(tmp_path / "c.zip", folder, more=more), r"2 scenes, .*b/meta.json, lod-meta.json"),
-        (zipped_folder(tmp_path / "d.zip", folder, more=bundle), r"0_0/meta.json, lod-meta.json"),
-        (zipped(tmp_path / "e.sog", {"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}), "2 scenes"),
-    ):
+    first = (folder / "lod-meta.json").read_bytes()
+    foreign = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
+    not_sog = "meta.json is not the one of SOG, which has means, quats, scales, sh0; .*"
+    within = {"lod-meta.json": first.replace(b"0_0/meta.json", b"0_0.sog"), "0_0/meta.json": None}
+    scene = {f"a/{name}": data for name, data in other.items()}
+    for files, message in (
+        ({f"{one}/{name}": data for one in ("one", "two") for name, data in other.items()},
+            r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
+        ({f"b/{name}": data for name, data in other.items()} | all_of(folder), r"2 scenes, .*b/meta.json, lod-meta"),
+        (all_of(folder) | {"lod-meta.json": within["lod-meta.json"]}, r"0_0/meta.json, lod-meta.json"),
+        (all_of(folder) | within, r"0_0.sog is a zip within a zip: unpack a.zip"),
+        ({"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}, "2 scenes"),
+        (scene | {"scene.ply": b"ply"}, r"it contains 2 scenes, expected one \(a/meta.json, scene.ply\)"),
+        (foreign, not_sog + r"a zip that contains room\.ply: unzip it"),
+    ):  # fmt: skip
         with pytest.raises(InputError, match=message):
-            csplat.read(path)
+            csplat.read(zipped(tmp_path / "a.zip", {name: data for name, data in files.items() if data is not None}))
+    report = []
+    assert COUNT == len(csplat.read(zipped(tmp_path / "a.zip", {**scene, "a/b/scene.PLY": b"ply"}), report=report))
+    assert [("other-scenes", "note", "the zip also holds a/b/scene.PLY: not read")] == [
+        (one.id, one.kind, one.text) for one in report
+    ]
+    with pytest.raises(InputError, match=not_sog + r"a folder, not a scene: name room\.ply"):
+        csplat.read(foldered(tmp_path / "foreign", foreign))
     foldered(folder, other)
     with pytest.raises(InputError, match=r"lod-meta.json, meta.json\): name one of these files"):
         csplat.read(folder)
@@ -248,34 +254,12 @@ def test_a_zip_of_several_scenes_is_refused(tmp_path):
     assert 13 == len(csplat.read(folder / "lod-meta.json"))
 
 
-def test_other_scenes_in_a_zip_are_reported(tmp_path):
-    files = {f"a/{name}": data for name, data in files_of(*splats()).items()}
-    report = []
-    assert 5 == len(csplat.read(zipped(tmp_path / "a.zip", {**files, "a/b/scene.PLY": b"ply"}), report=report))
-    assert [("other-scenes", "note")] == [(one.id, one.kind) for one in report]
-    assert "the zip also holds a/b/scene.PLY: not read" == report[0].text
-    with pytest.raises(InputError, match=r"it contains 2 scenes, expected one \(a/meta.json, scene.ply\)"):
-        csplat.read(zipped(tmp_path / "a.zip", {**files, "scene.ply": b"ply"}))
-
-
-def test_the_directory_of_a_zip_is_read_once(tmp_path, monkeypatch):
-    path = zipped_folder(tmp_path / "a.zip", levels(tmp_path))
-    opened = []
-    whole = zipfile.ZipFile
-    monkeypatch.setattr(zipfile, "ZipFile", lambda *args: opened.append(args) or whole(*args))
-    assert 13 == len(csplat.read(path))
-    assert len(opened) < 5
-
-
-def test_the_list_of_files_may_contain_backslashes(tmp_path):
+def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     folder = levels(tmp_path, filenames=[rf"{name}\meta.json" for name in ("0_0", "0_1", "1_0")])
-    for path in (folder, zipped_folder(tmp_path / "a.zip", folder)):
+    for path in (folder, zipped(tmp_path / "a.zip", all_of(folder))):
         report = []
         assert 13 == len(csplat.read(path, report=report))
         assert ["backslashes in filenames, read as slashes"] == [one.text for one in report]
-
-
-def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     files = files_of(*splats())
     expected = csplat.read(zipped(tmp_path / "a.sog", files))
     loud = {name.upper() if name == "meta.json" else name: data for name, data in files.items()}
@@ -293,22 +277,6 @@ def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     two = {**{name: data for name, data in files.items() if name != "sh0.webp"}, "SH0.webp": b"", "Sh0.webp": b""}
     with pytest.raises(InputError, match=r"SH0\.webp and Sh0\.webp would both be sh0\.webp"):
         csplat.read(zipped(tmp_path / "f.sog", two))
-
-
-def test_a_meta_json_of_another_program_is_refused(tmp_path):
-    files = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
-    message = "meta.json is not the one of SOG, which has means, quats, scales, sh0; .*"
-    with pytest.raises(InputError, match=message + r"a zip that contains room\.ply: unzip it"):
-        csplat.read(zipped(tmp_path / "a.zip", files))
-    with pytest.raises(InputError, match=message + r"a folder, not a scene: name room\.ply"):
-        csplat.read(foldered(tmp_path / "a", files))
-
-
-def test_a_zip_within_a_zip_is_refused(tmp_path):
-    path = levels(tmp_path, filenames=["0_0.sog", "0_1/meta.json", "1_0/meta.json"])
-    (path / "0_0" / "meta.json").unlink()
-    with pytest.raises(InputError, match=r"0_0.sog is a zip within a zip: unpack a.zip"):
-        csplat.read(zipped_folder(tmp_path / "a.zip", path))
 
 
 @pytest.mark.parametrize(("changes", "message"), [
@@ -386,60 +354,40 @@ def test_inconsistent_files_are_refused(tmp_path):
             csplat.read(zipped(tmp_path / "a.sog", files))
 
     assert [] == failures(BAD, check)
-
-
-@pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
-def test_parts_in_a_folder_are_webp_within_it(tmp_path):
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    for name, data in files_of(*splats()).items():
-        (folder / name).write_bytes(data)
-    csplat.read(folder)
-    (folder / "sh0.webp").rename(tmp_path / "sh0.webp")
-    (folder / "sh0.webp").symlink_to(tmp_path / "sh0.webp")
-    with pytest.raises(InputError, match=r"scene: the part 'sh0\.webp' is a link that leads out of it"):
-        csplat.read(folder)
-    (folder / "sh0.webp").unlink()
-    for data, title in ((b"%!PS-Adobe-3.0 EPSF-3.0\n", r"PostScript \(EPS\)"), (b"\x89PNG\r\n\x1a\n", "a PNG")):
-        (folder / "sh0.webp").write_bytes(data)
-        with pytest.raises(InputError, match=rf"scene: sh0\.webp is {title}, .*expected WebP"):
-            csplat.read(folder)
-
-
-def test_zip_bombs_are_not_unpacked(tmp_path):
-    files = files_of(*splats()) | {"meta.json": b" " * 30_000_000}
-    with pytest.raises(InputError, match="unpacked size of 30,000,000"):
-        csplat.read(zipped(tmp_path / "a.sog", files, how=zipfile.ZIP_DEFLATED))
-
-
-def test_a_cut_zip_is_named_as_such(tmp_path, make_model):
-    csplat.write(tmp_path / "a.sog", make_model(5, 0))
-    data = (tmp_path / "a.sog").read_bytes()
+    path = tmp_path / "a.sog"
+    data = path.read_bytes()
     for size in (len(data) // 2, len(data) - 5):
-        (tmp_path / "a.sog").write_bytes(data[:size])
+        path.write_bytes(data[:size])
         with pytest.raises(InputError, match=r"a\.sog: a damaged zip: its end is missing, .*: copy or download it aga"):
-            csplat.read(tmp_path / "a.sog")
+            csplat.read(path)
+    bomb = files_of(*splats()) | {"meta.json": b" " * 30_000_000}
+    with pytest.raises(InputError, match="unpacked size of 30,000,000"):
+        csplat.read(zipped(path, bomb, how=zipfile.ZIP_DEFLATED))
 
 
 def test_damage_is_refused_or_read(tmp_path):
-    whole = zipped(tmp_path / "a.sog", files_of(*splats(1, sh=False))).read_bytes()
-    damaged = [whole[:size] for size in range(0, len(whole), 61)] + [*flipped(whole, range(0, len(whole), 11))]
-    messages = refusals(tmp_path / "a.sog", damaged, lambda path: csplat.read(path, "sog"))
-    messages = [one for one in messages if one]
-    assert len(messages) > len(damaged) / 2
-    assert all(one.startswith("a.sog") and "\n" not in one for one in messages)
-
-
-def test_damaged_pictures_of_a_folder_are_refused_or_read(tmp_path):
     files = files_of(*splats(1, sh=False))
-    folder = foldered(tmp_path / "a", files)
-    whole = files["sh0.webp"]
-    damaged = flipped(whole, range(0, len(whole), 2), lambda at: 1 << at // 2 % 8)
+    path, folder = zipped(tmp_path / "a.sog", files), foldered(tmp_path / "b", files)
+    whole, picture = path.read_bytes(), files["sh0.webp"]
+    damaged = [whole[:size] for size in range(0, len(whole), 97)] + [*flipped(whole, range(0, len(whole), 31))]
+    messages = refusals(path, damaged, lambda path: csplat.read(path, "sog"))
+    assert sum(map(bool, messages)) > len(damaged) / 2
+    assert all(not one or (one.startswith("a.sog") and "\n" not in one) for one in messages)
+    damaged = flipped(picture, range(0, len(picture), 5), lambda at: 1 << at // 5 % 8)
     messages = refusals(folder / "sh0.webp", damaged, lambda _: csplat.read(folder))
-    assert all(not one or one.startswith("a: sh0.webp") for one in messages)
+    assert all(not one or one.startswith("b: sh0.webp") for one in messages)
 
 
 # Writing -------------------------------------------------------------------------------------------
+def assert_within_a_step(model, back, means):
+    """Assert that splats in the same order differ by the steps of SOG, in `means` by this tolerance."""
+    assert np.abs(model.means - back.means).max() < means
+    assert np.abs(model.opacities - back.opacities).max() <= 0.5 / 255 + 1e-7
+    assert np.abs((model.quats * back.quats).sum(axis=1)).min() > 1 - 4e-5
+    for name, most in (("scales", 0.02), ("sh0", 0.02), ("shN", 0.6)):
+        assert np.sqrt(np.mean((getattr(model, name) - getattr(back, name)) ** 2)) < most
+
+
 def test_written_files_read_back_within_a_step(tmp_path, make_model):
     model = make_model(600, 1, antialiased=True)
     csplat.write(tmp_path / "a.sog", model)
@@ -448,12 +396,8 @@ def test_written_files_read_back_within_a_step(tmp_path, make_model):
     rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
     assert 600 == len(set(rows))
     # Half of the largest step: 65,535 steps divide the logarithms.
-    logs = np.log1p(np.abs(model.means.astype(float)).max()) / 65535
-    assert np.abs(model.means[rows] - back.means).max() < logs * (1 + np.abs(model.means).max())
-    assert np.abs(model.opacities[rows] - back.opacities).max() <= 0.5 / 255 + 1e-7
-    assert np.abs((model.quats[rows] * back.quats).sum(1)).min() > 1 - 3e-5
-    for name, most in (("scales", 0.02), ("sh0", 0.02), ("shN", 0.6)):
-        assert np.sqrt(np.mean((getattr(model, name)[rows] - getattr(back, name)) ** 2)) < most
+    reach = np.abs(model.means.astype(float)).max()
+    assert_within_a_step(model.select(rows), back, np.log1p(reach) / 65535 * (1 + reach))
 
 
 def test_zip_and_folder_have_the_same_bytes(tmp_path, make_model):
@@ -468,9 +412,11 @@ def test_zip_and_folder_have_the_same_bytes(tmp_path, make_model):
     assert csplat.read(tmp_path / "c").flat
 
 
-@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 0), (1, 3), (17, 1)])
-def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree):
-    model = make_model(count, degree)
+@pytest.mark.parametrize(("count", "degree", "fields"), [
+    (0, 3, {}), (1, 0, {}), (1, 3, {}), (17, 1, {}), (3, 0, {"means": np.full((3, 3), 2.5, np.float32)}),
+])  # fmt: skip
+def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree, fields):
+    model = make_model(count, degree, **fields)
     csplat.write(tmp_path / "a.sog", model)
     back = csplat.read(tmp_path / "a.sog")
     assert (count, degree if count else 0) == (len(back), back.sh_degree)
@@ -479,13 +425,7 @@ def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree):
         np.testing.assert_allclose(wanted, found, atol=1e-3 if name == "shN" else 1e-4)
 
 
-def test_splats_at_one_point_are_written(tmp_path, make_model):
-    model = make_model(3, 0)
-    model.means[:] = 2.5
-    csplat.write(tmp_path / "a.sog", model)
-    np.testing.assert_allclose(csplat.read(tmp_path / "a.sog").means, 2.5, rtol=1e-6)
-
-
+SHAPES = {"quats": (4,), "scales": (3,), "sh0": (3,), "shN": (3, 3)}
 SIDE = 64  # positions are integers below, so that a splat is known by its place
 
 
@@ -493,14 +433,17 @@ def places_of(model):
     return np.rint(model.means).astype(int) @ [1, SIDE, SIDE**2]
 
 
-@pytest.fixture
-def streamed(tmp_path, make_model):
+@pytest.fixture(scope="module")
+def streamed(tmp_path_factory):
     """Three levels of a scene, the coarsest without splats in three quarters of space, and their streamed SOG."""
-    cells = np.random.default_rng(8).permutation(SIDE**3)[:40_000]
+    rng, count = np.random.default_rng(8), 18_000
+    cells = rng.permutation(SIDE**3)[:count]
     means = np.stack([cells % SIDE, cells // SIDE % SIDE, cells // SIDE**2], axis=1).astype(np.float32)
-    finest = make_model(len(means), 1, means=means, antialiased=True)
-    levels = [finest, finest.select(slice(0, 9_000)), finest.select((means[:, :2] < SIDE / 4).all(axis=1))]
-    path = tmp_path / "scene" / "lod-meta.json"
+    normal = {name: rng.standard_normal((count, *shape), np.float32) for name, shape in SHAPES.items()}
+    normal |= {"quats": normalise_quats(normal["quats"]), "scales": normal["scales"] - 4}
+    finest = SplatModel(means=means, opacities=rng.random(count, np.float32), antialiased=True, **normal)
+    levels = [finest, finest.select(slice(0, 4_000)), finest.select((means[:, :2] < SIDE / 4).all(axis=1))]
+    path = tmp_path_factory.mktemp("streamed") / "scene" / "lod-meta.json"
     write_levels(path, [source_from_model(one) for one in levels])
     return path, levels
 
@@ -516,7 +459,7 @@ def leaves_of(node):
     return [leaf for child in node["children"] for leaf in leaves_of(child)]
 
 
-def test_levels_of_streamed_sog_are_those_written_within_a_step(streamed):
+def test_levels_of_streamed_sog_read_back_within_a_step(streamed):
     path, levels = streamed
     for number, level in enumerate(levels):
         with open_scene(path.parent, level=number) as scene:
@@ -524,11 +467,7 @@ def test_levels_of_streamed_sog_are_those_written_within_a_step(streamed):
         assert (tuple(map(len, levels)), 1, True) == (scene.levels, back.sh_degree, back.antialiased)
         wanted, found = (one.select(np.argsort(places_of(one))) for one in (level, back))
         assert np.array_equal(places_of(wanted), places_of(found))
-        assert np.abs(wanted.means - found.means).max() < SIDE * np.log1p(SIDE) / 65535
-        assert np.abs(wanted.opacities - found.opacities).max() <= 0.5 / 255 + 1e-7
-        assert np.abs((wanted.quats * found.quats).sum(axis=1)).min() > 1 - 4e-5
-        for name, most in (("scales", 0.02), ("sh0", 0.02), ("shN", 0.6)):
-            assert np.sqrt(np.mean((getattr(wanted, name) - getattr(found, name)) ** 2)) < most
+        assert_within_a_step(wanted, found, SIDE * np.log1p(SIDE) / 65535)
 
 
 def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
@@ -538,7 +477,7 @@ def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
     counts = list(map(len, levels))
     assert (1, 3, counts, sum(counts)) == (meta["version"], meta["lodLevels"], meta["counts"], meta["count"])
     assert {"lod-meta.json", "0_0", "1_0", "2_0"} == {one.name for one in path.parent.iterdir()}
-    assert len(leaves) in (3, 4)
+    assert 2 == len(leaves)
     assert all(5_000 < leaf["lods"]["0"]["count"] <= 1 << 14 for leaf in leaves)
     assert 0 in [leaf["lods"]["2"]["count"] for leaf in leaves]
     for number in range(3):
@@ -558,6 +497,7 @@ def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
     assert -reach <= min(meta["tree"]["bound"]["min"]) < 0
 
 
+@pytest.mark.slow
 def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
     count = 530_000
     csplat.write(tmp_path / "a" / "lod-meta.json", make_model(count, 0))
@@ -574,10 +514,10 @@ def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
 
 
 def test_splats_at_one_point_are_one_leaf(tmp_path, make_model):
-    model = make_model(20_000, 0, means=np.full((20_000, 3), 2.5, np.float32))
+    model = make_model(17_000, 0, means=np.full((17_000, 3), 2.5, np.float32))
     csplat.write(tmp_path / "a" / "lod-meta.json", model)
     assert "lods" in json.loads((tmp_path / "a" / "lod-meta.json").read_text())["tree"]
-    assert 20_000 == len(csplat.read(tmp_path / "a"))
+    assert 17_000 == len(csplat.read(tmp_path / "a"))
 
 
 def test_all_levels_of_a_file_are_converted(tmp_path):
@@ -642,21 +582,22 @@ def test_real_files_are_read(data_dir):
             assert count == sum(map(len, scene.blocks()))
 
 
-def test_a_part_that_is_a_link_out_of_the_folder_is_refused(tmp_path):
-    meta, images = splats()
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    (folder / "meta.json").write_text(json.dumps(meta), encoding="utf-8")
-    for name, data in images.items():
-        (folder / name).write_bytes(data if isinstance(data, bytes) else webp(data))
+@pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
+def test_parts_of_a_folder_are_webp_within_it(tmp_path):
+    folder = foldered(tmp_path / "scene", files_of(*splats()))
+    part, inside = folder / "sh0.webp", folder / "inside" / "sh0.webp"
+    inside.parent.mkdir()
+    part.rename(inside)
+    part.symlink_to("inside/sh0.webp")  # a link within the folder is followed
     assert COUNT == len(csplat.read(folder))
-    (folder / "inside").mkdir()
-    (folder / "sh0.webp").rename(folder / "inside" / "sh0.webp")
-    (folder / "sh0.webp").symlink_to("inside/sh0.webp")  # a link within the folder is followed
-    assert COUNT == len(csplat.read(folder))
-    (folder / "inside" / "sh0.webp").rename(tmp_path / "secret")
+    inside.rename(tmp_path / "secret")
     for target in ("../secret", str(tmp_path / "secret"), "inside/../../secret", "sh0.webp"):
-        (folder / "sh0.webp").unlink()
-        (folder / "sh0.webp").symlink_to(target)
+        part.unlink()
+        part.symlink_to(target)
         with pytest.raises(InputError, match=r"a link that leads out of it|cannot be read|there is no sh0"):
+            csplat.read(folder)
+    part.unlink()
+    for data, title in ((b"%!PS-Adobe-3.0 EPSF-3.0\n", r"PostScript \(EPS\)"), (b"\x89PNG\r\n\x1a\n", "a PNG")):
+        part.write_bytes(data)
+        with pytest.raises(InputError, match=rf"scene: sh0\.webp is {title}, .*expected WebP"):
             csplat.read(folder)

@@ -1,20 +1,14 @@
 """SPZ: every version read from bytes written by hand; damaged files are refused."""
 
 import gzip
-import os
-import re
 import struct
-import subprocess
-import sys
 from dataclasses import replace
 from math import sqrt
-from pathlib import Path
 
 import numpy as np
 import pytest
 import zstandard
 from checked import checked, flipped, refusals
-from shared_fixtures import of_peers
 
 import csplat
 from csplat.editing.transform import convert_axes
@@ -83,6 +77,14 @@ def test_the_omitted_component_of_a_rotation_is_restored(largest):
     np.testing.assert_allclose([xyzw[3], *xyzw[:3]], model.quats[0], atol=1e-6)
 
 
+def test_gzip_members_are_joined_and_a_file_may_have_no_splats():
+    data = spz(3, splats(3), bare=True)
+    whole = checked(spz(3, splats(3)))
+    for model in (checked(data), checked(gzip.compress(data[:50]) + gzip.compress(data[50:]))):
+        assert all((getattr(whole, name) == getattr(model, name)).all() for name in ("means", "quats", "scales", "sh0"))
+    assert 0 == len(checked(spz(4, [b""] * 6, degree=3))) == len(checked(spz(3, [b""] * 6, degree=3)))
+
+
 @pytest.mark.parametrize("version", [3, 4])
 def test_the_axes_extension_is_read_and_others_are_skipped(version):
     data = spz(version, splats(version), flags=2, extensions=AXES)
@@ -90,19 +92,6 @@ def test_the_axes_extension_is_read_and_others_are_skipped(version):
     assert "RUB" == checked(spz(version, splats(version), extensions=AXES)).coordinate_system
     with pytest.raises(InputError, match="axes number 17"):
         checked(spz(version, splats(version), flags=2, extensions=AXES[:-4] + bytes([17, 0, 0, 0])))
-
-
-def test_a_file_of_two_gzip_members_is_read():
-    whole, bare = (checked(spz(3, splats(3), bare=bare)) for bare in (False, True))
-    data = spz(3, splats(3), bare=True)
-    halves = checked(gzip.compress(data[:50]) + gzip.compress(data[50:]))
-    for model in (bare, halves):
-        assert all((getattr(whole, name) == getattr(model, name)).all() for name in ("means", "quats", "scales", "sh0"))
-
-
-def test_a_file_without_splats_is_read():
-    assert 0 == len(checked(spz(4, [b""] * 6, degree=3)))
-    assert 0 == len(checked(spz(3, [b""] * 6, degree=3)))
 
 
 def test_sh_bands_above_the_requested_degree_are_left_out(tmp_path):
@@ -171,8 +160,8 @@ def test_a_damaged_file_is_refused_or_read(tmp_path, version):
     whole = spz(version, splats(version, degree=1), degree=1, flags=2, extensions=AXES)
     path = tmp_path / "a.spz"
     assert [""] == refusals(path, [whole], checked)
-    assert all(refusals(path, (whole[:size] for size in (*range(0, len(whole), 3), len(whole) - 1)), checked))
-    for message in refusals(path, flipped(whole, range(len(whole)), lambda at: 255 >> at % 8), checked):
+    assert all(refusals(path, (whole[:size] for size in (*range(0, len(whole), 5), len(whole) - 1)), checked))
+    for message in refusals(path, flipped(whole, range(0, len(whole), 2), lambda at: 255 >> at % 7), checked):
         assert not message or ("a.spz" in message and "\n" not in message)
 
 
@@ -200,9 +189,9 @@ def test_written_files_read_back_within_half_a_step(tmp_path, make_model, name, 
 
 
 def test_values_beyond_the_range_are_clipped(tmp_path, make_model):
-    model = make_model(2, 1, sh0=np.array([[9, -9, 0]] * 2, "f4"), shN=np.full((2, 3, 3), [2, -2, 0.99], "f4"))
+    sh0, shN = np.array([[9, -9, 0]] * 2, "f4"), np.full((2, 3, 3), [2, -2, 0.99], "f4")
     scales, opacities = np.array([[-30, 30, 0]] * 2, "f4"), np.array([0, 1], "f4")
-    model = csplat.SplatModel(**{**vars(model), "scales": scales, "opacities": opacities, "coordinate_system": "RUB"})
+    model = make_model(2, 1, sh0=sh0, shN=shN, scales=scales, opacities=opacities, coordinate_system="RUB")
     csplat.write(tmp_path / "a.spz", model)
     found = checked(tmp_path / "a.spz")
     assert [-10, 5.9375, 0] == found.scales[0].tolist()
@@ -237,36 +226,3 @@ def test_a_scene_without_axes_is_written_as_rdf(tmp_path, make_model):
     np.testing.assert_allclose(np.clip(model.shN * np.c_[flips], -1, 127 / 128), found.shN, atol=1 / 64)
     csplat.write(tmp_path / "b.spz", make_model(5, 3, means=model.means, coordinate_system="RDF"))
     assert (tmp_path / "a.spz").read_bytes() == (tmp_path / "b.spz").read_bytes()
-
-
-#: Tests of SPZ's repository that fail on csplat, by the beginning of their names, with reasons.
-FAIL_ON_CSPLAT = {
-    # Version 3 is written without the fourth band of SH.
-    "test_sh_degree_4_with_custom_bits", "test_spz_version_3_or_higher_sh_degree_4",
-    "test_version_3_or_higher_with_all_features",
-    # Versions 3 and 4 are written, without extensions, with 6 bits per SH coefficient.
-    "test_all_versions_round_trip[2-", "test_spz_version_2_first_three", "test_spz_version_compatibility_positions",
-    "test_version_roundtrip_consistency", "test_coordinate_system_extension_overrides_pack_to",
-    "test_coordinate_system_extension_used_on_unpack", "test_coordinate_system_extension_unspecified_uses_rub",
-    "test_coordinate_system_extension_rotated_family", "test_safe_orbit_extension_round_trip",
-    "test_toc_byte_offset_advances_with_extensions", "test_sh_quantization_8bit",
-    # Rotations have unit length in every file.
-    "test_save_load_ply[", "test_io_consistency_ply_format",
-    # No counterpart: the median volume, and how their binding treats arrays of wrong types and lengths.
-    "test_edge_cases_empty_cloud", "test_gaussian_cloud_median_volume", "test_error_handling_invalid_arrays",
-    "test_gaussian_cloud_array_dtype_handling", "test_sh_degree_4_invalid_length",
-}  # fmt: skip
-
-
-def test_tests_of_its_repository_pass_except_for_known_differences(tmp_path):
-    folder = of_peers("spz/tests/python").parents[1]
-    code = "import sys, spz_shim; sys.modules['spz'] = spz_shim; import pytest; sys.exit(pytest.main(sys.argv[1:]))"
-    paths = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    run = subprocess.run(
-        [sys.executable, "-Bc", code, "-q", "-p", "no:cacheprovider", "--tb=no", "--rootdir=.", "tests/python"],
-        cwd=folder, env={**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": paths}, capture_output=True, text=True,
-        check=False)  # fmt: skip
-    failed = re.findall(r"^FAILED \S+::(\S+)", run.stdout, re.MULTILINE)
-    assert re.search(r"\d{2,} passed", run.stdout), run.stdout + run.stderr
-    assert FAIL_ON_CSPLAT == {start for start in FAIL_ON_CSPLAT for name in failed if name.startswith(start)}
-    assert [] == [name for name in failed if not name.startswith(tuple(FAIL_ON_CSPLAT))]

@@ -49,22 +49,17 @@ def large(make_model):
 
 
 def test_a_ply_in_blocks_is_the_ply_at_once(tmp_path, large):
-    write_ply(tmp_path / "a.ply", large)
-    with open_scene(tmp_path / "a.ply") as scene:
+    path = tmp_path / "a.ply"
+    write_ply(path, large)
+    with open_scene(path) as scene:
         assert len(large) == scene.count
         assert 0 == len(scene.metadata_model)
         assert [BLOCK_SPLATS, 1000] == [len(block) for block in scene.blocks()]
-        same(read_ply(tmp_path / "a.ply"), scene.model())
+        same(read_ply(path), scene.model())
         write_scene(tmp_path / "b.ply", scene)
-    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
-
-
-def test_rows_that_are_dropped_are_not_counted(tmp_path, large):
-    write_ply(tmp_path / "a.ply", large)
-    data = bytearray((tmp_path / "a.ply").read_bytes())
-    data[-4:] = np.float32(np.nan).tobytes()
-    (tmp_path / "a.ply").write_bytes(data)
-    with open_scene(tmp_path / "a.ply") as scene:
+    assert path.read_bytes() == (tmp_path / "b.ply").read_bytes()
+    path.write_bytes(path.read_bytes()[:-4] + np.float32(np.nan).tobytes())
+    with open_scene(path) as scene:  # rows that are dropped are not counted
         assert len(large) - 1 == scene.count == sum(map(len, scene.blocks()))
         assert ["nonfinite-rows"] == [one.id for one in scene.findings if one.kind == "repair"]
 
@@ -80,16 +75,13 @@ def test_positions_in_doubles_keep_their_origin_in_every_block(tmp_path, large, 
 
 
 def test_formats_are_recognised_by_content_first(tmp_path, make_model):
-    model = make_model(40, 0)
+    model = make_model(40, 2)
     csplat.write(tmp_path / "a.ply", model)
     data = (tmp_path / "a.ply").read_bytes()
     (tmp_path / "a.csplat").write_bytes(data)
     same(csplat.read(tmp_path / "a.ply"), csplat.read(tmp_path / "a.csplat"))
     same(csplat.read(data), csplat.read(io.BytesIO(data)))
-
-
-def test_a_csplat_file_is_read_and_written(tmp_path, make_model):
-    csplat.write(tmp_path / "a.csplat", make_model(40, 2))
+    csplat.write(tmp_path / "a.csplat", model)
     same(csplat.decode(tmp_path / "a.csplat"), csplat.read(tmp_path / "a.csplat"))
 
 
@@ -99,12 +91,6 @@ def test_losses_of_a_format_are_reported(make_model):
     assert () == ply.losses(model)
     bare = type(ply)("splat", degree=0)
     assert ("SH bands 1 and 2", "that it is antialiased", "the origin", "metadata") == bare.losses(model)
-
-
-def test_each_format_has_a_name_of_its_own():
-    names, endings = [one.name for one in formats()], [end for one in formats() for end in one.suffixes]
-    assert len(set(names)) == len(names)
-    assert len(set(endings)) == len(endings)
 
 
 @pytest.mark.parametrize(("name", "data", "message"), [
@@ -145,7 +131,7 @@ def test_other_files_are_refused_with_their_type(tmp_path, name, data, message):
 LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:00\nsize 63327587\n"
 
 
-def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path):
+def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path, make_model):
     message = "is a pointer of Git LFS, not the file itself: run `git lfs pull`"
     ends = [end for one in formats() for end in one.suffixes]
     for path in [tmp_path / ("a" + end if end.startswith(".") else end) for end in [*ends, ".txt"]]:
@@ -155,14 +141,9 @@ def test_pointers_of_git_lfs_are_named_whatever_reads_them(tmp_path):
                 read(path)
         with assume_format("splat"), pytest.raises(InputError, match=message):
             csplat.read(path)
-    (tmp_path / "meta.json").write_text('{"version": 2, "count": 1}')
     for decode in (csplat.decode, csplat.open):
         with pytest.raises(csplat.FormatError, match="git lfs pull"):
             decode(tmp_path / "a.csplat")
-
-
-def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, make_model):
-    (tmp_path / "sog").mkdir()
     csplat.write(tmp_path / "sog" / "meta.json", make_model(20, 0))
     (tmp_path / "sog" / "quats.webp").write_bytes(LFS)
     with pytest.raises(InputError, match=r"quats\.webp is a pointer of Git LFS"):
@@ -172,50 +153,58 @@ def test_pointers_of_git_lfs_are_named_within_scenes_of_several_files(tmp_path, 
 def test_scenes_of_other_programs_are_named_with_the_way_out(tmp_path, make_model):
     png = {"shape": [50, 3], "dtype": "float32", "mins": [-1, -1, -1], "maxs": [1, 1, 1]}
     meta = json.dumps({"means": png, "scales": png, "opacities": {**png, "mins": 0}, "sh0": png})
-    for folder, name, text in (
-        ("png", "meta.json", meta), ("lcc", "scene.lcc", '{"version": "1", "cellLengthX": 30, "fileType": "Quality"}'),
-        ("lcc", "data.bin", "\1" * 64), ("lcc2", "scene.lcc2", '{"version": "2.0", "splatType": "sog", "root": {}}'),
-        ("bare", "renamed.json", '{"version": "1.1", "cellLengthX": 30}'), ("bare", "a.drc", "DRACO\2\2"),
-        ("bare", "a.splatv", "Kg\0\0\1\2\3"),
-    ):  # fmt: skip
-        (tmp_path / folder).mkdir(exist_ok=True)
-        (tmp_path / folder / name).write_text(text)
-    with zipfile.ZipFile(tmp_path / "png.zip", "w") as archive:
-        archive.writestr("compression/meta.json", meta)
-    wanted = {
-        "png": "PNG compression, .*PngCompr", "png/meta.json": "PNG compression", "png.zip": "PNG compression",
-        "lcc": "is LCC, .*splat-transform", "lcc/scene.lcc": "is LCC, ", "lcc/data.bin": ".* takes the .lcc file",
-        "lcc2": "is LCC2, .* in data/3dgs", "lcc2/scene.lcc2": "is LCC2, ", "bare/renamed.json": "is LCC, ",
-        "bare/a.drc": "is Draco, a mesh", "bare/a.splatv": "splats that move",
+    cases = {  # a file and its text, and what is said of it; an empty name stands for the folder
+        "png/meta.json": (meta, "PNG compression"), "png/": (None, "PNG compression, .*PngCompr"),
+        "png.zip": (zip_of([("compression/meta.json", meta)]), "PNG compression"),
+        "lcc/scene.lcc": ('{"version": "1", "cellLengthX": 30, "fileType": "Quality"}', "is LCC, "),
+        "lcc/data.bin": ("\1" * 64, ".* takes the .lcc file"), "lcc/": (None, "is LCC, .*splat-transform"),
+        "lcc2/scene.lcc2": ('{"version": "2.0", "splatType": "sog", "root": {}}', "is LCC2, "),
+        "lcc2/": (None, "is LCC2, .* in data/3dgs"),
+        "bare/renamed.json": ('{"version": "1.1", "cellLengthX": 30}', "is LCC, "),
+        "bare/a.drc": ("DRACO\2\2", "is Draco, a mesh"), "bare/a.splatv": ("Kg\0\0\1\2\3", "splats that move"),
     }  # fmt: skip
+    for name, (text, _) in cases.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        if text is not None:
+            (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
 
     def check(case):
         name, message = case
         with pytest.raises(InputError, match=message):
             csplat.read(tmp_path / name)
 
-    assert not failures({one[0]: one for one in wanted.items()}, check)
+    assert [] == failures({name: (name, message) for name, (_, message) in cases.items()}, check)
     csplat.write(tmp_path / "sog" / "meta.json", make_model(5, 0))
     assert "sog" == detect_format(tmp_path / "sog").name
 
 
 def test_a_zip_is_recognised_by_its_contents(tmp_path):
-    for name, message in (
-        ("x.npy", "NumPy"),
-        ("scene.ply", r"a zip that contains scene\.ply: unzip it"),
-        ("a.usdc", "USD"),
-        ("a/data.pkl", "checkpoint"),
+    for names, message in (
+        (["x.npy"], "NumPy"),
+        (["scene.ply"], r"a zip that contains scene\.ply: unzip it"),
+        (["a.usdc"], "USD"),
+        (["a/data.pkl"], "checkpoint"),
+        (
+            ["a/scene.ply", "__MACOSX/a/._scene.ply", "b.spz", "readme.txt"],
+            "contains a/scene.ply, b.spz: unzip it",
+        ),
     ):
-        with zipfile.ZipFile(tmp_path / "a.sog", "w") as archive:
-            archive.writestr(name, "")
+        path = tmp_path / "a.sog"
+        path.write_bytes(zip_of([(name, "x") for name in names]))
         with pytest.raises(InputError, match=message):
-            csplat.read(tmp_path / "a.sog")
+            csplat.read(path)
+    (tmp_path / "b.zip").write_bytes(path.read_bytes()[:-30])
+    with pytest.raises(InputError, match=r"b\.zip is a damaged zip"):
+        csplat.read(tmp_path / "b.zip")
+    np.savez(tmp_path / "c.npz", means=np.zeros((2, 3)), quats=np.zeros((2, 4)))
+    with pytest.raises(InputError, match=r"c\.npz is an archive of NumPy arrays \(means, quats\), not a scene"):
+        csplat.read(tmp_path / "c.npz")
 
 
-def test_insisting_counts_where_the_content_is_that_of_no_format(tmp_path, make_model):
+def test_a_given_format_counts_where_the_content_is_that_of_none(tmp_path, make_model):
     model = make_model(9, 0)
-    csplat.write(tmp_path / "a.splat", model)
-    csplat.write(tmp_path / "a.ply", model)
+    for name in ("a.splat", "a.ply"):
+        csplat.write(tmp_path / name, model)
     (tmp_path / "b").write_bytes((tmp_path / "a.splat").read_bytes())
     with pytest.raises(InputError, match="--from splat reads it"):
         csplat.read(tmp_path / "b")
@@ -224,15 +213,10 @@ def test_insisting_counts_where_the_content_is_that_of_no_format(tmp_path, make_
         assert len(csplat.read(tmp_path / "a.ply")) == 9
     with pytest.raises(InputError, match="the format is 'xyz'"), assume_format("xyz"):
         pass
-
-
-def test_names_that_no_format_has_are_refused(tmp_path, make_model):
-    with pytest.raises(InputError, match=r"expected one of .*\.ply"):
-        csplat.write(tmp_path / "a.xyz", make_model(3, 0))
     with pytest.raises(InputError, match=r"expected one of .*\bply\b"):
         csplat.read(tmp_path, format="xyz")
-    with pytest.raises(InputError, match="not a scene"):
-        csplat.read(tmp_path)
+    with pytest.raises(InputError, match=r"expected one of .*\.ply"):
+        csplat.write(tmp_path / "a.xyz", model)
 
 
 def test_a_scene_in_memory_is_read_in_blocks(large):
@@ -240,20 +224,6 @@ def test_a_scene_in_memory_is_read_in_blocks(large):
     assert [BLOCK_SPLATS, 1000] == [len(one) for one in scene.blocks()]
     same(large, scene.model())
     assert 0 == len(SceneSource(0, scene.metadata_model, lambda: iter(())).model())
-
-
-def test_scenes_in_a_zip_are_named(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        for name in ("a/scene.ply", "__MACOSX/a/._scene.ply", "b.spz", "readme.txt"):
-            archive.writestr(name, "x")
-    with pytest.raises(InputError, match=r"a.zip is a zip that contains a/scene.ply, b.spz: unzip it"):
-        csplat.read(tmp_path / "a.zip")
-    (tmp_path / "b.zip").write_bytes((tmp_path / "a.zip").read_bytes()[:-30])
-    with pytest.raises(InputError, match=r"b\.zip is a damaged zip"):
-        csplat.read(tmp_path / "b.zip")
-    np.savez(tmp_path / "c.npz", means=np.zeros((2, 3)), quats=np.zeros((2, 4)))
-    with pytest.raises(InputError, match=r"c\.npz is an archive of NumPy arrays \(means, quats\), not a scene"):
-        csplat.read(tmp_path / "c.npz")
 
 
 def test_of_a_folder_that_a_trainer_wrote_the_newest_scene_is_named(tmp_path):
@@ -276,7 +246,6 @@ def test_fewer_bands_are_read_of_any_format(tmp_path, make_model):
         whole, part = csplat.read(tmp_path / name), csplat.read(tmp_path / name, sh_degree=1)
         assert (2, 1) == (whole.sh_degree, part.sh_degree)
         assert np.array_equal(whole.shN[:, :3], part.shN)
-        assert 1 == csplat.read(tmp_path / name, sh_degree=1).sh_degree
 
 
 PLUGIN = """
@@ -310,38 +279,31 @@ def installed(tmp_path):
     return run
 
 
-def test_a_format_of_another_package_is_listed_and_read(installed, tmp_path):
+@pytest.mark.slow
+def test_a_format_of_another_package_is_loaded_only_when_it_is_needed(installed, tmp_path, make_model):
     (tmp_path / "a.lcc").write_bytes(bytes(32))
-    statement = "print('lcc' in [one.name for one in csplat.formats.formats()]); "
-    statement += f"print(len(csplat.read({str(tmp_path / 'a.lcc')!r})))"
-    assert "True\n1" == installed(statement, formats="lcc = other_plugin:FORMAT")
-
-
-def test_entry_points_are_read_only_for_formats_that_this_package_lacks(installed, tmp_path, make_model):
     csplat.write(tmp_path / "a.ply", make_model(3, 0))
-    statement = f"csplat.read({str(tmp_path / 'a.ply')!r})\nprint('other_plugin' in sys.modules)"
-    assert "False" == installed(statement, formats="lcc = other_plugin:FORMAT")
+    statement = f"csplat.read({str(tmp_path / 'a.ply')!r}); print('other_plugin' in sys.modules); "
+    statement += f"print(len(csplat.read({str(tmp_path / 'a.lcc')!r}))); "
+    statement += "print('lcc' in [one.name for one in csplat.formats.formats()])"
+    assert "False\n1\nTrue" == installed(statement, formats="lcc = other_plugin:FORMAT")
 
 
+@pytest.mark.slow
 def test_a_plug_in_that_cannot_be_loaded_is_left_out_with_a_warning(installed):
     statement = "import warnings\nwith warnings.catch_warnings(record=True) as seen:\n"
     statement += "    names = [one.name for one in csplat.formats.formats()]\nprint(names[0], seen[-1].message)"
-    found = installed(statement, formats="lcc = other_plugin:NOTHING")
-    assert found.startswith(
-        "compressed-ply other_plugin:NOTHING, installed as 'lcc' of csplat.formats, cannot be loaded: module"
-    )
+    message = "compressed-ply other_plugin:NOTHING, installed as 'lcc' of csplat.formats, cannot be loaded: module"
+    assert installed(statement, formats="lcc = other_plugin:NOTHING").startswith(message)
 
 
+@pytest.mark.slow
 def test_notebooks_use_the_display_that_is_installed(installed):
     model = "csplat.SplatModel(np.zeros((2, 3), np.float32), np.array([[1, 0, 0, 0]] * 2, np.float32), "
     model += "np.zeros((2, 3), np.float32), np.ones(2, np.float32), np.zeros((2, 3), np.float32))"
-    # A distribution of this name hides the metadata of the installed one, which has a display, too.
-    assert "<p>2</p>" == installed(f"print({model}._repr_html_())", "csplat", display="html = other_plugin:html")
-
-
-def test_without_entry_points_the_formats_are_those_of_the_codec(installed):
-    statement = "print([one.name for one in csplat.formats.formats()][-1])"
-    assert "gltf" == installed(statement, "csplat")
+    statement = f"print({model}._repr_html_(), [one.name for one in csplat.formats.formats()][-1])"
+    # A distribution of this name hides the metadata of the installed one, which has a display and formats, too.
+    assert "<p>2</p> gltf" == installed(statement, "csplat", display="html = other_plugin:html")
 
 
 def scene_in(shown):
@@ -351,7 +313,7 @@ def scene_in(shown):
     return csplat.decode(base64.b64decode(coded))
 
 
-def test_a_model_and_an_opened_file_show_themselves(make_model, tmp_path):
+def test_a_model_and_an_opened_file_show_themselves(make_model, tmp_path, monkeypatch):
     model = make_model(40, 1)
     shown = model._repr_html_()
     assert (40, 1) == (len(scene_in(shown)), scene_in(shown).sh_degree)
@@ -359,24 +321,21 @@ def test_a_model_and_an_opened_file_show_themselves(make_model, tmp_path):
     assert ' src="' not in shown
     csplat.write_ply(tmp_path / "scene.ply", model)
     assert 40 == len(scene_in(csplat_tools.load_model(tmp_path / "scene.ply")._repr_html_()))
+    assert make_model(0)._repr_html_() is None
+    monkeypatch.setitem(sys.modules, "csplat_tools.present.notebook", None)
+    assert model._repr_html_() is None
 
 
 def test_a_large_scene_is_reduced_to_the_largest_splats_with_a_note(make_model):
-    model = make_model(3000, 0)
+    model = make_model(1200, 0)
     model.opacities[::3] = 0.0
-    shown = scene_html(model, most_splats=1000)
-    assert 1000 == len(scene_in(shown))
-    assert "1,000 of 3,000 splats, the most visible ones" in shown
-    kept = most_visible(model, 1000)
+    shown = scene_html(model, most_splats=200)
+    assert 200 == len(scene_in(shown))
+    assert "200 of 1,200 splats, the most visible ones" in shown
+    kept = most_visible(model, 200)
     assert kept.opacities.min() > 0.0
     areas = np.exp(np.sort(kept.scales, axis=1)[:, 1:].sum(axis=1))
     assert np.median(areas) > np.median(np.exp(np.sort(model.scales, axis=1)[:, 1:].sum(axis=1)))
-
-
-def test_without_splats_or_without_the_tools_a_notebook_shows_text(make_model, monkeypatch):
-    assert make_model(0)._repr_html_() is None
-    monkeypatch.setitem(sys.modules, "csplat_tools.present.notebook", None)
-    assert make_model(5)._repr_html_() is None
 
 
 @pytest.mark.slow
@@ -398,45 +357,22 @@ KIND = "a file of tests"
 BROKEN = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': ("
 
 
-def archive(path, data, compression=zipfile.ZIP_STORED):
-    with zipfile.ZipFile(path, "w", compression) as file:
-        file.writestr("facts.npy", data)
-    return path
-
-
-def test_arrays_come_back(tmp_path):
+def test_an_archive_has_arrays_and_facts(tmp_path):
     np.savez(tmp_path / "a.npz", one=np.arange(3), facts=np.frombuffer(b'{"n": 1}', np.uint8))
     found = read_archive(tmp_path / "a.npz", KIND)
     assert np.array_equal(np.arange(3), found["one"])
     assert found.facts() == {"n": 1}
     found.check({"n": 1}, {"n": int})
-
-
-@pytest.mark.parametrize(("data", "why"), [
-    (b"hello", "facts is not an array"),
-    (BROKEN.ljust(128, b" "), "not a file of tests"),
-    (b"\x93NUMPY\x09\x09", "not a file of tests"),
-    (b"", "not a file of tests"),
-], ids=["bytes", "open bracket", "version", "empty"])  # fmt: skip
-def test_members_that_are_no_arrays_are_refused(tmp_path, data, why):
-    with pytest.raises(InputError, match=why):
-        read_archive(archive(tmp_path / "a.npz", data), KIND)
-
-
-def test_objects_are_not_run(tmp_path):
-    np.savez(tmp_path / "a.npz", one=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(InputError, match="not a file of tests"):
-        read_archive(tmp_path / "a.npz", KIND)
-
-
-def test_damage_of_a_deflated_file_is_named(tmp_path):
-    np.save(tmp_path / "a.npy", np.random.default_rng(1).normal(size=400))
-    path = archive(tmp_path / "a.npz", (tmp_path / "a.npy").read_bytes(), zipfile.ZIP_DEFLATED)
-    data = path.read_bytes()
-    for place in range(60, 1000, 37):
-        path.write_bytes(data[:place] + bytes([data[place] ^ 0x55]) + data[place + 1 :])
-        with pytest.raises(InputError, match=r"a\.npz is not a file of tests"):
-            read_archive(path, KIND)
+    with pytest.raises(InputError, match="has no two"):
+        found["two"]
+    with pytest.raises(InputError, match="its n is not of type int"):
+        found.check({"n": "1"}, {"n": int})
+    for text in (b"[1]", b"{", b"[" * 100_000, b"\xff"):
+        np.savez(tmp_path / "a.npz", facts=np.frombuffer(text, np.uint8))
+        with pytest.raises(InputError, match="not a file of tests"):
+            read_archive(tmp_path / "a.npz", KIND).facts()
+    with pytest.raises(FileNotFoundError, match="absent"):
+        read_archive(tmp_path / "absent.npz", KIND)
 
 
 def npy(header, data=b"", version=1):
@@ -462,8 +398,24 @@ def with_size(data, size):
     return data[:at] + struct.pack("<I", size) + data[at + 4 :]
 
 
+def npz_of(array):
+    """Return the bytes of an archive of one array."""
+    out = io.BytesIO()
+    np.savez(out, one=array)
+    return out.getvalue()
+
+
+DEFLATED = zip_of([("a.npy", npy(header_of("'<f8'", "(400,)"), np.random.default_rng(1).normal(size=400).tobytes()))],
+    zipfile.ZIP_DEFLATED)  # fmt: skip
 LARGE = zip_of([("a.npy", npy(header_of(shape="(300000000,)"), bytes(1000)))], zipfile.ZIP_DEFLATED)
 HOSTILE_ARCHIVES = {
+    "no array": (zip_of([("facts.npy", b"hello")]), "facts is not an array"),
+    **{f"damage at {place}": (DEFLATED[:place] + bytes([DEFLATED[place] ^ 0x55]) + DEFLATED[place + 1 :], "")
+        for place in range(60, 1000, 74)},
+    "an open bracket": (zip_of([("a.npy", BROKEN.ljust(128, b" "))]), ""),
+    "a later version": (zip_of([("a.npy", b"\x93NUMPY\x09\x09")]), ""),
+    "no bytes": (zip_of([("a.npy", b"")]), ""),
+    "a pickle": (npz_of(np.array([{"a": 1}], dtype=object)), "pickled objects are not read"),
     "bzip2": (zip_of([("a.npy", npy(header_of(), b"abcd"))], zipfile.ZIP_BZIP2), "by method 12, expected 8"),
     "LZMA": (zip_of([("a.npy", npy(header_of(), b"abcd"))], zipfile.ZIP_LZMA), "by method 14, expected 8"),
     "larger than its size allows": (with_size(LARGE, 300_000_070), "declares an unpacked size of 300,000,070"),
@@ -475,12 +427,11 @@ HOSTILE_ARCHIVES = {
     "shape below zero": (zip_of([("a.npy", npy(header_of(shape="(-1, -4)"), b"abcd"))]), "does not fit its 4 bytes"),
     "side of 5,000 digits": (zip_of([("a.npy", npy(header_of(shape=f"({'9' * 5000},)")))]), "."),
     "values without bytes": (zip_of([("a.npy", npy(header_of("'|V0'", "(1000000000000,)")))]), "expected numbers"),
-    "objects": (zip_of([("a.npy", npy(header_of("'|O'"), bytes(32)))]), "pickled objects are not read"),
     "header of brackets": (zip_of([("a.npy", npy(b"[" * 9000))]), "a is not an array"),
     "header of 1 MB": (zip_of([("a.npy", npy(b"{" + b" " * (1 << 20), version=2))]), "a is not an array"),
     "header of version 3": (zip_of([("a.npy", npy(header_of(), b"abcd", version=3))]), "version 3.0, expected 1.0"),
     "two arrays of a name": (zip_of([("a.npy", npy(header_of(), b"abcd"))] * 2), "two arrays a"),
-    "5,000 arrays": (zip_of([(f"{index}.npy", b"") for index in range(5000)]), "5,000 members, expected at most"),
+    "5,000 arrays": (zip_of([(f"{index}", b"") for index in range(5000)]), "5,000 members, expected at most"),
 }  # fmt: skip
 
 
@@ -506,12 +457,9 @@ def test_an_array_file_is_compared_with_its_size(tmp_path):
         np.save(path, array)
         assert np.array_equal(array, read_array(path))
         assert read_array(path).flags.writeable
-
-
-def test_a_header_of_python_2_is_read_without_a_warning(tmp_path):
-    (tmp_path / "a.npy").write_bytes(npy(header_of(shape="(4L,)"), b"abcd"))
+    path.write_bytes(npy(header_of(shape="(4L,)"), b"abcd"))  # as Python 2 wrote it
     with warnings.catch_warnings(action="error"):
-        assert 4 == len(read_array(tmp_path / "a.npy"))
+        assert 4 == len(read_array(path))
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -550,24 +498,3 @@ def test_large_pickles_and_compressed_parts_of_checkpoints_are_refused(tmp_path)
         (tmp_path / name).write_bytes(data)
         with pytest.raises(InputError, match=message), open_scene(tmp_path / name):
             pass
-
-
-@pytest.mark.parametrize("text", [b"[1]", b"{", b"[" * 100_000, b"\xff"], ids=["list", "open", "deep", "no text"])
-def test_facts_that_are_none_are_refused(tmp_path, text):
-    np.savez(tmp_path / "a.npz", facts=np.frombuffer(text, np.uint8))
-    with pytest.raises(InputError, match="not a file of tests"):
-        read_archive(tmp_path / "a.npz", KIND).facts()
-
-
-def test_missing_parts_and_parts_of_another_kind_are_named(tmp_path):
-    np.savez(tmp_path / "a.npz", one=np.zeros(1))
-    found = read_archive(tmp_path / "a.npz", KIND)
-    with pytest.raises(InputError, match="has no two"):
-        found["two"]
-    with pytest.raises(InputError, match="its n is not of type int"):
-        found.check({"n": "1"}, {"n": int})
-
-
-def test_a_file_that_is_not_there_is_missed(tmp_path):
-    with pytest.raises(FileNotFoundError, match="absent"):
-        read_archive(tmp_path / "absent.npz", KIND)

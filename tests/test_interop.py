@@ -140,6 +140,7 @@ def test_sh_bands_above_the_requested_degree_are_left_out(read_holding, make_mod
 def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
     splats = made_splats(make_model, 1)
     many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)
+    few = {name: values[:2] for name, values in splats.items()}
     for said, expected in (
         ([1], "it holds a list"),
         (([1, 2], 3), "it holds a tuple"),
@@ -154,7 +155,9 @@ def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
             "no sh0, .*; it was trained with appearance features",
         ),
         (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
-    ):
+        ({"pipeline": {**renamed(splats, "_model.gauss_params."), **renamed(few, "_model.background.gauss_params.")}},
+            r"2 models of splats, .*: _model\.gauss_params\.\* \(5 splats\), _model\.background\.gauss_params\.\* \(2"),
+    ):  # fmt: skip
         with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{expected}"):
             read_holding(said)
 
@@ -199,15 +202,6 @@ def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(read_hol
         assert all(np.array_equal(getattr(expected, name), getattr(read, name)) for name in ARRAYS)
 
 
-def test_several_models_in_one_checkpoint_are_refused(read_holding, make_model):
-    splats = made_splats(make_model, 1)
-    few = {name: values[:2] for name, values in splats.items()}
-    pipeline = {**renamed(splats, "_model.gauss_params."), **renamed(few, "_model.background.gauss_params.")}
-    words = r"2 models of splats, .*: _model\.gauss_params\.\* \(5 splats\), _model\.background\.gauss_params\.\* \(2 s"
-    with pytest.raises(InputError, match=words):
-        read_holding({"pipeline": pipeline})
-
-
 def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_path):
     splats = made_splats(make_model, 1)
     paths = [tmp_path / f"ckpt_29_rank{rank}.pt" for rank in range(3)]
@@ -229,54 +223,41 @@ def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_pat
     assert ("ranks", "note", True) == (report[-1].id, report[-1].kind, report[-1].usual)
 
 
-def read_splats(read_holding, splats):
-    report = []
-    return read_holding({"splats": splats}, report=report), {one.id: one for one in report}
+def test_values_are_checked_like_those_of_a_ply(read_holding, make_model):
+    splats = made_splats(make_model, 0)
 
+    def read(**changed):
+        report = []
+        return read_holding({"splats": {**splats, **changed}}, report=report), {one.id: one for one in report}
 
-def test_values_are_checked_like_those_of_a_ply(read_holding):
     rng = np.random.default_rng(0)
-    numbers = {"means": 3, "quats": 4, "scales": 3, "sh0": 3}
-    splats = {name: rng.standard_normal((20, width)).astype(np.float32) for name, width in numbers.items()}
-    splats = {name: tensor(one) for name, one in splats.items()}
-    splats |= {"sh0": splats["sh0"][:, None], "opacities": tensor(np.linspace(0, 1, 20, dtype=np.float32))}
-    splats["scales"] = tensor(np.abs(splats["scales"]) * np.float32(0.1))
-    splats["quats"][3] = 0
-    model, found = read_splats(read_holding, {**splats, "filter_3D": tensor(np.ones(20))})
+    many = {name: tensor(rng.standard_normal((20, width), np.float32)) for name, width in (("means", 3), ("quats", 4))}
+    many |= {"sh0": tensor(rng.standard_normal((20, 1, 3), np.float32)), "shN": tensor(np.zeros((20, 0, 3), "f4"))}
+    many |= {"opacities": tensor(np.linspace(0, 1, 20, dtype="f4")), "scales": tensor(rng.random((20, 3), "f4") / 10)}
+    many["quats"][3] = 0
+    model, found = read(**many, filter_3D=tensor(np.ones(20)))
     assert {"zero-quats", "opacities-are-alphas", "scales-are-linear", "filter-3d"} <= set(found)
     assert "repair" == found["zero-quats"].kind == found["filter-3d"].kind
     assert [1, 0, 0, 0] == model.quats[3].tolist()
 
-
-def test_one_scale_is_the_size_of_all_axes(read_holding, make_model):
-    splats = made_splats(make_model, 0)
-    for one in (splats["scales"][:, :1], splats["scales"][:, 0]):
-        model, found = read_splats(read_holding, {**splats, "scales": one})
+    scales = splats["scales"]
+    for one in (scales[:, :1], scales[:, 0]):
+        model, found = read(scales=one)
         assert "one-scale" in found
-        assert np.array_equal(np.repeat(splats["scales"][:, :1], 3, axis=1), model.scales)
-
-
-def test_log_scales_of_minus_infinity_in_a_checkpoint_are_sizes_of_0(read_holding, make_model):
-    splats = made_splats(make_model, 0)
-    splats["scales"][1:, 2] = -np.inf
-    model, found = read_splats(read_holding, splats)
+        assert np.array_equal(np.repeat(scales[:, :1], 3, axis=1), model.scales)
+    model, found = read(scales=scales[:, :2])
+    assert "flat-scales" in found
+    assert model.flat
+    assert np.array_equal(scales[:, :2], model.scales[:, :2])
+    np.testing.assert_allclose(model.scales[:, 2], scales[:, :2].min() - np.log(100), rtol=1e-6)
+    zero = scales.copy()
+    zero[1:, 2] = -np.inf
+    model, found = read(scales=zero)
     assert "zero-scales" in found
     assert (np.exp(model.scales[1:, 2].astype(float)) < 1e-37).all()
 
-
-def test_two_scales_are_discs(read_holding, make_model):
-    splats = made_splats(make_model, 0)
-    model, found = read_splats(read_holding, {**splats, "scales": splats["scales"][:, :2]})
-    assert "flat-scales" in found
-    assert model.flat
-    assert np.array_equal(splats["scales"][:, :2], model.scales[:, :2])
-    np.testing.assert_allclose(model.scales[:, 2], splats["scales"][:, :2].min() - np.log(100), rtol=1e-6)
-
-
-def test_positions_in_doubles_get_an_origin(read_holding, make_model):
-    splats = made_splats(make_model, 0)
     far = tensor(splats["means"].astype(np.float64) + 1e7 + 0.3)
-    model, found = read_splats(read_holding, {**splats, "means": far})
+    model, found = read(means=far)
     assert "double-means" in found
     assert np.float32 == model.means.dtype
     np.testing.assert_allclose(model.means + np.array(model.origin), far, rtol=0, atol=1e-6)
@@ -298,7 +279,7 @@ def test_other_files_are_refused_before_torch_loads_them(no_torch, tmp_path):
             csplat.read(tmp_path / "b_rank0.pt")
 
 
-def test_files_that_torch_cannot_load_are_refused(no_torch):
+def test_files_that_torch_cannot_load_are_refused(no_torch, monkeypatch):
     for error, expected in (
         (pickle.UnpicklingError("Weights only load failed"), "contains objects that could run code"),
         (RuntimeError("PytorchStreamReader failed"), "is a truncated or damaged checkpoint"),
@@ -310,13 +291,10 @@ def test_files_that_torch_cannot_load_are_refused(no_torch):
         no_torch(load)
         with pytest.raises(InputError, match=rf"^gsplat\.pt {expected}[^\n]*$"):
             csplat.read(STORED["gsplat.pt"])
-
-
-@pytest.mark.parametrize("name", STORED)
-def test_without_torch_the_extra_is_named(monkeypatch, name):
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(InputError, match=rf"{name} is a checkpoint of torch: .*csplat\[train\]"):
-        csplat.read(STORED[name])
+    for name, path in STORED.items():
+        with pytest.raises(InputError, match=rf"{name} is a checkpoint of torch: .*csplat\[train\]"):
+            csplat.read(path)
 
 
 # with torch
@@ -340,41 +318,32 @@ def test_checkpoints_of_all_programs_are_read(torch, make_model, degree):
     for name in ARRAYS if degree else ARRAYS[:-2]:
         assert np.allclose(getattr(model, name), getattr(own, name), atol=1e-6), name
         assert (getattr(own, name) == getattr(theirs, name)).all()
+    whole = saved(torch, {"schedulers": {"last": [np.float64(0.1), np.float32(0.2)]}, "splats": splats})
+    old = io.BytesIO()  # scalars as NumPy 1 writes them
+    with zipfile.ZipFile(io.BytesIO(whole)) as source, zipfile.ZipFile(old, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name).replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
+    assert 20 == len(csplat.read(whole)) == len(csplat.read(old.getvalue()))
     if not degree:  # logits of colours
         colours = 0.5 + 0.28209479177387814 * theirs.sh0
         assert np.allclose(1.0 / (1.0 + np.exp(-model.sh0)), colours, atol=1e-6)
 
 
 @pytest.mark.torch
-def test_learning_rates_may_be_scalars_of_numpy_1_or_2(torch, make_model):
-    splats = to_gsplat(make_model(5, 0), device="cpu")
-    whole = saved(torch, {"schedulers": {"last": [np.float64(0.1), np.float32(0.2)]}, "splats": splats})
-    old = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(whole)) as source, zipfile.ZipFile(old, "w") as target:
-        for name in source.namelist():
-            target.writestr(name, source.read(name).replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
-    assert len(csplat.read(whole)) == len(csplat.read(old.getvalue())) == 5
-
-
-@pytest.mark.torch
-def test_invalid_tensors_are_refused(torch, make_model, tmp_path):
-    splats = to_gsplat(make_model(5, 0), device="cpu")
+def test_invalid_tensors_and_damage_are_refused(torch, make_model, tmp_path):
+    splats, path = to_gsplat(make_model(3, 0), device="cpu"), tmp_path / "a.pt"
     for values, message in (
         ({**splats, "means": torch.zeros(1).expand(10**9, 3)}, "means is not a tensor, or larger than the file"),
-        ({**splats, "means": torch.full((5, 3), torch.inf)}, "NaN or infinite"),
-        ({**splats, "sh0": torch.zeros(5, 2)}, "sh0 has shape"),
+        ({**splats, "means": torch.full((3, 3), torch.inf)}, "NaN or infinite"),
+        ({**splats, "sh0": torch.zeros(3, 2)}, "sh0 has shape"),
         (print, "contains objects that could run code"),
     ):
-        (tmp_path / "a.pt").write_bytes(saved(torch, {"splats": values}))
+        path.write_bytes(saved(torch, {"splats": values}))
         with pytest.raises(InputError, match=rf"^a\.pt[^\n]*{message}[^\n]*$"):
-            csplat.read(tmp_path / "a.pt")
-
-
-@pytest.mark.torch
-def test_a_damaged_checkpoint_is_refused_or_read(torch, make_model, tmp_path):
-    whole, path = saved(torch, {"splats": to_gsplat(make_model(3, 0), device="cpu")}), tmp_path / "a.ckpt"
+            csplat.read(path)
+    whole = saved(torch, {"splats": splats})
     assert [""] == refusals(path, [whole])
-    assert all("a.ckpt" in one for one in refusals(path, (whole[:size] for size in range(0, len(whole), 311))))
+    assert all("a.pt" in one for one in refusals(path, (whole[:size] for size in range(0, len(whole), 311))))
     refusals(path, flipped(whole, range(0, len(whole), 29)))
 
 
@@ -390,24 +359,21 @@ def assert_near(a, b):
         assert np.allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=2e-7), name
 
 
-def test_parameters_are_logarithms_and_logits(model):
-    splats = csplat.to_gsplat(model)
-    assert ARRAYS == tuple(splats)
+def test_splats_of_gsplat_are_parameters_or_activated(model):
+    splats, activated = csplat.to_gsplat(model), csplat.to_gsplat(model, form="activated")
+    assert ARRAYS == tuple(splats) == tuple(activated)
     assert [(20, 3), (20, 4), (20, 3), (20,), (20, 1, 3), (20, 8, 3)] == [splats[name].shape for name in ARRAYS]
     assert np.array_equal(model.scales, splats["scales"])
     assert np.allclose(1.0 / (1.0 + np.exp(-splats["opacities"].astype(np.float64))), model.opacities, atol=1e-7)
     assert np.isfinite(splats["opacities"]).all()
-
-
-def test_the_activated_form_has_scales_and_alphas(model):
-    splats = csplat.to_gsplat(model, form="activated")
-    assert np.allclose(np.exp(model.scales), splats["scales"], rtol=1e-6)
-    assert np.array_equal(model.opacities, splats["opacities"])
-
-
-@pytest.mark.parametrize("form", ["parameters", "activated"])
-def test_to_gsplat_and_back_keeps_the_model(model, form):
-    assert_near(model, csplat.from_gsplat(csplat.to_gsplat(model, form=form), form=form))
+    assert np.allclose(np.exp(model.scales), activated["scales"], rtol=1e-6)
+    assert np.array_equal(model.opacities, activated["opacities"])
+    assert_near(model, csplat.from_gsplat(splats))
+    assert_near(model, csplat.from_gsplat(activated, form="activated"))
+    loose = {**splats, "quats": 3 * splats["quats"], "opacities": splats["opacities"][:, None]}  # as in a checkpoint
+    assert_near(model, csplat.from_gsplat({"step": 30_000, "splats": loose}))
+    del splats["shN"]
+    assert 0 == csplat.from_gsplat(splats).sh_degree
 
 
 def test_no_memory_is_shared_with_the_model(model):
@@ -419,19 +385,6 @@ def test_no_memory_is_shared_with_the_model(model):
     again["means"] += 1.0
     assert np.array_equal(before, made.means)
     assert model.opacities.max() <= 1.0
-
-
-def test_from_gsplat_accepts_a_checkpoint(model):
-    splats = csplat.to_gsplat(model)
-    splats["quats"] *= 3.0  # trainers normalise them on use
-    splats["opacities"] = splats["opacities"][:, None]
-    assert_near(model, csplat.from_gsplat({"step": 30_000, "splats": splats}))
-
-
-def test_shn_may_be_left_out(model):
-    splats = csplat.to_gsplat(model)
-    del splats["shN"]
-    assert 0 == csplat.from_gsplat(splats).sh_degree
 
 
 @pytest.mark.parametrize(("change", "expected"), [
@@ -451,7 +404,7 @@ def test_from_gsplat_refuses_invalid_arrays(model, change, expected):
         csplat.from_gsplat(splats)
 
 
-def test_a_wrong_form_is_refused(model):
+def test_a_wrong_form_and_tensors_without_torch_are_refused(model, monkeypatch):
     with pytest.raises(InputError, match="logarithms"):
         csplat.from_gsplat(csplat.to_gsplat(model), form="activated")
     for call, given in ((csplat.from_gsplat, {}), (csplat.to_gsplat, model)):
@@ -459,9 +412,6 @@ def test_a_wrong_form_is_refused(model):
             call(given, form="logits")
     with pytest.raises(InputError, match="expects a SplatModel"):
         csplat.to_gsplat({})
-
-
-def test_tensors_without_torch_are_an_error_with_a_remedy(model, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(InputError, match="use device=None for NumPy arrays"):
         csplat.to_gsplat(model, device="cpu")

@@ -1,14 +1,15 @@
-"""PLY: columns, headers, comments and doubles, read and written; refusals; limits of time and memory."""
+"""PLY: columns, headers, comments and doubles, read and written; refusals; a limit of memory."""
 
 import gzip
+import io
 import os
-import time
 import tracemalloc
 import zipfile
-from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import flipped, refusals
 from hypothesis import given
 from hypothesis import strategies as st
 from tables import failures
@@ -87,8 +88,7 @@ def assert_same_scene(expected, actual):
 
 
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
-@pytest.mark.parametrize("normals", [True, False])
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize(("degree", "normals"), [(0, True), (1, False), (2, True), (3, True), (3, False)])
 def test_reads_every_degree_and_encoding(tmp_path, degree, normals, kind):
     names = columns_of(degree, normals=normals)
     rows = random_rows(names)
@@ -97,6 +97,8 @@ def test_reads_every_degree_and_encoding(tmp_path, degree, normals, kind):
     model = read_ply(tmp_path / "a.ply", strict=True, report=report)
     assert_holds(model, names, rows)
     assert {one.id for one in report} <= {"unnormalised-quats"}
+    write_rows(tmp_path / "a.ply", names, rows[:0], kind=kind)
+    assert (0, degree) == (len(empty := read_ply(tmp_path / "a.ply", strict=True)), empty.sh_degree)
 
 
 def test_reads_more_rows_than_one_block(tmp_path):
@@ -115,43 +117,17 @@ def test_reads_columns_by_name_in_any_order(tmp_path):
     assert "shuffled-columns" in {one.id for one in report}
 
 
-def test_reads_a_header_with_windows_line_ends(tmp_path):
-    names, rows = written(tmp_path / "a.ply", 0)
-    head, body = (tmp_path / "a.ply").read_bytes().split(b"end_header\n")
-    crlf = head.replace(b"\n", b"\r\n") + b"end_header\r\n" + body
-    assert_holds(read_ply(crlf, strict=True), names, rows)
-
-
-def test_keeps_header_comments(tmp_path):
-    written(tmp_path / "a.ply", 0, comments=["made by", "a machine"])
-    model = read_ply(tmp_path / "a.ply")
-    assert ["made by", "a machine"] == model.metadata["comments"]
+@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
+def test_header_comments_are_kept_in_ascii(tmp_path, kind):
+    comments = ["made by", "a machine", "end_header", "é end_header", "café"]
+    names, rows = written(tmp_path / "a.ply", 0, kind=kind, comments=comments)
+    report = []
+    model = read_ply(tmp_path / "a.ply", strict=True, report=report)
+    assert_holds(model, names, rows)
+    assert ["made by", "a machine", "end_header", "?? end_header", "caf??"] == model.metadata["comments"]
+    assert {"non-ascii-header", "unnormalised-quats"} == {one.id for one in report}
     write_ply(tmp_path / "b.ply", model)
     assert model.metadata == read_ply(tmp_path / "b.ply").metadata
-
-
-@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
-def test_a_comment_of_end_header_does_not_end_the_header(tmp_path, kind):
-    names, rows = written(tmp_path / "a.ply", 0, kind=kind, comments=["end_header", "é end_header"])
-    report = []
-    assert_holds(read_ply(tmp_path / "a.ply", strict=True, report=report), names, rows)
-    assert {"non-ascii-header", "unnormalised-quats"} == {one.id for one in report}
-
-
-def test_a_header_outside_ascii_is_read_with_question_marks(tmp_path):
-    names, rows = written(tmp_path / "a.ply", 0, comments=["café"])
-    report = []
-    model = read_ply(tmp_path / "a.ply", report=report)
-    assert_holds(model, names, rows)
-    assert ["caf??"] == model.metadata["comments"]
-    assert "non-ascii-header" in {one.id for one in report}
-
-
-@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
-def test_reads_a_file_without_splats(tmp_path, kind):
-    written(tmp_path / "a.ply", 3, 0, kind=kind)
-    model = read_ply(tmp_path / "a.ply", strict=True)
-    assert (0, 3) == (len(model), model.sh_degree)
 
 
 def test_extra_columns_are_kept_on_request(tmp_path, make_model):
@@ -168,36 +144,28 @@ def test_extra_columns_are_kept_on_request(tmp_path, make_model):
     assert {} == dict(read_ply(tmp_path / "a.ply").extra)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("count", [0, 1, 2, 5000])
+@pytest.mark.parametrize(("count", "degree"), [(0, 3), (1, 0), (2, 1), (2, 2), (5000, 3)])
 def test_written_scenes_read_back(tmp_path, make_model, count, degree):
     model = make_model(count, degree)
     write_ply(tmp_path / "a.ply", model)
     report = []
     again = read_ply(tmp_path / "a.ply", strict=True, report=report)
     assert_same_scene(model, again)
-    assert ["empty"] if count == 0 else [] == ([one.id for one in report])
+    assert (["empty"] if count == 0 else []) == [one.id for one in report]
 
 
 def test_writes_the_columns_and_order_that_viewers_expect(tmp_path, make_model):
-    write_ply(tmp_path / "a.ply", make_model(3, 1, origin=(1.0, 2.0, 3.0)))
+    model, names = make_model(3, 2, origin=(1.0, 2.0, 3.0)), columns_of(2)
+    write_ply(tmp_path / "a.ply", model)
     lines = header_of(tmp_path / "a.ply")
     assert ["ply", "format binary_little_endian 1.0", "element vertex 3"] == lines[:3]
-    assert [f"property float {name}" for name in columns_of(1)] == lines[3:-1]
+    assert [f"property float {name}" for name in names] == lines[3:-1]
     assert "comment csplat origin 1.0 2.0 3.0" == lines[-1]
-
-
-def test_writes_rows_that_plain_numpy_reads(tmp_path, make_model):
-    model = make_model(5, 2)
-    write_ply(tmp_path / "a.ply", model)
-    names = columns_of(2)
-    rows = np.frombuffer((tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1], "<f4")
-    rows = rows.reshape(5, len(names))
+    rows = np.frombuffer((tmp_path / "a.ply").read_bytes().split(b"end_header\n")[1], "<f4").reshape(3, len(names))
     at = {name: rows[:, index] for index, name in enumerate(names)}
     assert np.array_equal(at["f_rest_9"], model.shN[:, 1, 1])
     assert np.array_equal(at["rot_0"], model.quats[:, 0])
-    assert not at["nx"].any()
-    assert not at["nz"].any()
+    assert not rows[:, 3:6].any()  # normals
 
 
 def test_metadata_survive_a_ply(tmp_path, make_model):
@@ -270,67 +238,37 @@ def read_doubles(path, positions, **options):
     return read_ply(path, **options)
 
 
-@pytest.mark.parametrize("centre", [(0, 0, 0), (1e7, 5e6, -2e6), (3.0, 1e7, 0)])
+@pytest.mark.parametrize("centre", [(0, 0, 0), (1e7, 5e6, -2e6), (3.0, 1e7, 0), (481_250.0, 5_467_100.0, 310.0)])
 def test_an_origin_keeps_positions_in_doubles(tmp_path, centre):
     positions = np.random.default_rng(3).standard_normal((500, 3)) + centre
     report = []
     model = read_doubles(tmp_path / "a.ply", positions, strict=True, report=report)
     assert "double-means" in {one.id for one in report}
     assert any(centre) == any(model.origin)
-    restored = model.means.astype(np.float64) + np.array(model.origin)
-    assert np.abs(restored - positions).max() < 1e-6
-
-
-def test_an_outlier_does_not_move_the_origin(tmp_path):
-    positions = np.random.default_rng(3).standard_normal((500, 3)) + 1e7
-    positions[0] = -1e12
-    model = read_doubles(tmp_path / "a.ply", positions)
-    assert np.abs(np.array(model.origin) - 1e7).max() < 1
-    restored = model.means[1:].astype(np.float64) + np.array(model.origin)
-    assert np.abs(restored - positions[1:]).max() < 1e-6
-
-
-def test_doubles_that_float32_does_not_hold_are_kept_and_written_back(tmp_path):
-    positions = np.random.default_rng(3).normal(0, 5, (20, 3)) + np.array([481_250.0, 5_467_100.0, 310.0])
-    model = read_doubles(tmp_path / "a.ply", positions)
+    assert np.abs(model.means.astype(np.float64) + model.origin - positions).max() < 1e-6
     write_ply(tmp_path / "b.ply", model, absolute=True)
     np.testing.assert_array_equal(positions, model.means_double)
     np.testing.assert_array_equal(positions, read_ply(tmp_path / "b.ply").means_double)
-
-
-def test_doubles_that_are_floats_keep_origin_zero(tmp_path):
-    positions = np.float32(1e7) + np.arange(30.0).reshape(10, 3)
+    positions[0] = -1e12  # an outlier does not move the origin
     model = read_doubles(tmp_path / "a.ply", positions)
-    assert (0.0, 0.0, 0.0) == model.origin
-    assert np.array_equal(model.means, positions)
+    assert np.abs(np.array(model.origin) - centre).max() < 1
+    assert np.abs(model.means[1:].astype(np.float64) + model.origin - positions[1:]).max() < 1e-6
 
 
-def test_splats_in_one_point_far_away_are_exact(tmp_path):
-    positions = np.full((10, 3), 1e7 + 0.1)
+@pytest.mark.parametrize(("positions", "origin"), [
+    (np.float32(1e7) + np.arange(30.0).reshape(10, 3), (0.0, 0.0, 0.0)),  # floats as doubles
+    (np.full((10, 3), 1e7 + 0.1), None),
+])  # fmt: skip
+def test_positions_that_floats_hold_about_their_origin_are_exact(tmp_path, positions, origin):
     model = read_doubles(tmp_path / "a.ply", positions)
+    assert origin in (None, model.origin)
     assert np.array_equal(model.means + np.array(model.origin), positions)
-
-
-def test_the_training_record_survives_files(tmp_path, make_model):
-    trained = TrainingRecord((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
-    write_ply(tmp_path / "a.ply", make_model(metadata={"training": trained.as_json()}))
-    model = read_ply(tmp_path / "a.ply")
-    assert {"training": trained.as_json()} == model.metadata
-    write_ply(tmp_path / "b.ply", decode(encode(model)))
-    assert trained == TrainingRecord.of(read_ply(tmp_path / "b.ply").metadata)
-    line = header_of(tmp_path / "b.ply")[-1]
-    assert line.startswith('comment csplat training {"background": [1.0, 1.0, 1.0], "test_every": 5')
-
-
-def test_an_invalid_training_record_is_not_written(tmp_path, make_model):
-    write_ply(tmp_path / "a.ply", make_model(metadata={"training": "on a laptop"}))
-    assert {} == read_ply(tmp_path / "a.ply").metadata
 
 
 COMMENTS = {
     "training ": "csplat training.*is invalid: not JSON",
     "training white": "csplat training.*is invalid: not JSON",
-    "training " + "[" * 100_000: "csplat training.*is invalid: .*nested too deep",
+    "training " + "[" * 10_000: "csplat training.*is invalid: .*nested too deep",
     "training []": r"is invalid: training is \[\], expected an object",
     "training {}": "training has no background",
     'training {"background": [0, 0]}': "background of training is",
@@ -345,7 +283,7 @@ COMMENTS = {
     'training {"background": [0, 0, 0], "images": "\\ud800"}': "half of a surrogate pair",
     **{
         f"view {text}": "csplat view.*is invalid"
-        for text in ("", "0 0 1", "[]", '{"near": 1e999}', '{"near": NaN}', "[" * 100_000)
+        for text in ("", "0 0 1", "[]", '{"near": 1e999}', '{"near": NaN}', "[" * 10_000)
     },
     **dict.fromkeys(("origin 1 2", "origin a b c", "absolute_origin 1 2 inf"), "3 finite numbers"),
 }
@@ -361,34 +299,40 @@ def test_invalid_comments_of_csplat_are_refused(tmp_path):
     assert [] == failures({one: (one, message) for one, message in COMMENTS.items()}, check)
 
 
-def test_the_first_view_survives_files(tmp_path, make_model):
-    view = {"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4, "image": "ä b.png"}
-    write_ply(tmp_path / "a.ply", make_model(metadata={"view": view}))
+VIEW = {"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4, "image": "ä b.png"}
+TRAINED = TrainingRecord((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
+
+
+@pytest.mark.parametrize(("metadata", "line"), [
+    ({"view": VIEW}, 'view {"H": 4, "K": [[1, 0, 2]'),
+    ({"training": TRAINED.as_json()}, 'training {"background": [1.0, 1.0, 1.0], "test_every": 5'),
+])  # fmt: skip
+def test_the_training_record_and_the_first_view_survive_files(tmp_path, make_model, metadata, line):
+    write_ply(tmp_path / "a.ply", make_model(metadata=metadata))
     model = read_ply(tmp_path / "a.ply")
-    assert {"view": view} == model.metadata == decode(encode(model)).metadata
-    for unsound in ("from above", {"near": np.inf}, {"K": np.eye(3)}):
-        write_ply(tmp_path / "b.ply", make_model(metadata={"view": unsound}))
+    assert metadata == model.metadata
+    write_ply(tmp_path / "b.ply", decode(encode(model)))
+    again = read_ply(tmp_path / "b.ply").metadata
+    assert metadata == again
+    assert "view" in metadata or TRAINED == TrainingRecord.of(again)
+    assert header_of(tmp_path / "b.ply")[-1].startswith(f"comment csplat {line}")
+
+
+def test_invalid_metadata_are_not_written(tmp_path, make_model):
+    for metadata in (
+        {"training": "on a laptop"}, {"view": "from above"}, {"view": {"near": np.inf}}, {"view": {"K": np.eye(3)}},
+    ):  # fmt: skip
+        write_ply(tmp_path / "b.ply", make_model(metadata=metadata))
         assert {} == read_ply(tmp_path / "b.ply").metadata
-
-
-def test_infinite_logits_are_alpha_1_and_0(tmp_path):
-    names = columns_of(0)
-    rows = random_rows(names, 3)
-    rows[:, names.index("opacity")] = [np.inf, -np.inf, 0]
-    write_rows(tmp_path / "a.ply", names, rows)
-    assert [1.0, 0.0, 0.5] == read_ply(tmp_path / "a.ply", strict=True).opacities.tolist()
 
 
 def test_alphas_of_0_and_1_have_finite_logits():
     logits = logits_of_alpha(np.array([0, 1], np.float32))
     assert [LOGIT_OF_0, LOGIT_OF_1] == logits.tolist()
     assert [0.0, 1.0] == alpha_of_logits(logits).tolist()
-    with np.errstate(over="ignore"):
-        in_float32 = np.float32(1) / (np.float32(1) + np.exp(-logits))
-        other_way = np.exp(logits) / (np.float32(1) + np.exp(logits))
-    assert np.float32 == in_float32.dtype
-    assert [0.0, 1.0] == in_float32.tolist()
-    assert [0.0, 1.0] == other_way.tolist()
+    with np.errstate(over="ignore"):  # by both formulas that programs use, in float32
+        formulas = 1 / (1 + np.exp(-logits)), np.exp(logits) / (1 + np.exp(logits))
+    assert all(np.float32 == one.dtype and [0.0, 1.0] == one.tolist() for one in formulas)
 
 
 @pytest.mark.slow
@@ -411,18 +355,15 @@ def test_a_file_is_replaced_only_once_it_is_complete(tmp_path, make_model):
     assert ["a.ply"] == [one.name for one in tmp_path.iterdir()]
 
 
-def test_writing_follows_a_symbolic_link(tmp_path, make_model):
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no /dev/null, and links require privileges")
+def test_writing_follows_a_symbolic_link_and_leaves_a_device(tmp_path, make_model):
     (tmp_path / "real.ply").write_bytes(b"")
     (tmp_path / "link.ply").symlink_to(tmp_path / "real.ply")
     write_ply(tmp_path / "link.ply", make_model())
     assert (tmp_path / "link.ply").is_symlink()
     assert 10 == len(read_ply(tmp_path / "real.ply"))
-
-
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no /dev/null")
-def test_writing_to_a_device_leaves_it_a_device(make_model):
     write_ply("/dev/null", make_model())
-    assert not os.path.isfile("/dev/null")  # noqa: PTH113 -- as short as it gets
+    assert Path("/dev/null").is_char_device()
 
 
 @pytest.mark.parametrize("name", ["x", "opacity", "f_rest_0", "two words", "ü", ""])
@@ -439,153 +380,83 @@ def test_comments_cannot_break_the_header(tmp_path, make_model):
     assert_same_scene(model, again)
 
 
-@pytest.mark.parametrize(("name", "data", "format"), [
-    ("a.spz", gzip.compress(b"NGSP\x02\0\0\0", mtime=0), "SPZ"),
-    ("renamed.ply", gzip.compress(b"NGSP\x02\0\0\0", mtime=0), "SPZ"),
-    ("v4.bin", b"NGSP\x04\0\0\0", "SPZ"),
-    ("a.splat", bytes(64), ".splat"),
-    ("unnamed", b"\x80" * 64, ".splat"),
-    ("a.ksplat", b"\x00\x01" + bytes(4096), ".ksplat"),
-    ("a.spx", b"spx\x01", "spx"),
-    ("a.bin", b"glTF\x02\0\0\0", "glTF"),
-    ("a.gltf", b'{"asset": {}}', "glTF"),
-    ("meta.json", b'{"means": {}}', "SOG"),
-    ("a.csplat", b"\x89CSP", "csplat decode"),
+def zip_of(name):
+    """Return the bytes of a zip of one small file."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr(name, "{}")
+    return out.getvalue()
+
+
+CONVERT = "convert it to PLY first, with.*"
+CODED = "\nproperty uchar opacity\nproperty uchar scaling\n"
+CODEBOOKS = f"element vertex_0 1{CODED}element codebook_centers 1{CODED}end_header\n\1\1\1\1"
+
+
+@pytest.mark.parametrize(("name", "data", "message"), [
+    ("a.spz", gzip.compress(b"NGSP\x02\0\0\0", mtime=0), f"SPZ.*{CONVERT}"),
+    ("renamed.ply", gzip.compress(b"NGSP\x02\0\0\0", mtime=0), f"SPZ.*{CONVERT}"),
+    ("v4.bin", b"NGSP\x04\0\0\0", f"SPZ.*{CONVERT}"),
+    ("a.splat", bytes(64), rf"is \.splat.*{CONVERT}"),
+    ("unnamed", b"\x80" * 64, rf"is .*\.splat.*{CONVERT}"),
+    ("a.ksplat", b"\x00\x01" + bytes(4096), rf"is \.ksplat.*{CONVERT}"),
+    ("a.spx", b"spx\x01", f"is .*spx.*{CONVERT}"),
+    ("a.bin", b"glTF\x02\0\0\0", f"glTF.*{CONVERT}"),
+    ("a.gltf", b'{"asset": {}}', f"glTF.*{CONVERT}"),
+    ("meta.json", b'{"means": {}}', f"SOG.*{CONVERT}"),
+    ("a.csplat", b"\x89CSP", f"{CONVERT}csplat decode"),
+    ("scene.ply", zip_of("meta.json"), r"is SOG, .* `csplat convert`.*csplat\.read"),
+    ("a.zip", zip_of("readme.txt"), r"is a zip without a scene: readme\.txt"),
+    ("a.ply", f"ply\nformat binary_little_endian 1.0\n{CODEBOOKS}".encode(), r"with codebooks .* without quantisation"),
+    ("a.ply", b"", r"a\.ply is"),
+    ("a.ply", b"plywood is no PLY", r"a\.ply is"),
 ])  # fmt: skip
-def test_other_formats_are_named_with_a_converter(tmp_path, name, data, format):
+def test_other_files_are_named_and_refused(tmp_path, name, data, message):
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(InputError, match="convert it to PLY first, with") as caught:
+    with pytest.raises(InputError, match=message):
         read_ply(tmp_path / name)
-    assert format in str(caught.value)
 
 
-def test_a_ply_with_codebooks_is_named(tmp_path):
-    columns = "\nproperty uchar opacity\nproperty uchar scaling\n"
-    text = f"ply\nformat binary_little_endian 1.0\nelement vertex_0 1{columns}element codebook_centers 1{columns}"
-    (tmp_path / "a.ply").write_bytes(f"{text}end_header\n".encode() + bytes(4))
-    with pytest.raises(InputError, match=r"is a PLY with codebooks .*: save it there without quantisation"):
-        read_ply(tmp_path / "a.ply")
-
-
-def test_sog_is_named_in_a_zip_and_in_a_folder(tmp_path):
-    with zipfile.ZipFile(tmp_path / "scene.ply", "w") as archive:
-        archive.writestr("meta.json", "{}")
-    folder = tmp_path / "scene"
-    folder.mkdir()
-    (folder / "meta.json").write_text("{}")
-    for path in (tmp_path / "scene.ply", folder):
-        with pytest.raises(InputError, match=r"is SOG, .* `csplat convert`.*csplat\.read"):
-            read_ply(path)
-
-
-def test_a_zip_without_a_scene_is_refused(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
-        archive.writestr("readme.txt", "")
-    with pytest.raises(InputError, match=r"is a zip without a scene: readme\.txt"):
-        read_ply(tmp_path / "a.zip")
-
-
-@pytest.mark.parametrize("data", [b"", b"hello", b"plywood is no PLY"])
-def test_other_files_are_refused(tmp_path, data):
-    (tmp_path / "a.ply").write_bytes(data)
-    with pytest.raises(InputError, match=r"a\.ply is"):
-        read_ply(tmp_path / "a.ply")
-
-
-def test_every_prefix_of_a_file_is_refused(tmp_path):
-    written(tmp_path / "a.ply", 0, 2)
-    data = (tmp_path / "a.ply").read_bytes()
-    for length in range(len(data)):
-        with pytest.raises(InputError):
-            read_ply(data[:length])
-
-
-@pytest.mark.slow
-def test_flipped_header_bits_are_read_or_refused(tmp_path):
-    """Read a header with every third bit flipped, so that each bit position within a byte occurs.
-
-    In lines of columns after the first two, only the name is changed: the rest repeats itself.
-    """
-    names = columns_of(0, normals=False)
-    write_rows(tmp_path / "a.ply", names, random_rows(names, 2))
-    data = (tmp_path / "a.ply").read_bytes()
-    lines = data[: data.index(b"end_header\n") + 11].splitlines(keepends=True)
-    starts = np.cumsum([0, *map(len, lines)]).tolist()
-    columns = [number for number, line in enumerate(lines) if line.startswith(b"property float ")]
-    same = {starts[number] + at for number in columns[2:] for at in range(len("property float "))}
-    bits = [8 * byte + place for byte in range(starts[-1]) if byte not in same for place in range(8)]
-    for bit in bits[::3]:
-        flipped = bytearray(data)
-        flipped[bit // 8] ^= 1 << bit % 8
-        with suppress(InputError):
-            read_ply(flipped)
-
-
-def test_a_missing_file_is_an_os_error(tmp_path):
+def test_folders_and_missing_files_are_refused(tmp_path):
+    (tmp_path / "meta.json").write_text("{}")
+    with pytest.raises(InputError, match=r"is SOG, .* `csplat convert`.*csplat\.read"):
+        read_ply(tmp_path)
     with pytest.raises(FileNotFoundError):
         read_ply(tmp_path / "none.ply")
 
 
-@pytest.fixture(scope="module")
-def many(tmp_path_factory):
-    """A PLY of 400,000 splats."""
-    path = tmp_path_factory.mktemp("many") / "a.ply"
-    written(path, 3, 10_000)
-    data = path.read_bytes().replace(b"vertex 10000\n", b"vertex 400000\n")
-    head = data.index(b"end_header\n") + 11
-    with path.open("wb") as stream:
-        stream.write(data[:head])
-        for _ in range(40):
-            stream.write(data[head:])
-    yield path
-    path.unlink()
+def test_damage_is_refused_or_read(tmp_path):
+    path, names = tmp_path / "a.ply", columns_of(0, normals=False)
+    write_rows(path, names, random_rows(names, 2))
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + 11
+    sizes = [*range(60), *range(60, end, 9), *range(end - 12, len(data), 5), len(data) - 1]
+    assert all(refusals(path, (data[:size] for size in sizes), read_ply))
+    places = [*range(60), *range(60, end - 20, 11), *range(end - 20, end)]
+    assert any(refusals(path, flipped(data, places), read_ply))
 
 
 @pytest.mark.slow
-def test_a_million_splats_are_read_in_under_a_second_of_cpu(many):
-    times = []
-    while len(times) < 5 and min(times, default=1.0) >= 0.4 * 0.8:  # until one run was undisturbed
-        start = time.process_time()
-        model = read_ply(many)
-        times.append(time.process_time() - start)
-    assert (400_000, 3) == (len(model), model.sh_degree)
-    assert min(times) < 0.4 * 0.8
-
-
-@pytest.mark.slow
-def test_reading_allocates_little_more_than_the_arrays(many):
+def test_reading_allocates_little_more_than_the_arrays(tmp_path):
+    written(tmp_path / "a.ply", 3, 10_000)
+    head, rows = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    with (tmp_path / "a.ply").open("wb") as stream:
+        stream.write(head.replace(b"vertex 10000\n", b"vertex 200000\n") + b"end_header\n")
+        stream.writelines([rows] * 20)
     tracemalloc.start()
-    model = read_ply(many)
+    model = read_ply(tmp_path / "a.ply")
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
+    assert (200_000, 3) == (len(model), model.sh_degree)
     size = sum(getattr(model, name).nbytes for name in (*ARRAYS, "opacities"))
     assert peak < size + 16e6
 
 
-SCENES = {
-    "lego60k": (60_000, 3), "fox120k": (120_000, 3), "fox60k_noreg": (60_000, 3), "plane3": (13_982, 3),
-    "train1000": (1_000, 3), "object_id": (4_560, 3), "donut": (45_624, 0), "horse": (28_218, 0),
-    "jacket": (54_460, 0), "trailing_bytes": (100, 3),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", SCENES)
-def test_real_scenes_are_read_and_written(data_dir, tmp_path, name):
+@pytest.mark.parametrize(("name", "count", "degree"), [
+    ("plane3", 13_982, 3), ("object_id", 4_560, 3), ("horse", 28_218, 0), ("trailing_bytes", 100, 3),
+])  # fmt: skip
+def test_real_scenes_are_read_and_written(data_dir, tmp_path, name, count, degree):
     model = read_ply(data_dir / "ply" / f"{name}.ply")
-    assert SCENES[name] == (len(model), model.sh_degree)
+    assert (count, degree) == (len(model), model.sh_degree)
     write_ply(tmp_path / "a.ply", model)
     assert_same_scene(model, read_ply(tmp_path / "a.ply", strict=True))
-
-
-@pytest.mark.parametrize(("path", "format"), [
-    ("other/guitar.compressed.ply", "compressed PLY"),
-    ("other/tabletop.spz", "SPZ"),
-    ("other/luma-seal.splat", ".splat"),
-    ("sog/angel.sog", "SOG"),
-    ("sog/statue", "SOG"),
-    ("sog/statue/meta.json", "SOG"),
-])  # fmt: skip
-def test_real_files_of_other_formats_are_named(data_dir, path, format):
-    with pytest.raises(InputError, match=r"splat-transform|csplat convert") as caught:
-        read_ply(data_dir / path)
-    assert f"is {format}, " in str(caught.value)

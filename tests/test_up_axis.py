@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import functools
 import json
 import math
 import re
@@ -34,7 +33,6 @@ pytest.importorskip("scipy", reason="the trainer needs scipy: pip install 'cspla
 pytest.importorskip("PIL", reason="pictures need pillow: pip install 'csplat[render]'")
 
 
-from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.up_estimate import estimate_up, with_estimated_up
@@ -58,10 +56,8 @@ def test_a_direction_gets_unit_length_and_keeps_it(values, up):
     assert up == unit_up(values) == unit_up(unit_up(values))
 
 
-@pytest.mark.parametrize(
-    "values",
-    [None, "xyz", (0, 0, 0), (1, 2), (1, 2, 3, 4), (math.nan, 0, 1), (math.inf, 0, 1), (True, 0, 0), "z", [[1]]],
-)
+@pytest.mark.parametrize("values", [None, "xyz", (0, 0, 0), (1, 2), (1, 2, 3, 4), (math.nan, 0, 1), (math.inf, 0, 1),
+    (True, 0, 0), [[1]]])  # fmt: skip
 def test_values_other_than_a_direction_are_refused(values):
     with pytest.raises(InputError, match="expected three finite numbers"):
         unit_up(values)
@@ -94,26 +90,22 @@ def test_up_survives_ply_and_csplat_files(tmp_path, make_model):
     assert {"up": [0.0, -0.995037, 0.099504]} == first.metadata == again.metadata
 
 
-def test_an_invalid_up_is_not_written(tmp_path, make_model):
+def test_an_invalid_up_is_neither_written_nor_read(tmp_path, make_model):
     write_ply(tmp_path / "a.ply", make_model(metadata={"up": "there"}))
     assert {} == read_ply(tmp_path / "a.ply").metadata
-
-
-@pytest.mark.parametrize("words", ["", "0 0 0", "1 2", "nan 0 1", "x y z"])
-def test_an_invalid_up_comment_is_refused(tmp_path, make_model, words):
     write_ply(tmp_path / "a.ply", make_model(metadata={"up": [0, 0, 1]}))
     data = (tmp_path / "a.ply").read_bytes()
-    (tmp_path / "b.ply").write_bytes(data.replace(b"csplat up 0.0 0.0 1.0", f"csplat up {words}".encode()))
-    with pytest.raises(InputError, match="csplat up"):
-        read_ply(tmp_path / "b.ply")
+    for words in ("", "0 0 0", "1 2", "nan 0 1", "x y z"):
+        with pytest.raises(InputError, match="csplat up"):
+            read_ply(data.replace(b"csplat up 0.0 0.0 1.0", f"csplat up {words}".encode()))
 
 
 AXES = [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
 
 
-def photographed_from(up, seed=0, **fields):
+def photographed_from(up, **fields):
     """Make a ball of fine splats; on the side that faces away from `up`, unseen, they are few and large."""
-    places = np.random.default_rng(seed).standard_normal((4000, 3))
+    places = np.random.default_rng(0).standard_normal((4000, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     unseen = places @ np.array(up, float) < -0.2
     kept = ~unseen | (np.arange(4000) % 40 == 0)
@@ -127,17 +119,14 @@ def test_an_object_was_photographed_from_above(up):
     assert up == parse_up(up_word(up))
 
 
-def test_no_up_is_estimated_without_evidence():
+def test_no_up_is_estimated_without_evidence_or_if_one_is_recorded():
     assert estimate_up(photographed_from((0, 0, 0))) is None  # seen from all sides
     assert estimate_up(photographed_from((0.6, 0.6, 0.6))) is None  # between the axes
     assert estimate_up(photographed_from((0, 0, 1)).select(np.arange(0))) is None
-
-
-@pytest.mark.parametrize("said", [{"metadata": {"up": [1, 0, 0]}}, {"coordinate_system": "RDF"}])
-def test_recorded_axes_are_not_replaced_by_an_estimate(said):
-    model = photographed_from((0, 0, 1), **said)
-    assert estimate_up(model) is None
-    assert with_estimated_up(model) is model
+    for fields in ({"metadata": {"up": [1, 0, 0]}}, {"coordinate_system": "RDF"}):
+        model = photographed_from((0, 0, 1), **fields)
+        assert estimate_up(model) is None
+        assert with_estimated_up(model) is model
 
 
 @pytest.mark.slow
@@ -149,15 +138,10 @@ def test_renders_for_display_are_upright_and_test_views_do_not_move():
         assert abs(camera.viewmat[0, 1]) < 1e-6
         assert camera.viewmat[1, 1] < 0.0  # down the picture
     assert all(camera.viewmat[1, 1] > 0.0 for camera in views.test)  # -y is up, as in a PLY without metadata
+    assert "up" not in decode(encode(model)).metadata  # nor is an estimate recorded
 
 
-def test_encoding_records_no_estimated_up():
-    assert "up" not in decode(encode(photographed_from((0, 0, 1)))).metadata
-
-
-@pytest.mark.parametrize(
-    ("name", "up"), [("lego60k", (0, 0, 1)), ("donut", (0, 0, 1)), ("horse", None), ("jacket", None)]
-)
+@pytest.mark.parametrize(("name", "up"), [("donut", (0, 0, 1)), ("horse", None)])
 def test_the_estimate_is_right_for_real_objects(data_dir, name, up):
     assert up == estimate_up(read_ply(data_dir / "ply" / f"{name}.ply"))
 
@@ -187,12 +171,12 @@ def degrees_off(level):
     return float(np.degrees(np.arccos(np.clip(np.sum(np.array(level.up) * UP), -1.0, 1.0))))
 
 
-@pytest.mark.parametrize("pitch", [-40.0, 0.0, 40.0, 70.0, 89.0])
-def test_pitch_does_not_change_the_estimate(pitch):
-    level = estimate_up_of_cameras(list(around(12, pitch=pitch)))
-    assert level.by_horizons
-    assert level.tilt_degrees < 0.01
-    assert degrees_off(level) < 0.01
+def test_pitch_does_not_change_the_estimate():
+    for pitch in (-40.0, 0.0, 40.0, 70.0, 89.0):
+        level = estimate_up_of_cameras(list(around(12, pitch=pitch)))
+        assert level.by_horizons
+        assert level.tilt_degrees < 0.01
+        assert degrees_off(level) < 0.01
 
 
 def test_cameras_that_look_to_one_side_give_the_mean_of_their_own_up():
@@ -201,22 +185,15 @@ def test_cameras_that_look_to_one_side_give_the_mean_of_their_own_up():
     assert 4.0 < degrees_off(level) < 6.0
 
 
-def test_rolls_of_a_hand_held_camera_move_the_estimate_little_and_are_reported():
+def test_rolls_of_a_camera_move_the_estimate_little():
     level = estimate_up_of_cameras(list(around(60, rolls=6.0)))
     assert degrees_off(level) < 3.0
     assert 2.0 < level.tilt_degrees < 6.0
-    assert f"within {level.tilt_degrees:.1f} degrees" in str(level)
-
-
-def test_a_few_images_in_portrait_change_little():
-    viewmats = [rolled(one, 90.0 * (number % 5 == 0)) for number, one in enumerate(around(60))]
-    assert degrees_off(estimate_up_of_cameras(viewmats)) < 2.0
-
-
-def test_cameras_at_random_angles_give_no_estimate():
+    portrait = [rolled(one, 90.0 * (number % 5 == 0)) for number, one in enumerate(around(60))]
+    assert degrees_off(estimate_up_of_cameras(portrait)) < 2.0
     rng = np.random.default_rng(1)
     viewmats = [look_at([0, 0, 0], *rng.standard_normal((2, 3)), LEVEL_K, 64, 48).viewmat for _ in range(40)]
-    assert estimate_up_of_cameras(viewmats) is None
+    assert estimate_up_of_cameras(viewmats) is None  # cameras at random angles
 
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -236,7 +213,7 @@ def colours(model, directions):
     return np.einsum("dk,nkc->ndc", basis[:, : model.shN.shape[1]], model.shN.astype(np.float64))
 
 
-@pytest.mark.parametrize("matrix", [*WHOLE[::5], ANY, -ANY])
+@pytest.mark.parametrize("matrix", [*WHOLE[::9], ANY, -ANY])
 def test_rotation_turns_shapes_and_colours(make_model, matrix):
     model = make_model(20, 3, flat=True)
     after = rotate_scene(model, matrix)
@@ -258,11 +235,11 @@ def test_a_linear_map_transforms_covariances(make_model, matrix):
     assert np.abs(world - after.means - after.origin).max() < 1e-5
 
 
-@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize("degree", [0, 3])
 def test_changing_axes_and_back_is_exact(make_model, degree):
     model = make_model(20, degree, origin=(1.0, -2.5, 3.0))
     model.means[0] = (0.0, -0.0, 1e-45)
-    for matrix in WHOLE:
+    for matrix in WHOLE[::2]:
         back = rotate_scene(rotate_scene(model, matrix), matrix.T)
         exact = ARRAYS if abs(matrix[2, 2]) == 1 or degree < 2 else ARRAYS[:-1]
         assert all(getattr(model, name).tobytes() == getattr(back, name).tobytes() for name in exact)
@@ -308,8 +285,8 @@ def test_converted_axes_put_up_where_the_format_expects_it(make_model, fields, u
     assert convert_axes(scene, "LUF") is scene
 
 
-def test_lengths_scale_together(make_model):
-    model = make_model(5, 1, origin=(1e6, 2.0, 3.0), unit_metres=2.0, cameras=[CAMERA])
+def test_lengths_and_cameras_follow_a_scale_and_a_translation(make_model):
+    model = make_model(5, 1, origin=(1e6, 2.0, 3.0), unit_metres=2.0, cameras=[CAMERA], metadata={"view": CAMERA})
     doubles = model.means + np.array(model.origin)
     model = replace(model, means_double=doubles, means=(doubles - model.origin).astype(np.float32))
     for after, factor, offset in (
@@ -321,10 +298,6 @@ def test_lengths_scale_together(make_model):
         assert np.abs(model.scales + np.log(factor) - after.scales).max() < 1e-6
         assert 2.0 / factor == after.unit_metres
         assert 0.1 * factor == after.cameras[0]["near"]
-
-
-def test_cameras_follow_a_translation(make_model):
-    model = make_model(5, 0, cameras=[CAMERA], metadata={"view": CAMERA})
     after = translate_scene(model, (1.0, -2.0, 0.5))
     for before, now in ((CAMERA, after.cameras[0]), (CAMERA, after.metadata["view"])):
         seen = [
@@ -349,16 +322,11 @@ TURN = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # -y to z
 
 
 def trained(write, up):
-    @functools.cache
-    def known(folder):
-        folder.mkdir()
+    def make(folder, _make_model):
         write(folder, up=up)
         return train(load(folder), TrainOptions(**ALMOST_NONE)).model
 
-    return lambda folder, _make_model: known(folder.parent / write.__name__)
-
-
-TRANSFORMS = trained(write_transforms, (1, 0, 0))
+    return make
 
 
 def without_up(**fields):
@@ -369,18 +337,15 @@ def without_up(**fields):
 @pytest.mark.parametrize(("make", "words", "axes", "up"), [
     (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
     (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),
-    (TRANSFORMS, [], "unspecified", (1, 0, 0)),
-    (TRANSFORMS, ["--up", "-y"], "unspecified", (0, -1, 0)),
+    (trained(write_transforms, (1, 0, 0)), ["--up", "-y"], "unspecified", (0, -1, 0)),
     (without_up(), [], "unspecified", None),
     (without_up(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
     (without_up(coordinate_system="LUF"), [], "LUF", (0, 1, 0)),
-    (without_up(metadata={"up": [1, 0, 0]}, coordinate_system="RDF"), ["--up", "-y"], "RDF", (0, -1, 0)),
     (without_up(coordinate_system="RDF"), ["--up", "z"], "unspecified", (0, 0, 1)),
-    (lambda _folder, make_model: rotate_scene(make_model(60, 1), TURN), ["--up", "z"], "unspecified", (0, 0, 1)),
-], ids=["blender", "colmap", "transforms", "transforms-up", "ply", "ply-up", "ply-axes", "up-axes",
-    "axes-up", "turned"])  # fmt: skip
+], ids=["blender", "colmap", "transforms-up", "ply", "ply-up", "ply-axes", "axes-up"])  # fmt: skip
 def test_all_commands_agree_on_up(tmp_path, make_model, make, words, axes, up):
-    write_ply(tmp_path / "scene.ply", make(tmp_path, make_model))
+    (tmp_path / "set").mkdir()
+    write_ply(tmp_path / "scene.ply", make(tmp_path / "set", make_model))
     call("encode", tmp_path / "scene.ply", tmp_path / "a.csplat", *words, "--preset", "fast", "-q")
     call("decode", tmp_path / "a.csplat", tmp_path / "b.ply")
     call("encode", tmp_path / "b.ply", tmp_path / "b.csplat", "--preset", "fast", "-q")
@@ -394,6 +359,8 @@ def test_all_commands_agree_on_up(tmp_path, make_model, make, words, axes, up):
     model = read_ply(tmp_path / "b.ply")
     assert (scene.coordinate_system, scene.metadata.get("up")) == (model.coordinate_system, model.metadata.get("up"))
     upright(orbit_cameras(model, 2, 64, 48), up or (0, -1, 0))  # without a recorded up: as in a PLY
+    if up is None:  # a page of a PLY, with the direction of the command line
+        assert {"up": "0,-0.995037,0.099504"} == in_page(tmp_path / "scene.ply", "--up", "0,-1,0.1")[1]
 
 
 def in_page(path, *words):
@@ -411,22 +378,3 @@ def upright(cameras, up):
     for camera in cameras:
         assert abs(camera.viewmat[0, :3] @ direction) < 1e-6
         assert -camera.viewmat[1, :3] @ direction > 0.5
-
-
-@pytest.mark.slow
-def test_the_page_gets_the_up_direction_of_the_command_line(tmp_path, make_model):
-    write_ply(tmp_path / "scene.ply", make_model(60, 0))
-    _, wishes = in_page(tmp_path / "scene.ply", "--up", "0,-1,0.1")
-    assert {"up": "0,-0.995037,0.099504"} == wishes
-
-
-@pytest.mark.slow
-def test_a_rotated_scene_with_its_up_has_the_same_orbit(make_model):
-    model = make_model(60, 1, scales=np.full((60, 3), -0.7, np.float32) - np.arange(3, dtype=np.float32))
-    lying = rotate_scene(model, TURN)
-    marked = [replace(one, metadata={"up": up}) for one, up in ((model, [0, -1, 0]), (lying, [0, 0, 1]))]
-    films = [[render(one, camera).rgb for camera in orbit_cameras(one, 3, 64, 48)] for one in (*marked, lying)]
-    for before, after, guessed in zip(*films, strict=True):
-        # A loose bound: the orbit goes around points that are drawn along the axes of the splats, which have changed.
-        assert np.abs(after - before).mean() < 0.15 * np.abs(before).mean()
-        assert np.abs(guessed - before).mean() > 0.3 * np.abs(before).mean()
