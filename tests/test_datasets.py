@@ -104,15 +104,6 @@ def test_missing_images_are_reported_and_every_eighth_is_a_test_image(ngp):
     assert len(load(ngp / "transforms.json", test_every=0).train) == 9
 
 
-def test_frames_may_have_intrinsics_of_their_own_and_a_world_scale(ngp):
-    frames = frames_of(ngp)
-    scaled = (np.array(frames[1]["transform_matrix"]) @ np.diag([2.0, 2.0, 2.0, 1.0])).tolist()
-    change_frames(ngp, [1], fl_x=77.0, fl_y=77.0, transform_matrix=scaled)
-    picture = next(p for p in load(ngp).train if p.camera.image == "images/0001.png")
-    assert 77.0 == picture.camera.K[0, 0]
-    assert np.allclose(cameras(10)[1].viewmat, picture.camera.viewmat)
-
-
 def test_colmap_sets_have_points_and_colours(colmap):
     data = load(colmap)
     assert (7, ["im 000.png", "im 008.png"]) == (len(data.train), names(data.test))

@@ -633,7 +633,7 @@ def test_an_impossible_target_size_is_refused(capture, source, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("no_fits")
+@pytest.mark.usefixtures("brief_fits")
 def test_a_target_psnr_is_met(capture, whole, tmp_path, monkeypatch):
     change_options(monkeypatch, ENCODE_OPTIONS, **SCALAR)
     out, wanted = tmp_path / "s.csplat", whole["validation"]["psnr"] + 1.0
