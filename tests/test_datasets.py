@@ -792,16 +792,6 @@ def test_invalid_lines_of_text_files_are_refused(tmp_path):
         file.write_text(before)
 
 
-def test_shared_fox_agrees_with_its_cameras(data_dir):
-    data = load(data_dir / "images" / "fox", (270, 480))
-    assert (43, 0, 7) == counts(data)
-    wanted = json.loads((data_dir / "ply" / "fox120k.cameras.json").read_text())
-    for picture, camera in zip(data.test, wanted, strict=True):
-        assert camera["image"].endswith(picture.camera.image)
-        assert np.allclose(camera["viewmat"], picture.camera.viewmat, atol=1e-5)
-        assert np.allclose(camera["K"], picture.camera.K, atol=2.0)
-
-
 def test_points_of_shared_desk_have_the_colours_of_its_images(data_dir):
     data = load(data_dir / "images" / "desk29")
     assert (25, 4) == (len(data.train), len(data.test))

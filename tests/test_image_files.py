@@ -298,6 +298,7 @@ MASK_NAMES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_masks_have_names_of_several_programs(colmap_set):
     def check(name):
         (colmap_set / name).parent.mkdir(exist_ok=True)

@@ -164,6 +164,7 @@ def assert_is_straight(picture):
     assert error.max() < 4.0
 
 
+@pytest.mark.slow
 def test_images_of_every_kind_of_lens_are_undistorted(tmp_path):
     def check(model):
         folder, parameters = tmp_path / model, MODELS[model]

@@ -122,7 +122,10 @@ def test_training_reduces_the_loss(data, strategy):
 
 def test_the_same_seed_gives_the_same_file(data, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        write_ply(tmp_path / name, train(data, TrainOptions(**QUICK, seed=seed, background="random")).model)
+        write_ply(
+            tmp_path / name,
+            train(data, TrainOptions(**{**QUICK, "iterations": 30}, seed=seed, background="random")).model,
+        )
     first, second, other = ((tmp_path / name).read_bytes() for name in "abc")
     assert first == second
     assert first != other
@@ -669,14 +672,6 @@ def test_the_ssim_of_the_loss_agrees_with_the_metric():
     assert value.ssim == pytest.approx(ssim(y, x), abs=1e-5)
 
 
-def test_equal_images_have_no_loss_and_no_gradient():
-    x, _ = random_images(20, 20)
-    value, gradient = PhotometricLoss(20, 20)(x, x.copy())
-    assert (value.l1, value.mse) == (0.0, 0.0)
-    assert value.ssim == pytest.approx(1.0, abs=1e-6)
-    assert np.abs(gradient).max() <= 1e-6
-
-
 def test_calls_of_a_loss_are_independent():
     x, y = random_images(24, 24)
     loss = PhotometricLoss(24, 24)
@@ -747,6 +742,7 @@ def test_gains_are_estimated_with_a_mean_of_0(uneven):
     assert "exposures" not in plain.log
 
 
+@pytest.mark.slow
 def test_a_resumed_run_keeps_its_gains(uneven, tmp_path):
     options = TrainOptions(**QUICK, lr_exposure=0.02)
     whole, stopped = assert_resumes_identically(uneven, options, tmp_path)
