@@ -35,7 +35,6 @@ from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.optimise.simplify import simplify
 from csplat_tools.optimise.target_encoding import meet_target
 from csplat_tools.views import find_view_set
-from csplat_trainer.data.colmap import read_points
 from csplat_trainer.parameters import Parameters, from_model
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import StoredSensitivity
@@ -61,10 +60,8 @@ def test_half_the_splats_keep_the_psnr_of_the_results(name):
 @LONG
 @pytest.mark.parametrize("name", NAMES)
 def test_a_simplified_file_is_within_its_declared_bounds(name):
-    source = small_scene(name)
-    views, options = find_view_set(source, count=10, size=(60, 45)), FEW
-    target = Target(keep=0.5)
-    result = meet_target(source, EncodeOptions(), target=target, views=views, simplifying=options)
+    source, views = small_scene(name), find_view_set(small_scene(name), count=10, size=(60, 45))
+    result = meet_target(source, EncodeOptions(), target=Target(keep=0.5), views=views, simplifying=FEW)
     decoded = decode(result.data)
     assert max(1, len(source) // 2) == len(decoded)
     assert () == verify(source, result, decoded).failures
@@ -128,6 +125,7 @@ def test_training_from_centres_lowers_the_loss(name):
     assert COUNT == len(result.model)
     # Points without colours start with those of the images, which are nearly final if all splats are alike.
     assert np.mean(losses[-10:]) < max(0.92 * np.mean(losses[:10]), 0.03)
+    assert "all transparent" != name or result.metrics["psnr_mean"] > 40.0
 
 
 @LONG
@@ -148,11 +146,6 @@ def test_training_from_random_points_does_not_raise_the_loss(name):
     assert result.log["losses"][-1] <= result.log["losses"][0]
 
 
-@LONG
-def test_training_learns_transparency():
-    assert trained("all transparent").metrics["psnr_mean"] > 40.0
-
-
 def test_splats_that_start_in_one_place_get_sizes_that_fill_the_scene():
     data = images("a million identical", small_scene("a million identical").means[:COUNT])
     scales = train(data, replace(QUICK, iterations=1, init="points")).model.scales
@@ -168,15 +161,11 @@ def test_resuming_with_fewer_splats_keeps_the_most_visible():
     assert largest <= {tuple(row) for row in left.values["means"].tolist()}
 
 
-def test_points_that_are_not_finite_are_refused_by_training_and_skipped_in_files(tmp_path):
+def test_points_that_are_not_finite_are_refused_by_training():
     points = np.zeros((4, 3), np.float32)
     points[1, 2], points[3, 0] = np.nan, np.inf
     with pytest.raises(InputError, match="2 of the data set's 4 points are NaN or infinite"):
         train(images("needles", points), replace(QUICK, init="points"))
-    rows = ("1 nan 0 0 9 9 9 0", "2 1e300 0 0 9 9 9 0", "3 1 2 3 255 0 0 0", "4 0 -inf 0 9 9 9 0")
-    (tmp_path / "points3D.txt").write_text("\n".join(rows))
-    kept, colours = read_points(tmp_path / "points3D.txt")
-    assert ([[1.0, 2.0, 3.0]], [[1.0, 0.0, 0.0]]) == (kept.tolist(), colours.tolist())
 
 
 # Fine-tuning
@@ -188,10 +177,9 @@ def test_a_tuned_file_is_no_worse_than_before(name):
     *decoded, result, views = tuned(name)
     assert_finite(decoded[1])
     before, after = map(views.psnr, decoded)
-    assert after >= before - 0.5  # the best step is chosen by SSIM and L1
+    gain = 1.0 if name in ("a million identical", "half the rows NaN", "10 km away") else -0.5
+    assert after >= before + gain  # the best step is chosen by SSIM and L1
     assert after == pytest.approx(min(result.log["best_psnr"], 99.0), abs=0.01)
-    if name in ("a million identical", "half the rows NaN", "10 km away"):
-        assert after >= before + 1.0
 
 
 def test_splats_wider_than_float32_are_tuned():

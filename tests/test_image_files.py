@@ -175,14 +175,6 @@ def test_paths_of_frames_of_another_machine_are_found(transforms, path, folder):
     assert any("10 names of transforms.json found" in line or "images from images" in line for line in data.report)
 
 
-def test_frames_without_images_are_left_out(tmp_path):
-    write_transforms(tmp_path)
-    (tmp_path / "images" / "0003.png").rename(tmp_path / "0003.png")
-    data = load(tmp_path, test_every=0)
-    assert 9 == len(data.train)
-    assert "transforms.json: 1 of 10 images are missing and dropped: images/0003.png" in data.report
-
-
 def test_training_and_test_images_must_be_different_files(tmp_path):
     write_blender(tmp_path)
     move(tmp_path / "train", tmp_path)
@@ -201,19 +193,14 @@ def test_another_folder_of_images_may_be_chosen(transforms):
 
 
 def test_masks_are_found_like_images(transforms):
-    (transforms / "masks").mkdir()
     for i, camera in enumerate(cameras(10)):
         write_picture(transforms / "masks" / f"{i:04}.png", camera)
     assert any("folder masks is ignored, since transforms.json does not" in line for line in load(transforms).report)
-    frames = [
-        {"file_path": f"images/{i:04}.png", "mask_path": f"masks\\{i:04}.png", "transform_matrix": matrix}
-        for i, matrix in enumerate(POSES)
-    ]
-    change_transforms(transforms, frames=frames)
-    data = load(transforms)
-    assert "masks hide parts of 10 images, which do not count" in data.report
-    note = "10 names of transforms.json found with / for \\, without surrounding spaces"
-    assert any(note in line for line in data.report)
+    for i in range(10):
+        change_frames(transforms, [i], mask_path=f"masks\\{i:04}.png")
+    report = load(transforms).report
+    assert "masks hide parts of 10 images, which do not count" in report
+    assert any("10 names of transforms.json found with / for \\" in line for line in report)
 
 
 #: Names on disk, and the code page in which a list has them, with its title.
@@ -239,9 +226,7 @@ def test_names_in_other_code_pages_are_matched_by_their_bytes():
         for listed, files in ((raw, names), (names, raw), (misread, names), (names, misread)):
             matched, (note,) = match_names(listed, files, "images.bin")
             assert dict(zip(listed, files, strict=True)) == matched
-            assert note.startswith(
-                f"3 names of images.bin found in the code page {title if raw in (listed, files) else ''}"
-            )
+            assert f"found in the code page {title if raw in (listed, files) else ''}" in note
             note.encode("utf-8")
 
     assert [] == failures(CODE_PAGES, check)
@@ -254,27 +239,26 @@ def test_bytes_that_fit_no_file_or_several_are_no_match():
         match_names(listed, ["Köln.png", "K÷ln.png"], "x")
 
 
-@pytest.mark.parametrize(("page", "form"), [("gbk", "图像{}.png"), ("cp932", "図面表{}.png")])
-def test_sets_with_names_in_another_code_page_are_read(colmap_set, page, form):
-    names = [form.format(i) for i in range(9)]
+def test_sets_with_names_in_another_code_page_are_read(colmap_set):
+    names = [f"図面表{i}.png" for i in range(9)]  # in code page 932, some bytes are backslashes
     model = colmap_set / "sparse" / "0" / "images.bin"
     data = model.read_bytes()
     for i, name in enumerate(names):
         (colmap_set / "images" / f"im {i:03}.png").rename(colmap_set / "images" / name)
-        data = data.replace(b"im %03d.png\0" % i, name.encode(page) + b"\0")
+        data = data.replace(b"im %03d.png\0" % i, name.encode("cp932") + b"\0")
     model.write_bytes(data)
-    (colmap_set / "test.txt").write_bytes(names[2].encode(page))
-    found = load(colmap_set)
-    assert [names[2]] == [image.camera.image for image in found.test]
-    assert names[3] in [image.camera.image for image in found.train]
-    assert any("9 names of images.bin found in the code page" in line for line in found.report)
+    (colmap_set / "test.txt").write_bytes(names[2].encode("cp932"))
+    read = load(colmap_set)
+    assert [names[2]] == [image.camera.image for image in read.test]
+    assert names[3] in [image.camera.image for image in read.train]
+    assert any("9 names of images.bin found in the code page" in line for line in read.report)
     rename_in_images_txt(colmap_set, names.__getitem__)
-    text = colmap_set / "sparse" / "0" / "images.txt"
-    text.write_bytes(text.read_text("utf-8").encode(page))
+    text = model.with_suffix(".txt")
+    text.write_bytes(text.read_text("utf-8").encode("cp932"))
     assert [names[2]] == [image.camera.image for image in load(colmap_set).test]
 
 
-@pytest.mark.parametrize(("page", "form"), [("gbk", "图像{}.png"), ("cp932", "表{}.png"), ("cp1252", "Größe{}.png")])
+@pytest.mark.parametrize(("page", "form"), [("cp932", "表{}.png"), ("cp1252", "Größe{}.png")])
 def test_a_transforms_json_may_be_in_another_code_page(transforms, page, form):
     names = [form.format(i) for i in range(10)]
     for i, name in enumerate(names):
@@ -314,14 +298,20 @@ MASK_NAMES = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("name", MASK_NAMES)
-def test_masks_have_names_of_several_programs(colmap_set, name):
-    (colmap_set / name).parent.mkdir(exist_ok=True)
-    write_picture(colmap_set / name, cameras(9)[3])
-    data = load(colmap_set)
-    assert 9 == len(data.train) + len(data.test)
-    assert "masks hide parts of 1 image, which do not count" in data.report
-    assert ["im 003.png"] == [picture.camera.image for picture in data.train if picture.masked is not None]
+@pytest.mark.slow
+def test_masks_have_names_of_several_programs(colmap_set):
+    def check(name):
+        (colmap_set / name).parent.mkdir(exist_ok=True)
+        write_picture(colmap_set / name, cameras(9)[3])
+        data = load(colmap_set)
+        (colmap_set / name).unlink()
+        if not name.startswith("images"):
+            (colmap_set / name).parent.rmdir()
+        assert 9 == len(data.train) + len(data.test)
+        assert "masks hide parts of 1 image, which do not count" in data.report
+        assert ["im 003.png"] == [picture.camera.image for picture in data.train if picture.masked is not None]
+
+    assert [] == failures({name: name for name in MASK_NAMES}, check)
 
 
 def test_hidden_files_are_ignored(tmp_path):
@@ -349,6 +339,7 @@ GREY = np.rint(255.0 * RAMP).astype(np.uint8)
 RGB = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=2)
 HALF_SEEN = np.where(RAMP < 0.5, 0, 200).astype(np.uint8)
 RGBA = np.dstack([RGB, HALF_SEEN])
+RGB_16 = RGB.astype(np.uint16) * 257
 UINT16 = np.rint(65535.0 * RAMP).astype(np.uint16)
 SWAPPED = UINT16.astype(">u2").tobytes()
 
@@ -356,39 +347,28 @@ SWAPPED = UINT16.astype(">u2").tobytes()
 def tiff(path, values, bits, kind, *, channels=1, photometric=1, planes=1):
     """Write a TIFF with one strip per plane, in kinds that Pillow does not write: 1 unsigned, 2 signed, 3 float."""
     data = np.ascontiguousarray(values).tobytes()
-    size = len(data) // (channels if planes == 2 else 1)
     strips = channels if planes == 2 else 1
-    lists = [[bits] * channels, [8 + size * i for i in range(strips)], [size] * strips, [kind] * channels]
-    bits_at, offsets_at, sizes_at, kinds_at = (8 + len(data) + 64 * i for i in range(4))
-    tail = b"".join(
-        struct.pack(f"<{len(row)}{'I' if i in (1, 2) else 'H'}", *row).ljust(64, b"\0") for i, row in enumerate(lists)
-    )
-
-    def entry(tag, form, row, at):
-        packed = struct.pack(f"<{len(row)}{'H' if form == 3 else 'I'}", *row)
-        return struct.pack("<HHI", tag, form, len(row)) + (
-            packed.ljust(4, b"\0") if len(packed) <= 4 else struct.pack("<I", at)
-        )
-
-    height, width = RAMP.shape
-    entries = [
-        entry(256, 4, [width], 0), entry(257, 4, [height], 0), entry(258, 3, lists[0], bits_at),
-        entry(259, 3, [1], 0), entry(262, 3, [photometric], 0), entry(273, 4, lists[1], offsets_at),
-        entry(277, 3, [channels], 0), entry(278, 4, [height], 0), entry(279, 4, lists[2], sizes_at),
-        entry(284, 3, [planes], 0), entry(339, 3, lists[3], kinds_at),
+    size, end, entries, tail = len(data) // strips, 8 + len(data), b"", b""
+    tags = [
+        (256, "I", [W]), (257, "I", [H]), (258, "H", [bits] * channels), (259, "H", [1]), (262, "H", [photometric]),
+        (273, "I", [8 + size * i for i in range(strips)]), (277, "H", [channels]), (278, "I", [H]),
+        (279, "I", [size] * strips), (284, "H", [planes]), (339, "H", [kind] * channels),
     ]  # fmt: skip
-    directory = struct.pack("<H", len(entries)) + b"".join(entries) + b"\0\0\0\0"
-    path.write_bytes(b"II*\0" + struct.pack("<I", 8 + len(data) + len(tail)) + data + tail + directory)
+    for tag, form, row in tags:
+        packed = struct.pack(f"<{len(row)}{form}", *row)
+        place = packed.ljust(4, b"\0") if len(packed) <= 4 else struct.pack("<I", end + len(tail))
+        entries += struct.pack("<HHI", tag, 3 if form == "H" else 4, len(row)) + place
+        tail += packed if len(packed) > 4 else b""
+    directory = struct.pack("<H", len(tags)) + entries + bytes(4)
+    path.write_bytes(b"II*\0" + struct.pack("<I", end + len(tail)) + data + tail + directory)
 
 
 def png_16(path, colours):
     """Write [H, W, 3] big-endian as a 16-bit RGB PNG, which Pillow does not."""
     rows = b"".join(b"\0" + row.tobytes() for row in colours)
     head = struct.pack(">IIBBBBB", colours.shape[1], colours.shape[0], 16, 2, 0, 0, 0)
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
-    whole = [
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    ]
+    chunks = [b"IHDR" + head, b"IDAT" + zlib.compress(rows), b"IEND"]
+    whole = [struct.pack(">I", len(one) - 4) + one + struct.pack(">I", zlib.crc32(one)) for one in chunks]
     path.write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(whole))
 
 
@@ -422,8 +402,8 @@ READ = {
     "16-bit grey TIFF": ("a.tif", saved(UINT16), GREY, 0),
     "16-bit grey, bytes swapped": ("a.tif", lambda p: Image.frombytes("I;16B", (W, H), SWAPPED).save(p), GREY, 0),
     "16-bit grey, white is 0": ("a.tif", lambda p: tiff(p, 65535 - UINT16, 16, 1, photometric=0), GREY, 0),
-    "16-bit RGB": ("a.tif", lambda p: tiff(p, RGB.astype(np.uint16) * 257, 16, 1, channels=3, photometric=2), RGB, 0),
-    "16-bit RGB PNG": ("a.png", lambda p: png_16(p, np.ascontiguousarray(RGB.astype(">u2") * 257, ">u2")), RGB, 0),
+    "16-bit RGB": ("a.tif", lambda p: tiff(p, RGB_16, 16, 1, channels=3, photometric=2), RGB, 0),
+    "16-bit RGB PNG": ("a.png", lambda p: png_16(p, RGB_16.astype(">u2")), RGB, 0),
     "float TIFF": ("a.tif", saved(RAMP.astype(np.float32)), GREY, 0),
 }
 
@@ -434,21 +414,17 @@ REFUSED = {
     "32-bit grey": ("a.tif", saved(UINT16.astype(np.int32)), "grey of 32 bits"),
     "signed 16 bits": ("a.tif", lambda p: tiff(p, (UINT16 // 2).astype(np.int16), 16, 2), "or with a sign"),
     "16-bit RGB in planes": (
-        "a.tif",
-        lambda p: tiff(p, np.moveaxis(RGB.astype(np.uint16) * 257, 2, 0), 16, 1, channels=3, photometric=2, planes=2),
-        "has 16 bits in planes",
+        "a.tif", lambda p: tiff(p, np.moveaxis(RGB_16, 2, 0), 16, 1, channels=3, photometric=2, planes=2), "in planes",
     ),
     "float RGB": (
-        "a.tif",
-        lambda p: tiff(p, RGB.astype(np.float32), 32, 3, channels=3, photometric=2),
-        "not of 8 or 16 bits or of floats in one channel: convert it to PNG or JPEG",
+        "a.tif", lambda p: tiff(p, RGB.astype(np.float32), 32, 3, channels=3, photometric=2), "not of 8 or 16 bits or",
     ),
     "OpenEXR": ("a.exr", lambda p: p.write_bytes(b"\x76\x2f\x31\x01" + bytes(60)), "is an OpenEXR file"),
     "Radiance": ("a.hdr", lambda p: p.write_bytes(b"#?RADIANCE\n" + bytes(60)), "is a Radiance HDR file"),
     "HEIC": ("a.heic", lambda p: p.write_bytes(b"\0\0\0\x18ftypheic" + bytes(60)), "is a HEIC file"),
     "raw": ("a.dng", lambda p: Image.fromarray(RGB).save(p, "TIFF"), "a camera's raw file"),
     "a web page": ("a.jpg", lambda p: p.write_text("<html>"), "is a web page"),
-}
+}  # fmt: skip
 
 
 def pixels_of(path):
@@ -478,61 +454,41 @@ def test_pixels_of_every_kind_are_read(tmp_path):
 def test_other_kinds_of_pixels_are_refused(tmp_path):
     def check(case):
         name, write, message = case
-        path = tmp_path / name
-        write(path)
+        write(tmp_path / name)
         with pytest.raises(InputError, match=message):
-            pixels_of(path)
+            pixels_of(tmp_path / name)
 
     assert [] == failures(REFUSED, check)
 
 
-def test_a_set_reports_how_its_pixels_are_read(tmp_path):
-    write_transforms(tmp_path)
-    files = sorted((tmp_path / "images").glob("*.png"))
-    for path in files:
-        with Image.open(path) as image:
-            grey = np.asarray(image.convert("L"))
-        Image.fromarray(grey.astype(np.uint16) * 16).save(path)
-    (line,) = (line for line in load(tmp_path).report if "16-bit" in line)
-    assert line.startswith("10 images of 16-bit grey: 0 to 65535 is read as black to white; the first, 0001.png, has 0")
-    assert line.endswith("scale them if that is too dark")
-    for path in files:
-        colours = np.ascontiguousarray((RGB.astype(">u2") << 4).astype(">u2"))
-        png_16(path, colours)
-    (line,) = (line for line in load(tmp_path).report if "16-bit" in line)
-    assert line.startswith("10 images of 16-bit colours: 0 to 255 is read as black to white; the first, 0001.png, has")
-    assert line.endswith("0 to 15: scale them if that is too dark")
-    frames = [Image.new("RGB", (W, H), colour) for colour in ("red", "blue")]
-    for path in files:
-        frames[0].save(path, save_all=True, append_images=frames[1:])
-    data = load(tmp_path)
-    assert "10 files with several images: the first of each is read (such as 0001.png)" in data.report
+def test_a_set_reports_how_its_pixels_are_read(transforms):
+    red, blue = (Image.new("RGB", (W, H), colour) for colour in ("red", "blue"))
+    for write, line in (
+        (lambda path: Image.fromarray((UINT16 // 16)).save(path), "10 images of 16-bit grey: 0 to 65535 is read as"),
+        (lambda path: png_16(path, (RGB.astype(">u2") << 4).astype(">u2")), "10 images of 16-bit colours: 0 to 255 is"),
+        (lambda path: red.save(path, save_all=True, append_images=[blue]), "10 files with several images: the first"),
+    ):
+        for path in (transforms / "images").iterdir():
+            write(path)
+        data = load(transforms)
+        assert any(note.startswith(line) for note in data.report)
     assert (data.train[0].pixels == (255, 0, 0)).all()
 
 
-@pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_an_ambiguous_exif_rotation_is_reported(tmp_path, orientation):
-    write_transforms(tmp_path)
-    for path in sorted((tmp_path / "images").glob("*.png")):
-        exif = Image.Exif()
-        exif[ExifTags.Base.Orientation] = orientation
-        with Image.open(path) as image:
-            image.save(path, exif=exif)
-    data = load(tmp_path)
-    assert_dots_are_where_points_fall([*data.train, *data.test])
-    notes = [line for line in data.report if "EXIF" in line]
-    assert (orientation == 3) == bool(notes)  # 6 would swap the sides, which contradicts the cameras
-    assert all("orientation 3): read as stored" in line for line in notes)
-
-
-def test_the_exif_rotation_of_a_square_image_is_reported(tmp_path):
-    write_transforms(tmp_path)
+@pytest.mark.parametrize(("orientation", "square", "reported"), [(1, 0, 0), (3, 0, 1), (6, 0, 0), (6, 1, 1)])
+def test_an_ambiguous_exif_rotation_is_reported(transforms, orientation, square, reported):
     exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = 6
-    for path in sorted((tmp_path / "images").glob("*.png")):
-        Image.new("RGB", (W, W)).save(path, exif=exif)
-    change_transforms(tmp_path, h=W, cy=W / 2)
-    assert any("EXIF turns 10 images (0001.png: orientation 6): read as stored" in one for one in load(tmp_path).report)
+    exif[ExifTags.Base.Orientation] = orientation
+    for path in (transforms / "images").iterdir():
+        with Image.open(path) as image:
+            (Image.new("RGB", (W, W)) if square else image).save(path, exif=exif)
+    if square:  # otherwise, 6 would swap the sides, which contradicts the cameras
+        change_transforms(transforms, h=W, cy=W / 2)
+    data = load(transforms)
+    if not square:
+        assert_dots_are_where_points_fall([*data.train, *data.test])
+    line = f"EXIF turns 10 images (0001.png: orientation {orientation}): read as stored"
+    assert reported == sum(line in note for note in data.report) == sum("EXIF" in note for note in data.report)
 
 
 SHAPE = RAMP > 0.4
@@ -559,14 +515,12 @@ MASKS = {
 
 
 def test_images_and_masks_much_larger_than_their_cameras_are_refused_before_decoding(transforms, monkeypatch):
-    path = transforms / "images" / "0003.png"
+    path, large = transforms / "images" / "0003.png", Image.new("1", (6000, 4000))
     original = path.read_bytes()
-    Image.new("1", (6000, 4000)).save(path)
-    Image.new("1", (6000, 4000)).save(transforms / "mask.png")
+    for name in (path, transforms / "mask.png"):
+        large.save(name)
     monkeypatch.setattr(ImageFile.ImageFile, "load", lambda file: pytest.fail(f"{file.filename} is decoded"))
-    with pytest.raises(
-        InputError, match=r"0003\.png has 6000×4000 pixels, expected about 48×32 as its camera: scale it"
-    ):
+    with pytest.raises(InputError, match=r"0003\.png has 6000×4000 pixels, expected about 48×32 as its camera"):
         load(transforms)
     path.write_bytes(original)
     change_frames(transforms, range(10), mask_path="mask.png")
@@ -579,12 +533,10 @@ def test_images_without_a_camera_have_a_budget(transforms):
     kept = {name: value for name, value in document.items() if name not in ("w", "h", "cx", "cy")}
     (transforms / "transforms.json").write_text(json.dumps({**kept, "fl_x": 9000.0, "fl_y": 9000.0}))
     file = transforms / "images" / "0000.png"
-    head = struct.pack(">II", 13_300, 13_300) + file.read_bytes()[24:29]
-    crc = struct.pack(">I", zlib.crc32(b"IHDR" + head))
-    file.write_bytes(file.read_bytes()[:16] + head + crc + file.read_bytes()[33:])
-    with pytest.raises(
-        InputError, match=r"0000\.png has 13300×13300 pixels in [0-9,]+ bytes, expected at most 67,108,864"
-    ):
+    head, data = b"IHDR" + struct.pack(">II", 13_300, 13_300), file.read_bytes()
+    head += data[24:29]
+    file.write_bytes(data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:])
+    with pytest.raises(InputError, match=r"0000\.png has 13300×13300 pixels in [0-9,]+ bytes, expected at most 67,1"):
         load(transforms)
 
 
@@ -612,15 +564,14 @@ def test_masks_of_every_kind_are_read_alike(tmp_path):
     assert [] == failures(MASKS, check)
 
 
-def test_masks_of_0_and_1_are_reported_and_grey_ones_refused(tmp_path):
-    write_transforms(tmp_path)
-    Image.fromarray(LABELS).save(tmp_path / "mask.png")
-    change_frames(tmp_path, range(10), mask_path="mask.png")
-    data = load(tmp_path)
+def test_masks_of_0_and_1_are_reported_and_grey_ones_refused(transforms):
+    Image.fromarray(LABELS).save(transforms / "mask.png")
+    change_frames(transforms, range(10), mask_path="mask.png")
+    data = load(transforms)
     assert "masks such as mask.png: values are 0 and 1: 1 counts as white" in data.report
     assert (data.train[0].mask == SHAPE).all()
-    Image.fromarray(GREY // 4).save(tmp_path / "mask.png")
+    Image.fromarray(GREY // 4).save(transforms / "mask.png")
     with pytest.raises(InputError, match=r"mask\.png is a mask of values from 0 to 63, expected at least 128"):
-        load(tmp_path)
-    Image.fromarray(np.ones((H, W), np.uint8)).save(tmp_path / "mask.png")
-    assert load(tmp_path).train[0].mask.all()
+        load(transforms)
+    Image.fromarray(np.ones((H, W), np.uint8)).save(transforms / "mask.png")
+    assert load(transforms).train[0].mask.all()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from csplat.encoder import EncodeOptions, EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.training_record import TrainingRecord
 from csplat_render.camera import Camera, intrinsics, orbit, relative_to
+from csplat_render.metrics import ssim
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.training.training_run import plan_training, tuning_after
 from csplat_trainer.data import DataSet
@@ -61,19 +62,18 @@ def opaque(make_model):
     return training_images(make_model, alpha=False)
 
 
-@pytest.mark.slow
 def test_masked_pixels_do_not_influence_training(opaque):
     mask = np.ones((SIZE, SIZE), bool)
     mask[10:30, :20] = False
 
     def hidden(value: int) -> DataSet:
         def shown(picture: PosedImage) -> PosedImage:
-            pixels = np.where(mask[..., None], picture.pixels, np.uint8(value))
-            return PosedImage(picture.camera, pixels, mask)
+            return PosedImage(picture.camera, np.where(mask[..., None], picture.pixels, np.uint8(value)), mask)
 
         return DataSet("masked", [shown(one) for one in opaque.train], [shown(one) for one in opaque.test])
 
-    first, second = (train(hidden(value), TrainOptions(**QUICK, init="box")) for value in (0, 200))
+    options = TrainOptions(**{**QUICK, "iterations": 20}, init="box")
+    first, second = (train(hidden(value), options) for value in (0, 200))
     assert np.array_equal(first.model.means, second.model.means)
     assert np.array_equal(first.model.shN, second.model.shN)
     assert first.metrics == second.metrics
@@ -82,16 +82,16 @@ def test_masked_pixels_do_not_influence_training(opaque):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
-def test_training_prunes_to_the_final_share(data, tmp_path, strategy):
+def test_training_prunes_to_the_final_share(data, strategy):
     options = TrainOptions(**QUICK, strategy=strategy, final_share=0.5, refine_stop=0.5)
-    whole, _ = assert_resumes_identically(data, options, tmp_path)
-    counts = [entry["splat_count"] for entry in whole.log["entries"]]
-    assert counts[1] == counts[2] == len(whole.model)
-    assert len(train(data, replace(options, final_share=1.0)).model) / 2 == pytest.approx(counts[2], abs=3)
+    pruned, whole = (train(data, replace(options, final_share=share)) for share in (0.5, 1.0))
+    counts = [entry["splat_count"] for entry in pruned.log["entries"]]
+    assert counts[1] == counts[2] == len(pruned.model)
+    assert len(whole.model) / 2 == pytest.approx(counts[2], abs=3)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("steps", [38, 42, 60])  # while splats are pruned, after that, at the end
+@pytest.mark.parametrize("steps", [38, 60])  # while splats are pruned, at the end
 def test_a_run_resumed_late_prunes_to_the_final_share(data, tmp_path, steps):
     trunk = TrainOptions(**{**QUICK, "iterations": steps}, refine_stop=0.5)
     whole = train(data, trunk, outputs=Outputs(tmp_path / "trunk.npz"))
@@ -103,14 +103,9 @@ def test_a_run_resumed_late_prunes_to_the_final_share(data, tmp_path, steps):
 def test_training_starts_with_images_of_half_the_size(data, tmp_path, monkeypatch):
     widths: list[int] = []
     step = CpuEngine.step
-
-    def watched(engine, picture, *rest):
-        widths.append(picture.camera.W)
-        return step(engine, picture, *rest)
-
+    watched = lambda engine, picture, *rest: widths.append(picture.camera.W) or step(engine, picture, *rest)  # noqa: E731
     monkeypatch.setattr(CpuEngine, "step", watched)
-    options = TrainOptions(**QUICK, half_size=0.5)
-    assert_resumes_identically(data, options, tmp_path)
+    assert_resumes_identically(data, TrainOptions(**QUICK, half_size=0.5), tmp_path)
     assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # sizes in the run without interruption
 
 
@@ -127,7 +122,10 @@ def test_training_reduces_the_loss(data, strategy):
 
 def test_the_same_seed_gives_the_same_file(data, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        write_ply(tmp_path / name, train(data, TrainOptions(**QUICK, seed=seed, background="random")).model)
+        write_ply(
+            tmp_path / name,
+            train(data, TrainOptions(**{**QUICK, "iterations": 30}, seed=seed, background="random")).model,
+        )
     first, second, other = ((tmp_path / name).read_bytes() for name in "abc")
     assert first == second
     assert first != other
@@ -165,7 +163,6 @@ def test_an_outlier_camera_does_not_change_the_extent(data):
 
 @pytest.mark.slow
 def test_large_units_do_not_change_the_scene(data):
-
     def larger(picture: PosedImage) -> PosedImage:
         viewmat = picture.camera.viewmat.copy()
         viewmat[:3, 3] *= 1e5
@@ -189,8 +186,8 @@ def assert_resumes_identically(data, options, folder):
     with pytest.raises(KeyboardInterrupt):
         train(data, options, on_step=kill, outputs=Outputs(checkpoint=stopped, checkpoint_every=25))
     again = train(data, options, outputs=Outputs(resume=stopped))
-    assert np.array_equal(whole.model.means, again.model.means)
-    assert np.array_equal(whole.model.shN, again.model.shN)
+    for name in ("means", "shN"):
+        assert np.array_equal(getattr(whole.model, name), getattr(again.model, name))
     assert whole.log["losses"] == again.log["losses"]
     assert whole.log.get("exposures") == again.log.get("exposures")
     return whole, stopped
@@ -205,12 +202,11 @@ def test_a_run_resumes_with_another_number_of_splats(data, tmp_path):
 
 
 def test_progress_log_and_previews_are_written(data, tmp_path):
-    seen = []
-    outputs = Outputs(previews=tmp_path / "p", preview_every=30)
+    seen, previews = [], tmp_path / "p"
+    outputs = Outputs(previews=previews, preview_every=30)
     result = train(data, TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
     assert [20, 40, 60] == [now.iteration for now in seen]
-    assert seen[-1].seconds_left == 0
-    assert ["000030.png", "000060.png"] == sorted(path.name for path in (tmp_path / "p").iterdir())
+    assert ["000030.png", "000060.png"] == sorted(path.name for path in previews.iterdir())
     log = json.loads(json.dumps(result.log, allow_nan=False))
     assert 60 == len(log["losses"])
     assert {"psnr", "ssim", "lpips", "psnr_mean"} <= set(log["metrics"])
@@ -219,9 +215,11 @@ def test_progress_log_and_previews_are_written(data, tmp_path):
 def test_splats_start_within_the_hull_of_all_masks(data):
     scene = measure_extent(data.train)
     assert np.linalg.norm(scene.focus) < 0.1
-    found = place_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="hull")
-    boxed = place_splats(data.train, scene, 300, 0, np.random.default_rng(0), init="box")
-    assert np.linalg.norm(found["means"], axis=1).mean() < np.linalg.norm(boxed["means"], axis=1).mean()
+    hull, box = (
+        np.linalg.norm(place_splats(data.train, scene, 300, 0, np.random.default_rng(0), init=init)["means"], axis=1)
+        for init in ("hull", "box")
+    )
+    assert hull.mean() < box.mean()
 
 
 def test_images_without_alpha_start_in_a_box(opaque):
@@ -264,21 +262,14 @@ def test_points_outside_all_images_are_refused(data):
 
 @pytest.mark.slow
 def test_the_command_trains_from_a_folder(data, tmp_path):
-    (tmp_path / "train").mkdir()
-    frames = []
-    for number, picture in enumerate(data.train):
-        Image.fromarray(picture.pixels).save(tmp_path / "train" / f"{number}.png")
-        frames.append({"file_path": f"./train/{number}", "transform_matrix": to_opengl(picture.camera)})
-    angle = 2 * np.arctan(0.5 * SIZE / data.train[0].camera.K[0, 0])
-    (tmp_path / "transforms_train.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    run = ("train", tmp_path, tmp_path / "o.ply")
-    options = ("--max-splats", 50, "--sh-degree", 1, "--iterations", 5, "--size", "24x24", "--seed", 3)
-    assert "" == call(*run, *options, "--report", tmp_path / "log.json").stdout
+    write_set(tmp_path, data)
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
+    run = ("train", tmp_path, tmp_path / "o.ply", *FEW_WORDS, "--size", "24x24", "--seed", 3)
+    assert "" == call(*run, "--report", tmp_path / "log.json").stdout
     model = read_ply(tmp_path / "o.ply")
-    assert (1, "RFU") == (model.sh_degree, model.coordinate_system)
+    assert (0, "RFU") == (model.sh_degree, model.coordinate_system)
     assert 5 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
-    again = call(*run, "--device", "mps", status=2)
-    assert "mps is not supported" in " ".join(again.stderr.split())
+    assert "mps is not supported" in " ".join(call(*run, "--device", "mps", status=2).stderr.split())
 
 
 def write_set(folder, data):
@@ -298,7 +289,7 @@ FEW_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 5)
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("alpha", "background", "every", "size"),
-    [(True, "auto", 5, None), (False, "auto", 10, "24x20"), (False, "white", 8, None), (True, "random", 8, "24x24")],
+    [(True, "random", 5, "24x20"), (False, "auto", 10, None), (False, "white", 8, None)],
 )
 def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, background, every, size):
     folder = write_set(tmp_path, training_images(make_model, alpha=alpha))
@@ -311,16 +302,13 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
     assert str(record) in result.stderr
     colour = ",".join(str(value) for value in record.background)
     again = call("compare", ply, ply, "--data", folder, "--background", colour, "--json", "--test-every", every)
-    scores = json.loads(again.stdout)["photographs"]["a"]
-    metrics = json.loads(log.read_text())["metrics"]
+    scores, metrics = json.loads(again.stdout)["photographs"]["a"], json.loads(log.read_text())["metrics"]
     for name in ("psnr", "psnr_mean"):
         assert scores[name] == pytest.approx(metrics[name], abs=0.01)
 
 
-@pytest.mark.parametrize(
-    "record", [TrainingRecord((1.0, 1.0, 1.0), 5), TrainingRecord((0.0, 0.0, 0.0), 10, (24, 20), 0.05)]
-)
-def test_the_training_record_survives_encode_and_decode(make_model, tmp_path, record):
+def test_the_training_record_survives_encode_and_decode(make_model, tmp_path):
+    record = TrainingRecord((0.0, 0.0, 0.0), 10, (24, 20), 0.05)
     ply, file, back = (tmp_path / name for name in ("a.ply", "a.csplat", "b.ply"))
     write_ply(ply, make_model(10, 0, metadata={"training": record.as_json()}))
     call("encode", ply, file, "-q")
@@ -347,8 +335,8 @@ def test_the_command_resumes(file_runs, tmp_path):
     for name in ("run.npz", "run.tuning.npz"):
         shutil.copy(file_runs.folder / name, tmp_path / name)
     files = ("--keep", 1, "--checkpoint", tmp_path / "run.npz", "--resume", tmp_path / "run.npz")
-    for name, more in (("again", ()), ("further", ("--iterations", 40))):
-        file_runs.made(f"{name}.csplat", *files, *more)
+    file_runs.made("again.csplat", *files)
+    file_runs.made("further.csplat", *files, "--iterations", 40)
     first, again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("a", "again", "further"))
     assert first == again
     assert first != further  # another scene: the existing tuning does not apply
@@ -397,15 +385,14 @@ def test_tuning_after_a_long_training_takes_more_and_smaller_steps():
 
 
 def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch):
-    folder = write_set(tmp_path, data)
-    (folder / "11.png").write_bytes((folder / "11.png").read_bytes()[:100])
-    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_: pytest.fail("kernels are compiled"))
-    assert "11.png is a PNG that is truncated" in call("train", folder, tmp_path / "a.ply", status=1).stderr
-    document = json.loads((folder / "transforms.json").read_text())
+    file, damaged = write_set(tmp_path, data) / "transforms.json", tmp_path / "11.png"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: pytest.fail("kernels are compiled"))
+    assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.ply", status=1).stderr
+    document = json.loads(file.read_text())
     for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
-        frames = document["frames"][rows]
-        (folder / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": frames}))
-    assert "11.png is a PNG that is truncated" in call("train", folder, tmp_path / "a.csplat", status=1).stderr
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": document["frames"][rows]}))
+    assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.csplat", status=1).stderr
     assert [] == [*tmp_path.glob("a.*")]
 
 
@@ -415,12 +402,6 @@ def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch)
 def test_options_of_a_file_are_refused_for_a_ply(tmp_path, words):
     result = call("train", tmp_path, tmp_path / "a.ply", *words, status=2)
     assert "expected OUT.csplat" in " ".join(result.stderr.split())
-
-
-def test_the_command_names_the_missing_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "numba", None)
-    result = call("train", ".", tmp_path / "o.ply", status=1)
-    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)" == result.stderr.strip()
 
 
 @pytest.fixture
@@ -447,14 +428,6 @@ def test_adam_agrees_with_the_textbook(parameters, beta2):
     assert np.abs(np.linalg.norm(parameters.values["quats"], axis=1) - 1).max() <= 1e-6
 
 
-def test_a_splat_without_gradient_does_not_move(parameters):
-    before = {name: parameters.values[name].copy() for name in GROUPS}
-    for _ in range(3):
-        adam_step(parameters, {name: np.zeros_like(before[name]) for name in GROUPS}, dict.fromkeys(GROUPS, 0.1))
-    for name in GROUPS:
-        assert np.allclose(before[name], parameters.values[name], atol=1e-6)
-
-
 def test_parameters_of_a_model_convert_back(make_model):
     model = make_model(20, 1)
     again = to_model(from_model(model, 3))
@@ -477,19 +450,15 @@ def test_shared_splats_cover_as_one(alpha, count):
 
 
 def test_transparent_splats_are_relocated_to_others(parameters):
-    parameters.values["logits"][:] = 2.0
-    parameters.values["logits"][:10] = -9.0
+    parameters.values["logits"][:] = -9.0
+    assert 0 == relocate(parameters, 0.005, np.random.default_rng(0))
+    parameters.values["logits"][10:] = 2.0
     adam_step(parameters, {name: np.ones_like(parameters.values[name]) for name in GROUPS}, dict.fromkeys(GROUPS, 0.0))
     assert 10 == relocate(parameters, 0.005, np.random.default_rng(0))
     alive = {tuple(row) for row in parameters.values["means"][10:].tolist()}
     assert all(tuple(row) in alive for row in parameters.values["means"][:10].tolist())
     assert (parameters.first["means"][:10] == 0).all()
     assert parameters.alphas.min() > 0.005
-
-
-def test_nothing_is_relocated_if_all_splats_are_transparent(parameters):
-    parameters.values["logits"][:] = -9.0
-    assert 0 == relocate(parameters, 0.005, np.random.default_rng(0))
 
 
 def test_growth_stops_at_the_cap(parameters):
@@ -568,18 +537,6 @@ def test_a_checkpoint_is_saved_and_loaded(parameters, tmp_path):
         assert np.array_equal(parameters.second[name], again.parameters.second[name])
 
 
-@pytest.mark.parametrize("damage", ["text", "empty", "cut", "other"])
-def test_a_damaged_checkpoint_is_refused(parameters, tmp_path, damage):
-    path = tmp_path / "run.npz"
-    save_checkpoint(path, checkpoint_of(parameters))
-    whole = path.read_bytes()
-    path.write_bytes({"text": b"hello", "empty": b"", "cut": whole[: len(whole) // 2], "other": whole}[damage])
-    if damage == "other":
-        np.savez(path, facts=np.frombuffer(json.dumps({"version": 99}).encode(), np.uint8))
-    with pytest.raises(InputError, match=r"checkpoint"):
-        load_checkpoint(path)
-
-
 def test_a_checkpoint_of_the_previous_version_is_refused_in_one_line(parameters, tmp_path):
     path = tmp_path / "run.npz"
     save_checkpoint(path, checkpoint_of(parameters))
@@ -612,16 +569,12 @@ def test_options_out_of_range_are_refused():
             TrainOptions(**{name: value})
 
 
-def test_the_learning_rate_of_means_decays_to_its_final_value():
-    options = TrainOptions(iterations=100)
-    assert options.lr_means_final * 2 == pytest.approx(options.learning_rates(100, 2.0)["means"])
-    assert options.lr_means * 2 == pytest.approx(options.learning_rates(0, 2.0)["means"])
-
-
-def test_other_learning_rates_decay_after_refinement():
+def test_learning_rates_decay():
     options = TrainOptions(iterations=100, refine_stop=0.6, lr_decay=0.2)
+    assert options.lr_means * 2 == pytest.approx(options.learning_rates(0, 2.0)["means"])
+    assert options.lr_means_final * 2 == pytest.approx(options.learning_rates(100, 2.0)["means"])
     shares = [options.learning_rates(step, 2.0)["scales"] / options.lr_scales for step in (1, 60, 80, 100)]
-    assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)
+    assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)  # after refinement
     assert TrainOptions(refine_stop=1.0, lr_decay=0.2).learning_rates(7000, 2.0)["shN"] == TrainOptions.lr_shN
 
 
@@ -642,14 +595,11 @@ def test_a_halved_image_agrees_with_its_camera(channels):
 
 
 def test_an_image_without_pixels_at_half_the_size_is_kept():
-    lines, narrow = np.zeros((6, 8), bool), Camera(intrinsics(1, 6, 8.0), np.eye(4), 1, 6)
+    lines, camera = np.zeros((6, 8), bool), Camera(intrinsics(8, 6, 8.0), np.eye(4), 8, 6)
     lines[:, ::2] = True
-    camera = Camera(intrinsics(8, 6, 8.0), np.eye(4), 8, 6)
-    for picture in (
-        PosedImage(camera, np.zeros((6, 8, 3), np.uint8), lines),
-        PosedImage(narrow, np.zeros((6, 1, 3), np.uint8)),
-    ):
-        assert halve(picture) is picture
+    masked = PosedImage(camera, np.zeros((6, 8, 3), np.uint8), lines)
+    narrow = PosedImage(Camera(intrinsics(1, 6, 8.0), np.eye(4), 1, 6), np.zeros((6, 1, 3), np.uint8))
+    assert all(halve(picture) is picture for picture in (masked, narrow))
 
 
 def test_growth_reaches_the_cap_halfway():
@@ -684,13 +634,9 @@ def test_splats_with_the_least_effect_are_pruned(make_model):
     values["logits"][5:15] = -7.0
     parameters = Parameters.starting_at(values)
     parameters.second["means"][:] = np.arange(40, dtype=np.float32)[:, None]
-
-    def measure(views):
-        return measure_pruning_error(to_model(parameters.values), views, background=np.ones(3, np.float32))
-
-    prune_least_needed(parameters, cameras, measure, 30)
-    wanted = [*range(5), *range(15, 40)]
-    assert wanted == parameters.second["means"][:, 0].tolist()
+    measure = partial(measure_pruning_error, background=np.ones(3, np.float32))
+    prune_least_needed(parameters, cameras, lambda seen: measure(to_model(parameters.values), seen), 30)
+    assert [*range(5), *range(15, 40)] == parameters.second["means"][:, 0].tolist()
 
 
 def random_images(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -721,19 +667,9 @@ def test_the_gradient_of_the_twin_agrees_with_finite_differences():
 
 
 def test_the_ssim_of_the_loss_agrees_with_the_metric():
-    from csplat_render.metrics import ssim
-
     x, y = random_images(40, 30)
     value, _ = PhotometricLoss(40, 30)(x, y)
     assert value.ssim == pytest.approx(ssim(y, x), abs=1e-5)
-
-
-def test_equal_images_have_no_loss_and_no_gradient():
-    x, _ = random_images(20, 20)
-    value, gradient = PhotometricLoss(20, 20)(x, x.copy())
-    assert (value.l1, value.mse) == (0.0, 0.0)
-    assert value.ssim == pytest.approx(1.0, abs=1e-6)
-    assert np.abs(gradient).max() <= 1e-6
 
 
 def test_calls_of_a_loss_are_independent():
@@ -806,6 +742,7 @@ def test_gains_are_estimated_with_a_mean_of_0(uneven):
     assert "exposures" not in plain.log
 
 
+@pytest.mark.slow
 def test_a_resumed_run_keeps_its_gains(uneven, tmp_path):
     options = TrainOptions(**QUICK, lr_exposure=0.02)
     whole, stopped = assert_resumes_identically(uneven, options, tmp_path)
@@ -820,9 +757,7 @@ def test_tuning_corrects_gains(make_model, uneven):
     fixed = fix_quantisation(EncodePlan.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
     training, validation = ([TuningView(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
     views = TuningViews(training, validation, np.zeros(3, np.float32))
-    plain, corrected = (
-        tune(fixed, views, FinetuneOptions(iterations=200, validate_every=50, patience=0, lr_exposure=rate)).log
-        for rate in (0.0, 0.05)
-    )
+    options = FinetuneOptions(iterations=200, validate_every=50, patience=0)
+    plain, corrected = (tune(fixed, views, replace(options, lr_exposure=rate)).log for rate in (0.0, 0.05))
     assert corrected["validations"][-1]["psnr"] > plain["validations"][-1]["psnr"] + 0.5
     assert np.corrcoef(np.exp(np.array(corrected["exposures"])[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.95

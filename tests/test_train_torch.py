@@ -30,43 +30,35 @@ def tensors_of(model, dtype):
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("degree", [0, 3])
 def test_gradients_agree_with_finite_differences(make_model, camera, degree, antialiased):
-    model = make_model(
-        6, degree, seed=5, scales=np.full((6, 3), -1.0, np.float32) + 0.3 * np.eye(6, 3, dtype=np.float32)
-    )
-    inputs = tensors_of(model, torch.float64)
+    scales = np.full((6, 3), -1.0, np.float32) + 0.3 * np.eye(6, 3, dtype=np.float32)
+    inputs = tensors_of(make_model(6, degree, seed=5, scales=scales), torch.float64)
     weight = torch.tensor(np.random.default_rng(0).standard_normal((20, 24, 3)))
 
     def loss(*tensors):
-        return (
-            torch_rasteriser.render(*tensors, camera, background=(0.2, 0.4, 0.6), antialiased=antialiased) * weight
-        ).sum()
+        picture = torch_rasteriser.render(*tensors, camera, background=(0.2, 0.4, 0.6), antialiased=antialiased)
+        return (picture * weight).sum()
 
     # Alpha jumps at 1/255, where the render has no derivative: a step of 1e-7 meets few such pixels.
     loss(*inputs).backward()
-    rng = np.random.default_rng(1)
-    for tensor in inputs:
-        if tensor.numel() == 0:
-            continue
+    rng, step = np.random.default_rng(1), 1e-7
+    for tensor in (one for one in inputs if one.numel()):
         direction = torch.tensor(rng.standard_normal(tensor.shape))
-        step = 1e-7
         with torch.no_grad():
-            up, down = (
-                loss(*(one + sign * step * direction if one is tensor else one for one in inputs)) for sign in (1, -1)
-            )
+            up, down = (loss(*(t + h * direction if t is tensor else t for t in inputs)) for h in (step, -step))
         expected = float((up - down) / (2 * step))
         assert float((tensor.grad * direction).sum()) == pytest.approx(expected, rel=1e-5, abs=1e-5)
 
 
 def test_gradients_of_two_renders_are_independent(make_model, camera):
     inputs = tensors_of(make_model(6, 1), torch.float32)
-    first, second = (torch_rasteriser.render(*inputs, camera, background=(value,) * 3) for value in (0.0, 1.0))
-    together = torch.autograd.grad((first + second).sum(), inputs)
-    alone = [
-        torch.autograd.grad(torch_rasteriser.render(*inputs, camera, background=(v,) * 3).sum(), inputs)
-        for v in (0.0, 1.0)
-    ]
-    for got, *wanted in zip(together, *alone, strict=True):
-        assert torch.allclose(got, sum(wanted), rtol=1e-5, atol=1e-5)
+
+    def sums():
+        return [torch_rasteriser.render(*inputs, camera, background=(value,) * 3).sum() for value in (0.0, 1.0)]
+
+    together = torch.autograd.grad(sum(sums()), inputs)
+    alone = [torch.autograd.grad(one, inputs) for one in sums()]
+    for gradient, *parts in zip(together, *alone, strict=True):
+        assert torch.allclose(gradient, sum(parts), rtol=1e-5, atol=1e-5)
 
 
 def test_mixed_types_are_refused(make_model, camera):

@@ -182,15 +182,7 @@ TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1
 
 @dataclass(frozen=True)
 class TrainedScene:
-    """A trained scene and its sources.
-
-    Attributes:
-        data: folder of the images.
-        ply: the scene.
-        report: report of `csplat train`.
-        checkpoint: the checkpoint of the last step.
-        messages: what the command wrote to stderr.
-    """
+    """A trained scene and its sources."""
 
     data: Path
     ply: Path
@@ -201,14 +193,7 @@ class TrainedScene:
 
 @dataclass(frozen=True)
 class TunedFile:
-    """A tuned file and its sources.
-
-    Attributes:
-        source: the scene.
-        path: the file.
-        report: report of `csplat finetune`.
-        messages: what the command wrote to stderr.
-    """
+    """A tuned file and its sources."""
 
     source: TrainedScene
     path: Path
@@ -293,9 +278,7 @@ class FileRuns:
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
             change_options(patch, "csplat_tools.cli.train.TrainOptions", log_every=10, **options)
-            patch.setattr(
-                "csplat_trainer.data.loader.load", None
-            )  # a training opens its data set once, by another name
+            patch.setattr("csplat_trainer.data.loader.load", None)  # a training opens its data set by another name
             brief = lambda **given: replace(tuning_after(**given), iterations=self.TUNED)  # noqa: E731
             patch.setattr(training_run, "tuning_after", brief)
             words = ("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)
