@@ -61,7 +61,6 @@ def distortion(points, weights, entries, index):
     return float((squares * weights).sum() / weights.sum(dtype=np.float64))
 
 
-# Nearest entries.
 def assert_search_is_exact(points, entries):
     expected = squared_distances(points, entries)
     index, error = search_nearest(points, entries)
@@ -131,7 +130,6 @@ def test_assign_gives_no_index_for_no_points():
     assert assign(np.empty((0, 3), np.int16), np.zeros((1, 3), np.int32)).shape == (0,)
 
 
-# Clusters.
 def check_clusters(points, entries, index, size):
     assert entries.dtype == np.int32
     assert index.dtype == np.uint32
@@ -231,7 +229,6 @@ def test_invalid_arguments_are_refused():
         assign(points, np.empty((4, 8), np.int32))
 
 
-# Ranks.
 def test_ranks_follow_frequency_and_keep_the_order_of_equals():
     index = np.array([3, 3, 1, 0, 1, 2, 3], np.uint32)
     entries = np.array([[10], [11], [12], [13], [14]], np.int32)
@@ -242,7 +239,6 @@ def test_ranks_follow_frequency_and_keep_the_order_of_equals():
     np.testing.assert_array_equal(entries[index], ordered[ranked])
 
 
-# The same bytes at any thread count.
 @pytest.mark.slow
 def test_the_thread_count_of_blas_is_restored():
     control = kmeans._openblas()

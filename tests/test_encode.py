@@ -238,7 +238,6 @@ def test_an_outlier_does_not_change_the_precision_of_others(make_model):
         assert float(errors.max()) <= 0.5 * step * 1.01
 
 
-floats32 = st.floats(width=32, allow_nan=False, allow_infinity=False)
 magnitudes = st.sampled_from([1e-38, 1e-30, 1e-7, 1e-3, 1.0, 1e3, 1e7, 1e20, 1e30, 1e38])
 
 

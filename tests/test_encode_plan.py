@@ -133,7 +133,6 @@ def test_errors_may_be_declared_against_another_scene(make_model):
         assert rms <= stated[1] <= rms * 1.0001 + 1e-11
 
 
-# Absent bands.
 def sparse_model(source, share):
     """Return the model with bands 2 and 3 of some splats set to zero."""
     shN = 0.1 * source.shN

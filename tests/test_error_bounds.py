@@ -47,7 +47,6 @@ def test_an_invalid_index_is_refused(make_model):
 ORIGIN = (481_250.0, 5_467_100.0, 310.0)
 
 
-# The slow twin -------------------------------------------------------------------------------------
 def twin_covariance(quat, scales, top):
     length = math.sqrt(math.fsum(c * c for c in quat))
     w, x, y, z = (c / length for c in quat)
@@ -146,7 +145,6 @@ def test_errors_agree_with_the_slow_twin(degree, doubles):
         assert expected == {name: pytest.approx(pair, rel=1e-6) for name, pair in encoders.items()}
 
 
-# The source --------------------------------------------------------------------------------
 def rows_of(count=8):
     rng = np.random.default_rng(0)
     return PlyRows(

@@ -45,7 +45,6 @@ def elsewhere(monkeypatch):
         monkeypatch.setitem(sys.modules, name, None)
 
 
-# Files.
 @pytest.mark.usefixtures("elsewhere")
 def test_a_file_is_read_in_parts(make_model, tmp_path):
     path, model = tmp_path / "scene.csplat", make_model(3000, 1)
@@ -113,7 +112,6 @@ def test_paths_of_windows_do_not_lead_out_of_a_folder(tmp_path):
     assert names == {name: leads_out(name, PureWindowsPath) for name in names}
 
 
-# Memory.
 @pytest.mark.usefixtures("elsewhere")
 def test_the_memory_has_a_default_size(monkeypatch):
     def absent(*_):
@@ -125,7 +123,6 @@ def test_the_memory_has_a_default_size(monkeypatch):
     assert system.core_count() == os.cpu_count()
 
 
-# Processes.
 @pytest.mark.slow
 def test_spawned_processes_share_the_work(monkeypatch):
     starts, context = [], multiprocessing.get_context
@@ -168,7 +165,6 @@ def test_the_main_thread_is_interrupted_without_signals_to_threads():
         signal.signal(signal.SIGINT, before)
 
 
-# Batches.
 @pytest.mark.usefixtures("elsewhere")
 def test_one_program_at_a_time_writes_a_journal_without_fcntl(tmp_path):
     with open_journal(tmp_path), pytest.raises(InputError, match="another batch writes to"), open_journal(tmp_path):

@@ -314,7 +314,6 @@ def graded(model):
     return encode_with_report(model, importance=important(model))
 
 
-# Errors.
 def test_blocks_of_shapes_agree_with_the_covariance(make_model):
     model = make_model(50, 0)
     plan = choose_parameters(model, EncodeOptions(scale_step=1.0, quat_levels=100), importance_given=True)
@@ -381,7 +380,6 @@ def test_the_error_of_rounding_is_predicted():
     assert foretold / 1.6 < lost < 1.6 * foretold
 
 
-# Files.
 def test_classes_have_steps_of_their_own(model):
     result, _ = encoded(model, important(model))
     classes = result.report.options["classes"]
@@ -537,7 +535,6 @@ def test_the_javascript_decoder_agrees_about_classes(graded):
         assert ("decoded", "") == compared(answer(graded.data), decoder.ask(graded.data), "JavaScript")
 
 
-# Classes and integers.
 def test_tiles_have_the_step_factors_of_their_class(model):
     plan = choose_parameters(model, EncodeOptions(), importance_given=True)
     finer, classes = choose_classes(model, unequal(model), plan, EncodeOptions())

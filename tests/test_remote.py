@@ -60,7 +60,6 @@ def store(data, monkeypatch):
     return system
 
 
-# Reading.
 @pytest.mark.slow
 def test_a_part_equals_that_of_a_whole_decode_with_fewer_bytes_read(data, box, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(data)
@@ -156,7 +155,6 @@ def test_neighbouring_parts_are_read_in_one_request(data):
     assert not any(window.view)
 
 
-# Refusals.
 def test_invalid_arguments_are_refused_before_reading(data):
     with csplat.open(data, limits=Limits(splats=1000)) as file:
         before = file.bytes_read
@@ -207,7 +205,6 @@ def test_a_damaged_file_is_named(store, data, tmp_path):
         assert name == raised.value.path
 
 
-# Stores of fsspec.
 def test_parts_are_read_from_a_store(store, data, box):
     for store.protocol, url in (
         ("store", "store://scenes/scene.csplat"),
@@ -300,7 +297,6 @@ def test_without_the_extra_a_url_is_an_error_with_a_remedy(monkeypatch):
         csplat.open("https://example.org/scene.csplat")
 
 
-# The command.
 def test_extract_reads_a_url_and_leaves_no_partial_file(store, data, box, tmp_path):
     out, local = tmp_path / "part.csplat", tmp_path / "local.csplat"
     words = ["extract", "store://scenes/scene.csplat", str(out), f"--box={','.join(map(repr, box))}"]

@@ -39,7 +39,6 @@ def web(data, monkeypatch):
         yield server
 
 
-# Web servers.
 def test_parts_are_read_from_a_web_server(web, data, box):
     with csplat.open(web.url) as file:
         assert [("HEAD", None), ("GET", "bytes=0-65535")] == [(one[0], one[2]) for one in web.asked]
@@ -144,7 +143,7 @@ def test_a_proxy_of_the_environment_is_used(web, data, monkeypatch):
         assert_same(decode(data, sh_degree=0), file.read(sh_degree=0))
 
 
-def test_a_weak_etag_is_the_same_version_and_a_damaged_file_is_named(web, data):
+def test_a_weak_etag_is_the_same_version_and_another_one_an_error(web, data):
     web.tag = '"a"'
     web.files["/scene.csplat"] = data[:-1] + bytes([data[-1] ^ 1])
     with csplat.open(web.url) as file:
@@ -152,6 +151,10 @@ def test_a_weak_etag_is_the_same_version_and_a_damaged_file_is_named(web, data):
         with pytest.raises(FormatError, match="E_CRC") as raised:
             file.read()
     assert web.url == raised.value.path
+    with csplat.open(web.url) as file:
+        web.tag = '"b"'
+        with pytest.raises(StoreError, match=r"/scene\.csplat has changed while it was read: open it again"):
+            file.read(tiles=[5])
 
 
 def test_errors_of_a_server_contain_no_secrets(web):
@@ -177,7 +180,6 @@ def test_other_file_systems_of_fsspec_are_used(data, box, tmp_path):
             assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
 
 
-# S3.
 def test_parts_are_read_from_s3(data, box):
     pytest.importorskip("moto", reason="an S3 requires the extra [remote-tests]")
     with s3({"scene.csplat": data}) as storage:
@@ -195,6 +197,3 @@ def test_parts_are_read_from_s3(data, box):
         assert part.splat_count == len(decode(stream.getvalue()))
         with pytest.raises(FileNotFoundError, match="s3://scenes/absent"):
             csplat.open("s3://scenes/absent", storage=storage)
-
-
-# The command.

@@ -256,7 +256,6 @@ def assert_same_render(model, view, every=1, mode="standard"):
     assert wanted.ignored == found.ignored
 
 
-# pictures
 def test_sliced_renders_equal_those_in_memory(model, view, counts):
     crowd, flat, far = model.means.copy(), model.means.copy(), model.means + np.float32([0, 0, -90])
     crowd[:900, 2] = flat[:, 2] = 0.25
@@ -297,7 +296,6 @@ def test_slices_have_equal_costs_and_do_not_split_a_depth():
     assert [same, np.nextafter(same, np.float32(3.0))] == slice_limits(np.full(9, same), np.ones(9), 4).tolist()
 
 
-# scenes
 def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
     with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
         assert {LoadedModel} == {type(one) for one in loaded}
@@ -325,7 +323,6 @@ def test_a_sample_gives_about_the_same_views(sample_path):
         assert np.linalg.norm(found.position) == pytest.approx(distance, rel=0.15)
 
 
-# comparisons
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_least")
 def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path, monkeypatch):
