@@ -142,7 +142,7 @@ def test_no_program_is_started(tmp_path, monkeypatch):
         (tmp_path / name).write_text(f"#!/bin/sh\necho ran >> {ran}\n")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
-    for name in ("3.png", "3.jpg", "3.tiff", "3.webp", "3.eps", "3.ps"):
+    for name in ("3.png", "3.eps"):
         (tmp_path / name).write_bytes(EPS)
         with pytest.raises(InputError, match="PostScript"), open_image(tmp_path / name) as image:
             image.load()

@@ -7,15 +7,12 @@ import threading
 import numpy as np
 import pytest
 from stores import Web, assert_same, box_of, s3
-from typer.testing import CliRunner
 
 import csplat
-from csplat import EncodeOptions, FormatError, InputError, StoreError, decode, encode
+from csplat import EncodeOptions, FormatError, StoreError, decode, encode
 from csplat.byte_store import RequestSizes
 from csplat.encoder import EncodePlan, LevelNode, encode_levels
 from csplat.remote_store import RemoteStore
-from csplat_conformance.validator import validate
-from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.remote
 pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
@@ -42,7 +39,6 @@ def web(data, monkeypatch):
         yield server
 
 
-# Web servers.
 def test_parts_are_read_from_a_web_server(web, data, box):
     with csplat.open(web.url) as file:
         assert [("HEAD", None), ("GET", "bytes=0-65535")] == [(one[0], one[2]) for one in web.asked]
@@ -147,59 +143,31 @@ def test_a_proxy_of_the_environment_is_used(web, data, monkeypatch):
         assert_same(decode(data, sh_degree=0), file.read(sh_degree=0))
 
 
-def test_a_weak_etag_is_the_same_version(web, data):
+def test_a_weak_etag_is_the_same_version_and_another_one_an_error(web, data):
     web.tag = '"a"'
     web.files["/scene.csplat"] = data[:-1] + bytes([data[-1] ^ 1])
     with csplat.open(web.url) as file:
         web.tag = 'W/"a"'
-        with pytest.raises(FormatError, match="E_CRC"):
+        with pytest.raises(FormatError, match="E_CRC") as raised:
             file.read()
-
-
-def test_a_lost_connection_is_a_typed_error(web):
-    web.cut_after = 0
-    with pytest.raises(StoreError, match=r"/scene\.csplat: "):
-        csplat.open(web.url)
-    web.cut_after = 1 + len(web.gets)
+    assert web.url == raised.value.path
     with csplat.open(web.url) as file:
-        with pytest.raises(StoreError, match=r"/scene\.csplat: "):
-            file.read(sh_degree=0)
-        with pytest.raises(StoreError, match=r"/scene\.csplat: "):
-            list(file.tiles())
-
-
-@pytest.mark.parametrize("size", [None, 70_000])
-def test_a_file_that_changes_between_requests_is_an_error(web, data, size):
-    with csplat.open(web.url) as file:
-        web.files["/scene.csplat"] = bytes(reversed(data))[:size]
+        web.tag = '"b"'
         with pytest.raises(StoreError, match=r"/scene\.csplat has changed while it was read: open it again"):
             file.read(tiles=[5])
 
 
-def test_a_file_of_the_web_that_is_damaged_is_named(web, data):
-    web.files["/scene.csplat"] = data[:-1] + bytes([data[-1] ^ 1])
-    with csplat.open(web.url) as file, pytest.raises(FormatError, match="E_CRC") as raised:
-        file.read()
-    assert web.url == raised.value.path
-
-
-@pytest.mark.parametrize(
-    ("answer", "error", "message"),
-    [(404, FileNotFoundError, "No such file"), (403, PermissionError, "Permission"), (500, StoreError, "status 500")],
-)
-def test_errors_of_a_server_contain_no_secrets(web, answer, error, message):
-    web.files["/other.csplat?key=secret"] = answer
-    address = web.url.replace("://", "://somebody:password@").replace("scene", "other")
-    with pytest.raises(error, match=message) as raised:
-        csplat.open(address + "?key=secret")
-    assert "other.csplat" in str(raised.value)
-    assert "secret" not in str(raised.value)
-    assert "password" not in str(raised.value)
-
-
-def test_an_unknown_url_is_refused():
-    with pytest.raises(InputError, match="nowhere://scene"):
-        csplat.open("nowhere://scene.csplat")
+def test_errors_of_a_server_contain_no_secrets(web):
+    address = web.url.replace("://", "://somebody:password@").replace("scene", "other") + "?key=secret"
+    for web.files["/other.csplat?key=secret"], error, message in (
+        (404, FileNotFoundError, "No such file"),
+        (403, PermissionError, "Permission"),
+        (500, StoreError, "status 500"),
+    ):
+        with pytest.raises(error, match=message) as raised:
+            csplat.open(address)
+        assert "other.csplat" in str(raised.value)
+        assert not re.search("secret|password", str(raised.value))
 
 
 def test_other_file_systems_of_fsspec_are_used(data, box, tmp_path):
@@ -212,7 +180,6 @@ def test_other_file_systems_of_fsspec_are_used(data, box, tmp_path):
             assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
 
 
-# S3.
 def test_parts_are_read_from_s3(data, box):
     pytest.importorskip("moto", reason="an S3 requires the extra [remote-tests]")
     with s3({"scene.csplat": data}) as storage:
@@ -230,25 +197,3 @@ def test_parts_are_read_from_s3(data, box):
         assert part.splat_count == len(decode(stream.getvalue()))
         with pytest.raises(FileNotFoundError, match="s3://scenes/absent"):
             csplat.open("s3://scenes/absent", storage=storage)
-
-
-# The command.
-def test_extract_reads_a_url_and_reports_the_bytes(web, data, box, tmp_path):
-    out = tmp_path / "part.csplat"
-    words = ["extract", web.url, str(out), f"--box={','.join(map(repr, box))}"]
-    done = CliRunner().invoke(app, words)
-    assert 0 == done.exit_code, done.stderr
-    assert "; read " in done.stderr
-    local = tmp_path / "local.csplat"
-    csplat.extract(data, box, local)
-    assert local.read_bytes() == out.read_bytes()
-    assert () == validate(out.read_bytes()).violations
-    web.cut_after = 0
-    refused = CliRunner().invoke(app, [*words, "--force"])
-    assert 1 == refused.exit_code
-    assert 1 == len(refused.stderr.splitlines())
-    assert web.url in refused.stderr
-    assert local.read_bytes() == out.read_bytes()  # the previous file
-    web.cut_after = 1 + len(web.gets)
-    refused = CliRunner().invoke(app, ["extract", web.url, "-", *words[3:]])
-    assert (1, b"") == (refused.exit_code, refused.stdout_bytes)

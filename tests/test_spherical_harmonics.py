@@ -66,22 +66,22 @@ def test_band_4_is_rotated_and_mirrored_as_in_spz():
     np.testing.assert_array_equal(sh_rotations(4, np.diag(signs))[3], np.diag(expected))
 
 
-@pytest.mark.parametrize("degree", range(5))
-def test_the_gradient_is_that_of_the_basis(degree):
-    weights = RNG.standard_normal((degree + 1) ** 2)
-    for point in DIRECTIONS[:20]:
-        found = np.array(sh_basis_gradient(degree, *point, weights))
-        across = np.linalg.svd(point[None])[2][1:]  # two directions at right angles to the point
-        for way in across:
-            ahead, behind = (point * np.cos(t) + way * np.sin(t) for t in (1e-5, -1e-5))
-            slope = (evaluate_sh(degree, np.stack([ahead, behind])) @ weights) @ [1, -1] / 2e-5
-            assert found @ way == pytest.approx(slope, rel=1e-7, abs=1e-8)
+def test_the_gradient_is_that_of_the_basis():
+    for degree in range(5):
+        weights = RNG.standard_normal((degree + 1) ** 2)
+        for point in DIRECTIONS[:6]:
+            gradient = np.array(sh_basis_gradient(degree, *point, weights))
+            across = np.linalg.svd(point[None])[2][1:]  # two directions at right angles to the point
+            for way in across:
+                ends = np.stack([point * np.cos(t) + way * np.sin(t) for t in (1e-5, -1e-5)])
+                slope = (evaluate_sh(degree, ends) @ weights) @ [1, -1] / 2e-5
+                assert gradient @ way == pytest.approx(slope, rel=1e-7, abs=1e-8)
 
 
-@pytest.mark.parametrize("matrix", [ANY, -ANY, np.eye(3)[[2, 0, 1]], np.diag([1.0, -1.0, 1.0])])
-def test_rotations_move_the_colour_of_each_direction(matrix):
-    before, after = evaluate_sh(4, DIRECTIONS), evaluate_sh(4, DIRECTIONS @ matrix.T)
-    for band, turn in enumerate(sh_rotations(4, matrix), start=1):
-        part = slice(band**2, (band + 1) ** 2)
-        coefficients = RNG.standard_normal(2 * band + 1)
-        np.testing.assert_allclose(after[:, part] @ turn @ coefficients, before[:, part] @ coefficients, atol=1e-12)
+def test_rotations_move_the_colour_of_each_direction():
+    before = evaluate_sh(4, DIRECTIONS)
+    for matrix in (ANY, -ANY, np.eye(3)[[2, 0, 1]], np.diag([1.0, -1.0, 1.0])):
+        after = evaluate_sh(4, DIRECTIONS @ matrix.T)
+        for band, turn in enumerate(sh_rotations(4, matrix), start=1):
+            part, sh = slice(band**2, (band + 1) ** 2), RNG.standard_normal(2 * band + 1)
+            np.testing.assert_allclose(after[:, part] @ turn @ sh, before[:, part] @ sh, atol=1e-12)

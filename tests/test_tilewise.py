@@ -5,7 +5,7 @@ import json
 import tempfile
 from dataclasses import fields, replace
 from functools import partial
-from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,11 +87,11 @@ def assert_same(expected, found):
 
 @pytest.fixture
 def many_tiles(make_model, tmp_path):
-    """Return the path of a file of eleven tiles."""
-    data = csplat.encode(make_model(2000, 2), csplat.EncodeOptions(tile_splats=200))
+    """Return the path of a file of ten tiles."""
+    data = csplat.encode(make_model(600, 2), csplat.EncodeOptions(preset="fast", tile_splats=60))
     path = tmp_path / "scene.csplat"
     path.write_bytes(data)
-    assert len(read_header(data).tiles) > 8
+    assert len(read_header(data).tiles) == 10
     return path
 
 
@@ -128,30 +128,30 @@ def test_invalid_files_give_the_same_error_and_leave_no_ply(tmp_path):
     assert [] == failures({vector.name: vector for vector in INVALID}, check)
 
 
-@pytest.mark.parametrize("threads", [1, 2, 7])
-def test_threads_and_released_pages_do_not_change_the_result(many_tiles, threads, monkeypatch):
+def test_threads_and_released_pages_do_not_change_the_result(many_tiles, monkeypatch):
     monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
     expected = decode(many_tiles)
-    opened = open_tiles(many_tiles, threads=threads)
-    for _ in range(2):
-        models = list(opened.models())
-        assert [tile.splat_count for tile in opened.header.tiles] == [len(model) for model in models]
-        for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-            together = np.concatenate([getattr(model, name) for model in models])
-            assert getattr(expected, name).tobytes() == together.tobytes()
+    for threads in (1, 3):
+        opened = open_tiles(many_tiles, threads=threads)
+        for _ in range(2):
+            models = list(opened.models())
+            assert [tile.splat_count for tile in opened.header.tiles] == [len(model) for model in models]
+            for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+                together = np.concatenate([getattr(model, name) for model in models])
+                assert getattr(expected, name).tobytes() == together.tobytes()
 
 
-@pytest.mark.parametrize("threads", [1, 3])
-def test_tiles_before_a_damaged_one_are_decoded(many_tiles, threads):
+def test_tiles_before_a_damaged_one_are_decoded(many_tiles):
     data = bytearray(many_tiles.read_bytes())
     tiles = read_header(data).tiles
     for place in (4, 6):
         layer = tiles[place].layers[0]
         data[layer.offset + layer.size - 1] ^= 1
-    models = open_tiles(bytes(data), threads=threads).models()
-    assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
-    with pytest.raises(CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
-        next(models)
+    for threads in (1, 3):
+        models = open_tiles(bytes(data), threads=threads).models()
+        assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
+        with pytest.raises(CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
+            next(models)
 
 
 @pytest.mark.slow
@@ -167,28 +167,20 @@ def test_no_part_of_a_damaged_file_goes_to_standard_output(many_tiles):
 
 def test_the_limit_of_splats_is_per_file_and_that_of_bytes_per_tile(many_tiles):
     with pytest.raises(LimitError, match="splats"):
-        open_tiles(many_tiles, limits=Limits(splats=1999))
+        open_tiles(many_tiles, limits=Limits(splats=599))
     tile = max(one.splat_count for one in read_header(many_tiles.read_bytes()).tiles)
     limits = Limits(bytes=tile * 4 * (11 + 27))
-    assert 2000 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
+    assert 600 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
     with pytest.raises(LimitError, match="bytes"):
         decode(many_tiles, limits=limits)
 
 
-def test_progress_goes_from_0_to_1(many_tiles, tmp_path):
-    seen = []
-    decode_file(str(many_tiles), str(tmp_path / "scene.ply"), progress=lambda stage, done: seen.append((stage, done)))
-    shares = [done for stage, done in seen if stage == "decoding"]
-    assert shares == sorted(shares)
-    assert (0.0, 1.0) == (shares[0], shares[-1])
-
-
-@pytest.mark.parametrize("suffix", [".csplat", ".ply"])
-def test_loading_a_scene_that_exceeds_the_memory_is_refused(many_tiles, tmp_path, monkeypatch, suffix):
-    decode_file(str(many_tiles), str(tmp_path / "scene.ply"))
+def test_loading_a_scene_that_exceeds_the_memory_is_refused(many_tiles, monkeypatch):
+    decode_file(str(many_tiles), str(many_tiles.with_suffix(".ply")))
     monkeypatch.setattr(scene_files, "available_memory_bytes", lambda: 4000)
-    with pytest.raises(LimitError, match="allowed 4000"):
-        scene_files.load_model(many_tiles.with_suffix(suffix))
+    for suffix in (".csplat", ".ply"):
+        with pytest.raises(LimitError, match="allowed 4000"):
+            scene_files.load_model(many_tiles.with_suffix(suffix))
 
 
 UP = (0.0, -1.0, 0.0)
@@ -218,11 +210,11 @@ def camera_file(view, tmp_path):
 def files_of_both(model, tmp_path):
     """Return the paths of a PLY, its encoded file and the source index."""
     result = encode_with_report(model, EncodeOptions(preset="fast"))
-    source, made, index = (tmp_path / name for name in ("scene.ply", "scene.csplat", "index.npy"))
+    source, encoded, index = (tmp_path / name for name in ("scene.ply", "scene.csplat", "index.npy"))
     write_ply(source, model)
-    made.write_bytes(result.data)
+    encoded.write_bytes(result.data)
     np.save(index, result.source_index)
-    return str(source), str(made), str(index)
+    return str(source), str(encoded), str(index)
 
 
 @pytest.fixture
@@ -264,25 +256,20 @@ def assert_same_render(model, view, every=1, mode="standard"):
     assert wanted.ignored == found.ignored
 
 
-# pictures
-@pytest.mark.parametrize("mode", ["standard", "fast"])
-@pytest.mark.parametrize("antialiased", [False, True])
-def test_sliced_renders_equal_those_in_memory(model, view, counts, mode, antialiased):
-    assert_same_render(replace(model, antialiased=antialiased), view, mode=mode)
+def test_sliced_renders_equal_those_in_memory(model, view, counts):
+    crowd, flat, far = model.means.copy(), model.means.copy(), model.means + np.float32([0, 0, -90])
+    crowd[:900, 2] = flat[:, 2] = 0.25
+    for scene, options in (
+        (model, {"mode": "fast"}),
+        (replace(model, antialiased=True), {}),
+        (model, {"every": 700}),  # the sample decides the slices
+        (replace(model, means=crowd), {}),  # splats of one depth are drawn in their order
+        (replace(model, means=flat), {}),
+        (replace(model, means=far), {}),  # out of view
+        (model.select(slice(0, 0)), {}),
+    ):
+        assert_same_render(scene, view, **options)
     assert len(counts) > 5
-    assert max(counts) < 300
-
-
-def test_a_sparse_sample_does_not_change_the_render(model, view, counts):
-    assert_same_render(model, view, every=700)
-    assert max(counts) < 300
-
-
-@pytest.mark.parametrize("crowd", [1500, 900])
-def test_splats_of_one_depth_are_drawn_in_their_order(model, view, crowd, counts):
-    means = model.means.copy()
-    means[:crowd, 2] = 0.25
-    assert_same_render(replace(model, means=means), view)
     assert max(counts) < 300
 
 
@@ -294,12 +281,7 @@ def test_splats_behind_opaque_pixels_are_not_drawn(model, view, counts):
     assert sum(counts) < 600
 
 
-def test_a_scene_out_of_view_renders_as_the_background(model, view):
-    assert_same_render(replace(model, means=model.means + np.float32([0, 0, -90])), view)
-    assert_same_render(model.select(slice(0, 0)), view)
-
-
-def test_mode_exact_is_refused(model, view):
+def test_mode_exact_requires_scenes_in_memory(model, view):
     with pytest.raises(InputError, match="exact"):
         renderer(by_disk(model), BEHIND, mode="exact")(view)
 
@@ -314,7 +296,6 @@ def test_slices_have_equal_costs_and_do_not_split_a_depth():
     assert [same, np.nextafter(same, np.float32(3.0))] == slice_limits(np.full(9, same), np.ones(9), 4).tolist()
 
 
-# scenes
 def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
     with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
         assert {LoadedModel} == {type(one) for one in loaded}
@@ -342,73 +323,58 @@ def test_a_sample_gives_about_the_same_views(sample_path):
         assert np.linalg.norm(found.position) == pytest.approx(distance, rel=0.15)
 
 
-# comparisons
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_least")
 def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path, monkeypatch):
-    source, made, index = files_of_both
-    words = ["compare", source, made, "--cameras", camera_file, "--source-index", index, "--json"]
-    found = []
-    for more in (False, True):
-        if more:
-            monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
-        result = CliRunner().invoke(app, [*words, "--pictures", str(tmp_path / f"shown{more}")])
+    source, encoded, index = files_of_both
+    words = ["compare", source, encoded, "--cameras", camera_file]
+
+    def run(*more):
+        result = CliRunner().invoke(app, [*words, *more])
         assert 0 == result.exit_code, result.stderr
-        found.append(json.loads(result.stdout))
-        assert ("rendered from the disk" in result.stderr) == more
-        del found[-1]["seconds"]
-    errors, others = (one["attributes"].pop("errors") for one in found)
-    assert found[0] == found[1]
-    assert errors.keys() == others.keys()
-    for name, one in errors.items():
-        assert one == pytest.approx(others[name], rel=1e-12)
-    shown, also = (sorted((tmp_path / f"shown{n}").iterdir()) for n in (False, True))
-    assert [one.read_bytes() for one in shown] == [one.read_bytes() for one in also]
+        return result
+
+    def report(name):
+        result = run("--source-index", index, "--json", "--pictures", str(tmp_path / name))
+        shown = json.loads(result.stdout)
+        return shown["attributes"].pop("errors"), shown | {"seconds": 0}, "rendered from the disk" in result.stderr
+
+    errors, report_in_memory, by_disk = report("memory")
+    assert not by_disk
+    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
+    others, report_of_disk, by_disk = report("disk")
+    assert by_disk
+    assert report_in_memory == report_of_disk
+    assert errors == {name: pytest.approx(error, rel=1e-12) for name, error in others.items()}
+    images = [[image.read_bytes() for image in sorted((tmp_path / name).iterdir())] for name in ("memory", "disk")]
+    assert bool(images[0] == images[1])
+    assert "the errors of splats are unknown" in run().stdout  # without an index
+    refused = CliRunner().invoke(app, ["compare", source, encoded, "--backend", "exact"])
+    assert 1 == refused.exit_code
+    assert "error: --backend exact requires both scenes in memory" in refused.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_least")
 def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, tmp_path):
     source, moved = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
     write_ply(source, model)
     write_ply(moved, replace(model, means=model.means + np.float32(0.001)))
     views = csplat_tools.find_view_set(model, cameras=camera_file, count=0)
-    wanted, found = (csplat_tools.compare(source, moved, views=views, memory_bytes=most) for most in (None, LITTLE))
-    assert wanted.quality == found.quality
-    assert "order" == found.attributes.pairing
-    assert wanted.attributes.errors == {
-        name: pytest.approx(one, rel=1e-12) for name, one in found.attributes.errors.items()
-    }
+    wanted, shown = (csplat_tools.compare(source, moved, views=views, memory_bytes=most) for most in (None, LITTLE))
+    assert wanted.quality == shown.quality
+    assert "order" == shown.attributes.pairing
+    for name, error in shown.attributes.errors.items():
+        assert wanted.attributes.errors[name] == pytest.approx(error, rel=1e-12)
 
 
-@pytest.mark.usefixtures("no_least")
-def test_without_an_index_the_errors_are_reported_as_unknown(files_of_both, camera_file, monkeypatch):
-    source, made, _ = files_of_both
-    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
-    result = CliRunner().invoke(app, ["compare", source, made, "--cameras", camera_file])
-    assert 0 == result.exit_code
-    assert "the errors of splats are unknown" in result.stdout
-
-
-@pytest.mark.usefixtures("no_least")
-def test_mode_exact_of_scenes_beyond_the_memory_is_refused(files_of_both, monkeypatch):
-    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
-    result = CliRunner().invoke(app, ["compare", *files_of_both[:2], "--backend", "exact"])
-    assert 1 == result.exit_code
-    assert ["error: --backend exact requires both scenes in memory, and they do not fit: use cpu (E_INPUT)"] == [
-        line for line in result.stderr.splitlines() if "exact" in line
-    ]
-
-
-@pytest.mark.usefixtures("no_least")
-def test_too_little_disk_space_is_an_error_before_drawing(files_of_both, monkeypatch):
-    usage = type("Usage", (), {"free": 1000})
-    monkeypatch.setattr(disk_files.shutil, "disk_usage", lambda _: usage)
-    with pytest.raises(InputError, match="TMPDIR"):
-        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
-
-
-def test_a_memory_limit_below_the_minimum_is_refused(files_of_both, monkeypatch):
+def test_too_little_memory_or_disk_space_is_an_error_before_drawing(files_of_both, monkeypatch):
     monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
     with pytest.raises(InputError, match=r"^the memory is 0 MB, expected at least 482 MB to draw these scenes$"):
+        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+    monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
+    monkeypatch.setattr(disk_files.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(InputError, match="TMPDIR"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
 
 
@@ -421,4 +387,4 @@ def test_an_interrupted_render_leaves_no_files(model, view, monkeypatch, tmp_pat
 
     with pytest.raises(KeyboardInterrupt):
         renderer(by_disk(model, progress=interrupted), BEHIND)(view)
-    assert [] == list(Path(tmp_path).iterdir())
+    assert [] == list(tmp_path.iterdir())
