@@ -6,9 +6,9 @@ import doctest
 import gzip
 import io
 import pickle
+import re
 import subprocess
 import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -54,16 +54,13 @@ def assert_same(a, b):
 
 
 # Names.
-@pytest.mark.parametrize("package", [csplat, csplat_render, csplat_tools, csplat_trainer])
-def test_every_listed_name_exists(package):
-    assert set(package.__all__) <= set(dir(package))
-    for name in package.__all__:
-        assert getattr(package, name) is not None
-
-
-def test_importing_the_packages_loads_no_renderer_or_command_line():
-    loaded = modules_after("import csplat, csplat_tools, csplat_trainer")
-    assert not {"numba", "numpy", "typer", "rich", "torch", "csplat_render"} & loaded
+def test_every_listed_name_exists():
+    for package in (csplat, csplat_render, csplat_tools, csplat_trainer):
+        assert set(package.__all__) <= set(dir(package))
+        assert all(getattr(package, name) is not None for name in package.__all__)
+    assert sorted(csplat.__all__) == dir(csplat)
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        csplat.nonsense  # noqa: B018 -- the access is the test
 
 
 # Examples of the documentation.
@@ -103,46 +100,35 @@ def test_files_may_be_paths_streams_or_bytes(files, form):
         assert (len(model), path.stat().st_size) == (len(loaded.model), loaded.size_bytes)
 
 
-def test_a_ply_is_written_to_an_open_file(files):
+def test_open_files_are_written_read_from_their_position_and_named(files, tmp_path):
     model, ply, _ = files
     stream = io.BytesIO()
     csplat.write_ply(stream, model)
     assert ply.read_bytes() == stream.getvalue()
-
-
-def test_open_files_are_read_from_their_position(files):
-    _, ply, _ = files
     stream = io.BytesIO(b"before" + ply.read_bytes())
     stream.seek(6)
     assert_same(csplat.read_ply(ply), csplat.read_ply(stream))
-
-
-def test_messages_name_an_open_file(tmp_path):
     (tmp_path / "wrong.ply").write_bytes(b"nothing of the kind")
     with (tmp_path / "wrong.ply").open("rb") as stream, pytest.raises(InputError, match=r"wrong\.ply is not a PLY"):
         csplat.read_ply(stream)
 
 
 # Refusals.
-@pytest.mark.parametrize("wrong", [5, None, 1.5, ["scene.ply"], io.StringIO("ply\n")])
 @pytest.mark.parametrize("function", ["read_ply", "decode", "read_header", "lint_ply"])
-def test_other_objects_than_files_are_typed_errors(function, wrong):
-    with pytest.raises(InputError, match="expected"):
-        getattr(csplat, function)(wrong)
-
-
-@pytest.mark.parametrize("function", ["read_ply", "decode", "read_header"])
-def test_an_absent_file_is_named(function, tmp_path):
+def test_other_objects_than_files_are_typed_errors(function, tmp_path):
+    for wrong in (5, None, 1.5, ["scene.ply"], io.StringIO("ply\n")):
+        with pytest.raises(InputError, match="expected"):
+            getattr(csplat, function)(wrong)
     with pytest.raises(FileNotFoundError, match="absent"):
         getattr(csplat, function)(tmp_path / "absent")
 
 
-@pytest.mark.parametrize("wrong", ["scene.ply", b"ply", None, 5])
-def test_other_objects_than_models_are_refused_with_a_remedy(wrong, tmp_path):
+def test_other_objects_than_models_are_refused_with_a_remedy(tmp_path):
     calls = [csplat.encode, csplat.encode_with_report, lambda model: csplat.write_ply(tmp_path / "out.ply", model)]
     for call in calls:
-        with pytest.raises(InputError, match=r"expects a SplatModel.*csplat\.read_ply"):
-            call(wrong)
+        for wrong in ("scene.ply", b"ply", None, 5):
+            with pytest.raises(InputError, match=r"expects a SplatModel.*csplat\.read_ply"):
+                call(wrong)
     assert not list(tmp_path.iterdir())
 
 
@@ -157,11 +143,8 @@ def test_files_of_the_other_kind_are_typed_errors(files):
         for form in FORMS.values():
             with pytest.raises(CsplatError):
                 call(form(wrong))
-
-
-def test_decoding_a_ply_names_the_right_function(files):
     with pytest.raises(csplat.FormatError, match=r"a PLY, which csplat\.read_ply reads"):
-        csplat.decode(files[1])
+        csplat.decode(ply)
 
 
 @pytest.mark.slow
@@ -204,16 +187,11 @@ for call in (
 # Targets.
 def test_a_target_of_largest_errors_needs_no_search(files, tmp_path):
     model, stages = files[0], []
-
-    def progress(stage, done):
-        stages.append((stage, done))
-
     target = csplat.Target(max_error={"means": 0.01})
     found = csplat.encode_with_report(model, target=target)
-    assert found.data == csplat.encode(model, target=target, progress=progress)
+    assert found.data == csplat.encode(model, target=target, progress=lambda *stage: stages.append(stage))
     assert found.report.search.reached["means"] <= 0.01
     assert (len(found.data), None) == (found.size_bytes, found.psnr)
-    assert f"EncodeResult({found.size_bytes:,} bytes, 60 splats)" == repr(found)
     found.save(tmp_path / "found.csplat")
     assert found.data == (tmp_path / "found.csplat").read_bytes()
     assert stages
@@ -221,27 +199,24 @@ def test_a_target_of_largest_errors_needs_no_search(files, tmp_path):
 
 
 def test_a_search_is_called_by_its_entry_point(files, monkeypatch):
+    from csplat_tools.optimise.target_encoding import meet_target
+
+    assert {"target": meet_target} == load_plugins("csplat.search")
+
     def search(*given, **named):
         raise Called(given, named)
 
-    monkeypatch.setattr(
-        "csplat.encoder.encode_api.load_plugins", lambda group: {"csplat.search": {"target": search}}[group]
-    )
+    place = "csplat.encoder.encode_api.load_plugins"
+    monkeypatch.setattr(place, lambda group: {"csplat.search": {"target": search}}[group])
     target, weights = csplat.Target(psnr=40.0), np.ones(60)
     with pytest.raises(Called) as raised:
         csplat.encode_with_report(files[0], target=target, views="views", importance=weights)
     (model, options), named = raised.value.args
     assert (files[0], csplat.EncodeOptions()) == (model, options)
     assert {"target": target, "views": "views", "importance": weights, "progress": None} == named
-    monkeypatch.setattr("csplat.encoder.encode_api.load_plugins", lambda _: {})
+    monkeypatch.setattr(place, lambda _: {})
     with pytest.raises(InputError, match=r"no search for targets is installed.*pip install 'csplat\[render\]'"):
         csplat.encode(files[0], target=target)
-
-
-def test_the_search_is_an_entry_point_of_this_package():
-    from csplat_tools.optimise.target_encoding import meet_target
-
-    assert {"target": meet_target} == load_plugins("csplat.search")
 
 
 @pytest.mark.parametrize(("named", "message"), [
@@ -331,6 +306,59 @@ def test_the_size_of_a_model_is_that_of_a_plain_ply(files):
     assert replace(loaded, size_bytes=1).header == csplat.read_header(coded)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("statement", "unwanted"), [
+    ("import csplat", r"csplat\..*"),
+    ("import csplat, csplat_tools, csplat_trainer", "numba|numpy|typer|rich|torch|csplat_render"),
+    ("import sys; sys.modules['plyfile'] = None; import csplat.decoder; csplat.decode; del sys.modules['plyfile']",
+        r"(plyfile|torch|numba|deflate|typer|rich|csplat_tools|csplat\.(encoder|ply|lint|detect|disk_files)).*"),
+    ("from csplat import read_ply", r"csplat\.(encoder|decoder).*"),
+    ("import csplat_render.rasteriser, csplat_render.reference_rasteriser",
+        r"(torch|csplat_trainer|csplat_tools|plyfile)(\..*)?"),
+], ids=["csplat", "packages", "decoder", "reader", "renderer"])  # fmt: skip
+def test_an_import_loads_no_other_part(statement, unwanted):
+    if "rasteriser" in statement:
+        pytest.importorskip("numba", reason="the renderer requires the extra [render]")
+    code = f"{statement}\nimport sys\nprint(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert [] == [name for name in done.stdout.split() if re.fullmatch(unwanted, name)]
+
+
+@pytest.mark.parametrize(("error", "message", "fields"), [
+    (errors.FormatError("E_CRC", 12, "CRC-1", "found 0x1a2b3c4d, computed 0x5e6f7081"),
+        "E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081",
+        {"code": "E_CRC", "offset": 12, "clause": "CRC-1"}),
+    (errors.FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5"),
+        "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5", {"code": "E_COUNT"}),
+    (errors.FormatError("E_HASH", None, "SHA-1"), "E_HASH (SHA-1)", {}),
+    (errors.UnsupportedError("version 0.7"), "E_UNSUPPORTED: version 0.7 is not supported",
+        {"code": "E_UNSUPPORTED", "feature": "version 0.7"}),
+    (errors.UnsupportedError("x", code="E_VERSION", offset=8, clause="VER-1"),
+        "E_VERSION at byte 8 (VER-1): x is not supported", {"code": "E_VERSION", "offset": 8, "clause": "VER-1"}),
+    (errors.LimitError("max_splats", 10, 5), "E_LIMIT: max_splats: needs 10, allowed 5",
+        {"limit": "max_splats", "wanted": 10, "allowed": 5}),
+    (errors.LimitError("x", 2, code="E_BUDGET", offset=3), "E_BUDGET at byte 3: x: needs 2", {"code": "E_BUDGET"}),
+    (errors.InputError("x"), "x", {"code": "E_INPUT"}),
+])  # fmt: skip
+def test_an_error_names_code_place_and_values_also_in_another_process(error, message, fields):
+    for one in (error, pickle.loads(pickle.dumps(error))):  # noqa: S301 -- our own bytes
+        assert isinstance(one, errors.CsplatError)
+        assert message == str(one)
+        assert fields == {name: getattr(one, name) for name in fields}
+
+
+def test_fields_have_defaults_and_arrays_are_not_copied(make_model):
+    model = make_model(4, 0)
+    arrays = {name: getattr(model, name) for name in ("means", "quats", "scales", "opacities", "sh0")}
+    bare = SplatModel(**arrays)
+    assert all(getattr(bare, name) is array for name, array in arrays.items())
+    assert (4, 0, (4, 0, 3)) == (len(bare), bare.sh_degree, bare.shN.shape)
+    assert ((0.0, 0.0, 0.0), "unspecified") == (bare.origin, bare.coordinate_system)
+    assert (None, None, False, False) == (bare.unit_metres, bare.cameras, bare.antialiased, bare.flat)
+    assert ({}, {}) == (dict(bare.metadata), dict(bare.extra))
+    assert [0, 1, 2, 3] == [make_model(5, degree).sh_degree for degree in range(4)]
+
+
 @pytest.mark.parametrize(("words", "name", "kind"), [
     (["train", ".", "out.ply", "--iterations", "3"], "train", "DataSet"),
     (["finetune", "scene.ply", "out.csplat", "--data", "."], "finetune", "SplatModel"),
@@ -343,98 +371,6 @@ def test_train_and_finetune_call_the_public_functions(tmp_path, monkeypatch, wor
     monkeypatch.chdir(photograph(shell(3), tmp_path))
     (given, *_), _ = arguments_of(monkeypatch, csplat_trainer, name, words)
     assert kind == type(given).__name__
-
-
-def modules_after(statement: str) -> set[str]:
-    code = f"import sys\n{statement}\nprint(*sorted(sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return set(done.stdout.split())
-
-
-def test_importing_csplat_loads_none_of_its_modules():
-    assert set() == {one for one in modules_after("import csplat") if one.startswith("csplat.")}
-
-
-def test_the_decoder_loads_no_other_part_and_works_without_plyfile():
-    loaded = modules_after("sys.modules['plyfile'] = None; import csplat.decoder; from csplat import decode")
-    assert "csplat.decoder" in loaded
-    loaded.remove("plyfile")
-    packages = {name.split(".")[0] for name in loaded}
-    assert not packages & {"plyfile", "torch", "numba", "deflate", "typer", "rich", "csplat_tools"}
-    foreign = ("csplat.encoder", "csplat.ply", "csplat.lint", "csplat.detect", "csplat.disk_files")
-    assert not [name for name in loaded if name.startswith(foreign)]
-
-
-def test_the_reader_loads_neither_encoder_nor_decoder():
-    loaded = modules_after("from csplat import read_ply")
-    assert not [name for name in loaded if name.startswith(("csplat.encoder", "csplat.decoder"))]
-
-
-def test_dir_lists_the_public_names():
-    assert sorted(csplat.__all__) == dir(csplat)
-
-
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
-        csplat.nonsense  # noqa: B018 -- the access is the test
-
-
-@pytest.mark.slow
-def test_the_renderer_requires_no_torch():
-    pytest.importorskip("numba", reason="the renderer requires the extra [render]")
-    loaded = modules_after("import csplat_render.rasteriser, csplat_render.reference_rasteriser")
-    packages = {name.split(".")[0] for name in loaded}
-    assert not packages & {"torch", "csplat_trainer", "csplat_tools", "plyfile"}  # numba itself may load scipy
-
-
-@pytest.mark.parametrize(("error", "message", "fields"), [
-    (errors.FormatError("E_CRC", 12, "CRC-1", "found 0x1a2b3c4d, computed 0x5e6f7081"),
-        "E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081",
-        {"code": "E_CRC", "offset": 12, "clause": "CRC-1"}),
-    (errors.FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5"),
-        "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5", {}),
-    (errors.FormatError("E_HASH", None, "SHA-1"), "E_HASH (SHA-1)", {}),
-    (errors.UnsupportedError("version 0.7"), "E_UNSUPPORTED: version 0.7 is not supported",
-        {"code": "E_UNSUPPORTED", "feature": "version 0.7"}),
-    (errors.LimitError("max_splats", 10, 5), "E_LIMIT: max_splats: needs 10, allowed 5",
-        {"limit": "max_splats", "wanted": 10, "allowed": 5}),
-])  # fmt: skip
-def test_an_error_names_code_place_and_values(error, message, fields):
-    assert message == str(error)
-    assert fields == {name: getattr(error, name) for name in fields}
-
-
-@pytest.mark.parametrize("error", [
-    errors.FormatError("E_CRC", 12, "CRC-1", found=1, wanted=2),
-    errors.UnsupportedError("x", code="E_VERSION", offset=8, clause="VER-1"),
-    errors.LimitError("x", 2, code="E_BUDGET", offset=3),
-    errors.InputError("x"),
-])  # fmt: skip
-def test_errors_survive_another_process_and_have_a_code(error):
-    again = pickle.loads(pickle.dumps(error))  # noqa: S301 -- our own bytes
-    assert str(error) == str(again)
-    assert error.code == again.code
-    assert isinstance(error, errors.CsplatError)
-    assert error.code.startswith("E_")
-
-
-def test_fields_have_defaults(make_model):
-    model = make_model(4, 0)
-    bare = SplatModel(
-        means=model.means, quats=model.quats, scales=model.scales, opacities=model.opacities, sh0=model.sh0
-    )
-    assert (4, 0, 3) == bare.shN.shape
-    assert (0.0, 0.0, 0.0) == bare.origin
-    assert "unspecified" == bare.coordinate_system
-    assert (None, None) == (bare.unit_metres, bare.cameras)
-    assert (False, False) == (bare.antialiased, bare.flat)
-    assert ({}, {}) == (dict(bare.metadata), dict(bare.extra))
-
-
-def test_sh_degree_and_length_follow_from_the_shapes(make_model):
-    assert [0, 1, 2, 3] == [make_model(5, degree).sh_degree for degree in range(4)]
-    assert (7, 0) == (len(make_model(7)), len(make_model(0)))
-    assert "SplatModel(7 splats, sh_degree=2)" == repr(make_model(7, 2))
 
 
 @pytest.mark.parametrize(("field", "value", "message"), [
@@ -467,13 +403,13 @@ def test_invalid_fields_are_refused(make_model, field, value, message):
         make_model(10, **{field: value})
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("field", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_values_that_are_not_finite_are_refused(make_model, field, value):
-    array = getattr(make_model(), field).copy()
-    array.flat[-1] = value
-    with pytest.raises(InputError, match=f"{field} contains 1 values that are NaN or infinite"):
-        make_model(**{field: array})
+def test_values_that_are_not_finite_are_refused(make_model, field):
+    for value in (np.nan, np.inf, -np.inf):
+        array = getattr(make_model(), field).copy()
+        array.flat[-1] = value
+        with pytest.raises(InputError, match=f"{field} contains 1 values that are NaN or infinite"):
+            make_model(**{field: array})
 
 
 def test_values_at_their_limits_are_accepted(make_model):
@@ -485,27 +421,17 @@ def test_values_at_their_limits_are_accepted(make_model):
         assert letters == make_model(coordinate_system=letters).coordinate_system
 
 
-def with_doubles(make_model):
-    doubles = np.random.default_rng(1).normal(0, 1, (10, 3)) + np.array([5e5, 5e6, 300.0])
-    origin = (5e5, 5e6, 300.0)
-    means = (doubles - np.array(origin)).astype(np.float32)
-    return make_model(10, 0, means=means, origin=origin, means_double=doubles)
-
-
 def test_doubles_have_to_match_their_means(make_model):
-    model = with_doubles(make_model)
+    origin = (5e5, 5e6, 300.0)
+    doubles = np.random.default_rng(1).normal(0, 1, (10, 3)) + np.array(origin)
+    means = (doubles - np.array(origin)).astype(np.float32)
+    model = make_model(10, 0, means=means, origin=origin, means_double=doubles)
     some = model.select(np.array([3, 1]))
     np.testing.assert_array_equal(model.means_double[[3, 1]], some.means_double)
     assert replace(model, means=model.means + 1, means_double=None).means_double is None
     for wrong in ({"means": model.means + 1}, {"origin": (0.0, 0.0, 0.0)}, {"means_double": model.means}):
         with pytest.raises(InputError, match="means_double"):
             replace(model, **wrong)
-
-
-def test_arrays_are_not_copied(make_model):
-    model = make_model()
-    again = make_model(means=model.means)
-    assert again.means is model.means
 
 
 @pytest.mark.parametrize("index", [slice(2, 5), np.array([4, 1, 1]), np.arange(10) % 3 == 0, slice(0, 0)])
@@ -525,29 +451,7 @@ def test_normalised_quats_have_unit_length_and_stay_unchanged():
     length = np.sqrt(np.sum(once.astype(np.float64) ** 2, 1))
     assert np.abs(length - 1).max() < 2**-23
     assert np.array_equal(normalise_quats(once), once)
-
-
-def test_zero_huge_and_denormal_quats_are_normalised():
-    quats = np.array([[0, 0, 0, 0], [3e38, 0, 3e38, 0], [0, 1e-45, 0, 0], [0, 0, 0, -2]], np.float32)
+    extremes = np.array([[0, 0, 0, 0], [3e38, 0, 3e38, 0], [0, 1e-45, 0, 0], [0, 0, 0, -2]], np.float32)
     half = np.float32(np.sqrt(0.5))
     expected = [[1, 0, 0, 0], [half, 0, half, 0], [0, 1, 0, 0], [0, 0, 0, -1]]
-    assert np.array_equal(normalise_quats(quats), np.array(expected, np.float32))
-
-
-@pytest.mark.slow
-def test_checking_a_million_splats_takes_a_fraction_of_a_second():
-    count = 1_000_000
-    fields = {
-        "means": np.ones((count, 3), np.float32),
-        "quats": np.full((count, 4), 0.5, np.float32),
-        "scales": np.ones((count, 3), np.float32),
-        "opacities": np.ones(count, np.float32),
-        "sh0": np.ones((count, 3), np.float32),
-        "shN": np.ones((count, 15, 3), np.float32),
-    }
-    times = []
-    for _ in range(3):
-        start = time.process_time()
-        SplatModel(**fields)
-        times.append(time.process_time() - start)
-    assert min(times) < 0.15
+    assert np.array_equal(normalise_quats(extremes), np.array(expected, np.float32))

@@ -54,22 +54,12 @@ def slow_ssim(a, b):
     return np.mean(values)
 
 
-def test_psnr_of_a_known_error():
-    a = np.full((4, 5, 3), 0.5, np.float64)
-    assert math.isclose(20.0, psnr(a, a + 0.1))
-
-
-def test_equal_images_have_the_largest_psnr():
-    a, _ = two_images()
-    assert PSNR_CAP == psnr(a, a)
-    assert PSNR_CAP == psnr(a, a + np.float32(1e-9))
-    assert math.isclose(1.0, ssim(a, a))
-
-
-def test_images_are_clipped():
+def test_psnr_is_that_of_clipped_images_and_has_a_largest_value():
+    flat = np.full((4, 5, 3), 0.5, np.float64)
+    assert math.isclose(20.0, psnr(flat, flat + 0.1))
     a, b = two_images()
-    over = np.where(b == 1.0, 7.0, b)
-    assert psnr(a, b) == psnr(a, over)
+    assert PSNR_CAP == psnr(a, a) == psnr(a, a + np.float32(1e-9))
+    assert psnr(a, b) == psnr(a, np.where(b == 1.0, 7.0, b))
 
 
 def test_ssim_agrees_with_explicit_sums():
@@ -86,13 +76,8 @@ def test_errors_are_pooled_and_a_mean_psnr_is_reported():
     assert math.isclose(-10.0 * math.log10((0.01 + 0.0001) / 2.0), scores.psnr)
     assert (0, 2) == (scores.worst_view, scores.as_json()["views"])
     assert math.isclose(20.0, scores.psnr_worst)
-    assert scores.cover is None
-    assert scores.psnr_covered is None
-    assert scores.lpips is None
-
-
-def test_views_are_weighted_by_their_pixels():
-    wide = score_view(np.zeros((1, 3, 3)), np.full((1, 3, 3), 0.1))
+    assert (None, None, None) == (scores.cover, scores.psnr_covered, scores.lpips)
+    wide = score_view(np.zeros((1, 3, 3)), np.full((1, 3, 3), 0.1))  # weighted by its pixels
     one = score_view(np.zeros((1, 1, 3)), np.zeros((1, 1, 3)))
     assert math.isclose(-10.0 * math.log10(0.01 * 3 / 4), Scores.of([wide, one]).psnr)
 
@@ -126,19 +111,6 @@ def noise_pair(height, width, dtype=np.float64):
     return x.astype(dtype), np.clip(x + 0.2 * rng.standard_normal(x.shape), 0.0, 1.0).astype(dtype)
 
 
-@pytest.mark.parametrize("size", [(1, 1), (2, 40), (11, 11), (37, 21), (120, 160)])
-def test_mean_ssim_equals_its_twin(size):
-    x, y = noise_pair(*size)
-    assert mean_ssim(x, y) == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
-
-
-def test_mean_ssim_of_flat_and_equal_images_is_exact():
-    x, y = np.full((30, 20, 3), 0.5), np.full((30, 20, 3), 0.7)
-    assert mean_ssim(x, x) == pytest.approx(1.0, abs=1e-12)
-    assert mean_ssim(x, y) == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
-    assert mean_ssim(0.0 * x, 0.0 * x) == pytest.approx(1.0, abs=1e-12)
-
-
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_both_passes_of_the_blur_equal_the_window(dtype):
     x, _ = noise_pair(24, 17, dtype)
@@ -163,10 +135,15 @@ def in_threads(make):
     return found
 
 
-def test_the_number_of_threads_does_not_change_ssim():
-    x, y = noise_pair(61, 80)
+@pytest.mark.parametrize("size", [(1, 1), (2, 40), (11, 11), (37, 21), (61, 80)])
+def test_mean_ssim_equals_its_twin_in_any_number_of_threads(size):
+    x, y = noise_pair(*size)
     one, two = in_threads(lambda: mean_ssim(x, y))
-    assert one == two
+    assert one == two == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
+    for flat in (x, 0.0 * x):
+        assert mean_ssim(flat, flat) == pytest.approx(1.0, abs=1e-12)
+    x, y = np.full_like(x, 0.5), np.full_like(x, 0.7)
+    assert mean_ssim(x, y) == pytest.approx(mean_ssim_twin(x, y), rel=1e-12)
 
 
 @pytest.fixture
@@ -197,16 +174,6 @@ def test_lpips_of_the_published_images_agrees(data_dir):
     assert 0.0 == distance(reference, reference)
 
 
-@pytest.mark.long
-def test_lpips_is_symmetric_and_positive_and_grows(random_weights):
-    rng = np.random.default_rng(1)
-    a = rng.random((48, 40, 3))
-    noise = rng.standard_normal(a.shape)
-    near, far = random_weights(a, a + 0.02 * noise), random_weights(a, a + 0.2 * noise)
-    assert 0.0 < near < far
-    assert np.isclose(near, random_weights(a + 0.02 * noise, a), rtol=1e-4)
-
-
 def test_weights_are_saved_and_loaded(tmp_path, random_weights):
     save_lpips(tmp_path / "w.npz", random_weights)
     back = load_lpips(tmp_path / "w.npz")
@@ -215,28 +182,18 @@ def test_weights_are_saved_and_loaded(tmp_path, random_weights):
             assert (a == b).all()
 
 
-def test_weights_are_found_by_environment_and_cache(tmp_path, monkeypatch, random_weights):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv("CSPLAT_LPIPS", raising=False)
-    (tmp_path / "csplat").mkdir()
-    save_lpips(tmp_path / "csplat" / "lpips_alex.npz", random_weights)
-    assert load_lpips().source == str(tmp_path / "csplat" / "lpips_alex.npz")
-    save_lpips(tmp_path / "other.npz", random_weights)
-    monkeypatch.setenv("CSPLAT_LPIPS", str(tmp_path / "other.npz"))
-    assert load_lpips().source == str(tmp_path / "other.npz")
-
-
-def test_absent_weights_are_an_error(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.delenv("CSPLAT_LPIPS", raising=False)
+def test_weights_are_read_from_the_environment_before_the_cache(tmp_path, monkeypatch, random_weights):
     monkeypatch.setattr(importlib.util, "find_spec", {}.get)  # torch is absent
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("CSPLAT_LPIPS", raising=False)
+    assert load_torch_lpips() is None
     with pytest.raises(InputError, match="no LPIPS weights"):
         load_lpips()
-
-
-def test_without_torch_its_cache_is_ignored(monkeypatch):
-    monkeypatch.setattr(importlib.util, "find_spec", {}.get)
-    assert load_torch_lpips() is None
+    (tmp_path / "csplat").mkdir()
+    for path in (tmp_path / "csplat" / "lpips_alex.npz", tmp_path / "other.npz"):
+        save_lpips(path, random_weights)
+        assert str(path) == load_lpips().source
+        monkeypatch.setenv("CSPLAT_LPIPS", str(tmp_path / "other.npz"))
 
 
 @pytest.mark.torch
@@ -271,10 +228,19 @@ def test_invalid_files_of_weights_are_refused(tmp_path, random_weights):
 
 def test_lpips_refuses_small_or_different_images(random_weights):
     a = np.zeros((40, 40, 3))
-    assert random_weights(np.zeros((31, 31, 3)), np.ones((31, 31, 3))) > 0.0
     for x, y in ((a, a[1:]), (a[:30], a[:30]), (a[..., 0], a[..., 0]), (a.astype(np.uint8), a.astype(np.uint8))):
         with pytest.raises(InputError):
             random_weights(x, y)
+
+
+@pytest.mark.slow
+def test_lpips_of_the_smallest_images_is_symmetric_and_grows(random_weights):
+    rng = np.random.default_rng(1)
+    a = rng.random((31, 31, 3))
+    noise = rng.standard_normal(a.shape)
+    near, far = random_weights(a, a + 0.02 * noise), random_weights(a, a + 0.2 * noise)
+    assert 0.0 < near < far
+    assert np.isclose(near, random_weights(a + 0.02 * noise, a), rtol=1e-4)
 
 
 SHAPES_AND_STRIDES = [
@@ -301,10 +267,11 @@ def convolution_case(picture, kernel, seed=0):
 @pytest.mark.parametrize(("picture", "kernel", "stride", "padding"), SHAPES_AND_STRIDES)
 def test_the_convolution_equals_its_twin(picture, kernel, stride, padding):
     x, weights, bias = convolution_case(picture, kernel)
-    found = convolve(x, weights, bias, stride, padding)
+    found, again = in_threads(lambda: convolve(x, weights, bias, stride, padding))
     wanted = convolve_twin(x, weights, bias, stride, padding)
     assert found.dtype == np.float32
     assert wanted.shape == found.shape
+    np.testing.assert_array_equal(found, again)
     np.testing.assert_allclose(found, wanted, atol=2e-5)
 
 
@@ -317,9 +284,3 @@ def test_the_twin_agrees_with_explicit_sums(stride, padding):
     windows = [[padded[r * stride :][:5, c * stride :][:, :3] for c in range(columns)] for r in range(rows)]
     expected = np.einsum("rchwi,hwio->rco", np.array(windows), kernel.astype(np.float64))
     np.testing.assert_allclose(convolve_twin(x, kernel, bias, stride, padding), expected + bias, atol=1e-12)
-
-
-@pytest.mark.long
-def test_the_number_of_threads_does_not_change_a_convolution():
-    x, weights, bias = convolution_case((33, 20, 8), (3, 3, 8, 24))
-    np.testing.assert_array_equal(*in_threads(lambda: convolve(x, weights, bias, 1, 1)))
