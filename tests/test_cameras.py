@@ -44,32 +44,31 @@ def test_saved_cameras_are_loaded_exactly(tmp_path):
         look_at([-3.0, 0.3, 1.0], [0.0, 0.0, 0.2], UP, K, 320, 200),
     ]
     save_cameras(tmp_path / "c.json", cameras)
-    back = load_cameras(tmp_path / "c.json")
-    for camera, same in zip(cameras, back, strict=True):
-        assert (camera.K == same.K).all()
-        assert (camera.viewmat == same.viewmat).all()
-        assert (camera.W, camera.H, camera.near, camera.image) == (same.W, same.H, same.near, same.image)
+    assert [camera.to_json() for camera in cameras] == [c.to_json() for c in load_cameras(tmp_path / "c.json")]
 
 
 def test_near_and_image_may_be_left_out(tmp_path):
-    entry = {"K": K.tolist(), "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
-    (tmp_path / "c.json").write_text(json.dumps([entry]))
+    (tmp_path / "c.json").write_text(json.dumps([{"K": K.tolist(), "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}]))
     (camera,) = load_cameras(tmp_path / "c.json")
-    assert 0.2 == camera.near
-    assert camera.image is None
+    assert (0.2, None) == (camera.near, camera.image)
 
 
+FAR_TOO_LARGE = r"c\.json is not a JSON file: an integer has \d[\d,]* digits"
 NO_CAMERAS = {
     b"{": "not a JSON file", b"\xff\xfe": "not a JSON file", b"[]": "not a camera file", b"{}": "not a camera file",
     b"[1]": "camera 0", b'[{"K": 1}]': "camera 0.*viewmat",
+    b'[{"W": %d}]' % 10**400: FAR_TOO_LARGE, b'{"fl_x": ' + b"9" * 5000 + b', "frames": []}': FAR_TOO_LARGE,
 }  # fmt: skip
 
 
 def test_other_and_absent_files_are_refused(tmp_path):
-    for text, message in NO_CAMERAS.items():
+    def check(case):
+        text, message = case
         (tmp_path / "c.json").write_bytes(text)
         with pytest.raises(InputError, match=message):
             load_cameras(tmp_path / "c.json")
+
+    assert [] == failures({repr(case[0][:30]): case for case in NO_CAMERAS.items()}, check)
     with pytest.raises(InputError, match=r"nowhere\.json"):
         load_cameras("nowhere.json")
 
@@ -146,20 +145,26 @@ def test_cameras_far_from_all_others_are_outliers():
 
 
 def test_cameras_of_ordinary_sets_are_no_outliers():
-    rng = np.random.default_rng(0)
-    ones = rng.normal(size=(90, 3))
+    places = np.random.default_rng(0).normal(size=(90, 3))
     ahead = np.geomspace(5.0, 2000.0, 20)[:, None] * np.array([1.0, 0.0, 0.0])
-    for name, positions, points in (
-        ("one", ones[:1], None),
-        ("all in one place", np.zeros((9, 3)), None),
-        ("three, one of them far away", [(0, 0, 0), (1, 0, 0), (1e5, 0, 0)], None),
-        ("a corridor", np.linspace((0, 0, 0), (1000, 0, 0), 200), None),
-        ("a flight towards a building", np.concatenate([ones, ahead]), None),
-        ("two places", np.concatenate([ones[:60], ones[60:] + np.array((1e4, 0, 0))]), None),
-        ("close-ups and overviews", np.concatenate([0.01 * ones[:80], ones[80:]]), None),
-        ("a tripod that was moved once", np.concatenate([1e-3 * ones[:15], [(0.5, 0, 0)]]), ones + np.array((0, 0, 3))),
-    ):
-        assert not camera_outliers(viewmats(positions), points).any(), name
+
+    def check(case):
+        assert not camera_outliers(viewmats(case[0]), *case[1:]).any()
+
+    cases = {
+        "one": (places[:1],),
+        "all in one place": (np.zeros((9, 3)),),
+        "three, one of them far away": ([(0, 0, 0), (1, 0, 0), (1e5, 0, 0)],),
+        "a corridor": (np.linspace((0, 0, 0), (1000, 0, 0), 200),),
+        "a flight towards a building": (np.concatenate([places, ahead]),),
+        "two places": (np.concatenate([places[:60], places[60:] + np.array((1e4, 0, 0))]),),
+        "close-ups and overviews": (np.concatenate([0.01 * places[:80], places[80:]]),),
+        "a moved tripod": (
+            np.concatenate([1e-3 * places[:15], [(0.5, 0, 0)]]),
+            np.add(places, [0, 0, 3]),
+        ),
+    }
+    assert [] == failures(cases, check)
 
 
 def test_a_second_tripod_without_points_is_no_outlier():
@@ -173,9 +178,9 @@ def test_a_second_tripod_without_points_is_no_outlier():
 def test_cameras_relative_to_the_origin_or_to_0_are_distinguished(tmp_path):
     K, place, path = intrinsics(64, 48, 50.0), np.array((500123.0, 4649876.0, 214.0)), tmp_path / "cameras.json"
     own = [look_at((x, 3, 0), (0, 0, 5), (0, -1, 0), K, 64, 48) for x in (-2, 0, 2)]
-    for cameras, origin, said in (
+    for cameras, origin, note_count in (
         (own, place, 0),
-        ([relative_to(-place, one) for one in own], place, 1),
+        ([relative_to(-place, camera) for camera in own], place, 1),
         (own, np.zeros(3), 0),
         (own, np.array((0.0, 3.0, 1.0)), 0),
     ):
@@ -183,7 +188,7 @@ def test_cameras_relative_to_the_origin_or_to_0_are_distinguished(tmp_path):
         notes = []
         found = load_cameras(path, notes, origin)
         assert all(np.allclose(a.viewmat, b.viewmat) for a, b in zip(own, found, strict=True))
-        assert said == len(notes)
+        assert note_count == len(notes)
 
 
 def inria(**fields):
@@ -303,12 +308,15 @@ SLANTED = [0.0, -0.8, 0.6]
 def figure(seed=0):
     """Return a round body with thin legs (y points down) and a few floaters, and the number of splats without these."""
     rng = np.random.default_rng(seed)
-    body = rng.standard_normal((4000, 3))
-    body /= np.linalg.norm(body, axis=1, keepdims=True)
-    heights = 0.95 + 1.2 * rng.random(120)
-    legs = np.stack([np.where(np.arange(120) % 2, 0.3, -0.3), heights, 0.02 * rng.standard_normal(120)], axis=1)
+    heights = 0.95 + 1.2 * rng.random(60)
+    legs = np.stack([np.where(np.arange(60) % 2, 0.3, -0.3), heights, 0.02 * rng.standard_normal(60)], axis=1)
     crumbs = [[9.0, 9.0, 9.0], [-8.0, 0.0, 0.0], [-8.1, 0.1, 0.0]]
-    return cloud(np.concatenate([body, legs, crumbs])), 4120
+    return cloud(np.concatenate([on_a_sphere(rng, 2000), legs, crumbs])), 2060
+
+
+def on_a_sphere(rng, count, radius=1.0):
+    points = rng.standard_normal((count, 3))
+    return radius * points / np.linalg.norm(points, axis=1, keepdims=True)
 
 
 def same(cameras, others):
@@ -326,8 +334,6 @@ def test_an_orbit_shows_an_object_entirely(size):
     model, count = figure()
     assert "object" == scene_frame(model).kind
     cameras = orbit_cameras(model, 6, *size)
-    if size == (240, 320):
-        assert same(cameras, orbit_cameras(figure()[0], 6, *size))
     places = np.concatenate([project(model.means[:count], camera) for camera in cameras])
     assert ((places > 0) & (places < size)).all()
     filled = np.max(np.abs(places - np.array(size) / 2) / (np.array(size) / 2), axis=0)
@@ -351,9 +357,8 @@ def niche(seed=0):
     rng = np.random.default_rng(seed)
     things = 0.3 * rng.standard_normal((5000, 3))
     wall = np.stack([np.full(900, -1.0), *(6.0 * rng.random((2, 900)) - 3.0)], axis=1)
-    room = rng.standard_normal((1500, 3))
-    room *= 6.0 / np.linalg.norm(room, axis=1, keepdims=True)
-    return cloud(np.concatenate([things, wall, room]), np.repeat([0.02, 0.3, 0.4], [5000, 900, 1500]))
+    sizes = np.repeat([0.02, 0.3, 0.4], [5000, 900, 1500])
+    return cloud(np.concatenate([things, wall, on_a_sphere(rng, 1500, 6.0)]), sizes)
 
 
 @pytest.mark.slow
@@ -376,27 +381,23 @@ def ring(count, spread=360.0):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("spread", "off"), [(360.0, 0.4), (90.0, 0.4)])
-def test_a_path_along_cameras_has_their_positions_and_directions(spread, off):
+@pytest.mark.parametrize("spread", [360.0, 90.0])
+def test_a_path_along_cameras_has_their_positions_and_directions(spread):
     known = ring(40, spread)
     places = np.stack([camera.position for camera in known])
     cameras = orbit_cameras(niche(), 24, 64, 48, along=known)
     for camera in cameras:
-        assert np.linalg.norm(places - camera.position, axis=1).min() < off
+        assert np.linalg.norm(places - camera.position, axis=1).min() < 0.4
         towards = -camera.position / np.linalg.norm(camera.position)
         assert camera.viewmat[2, :3] @ towards > 0.95
     middle = np.mean([camera.position for camera in cameras], axis=0)
     assert np.linalg.norm(middle - places.mean(axis=0)) < 0.4
     far = look_at([0, 5000.0, 0], [0, 0, 0], [0, 0, 1], SMALL_K, 64, 48)
     assert same(cameras, orbit_cameras(niche(), 24, 64, 48, along=[*known, far]))
-
-
-@pytest.mark.slow
-def test_a_path_in_surroundings_follows_the_recorded_cameras():
-    known = ring(40, 90.0)
     carrying = SplatModel(**{**vars(niche()), "cameras": [camera.to_json() for camera in known]})
-    wanted = orbit_cameras(niche(), 8, 64, 48, along=known)
-    assert same(wanted, orbit_cameras(carrying, 8, 64, 48))
+    assert same(cameras, orbit_cameras(carrying, 24, 64, 48))  # the recorded cameras
+    for camera in orbit_cameras(niche(), 3, 64, 48, along=known[:1]):  # one camera does not move
+        assert np.allclose(known[0].viewmat, camera.viewmat)
 
 
 @pytest.mark.slow
@@ -414,83 +415,41 @@ def test_a_path_sways_around_the_recorded_first_view():
     assert len(orbit_cameras(unread, 24, 64, 48)) == 24  # the arc of a scene without a valid view
 
 
-@pytest.mark.slow
-def test_a_path_along_one_camera_does_not_move():
-    (known,) = ring(1)
-    for camera in orbit_cameras(niche(), 3, 64, 48, along=[known]):
-        assert np.allclose(known.viewmat, camera.viewmat)
-
-
-@pytest.mark.slow
-def test_degenerate_scenes_have_a_path():
-    for means, size in ((np.zeros((0, 3)), 0.1), (np.zeros((1, 3)), 0.1), (figure()[0].means, 1e25)):
-        assert all(np.isfinite(camera.viewmat).all() for camera in orbit_cameras(cloud(means, size), 3))
-    with pytest.raises(InputError, match="at least 1"):
-        orbit_cameras(niche(), 0)
-
-
-@pytest.mark.slow
-def test_the_orbit_of_an_empty_scene_has_radius_1(make_model):
-    cameras = orbit_cameras(make_model(0), 4, 64, 48)
-    wanted = orbit([0, 0, 0], 1.0, [0, -1, 0], 4, SMALL_K, 64, 48, near=cameras[0].near)
-    assert same(wanted, cameras)
-
-
 # Virtual cameras.
-def ball(count=3000, radius=1.0, seed=0, **fields):
-    p = np.random.default_rng(seed).standard_normal((count, 3))
-    return cloud(radius * p / np.linalg.norm(p, axis=1, keepdims=True), **fields)
-
-
-def capture(seed=0):
-    """Return a small subject of fine splats, surrounded by far, coarse walls."""
-    rng = np.random.default_rng(seed)
-    subject, walls = rng.standard_normal((4000, 3)) * 0.3, rng.standard_normal((1500, 3))
-    walls *= 6.0 / np.linalg.norm(walls, axis=1, keepdims=True)
-    return cloud(np.concatenate([subject, walls]), np.repeat([0.02, 0.4], [4000, 1500]))
+def ball(count=1500, radius=1.0, seed=0, **fields):
+    return cloud(on_a_sphere(np.random.default_rng(seed), count, radius), **fields)
 
 
 def test_objects_and_surroundings_are_distinguished():
     assert "object" == scene_frame(ball()).kind
-    assert "surrounding" == scene_frame(capture()).kind
+    assert "surrounding" == scene_frame(niche()).kind
 
 
-def test_one_far_floater_does_not_change_the_kind_of_scene():
-    means = np.concatenate([ball().means, [[300.0, 0.0, 0.0]]])
-    frame = scene_frame(cloud(means))
-    assert "object" == frame.kind
-    assert np.allclose(frame.centre, 0.0, atol=0.05)
-
-
-def test_transparent_splats_are_ignored():
+def test_floaters_and_transparent_splats_do_not_change_the_frame_of_a_scene():
     clean = ball()
-    means = np.concatenate([clean.means, 50.0 * np.random.default_rng(1).standard_normal((3000, 3))])
-    dirty = scene_frame(cloud(means, opacities=np.repeat(np.array([0.9, 0.001], np.float32), 3000)))
-    assert "object" == dirty.kind
-    assert np.allclose(scene_frame(clean).centre, dirty.centre)
-    assert np.isclose(scene_frame(clean).extent, dirty.extent)
+    fog = 50.0 * np.random.default_rng(1).standard_normal((1500, 3))
+    foggy = cloud(np.concatenate([clean.means, fog]), opacities=np.repeat(np.array([0.9, 0.001], np.float32), 1500))
+    for model, tolerance in ((foggy, 1e-6), (cloud(np.concatenate([clean.means, [[300.0, 0.0, 0.0]]])), 0.05)):
+        assert "object" == scene_frame(model).kind
+        assert np.allclose(scene_frame(clean).centre, scene_frame(model).centre, atol=tolerance)
+        assert np.isclose(scene_frame(clean).extent, scene_frame(model).extent, rtol=tolerance)
 
 
-@pytest.mark.parametrize(("count", "seed"), [(8, 0), (8, 3), (1, 0), (5, 1)])
-def test_an_object_covers_half_of_each_render(count, seed):
-    model = ball()
-    sample = sample_cloud(model, 50_000, np.random.default_rng(9))
+def tower():
+    return cloud(np.random.default_rng(0).random((5000, 3)) * [0.3, 3.0, 0.3], 0.02)
+
+
+@pytest.mark.parametrize(("make", "count", "seed"), [(ball, 8, 0), (tower, 3, 0), (ball, 1, 3)])
+def test_an_object_covers_half_of_each_render(make, count, seed):
+    model = make()
+    frame, sample = scene_frame(model), sample_cloud(model, 50_000, np.random.default_rng(9))
     cameras = virtual_cameras(model, count, seed=seed)
-    assert count == len(cameras)
-    frame = scene_frame(model)
+    assert [(640, 480)] * count == [(camera.W, camera.H) for camera in cameras]
     for camera in cameras:
-        assert (640, 480) == (camera.W, camera.H)
         assert covered_fraction(sample, camera) >= 0.5
         distance = np.linalg.norm(camera.position - frame.centre) / frame.extent
         assert np.isclose(distance, OBJECT_DISTANCES).any()
         assert camera.near == min(0.2, 0.05 * frame.extent)
-
-
-def test_a_tower_covers_half_of_each_render():
-    rng = np.random.default_rng(0)
-    model = cloud(rng.random((5000, 3)) * [0.3, 3.0, 0.3], 0.02)
-    sample = sample_cloud(model, 50_000, rng)
-    assert all(covered_fraction(sample, camera) >= 0.5 for camera in virtual_cameras(model, 3))
 
 
 def test_cameras_surround_an_object():
@@ -503,7 +462,7 @@ def test_cameras_surround_an_object():
 
 @pytest.mark.slow
 def test_cameras_in_surroundings_look_at_the_subject():
-    model = capture()
+    model = niche()
     frame = scene_frame(model)
     for camera in virtual_cameras(model):
         towards = frame.centre - camera.position
@@ -546,8 +505,7 @@ from csplat_render.virtual_cameras import virtual_cameras
 
 rng = np.random.default_rng(0)
 f = lambda *shape: rng.standard_normal((20000, *shape)).astype(np.float32)
-alpha = np.abs(np.tanh(f()))
-model = SplatModel(means=f(3), quats=normalise_quats(f(4)), scales=f(3) - 4, opacities=alpha, sh0=f(3))
+model = SplatModel(means=f(3), quats=normalise_quats(f(4)), scales=f(3) - 4, opacities=abs(np.tanh(f())), sh0=f(3))
 print(json.dumps([camera.to_json() for camera in virtual_cameras(model)]))
 """
 
@@ -556,33 +514,34 @@ print(json.dumps([camera.to_json() for camera in virtual_cameras(model)]))
 def test_the_number_of_threads_does_not_change_the_cameras():
     out = []
     for threads in ("1", "2"):
-        environment = dict(os.environ)
-        environment.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), threads))
-        run = subprocess.run([sys.executable, "-c", THREADS], env=environment, capture_output=True, check=True)
-        out.append(run.stdout)
+        environment = {**os.environ, "OMP_NUM_THREADS": threads, "OPENBLAS_NUM_THREADS": threads}
+        out.append(subprocess.check_output([sys.executable, "-c", THREADS], env=environment))
     assert out[0] == out[1]
     assert 8 == out[0].count(b"viewmat")
 
 
 @pytest.mark.slow
 def test_degenerate_scenes_have_cameras():
-    nothing = cloud(np.zeros((0, 3)), np.zeros(0))
-    point = cloud(np.zeros((1, 3)))
-    clear = ball(300, opacities=np.zeros(300, np.float32))
-    huge = ball(300, scales=np.full((300, 3), 60.0, np.float32))
-    tiny = ball(300, scales=np.full((300, 3), -60.0, np.float32))
-    far = ball(300, radius=1e15)
-    assert 3 == len(virtual_cameras(nothing, 3))
-    for model in (point, clear, huge, tiny, far):
-        (camera,) = virtual_cameras(model, 1)
-        assert np.isfinite(camera.viewmat).all()
-    for model in (clear, tiny, far):  # test_cameras.py makes paths for the others
-        assert all(np.isfinite(camera.viewmat).all() for camera in orbit_cameras(model, 3))
+    scenes = {
+        "without splats": cloud(np.zeros((0, 3)), np.zeros(0)),
+        "one point": cloud(np.zeros((1, 3))),
+        "transparent": ball(300, opacities=np.zeros(300, np.float32)),
+        "huge splats": ball(300, scales=np.full((300, 3), 60.0, np.float32)),
+        "tiny splats": ball(300, scales=np.full((300, 3), -60.0, np.float32)),
+        "far away": ball(300, radius=1e15),
+    }
 
+    def check(model):
+        cameras = [*virtual_cameras(model, 1), *orbit_cameras(model, 3)]
+        assert 4 == len(cameras)
+        assert all(np.isfinite(camera.viewmat).all() for camera in cameras)
 
-def test_zero_cameras_are_refused():
-    with pytest.raises(InputError, match="at least 1"):
-        virtual_cameras(ball(), 0)
+    assert [] == failures(scenes, check)
+    cameras = orbit_cameras(scenes["without splats"], 4, 64, 48)
+    assert same(orbit([0, 0, 0], 1.0, [0, -1, 0], 4, SMALL_K, 64, 48, near=cameras[0].near), cameras)
+    for make in (virtual_cameras, orbit_cameras):
+        with pytest.raises(InputError, match="at least 1"):
+            make(ball(), 0)
 
 
 def test_weighted_quantiles_agree_with_values_by_hand():
@@ -592,7 +551,7 @@ def test_weighted_quantiles_agree_with_values_by_hand():
     assert np.allclose([1.0, 3.0, 5.0], weighted_quantiles(values, weights, (0.75, 0.875, 1.0)))
 
 
-@pytest.mark.parametrize("name", ["donut", "horse", "jacket", "lego60k", "plane3", "fox60k_noreg", "object_id"])
+@pytest.mark.parametrize("name", ["donut", "horse", "plane3", "fox60k_noreg"])
 def test_distances_agree_with_the_cameras_of_the_shared_scenes(data_dir, name):
     model = read_ply(data_dir / "ply" / f"{name}.ply")
     frame = scene_frame(model)
@@ -602,18 +561,3 @@ def test_distances_agree_with_the_cameras_of_the_shared_scenes(data_dir, name):
 
     wanted = distance(load_cameras(data_dir / "psnr_cameras" / f"{name}.json"))
     assert 0.8 < distance(virtual_cameras(model)) / wanted < 1.25
-
-
-def test_numbers_beyond_float64_in_camera_files_are_refused(tmp_path):
-    path = tmp_path / "a.json"
-    for document in (
-        [{"K": np.eye(3).tolist(), "viewmat": np.eye(4).tolist(), "W": 10**400, "H": 2}],
-        [{"width": 2, "height": 2, "position": [0, 0, 10**400], "rotation": np.eye(3).tolist(), "fx": 1, "fy": 1}],
-        {"w": 2, "h": 2, "fl_x": 10**5000 // 3, "frames": []},
-    ):  # fmt: skip
-        limit = sys.get_int_max_str_digits()
-        sys.set_int_max_str_digits(0)
-        path.write_text(json.dumps(document), encoding="utf-8")
-        sys.set_int_max_str_digits(limit)
-        with pytest.raises(InputError, match=r"a\.json is not a JSON file: an integer has \d[\d,]* digits"):
-            load_cameras(path)

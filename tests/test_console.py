@@ -2,6 +2,7 @@
 
 import io
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -17,17 +18,16 @@ from csplat_tools.console import (
 )
 
 
-class Clock:
-    def __init__(self):
-        self.now = 1000.0
-
-    def __call__(self):
-        return self.now
-
-
 class Terminal(io.StringIO):
     def isatty(self):
         return True
+
+
+class Clock:
+    now = 1000.0
+
+    def __call__(self):
+        return self.now
 
 
 @pytest.fixture
@@ -49,17 +49,13 @@ def test_without_a_terminal_a_line_is_printed_every_ten_seconds(clock, capsys):
     display.report("encoding", 0.0)
     assert [] == lines(display, clock, capsys, 9)
     display.report("encoding", 0.4)
-    assert ["encoding 40 %, about 15 s left; 0:10 so far"] == lines(display, clock, capsys, 2)
-    assert 3 == len(lines(display, clock, capsys, 30))
-
-
-def test_work_without_reports_is_shown_as_working(clock, capsys):
-    display = Display(terminal=False, clock=clock)
-    assert ["working; 0:10 so far"] == lines(display, clock, capsys, 11)
-    display.report("matching", 0.0)
-    display.report("matching", 1.0)
-    display.report("preparing the renderer", 0.0)
-    assert ["preparing the renderer; 1:00 so far"] == lines(display, clock, capsys, 50)[-1:]
+    (line,) = lines(display, clock, capsys, 2)
+    assert "40 %, about 15 s left" in line
+    display.report("encoding", 1.0)
+    display.report("preparing the renderer", 0.0)  # without reports until it ends
+    seen = lines(display, clock, capsys, 30)
+    assert 3 == len(seen)
+    assert "%" not in seen[-1]
 
 
 def test_a_restarted_stage_estimates_its_own_time_left(clock, capsys):
@@ -70,30 +66,23 @@ def test_a_restarted_stage_estimates_its_own_time_left(clock, capsys):
     clock.now += 20.0
     display.report("tiles", 0.5)
     display.tick()
-    assert "tiles 50 %, about 20 s left; 17:00 so far\n" == capsys.readouterr().err
+    assert "50 %, about 20 s left" in capsys.readouterr().err
 
 
 def test_a_stage_may_have_its_own_text(clock, capsys):
     display = Display(terminal=False, clock=clock)
     with displayed(display), step_progress("training", lambda now: f"step {now.iteration}, 3 s left") as show:
-        show(type("Step", (), {"iteration": 40, "iterations": 50})())
-    assert ["training step 40, 3 s left; 0:10 so far"] == lines(display, clock, capsys, 11)
+        show(SimpleNamespace(iteration=40, iterations=50))
+    assert "step 40, 3 s left" in lines(display, clock, capsys, 11)[0]
 
 
 def test_long_runs_announce_their_time(clock, capsys):
-    def step(iteration):
-        return type("Step", (), {"iteration": iteration, "iterations": 5000})()
-
-    with step_progress("training", lambda _: "", clock=clock) as show:
-        for iteration in (1000, 1100, 1200):  # a resumed run
-            show(step(iteration))
-            clock.now += 4.0
-    assert "training takes about 2 to 5 minutes from here\n" == capsys.readouterr().err
-    with step_progress("training", lambda _: "", clock=clock) as show:
-        for iteration in (4600, 4800):
-            show(step(iteration))
-            clock.now += 4.0
-    assert "" == capsys.readouterr().err
+    for iterations, announced in ((range(1000, 1300, 100), True), (range(4600, 5000, 200), False)):
+        with step_progress("training", lambda _: "", clock=clock) as show:
+            for iteration in iterations:  # of a resumed run
+                show(SimpleNamespace(iteration=iteration, iterations=5000))
+                clock.now += 4.0
+        assert announced == ("2 to 5 minutes" in capsys.readouterr().err)
 
 
 def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
@@ -102,14 +91,11 @@ def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
     display = Display(terminal=True, clock=clock)
     display.report("tiles", 0.25)
-    clock.now += 1.9
-    display.tick()
-    assert "" == sys.stderr.getvalue()
-    clock.now += 1.1
-    display.tick()
+    for seconds, shown in ((1.9, False), (1.1, True)):
+        clock.now += seconds
+        display.tick()
+        assert shown == ("25 %, about 9 s left" in sys.stderr.getvalue())
     display.close()
-    assert "tiles" in sys.stderr.getvalue()
-    assert "25 %, about 9 s left" in sys.stderr.getvalue()
 
 
 def test_bars_are_removed_before_other_output(clock, monkeypatch, capsys):

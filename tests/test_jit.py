@@ -34,19 +34,8 @@ def fail_at(lane, lanes, which):
         raise ValueError("this lane")
 
 
-@kernel
-def run_of(lane, lanes, count):
-    return lane_range(lane, lanes, count)
-
-
-def test_the_ranges_of_all_lanes_cover_everything():
-    for count in (0, 1, 5, 100):
-        runs = [run_of(lane, 3, count) for lane in range(3)]
-        assert list(range(count)) == [i for first, end in runs for i in range(first, end)]
-
-
 def test_every_lane_runs_once():
-    for threads, count in ((1, 1000), (2, 1000), (None, 1000), (None, 100_000), (1, 1000)):
+    for threads, count in ((1, 1000), (2, 5), (2, 1000), (None, 1000), (None, 100_000), (1, 0)):
         seen = np.zeros(count, np.int64)
         with thread_count(threads) as lanes:
             note(seen)
@@ -80,17 +69,15 @@ def test_an_error_waits_for_the_other_lanes():
     def slow(lane, _lanes, written):
         if lane == 0:
             raise MemoryError("the first lane")
-        time.sleep(0.2)
+        time.sleep(0.05)
         written[0] += 1
 
     written = [0]
-    run = ParallelKernel(slow)
     with thread_count(available_threads()) as lanes:
         before = threading.active_count()
-        for _ in range(3):
-            with pytest.raises(MemoryError, match="the first lane"):
-                run(written)
-        assert [3 * (lanes - 1)] == written
+        with pytest.raises(MemoryError, match="the first lane"):
+            ParallelKernel(slow)(written)
+        assert [lanes - 1] == written
         assert threading.active_count() <= before + lanes - 1
 
 
@@ -106,24 +93,24 @@ def test_the_number_of_threads_is_restored():
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
-def test_a_forked_child_has_its_own_threads_and_locks():
-    script = """
+def test_a_forked_child_has_its_own_threads_and_locks(tmp_path):
+    (tmp_path / "forks.py").write_text("""
 import os, signal, threading, time
 import numpy as np
-from csplat_render.kernels import thread_count
-from test_jit import note
-def noted():
-    seen = np.zeros(9, np.int64)
+from csplat_render.kernels import parallel_kernel, thread_count
+@parallel_kernel()
+def note(lane, lanes, seen):
+    seen[lane] += 1
+def all_noted():
+    seen = np.zeros(2, np.int64)
     with thread_count(2):
         note(seen)
-    return seen
+    return 0 if seen.all() else 3
 def in_child(call):
     if child := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     signal.alarm(20)  # ends a child that waits for ever
     os._exit(call())
-def all_noted():
-    return 0 if noted().all() else 3
 def counted():
     with thread_count(None):
         return 7
@@ -132,16 +119,17 @@ def hold():
     with thread_count(1):
         held.set()
         time.sleep(100)
-noted()
+all_noted()
 print(in_child(all_noted), flush=True)
 threading.Thread(target=hold, daemon=True).start()
 held.wait()
 print(in_child(counted), flush=True)
 os._exit(0)
-"""
-    environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    words = [sys.executable, "-W", "ignore", "-c", script]
-    run = subprocess.run(words, env=environment, timeout=90, check=True, stdout=subprocess.PIPE, text=True)
+""")
+    words = [sys.executable, "-W", "ignore", str(tmp_path / "forks.py")]
+    run = subprocess.run(
+        words, env={**os.environ, "NUMBA_NUM_THREADS": "2"}, timeout=90, check=True, stdout=subprocess.PIPE, text=True
+    )
     assert ["0", "7"] == run.stdout.split()
 
 
@@ -172,19 +160,14 @@ def test_an_unusable_cache_costs_a_compilation_not_the_run(tmp_path, monkeypatch
         path.mkdir()
 
     damages = {
-        "nothing": lambda _index, _data: None,
         "an empty index": lambda index, _: index.write_bytes(b""),
         "an index that ends early": lambda index, _: index.write_bytes(index.read_bytes()[:-9]),
-        "an index of another file": lambda index, _: index.write_bytes(b"\x89PNG\r\n\x1a\n" * 99),
-        "an index of zeros": lambda index, _: index.write_bytes(bytes(index.stat().st_size)),
         "an index of an older numba": lambda index, _: index.write_bytes(b"\x80\x04\x8c\x060.60.0\x94.garbage"),
         "an index of another pickle": lambda index, _: index.write_bytes(index.read_bytes()[:-30] + b"N."),
         "an index that is a folder": lambda index, _: replace_by_folder(index),
         "data that are absent": lambda _, data: data.unlink(),
-        "data of 0 bytes": lambda _, data: data.write_bytes(b""),
         "data that end early": lambda _, data: data.write_bytes(data.read_bytes()[:-100]),
         "data of another pickle": lambda _, data: data.write_bytes(b"\x80\x04K\x01."),
-        "data that are a folder": lambda _, data: replace_by_folder(data),
     }
     whole = tmp_path / "whole"
     assert 2 == kernel_with_cache(whole, monkeypatch)(1)
@@ -192,13 +175,13 @@ def test_an_unusable_cache_costs_a_compilation_not_the_run(tmp_path, monkeypatch
     for number, (what, damage) in enumerate(damages.items()):
         folder = shutil.copytree(whole, tmp_path / str(number))
         damage(next(folder.rglob("*.nbi")), next(folder.rglob("*.nbc")))
-        again = kernel_with_cache(folder, monkeypatch)
-        assert 2 == again(1), what
+        assert 2 == kernel_with_cache(folder, monkeypatch)(1), what
         third = kernel_with_cache(folder, monkeypatch)
         third(1)
         healed[what] = bool(third.stats.cache_hits)
-    assert {"an index that is a folder", "data that are a folder"} == {what for what in healed if not healed[what]}
-    assert kernels.cache_failure().endswith("Is a directory")
+        if "folder" in what:
+            assert kernels.cache_failure().endswith("Is a directory")
+    assert ["an index that is a folder"] == [what for what in healed if not healed[what]]
 
     file = tmp_path / "file"
     file.write_bytes(b"")
@@ -292,40 +275,16 @@ judge = Scorer.of_source(model, [camera], (0.0, 0.0, 0.0))
 judge.scores(model.select(np.arange(30)), lpips=lpips)
 """
 
-_TELL = "print(json.dumps([plain, before, compiled()]), flush=True)"
-
-
-@pytest.fixture(scope="module")
-def versions():
-    """Count the compiled versions of each kernel at three points of each part, in processes that share only imports."""
-    parts = [f"{part}{_TELL}" for part in (_PLAIN + _SIMPLIFY, _COMPARE)]
-    code = f"""{_USE}
-for part in {parts!r}:
-    if os.fork() == 0:
-        exec(part)
-        os._exit(0)
-    if os.wait()[1]:
-        sys.exit("a part failed")
-"""
-    run = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True)
-    return [json.loads(line) for line in run.stdout.splitlines()]
-
-
-def assert_nothing_was_compiled(before, after):
-    assert sum(before.values()) > 5
-    assert {} == {name: count for name, count in after.items() if count != before.get(name, 0)}
-
 
 @pytest.mark.long
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
-def test_warming_up_compiles_all_kernels_of_simplify(versions):
-    plain, before, after = versions[0]
-    assert_nothing_was_compiled(before, after)
-    assert "csplat_render.contributions.sum_pruning" in {name for name in after if after[name] > plain.get(name, 0)}
-
-
-@pytest.mark.long
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
-def test_warming_up_compiles_all_kernels_of_compare(versions):
-    _, before, after = versions[1]
-    assert_nothing_was_compiled(before, after)
+def test_warming_up_compiles_all_kernels_of_simplify_and_compare():
+    for part in (_PLAIN + _SIMPLIFY, _COMPARE):
+        code = f"{_USE}{part}print(json.dumps([plain, before, compiled()]), flush=True)"
+        run = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True)
+        plain, before, after = json.loads(run.stdout.splitlines()[-1])
+        assert sum(before.values()) > 5
+        assert {} == {name: count for name, count in after.items() if count != before.get(name, 0)}
+        if plain:
+            added = {name for name in after if after[name] > plain.get(name, 0)}
+            assert "csplat_render.contributions.sum_pruning" in added

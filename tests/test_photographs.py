@@ -3,10 +3,10 @@
 import json
 import shutil
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import cloud
 from command_line import call, invoke
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
@@ -17,7 +17,8 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 from PIL import Image
 
 from csplat_render import render
-from csplat_render.camera import intrinsics, look_at, relative_to
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.camera_files import save_cameras
 from csplat_tools.inspect.comparison import compare
 from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.posed_images import PosedImage, image_scorer
@@ -25,11 +26,12 @@ from csplat_trainer.posed_images import PosedImage, image_scorer
 W, H = 64, 48
 
 
-@pytest.fixture
-def scene(make_model):
-    model = make_model(300, 1)
-    dim = {name: getattr(model, name) * np.float32(0.2) for name in ("sh0", "shN")}  # no colour beyond 1
-    return replace(model, scales=model.scales * np.float32(0.3) - np.float32(1.5), **dim)
+@pytest.fixture(scope="module")
+def scene():
+    rng = np.random.default_rng(0)
+    fields = {"scales": rng.normal(-2.7, 0.3, (300, 3)), "opacities": rng.random(300)}
+    fields |= {"sh0": 0.2 * rng.normal(size=(300, 3)), "shN": 0.2 * rng.normal(size=(300, 3, 3))}  # no colour beyond 1
+    return cloud(rng.normal(size=(300, 3)), **{name: values.astype(np.float32) for name, values in fields.items()})
 
 
 def cameras(count):
@@ -57,18 +59,19 @@ def write_set(folder, scene, *, alpha, shift=(0.0, 0.0, 0.0)):
     return folder
 
 
-@pytest.fixture
-def files(scene, tmp_path):
-    write_ply(tmp_path / "a.ply", scene)
+@pytest.fixture(scope="module")
+def files(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("files")
+    write_ply(folder / "a.ply", scene)
     worse = replace(scene, sh0=scene.sh0 + np.float32(0.2))
-    (tmp_path / "b.csplat").write_bytes(encode(worse, EncodeOptions(preset="fast")))
-    return tmp_path / "a.ply", tmp_path / "b.csplat"
+    (folder / "b.csplat").write_bytes(encode(worse, EncodeOptions(preset="fast")))
+    return folder / "a.ply", folder / "b.csplat"
 
 
-@pytest.fixture
-def data(scene, tmp_path):
+@pytest.fixture(scope="module")
+def data(scene, tmp_path_factory):
     """The set of the scene without alpha."""
-    return write_set(tmp_path / "capture", scene, alpha=False)
+    return write_set(tmp_path_factory.mktemp("set") / "capture", scene, alpha=False)
 
 
 def compared(*words):
@@ -86,12 +89,9 @@ def test_both_scenes_are_scored_on_the_test_images(files, data):
     assert scores["b"]["psnr"] == pytest.approx(result["psnr"], abs=0.2)
     assert scores["b"]["ssim"] < scores["a"]["ssim"]
     assert scores["a"]["lpips"] is None
-
-
-def test_training_images_are_the_others(files, data):
-    result = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
-    assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in result["views"]]
-    assert 6 == result["photographs"]["a"]["views"]
+    training = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
+    assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in training["views"]]
+    assert 6 == training["photographs"]["a"]["views"]
 
 
 def test_a_background_is_composited_behind_images_and_scene(scene, files, tmp_path):
@@ -112,19 +112,15 @@ def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
     result = compared(tmp_path / "moved.ply", tmp_path / "moved.ply", "--data", data)
     assert result["photographs"]["a"]["psnr"] > 50.0
     call("render", tmp_path / "moved.ply", "--data", data, tmp_path / "out")
-    assert_equal_images(tmp_path / "out" / "view0.png", data / "images" / "view0.png")
-
-
-def assert_equal_images(path, other):
-    with Image.open(path) as one, Image.open(other) as two:
+    assert ["view0.png", "view8.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
+    with Image.open(tmp_path / "out" / "view0.png") as one, Image.open(data / "images" / "view0.png") as two:
         assert (W, H) == one.size
         assert np.abs(np.asarray(one).astype(int) - np.asarray(two)).max() <= 1
 
 
 def test_the_table_has_a_column_for_each_scene(files, data, tmp_path):
     text = call("compare", *files, "--data", data, "--pictures", tmp_path / "out").stdout
-    for word in ("2 views of capture", "against 2 test images", "B - A", "psnr_mean"):
-        assert word in text
+    assert "B - A" in text
     with Image.open(tmp_path / "out" / "view8.png") as sheet:
         assert (4 * W, H) == sheet.size
 
@@ -135,35 +131,27 @@ def test_lpips_is_computed_with_weights(files, data, data_dir):
     assert 0.0 <= scores["a"]["lpips"] < scores["b"]["lpips"] < 1.0
 
 
-def test_renders_have_the_names_and_sizes_of_the_test_images(files, data, tmp_path):
-    call("render", files[0], "--data", data, tmp_path / "out")
-    assert ["view0.png", "view8.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
-    assert_equal_images(tmp_path / "out" / "view0.png", data / "images" / "view0.png")
-
-
-def test_a_set_without_test_images_is_refused(scene, data):
+def test_cameras_and_data_exclude_each_other(scene, files, data, tmp_path):
+    for words in (
+        ("compare", *files, "--cameras", "x.json", "--data", data),
+        ("render", files[0], "--cameras", "x.json", "--data", data, tmp_path / "o"),
+        ("compare", *files, "--test-every", "5"),
+        ("compare", *files, "--data", data, "--split", "val"),
+    ):
+        call(*words, status=2)
+    with pytest.raises(InputError, match="exclude each other"):
+        find_view_set(scene, cameras="x.json", data=DataOptions(str(data)))
     with pytest.raises(InputError, match="has no test views"):
         compare(scene, scene, views=find_view_set(scene, data=DataOptions(str(data), test_every=0)))
 
 
-def test_cameras_and_data_exclude_each_other(files, tmp_path):
-    assert 2 == invoke("compare", *files, "--cameras", "x.json", "--data", tmp_path).exit_code
-    assert 2 == invoke("render", files[0], "--cameras", "x.json", "--data", tmp_path, tmp_path / "o").exit_code
-    assert 2 == invoke("compare", *files, "--test-every", "5").exit_code
-    assert 2 == invoke("compare", *files, "--data", tmp_path, "--split", "val").exit_code
-    with pytest.raises(InputError, match="exclude each other"):
-        find_view_set(read_ply(files[0]), cameras="x.json", data=DataOptions(str(tmp_path)))
-
-
 def test_an_image_with_alpha_is_composited_over_the_background():
-    pixels = np.zeros((1, 2, 4), np.uint8)
-    pixels[0, 1] = (255, 0, 0, 51)
+    pixels = np.array([[[0, 0, 0, 0], [255, 0, 0, 51]]], np.uint8)
     picture = PosedImage(replace(cameras(1)[0], W=2, H=1), pixels)
     reference = image_scorer([picture], (0.0, 1.0, 1.0)).reference(0)
-    shown = reference.rgb
     assert [[False, False]] == reference.covered.tolist()
-    assert np.float32 == shown.dtype
-    assert np.allclose([[[0, 1, 1], [0.2, 0.8, 0.8]]], shown)
+    assert np.float32 == reference.rgb.dtype
+    assert np.allclose([[[0, 1, 1], [0.2, 0.8, 0.8]]], reference.rgb)
 
 
 def test_masked_pixels_are_not_scored(scene):
@@ -183,25 +171,6 @@ def test_masked_pixels_are_not_scored(scene):
     assert [mask.sum(), H * W] == [one.pixels for one in scores.each]
 
 
-def test_an_origin_moves_the_camera_in_the_opposite_direction():
-    camera = cameras(1)[0]
-    moved = relative_to((1.0, 2.0, 3.0), camera)
-    assert np.allclose(camera.position - (1.0, 2.0, 3.0), moved.position)
-    assert relative_to((0.0, 0.0, 0.0), camera) is camera
-
-
-# Inputs are checked first.
-
-
-@pytest.fixture
-def no_compiling(monkeypatch):
-    """Compiling the renderer fails the test."""
-
-    for place in ("tools.cli.compare.prepare_renderer", "tools.cli.render.prepare_renderer", "render.warmup.warm_up"):
-        monkeypatch.setattr(f"csplat_{place}", lambda *_, **__: pytest.fail("compiled before the inputs were checked"))
-
-
-@pytest.mark.usefixtures("no_compiling")
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -212,21 +181,20 @@ def no_compiling(monkeypatch):
         (("compare", "A", "B", "--lpips", "absent.npz"), "absent.npz"),
         (("compare", "A", "B", "--source-index", "absent.npy"), "absent.npy"),
         (("compare", "A", "B", "--cameras", "cameras.json", "--pictures", "A"), "not a folder"),
-        (("render", "absent.ply", "--orbit", "2", "o"), "absent.ply"),
         (("render", "A", "--cameras", "absent.json", "o"), "absent.json"),
-        (("render", "A", "--data", "absent", "o"), "absent"),
         (("render", "A", "--orbit", "2", "A"), "not a folder"),
         (("render", "A", "--orbit", "2", "nowhere/film.gif"), "nowhere"),
-        (("train", "absent", "o.ply"), "absent"),
         (("train", "capture", "o.ply", "--resume", "absent.npz"), "absent.npz"),
     ],
 )
 def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypatch, words, message):
+    for place in ("tools.cli.compare.prepare_renderer", "tools.cli.render.prepare_renderer", "render.warmup.warm_up"):
+        monkeypatch.setattr(f"csplat_{place}", lambda *_, **__: pytest.fail("compiled before the inputs were checked"))
     monkeypatch.chdir(tmp_path)
     shutil.copy(files[0], "A")
     shutil.copy(files[1], "B")
     (tmp_path / "capture").mkdir()
-    Path("cameras.json").write_text(json.dumps([cameras(1)[0].to_json()]), encoding="utf-8")
+    save_cameras("cameras.json", cameras(1))
     done = invoke(*words)
     assert done.exit_code in (1, 2), (done.stdout, done.exception)
     assert message in done.stderr
@@ -234,7 +202,7 @@ def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypa
 
 def test_the_renderer_is_prepared_once_after_reading(files, tmp_path):
     calls = []
-    (tmp_path / "cameras.json").write_text(json.dumps([camera.to_json() for camera in cameras(2)]))
+    save_cameras(tmp_path / "cameras.json", cameras(2))
     views = find_view_set(read_ply(files[0]), cameras=str(tmp_path / "cameras.json"), count=0)
     note = {"prepare": lambda: calls.append("prepare"), "progress": lambda stage, _: calls.append(stage)}
     compare(*files, views=views, **note)

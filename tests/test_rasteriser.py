@@ -1,10 +1,6 @@
-"""The rasteriser: renders and gradients against the exact twin, numbers worked out by hand, and adversarial inputs.
-
-`pytest -rP` prints the errors of gradients: relative L2, the largest of any group of parameters.
-"""
+"""The rasteriser: renders and gradients against the exact twin, numbers worked out by hand, and adversarial inputs."""
 
 import itertools
-import json
 import math
 from dataclasses import replace
 
@@ -22,8 +18,8 @@ pytest.importorskip("numba", reason="the renderer requires the extra [render]")
 from oracle import (
     GROUPS,
     VIEW,
+    Case,
     adversarial,
-    cropped,
     difference,
     extreme_splats,
     facing,
@@ -34,21 +30,17 @@ from oracle import (
     random_splats,
     relative_error,
 )
+from tables import failures
 
-from csplat_render import Camera, rasteriser, render
+from csplat_render import rasteriser, render
 from csplat_render.contributions import Contributions
 from csplat_render.conventions import ALPHA_CAP, DILATION, UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
-from csplat_render.reference_rasteriser import render_exact
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_render.warmup import warm_up
 
 
-def camera(width=64, height=48, focal=60.0, distance=4.0, **fields):
-    viewmat = np.eye(4)
-    viewmat[2, 3] = distance
-    K = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
-    return Camera(K, viewmat, width, height, **fields)
+def camera(width=64, height=48, focal=60.0, distance=4.0):
+    return facing(focal, distance=distance, width=width, height=height)
 
 
 def one_splat(alpha=0.5, scale=-2.0, colour=(1.0, 0.5, 0.25), mean=(0.0, 0.0, 0.0), quat=(1.0, 0.0, 0.0, 0.0)):
@@ -85,7 +77,6 @@ def assert_same_render(model, view, **options):
     fast, exact = render(model, view, **options), render(model, view, mode="exact", **options)
     for found, wanted in ((fast.rgb, exact.rgb), (fast.alpha[..., None], exact.alpha[..., None])):
         off = difference(found, wanted)
-        print(f"differs from the twin by {off.most:.1e} at most")
         assert off.share <= 1e-3
         assert off.mean <= 1e-5
     assert np.abs(fast.depth - exact.depth).mean() <= 1e-5 * max(1.0, exact.depth.max())
@@ -108,27 +99,9 @@ def test_antialiased_renders_agree_with_the_twin():
 @pytest.mark.slow
 def test_renders_of_the_sample_agree_with_the_twin(sample_path):
     model = read_ply(sample_path)
-    centre = np.median(model.means, axis=0)
-    spread = float(np.quantile(np.abs(model.means - centre), 0.9))
-    viewmat = np.eye(4)
-    viewmat[:3, 3] = -centre + [0.0, 0.0, 3.0 * spread]
-    view = Camera([[90.0, 0.0, 48.0], [0.0, 90.0, 36.0], [0.0, 0.0, 1.0]], viewmat, 96, 72, near=0.05 * spread)
-    result = render(model, view)
-    assert result.alpha.mean() > 0.1
+    view = virtual_cameras(model, 1, 96, 72)[0]
+    assert render(model, view).alpha.mean() > 0.1
     assert_same_render(model.select(slice(0, None, 8)), view)
-
-
-def shared_scene(data_dir, name):
-    path, cameras = data_dir / "ply" / f"{name}.ply", data_dir / "psnr_cameras" / f"{name}.json"
-    if not (path.exists() and cameras.exists()):
-        pytest.skip(f"{name} is absent")
-    return read_ply(path), [Camera.from_json(entry) for entry in json.loads(cameras.read_text())]
-
-
-@pytest.mark.parametrize("name", ["donut", "lego60k", "fox60k_noreg"])
-def test_renders_of_shared_scenes_agree_with_the_twin(data_dir, name):
-    model, views = shared_scene(data_dir, name)
-    assert_same_render(model.select(slice(0, None, 4)), cropped(views[1], 64, 48))
 
 
 def test_one_splat_has_the_values_worked_out_by_hand():
@@ -204,18 +177,18 @@ def test_the_fast_mode_is_close_to_the_standard_one():
 
 
 def test_the_number_of_threads_does_not_change_a_bit():
-    model = scene(count=3000)
-    view = camera(100, 75)
-    rng = np.random.default_rng(0)
-    gradient = rng.standard_normal((75, 100, 3)).astype(np.float32)
-    outcomes = []
-    for threads in (1, 2, None):
+    model, view = scene(count=3000), camera(100, 75)
+    gradient = np.random.default_rng(0).standard_normal((75, 100, 3)).astype(np.float32)
+
+    def outcome(threads):
         rasteriser = Rasteriser(threads=threads)
         picture = rasteriser.forward(model, view)
         g = rasteriser.backward(gradient)
-        outcomes.append([picture.rgb, picture.alpha, picture.depth, g.means, g.quats, g.scales, g.opacities, g.shN])
-    for other in outcomes[1:]:
-        for a, b in zip(outcomes[0], other, strict=True):
+        return [picture.rgb, picture.alpha, picture.depth, g.means, g.quats, g.scales, g.opacities, g.shN]
+
+    wanted = outcome(1)
+    for threads in (2, None):
+        for a, b in zip(wanted, outcome(threads), strict=True):
             np.testing.assert_array_equal(a, b)
 
 
@@ -285,144 +258,45 @@ def test_invalid_arrays_and_options_are_refused():
             call()
 
 
-def test_the_twin_accepts_the_same_arguments():
-    model = scene(count=30)
-    assert render_exact(model, camera()).rgb.dtype == np.float64
-    assert render(model, camera(), mode="exact").drawn == 30
+def assert_survives(case):
+    """Render forward and backward in both dtypes; assert finite results near the twin, and return the float32 render.
 
-
-W, H = 50, 37
-
-
-def assert_survives(arrays, view, *, antialiased=False):
-    """Render forward and backward in both dtypes; assert finite results that agree with the twin."""
-    found = []
-    rng = np.random.default_rng(1)
-    weights = rng.standard_normal((view.H, view.W, 3)), *rng.standard_normal((2, view.H, view.W))
-    for dtype in (np.float32, np.float64):
-        rasteriser = Rasteriser(dtype=dtype)
-        picture = rasteriser.forward(UncheckedSplats(**arrays), view, antialiased=antialiased)
-        g = rasteriser.backward(*weights)
-        for name in ("rgb", "alpha", "depth"):
-            assert np.isfinite(getattr(picture, name)).all(), name
-        for name in ("means", "quats", "scales", "opacities", "sh0", "shN", "means2d"):
-            assert np.isfinite(getattr(g, name)).all(), name
-        found.append((picture, {name: np.array(value, np.float64) for name, value in vars(g).items()}))
-    exact = render(UncheckedSplats(**arrays), view, mode="exact", antialiased=antialiased)
+    Unless they exceed float32, gradients of both dtypes agree, too.
+    """
+    splats, weights = UncheckedSplats(**case.arrays), random_gradients(case.view, seed=1)
+    options = {"antialiased": case.antialiased}
+    exact = render(splats, case.view, mode="exact", **options)
     assert np.isfinite(exact.rgb).all()
-    for picture, _ in found:
+    pictures = []
+    for dtype in (np.float32, np.float64):
+        picture, gradients = gradients_of(splats, case.view, weights, dtype, **options)
+        values = {"rgb": picture.rgb, "alpha": picture.alpha, "depth": picture.depth, **vars(gradients)}
+        assert [] == [name for name, value in values.items() if not np.isfinite(value).all()]
         off = np.abs(picture.rgb - exact.rgb).max(2) > 1 / 255 * max(1.0, np.abs(exact.rgb).max())
         assert off.mean() <= 2e-3
-    return found
+        assert exact.ignored == picture.ignored
+        pictures.append(picture)
+    if not case.beyond:
+        flipped, errors = float32_errors(splats, case.view, weights, **options)
+        assert flipped <= 1
+        assert max(errors.values()) <= 1e-2, errors
+    return pictures[0]
 
 
-def assert_gradients_agree(found):
-    for name, wanted in found[1][1].items():
-        size = np.linalg.norm(wanted)
-        assert np.linalg.norm(found[0][1][name] - wanted) <= 1e-2 * size + 1e-30, name
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize(
-    "scales",
-    [(0.0, -13.8, -13.8), (0.0, 0.0, -13.8), (4.0, -9.8, -9.8), (4.0, 4.0, -9.8), (9.0, -4.8, -4.8)],
-    ids=["needle", "disc", "large needle", "large disc", "huge needle"],
-)
-def test_splats_with_an_anisotropy_of_a_million_survive(scales, antialiased):
-    arrays = extreme_splats(scales=scales)
-    assert_gradients_agree(assert_survives(arrays, facing(), antialiased=antialiased))
-
-
-@pytest.mark.long
-def test_splats_around_the_camera_survive():
-    arrays = extreme_splats(scales=(1.0, 0.5, 0.2))
-    assert_gradients_agree(assert_survives(arrays, facing(distance=0.0)))
+def more_adversarial():
+    """Yield cases in addition to `adversarial`: log scales at the limits of float32, and renders of any size."""
+    for log_scale in (-60.0, 60.0, 88.0, -88.0, 3e38, -3e38):
+        for axes in ((1, 1, 1), (1, 0, 0), (1, 1, 0)):
+            arrays = extreme_splats()
+            arrays["scales"][:] = np.where(axes, np.float32(log_scale), arrays["scales"])
+            yield f"log scales {log_scale:g} on axes {axes}", Case(arrays, facing(), beyond=True)
+    for width, height in ((1, 1), (16, 16), (17, 15), (1, 100), (333, 1)):
+        yield f"{width} by {height} pixels", Case(extreme_splats(), facing(width=width, height=height), beyond=True)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("near", [1e-30, 1e-6, 0.2, 3.0])
-def test_splats_at_and_behind_the_near_plane_survive(near):
-    arrays = extreme_splats(count=80)
-    arrays["means"][:, 2] = np.concatenate([np.float32(near) * np.linspace(0.5, 2.0, 40), np.linspace(-4.0, 4.0, 40)])
-    found = assert_survives(arrays, facing(near=near, distance=0.0))
-    assert 0 < found[0][0].drawn < 80
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("log_scale", [-60.0, 60.0, 88.0, -88.0, 3e38, -3e38])
-def test_extreme_log_scales_survive(log_scale):
-    for axes in ((1, 1, 1), (1, 0, 0), (1, 1, 0)):
-        arrays = extreme_splats()
-        arrays["scales"][:] = np.where(axes, np.float32(log_scale), arrays["scales"])
-        assert_survives(arrays, facing())
-    mixed = extreme_splats()
-    mixed["scales"][:, 0], mixed["scales"][:, 1] = 60.0, -60.0
-    assert_survives(mixed, facing(), antialiased=True)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("alpha", [0.0, 1.0])
-def test_alphas_of_0_and_1_survive(alpha):
-    found = assert_survives(extreme_splats(opacities=alpha), facing())
-    assert (found[0][0].alpha.max() > 0.0) == (alpha > 0.0)
-    assert_gradients_agree(found)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("focal", [1e-6, 1e-2, 1e4, 1e9])
-def test_tiny_and_huge_focal_lengths_survive(focal):
-    assert_survives(extreme_splats(), facing(focal=focal))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("distance", [1e-20, 1e20, 1e37])
-def test_scenes_of_any_size_survive(distance):
-    arrays = extreme_splats()
-    arrays["means"] *= np.float32(distance)
-    arrays["scales"] += np.float32(math.log(distance))
-    assert_survives(arrays, facing(near=distance * 1e-3, distance=3 * distance))
-
-
-@pytest.mark.long
-def test_quaternions_of_any_length_survive():
-    arrays = extreme_splats()
-    arrays["quats"][::3] = 0.0
-    arrays["quats"][1::3] *= np.float32(1e30)
-    arrays["quats"][2::3] *= np.float32(1e-30)
-    found = assert_survives(arrays, facing())
-    plain = dict(arrays)
-    plain["quats"] = arrays["quats"].copy()
-    plain["quats"][::3] = [1.0, 0.0, 0.0, 0.0]
-    np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**plain), facing()).rgb)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_non_finite_rows_are_ignored_and_counted(name, bad):
-    arrays = extreme_splats(count=30)
-    clean = {key: value[3:].copy() for key, value in arrays.items()}
-    arrays[name].reshape(30, -1)[:3, -1] = bad
-    found = assert_survives(arrays, facing())
-    assert [result.ignored for result, _ in found] == [3, 3]
-    assert render(UncheckedSplats(**arrays), facing(), mode="exact").ignored == 3
-    np.testing.assert_array_equal(found[0][0].rgb, render(UncheckedSplats(**clean), facing()).rgb)
-
-
-@pytest.mark.long
-def test_an_empty_scene_renders_as_the_background():
-    for degree in (0, 3):
-        arrays = extreme_splats(count=0, degree=degree)
-        assert_survives(arrays, facing())
-        picture = render(UncheckedSplats(**arrays), facing(), background=(0.1, 0.2, 0.3))
-        np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (H, W, 3)))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (1, 100), (333, 1)])
-def test_renders_of_any_size_survive(width, height):
-    assert_survives(extreme_splats(), facing(width=width, height=height))
+def test_adversarial_splats_survive():
+    assert [] == failures({**dict(adversarial()), **dict(more_adversarial())}, assert_survives)
 
 
 @pytest.mark.long
@@ -433,26 +307,64 @@ def test_gradients_beyond_float32_are_clamped():
     assert all(np.isfinite(value).all() for value in vars(g).values())
 
 
+@pytest.mark.parametrize("near", [1e-30, 1e-6, 0.2, 3.0])
+def test_splats_in_front_of_the_near_plane_are_not_drawn(near):
+    arrays = extreme_splats(count=4, degree=0, means=0.0, opacities=0.9)
+    arrays["means"][:, 2] = np.float32(near) * np.array([-1.0, 0.5, 0.99, 1.5])
+    assert 1 == render(UncheckedSplats(**arrays), facing(near=near, distance=0.0)).drawn
+
+
+def test_splats_of_alpha_0_are_not_drawn():
+    for alpha in (0.0, 1.0):
+        picture = render(UncheckedSplats(**extreme_splats(opacities=alpha)), facing())
+        assert (picture.alpha.max() > 0.0) == (alpha > 0.0)
+
+
 @pytest.mark.long
+def test_quaternions_of_any_length_survive():
+    arrays = extreme_splats()
+    arrays["quats"][1::3] *= np.float32(1e30)
+    arrays["quats"][2::3] *= np.float32(1e-30)
+    plain = {**arrays, "quats": arrays["quats"].copy()}
+    plain["quats"][::3] = [1.0, 0.0, 0.0, 0.0]
+    arrays["quats"][::3] = 0.0
+    found = assert_survives(Case(arrays, facing(), beyond=True))
+    np.testing.assert_array_equal(found.rgb, render(UncheckedSplats(**plain), facing()).rgb)
+
+
+@pytest.mark.long
+def test_non_finite_rows_are_ignored_and_counted():
+    def check(case):
+        name, bad = case
+        arrays = extreme_splats(count=30)
+        clean = UncheckedSplats(**{key: value[3:].copy() for key, value in arrays.items()})
+        arrays[name].reshape(30, -1)[:3, -1] = bad
+        found = assert_survives(Case(arrays, facing(), beyond=True))
+        assert 3 == found.ignored
+        np.testing.assert_array_equal(found.rgb, render(clean, facing()).rgb)
+
+    cases = itertools.product(GROUPS, (np.nan, np.inf, -np.inf))
+    assert [] == failures({f"{name} {bad}": (name, bad) for name, bad in cases}, check)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("degree", [0, 3])
+def test_an_empty_scene_renders_as_the_background(degree):
+    arrays = extreme_splats(count=0, degree=degree)
+    assert_survives(Case(arrays, facing(), beyond=True))
+    picture = render(UncheckedSplats(**arrays), facing(), background=(0.1, 0.2, 0.3))
+    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (37, 50, 3)))
+
+
 def test_too_many_intersections_are_refused(monkeypatch):
     monkeypatch.setattr(rasteriser, "MAX_INTERSECTIONS", 100)
     with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
         render(UncheckedSplats(**extreme_splats(scales=2.0)), facing())
 
 
-@pytest.mark.long
-def test_warming_up_again_is_silent():
-    warm_up()
-    messages = []
-    assert warm_up(messages.append) < 5.0
-    assert len(messages) in (0, 2)
-
-
-def most(errors):
-    """Print and return the largest error."""
-    error = max(errors.values())
-    print(f"relative error {error:.1e}")
-    return error
+def largest_error(gradients, wanted):
+    """Return the largest relative error of any group of parameters."""
+    return max(relative_error(getattr(gradients, group), wanted[group]) for group in GROUPS)
 
 
 @pytest.mark.long
@@ -463,8 +375,7 @@ def test_gradients_agree_with_finite_differences_of_the_twin(degree, antialiased
     picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
     exact, differences = finite_differences(arrays, VIEW, weights, **options)
     np.testing.assert_allclose(picture.rgb, exact.rgb, atol=1e-12)
-    errors = {group: relative_error(getattr(gradients, group), differences[group]) for group in GROUPS}
-    assert most(errors) <= 1e-6, errors
+    assert largest_error(gradients, differences) <= 1e-6
 
 
 @pytest.mark.long
@@ -480,41 +391,16 @@ def test_gradients_agree_with_autograd(degree, antialiased):
     picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
     other, wanted = autograd_gradients(arrays, VIEW, weights, **options)
     np.testing.assert_allclose(picture.rgb, other, atol=1e-12)
-    errors = {group: relative_error(getattr(gradients, group), wanted[group]) for group in GROUPS}
-    assert most(errors) <= 1e-6, errors
+    assert largest_error(gradients, wanted) <= 1e-6
 
 
 @pytest.mark.long
 def test_float32_gradients_agree_with_float64_on_the_sample(sample_path):
     model = read_ply(sample_path)
-    assert_gradients_agree_with_float64(model, virtual_cameras(model, 1, 160, 120)[0])
-
-
-def assert_gradients_agree_with_float64(model, view):
+    view = virtual_cameras(model, 1, 160, 120)[0]
     flipped, errors = float32_errors(model, view, random_gradients(view, seed=2))
     assert flipped <= 10
-    assert most(errors) <= 1e-4, errors
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["donut", "lego60k", "fox120k"])
-def test_float32_gradients_agree_with_float64_on_shared_scenes(data_dir, name):
-    model, views = shared_scene(data_dir, name)
-    assert_gradients_agree_with_float64(model, views[0])
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("name", "case"), [pytest.param(*pair, id=pair[0]) for pair in adversarial()])
-def test_float32_gradients_survive_adversarial_splats(name, case):
-    splats, weights = UncheckedSplats(**case.arrays), random_gradients(case.view, seed=1)
-    _, found = gradients_of(splats, case.view, weights, np.float32, antialiased=case.antialiased)
-    for group in GROUPS:
-        assert np.isfinite(getattr(found, group)).all(), (name, group)
-    if case.beyond:
-        return
-    flipped, errors = float32_errors(splats, case.view, weights, antialiased=case.antialiased)
-    assert flipped <= 1
-    assert most(errors) <= 1e-2, (name, errors)
+    assert max(errors.values()) <= 1e-4, errors
 
 
 @pytest.mark.long

@@ -3,14 +3,12 @@
 import html
 import json
 import re
-import subprocess
 import sys
 
 import numpy as np
 import pytest
 from captures import cameras, shell
-from posed_sets import write_blender
-from typer.testing import CliRunner
+from command_line import call
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
 
@@ -21,15 +19,12 @@ pytest.importorskip("matplotlib", reason="plots require the extra [render]")
 
 
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
-from csplat_tools.cli.app import app
 from csplat_tools.html_report import HardestPlaceSearch, attribute_figure
 from csplat_tools.inspect.file_description import describe_file
 from csplat_tools.views import comparison_cameras, display_cameras, find_view_set
 from csplat_tools.views.view_sets import ViewSet
 
-
-def invoke(*words):
-    return CliRunner().invoke(app, ["info", *map(str, words)])
+pytestmark = pytest.mark.usefixtures("small_views")
 
 
 @pytest.fixture(scope="module")
@@ -46,12 +41,10 @@ def files(tmp_path_factory):
 def page(files):
     """Return the page of the file compared with its source."""
     path = files[0].with_name("page.html")
-    result = invoke(files[0], "--page", path, "--source", files[1])
-    assert 0 == result.exit_code, result.output
+    call("info", files[0], "--page", path, "--source", files[1])
     return path
 
 
-@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_the_page_agrees_with_the_text(files, page):
     text = html.unescape(page.read_text())
@@ -68,17 +61,33 @@ def test_the_page_agrees_with_the_text(files, page):
         assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td>", text)
 
 
-@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_the_page_shows_source_and_file(files, page):
+def test_the_page_shows_source_and_file_without_external_references(files, page):
     text = page.read_text()
     assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', text))
-    words = ["compare", str(files[1]), str(files[0])]
-    compared = CliRunner().invoke(app, words).stdout
+    compared = call("compare", files[1], files[0]).stdout
     assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: similarity", text)[1]
+    assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
+    assert all(link.startswith("data:image/webp") for link in re.findall(r'(?:src|href)="([^"]*)"', text))
+    assert "default-src 'none'" in text
 
 
-@pytest.mark.usefixtures("small_views")
+@pytest.mark.slow
+def test_a_file_without_splats_has_a_page_which_is_not_replaced_without_force(tmp_path, make_model):
+    page = tmp_path / "a.html"
+    page.write_text("mine")
+    (tmp_path / "empty.csplat").write_bytes(encode(make_model(0)))
+    write_ply(tmp_path / "empty.ply", make_model(0))
+    words = ("info", tmp_path / "empty.csplat", "--source", tmp_path / "empty.ply")
+    assert "--force replaces it" in call(*words, "--page", page, status=1).stderr
+    assert "a.html exists" in call("train", tmp_path, tmp_path / "a.ply", "--page", page, status=1).stderr
+    assert "mine" == page.read_text()
+    call(*words, "--page", page, "--force")
+    assert "0 splats" in page.read_text()
+    call(*words, status=2)  # a source requires a page
+    call(*words[:2], "--page", "-", status=2)
+
+
 @pytest.mark.slow
 def test_the_page_opens_in_a_browser(tab, page):
     tab.page.set_viewport_size({"width": 400, "height": 700})
@@ -94,65 +103,17 @@ def test_the_page_opens_in_a_browser(tab, page):
     assert grounds[0] != grounds[1]
 
 
-@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
-def test_the_page_has_no_external_references(page):
-    text = page.read_text()
-    assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
-    assert all(one.startswith("data:image/webp") for one in re.findall(r'(?:src|href)="([^"]*)"', text))
-    assert "default-src 'none'" in text
-
-
-@pytest.mark.usefixtures("small_views")
-@pytest.mark.slow
-def test_the_page_does_not_replace_a_file_without_force(files, tmp_path):
-    target = tmp_path / "page.html"
-    target.write_text("mine")
-    refused = invoke(files[0], "--page", target)
-    assert 1 == refused.exit_code
-    assert f"error: {target} exists: --force replaces it (E_INPUT)\n" == refused.stderr
-    assert "mine" == target.read_text()
-    assert 0 == invoke(files[0], "--page", target, "--force").exit_code
-    assert target.read_text().startswith("<!doctype html>")
-
-
-@pytest.mark.usefixtures("small_views")
-@pytest.mark.slow
-def test_a_file_without_splats_has_a_page(tmp_path, make_model):
-    (tmp_path / "empty.csplat").write_bytes(encode(make_model(0)))
-    write_ply(tmp_path / "empty.ply", make_model(0))
-    done = invoke(tmp_path / "empty.csplat", "--page", tmp_path / "a.html", "--source", tmp_path / "empty.ply")
-    assert 0 == done.exit_code, done.output
-    assert "0 splats" in (tmp_path / "a.html").read_text()
-
-
-@pytest.mark.usefixtures("small_views")
-def test_a_source_without_a_page_has_status_2(files):
-    assert 2 == invoke(files[0], "--source", files[1]).exit_code
-    assert 2 == invoke(files[0], "--page", "-").exit_code
-
-
-@pytest.mark.usefixtures("small_views")
-@pytest.mark.slow
-def test_without_the_renderer_the_page_has_no_comparison(files, tmp_path):
-    code = """import json, sys
-sys.modules["numba"] = sys.modules["PIL"] = None
-from typer.testing import CliRunner
-from csplat_tools.cli.app import app
-file, source, folder = sys.argv[1:]
-for words in ((f"{folder}/a.html",), (f"{folder}/b.html", "--source", source)):
-    done = CliRunner().invoke(app, ["info", file, "--page", *words])
-    print(json.dumps([done.exit_code, done.stderr]))"""
-    words = [sys.executable, "-c", code, *map(str, files), str(tmp_path)]
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
-    alone, compared = map(json.loads, done.stdout.splitlines())
-    assert [0, ""] == alone
+def test_without_the_renderer_the_page_has_no_comparison(files, tmp_path, monkeypatch):
+    for module in ("numba", "PIL"):
+        monkeypatch.setitem(sys.modules, module, None)
+    call("info", files[0], "--page", tmp_path / "a.html")
     assert "Declared error bounds" in (tmp_path / "a.html").read_text()
-    assert [1, "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n"] == compared
+    refused = call("info", files[0], "--page", tmp_path / "b.html", "--source", files[1], status=1)
+    assert "error: this needs numba: pip install 'csplat[render]' (E_INPUT)\n" == refused.stderr
     assert not (tmp_path / "b.html").exists()
 
 
-@pytest.mark.usefixtures("small_views")
 def test_bars_are_proportional_to_bytes():
     text = attribute_figure({"means": 100, "sh0": 300, "sh1": 50})
     widths = [float(one) for one in re.findall(r'width="([\d.]+)" height="17"', text)]
@@ -160,14 +121,15 @@ def test_bars_are_proportional_to_bytes():
     np.testing.assert_allclose(np.array(widths) / widths[0], [1.0, 3.0, 0.5], atol=1e-3)
 
 
-@pytest.mark.usefixtures("small_views")
 def test_the_hardest_place_is_where_the_error_is():
     source = np.full((80, 120, 3), 0.5, np.float32)
-    slightly, badly = source.copy(), source.copy()
-    slightly[:, :] += 0.05
+    slightly, badly = source + np.float32(0.05), source.copy()
     badly[31:39, 70:80] = 1.0
     place = HardestPlaceSearch()
-    for number, seen in enumerate((source, badly, slightly)):
+    assert place.found() is None
+    place.examine(0, source, source)
+    assert 99.0 == place.found().psnr
+    for number, seen in ((1, badly), (2, slightly)):
         place.examine(number, source, seen)
     found = place.found()
     assert 1 == found.view
@@ -175,15 +137,10 @@ def test_the_hardest_place_is_where_the_error_is():
     assert 80 * 3 == np.count_nonzero(found.decoded == 255)
     assert found.psnr == pytest.approx(10.0 * np.log10(600.0 / (80 * 0.25)), abs=0.01)
     frame = np.argwhere((found.where == 255).all(axis=2))
-    (top, left), (bottom, right) = frame.min(axis=0), frame.max(axis=0)
-    assert top <= 32
-    assert left <= 71
-    assert bottom >= 37
-    assert right >= 78
-    assert HardestPlaceSearch().found() is None
+    assert (frame.min(axis=0) <= (32, 71)).all()
+    assert (frame.max(axis=0) >= (37, 78)).all()
 
 
-@pytest.mark.usefixtures("small_views")
 @pytest.mark.slow
 def test_display_views_show_detail(sample_path):
     source = read_ply(sample_path)
@@ -193,31 +150,8 @@ def test_display_views_show_detail(sample_path):
     cloud, nearest = sample_cloud(source, 20_000, np.random.default_rng(1)), 0.4 * scene_frame(source).extent
     best = max(detail(cloud, camera, nearest) for camera in comparison_cameras(source))
     assert all(detail(cloud, camera, nearest) > 0.6 * best for camera in shown)
-
-
-@pytest.mark.usefixtures("small_views")
-def test_views_of_the_user_are_displayed_unchanged():
-    own = cameras(3)
-    assert display_cameras(shell(8), ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
-
-
-@pytest.mark.usefixtures("small_views")
-def test_equal_images_have_a_hardest_place():
-    place = HardestPlaceSearch()
-    place.examine(0, np.zeros((8, 8, 3), np.float32), np.zeros((8, 8, 3), np.float32))
-    assert 99.0 == place.found().psnr
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    path = tmp_path_factory.mktemp("set")
-    write_blender(path)
-    return path
-
-
-def call(*words):
-    result = CliRunner().invoke(app, [str(word) for word in words])
-    assert result.exit_code == 0, (result.stderr, result.exception)
+    own = cameras(3)  # of the user, which are displayed unchanged
+    assert display_cameras(source, ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
 
 
 def headings(page):
@@ -251,11 +185,3 @@ def test_a_page_of_a_training_without_a_file_agrees_with_compare(file_runs, tmp_
         scores = file_runs.report["file"]["scores"][name]
         for score in ("psnr", "psnr_mean", "ssim"):
             assert scores[score] == pytest.approx(judged[one][score], abs=1e-3)
-
-
-def test_a_page_is_not_replaced_without_force(folder, tmp_path):
-    (tmp_path / "page.html").write_text("mine")
-    words = ["train", str(folder), str(tmp_path / "a.ply"), "--page", str(tmp_path / "page.html")]
-    result = CliRunner().invoke(app, words)
-    assert (1, "mine") == (result.exit_code, (tmp_path / "page.html").read_text())
-    assert "page.html exists" in result.stderr

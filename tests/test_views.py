@@ -57,9 +57,7 @@ def numbers(seen_from):
 
 
 # Roles.
-@pytest.mark.parametrize("size", [None, (24, 20)])
-@pytest.mark.parametrize("every", [5, 10])
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("kind", "every", "size"), [("rgb", 5, None), ("rgba", 10, (24, 20)), ("colmap", 5, (24, 20))])
 def test_each_image_has_one_role(sets, scene, kind, every, size):
     views = find_view_set(scene, data=DataOptions(str(sets[kind]), size, test_every=every))
     assert list(range(0, 16, every)) == numbers(views.test)
@@ -95,11 +93,21 @@ def test_virtual_test_views_have_a_black_background(scene):
 
 def test_the_number_of_validation_views_may_be_chosen(sets, scene):
     data = DataOptions(str(sets["rgb"]))
-    assert 0 == len(find_view_set(scene, data=data, validation_count=0).validation)
-    views = find_view_set(scene, data=data, validation_count=4)
-    assert (10, 4, 2) == tuple(map(len, poses(views)))
+    for count, sizes in ((0, (14, 0, 2)), (4, (10, 4, 2))):
+        assert sizes == tuple(map(len, poses(find_view_set(scene, data=data, validation_count=count))))
     with pytest.raises(InputError, match=r"none of .* for training"):
         find_view_set(scene, data=data, validation_count=14)
+    assert (0, 0, 14) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
+
+
+def test_a_folder_of_images_and_an_opened_set_have_the_same_views(sets, scene):
+    whole, opened = DataOptions(str(sets["rgb"])), load(sets["rgb"])
+    wanted, named, found = (
+        find_view_set(scene, data=data) for data in (whole, DataOptions(str(sets["rgb"] / "images")), opened)
+    )
+    assert (wanted.name, poses(wanted)) == (named.name, poses(named))
+    assert (poses(wanted), wanted.background) == (poses(found), found.background)
+    assert found.images[0].source is opened.train[0].source  # pixels are read once
 
 
 def test_validation_images_of_a_set_are_validation_views(sets, scene, tmp_path):
@@ -116,11 +124,6 @@ def test_validation_images_of_a_set_are_validation_views(sets, scene, tmp_path):
     assert 4 == len(views.image_validation_scorer().references)
     assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, validation_count=2))))
     assert (0, 0, 8) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
-
-
-def test_the_training_split_may_be_scored_alone(sets, scene):
-    views = find_view_set(scene, data=DataOptions(str(sets["rgb"])), split="train")
-    assert (0, 0, 14) == tuple(map(len, poses(views)))
 
 
 def test_a_view_of_two_roles_is_refused_at_any_size(scene):
@@ -145,18 +148,6 @@ def test_recorded_training_options_are_the_defaults(sets, scene):
         "test_every is 10, but the scene was trained with 5",
         "background is white, but the scene was trained on 0,1,0",
     ] == [line for line in views.notes if "trained" in line]
-
-
-def test_an_opened_data_set_has_the_same_views(sets, scene):
-    opened = load(sets["rgb"])
-    found, named = (find_view_set(scene, data=data) for data in (opened, DataOptions(str(sets["rgb"]))))
-    assert (poses(named), named.background) == (poses(found), found.background)
-    assert found.images[0].source is opened.train[0].source  # pixels are read once
-
-
-def test_a_folder_of_images_is_read_as_its_set(sets, scene):
-    whole, named = (find_view_set(scene, data=DataOptions(str(path))) for path in (sets["rgb"], sets["rgb"] / "images"))
-    assert (whole.name, poses(whole)) == (named.name, poses(named))
 
 
 def test_a_scene_without_a_training_record_is_noted_once(sets, scene):
@@ -220,13 +211,7 @@ def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, 
     assert simplified["photographs"]["psnr"] == pytest.approx(again, abs=0.01)
 
 
-def test_another_origin_does_not_change_scores(sets, scene):
-    moved = replace(scene, means=scene.means - np.float32((10.0, -20.0, 5.0)), origin=(10.0, -20.0, 5.0))
-    scorers = [find_view_set(one, data=DataOptions(str(sets["rgb"]))).image_test_scorer() for one in (scene, moved)]
-    assert scorers[0].psnr(scene) == pytest.approx(scorers[1].psnr(moved), abs=0.01)
-    assert scorers[0].psnr(scene) == pytest.approx(scorers[0].psnr(moved), abs=0.01)
-
-
+@pytest.mark.slow
 def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
     # The scene has another origin than the set, and the camera file has none.
     place = np.array((500123.25, 4649876.5, 214.75))
@@ -238,47 +223,37 @@ def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
         frame["transform_matrix"] = pose.tolist()
     (tmp_path / "set" / "transforms.json").write_text(json.dumps(document))
     far = replace(scene, origin=tuple(place))
-    wanted = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).image_test_scorer().psnr(scene)
-    judge = find_view_set(far, data=DataOptions(str(tmp_path / "set"))).image_test_scorer()
-    assert wanted == pytest.approx(judge.psnr(far), abs=0.01)
+    scorer = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).image_test_scorer()
+    wanted = pytest.approx(scorer.psnr(scene), abs=0.01)
+    assert wanted == find_view_set(far, data=DataOptions(str(tmp_path / "set"))).image_test_scorer().psnr(far)
+    moved = replace(scene, means=scene.means - np.float32((10.0, -20.0, 5.0)), origin=(10.0, -20.0, 5.0))
+    assert wanted == scorer.psnr(moved)
+    assert wanted == find_view_set(moved, data=DataOptions(str(sets["rgb"]))).image_test_scorer().psnr(moved)
     own = cameras(3)
     save_cameras(tmp_path / "own.json", own)
-    save_cameras(tmp_path / "far.json", [relative_to(-place, one) for one in own])
+    save_cameras(tmp_path / "far.json", [relative_to(-place, camera) for camera in own])
     one, other = (find_view_set(far, cameras=str(tmp_path / f"{name}.json")) for name in ("own", "far"))
     assert all(np.allclose(a.viewmat, b.viewmat) for a, b in zip(one.test, other.test, strict=True))
     assert [False, True] == [any("around the scene's origin" in line for line in v.notes) for v in (one, other)]
 
 
-SIZE = (24, 20)
-
-
-def photographs(kind, folder):
-    folder.mkdir()
-    if kind == "blender":
-        return photograph_object(shell(3), folder)
-    return as_colmap(photograph(shell(3), folder)) if kind == "colmap" else photograph(shell(3), folder)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "every", "held_out", "commands"),
-    [
-        ("blender", 5, 4, ("compare", "finetune", "simplify", "tradeoff", "encode")),
-        ("transforms", 10, 2, ("compare", "finetune", "simplify", "tradeoff")),
-        ("colmap", 5, 4, ("compare", "finetune", "simplify", "tradeoff")),
-    ],
+    [("blender", 5, 4, ("compare", "finetune", "simplify", "tradeoff", "encode")), ("colmap", 10, 2, ("compare",))],
 )
 def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands, monkeypatch):
-    # No command gets a background, split or size: the PLY records them. `encode` runs once because it searches.
-    data, ply, log = photographs(kind, tmp_path / "data"), tmp_path / "s.ply", tmp_path / "log.json"
-    quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10)
-    size = "x".join(map(str, SIZE))
+    # No command gets a background, split or size: the PLY records them.
+    data, ply, log = tmp_path / "data", tmp_path / "s.ply", tmp_path / "log.json"
+    data.mkdir()
+    data = photograph_object(shell(3), data) if kind == "blender" else as_colmap(photograph(shell(3), data))
+    quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10, "--size", "24x20", "--test-every", every)
     change_options(monkeypatch, "csplat_tools.cli.train.TrainOptions", init="box")
     change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", refit=False)
     change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
-    call("train", data, ply, *quick, "--size", size, "--test-every", every, "--report", log, "-q")
+    call("train", data, ply, *quick, "--report", log, "-q")
     record = TrainingRecord.of(read_ply(ply).metadata)
-    assert ((1.0, 1.0, 1.0) if kind == "blender" else (0.0, 0.0, 0.0), SIZE) == (record.background, record.size)
+    assert ((1.0, 1.0, 1.0) if kind == "blender" else BLACK, (24, 20)) == (record.background, record.size)
     trained = json.loads(log.read_text())["metrics"]
     found = {name: score_of(name, ply, data, tmp_path) for name in commands}
     assert {held_out} == {trained["views"]} | {views for views, _ in found.values() if views is not None}

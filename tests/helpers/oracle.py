@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -68,14 +68,6 @@ def difference(picture: Array, exact: Array) -> Difference:
     """Compare two renders, [H, W, 3]."""
     error = np.abs(np.asarray(picture, np.float64) - exact)
     return Difference(float(error.max()), float(np.mean(error.max(2) > 1 / 255)), float(error.mean()))
-
-
-def cropped(view: Camera, width: int, height: int) -> Camera:
-    """Return a camera of the middle of a view, pixel for pixel, which the twin renders in seconds."""
-    K = view.K.copy()
-    K[0, 2] -= (view.W - width) // 2
-    K[1, 2] -= (view.H - height) // 2
-    return replace(view, K=K, W=width, H=height)
 
 
 def facing(focal: float = 40.0, near: float = 0.2, distance: float = 3.0, width: int = 50, height: int = 37) -> Camera:
