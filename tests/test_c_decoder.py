@@ -36,18 +36,16 @@ def run(command, **options):
 
 def compiled(folder, name, *arguments):
     """Compile a program; return its path."""
-    program = folder / name
     libraries = () if "-c" in arguments else ("-lz", "-lm")
-    command = [COMPILER, *STRICT, f"-I{C}", *map(str, arguments), "-o", str(program), *libraries]
-    made = run(command)
+    made = run([COMPILER, *STRICT, f"-I{C}", *map(str, arguments), "-o", str(folder / name), *libraries])
     assert (made.returncode, made.stderr) == (0, "")
-    return program
+    return folder / name
 
 
 @pytest.fixture(scope="module")
 def decoder(tmp_path_factory):
-    """The decoder that inflates with zlib."""
-    return compiled(tmp_path_factory.mktemp("c"), "csplat.o", "-c", C / "csplat.c")
+    """The decoder that inflates with zlib; some warnings need optimisation."""
+    return compiled(tmp_path_factory.mktemp("c"), "csplat.o", "-c", "-O1", C / "csplat.c")
 
 
 @pytest.fixture(scope="module")
@@ -99,19 +97,13 @@ def test_passes_the_conformance_suite(tmp_path):
     assert_passes(compiled(tmp_path, "adapter", "-DCSPLAT_NO_ZLIB", *sources))
 
 
+@pytest.mark.slow
 def test_selects_the_tiles_of_cuts(decoder, tmp_path):
     adapter = compiled(tmp_path, "adapter", decoder, C / "tools" / "adapter.c")
     options = DecoderSuiteOptions("valid/levels*,extreme/levels*", levels=(5,))
     report = run_command(None, options, cuts=f"{adapter} --cuts {{input}} {{cuts}}")
     assert report.failures == []
     assert len(report.outcomes) > 10
-
-
-@in_depth
-@pytest.mark.slow
-def test_compiles_without_a_warning_when_it_is_optimised(tmp_path):
-    # Some warnings need it.
-    compiled(tmp_path, "csplat.o", "-c", "-O1", C / "csplat.c")
 
 
 @in_depth

@@ -2,10 +2,10 @@
 
 import json
 import sys
-import zlib
 
 import numpy as np
 import pytest
+from tables import failures
 
 from csplat.errors import InputError
 from csplat_authoring import __main__ as recipes
@@ -59,18 +59,19 @@ def copier(tmp_path_factory):
     return lambda fault: f"{sys.executable} -I -S {script} {fault} {{input}} {{camera}} {{out}}"
 
 
-@pytest.mark.parametrize("vector", RENDERED, ids=lambda vector: vector.name)
-def test_a_scene_is_seen_by_two_cameras_and_not_dark(vector):
-    assert 2 == len(vector.views)
-    for view in vector.views:
-        picture = read_png((VECTORS / view["picture"]).read_bytes())
-        assert (view["camera"]["H"], view["camera"]["W"], 3) == picture.shape
-        assert psnr(picture, np.zeros_like(picture)) < 25
+def test_a_scene_is_seen_by_two_cameras_and_not_dark():
+    def check(vector):
+        assert 2 == len(vector.views)
+        for view in vector.views:
+            picture = read_png((VECTORS / view["picture"]).read_bytes())
+            assert (view["camera"]["H"], view["camera"]["W"], 3) == picture.shape
+            assert psnr(picture, np.zeros_like(picture)) < 25
+
+    assert [] == failures(RENDERED, check)
 
 
 def test_our_renderer_is_within_the_tolerance():
     report = run_builtin(DecoderSuiteOptions(pattern="render/*", levels=(4,)))
-
     assert report.passed
     assert 8 == len(report.outcomes)
     assert min(outcome.details["psnr"] for outcome in report.outcomes) > 60
@@ -94,11 +95,11 @@ def test_a_faulty_renderer_is_below_the_required_psnr(mistake):
     floats = change(made.floats) if change else made.floats
     antialiased = bool(made.header["scene_flags"]) and change is not None
 
-    def is_near(number, view):
+    def score(number, view):
         reference = read_png((VECTORS / f"{name}.{number}.png").read_bytes())
-        return psnr(reference, reference_renders.reference_render(floats, view.camera, antialiased)) >= view.psnr
+        return psnr(reference, reference_renders.reference_render(floats, view.camera, antialiased))
 
-    assert not all(is_near(number, view) for number, view in enumerate(recipe.views))
+    assert any(score(number, view) < view.psnr for number, view in enumerate(recipe.views))
 
 
 @pytest.mark.parametrize(
@@ -114,7 +115,6 @@ def test_a_faulty_renderer_is_below_the_required_psnr(mistake):
 )
 def test_each_fault_of_a_renderer_has_its_status(copier, fault, status, message):
     report = run_command(None, DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,)), render=copier(fault))
-
     assert {status} == {outcome.status for outcome in report.outcomes}
     assert all(message in outcome.message for outcome in report.outcomes)
 
@@ -122,7 +122,6 @@ def test_each_fault_of_a_renderer_has_its_status(copier, fault, status, message)
 def test_without_a_renderer_pictures_are_skipped_with_a_note(monkeypatch):
     monkeypatch.setattr(reference_renders, "can_render", lambda: False)
     (outcome, _) = run_builtin(DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,))).outcomes
-
     assert (Status.SKIPPED, "needs the packages of the extra render") == (outcome.status, outcome.message)
 
 
@@ -140,7 +139,6 @@ def ellipsoids(monkeypatch):
 @pytest.mark.usefixtures("ellipsoids")
 def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
     monkeypatch.setattr(recipes, "can_render", lambda: False)
-
     assert 0 == recipes.main()
     assert "SKIPPED: reference pictures" in capsys.readouterr().err
 
@@ -150,7 +148,6 @@ def test_a_changed_picture_is_out_of_date(monkeypatch, capsys):
     assert 0 == recipes.main()
     right = recipes.reference_render
     monkeypatch.setattr(recipes, "reference_render", lambda *args: 255 - right(*args))
-
     assert 1 == recipes.main()
     assert "ellipsoids.0.png" in capsys.readouterr().err
 
@@ -158,44 +155,16 @@ def test_a_changed_picture_is_out_of_date(monkeypatch, capsys):
 # PNG -----------------------------------------------------------------------------------------------
 
 
-def test_pictures_survive_writing_and_reading():
-    picture = np.random.default_rng(0).integers(0, 256, (5, 7, 3), np.uint8)
-
-    assert np.array_equal(picture, read_png(write_png(picture)))
-
-
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])
-def test_pictures_of_other_writers_are_read(tmp_path, mode):
+def test_pictures_of_other_writers_and_of_ours_are_read(tmp_path, mode):
     image = pytest.importorskip("PIL.Image", reason="pictures require the extra [render]")
     noise = np.random.default_rng(1).integers(0, 256, (40, 30, 3), np.uint8)
     noise[10:] = np.arange(90, dtype=np.uint8).reshape(30, 3)  # the writer then chooses every filter
     picture = image.fromarray(noise).convert(mode)
     picture.save(tmp_path / "a.png")
-
-    assert np.array_equal(np.asarray(picture.convert("RGB")), read_png((tmp_path / "a.png").read_bytes()))
-
-
-@pytest.mark.parametrize("kind", [0, 1, 2, 3, 4])
-def test_every_filter_is_undone(kind):
-    rng = np.random.default_rng(kind)
-    rows = rng.integers(0, 256, (3, 1 + 4 * 3), np.uint8)
-    rows[:, 0] = kind
-    data = bytearray(write_png(np.zeros((3, 4, 3), np.uint8)))
-    coded = zlib.compress(rows.tobytes())
-    at = data.index(b"IDAT") - 4
-    patched = bytes(data[:at]) + len(coded).to_bytes(4, "big") + b"IDAT" + coded + bytes(4) + bytes(data[-12:])
-    previous = np.zeros(12, int)
-    expected_rows = []
-    for row in rows[:, 1:].astype(int):
-        line = np.zeros(12, int)
-        for i, value in enumerate(row):
-            a, b, c = (line[i - 3] if i > 2 else 0), previous[i], (previous[i - 3] if i > 2 else 0)
-            p = a + b - c
-            paeth = a if abs(p - a) <= min(abs(p - b), abs(p - c)) else b if abs(p - b) <= abs(p - c) else c
-            line[i] = (value + (0, a, b, (a + b) // 2, paeth)[kind]) % 256
-        expected_rows.append(previous := line)
-
-    assert np.array_equal(np.array(expected_rows, np.uint8).reshape(3, 4, 3), read_png(patched))
+    pixels = np.asarray(picture.convert("RGB"))
+    assert np.array_equal(pixels, read_png((tmp_path / "a.png").read_bytes()))
+    assert np.array_equal(pixels, read_png(write_png(pixels)))
 
 
 @pytest.mark.parametrize("data", [b"", b"GIF89a", write_png(np.zeros((2, 2, 3), np.uint8))[:40]])
@@ -206,7 +175,6 @@ def test_other_data_is_no_picture(data):
 
 def test_equal_pictures_score_the_cap_and_other_sizes_are_refused():
     picture = np.zeros((2, 2, 3), np.uint8)
-
     assert PSNR_CAP == psnr(picture, picture)
     assert 0.0 == psnr(picture, picture + np.uint8(255))
     with pytest.raises(InputError):

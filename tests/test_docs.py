@@ -13,7 +13,7 @@ from command_line import InThisProcess
 from typer.testing import CliRunner
 
 import csplat
-from csplat_bench.pages import RESULTS, with_tables, write_pages
+from csplat_bench.pages import with_tables, write_pages
 from csplat_bench.tables import markdown_table, select_rows
 from csplat_tools import batch
 from csplat_tools.cli.app import app
@@ -38,21 +38,17 @@ def blocks(text, language):
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
-def test_links_of_pages_lead_to_files(site):
-    for path in site.pages().values():
-        text = (ROOT / path).read_text("utf-8")
-        for match in site.links(text):
-            if "://" not in match[3]:
-                site.target_of(path, match[3])
-
-
-def test_anchors_of_links_are_headings(site):
+def test_links_of_pages_lead_to_files_and_headings(site):
     for path in site.pages().values():
         for match in site.links((ROOT / path).read_text("utf-8")):
-            if "#" in match[3] and "://" not in match[3]:
-                target, anchor = site.target_of(path, match[3])
+            if "://" in match[3]:
+                continue
+            target, anchor = site.target_of(path, match[3])
+            if anchor:
                 headings = re.findall(r"^#+ (.+)$", (ROOT / target).read_text("utf-8"), re.MULTILINE)
                 assert anchor in {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+    with pytest.raises(FileNotFoundError, match=r"README\.md: nowhere\.md"):
+        site.rewritten("see [this](nowhere.md)", "README.md")
 
 
 def test_tables_show_templates_missing_values_and_labels():
@@ -74,32 +70,10 @@ def test_rows_of_results_are_filtered_ordered_and_grouped(tmp_path):
         select_rows({"source": "r.json", "where": {"scene": "c"}}, tmp_path)
 
 
-def test_means_on_the_page_on_quality_are_those_of_the_results():
-    text = (DOCS / "results" / "quality.md").read_text("utf-8")
-    rows = json.loads((RESULTS / "spz_and_sog.json").read_text("utf-8"))["at_spz_psnr"]
-    groups = [[row for row in rows[:10] if row["sh_degree"] == degree] for degree in (3, 0)]
-    for group in (*groups, rows[10:]):
-        mean = np.exp(np.mean([np.log(row["pruned_bytes"] / row["spz_bytes"]) for row in group]))
-        assert f" {mean:.3f}" in text
-
-
-def test_a_page_with_an_undeclared_table_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="table sizes is not declared"):
-        with_tables("<!-- table: sizes -->\n<!-- end -->", {}, tmp_path)
-
-
-def test_a_broken_link_is_refused(site):
-    with pytest.raises(FileNotFoundError, match=r"README\.md: nowhere\.md"):
-        site.rewritten("see [this](nowhere.md)", "README.md")
-
-
-def test_links_between_files_become_links_between_pages(site):
+def test_markdown_of_github_is_converted_for_the_site(site):
     text = "[a](../spec/format.md#1-scope), [b](js/decoder.d.ts), `[c](x.md)`, [d](https://example.org)"
     expected = "[a](format.md#1-scope), b, `[c](x.md)`, [d](https://example.org)"
     assert expected == site.rewritten(text, "codec/EMBEDDING.md")
-
-
-def test_markdown_of_github_is_converted_for_the_site(site):
     text = "Words:\n- one\n- two\n<!-- begin -->\n```python spec-test\n- x\n```\n"
     assert "Words:\n\n- one\n- two\n```python\n- x\n```\n" == site.for_python_markdown(text)
 
@@ -109,26 +83,22 @@ def test_the_navigation_contains_every_page(site):
     assert sorted({*site.pages(), "commands.md", "python.md"}) == sorted(named)
 
 
-def test_the_images_of_the_readme_are_small():
-    assert sum(path.stat().st_size for path in (DOCS / "pictures").iterdir()) < 300_000
-
-
-def test_the_readme_shows_measured_figures(sample_path):
+@pytest.mark.slow
+def test_the_readme_shows_measured_figures_of_this_encoder(sample_path):
     assert MEASURED["source"]["size_bytes"] == sample_path.stat().st_size
     for name, one in PRESETS.items():
         assert f"| `{name}` | {one['size_bytes']:,} | {one['psnr']:.1f} | {one['seconds']:.1f} |" in README
+        size = len(csplat.encode(csplat.read_ply(sample_path), csplat.EncodeOptions(name)))
+        assert one["size_bytes"] == pytest.approx(size, rel=0.02)
     shown = PRESETS["balanced"]
     assert f"`csplat encode`: {shown['size_bytes'] / 1000:.0f} kB, {shown['psnr']:.1f} dB" in README
 
 
-def test_tables_and_plots_are_up_to_date():
+@pytest.mark.slow
+def test_tables_and_plots_are_up_to_date(tmp_path):
     assert [] == write_pages(check=True), "run `python -m csplat_bench pages`"
-
-
-def test_encoded_sizes_match_the_readme(sample_path):
-    for name in PRESETS:
-        size = len(csplat.encode(csplat.read_ply(sample_path), csplat.EncodeOptions(name)))
-        assert PRESETS[name]["size_bytes"] == pytest.approx(size, rel=0.02)
+    with pytest.raises(ValueError, match="table sizes is not declared"):
+        with_tables("<!-- table: sizes -->\n<!-- end -->", {}, tmp_path)
 
 
 def test_the_readme_of_the_package_has_no_relative_links():
@@ -141,27 +111,28 @@ def test_the_readme_of_the_package_has_no_relative_links():
     assert len(text) > 0.7 * len(README)
 
 
-def test_commands_in_readme_and_guides_are_valid():
-    """Commands are parsed, not run, which finds removed options."""
+@pytest.fixture(scope="module")
+def commands():
+    """The commands of csplat, by name."""
     from typer.main import get_command
 
     group = get_command(app)
+    return {name: group.get_command(None, name) for name in group.list_commands(None)}
+
+
+def test_commands_in_readme_and_guides_are_valid(commands):
+    """Commands are parsed, not run, which reveals removed options."""
     texts = [README, *(path.read_text("utf-8") for path in sorted((DOCS / "guide").glob("*.md")))]
     lines = [line for text in texts for block in blocks(text, "sh") for line in block.splitlines()]
-    commands = [line.split("||")[0].strip() for line in lines if line.strip().startswith("csplat ")]
-    assert len(commands) > 20
-    for line in commands:
+    lines = [line.split("||")[0].strip() for line in lines if line.strip().startswith("csplat ")]
+    assert len(lines) > 20
+    for line in lines:
         name, *words = shlex.split(line, comments=True)[1:]
-        command = group.get_command(None, name)
-        command.make_context(name, words, resilient_parsing=False)
+        commands[name].make_context(name, words, resilient_parsing=False)
 
 
-def test_options_on_result_pages_exist():
-    from typer.main import get_command
-
-    group = get_command(app)
-    commands = [group.get_command(None, name) for name in group.list_commands(None)]
-    options = {option for command in commands for parameter in command.params for option in parameter.opts}
+def test_options_on_result_pages_exist(commands):
+    options = {option for command in commands.values() for parameter in command.params for option in parameter.opts}
     for path in (DOCS / "results").glob("*.md"):
         prose = re.sub(r"<!-- table.*?<!-- end -->", "", path.read_text("utf-8"), flags=re.DOTALL)
         words = " ".join(re.findall(r"`([^`]+)`", prose)).split()

@@ -49,18 +49,20 @@ def packages():
 @pytest.fixture(scope="module")
 def files(packages, sample_path):
     """A served folder with a scene in all tested states, the scene, and a camera."""
-    source = read_ply(sample_path)
-    source = source.select(slice(0, 4001))  # no multiple of anything
+    source = read_ply(sample_path).select(slice(0, 4001))  # no multiple of anything
     data = encode(source, replace(FAST, tile_splats=3000))
     model = decode(data)
     camera = orbit_cameras(model, 8, 120, 90)[1]
     with served(packages) as (folder, address):
-        (folder / "scene.csplat").write_bytes(data)
-        (folder / "flipped.csplat").write_bytes(data[:-9] + bytes([data[-9] ^ 4]) + data[-8:])
-        (folder / "cut.csplat").write_bytes(data[: len(data) // 2])
-        (folder / "text.csplat").write_text("no scene")
+        for name, content in {
+            "scene": data,
+            "flipped": data[:-9] + bytes([data[-9] ^ 4]) + data[-8:],
+            "cut": data[: len(data) // 2],
+            "text": b"no scene",
+            "left": encode(convert_axes(source_from_model(model), "LUF").model(), FAST),
+        }.items():
+            (folder / f"{name}.csplat").write_bytes(content)
         write(folder / "scene.ply", model, "ply")
-        (folder / "left.csplat").write_bytes(encode(convert_axes(source_from_model(model), "LUF").model(), FAST))
         yield folder, address, model, camera
 
 
@@ -76,12 +78,8 @@ def trial(request, browser, files):
 
 @pytest.fixture(scope="module")
 def picture(trial):
-    """Return the engine's picture of the scene and its messages."""
-    said = trial.show("scene.csplat")
-    assert "failed" not in said, said
-    shown = settled(trial)
-    trial.remove()
-    return shown, said
+    """The engine's picture of the scene and its messages."""
+    return shown(trial, "scene.csplat")
 
 
 def settled(trial):
@@ -89,20 +87,26 @@ def settled(trial):
     return settled_image(trial.page, 0.2)
 
 
+def shown(trial, name, **options):
+    """Show a file and remove it again; return the picture and the engine's messages."""
+    said = trial.show(name, **options)
+    assert "failed" not in said, said
+    image = settled(trial)
+    trial.remove()
+    return image, said
+
+
 def test_a_scene_is_upright_and_equals_ours(trial, picture, files):
-    shown, said = picture
+    image, said = picture
     _, _, model, camera = files
     assert said["count"] - len(model) in range(16)  # Babylon.js fills up
     assert "upright" == up_in_world(model, said["world"])
     ours = ENGINES[trial.engine].render(model, camera, 3)
-    assert psnr(shown, ours) > max(30.0, psnr(shown, ours[:, ::-1]) + 3.0)
+    assert psnr(image, ours) > max(30.0, psnr(image, ours[:, ::-1]) + 3.0)
 
 
 def test_a_left_handed_scene_in_two_steps_ends_in_the_same_picture(trial, picture):
-    said = trial.show("left.csplat", moved=False, progressive=True)  # seen from where the last one was
-    again = settled(trial)
-    trial.remove()
-    assert "failed" not in said, said
+    again, _ = shown(trial, "left.csplat", moved=False, progressive=True)  # seen from where the last one was
     assert psnr(picture[0], again) > 35.0
 
 
@@ -114,22 +118,16 @@ def test_band_4_is_drawn_or_reported_once(trial, files):
     told = []
     trial.page.on("console", lambda message: told.append(message.text))
     for options in ({}, {"progressive": True}):
-        said = trial.show("degree_4.csplat", **options)
-        assert "failed" not in said, said
-        shown = settled(trial)
-        trial.remove()
-        to_3, to_4 = (psnr(shown, ENGINES[trial.engine].render(model, camera, degree)) for degree in (3, 4))
+        image, _ = shown(trial, "degree_4.csplat", **options)
+        to_3, to_4 = (psnr(image, ENGINES[trial.engine].render(model, camera, degree)) for degree in (3, 4))
         assert (to_4 > to_3 + 2.0) == (trial.engine == "babylon"), (to_3, to_4)
         assert abs(to_4 - to_3) > 2.0
     warnings = [text for text in told if "the engine ends at degree 3" in text]
     assert len(warnings) == (trial.engine != "babylon")
 
 
-def test_the_picture_is_that_of_the_ply(trial, picture):
-    trial.show("scene.ply")
-    twin = settled(trial)
-    trial.remove()
-    assert psnr(picture[0], twin) > LIKE_THE_PLY[trial.engine]
+def test_the_picture_equals_the_picture_of_the_ply(trial, picture):
+    assert psnr(picture[0], shown(trial, "scene.ply")[0]) > LIKE_THE_PLY[trial.engine]
 
 
 @pytest.mark.parametrize(
@@ -162,12 +160,10 @@ def test_a_budget_selects_the_version_of_a_file_with_levels(trial, files):
     (folder / "levels.csplat").write_bytes(encode_levels(EncodePlan.of(model, FAST), nodes).write().data)
     for options, wanted, other in (({"maxSplats": 2000}, coarser, model), ({}, model, coarser)):
         for more in ({}, {"progressive": True}):
-            said = trial.show("levels.csplat", **options, **more)
-            shown = settled(trial)
-            trial.remove()
+            image, said = shown(trial, "levels.csplat", **options, **more)
             assert said["count"] - len(wanted) in range(16), said
             ours, others = (ENGINES[trial.engine].render(one, camera, 3) for one in (wanted, other))
-            assert psnr(shown, ours) > max(30.0, psnr(shown, others) + 3.0)
+            assert psnr(image, ours) > max(30.0, psnr(image, others) + 3.0)
 
 
 @pytest.mark.parametrize("engine", ["playcanvas", "babylon"])

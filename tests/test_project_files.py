@@ -14,12 +14,18 @@ import csplat
 ROOT = Path(__file__).resolve().parent.parent
 
 
+in_a_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a checkout: git knows nothing of it")
+
+
+def listed(*words):
+    words = ["git", "ls-files", *words]
+    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+
+
+@in_a_checkout
 def test_attributes_of_git_know_binary_files():
-    if not (ROOT / ".git").exists():
-        pytest.skip("not a checkout: git knows nothing of these files")
-    listed = subprocess.run(["git", "ls-files", "--eol"], cwd=ROOT, capture_output=True, text=True, check=True).stdout  # noqa: S607
     wrong = []
-    for line in listed.splitlines():
+    for line in listed("--eol"):
         facts, path = line.split("\t")
         content, _, attributes = facts.split(None, 2)
         is_text = "-text" not in attributes
@@ -28,14 +34,11 @@ def test_attributes_of_git_know_binary_files():
     assert [] == wrong
 
 
+@in_a_checkout
 @pytest.mark.parametrize(("page", "least"), [("ARCHITECTURE.md", 50), ("CONTRIBUTING.md", 20)])
 def test_every_file_that_a_page_about_the_code_names_exists(page, least):
-    if not (ROOT / ".git").exists():
-        pytest.skip("not a checkout: git knows nothing of these files")
-    text = (ROOT / page).read_text("utf-8")
-    named = set(re.findall(r"`([\w./-]+\.(?:py|mjs|md|toml|c|h))`", text))
-    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)  # noqa: S607
-    found = {name for path in listed.stdout.split() for name in named if f"/{path}".endswith(f"/{name}")}
+    named = set(re.findall(r"`([\w./-]+\.(?:py|mjs|md|toml|c|h))`", (ROOT / page).read_text("utf-8")))
+    found = {name for path in listed() for name in named if f"/{path}".endswith(f"/{name}")}
     assert len(found) >= least
     assert [] == sorted(name for name in named - found if "NAME" not in name)
 

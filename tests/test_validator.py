@@ -1,5 +1,6 @@
 """The strict validator: every violation by its clause, of vectors, of damaged files, and of files with many defects."""
 
+import json
 import random
 import re
 import subprocess
@@ -78,6 +79,7 @@ def broken():
 
 
 # Vectors -------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_valid_vectors_have_no_violations(sound):
     def check(vector):
         found, header = sound[vector.name], vector.expect["header"]
@@ -96,33 +98,23 @@ def test_invalid_vectors_violate_their_clause_at_their_offset(broken):
             offset += RICH.fields[better].offset - RICH.fields[stated].offset
         found = {(one.clause, one.code, one.offset) for one in broken[vector.name]}
         assert (vector.error["clause"], vector.error["code"], offset) in found
+        assert len(broken[vector.name]) <= 9  # consequences must not bury the defect
 
     assert [] == failures(INVALID, check)
 
 
 @pytest.mark.slow
-def test_one_defect_causes_few_violations(broken):
-    # Consequences of a defect are reported too, but must not bury the defect.
-    assert {} == {name: len(violations) for name, violations in broken.items() if len(violations) > 9}
-
-
-@pytest.mark.parametrize(
-    ("name", "part"),
-    [
-        ("valid/chunks_reversed", "recommended order"),
-        ("valid/levels_in_reverse", "recommended order"),
-        ("extreme/deflate_unused_bits", "unused bits after the final block"),
-    ],
-)
-def test_recommendations_that_are_not_followed_are_remarked(name, part, sound):
-    (remark,) = sound[name].remarks
-    assert part in remark
-
-
-def test_sound_files_get_no_remark(sound):
-    remarked = [name for name, found in sound.items() if found.remarks]
-
-    assert len(remarked) < len(VALID) / 10
+def test_recommendations_that_are_not_followed_are_remarked(sound):
+    remarked = {name: found.remarks for name, found in sound.items() if found.remarks}
+    parts = {
+        "valid/chunks_reversed": "recommended order",
+        "valid/levels_in_reverse": "recommended order",
+        "extreme/deflate_unused_bits": "unused bits after the final block",
+        "extreme/json_deep_again": "camera 0 has no K, viewmat, W, H",
+    }
+    assert set(parts) == set(remarked)
+    for name, part in parts.items():
+        assert [True] == [part in remark for remark in remarked[name]]
 
 
 # Clauses -------------------------------------------------------------------------------------------
@@ -137,67 +129,50 @@ def requirements():
 
 
 def test_every_clause_about_files_has_its_code():
-    assert set(requirements()) - NOT_ABOUT_FILES == set(CODES)
-
-
-def test_codes_agree_with_the_spec():
     texts = requirements()
+    assert set(texts) - NOT_ABOUT_FILES == set(CODES)
+    wrong = [clause for clause, code in CODES.items() if code and code not in re.findall(r"E_[A-Z]+", texts[clause])]
+    assert [] == wrong
 
-    assert [] == [
-        clause for clause, code in CODES.items() if code and code not in re.findall(r"E_[A-Z]+", texts[clause])
-    ]
 
-
+@pytest.mark.slow
 def test_every_clause_is_reached_by_a_vector_or_a_test_of_this_file(broken):
     reached = {one.clause for violations in broken.values() for one in violations}
     here = Path(__file__).read_text(encoding="utf-8")
     tested = {clause for clause in CODES if f'"{clause}" in clauses_of' in here}
-
     assert set(UNBREAKABLE) == set(CODES) - reached - tested
 
 
 # More than one defect ------------------------------------------------------------------------------
-def test_all_defects_of_a_file_are_reported():
+def test_all_defects_of_a_file_are_reported_at_their_fields():
     changes = {
         "header.profile": 9,
         "header.reserved_0": 1,
         "index.scene_flags": 0x08,
         "index.unit_metres": -1.0,
         "attribute[means].levels": 3,
-        "attribute[sh1].chroma_shift": 17,
         "codebook[2].reserved_0": 1,
         "directory[META].reserved_0": 1,
         "tile[0].level": 1,
         "tile[0].max_scale": 7.5,
-        "tile[1].extent": (1, 2, 3),
         "META/header.reserved_0": 1,
         "SERR/head.error_flags": 0x40,
         "CODB.7.2/head.reserved_0": 1,
         "TILE.0.0/head.layer": 1,
         "TILE.0.0/opacities.stream.reserved_0": 1,
         "TILE.0.0/sh0.params.reserved_0": 1,
-        "tile[1].layer[0].crc": 99,
     }
-    found = {one.field for one in validate(RICH.patched(changes)).violations}
-
-    elsewhere = {"tile[1].extent", "attribute[sh1].chroma_shift", "tile[1].layer[0].crc"}
-    assert set() == set(changes) - elsewhere - found
-    assert "tile[1].corner" in found  # TIL-10 names a box by its first field
-    assert "TILE.1.0" in found  # CHK-1 names the chunk
-
-
-def test_violations_have_the_offsets_of_their_fields():
-    changes = {
-        "index.unit_metres": -1.0, "tile[1].reserved_0": 3, "TILE.0.2/sh2.reserved_0": 1, "SERR/head.error_flags": 8,
-    }  # fmt: skip
-    found = {one.field: one.offset for one in validate(RICH.patched(changes)).violations}
-
-    assert {name: RICH.fields[name].offset for name in changes} == found
+    elsewhere = {"tile[1].extent": (1, 2, 3), "attribute[sh1].chroma_shift": 17, "tile[1].layer[0].crc": 99}
+    violations = validate(RICH.patched(changes | elsewhere)).violations
+    found = {one.field: one.offset for one in violations}
+    assert {name: RICH.fields[name].offset for name in changes}.items() <= found.items()
+    assert {"tile[1].corner", "TILE.1.0"} <= set(found)  # the box's first field (TIL-10), and the chunk (CHK-1)
+    assert sorted(one.offset for one in violations) == [one.offset for one in violations]
+    assert all(one.message and "\n" not in str(one) for one in violations)
 
 
 def test_a_damaged_stream_does_not_hide_the_next():
     data = RICH.patched({"TILE.0.0/opacities.stream.count": 8, "TILE.0.0/means.stream.count": 8})
-
     assert ["TILE.0.0/opacities.stream.count", "TILE.0.0/means.stream.count"] == [
         one.field for one in validate(data).violations if one.clause == "STR-1"
     ]
@@ -205,39 +180,23 @@ def test_a_damaged_stream_does_not_hide_the_next():
 
 def test_bytes_of_unknown_structure_are_listed_as_unread():
     found = validate(RICH.patched({"TILE.0.0/scales.coding": 99}))
-
     assert ["BLK-1"] == [one.clause for one in found.violations]
     assert [f"TILE.0.0 from byte {RICH.fields['TILE.0.0/scales.coding'].offset + 3} on"] == [
         one.field for one in found.unread
     ]
 
 
-def test_violations_are_ordered_by_offset(broken):
-    for violations in broken.values():
-        offsets = [one.offset for one in violations]
-        assert offsets == sorted(offsets)
-
-
-def test_a_violation_is_one_line(broken):
-    for violations in broken.values():
-        for one in violations:
-            assert "\n" not in str(one)
-            assert one.message
-
-
 @pytest.mark.slow
 def test_the_number_of_violations_is_bounded():
-    names = [Chunk(b"prv%c" % (65 + i % 26), payload=b"", flags=0xFF00) for i in range(60)]
-    data = bytearray(build(scene(chunks=names)).data)
+    data = bytearray(SMALL.data)
     header = _spec.unpack_header(data)
-    count = 5_500
     record = _spec.pack_directory_record(_spec.DirectoryRecord(b"bad!", 0x00FC, 1, 1, 1, 1, 0, 0, 0))
+    count = 5_500
     index = bytearray(data[_spec.HEADER_SIZE : _spec.HEADER_SIZE + header.index_size - 4])
     at = _spec.INDEX_HEAD_OFFSETS["directory_count"]
     index[at : at + 2] = count.to_bytes(2, "little")
     data[16:20] = (len(index) + count * len(record) + 4).to_bytes(4, "little")
     found = validate(bytes(data[: _spec.HEADER_SIZE]) + bytes(index) + record * count + bytes(4))
-
     assert VIOLATIONS_MAX == len(found.violations)
     assert "at least" in found.remarks[-1]
 
@@ -258,13 +217,8 @@ def tree_violations(**changes):
 
 def test_all_defects_of_a_tree_are_reported():
     found = tree_violations(n0_parent=1, n1_error=-1.0, n2_error=0.75, n3_parent=9, n4_error=float("inf"))
-
-    assert [
-        ("TRE-5", "TREE/node[0].parent"),
-        ("TRE-8", "TREE/node[1].error"),
-        ("TRE-5", "TREE/node[3].parent"),
-        ("TRE-8", "TREE/node[4].error"),
-    ] == found
+    expected = {0: "TRE-5 parent", 1: "TRE-8 error", 3: "TRE-5 parent", 4: "TRE-8 error"}
+    assert [(text.split()[0], f"TREE/node[{node}].{text.split()[1]}") for node, text in expected.items()] == found
 
 
 def test_consequences_of_a_defect_of_a_tree_are_not_reported():
@@ -287,14 +241,12 @@ def test_consequences_of_a_defect_of_a_tree_are_not_reported():
 
 def test_tiles_of_all_levels_are_checked():
     changes = {f"TILE.{i}.0/opacities.stream.count": 99 for i in (0, 4, 6)}
-
     assert {*changes} == {one.field for one in validate(build(TREE).patched(changes)).violations}
 
 
 def test_no_more_nodes_are_read_than_there_are_tiles():
     many = replace(TREE, nodes=TREE.nodes + (Node(_spec.NO_PARENT, 1, 1.0),) * 50)
     found = validate(build(many).data)
-
     assert ["TRE-3"] == [one.clause for one in found.violations]
     assert ["there are more nodes than tiles"] == [one.reason for one in found.unread]
 
@@ -314,9 +266,10 @@ def test_the_order_that_is_recommended_for_levels_gets_no_remark():
     assert [0, 1, 1, 1] == [remarks(), remarks("META"), remarks("TREE", "META", "TILE.4.0"), remarks("TREE", "SERR")]
 
 
-def test_the_budget_of_splats_is_that_of_level_0():
-    assert set() == clauses_of(build(TREE).data, splats_max=18)
-    assert {"LIM-1"} == clauses_of(build(TREE).data, splats_max=17)
+def test_a_file_beyond_the_budget_of_splats_at_level_0_is_not_read():
+    for data, count in ((build(TREE).data, 18), (RICH.data, 5)):
+        assert set() == clauses_of(data, splats_max=count)
+        assert {"LIM-1"} == clauses_of(data, splats_max=count - 1)
 
 
 # Clauses that no decoder checks or no vector covers -----------------------------------------------
@@ -334,11 +287,6 @@ def test_impossible_declared_errors_are_found():
     assert set() == clauses_of(stated((sh2, 0.5, 0.5), degree=2))
 
 
-def test_a_file_beyond_the_budget_of_splats_is_not_read():
-    assert "LIM-1" in clauses_of(RICH.data, splats_max=4)
-    assert set() == clauses_of(RICH.data, splats_max=5)
-
-
 def test_a_text_beyond_the_budget_is_not_read():
     assert "STR-8" in clauses_of(RICH.data, json_bytes_max=3)
     assert "STR-8" in clauses_of(RICH.data, json_bytes_max=255)
@@ -351,15 +299,13 @@ def test_a_text_beyond_the_budget_is_not_read():
     [
         (b' {"a" : [1, -0.5e+2, true, null, "\\u00e9\\n\xc3\xa9"]}\r\n', {"a": [1.0, -50.0, True, None, "é\né"]}),
         (b'{"\\ud83d\\ude00":"\xf0\x9f\x98\x80"}', {"😀": "😀"}),
-        (b"[" * 64 + b"]" * 64, None),
+        (b"[" * 64 + b"]" * 64, json.loads("[" * 64 + "]" * 64)),
         (b"0", 0.0),
         (b'""', ""),
     ],
 )
 def test_json_texts_are_parsed(text, value):
-    found = parse_json(text)
-
-    assert value is None or value == found
+    assert value == parse_json(text)
 
 
 @pytest.mark.parametrize(
@@ -385,29 +331,18 @@ def flip(data, bit):
     return bytes(damaged)
 
 
-def flips(data, count, seed):
-    """Return copies of the file with one random bit flipped in each."""
-    bits = random.Random(seed).sample(range(8 * len(data)), count)  # noqa: S311 - repeatable, no secret
-    return [flip(data, bit) for bit in bits]
-
-
-def prefixes(data, count):
-    """Return `count` evenly spread prefixes, from the empty one to all but one byte."""
-    last = len(data) - 1
-    return [data[: i * last // (count - 1)] for i in range(count)]
-
-
 def undetected(files):
     """Return the numbers of the damaged files in which the validator finds nothing."""
     return [number for number, data in enumerate(files) if validate(data).conforms]
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("built", "count"), [(SMALL, len(SMALL.data)), (RICH, 150)], ids=["small", "rich"])
-def test_prefixes_are_found(built, count):
-    # All prefixes of the small file; test_damage.py passes all those of the rich file to the decoder.
-    found = [{one.clause for one in validate(data).violations} for data in prefixes(built.data, count)]
-
+@pytest.mark.parametrize("built", [SMALL, RICH], ids=["small", "rich"])
+def test_prefixes_are_found(built):
+    # All prefixes of the small file, as many of the rich: the decoder's tests read all of these, too.
+    last = len(built.data) - 1
+    steps = len(SMALL.data) - 1
+    found = [{one.clause for one in validate(built.data[: i * last // steps]).violations} for i in range(steps + 1)]
     assert all(found)
     assert {"HDR-5", "HDR-11"} == set().union(*found)
 
@@ -421,18 +356,10 @@ def test_every_flipped_bit_of_a_small_file_is_found():
 @pytest.mark.slow
 def test_flipped_bits_of_a_real_file_are_found(sample_path):
     data = csplat.encode(csplat.read_ply(sample_path).select(slice(0, 200)))
-    damaged = flips(data, 16, seed=5)
-
+    bits = random.Random(5).sample(range(8 * len(data)), 16)  # noqa: S311 - repeatable, no secret
+    damaged = [flip(data, bit) for bit in bits]
     assert [] == undetected(damaged)
     assert undetected([repair(one, chunk_records(data)) for one in damaged])  # some are found only by checksums
-    assert [] == undetected(prefixes(data, 10))
-
-
-def test_flipped_bits_of_a_trained_scene_are_found(data_dir):
-    data = csplat.encode(csplat.read_ply(data_dir / "ply" / "train1000.ply"))
-
-    assert [] == undetected(flips(data, 40, seed=6))
-    assert [] == undetected(prefixes(data, 40))
 
 
 @pytest.mark.slow
@@ -473,15 +400,13 @@ def test_no_content_of_a_file_raises():
     assert [] == failures({f"seed {seed}": seed for seed in range(20)}, check)
 
 
-@pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
-def test_any_buffer_is_validated(kind):
-    assert validate(kind(SMALL.data)).conforms
+def test_any_buffer_is_validated():
+    assert all(validate(kind(SMALL.data)).conforms for kind in (bytes, bytearray, memoryview))
 
 
 def test_huge_counts_of_levels_do_not_overflow():
     # A count of levels beyond ATT-4 whose square exceeds 64 bits.
     made = attributes() | {3: Attribute(_spec.MAPPING_UNIT_W, levels=2**32 - 1)}
-
     assert {"ATT-4"} == clauses_of(build(scene(attributes=made)).data)
 
 
@@ -489,7 +414,6 @@ def test_overlapping_chunks_are_read_once():
     # Otherwise an index could make a validator read the same megabytes a million times.
     twins = build(scene(tiles=[tile(1), tile(2)]))
     found = validate(twins.patched({"tile[1].layer[0].offset": twins.spans["TILE.0.0"][0]}))
-
     assert ["TILE.1.0"] == [one.field for one in found.unread]
 
 
@@ -501,15 +425,10 @@ def test_validator_and_encoder_suite_import_no_decoder_encoder_or_renderer():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     by_validator, by_suite = (line.split() for line in done.stdout.splitlines())
-    loaded = [name for name in by_validator if name.startswith("csplat")]
-
+    loaded = {".".join(name.split(".")[:2]) for name in by_validator if name.startswith("csplat")}
     # `csplat.file_source` releases memory that was read, `csplat.types` names array types: neither knows the format.
-    assert {"csplat", "csplat._spec", "csplat.file_source", "csplat.types", "csplat_conformance"} == {
-        name for name in loaded if not name.startswith("csplat_conformance.")
-    }
-    assert {"csplat_conformance.tolerance", "csplat_conformance.validator"} == {
-        ".".join(name.split(".")[:2]) for name in loaded if name.startswith("csplat_conformance.")
-    }
+    allowed = {"csplat", "csplat._spec", "csplat.file_source", "csplat.types", "csplat_conformance"}
+    assert allowed | {"csplat_conformance.tolerance", "csplat_conformance.validator"} == loaded
     unwanted = ("csplat.encoder", "csplat.ply", "csplat_tools", "numba", "torch")
     assert [] == [name for name in by_suite if name.startswith(unwanted)]
 
@@ -576,14 +495,11 @@ def damaged(count):
 
 @pytest.mark.slow
 def test_inflate_accepts_the_same_streams_as_zlib():
-    verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(1500)]
-
+    verdicts = [(by_zlib(coded), by_validator(coded)) for coded in damaged(600)]
     assert [] == [pair for pair in verdicts if pair[0] != pair[1]]
-    refused = sum(expected == "refused" for expected, _ in verdicts)
-    assert 375 < refused < 1300
+    assert 150 < sum(expected == "refused" for expected, _ in verdicts) < 520
 
 
 def test_a_code_of_code_lengths_without_codewords_is_refused():
     nothing = Deflate().number(1, 1).number(2, 2).number(0, 14 + 4 * 3 + 258 + 3).end()
-
     assert "refused" == by_zlib(nothing) == by_validator(nothing)

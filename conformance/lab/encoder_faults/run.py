@@ -143,7 +143,7 @@ def run_here(command, places, _seconds):
     index = places.get("index")
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        code = status_of(shlex.split(command)[2], places["ply"], places["out"], index)
+        code = status_of(shlex.split(command)[3], places["ply"], places["out"], index)
     status, message = (Status.WRONG_STATUS, f"exit status {code}") if code > 1 else (None, "")
     seconds = time.perf_counter() - began
     return ProcessEnd(status, code, out.getvalue().encode(), err.getvalue().encode(), seconds, message)

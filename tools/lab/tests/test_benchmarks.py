@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 import tomllib
-from contextlib import contextmanager
+from contextlib import nullcontext
 from dataclasses import replace
 from http.client import HTTPConnection
 
@@ -35,7 +35,7 @@ from csplat_bench.engine_stage import Engine
 from csplat_bench.made_scenes import crowd, split
 from csplat_bench.protocol import AbsentError, Setup
 from csplat_bench.results import Results
-from csplat_bench.rules import bytes_at, mark_beaten, mean_rows, paired_ratio, size_ratios, summarise_turns
+from csplat_bench.rules import bytes_at, mark_beaten, mean_rows, size_ratios, summarise_turns
 from csplat_bench.runner import run_suite
 from csplat_bench.slow_line import Line
 from csplat_bench.subjects import SUBJECTS
@@ -111,6 +111,7 @@ def test_one_case_stands_for_each_combination_of_values(tmp_path):
 
 
 HEAD = 'title = "t"\nsubject = "files"\nscenes = ["a"]\n'
+CASE = '[[cases]]\nname = "x"\n'
 
 
 @pytest.mark.parametrize(
@@ -120,11 +121,11 @@ HEAD = 'title = "t"\nsubject = "files"\nscenes = ["a"]\n'
         (HEAD + "scene = 1", "'scene' is not a key of a suite, expected one of title, subject"),
         (HEAD + 'repeats = "3"', "'repeats' is a str, expected a int"),
         (HEAD, "'cases' is missing or empty"),
-        (HEAD.replace("files", "fils") + '[[cases]]\nname = "x"', "subject is 'fils', expected one of files"),
-        (HEAD + 'repeats = 0\n[[cases]]\nname = "x"', "repeats is 0, expected 1 or more"),
+        (HEAD.replace("files", "fils") + CASE, "subject is 'fils', expected one of files"),
+        (HEAD + "repeats = 0\n" + CASE, "repeats is 0, expected 1 or more"),
         (HEAD + "[[cases]]\ncommand = 'x'", "a case has no name"),
-        (HEAD + '[[cases]]\nname = "x"\n[[cases]]\nname = "x"', "two cases have the name 'x'"),
-        (HEAD + '[[cases]]\nname = "x"\nreference = "y"', "the reference 'y', which is not a case"),
+        (HEAD + 2 * CASE, "two cases have the name 'x'"),
+        (HEAD + CASE + 'reference = "y"', "the reference 'y', which is not a case"),
     ],
 )
 def test_an_invalid_suite_is_refused_with_the_reason(tmp_path, text, message):
@@ -132,11 +133,6 @@ def test_an_invalid_suite_is_refused_with_the_reason(tmp_path, text, message):
     with pytest.raises(InputError, match=message) as raised:
         load_suite(str(tmp_path / "s.toml"), ["files"])
     assert str(raised.value).startswith(f"{tmp_path / 's.toml'}: ")
-
-
-def test_an_unknown_suite_is_refused_with_those_that_exist(capsys):
-    assert 1 == main(["run", "nothing"])
-    assert "'nothing' is not a suite, expected a TOML file or one of arrival, " in capsys.readouterr().err
 
 
 # the runner
@@ -158,27 +154,26 @@ def test_a_suite_gives_rows_a_table_and_a_plot(suite, tmp_path, capsys):
     assert fast["seconds"] == pytest.approx(np.median(fast["turns"]["seconds"]), rel=1e-4)
     table = capsys.readouterr().out
     assert "| scene | case | bytes | beaten by |" in table
+    assert f"| one | splat | {60 * 32} |" in table
     assert 0 == main(["table", str(tmp_path / "out.json"), "--suite", str(suite)])
     assert table == capsys.readouterr().out
     assert 0 == main(["plot", str(tmp_path / "out.json"), "--suite", str(suite)])
-    assert (tmp_path / "out.svg").stat().st_size > 1000
-
-
-def test_the_table_and_the_plot_come_from_the_results_alone(tmp_path, capsys):
-    rows = [{"scene": "a", "case": case, "splats": 10, "size_bytes": size, "psnr": psnr, "encode_seconds": 1.0}
-            for case, size, psnr in (("fast", 400, 40.0), ("small", 300, 41.0))]  # fmt: skip
-    (tmp_path / "codec.json").write_text(json.dumps({"suite": "codec", "rows": rows}))
-    assert 0 == main(["table", str(tmp_path / "codec.json"), "--before", str(tmp_path / "codec.json")])
-    assert "| a | fast | 10 | 40.00 |" in capsys.readouterr().out
-    assert 0 == main(["plot", str(tmp_path / "codec.json")])
-    assert (tmp_path / "codec.svg").read_text().startswith("<?xml")
-    assert 1 == main(["table", str(tmp_path / "codec.svg")])
+    assert (tmp_path / "out.svg").read_text().startswith("<?xml")
+    assert 1 == main(["table", str(tmp_path / "out.svg")])
     assert "cannot be read" in capsys.readouterr().err
 
 
-def test_a_pattern_that_matches_no_case_is_refused(suite, tmp_path, capsys):
-    status, found = run(suite, tmp_path, "--only", "smal*")
-    assert (1, None) == (status, found)
+def test_a_table_compares_the_results_of_two_builds(tmp_path, capsys):
+    row = {"scene": "a", "case": "fast", "splats": 10, "size_bytes": 400, "psnr": 40.0, "encode_seconds": 1.0}
+    (tmp_path / "codec.json").write_text(json.dumps({"suite": "codec", "rows": [row]}))
+    assert 0 == main(["table", str(tmp_path / "codec.json"), "--before", str(tmp_path / "codec.json")])
+    assert "| a | fast | 10 | 40.00 |" in capsys.readouterr().out
+
+
+def test_an_unknown_suite_and_a_pattern_that_matches_no_case_are_refused(suite, tmp_path, capsys):
+    assert 1 == main(["run", "nothing"])
+    assert "'nothing' is not a suite, expected a TOML file or one of arrival, " in capsys.readouterr().err
+    assert (1, None) == run(suite, tmp_path, "--only", "smal*")
     assert "--only is 'smal*', expected a pattern of some of 'fast', 'splat'" in capsys.readouterr().err
 
 
@@ -191,9 +186,7 @@ def test_known_rows_are_not_measured_again(suite, tmp_path, capsys):
     assert "turn" not in capsys.readouterr().err
     suite.write_text(suite.read_text().replace('format = "splat"', 'format = "ply"'))
     _, found = run(suite, tmp_path, "--only", "splat", "--scenes", tmp_path / "one.ply")
-    assert [60 * 32, "larger"] == [
-        size if size == 60 * 32 else "larger" for size in (row["size_bytes"] for row in found["rows"])
-    ]
+    assert [True, False] == [row["size_bytes"] == 60 * 32 for row in found["rows"]]
     assert 1 == capsys.readouterr().err.count("turn 2")
 
 
@@ -203,67 +196,60 @@ def setup_of(folder):
 
 def fake(measure):
     """A subject whose measurement is a function of the case."""
+    return lambda _setup, _scene, _cases: nullcontext(measure)
 
-    @contextmanager
-    def subject(_setup, _scene, _cases):
-        yield measure
 
-    return subject
+def fake_suite(names="x", **fields):
+    return Suite("s", "t", "fake", ["a"], [Case(name, {}) for name in names], **fields)
+
+
+def run_fake(folder, suite, measure):
+    """Run a suite on the scene "a"; return whether all went well, and the rows."""
+    file = Results(folder / "r.json", suite, "c")
+    return run_suite(suite, fake(measure), setup_of(folder), file, ["a"]), file.rows
 
 
 def test_rows_survive_an_interruption(tmp_path):
-    suite = Suite("s", "t", "fake", ["a"], [Case(name, {}) for name in "xyz"])
-
     def measure(case):
         if case.name == "z":
             raise KeyboardInterrupt
         return {"value": 1}
 
     with pytest.raises(KeyboardInterrupt):
-        run_suite(suite, fake(measure), setup_of(tmp_path), Results(tmp_path / "r.json", suite, "c"), ["a"])
-    again = Results(tmp_path / "r.json", suite, "c")
+        run_fake(tmp_path, fake_suite("xyz"), measure)
     seen = []
-    run_suite(suite, fake(lambda case: seen.append(case.name) or {"value": 2}), setup_of(tmp_path), again, ["a"])
+    _, rows = run_fake(tmp_path, fake_suite("xyz"), lambda case: seen.append(case.name) or {"value": 2})
     assert ["z"] == seen
-    assert [1, 1, 2] == [row["value"] for row in again.rows]
+    assert [1, 1, 2] == [row["value"] for row in rows]
 
 
 def test_cases_take_turns_and_ratios_are_those_of_one_turn(tmp_path):
     cases = [Case("ours", {"reference": "theirs"}), Case("theirs", {})]
-    suite = Suite("s", "t", "fake", ["a"], cases, repeats=3, warmups=1, ratio="seconds")
+    suite = replace(fake_suite(repeats=3, warmups=1, ratio="seconds"), cases=cases)
     seconds = {"ours": iter([9.0, 1.0, 2.0, 4.0]), "theirs": iter([9.0, 5.0, 4.0, 12.0])}  # 5, 2 and 3 times as long
-    order, file = [], Results(tmp_path / "r.json", suite, "c")
-
-    def measure(case):
-        order.append(case.name)
-        return {"seconds": next(seconds[case.name])}
-
-    assert run_suite(suite, fake(measure), setup_of(tmp_path), file, ["a"])
+    order = []
+    passed, (ours, theirs) = run_fake(
+        tmp_path, suite, lambda case: order.append(case.name) or {"seconds": next(seconds[case.name])}
+    )
+    assert passed
     assert ["ours", "theirs"] * 4 == order
-    ours, theirs = file.rows
     assert (3.0, 2.0, [1.0, 2.0, 4.0]) == (ours["times_as_fast"], ours["seconds"], ours["turns"]["seconds"])
     assert "times_as_fast" not in theirs
-
-
-def test_small_scenes_are_warmed_up_longer(tmp_path):
-    suite = Suite("s", "t", "fake", ["a"], [Case("x", {})], warmups=1, warmup_splats=100)
     count = []
-    measure = fake(lambda _: count.append(1) or {"splats": 50})
-    run_suite(suite, measure, setup_of(tmp_path), Results(tmp_path / "r.json", suite, "c"), ["a"])
+    small_scene = fake_suite("x", warmups=1, warmup_splats=100)  # fewer splats need more turns
+    run_fake(tmp_path / "small", small_scene, lambda _: count.append(1) or {"splats": 50})
     assert 1 + 2 + 1 == len(count)
 
 
 def test_failures_are_rows_and_absent_programs_are_left_out(tmp_path, capsys):
-    suite = Suite("s", "t", "fake", ["a"], [Case(name, {}) for name in ("bad", "absent", "good")], repeats=2)
-
     def measure(case):
         if case.name != "good":
             raise {"bad": OSError("it broke"), "absent": AbsentError("not installed")}[case.name]
         return {"value": 1}
 
-    file = Results(tmp_path / "r.json", suite, "c")
-    assert not run_suite(suite, fake(measure), setup_of(tmp_path), file, ["a"])
-    assert [("bad", "it broke"), ("good", None)] == [(row["case"], row.get("error")) for row in file.rows]
+    passed, rows = run_fake(tmp_path, fake_suite(("bad", "absent", "good"), repeats=2), measure)
+    assert not passed
+    assert [("bad", "it broke"), ("good", None)] == [(row["case"], row.get("error")) for row in rows]
     assert "a absent is left out: not installed" in capsys.readouterr().err
 
 
@@ -275,9 +261,8 @@ def test_a_command_that_fails_gives_its_message_and_status_1(suite, tmp_path):
 
 
 def test_results_of_another_suite_or_machine_are_told_apart(tmp_path, monkeypatch):
-    suite = Suite("s", "t", "fake", ["a"], [Case("x", {})])
-    file = Results(tmp_path / "r.json", suite, "c")
-    file.write()
+    suite = fake_suite()
+    Results(tmp_path / "r.json", suite, "c").write()
     with pytest.raises(InputError, match="holds results of 's', expected 'other': use --out"):
         Results(tmp_path / "r.json", replace(suite, name="other"), "c")
     monkeypatch.setattr(results, "describe", lambda: ("another", {}))
@@ -294,10 +279,6 @@ def test_numbers_that_vary_become_medians():
     expected = {"s": 2.0, "size": 5, "word": "b", "turns": {"s": [1.0, 3.0, 2.0]}}
     assert expected == summarise_turns(turns, 3)
     assert {"s": 1.0} == summarise_turns([{"s": 1.0}])
-
-
-def test_a_paired_ratio_is_the_median_of_the_ratios():
-    assert 3.0 == paired_ratio([{"s": 5.0}, {"s": 4.0}, {"s": 12.0}], [{"s": 1.0}, {"s": 2.0}, {"s": 4.0}], "s")
 
 
 def test_sizes_are_interpolated_between_neighbours_and_never_extrapolated():
@@ -322,17 +303,15 @@ def test_sizes_of_two_builds_are_compared_at_equal_psnr():
     assert (pytest.approx(math.exp(-0.045)), True) == (estimated["ratio"], estimated["estimated"])
 
 
-def test_a_file_is_beaten_by_one_that_is_clearly_smaller_and_better():
-    rows = [made("small", 1000, 40.0), made("38 dB", 980, 40.2), made("fast", 500, 39.0), made("hair", 995, 40.3)]
-    assert ["38 dB", None, None, None] == [row["beaten_by"] for row in mark_beaten(rows)]
-
-
-def test_a_file_of_every_splat_is_only_beaten_by_such_files():
-    rows = [made("small", 1000, 40.0), made("pruned", 500, 41.0, all_splats=False)]
-    assert [None, None] == [row["beaten_by"] for row in mark_beaten(rows)]
-    rows = [made("pruned", 1000, 40.0, all_splats=False), made("small", 500, 41.0)]
-    rows.append({"scene": "a", "case": "failed", "error": "e"})
-    assert ["small", None, None] == [row["beaten_by"] for row in mark_beaten(rows)]
+def test_a_file_is_beaten_by_clearly_smaller_and_better_files_with_as_many_splats():
+    for rows, beaten_by in (
+        ([made("small", 1000, 40.0), made("38 dB", 980, 40.2), made("fast", 500, 39.0), made("hair", 995, 40.3)],
+         ["38 dB", None, None, None]),
+        ([made("small", 1000, 40.0), made("pruned", 500, 41.0, all_splats=False)], [None, None]),
+        ([made("pruned", 1000, 40.0, all_splats=False), made("small", 500, 41.0),
+          {"scene": "a", "case": "failed", "error": "e"}], ["small", None, None]),
+    ):  # fmt: skip
+        assert beaten_by == [row["beaten_by"] for row in mark_beaten(rows)]
 
 
 def test_a_mean_requires_a_value_of_every_scene():
@@ -354,15 +333,14 @@ def test_published_figures_of_scenes_give_the_published_means():
 
 
 def test_published_rows_follow_the_scenes_and_sets_that_were_measured(tmp_path):
-    suite = Suite("s", "t", "fake", [], [Case("PLY", {})])
-    file = Results(tmp_path / "r.json", suite, "c")
-    file.add("synthetic-lego200", suite.cases[0], {"set": "synthetic"})
+    file = Results(tmp_path / "r.json", fake_suite(), "c")
+    file.add("synthetic-lego200", Case("PLY", {}), {"set": "synthetic"})
     for _ in range(2):
         file.set_published("captures")
+    lego, all_scenes = "synthetic-lego200", "all of synthetic"
     assert [
-        ("synthetic-lego200", "PLY"), ("synthetic-lego200", "3DGS, published"),
-        *2 * [("synthetic-lego200", "HEMGS, published")], ("all of synthetic", "3DGS, published"),
-        ("all of synthetic", "c3dgs, published"),
+        (lego, "PLY"), (lego, "3DGS, published"), *2 * [(lego, "HEMGS, published")],
+        (all_scenes, "3DGS, published"), (all_scenes, "c3dgs, published"),
     ] == [(row["scene"], row["case"]) for row in file.rows]  # fmt: skip
 
 
@@ -379,17 +357,17 @@ def measure_once(tmp_path, name, scene, cases, **options):
     return file.rows
 
 
-@pytest.mark.parametrize("share", [1e-6, 0.1, 0.5, 1.0])
-def test_the_box_holds_the_share_of_the_splats_or_slightly_more(sample_path, tmp_path, share):
+def test_the_box_holds_the_share_of_the_splats_or_slightly_more(sample, tmp_path):
     options = csplat.EncodeOptions(preset="fast", tile_splats=500)
-    (tmp_path / "scene.csplat").write_bytes(csplat.encode(csplat.read_ply(sample_path), options))
+    (tmp_path / "scene.csplat").write_bytes(csplat.encode(sample.select(slice(0, 3000)), options))
     with csplat.open(tmp_path / "scene.csplat") as file:
-        low, high = np.reshape(middle_box(file, share), (2, 3))
-        found = [tile.tile.splat_count for tile in file.tiles((*low, *high), sh_degree=0)]
-        smaller = (low + 1e-6, high - 1e-6)
-        less = [] if (smaller[0] > smaller[1]).any() else list(file.tiles((*smaller[0], *smaller[1]), sh_degree=0))
-        assert share * len(file) <= sum(found)
-        assert sum(len(one.means) for one in less) < sum(found) or share == 1e-6
+        for share in (1e-6, 0.1, 0.5, 1.0):
+            low, high = np.reshape(middle_box(file, share), (2, 3))
+            found = sum(tile.tile.splat_count for tile in file.tiles((*low, *high), sh_degree=0))
+            assert share * len(file) <= found
+            low, high = low + 1e-6, high - 1e-6
+            less = [] if (low > high).any() else file.tiles((*low, *high), sh_degree=0)
+            assert sum(len(tile.means) for tile in less) < found or share == 1e-6
 
 
 def test_reading_a_part_counts_splats_bytes_and_requests(sample_path, tmp_path):
@@ -462,15 +440,12 @@ while head := sys.stdin.buffer.read(4):
     ],
 )
 def test_decoders_that_differ_fail(tmp_path, make_model, answer, expected):
-    stub = tmp_path / "stub"
+    stub, scene = tmp_path / "stub", tmp_path / "scene.csplat"
     stub.write_text(STUB.format(python=sys.executable, answer=answer))
     stub.chmod(0o755)
-    (tmp_path / "scene.csplat").write_bytes(encode(make_model(50, 0)))
-    setup = replace(setup_of(tmp_path), options={"node": str(stub)})
-    with (
-        SUBJECTS["decoder_agreement"](setup, str(tmp_path / "scene.csplat"), []) as measure,
-        pytest.raises(OSError, match=expected),
-    ):
+    scene.write_bytes(encode(make_model(50, 0)))
+    subject = SUBJECTS["decoder_agreement"](replace(setup_of(tmp_path), options={"node": str(stub)}), str(scene), [])
+    with subject as measure, pytest.raises(OSError, match=expected):
         measure(Case("x", {}))
 
 
@@ -577,38 +552,34 @@ def test_a_data_set_is_trained_scored_and_encoded_once(tmp_path):
     ply, fast, tuned, published, *_ = found["rows"]
     assert ("synthetic-lego", "PLY", 20) == (ply["scene"], ply["case"], ply["steps"])
     assert "20 steps, the papers' 30000" in ply["remarks"]
-    assert (
-        fast["size_bytes"] < ply["size_bytes"] == (tmp_path / "work" / "captures" / "synthetic-lego.ply").stat().st_size
-    )
-    assert abs(fast["psnr_mean"] - ply["psnr_mean"]) < 3.0
+    trained = tmp_path / "work" / "captures" / "synthetic-lego.ply"
+    assert fast["size_bytes"] < ply["size_bytes"] == trained.stat().st_size
     assert tuned["size_bytes"] <= 4000
-    assert abs(tuned["psnr_mean"] - ply["psnr_mean"]) < 3.0
+    assert all(abs(row["psnr_mean"] - ply["psnr_mean"]) < 3.0 for row in (fast, tuned))
     assert {"pruning", "choosing", "encoding", "tuning"} <= tuned["seconds"].keys()
     assert 35.78 == published["psnr_mean"]
-    (tmp_path / "s.toml").write_text((tmp_path / "s.toml").read_text().replace("= 20", "= 25"))
-    with pytest.raises(InputError, match="was trained with other options"):
-        run_suite_file(tmp_path)
-
-
-def run_suite_file(tmp_path):
+    (tmp_path / "s.toml").write_text(text.replace("= 20", "= 25"))
     suite = load_suite(str(tmp_path / "s.toml"), list(SUBJECTS))
     setup = replace(setup_of(tmp_path / "work"), data=tmp_path / "data", options=suite.options)
-    with SUBJECTS["captures"](setup, "synthetic-lego", suite.cases) as measure:
+    with (
+        SUBJECTS["captures"](setup, "synthetic-lego", suite.cases) as measure,
+        pytest.raises(InputError, match="was trained with other options"),
+    ):
         measure(suite.cases[0])
 
 
 def test_a_scene_reaches_another_machine_in_pieces(tmp_path):
     write_blender(tmp_path / "lego")
     sizes = {path: path.stat().st_size for path in (tmp_path / "lego").rglob("*") if path.is_file()}
-    count = gpu_machine.pack_pieces(tmp_path / "lego", tmp_path / "pieces", max(sizes.values()), tmp_path / "none")
-    for number in range(1, count + 1):
-        piece = [path for path in (tmp_path / "pieces" / str(number)).rglob("*") if path.is_file()]
-        assert sum(path.stat().st_size for path in piece) <= max(sizes.values())
-        assert 0 == gpu_machine.main(["unpack", str(tmp_path / "pieces" / str(number)), str(tmp_path / "there")])
+    most = max(sizes.values())
+    count = gpu_machine.pack_pieces(tmp_path / "lego", tmp_path / "pieces", most, tmp_path / "none")
+    assert count > 1
+    for piece in (tmp_path / "pieces" / str(number) for number in range(1, count + 1)):
+        assert sum(path.stat().st_size for path in piece.rglob("*") if path.is_file()) <= most
+        assert 0 == gpu_machine.main(["unpack", str(piece), str(tmp_path / "there")])
     for path in sizes:
         copy = tmp_path / "there" / "data" / "lego" / path.relative_to(tmp_path / "lego")
         assert path.read_bytes() == copy.read_bytes()
-    assert count > 1
     assert 3 == gpu_machine.run_suite(tmp_path / "there", "captures_cpu", [], 0.1)
 
 
@@ -623,14 +594,12 @@ def test_levels_are_compared_at_their_size(sample_path, tmp_path):
     setup = Setup(work=tmp_path, peers=tmp_path, data=tmp_path, csplat=[])
     with SUBJECTS["level_quality"](setup, str(sample_path), []) as measure:
         fitted, merged = (measure({"maker": maker, "level": 1}) for maker in ("fitted", "merged"))
-        with pytest.raises(AbsentError, match="coarser levels"):
-            measure({"maker": "merged", "level": 9})
-        with pytest.raises(AbsentError, match="clone https"):
-            measure({"maker": "nanogs", "level": 1})
+        for maker, level, reason in (("merged", 9, "coarser levels"), ("nanogs", 1, "clone https")):
+            with pytest.raises(AbsentError, match=reason):
+                measure({"maker": maker, "level": level})
     assert fitted["level_splats"] == pytest.approx(fitted["splats"] / 4, rel=0.01)
     assert fitted["psnr"] > merged["psnr"] + 2.0
     assert fitted["ssim"] > merged["ssim"]
-    assert fitted["seconds"] > merged["seconds"] > 0.0
 
 
 def test_training_steps_are_measured(tmp_path):
@@ -713,8 +682,6 @@ def test_connections_share_the_rate_and_every_byte_is_recorded(folder):
         seconds = time.time() - start
     assert seconds >= 2 * len(BODY) / 256_000  # 0.4 s: one alone takes half of that
     assert 2 * len(BODY) == sum(size for _, size in line.sent)
-    halfway = sum(size for when, size in line.sent if when <= start + seconds / 2)
-    assert 0.25 < halfway / (2 * len(BODY)) < 0.75
     line.forget()
     assert ([], None) == (line.sent, line.begun)
 

@@ -63,22 +63,17 @@ def test_the_recipe_makes_the_same_scene_twice(recipe, small, tmp_path):
 
 
 @RECIPE
-def test_pictures_are_read_with_their_cameras(recipe, small, tmp_path):
-    recipe.photograph_all(tmp_path, small)
+def test_pictures_are_read_with_their_cameras_and_start_points_lie_on_the_garden(recipe, garden, small, tmp_path):
+    points, colours = recipe.photograph_all(tmp_path, small)
+    assert (150, 3) == points.shape == colours.shape
+    assert 0.0 <= colours.min() < colours.max() <= 1.0
+    assert max(abs(field_at(garden, point)[0]) for point in points * TURN) < 1e-3
     data = load(tmp_path)
     for pictures, count, between in ((data.train, 3, False), (data.test, 2, True)):
         for picture, wanted in zip(pictures, recipe.cameras(count, 32, between=between), strict=True):
             np.testing.assert_allclose(picture.camera.viewmat, wanted.viewmat, atol=1e-12)
             np.testing.assert_allclose(picture.camera.K, wanted.K, rtol=1e-12)
             assert 0.2 < np.mean(picture.pixels[..., 3] == SOLID) < 0.95
-
-
-@RECIPE
-def test_points_to_start_from_lie_on_the_garden(recipe, garden, small, tmp_path):
-    points, colours = recipe.photograph_all(tmp_path, small)
-    assert (150, 3) == points.shape == colours.shape
-    assert 0.0 <= colours.min() < colours.max() <= 1.0
-    assert max(abs(field_at(garden, point)[0]) for point in points * TURN) < 1e-3
 
 
 @RECIPE
@@ -94,12 +89,8 @@ def test_rays_end_at_the_first_surface(recipe, garden):
         places = eye + np.arange(1.5, reach - 0.01, 0.002)[:, None] * (end - eye) / reach
         missed += min(field_at(garden, place)[0] for place in places) < 0.0
     assert missed <= 0.02 * len(ends)
-
-
-@RECIPE
-def test_a_camera_that_looks_away_sees_nothing(recipe, garden):
-    camera = look_at((0.0, -0.1, -4.0), (0.0, -0.1, -8.0), UP, intrinsics(16, 16, 42.0), 16, 16)
-    assert not recipe.photograph(garden, camera)[0][..., 3].any()
+    away = look_at((0.0, -0.1, -4.0), (0.0, -0.1, -8.0), UP, intrinsics(16, 16, 42.0), 16, 16)
+    assert not recipe.photograph(garden, away)[0][..., 3].any()
 
 
 @RECIPE
@@ -119,19 +110,14 @@ def test_gloss_depends_on_the_direction_and_moss_does_not(garden):
     assert np.ptp(colours((x, heights[0], z), kinds.MOSS), axis=0).max() == 0.0
 
 
-def test_the_sample_has_no_defects_and_names_its_author(sample_path):
+def test_the_sample_has_no_defects_and_all_kinds_of_splats(sample_path):
+    """Examples and tests depend on it: three bands of colour, needles, discs, glass and solid."""
     report = []
     model = read_ply(sample_path, strict=True, report=report)
     assert [] == report
-    assert ("RDF", "CC0-1.0") == (model.coordinate_system, model.metadata["licence"])
+    assert ("RDF", "CC0-1.0", 3) == (model.coordinate_system, model.metadata["licence"], model.sh_degree)
     assert ["made by tools/sample/make_sample.py"] == model.metadata["comments"]
     assert sample_path.stat().st_size < 2.6e6
-
-
-def test_the_sample_contains_all_kinds_of_splats(sample_path):
-    """Examples and tests depend on it: three bands of colour, needles, discs, glass and solid."""
-    model = read_ply(sample_path)
-    assert 3 == model.sh_degree
     assert 6000 <= len(model) <= 10_000
     sizes = np.sort(model.scales, axis=1)
     assert np.ptp(np.quantile(sizes[:, 2], (0.01, 0.99))) > np.log(8)
