@@ -70,6 +70,11 @@ def model(sample_path):
 
 
 @pytest.fixture(scope="module")
+def larger_model(sample_path):
+    return csplat.read_ply(sample_path).select(slice(0, 1200))
+
+
+@pytest.fixture(scope="module")
 def data(model):
     """A file of four leaves in two levels above, with errors that grow."""
     leaves = kd_groups(model.means, 4)
@@ -501,8 +506,8 @@ def test_the_number_of_levels_is_the_one_asked_for(model):
 
 
 @pytest.mark.slow
-def test_fitted_levels_look_better_than_merged_ones(sample_path):
-    model = csplat.read_ply(sample_path).select(slice(0, 1200))
+def test_fitted_levels_look_better_than_merged_ones(larger_model):
+    model = larger_model
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
     nodes, count = np.zeros(len(model), np.int64), len(model) // 4
     fitters = LevelFitter(model, is_part=True), LevelFitter(model)  # with all steps
@@ -671,30 +676,31 @@ def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tm
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("small_views")
-def test_a_size_counts_all_levels(model):
-    target = csplat.Target(size_bytes=8_000, prune=False, effort=1)
-    result = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
-    assert 7_500 < len(result.data) == result.report.search.size_bytes <= 8_000
+def test_a_size_counts_all_levels(larger_model):
+    target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
+    result = encode_with_levels(larger_model, EncodeOptions(), LevelBuilder(1), target=target)
+    assert 17_460 < len(result.data) == result.report.search.size_bytes <= 18_000
     assert () == tuple(validate(result.data).violations)
     with csplat.open(result.data) as file:
-        assert [SPLATS, SPLATS // 4] == [len(file.read(tiles=file.cut(level=level))) for level in (0, 1)]
+        assert [1200, 1200 // 4] == [len(file.read(tiles=file.cut(level=level))) for level in (0, 1)]
+    alone = csplat.encode(larger_model, target=replace(target, size_bytes=int(0.72 * 18_000)))
+    scorer = Scorer.of_source(larger_model, virtual_cameras(larger_model, 3, 96, 72))
+    assert scorer.psnr(decode(result.data)) > scorer.psnr(decode(alone)) - 0.3  # as a search for the rest of the size
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("small_views")
-def test_other_targets_and_an_importance_have_levels(model, tmp_path):
+def test_other_targets_and_an_importance_have_levels(larger_model, tmp_path):
     weights, out = tmp_path / "weights.npy", tmp_path / "out.csplat"
-    np.save(weights, np.linspace(0.1, 1.0, SPLATS, dtype=np.float32))
+    np.save(weights, np.linspace(0.1, 1.0, 1200, dtype=np.float32))
     kept = csplat.Target(keep=0.5, effort=1)
-    for what, count in (({"target": kept}, SPLATS // 2), ({"importance": str(weights)}, SPLATS)):
-        encoded = encode_file(LoadedModel(model, 1), str(out), EncodeOptions(), levels=1, **what)
+    for what, count in (({"target": kept}, 1200 // 2), ({"importance": str(weights)}, 1200)):
+        encoded = encode_file(LoadedModel(larger_model, 1), str(out), EncodeOptions(), levels=1, **what)
         assert () == tuple(validate(out.read_bytes()).violations)
         with csplat.open(out) as file:
             assert [count, count // 4] == [len(file.read(tiles=file.cut(level=level))) for level in (0, 1)]
         assert encoded.report.options["levels"]["count"] == 1
     target = csplat.Target(max_error={"means": 0.01})
-    bounded = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
+    bounded = encode_with_levels(larger_model, EncodeOptions(), LevelBuilder(1), target=target)
     assert bounded.report.search.size_bytes == len(bounded.data)
     assert 0.005 < bounded.report.errors["means"][0] <= 0.01
     assert () == tuple(validate(bounded.data).violations)
