@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import call
-from oracle import VIEW, adversarial, extreme_splats, facing, random_splats
+from oracle import GROUPS, VIEW, adversarial, extreme_splats, facing, random_splats
+from tables import failures
 
 import csplat
 from csplat.decoder import iter_packed, iter_tiles
@@ -70,8 +71,7 @@ def bands_of(tile, count):
 
 
 def test_packed_tiles_have_the_values_of_decoded_ones():
-    files = [path for path in sorted(VECTORS.rglob("valid/*.csplat")) if path.stat().st_size < 1 << 14]
-    assert len(files) > 100
+    files = [path for path in sorted(VECTORS.rglob("valid/*.csplat")) if path.stat().st_size < 1 << 14][::4]
     kinds = set()
     for path in files:
         for tile, packed in zip(iter_tiles(path), iter_packed(path), strict=True):
@@ -180,23 +180,6 @@ def test_the_sort_is_stable(device, count):
     np.testing.assert_array_equal(order, device.read(values[0], 4 * count).view(np.uint32))
 
 
-@area
-def test_records_are_in_the_order_of_the_splats(device):
-    arrays = random_splats(3000, 0, seed=1)
-    arrays["means"][::2, 2] -= 10.0  # behind the camera
-    scene = GpuScene(device, [UncheckedSplats(**arrays)])
-    renderer = GpuRenderer(scene)
-    found = renderer.render(VIEW)
-    assert 1500 >= found.visible > 500
-    centres = device.read(renderer._ellipses, 16 * found.visible).view(np.float32).reshape(-1, 4)[:, :2]
-    camera = arrays["means"] @ VIEW.viewmat[:3, :3].T + VIEW.viewmat[:3, 3]
-    pixels = camera @ VIEW.K.T
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    drawn = device.read(renderer._looks, 16 * found.visible).view(np.float32).reshape(-1, 4)[:, 1] > 0
-    places = [int(np.argmin(np.abs(pixels - centre).sum(1))) for centre in centres[drawn]]
-    assert sorted(places) == places
-
-
 # Renders -----------------------------------------------------------------------------------------------------------
 def assert_same(model, view, found, least=_LEAST_PSNR, **options):
     wanted = render(model, view, **options)
@@ -206,8 +189,9 @@ def assert_same(model, view, found, least=_LEAST_PSNR, **options):
 
 
 @area
-@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
-@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize(
+    ("degree", "antialiased"), [(0, True), (1, False), (2, True), (3, False), (3, True), (4, False)]
+)
 def test_renders_of_models_agree_with_the_rasteriser(degree, antialiased):
     model = UncheckedSplats(**random_splats(500, degree, seed=degree))
     options = {"background": (0.2, 0.5, 0.9), "antialiased": antialiased}
@@ -232,38 +216,34 @@ def test_renders_of_files_agree_with_the_rasteriser(device, sample):
 
 
 @area
-@pytest.mark.parametrize(("name", "case"), list(adversarial()))
-def test_adversarial_splats_survive(name, case):
-    model = UncheckedSplats(**case.arrays)
-    found = render(model, case.view, backend="software", antialiased=case.antialiased)
-    wanted = render(model, case.view, antialiased=case.antialiased)
-    assert np.isfinite(found.rgb).all(), name
-    if case.view.near > 1e-20:  # nearer than that, products leave float32
-        assert psnr(wanted.rgb, found.rgb) >= 50.0
+def test_adversarial_splats_survive():
+    def check(case):
+        model = UncheckedSplats(**case.arrays)
+        found = render(model, case.view, backend="software", antialiased=case.antialiased)
+        wanted = render(model, case.view, antialiased=case.antialiased)
+        assert np.isfinite(found.rgb).all()
+        if case.view.near > 1e-20:  # nearer than that, products leave float32
+            assert psnr(wanted.rgb, found.rgb) >= 50.0
+
+    assert [] == failures(dict(adversarial()), check)
 
 
 @area
-@pytest.mark.parametrize("name", ["means", "quats", "scales", "opacities", "sh0", "shN"])
-def test_splats_with_nan_are_ignored_and_counted(name):
-    arrays = extreme_splats(count=30)
-    arrays[name].reshape(30, -1)[:3, -1] = np.nan
-    model = UncheckedSplats(**arrays)
-    assert_same(model, facing(), render(model, facing(), backend="software"))
+def test_unusual_splats_and_sizes_agree_with_the_rasteriser():
+    def check(case):
+        arrays, size, least = case
+        model, view = UncheckedSplats(**arrays), facing(width=size[0], height=size[1])
+        assert_same(model, view, render(model, view, backend="software"), least=least)
 
-
-@area
-@pytest.mark.parametrize(("width", "height"), [(1, 1), (16, 16), (17, 15), (1, 100), (333, 1), (8192, 40)])
-def test_renders_of_any_size_agree(width, height):
-    model = UncheckedSplats(**extreme_splats())
-    view = facing(width=width, height=height)
-    assert_same(model, view, render(model, view, backend="software"))
-
-
-@area
-@pytest.mark.parametrize("log_scale", [-80.0, -20.0, 20.0, 80.0])
-def test_extreme_scales_survive(log_scale):
-    model = UncheckedSplats(**extreme_splats(scales=log_scale))
-    assert_same(model, facing(), render(model, facing(), backend="software"), least=60.0)
+    sizes = ((1, 1), (16, 16), (17, 15), (1, 100), (333, 1), (8192, 40))
+    cases = {f"size {size}": (extreme_splats(), size, _LEAST_PSNR) for size in sizes}
+    for scale in (-80.0, -20.0, 20.0, 80.0):
+        cases[f"log scales {scale}"] = (extreme_splats(scales=scale), (50, 37), 60.0)
+    for name in GROUPS:  # splats with NaN are ignored and counted
+        arrays = extreme_splats(count=30)
+        arrays[name].reshape(30, -1)[:3, -1] = np.nan
+        cases[f"NaN in {name}"] = (arrays, (50, 37), _LEAST_PSNR)
+    assert [] == failures(cases, check)
 
 
 @area
@@ -467,11 +447,6 @@ def test_what_a_gpu_cannot_do_is_refused():
         GpuScene(device, [model], sh_degree=-1)
 
 
-def test_invalid_backends_are_refused():
-    with pytest.raises(InputError, match="'vulkan', expected one of cpu, gpu, auto, software"):
-        render(UncheckedSplats(**extreme_splats()), facing(), backend="vulkan")
-
-
 def test_without_a_gpu_auto_warns_and_gpu_is_an_error(monkeypatch):
     def none(**_options):
         raise InputError("no GPU was found, only a toaster")
@@ -483,3 +458,5 @@ def test_without_a_gpu_auto_warns_and_gpu_is_an_error(monkeypatch):
     with pytest.warns(UserWarning, match="only a toaster: rendering on the CPU"):
         found = render(model, facing(), backend="auto")
     np.testing.assert_array_equal(render(model, facing()).rgb, found.rgb)
+    with pytest.raises(InputError, match="'vulkan', expected one of cpu, gpu, auto, software"):
+        render(model, facing(), backend="vulkan")

@@ -236,13 +236,6 @@ def write_scene(folder: Path, name: str) -> Path:
     return write_columns(folder / "scene.ply", condition.make(), condition.comments)
 
 
-def write_small_scene(folder: Path, name: str) -> Path:
-    """Write the PLY of a condition, with `COPIES` instead of a million splats."""
-    if name in DRAWN:
-        return write_scene(folder, name)
-    return write_columns(folder / "scene.ply", identical(COPIES))
-
-
 @cache
 def scene(name: str) -> tuple[SplatModel, tuple[Finding, ...]]:
     """Return the scene of a condition, and the reader's findings."""
@@ -258,12 +251,9 @@ def encoded(name: str, preset: str, quality: float | None = None) -> EncodeResul
 
 
 @cache
-def scorer(name: str, size: tuple[int, int] = (640, 480)):
+def scorer(name: str, size: tuple[int, int] = (640, 480)) -> Scorer:
     """Return a scorer of renders against those of a condition, from eight virtual cameras."""
-    from csplat_render.scorer import Scorer
-    from csplat_render.virtual_cameras import virtual_cameras
-
-    model = scene(name)[0]
+    model = small_scene(name)
     return Scorer.of_source(model, virtual_cameras(model, 8, *size), (0.0, 0.0, 0.0))
 
 
@@ -327,7 +317,8 @@ def chain_of(name: str) -> Chain:
     """Take a condition through all stages, with `COPIES` instead of a million splats."""
     findings: list[Finding] = []
     with tempfile.TemporaryDirectory() as folder:
-        path = write_small_scene(Path(folder), name)
+        columns = CONDITIONS[name].make() if name in DRAWN else identical(COPIES)
+        path = write_columns(Path(folder) / "scene.ply", columns, CONDITIONS[name].comments)
         source, refusal = read_ply(path, report=findings), ""
         linted = tuple(one.id for one in lint_ply(path) if one.kind == "repair")
         try:
@@ -382,13 +373,9 @@ def small_scene(name: str) -> SplatModel:
     return scene(name)[0].select(slice(COPIES))
 
 
-@cache
 def small_scorer(name: str) -> Scorer:
     """Return a scorer of 160×120 renders against those of a condition."""
-    if name in DRAWN:
-        return scorer(name, SMALL)
-    model = small_scene(name)
-    return Scorer.of_source(model, virtual_cameras(model, 8, *SMALL), (0.0, 0.0, 0.0))
+    return scorer(name, SMALL)
 
 
 @cache
