@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from csplat.errors import FormatError, InputError
 from csplat_conformance import adapter
-from csplat_conformance.answers import PARTS, Answer, check_payload_consistency, compare_answer
+from csplat_conformance.answers import Answer, check_payload_consistency, compare_answer
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.decoder_suite import DecoderSuiteOptions, parse_levels, run_builtin, run_command
 from csplat_conformance.encoders.encoder_inputs import all_inputs
