@@ -355,6 +355,7 @@ def measure_once(tmp_path, name, scene, cases, **options):
 
 
 def test_reading_a_part_counts_splats_bytes_and_requests(sample_path, tmp_path):
+    pytest.importorskip("fsspec", reason="reading by HTTP needs the extra [remote]")
     disk, http = measure_once(tmp_path, "file_parts", sample_path, ["disk, SH 0", "HTTP, SH 0"], share=0.1)
     assert disk["read_splats"] == http["read_splats"] >= 0.1 * disk["splats"]
     assert 0 < disk["read_bytes"] < disk["size_bytes"]
