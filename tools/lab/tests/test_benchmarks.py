@@ -24,14 +24,12 @@ pytest.importorskip("PIL.Image", reason="images need the extra [render]")
 from chromium import absent
 from posed_sets import write_blender
 
-import csplat
 import gpu_machine
 from csplat import encode, write_ply
 from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat_bench import data_set_folders, results
 from csplat_bench.__main__ import main
-from csplat_bench.engine_stage import Engine
 from csplat_bench.made_scenes import crowd, split
 from csplat_bench.protocol import AbsentError, Setup
 from csplat_bench.results import Results
@@ -40,7 +38,6 @@ from csplat_bench.runner import run_suite
 from csplat_bench.slow_line import Line
 from csplat_bench.subjects import SUBJECTS
 from csplat_bench.subjects.arrival import Record
-from csplat_bench.subjects.file_parts import middle_box
 from csplat_bench.suites import Case, Suite, load_suite, suite_names
 from csplat_render import render
 from csplat_render.virtual_cameras import virtual_cameras
@@ -357,20 +354,8 @@ def measure_once(tmp_path, name, scene, cases, **options):
     return file.rows
 
 
-def test_the_box_holds_the_share_of_the_splats_or_slightly_more(sample, tmp_path):
-    options = csplat.EncodeOptions(preset="fast", tile_splats=500)
-    (tmp_path / "scene.csplat").write_bytes(csplat.encode(sample.select(slice(0, 3000)), options))
-    with csplat.open(tmp_path / "scene.csplat") as file:
-        for share in (1e-6, 0.1, 0.5, 1.0):
-            low, high = np.reshape(middle_box(file, share), (2, 3))
-            found = sum(tile.tile.splat_count for tile in file.tiles((*low, *high), sh_degree=0))
-            assert share * len(file) <= found
-            low, high = low + 1e-6, high - 1e-6
-            less = [] if (low > high).any() else file.tiles((*low, *high), sh_degree=0)
-            assert sum(len(tile.means) for tile in less) < found or share == 1e-6
-
-
 def test_reading_a_part_counts_splats_bytes_and_requests(sample_path, tmp_path):
+    pytest.importorskip("fsspec", reason="reading by HTTP needs the extra [remote]")
     disk, http = measure_once(tmp_path, "file_parts", sample_path, ["disk, SH 0", "HTTP, SH 0"], share=0.1)
     assert disk["read_splats"] == http["read_splats"] >= 0.1 * disk["splats"]
     assert 0 < disk["read_bytes"] < disk["size_bytes"]
@@ -506,24 +491,17 @@ def test_files_of_photographs_are_trained_made_and_scored(tmp_path):
     assert {"HAC++", "MesonGS"} < {row["case"] for row in found["rows"] if "published" in row}
 
 
-def touch_colmap(folder, *images):
-    """Create only the files and folders that discovery looks at."""
-    for name in ("cameras.bin", "images.bin"):
-        (folder / "sparse" / "0").mkdir(parents=True, exist_ok=True)
-        (folder / "sparse" / "0" / name).touch()
-    for name in images:
-        (folder / name).mkdir()
-
-
 @pytest.fixture
 def disk(tmp_path):
-    """Data sets as their archives unpack."""
-    for name in ("garden", "bicycle"):
-        touch_colmap(tmp_path / "360_v2" / name, "images", "images_4")
-    touch_colmap(tmp_path / "tandt_db" / "tandt" / "truck", "images")
-    touch_colmap(tmp_path / "nerf_llff_data" / "room", "images")
-    touch_colmap(tmp_path / "mine" / "room2", "images")
-    touch_colmap(tmp_path / "mine" / "models_alone")
+    """Data sets as their archives unpack: only the files and folders that discovery looks at."""
+    for folder in ("360_v2/garden", "360_v2/bicycle", "tandt_db/tandt/truck", "nerf_llff_data/room", "mine/room2"):
+        (tmp_path / folder / "images").mkdir(parents=True)
+    for folder in [*tmp_path.rglob("images"), tmp_path / "mine" / "models_alone" / "none"]:
+        sparse = folder.parent / "sparse" / "0"
+        sparse.mkdir(parents=True)
+        for name in ("cameras.bin", "images.bin"):
+            (sparse / name).touch()
+    (tmp_path / "360_v2" / "garden" / "images_4").mkdir()
     (tmp_path / "nerf_synthetic" / "ship_400x400" / "train").mkdir(parents=True)
     (tmp_path / "nerf_synthetic" / "ship_400x400" / "transforms_train.json").touch()
     return tmp_path
@@ -570,16 +548,14 @@ def test_a_data_set_is_trained_scored_and_encoded_once(tmp_path):
 
 def test_a_scene_reaches_another_machine_in_pieces(tmp_path):
     write_blender(tmp_path / "lego")
-    sizes = {path: path.stat().st_size for path in (tmp_path / "lego").rglob("*") if path.is_file()}
-    most = max(sizes.values())
+    whole = {path.relative_to(tmp_path): path.read_bytes() for path in (tmp_path / "lego").rglob("*.*")}
+    most = max(map(len, whole.values()))
     count = gpu_machine.pack_pieces(tmp_path / "lego", tmp_path / "pieces", most, tmp_path / "none")
     assert count > 1
     for piece in (tmp_path / "pieces" / str(number) for number in range(1, count + 1)):
         assert sum(path.stat().st_size for path in piece.rglob("*") if path.is_file()) <= most
         assert 0 == gpu_machine.main(["unpack", str(piece), str(tmp_path / "there")])
-    for path in sizes:
-        copy = tmp_path / "there" / "data" / "lego" / path.relative_to(tmp_path / "lego")
-        assert path.read_bytes() == copy.read_bytes()
+    assert whole == {path: (tmp_path / "there" / "data" / path).read_bytes() for path in whole}
     assert 3 == gpu_machine.run_suite(tmp_path / "there", "captures_cpu", [], 0.1)
 
 
@@ -633,14 +609,6 @@ def test_split_splats_have_the_spread_of_the_whole(make_model):
     np.testing.assert_allclose(total, [0.5, 0.1, 0.02], rtol=0.03)
 
 
-def test_an_engine_that_clips_colours_renders_the_same_if_none_leave_their_range(sample):
-    view = virtual_cameras(sample, 1, 80, 60)[0]
-    pale = replace(sample, sh0=0.2 * sample.sh0, shN=0.2 * sample.shN)
-    plain, clipped = Engine("plain", ()), Engine("clipped", (), clips=True)
-    np.testing.assert_allclose(clipped.render(pale, view, 3), plain.render(pale, view, 3), atol=1e-4)
-    assert np.abs(clipped.render(sample, view, 3) - plain.render(sample, view, 3)).max() > 0.01
-
-
 BODY = bytes(range(256)) * 200
 
 
@@ -670,41 +638,23 @@ def test_the_line_serves_ranges(folder):
         assert 404 == get(address, "/scenes/b.bin")[0]
 
 
-def test_connections_share_the_rate_and_every_byte_is_recorded(folder):
-    line = Line(8 * 256_000, 0.0)
-    with line.serve(folder) as address:
-        threads = [threading.Thread(target=get, args=(address, "/scenes/a.bin")) for _ in range(2)]
-        start = time.time()
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-        seconds = time.time() - start
-    assert seconds >= 2 * len(BODY) / 256_000  # 0.4 s: one alone takes half of that
-    assert 2 * len(BODY) == sum(size for _, size in line.sent)
-    line.forget()
-    assert ([], None) == (line.sent, line.begun)
-
-
-def test_answers_wait_for_the_latency_and_an_open_request_is_not_quiet(folder):
+def test_an_open_request_is_not_quiet_and_every_byte_is_recorded(folder):
     line = Line(1e9, 0.2)
     with line.serve(folder) as address:
         get(address, "/page.html")
         assert line.begun is None  # files other than scenes are not slowed down
-        start = time.time()
         thread = threading.Thread(target=get, args=(address, "/scenes/a.bin", "bytes=0-9"))
         thread.start()
         while line.begun is None:
             time.sleep(0.01)
         assert 0.0 == line.quiet_seconds
         thread.join()
-        assert time.time() - start >= 0.2
-        while line.quiet_seconds == 0.0:
-            time.sleep(0.01)
         assert 10 == sum(size for _, size in line.sent)
+    line.forget()
+    assert ([], None) == (line.sent, line.begun)
 
 
-def test_the_first_image_is_not_black_and_later_ones_are_nearer_to_the_last():
+def test_the_first_image_is_not_black_and_later_images_are_nearer_to_the_last():
     finished = np.zeros((120, 160, 3), np.uint8)
     finished[30:90, 40:120] = 200
     images = np.stack([np.zeros_like(finished), finished // 2, finished - finished // 20, finished])

@@ -85,8 +85,11 @@ def test_entries_are_the_means_of_their_splats(source):
         np.testing.assert_allclose(members.mean(axis=0), entry, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(found.quats, axis=1), 1.0, atol=1e-6)
     assert 7 >= len(np.unique(found.quats, axis=0))
-    assert 1.0 == pytest.approx(cluster_attributes(source, 1)[1]["means"]["error_share"])
+    told = []
+    _, whole = cluster_attributes(source, 1, progress=lambda *step: told.append(step))
+    assert 1.0 == pytest.approx(whole["means"]["error_share"])
     assert 0.0 < report["means"]["error_share"] < 1.0
+    assert ("clustering", 1.0) == told[-1]
 
 
 def test_an_entry_per_splat_changes_nothing_but_the_order_of_axes(source):
