@@ -1,0 +1,317 @@
+"""Editing without decoding: parts of a file as files of their own, and several files as one."""
+
+import io
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from editing_cases import STEPS, box_of, extract, merge
+from tables import failures
+
+import csplat
+import csplat_conformance
+from csplat import EncodeOptions, FormatError, InputError, _spec, decode, encode, read_header, read_ply
+from csplat.decoder import read_declared_bounds, read_metadata, read_options
+from csplat.decoder.tiles import codebook_references
+from csplat_conformance.validator import validate
+
+VECTORS = Path(csplat_conformance.__file__).parent / "vectors" / "valid"
+
+
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+ALL = (-1e6, -1e6, -1e6, 1e6, 1e6, 1e6)
+
+
+@pytest.fixture(scope="module")
+def sample(sample_path):
+    return read_ply(sample_path).select(slice(0, None, 9))
+
+
+@pytest.fixture(scope="module")
+def data(sample):
+    return encode(sample, EncodeOptions(tile_splats=120))
+
+
+def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
+    header = read_header(data)
+    low, high = box_of(header.tiles[2], header)
+    part, cut = extract(data, (*high, *low))
+    assert 2 in part.tiles
+    assert 1 <= len(part.tiles) < len(header.tiles)
+    whole, found = decode(data, tiles=part.tiles), decode(cut)
+    assert part.splat_count == len(found) == len(whole)
+    assert_joined([whole], found)
+    for index, tile in enumerate(header.tiles):
+        least, most = box_of(tile, header)
+        touches = all(least[k] <= high[k] and most[k] >= low[k] for k in range(3))
+        assert touches == (index in part.tiles)
+    assert () == validate(cut).violations
+    assert len(cut) < 0.9 * len(data)
+
+
+def test_a_part_keeps_the_metadata_but_no_declared_errors(data):
+    part = extract(data, ALL)[1]
+    assert read_metadata(data) == read_metadata(part)
+    assert decode(data).cameras == decode(part).cameras
+    assert read_declared_bounds(data) is not None
+    assert read_declared_bounds(part) is None
+    assert read_options(part) is None
+    before, after = read_header(data), read_header(part)
+    for name in ("origin", "coordinate_system", "antialiased", "flat", "unit_metres", "sh_degree", "codebooks"):
+        assert getattr(before, name) == getattr(after, name)
+    assert part == extract(part, ALL)[1]
+
+
+COPIED = [
+    "rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed", "codebook_sh_1_4_escape",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*COPIED, "empty"])
+def test_a_part_of_all_tiles_and_two_merged_copies_of_a_vector_decode_to_the_same(name):
+    path = VECTORS / f"{name}.csplat"
+    whole = decode(path)
+    if name != "empty":
+        _, part = extract(path.read_bytes(), (-1e300, -1e300, -1e300, 1e300, 1e300, 1e300))
+        assert () == validate(part).violations
+        assert_joined([whole], decode(part))
+        assert whole.extra.keys() == decode(part).extra.keys()
+    done, twice = merge(path, path.read_bytes())
+    assert not done.why
+    assert () == validate(twice).violations
+    assert_joined([whole] * 2, decode(twice))
+
+
+def _scene(**changes):
+    rng = np.random.default_rng(5)
+    means = rng.normal(size=(300, 3)).astype(np.float32) * 10
+    model = csplat.SplatModel(
+        means=means,
+        quats=np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
+        scales=np.full((300, 3), -4, np.float32),
+        opacities=np.full(300, 0.5, np.float32),
+        sh0=np.zeros((300, 3), np.float32),
+        shN=np.zeros((300, 0, 3), np.float32),
+    )
+    return replace(model, **{key: change(means) if callable(change) else change for key, change in changes.items()})
+
+
+def _far(means):
+    means[7] = (3e7, -2e6, 1e5)
+    return means
+
+
+SCENES = {
+    "ordinary": {},
+    "far from the origin": {"origin": (500_000.1, -4_649_776.3, 1e12)},
+    "an outlier": {"means": _far},
+    "huge": {"means": lambda means: means * np.float32(3e36)},
+    "subnormal": {"means": lambda means: means * np.float32(1e-41)},
+    "around zero": {"means": lambda means: np.where(np.abs(means) < 9, 0, means) * np.float32(-1)},
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_box_that_touches_a_decoded_centre_returns_its_splat(name):
+    data = encode(_scene(**SCENES[name]), EncodeOptions(tile_splats=64))
+    means = decode(data).means.astype(np.float64)
+    header = read_header(data)
+    ends = np.cumsum([tile.splat_count for tile in header.tiles])
+    wrong = []
+    with csplat.open(data) as file:
+        for tile, (low, high) in enumerate(file.boxes):
+            own = means[ends[tile] - header.tiles[tile].splat_count : ends[tile]]
+            assert (own.min(axis=0) == low).all()
+            assert (own.max(axis=0) == high).all()
+        for axis in range(3):
+            for row, end in ((means[:, axis].argmax(), math.inf), (means[:, axis].argmin(), -math.inf)):
+                tile = int(np.searchsorted(ends, row, side="right"))
+                box = [-math.inf] * 3 + [math.inf] * 3
+                box[axis], box[axis + 3] = means[row, axis], end  # corners in any order
+                found = [
+                    [one.tile.index for one in file.tiles(box)],
+                    file.cut(box=box),
+                    list(extract(data, box)[0].tiles),
+                    file.cut(box=[*means[row], *means[row]]),
+                ]
+                wrong += [(axis, end, tiles) for tiles in found if tile not in tiles]
+                box[axis] = math.nextafter(means[row, axis], end)
+                with pytest.raises(InputError, match="no tile touches the box"):
+                    file.cut(box=box)
+    assert [] == wrong
+
+
+def test_a_box_that_nothing_touches_is_refused(data):
+    with pytest.raises(InputError, match="no tile touches the box 1000, 1000, 1000"):
+        extract(data, (1000, 1000, 1000, 1001, 1001, 1001))
+    with pytest.raises(InputError, match="six numbers other than NaN"):
+        extract(data, (0, 0, 0, 1, 1, math.nan))
+
+
+def assert_joined(parts, whole):
+    """Assert that `whole` is the splats of `parts` one after the other, bit for bit."""
+    for name in ARRAYS:
+        expected = np.concatenate([getattr(part, name) for part in parts])
+        np.testing.assert_array_equal(expected.view(np.uint32), getattr(whole, name).view(np.uint32))
+    for name in whole.extra:
+        np.testing.assert_array_equal(np.concatenate([part.extra[name] for part in parts]), whole.extra[name])
+
+
+@pytest.fixture(scope="module")
+def halves(sample):
+    """Encode two files with the same steps and separate codebooks of SH and of shapes."""
+    order = np.argsort(sample.means[:, 0])
+    options = EncodeOptions(
+        preset="fast", sh_coding="codebook", codebook_size=64, escape_fraction=0.05, shape_codebook_size=64,
+        shape_escape_fraction=0.05, tile_splats=170, keep_extra=True, **STEPS,
+    )  # fmt: skip
+    ids = np.arange(len(sample), dtype=np.uint32)
+    model = replace(sample, extra={"id": ids})
+    return [encode(model.select(half), options) for half in np.array_split(order, 2)]
+
+
+def test_copied_bytes_are_checked(data, halves):
+    def damaged(file):
+        record = read_header(file).tiles[0].layers[0]
+        changed = bytearray(file)
+        changed[record.offset + record.size - 1] ^= 1
+        return bytes(changed)
+
+    with pytest.raises(FormatError, match="E_CRC"):
+        extract(damaged(data), ALL)
+    with pytest.raises(FormatError, match="E_CRC"):
+        merge(halves[0], damaged(halves[1]))
+
+
+def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(sample, halves):
+    done, data = merge(*halves)
+    assert ("", len(sample)) == (done.why, done.splat_count)
+    assert () == validate(data).violations
+    assert_joined([decode(one) for one in halves], decode(data))
+    header = read_header(data)
+    kinds = [book.kind for one in halves for book in read_header(one).codebooks]
+    assert len(set(kinds)) == 2
+    assert sorted(kinds) == sorted(book.kind for book in header.codebooks)
+    assert done.tile_count == len(header.tiles) == sum(len(read_header(one).tiles) for one in halves)
+    assert data == merge(*halves)[1]
+    assert None is not read_declared_bounds(halves[0])
+    assert (None, None) == (read_declared_bounds(data), read_options(data))
+    done, data = merge(*halves, options=EncodeOptions(preset="fast"), codebooks_max=3)
+    assert "they have 4 codebooks together, a file has at most 3" == done.why
+    assert len(sample) == len(decode(data))
+
+
+def test_parts_of_a_file_share_their_codebooks_again(sample):
+    sample = sample.select(slice(0, 1000))
+    whole = encode(sample, EncodeOptions(preset="balanced", tile_splats=120))
+    middle = float(np.median(sample.means[:, 0]))
+    parts = []
+    for box in ((-1e3, -1e3, -1e3, middle, 1e3, 1e3), (middle, -1e3, -1e3, 1e3, 1e3, 1e3)):
+        stream = io.BytesIO()
+        csplat.extract(whole, box, stream)
+        parts.append(stream.getvalue())
+    done, data = merge(*parts)
+    assert not done.why
+    assert read_header(whole).codebooks == read_header(data).codebooks != ()
+    assert read_metadata(whole) == read_metadata(data)
+    assert decode(whole).cameras == decode(data).cameras
+    assert_joined([decode(part) for part in parts], decode(data))
+
+
+def test_references_to_codebooks_are_found_without_decoding():
+    assert [] == failures({path.stem: path for path in VECTORS.glob("*.csplat")}, check_references)
+
+
+def check_references(path):
+    data = path.read_bytes()
+    header = read_header(data)
+    found = set()
+    for tile in header.tiles:
+        here = set()
+        for layer in tile.layers.values():
+            if layer.layer <= _spec.SH_DEGREE_MAX:
+                for at, id in codebook_references(memoryview(data), header, layer):
+                    assert id == int.from_bytes(data[at : at + 2], "little")
+                    here.add(id)
+        assert here <= set(tile.codebook_ids)
+        found |= here
+    # If a stream is skipped wrongly, its end is not the end of the chunk: E_STREAM.
+    if "codebook" in path.stem and header.codebooks:
+        assert found
+
+
+def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
+    options = EncodeOptions(preset="fast", **STEPS)
+    models = [make_model(40, 1), make_model(50, 1, coordinate_system="RDF", unit_metres=2.0)]
+    models[0] = replace(models[0], metadata={"licence": "CC0-1.0", "only": 1, "up": [0, -1, 0]})
+    models[1] = replace(models[1], metadata={"licence": "CC0-1.0", "up": [0, -0.8, 0.6]}, cameras=[])
+    done, data = merge(*(encode(model, options) for model in models))
+    assert not done.why
+    header = read_header(data)
+    assert ("RDF", 2.0) == (header.coordinate_system, header.unit_metres)
+    assert {"licence": "CC0-1.0"} == read_metadata(data)
+    assert (
+        "file 1 without axes: RDF is assumed, as the other files have",
+        "file 1 without a unit: 2 m is assumed, as the other files have",
+        "metadata left out, because not all files have the same: only, up",
+    ) == tuple(one.removesuffix(", cameras") for one in done.notes)
+
+
+# Re-encoded scenes.
+@pytest.mark.parametrize(("degree", "fields", "options", "reason"), [
+    (1, {}, {"scale_step": 0.1}, "different steps of scales"),
+    (3, {}, {}, "file 2 has SH of degree 3, file 1 of 1"),
+    (1, {"origin": (100.0, 0.0, 0.0)}, {}, "different origins"),
+    (1, {"extra": {"id": np.arange(50, dtype=np.int32)}}, {}, "different extra columns"),
+])  # fmt: skip
+def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, degree, fields, options, reason):
+    first, second = make_model(40, 1), make_model(50, degree, **fields)
+    files = [
+        encode(first, EncodeOptions(preset="fast", keep_extra=True, **STEPS)),
+        encode(second, EncodeOptions(preset="fast", keep_extra=True, **{**STEPS, **options})),
+    ]
+    done, data = merge(*files, options=EncodeOptions(preset="small", position_step=1e-4))
+    assert reason in done.why
+    assert () == validate(data).violations
+    model = decode(data)
+    assert 90 == len(model) == done.splat_count
+    assert (degree, ("id",) if "extra" in fields else ()) == (model.sh_degree, done.dropped)
+    sources = [decode(one) for one in files]
+    wanted = np.concatenate([one.means.astype(np.float64) + one.origin for one in sources])
+    found = model.means.astype(np.float64) + model.origin
+    distance = np.linalg.norm(wanted[:, None] - found, axis=2)
+    assert distance.min(axis=1).max() < 1e-3
+    assert distance.min(axis=0).max() < 1e-3
+
+
+def test_scenes_that_contradict_each_other_or_have_no_partner_are_refused(make_model, tmp_path):
+    def check(case):
+        fields, message = case
+        for name, its in zip("ab", fields, strict=True):
+            (tmp_path / name).write_bytes(encode(make_model(5, 0, **its), EncodeOptions(preset="fast", **STEPS)))
+        with pytest.raises(InputError, match=message):
+            csplat.merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out.csplat")
+        with pytest.raises(InputError, match="cannot be merged"):
+            csplat.merge([tmp_path / "b", tmp_path / "b", tmp_path / "a"], tmp_path / "out.csplat")
+
+    assert [] == failures({case[1]: case for case in CONTRADICTIONS}, check)
+    for files in ("scene.csplat", [], ["scene.csplat"], b"x"):
+        with pytest.raises(InputError, match="two files or more"):
+            csplat.merge(files, tmp_path / "out.csplat")
+    assert not (tmp_path / "out.csplat").exists()
+
+
+CONTRADICTIONS = [
+    (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be merged: RDF in .*a, RUB in .*b"),
+    (({}, {"coordinate_system": "RUB"}), "none, for which RDF is assumed, in .*a, RUB in .*b: turn one with"),
+    (({"coordinate_system": "LUF"}, {}), "axes cannot be merged: LUF in .*a, none, for which RDF is assumed, in .*b"),
+    (({"metadata": {"up": [0, 0, 1]}}, {"metadata": {"up": [0, 1, 0]}}), "up direct.*: 0,0,1 in .*a, 0,1,0 in .*b"),
+    (({"coordinate_system": "RDF"}, {"metadata": {"up": [0, 1, 0]}}), "up directions cannot be merged: 0,-1,0 in .*a"),
+    (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
+    (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
+    (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),
+]

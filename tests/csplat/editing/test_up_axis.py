@@ -1,0 +1,129 @@
+"""Tests of csplat.editing.up_axis."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+from command_line import call
+from posed_sets import write_blender, write_colmap_set, write_transforms
+
+from csplat import decode, read_ply, write_ply
+from csplat.editing.up_axis import unit_up, up_of, with_up
+from csplat.errors import InputError
+from csplat_render.camera_paths import orbit_cameras
+from csplat_trainer.data import load
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import TrainOptions
+
+pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
+
+
+pytest.importorskip("scipy", reason="the trainer needs scipy: pip install 'csplat[render]'")
+
+
+pytest.importorskip("PIL", reason="pictures need pillow: pip install 'csplat[render]'")
+
+
+TILTED = (0.0, -0.99503719, 0.09950372)  # 0, -1, 0.1
+
+
+@pytest.mark.parametrize(("values", "up"), [
+    ((0, 0, 2), (0, 0, 1)),
+    ([0.0, -1.0, 0.1], (0, -0.995037, 0.099504)),
+    ((1e300, -1e300, 0), (0.707107, -0.707107, 0)),
+    ((5e-324, 0, 0), (1, 0, 0)),
+])  # fmt: skip
+def test_a_direction_gets_unit_length_and_keeps_it(values, up):
+    assert up == unit_up(values) == unit_up(unit_up(values))
+
+
+@pytest.mark.parametrize("values", [None, "xyz", (0, 0, 0), (1, 2), (1, 2, 3, 4), (math.nan, 0, 1), (math.inf, 0, 1),
+    (True, 0, 0), [[1]]])  # fmt: skip
+def test_values_other_than_a_direction_are_refused(values):
+    with pytest.raises(InputError, match="expected three finite numbers"):
+        unit_up(values)
+
+
+def test_up_of_the_metadata_comes_before_the_axes():
+    assert (0, 0, 1) == up_of({}, "RFU")
+    assert (0, -1, 0) == up_of({}, "RDF")
+    assert (1, 0, 0) == up_of({"up": [1, 0, 0]}, "RFU")
+    assert (0, 0, 1) == up_of({"up": "there"}, "RFU")
+    assert up_of({}) is None
+    assert up_of({"up": [0, 0, 0]}) is None
+
+
+def test_setting_up_drops_axes_that_contradict_it(make_model):
+    model = make_model(coordinate_system="RDF", metadata={"up": [0.0, -1.0, 0.0]})
+    leaning, lying = with_up(model, TILTED), with_up(model, (0, 0, 1))
+    assert ("RDF", [0.0, -0.995037, 0.099504]) == (leaning.coordinate_system, leaning.metadata["up"])
+    assert ("unspecified", [0.0, 0.0, 1.0]) == (lying.coordinate_system, lying.metadata["up"])
+    turned = with_up(model, coordinate_system="RFU")
+    assert ("RFU", {}) == (turned.coordinate_system, turned.metadata)
+
+
+ALMOST_NONE = {"max_splats": 40, "sh_degree": 0, "iterations": 1, "strategy": "none"}
+
+
+def trained(write, up):
+    def make(folder, _make_model):
+        write(folder, up=up)
+        return train(load(folder), TrainOptions(**ALMOST_NONE)).model
+
+    return make
+
+
+def without_up(**fields):
+    return lambda _folder, make_model: make_model(60, 1, **fields)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("make", "words", "axes", "up"), [
+    (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
+    (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),
+    (trained(write_transforms, (1, 0, 0)), ["--up", "-y"], "unspecified", (0, -1, 0)),
+    (without_up(), [], "unspecified", None),
+    (without_up(), ["--up", "0,-2,2"], "unspecified", (0, -0.707107, 0.707107)),
+    (without_up(coordinate_system="LUF"), [], "LUF", (0, 1, 0)),
+    (without_up(coordinate_system="RDF"), ["--up", "z"], "unspecified", (0, 0, 1)),
+], ids=["blender", "colmap", "transforms-up", "ply", "ply-up", "ply-axes", "axes-up"])  # fmt: skip
+def test_all_commands_agree_on_up(tmp_path, make_model, make, words, axes, up):
+    (tmp_path / "set").mkdir()
+    write_ply(tmp_path / "scene.ply", make(tmp_path / "set", make_model))
+    call("encode", tmp_path / "scene.ply", tmp_path / "a.csplat", *words, "--preset", "fast", "-q")
+    call("decode", tmp_path / "a.csplat", tmp_path / "b.ply")
+    call("encode", tmp_path / "b.ply", tmp_path / "b.csplat", "--preset", "fast", "-q")
+    for path in (tmp_path / "a.csplat", tmp_path / "b.csplat"):
+        info = json.loads(call("info", path, "--json").stdout)
+        assert (axes, None if up is None else list(up)) == (info["coordinate_system"], info["up"])
+    scene, wishes = in_page(path)
+    assert (up, {}) == (up_of(scene.metadata, scene.coordinate_system), wishes)
+    shown = "unknown" if up is None else " ".join(f"{value:g}" for value in up)
+    assert f"\nup           {shown}\n" in call("info", tmp_path / "b.csplat").stdout
+    model = read_ply(tmp_path / "b.ply")
+    assert (scene.coordinate_system, scene.metadata.get("up")) == (model.coordinate_system, model.metadata.get("up"))
+    upright(orbit_cameras(model, 2, 64, 48), up or (0, -1, 0))  # without a recorded up: as in a PLY
+    if up is None:  # a page of a PLY, with the direction of the command line
+        assert {"up": "0,-0.995037,0.099504"} == in_page(tmp_path / "scene.ply", "--up", "0,-1,0.1")[1]
+
+
+def in_page(path, *words):
+    """Export a page; return its scene, and the view parameters that it sets."""
+    page = path.with_suffix(".html")
+    call("export-html", path, page, "--force", *words)
+    text = page.read_text("utf-8")
+    settings = json.loads(re.search(r'id="csplat-page">(.*?)</script>', text, re.DOTALL)[1])
+    scene = decode(base64.b64decode(re.search(r'id="csplat-scene">(.*?)</script>', text, re.DOTALL)[1]))
+    return scene, settings["wishes"]
+
+
+def upright(cameras, up):
+    direction = np.array(up) / np.linalg.norm(up)
+    for camera in cameras:
+        assert abs(camera.viewmat[0, :3] @ direction) < 1e-6
+        assert -camera.viewmat[1, :3] @ direction > 0.5

@@ -1,0 +1,407 @@
+"""Codebooks: k-means finds near entries at any thread count; codebooks of shapes make smaller files."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checked import encoded
+from chromium import absent
+from codebooks_cases import exact, few_shapes, scene
+
+import csplat
+from csplat import _spec
+from csplat.decoder import decode_scene
+from csplat.encoder import EncodeOptions, Importance, encode_with_report, kmeans
+from csplat.encoder.error_bounds import covariance_entries
+from csplat.encoder.kmeans import (
+    assign,
+    cluster,
+    rank_by_frequency,
+    reassign_by_metric,
+    refine_by_metric,
+    search_nearest,
+)
+from csplat.encoder.quantisation import canonicalise_shape
+from csplat.encoder.shape_codebook import mean_axes, unit_covariances
+from csplat.errors import InputError
+from csplat.model import normalise_quats
+from csplat_conformance.adapter import answer
+from csplat_selftest.decoder_processes import JsDecoder
+from csplat_selftest.fuzzing.decoder_targets import compared
+
+
+def blobs(count=3000, width=9, centres=40, spread=3.0, seed=0):
+    rng = np.random.default_rng(seed)
+    middle = rng.integers(-90, 91, (centres, width))
+    noise = rng.normal(0, spread, (count, width))
+    points = np.rint(middle[rng.integers(0, centres, count)] + noise).astype(np.int16)
+    return points, rng.random(count).astype(np.float32)
+
+
+def ones(points):
+    return np.ones(len(points), np.float32)
+
+
+def squared_distances(points, entries):
+    difference = points[:, None].astype(np.int64) - entries[None].astype(np.int64)
+    return (difference**2).sum(2)
+
+
+def distortion(points, weights, entries, index):
+    """Return the weighted mean of squared distances of points from their entries."""
+    squares = ((points.astype(np.float64) - entries[index]) ** 2).sum(1)
+    return float((squares * weights).sum() / weights.sum(dtype=np.float64))
+
+
+def assert_search_is_exact(points, entries):
+    expected = squared_distances(points, entries)
+    index, error = search_nearest(points, entries)
+    assert index.dtype == np.uint32
+    np.testing.assert_array_equal(expected.argmin(1), index)
+    np.testing.assert_array_equal(expected.min(1), error)
+
+
+def test_assign_finds_the_first_nearest_entry():
+    rng = np.random.default_rng(1)
+    for entry_count in (1, 2, 300, kmeans._PRODUCT_COLUMNS + 3):
+        points = rng.integers(-3, 4, (200, 4)).astype(np.int16)  # many equal distances
+        assert_search_is_exact(points, rng.integers(-3, 4, (entry_count, 4)).astype(np.int32))
+
+
+def test_search_is_exact_just_below_the_bound():
+    rng = np.random.default_rng(2)
+    points = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
+    entries = points[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)
+    assert kmeans._shift(points, entries) == 0
+    assert_search_is_exact(points, entries)
+
+
+def test_shift_keeps_every_partial_sum_below_the_bound():
+    for largest in (4000, 2**20, 2**31 - 1):
+        points = np.array([[largest] * 45, [-largest - 1] * 45], np.int32)
+        shift = kmeans._shift(points, points)
+        norm = float((kmeans._divide(points, shift) ** 2).sum(1).max())
+        assert shift > 0
+        assert norm * 1.5 < kmeans._EXACT
+        assert kmeans._divide(points, shift - 1).max() ** 2 * 45 * 1.5 > kmeans._EXACT / 4
+
+
+def test_search_for_another_entry_skips_the_own_one():
+    for entry_count in (2, 300, kmeans._PRODUCT_COLUMNS + 3):  # the last has a second block of columns
+        points = np.random.default_rng(6).integers(-9, 10, (entry_count, 4)).astype(np.int32)
+        points[-1] = points[0]
+        rows = np.unique(np.r_[0 : min(100, entry_count), max(0, entry_count - 53) : entry_count])
+        expected = squared_distances(points[rows], points)
+        expected[np.arange(len(rows)), rows] = 10**6
+        index, error = search_nearest(points, points, other=True)
+        np.testing.assert_array_equal(expected.argmin(1), index[rows])
+        np.testing.assert_array_equal(expected.min(1), error[rows])
+
+
+def test_large_points_are_assigned_to_nearly_nearest_entries():
+    rng = np.random.default_rng(3)
+    points = rng.integers(-30000, 30000, (800, 5)).astype(np.int16)
+    entries = rng.integers(-30000, 30000, (50, 5)).astype(np.int32)
+    exact = squared_distances(points, entries)
+    found = exact[np.arange(800), assign(points, entries)]
+    assert np.sqrt(found).max() > 10000
+    assert np.all(np.sqrt(found) <= np.sqrt(exact.min(1)) + 60 * np.sqrt(5))
+
+
+def test_searching_near_groups_loses_less_than_two_per_cent_and_all_groups_nothing():
+    points, _ = blobs(1000, 12, 300, 8.0)
+    entries = points[:400].astype(np.int32)
+    (_, exact), (index, error) = search_nearest(points, entries), search_nearest(points, entries, near_groups=5)
+    assert np.all(error >= exact)
+    assert error.sum() <= 1.02 * exact.sum()
+    np.testing.assert_array_equal(squared_distances(points, entries)[np.arange(1000), index], error)
+    np.testing.assert_array_equal(exact, search_nearest(points, entries, near_groups=20)[1])
+
+
+def test_assign_gives_no_index_for_no_points():
+    assert assign(np.empty((0, 3), np.int16), np.zeros((1, 3), np.int32)).shape == (0,)
+
+
+def check_clusters(points, entries, index, size):
+    assert entries.dtype == np.int32
+    assert index.dtype == np.uint32
+    assert len(index) == len(points)
+    assert len(entries) <= size
+    assert len(np.unique(entries, axis=0)) == len(entries)
+    np.testing.assert_array_equal(np.arange(len(entries)), np.unique(index))
+
+
+def test_clusters_are_distinct_used_and_close():
+    points, weights = blobs()
+    for dtype, near_groups in ((np.int16, 0), (np.int32, 0), (np.int16, 5)):
+        points = points.astype(dtype)
+        entries, index = cluster(points, weights, 40, seed=0, iterations=6, near_groups=near_groups)
+        check_clusters(points, entries, index, 40)
+        assert len(entries) == 40
+        assert distortion(points, weights, entries, index) < 2.0 * 9 * 3.0**2
+
+
+def test_more_iterations_and_entries_lower_the_distortion():
+    points, weights = blobs(spread=30.0)
+
+    def run(size, iterations):
+        found = cluster(points, weights, size, seed=0, iterations=iterations)
+        return distortion(points, weights, *found)
+
+    assert run(64, 10) < run(64, 0)
+    assert run(256, 4) < 0.9 * run(64, 4)
+
+
+def test_first_entries_beat_uniform_ones():
+    points, _ = blobs(6000, 9, 200, 2.0)
+    points[:4000] = points[0] + np.random.default_rng(4).integers(-2, 3, (4000, 9))
+    uniform = points[np.random.default_rng(5).choice(6000, 200, replace=False)].astype(np.int32)
+    entries, index = cluster(points, ones(points), 200, seed=0, iterations=0)
+    found = distortion(points, ones(points), entries, index)
+    assert found < 0.5 * distortion(points, ones(points), uniform, assign(points, uniform))
+
+
+def test_heavy_points_keep_their_values():
+    points, _ = blobs(5000, 6, 500, 20.0)
+    weights = np.full(5000, 1e-12, np.float32)
+    heavy = np.arange(0, 5000, 250)
+    weights[heavy] = 1e6
+    entries, index = cluster(points, weights, 64, seed=0, iterations=4, sample_per_entry=8)
+    check_clusters(points, entries, index, 64)
+    np.testing.assert_array_equal(points[heavy], entries[index[heavy]])
+
+
+def test_weights_matter_by_ratio_and_zeros_are_equal_weights():
+    points, weights = blobs(1000)
+    for one, same in ((weights, weights * np.float32(2**-40)), (ones(points), 0 * ones(points))):
+        first, second = (cluster(points, each, 30, seed=0, iterations=3) for each in (one, same))
+        np.testing.assert_equal(second, first)
+
+
+def test_few_positive_weights_give_no_unused_entry():
+    points, _ = blobs(500)
+    for positive in (0, 1, 5, 20):
+        weights = np.where(np.arange(500) < positive, np.float32(2.0), np.float32(0.0))
+        entries, index = cluster(points, weights, 16, seed=0, iterations=3, sample_per_entry=2)
+        check_clusters(points, entries, index, 16)
+
+
+def test_fewer_values_than_entries_are_kept_exactly():
+    values = blobs(16, 5)[0]
+    for value_count, point_count in ((0, 0), (1, 1), (7, 7), (16, 16), (1, 900), (10, 900)):
+        points = values[np.arange(point_count) % max(value_count, 1)]
+        for near_groups in (0, 2):
+            entries, index = cluster(points, ones(points), 16, seed=0, iterations=3, near_groups=near_groups)
+            check_clusters(points, entries, index, 16)
+            assert len(entries) <= max(value_count, 1)
+            np.testing.assert_array_equal(points, entries[index])
+
+
+def test_points_beyond_the_exact_norm_are_clustered_on_a_coarser_lattice():
+    points, weights = blobs(2000, 9, 30, 2.0)
+    large = points.astype(np.int32) * 1000
+    entries, index = cluster(large, weights, 30, seed=0, iterations=5)
+    check_clusters(large, entries, index, 30)
+    assert distortion(large, weights, entries, index) < 2.0 * 9 * 2000.0**2
+
+
+def test_invalid_arguments_are_refused():
+    points, weights = blobs(50)
+    for bad in (weights[:-1], -weights, weights * np.inf, weights * np.nan):
+        with pytest.raises(InputError, match="weights"):
+            cluster(points, bad, 8, seed=0, iterations=1)
+    for bad in (points.astype(np.float32), points[0], points[:, :0]):
+        with pytest.raises(InputError, match="points"):
+            cluster(bad, weights, 8, seed=0, iterations=1)
+    with pytest.raises(InputError, match="size"):
+        cluster(points, weights, 0, seed=0, iterations=1)
+    with pytest.raises(InputError, match="no entries"):
+        assign(points, np.empty((0, 9), np.int32))
+    with pytest.raises(InputError, match="entries"):
+        assign(points, np.empty((4, 8), np.int32))
+
+
+def test_ranks_follow_frequency_and_keep_the_order_of_equals():
+    index = np.array([3, 3, 1, 0, 1, 2, 3], np.uint32)
+    entries = np.array([[10], [11], [12], [13], [14]], np.int32)
+    ranked, ordered = rank_by_frequency(index, entries)
+    assert [0, 0, 1, 2, 1, 3, 0] == ranked.tolist()
+    assert [13, 11, 10, 12, 14] == ordered.ravel().tolist()
+    assert ranked.dtype == np.uint32
+    np.testing.assert_array_equal(entries[index], ordered[ranked])
+
+
+@pytest.mark.slow
+def test_the_thread_count_of_blas_is_restored():
+    control = kmeans._openblas()
+    if control is None:
+        pytest.skip("NumPy's BLAS here is not an OpenBLAS whose threads can be set")
+    before = control[0]()
+    with kmeans.one_blas_thread():
+        assert control[0]() == 1
+    assert control[0]() == before
+
+
+def test_reassigning_over_all_entries_finds_the_best():
+    points, matrices, metric, entries = scene()
+    errors = np.stack([exact(points - entry, matrices, np.ones(len(points))) for entry in entries], axis=1)
+    found = reassign_by_metric(points, metric, entries, np.zeros(len(points), np.int64), 2, candidates=len(entries))
+    np.testing.assert_allclose(errors.min(axis=1), errors[np.arange(len(points)), found], rtol=1e-4)
+
+
+def test_refining_reduces_errors_without_unused_entries():
+    points, _, metric, entries = scene()
+    start = np.linalg.norm((points[:, None] - entries).reshape(len(points), len(entries), -1), axis=2).argmin(axis=1)
+    moved, index = refine_by_metric(points, metric, entries, start, 1)
+    before = metric.errors(points - entries[start], slice(None)).sum()
+    assert metric.errors(points - moved[index], slice(None)).sum() < 0.8 * before
+    assert set(range(len(moved))) == set(index.tolist())
+    assert len(moved) == len(np.unique(moved.reshape(len(moved), -1), axis=0))
+
+
+def seen_more(model, seed=1):
+    """Return random weights and matrices."""
+    rng = np.random.default_rng(seed)
+    roots = rng.normal(size=(len(model), 6, 3))
+    matrices = roots @ roots.transpose(0, 2, 1)
+    matrices *= (6 / np.einsum("nii->n", matrices))[:, None, None]
+    weights = rng.lognormal(0, 2, len(model))
+    rows, columns = np.triu_indices(6)
+    return Importance(weights, weights, None, matrices[:, rows, columns])
+
+
+def books(data):
+    return [book for book in decode_scene(data).header.codebooks if book.kind == _spec.CODEBOOK_KIND_SHAPE]
+
+
+@pytest.mark.slow
+def test_shape_codebooks_make_files_smaller_within_declared_errors(make_model):
+    model = few_shapes(make_model, 1200)
+    for importance, tile_splats, escapes in (
+        (None, 65536, None),
+        (None, 500, 0.0),
+        (seen_more(model), 65536, 0.3),
+        (seen_more(model), 500, None),
+    ):
+        options = {"sh_coding": "none", "tile_splats": tile_splats}
+        plain = encode_with_report(model, EncodeOptions(**options), importance=importance)
+        result, _ = encoded(model, importance, shape_codebook_size=64, shape_escape_fraction=escapes, **options)
+        assert len(result.data) < len(plain.data)
+        assert 1 <= result.report.options["shape_codebook_size"] <= 64
+        assert [result.report.options["shape_codebook_size"]] == [book.size for book in books(result.data)]
+
+
+def test_a_shape_codebook_never_makes_a_file_larger(make_model):
+    for count in (0, 1, 60, 800):
+        model = make_model(count, 0)  # random shapes gain nothing
+        plain = encode_with_report(model).data
+        coded = encode_with_report(model, EncodeOptions(shape_codebook_size=4096)).data
+        assert len(coded) <= len(plain) + len('"shape_codebook_size":4096,')  # it records the requested options
+        assert count > 100 or not books(coded)
+
+
+def test_splats_of_one_shape_share_an_entry(make_model):
+    model = few_shapes(make_model, 1000, 1)
+    result, decoded = encoded(model, shape_codebook_size=1, shape_escape_fraction=0.0, sh_coding="none")
+    rotations = {tuple(row) for row in decoded.quats}
+    assert 1 == len(rotations)
+    trace = [0.5 * np.log(np.exp(2.0 * m.scales.astype(np.float64)).sum(axis=1)) for m in (model, decoded)]
+    step = result.report.options["scale_step"]
+    assert np.abs(trace[0][result.source_index] - trace[1]).max() <= 0.5 * step * (1 + 1e-6)
+
+
+def test_important_shapes_have_smaller_errors(make_model):
+    model = make_model(3000, 0)
+    heavy = np.arange(3000) % 10 == 0
+    importance = Importance(np.ones(3000), np.where(heavy, 1.0, 1e-4))
+    options = {"shape_codebook_size": 100, "shape_escape_fraction": 0.0}
+    result, decoded = encoded(model, importance, **options)
+    errors = covariance_entries(decoded.quats.T, np.exp(2.0 * decoded.scales.T.astype(np.float64)))
+    source = model.select(result.source_index)
+    wanted = covariance_entries(source.quats.T, np.exp(2.0 * source.scales.T.astype(np.float64)))
+    relative = np.linalg.norm(errors - wanted, axis=0) / np.linalg.norm(wanted, axis=0)
+    chosen = heavy[result.source_index]
+    assert np.median(relative[chosen]) < 0.8 * np.median(relative[~chosen])
+
+
+def test_huge_scales_only_affect_their_tile(make_model):
+    model = few_shapes(make_model, 1200)
+    scales = model.scales.copy()
+    scales[17] = 3e8
+    result, _ = encoded(replace(model, scales=scales), shape_codebook_size=16, tile_splats=500, scale_step=0.05)
+    assert books(result.data)
+
+
+def test_axes_are_recovered_from_covariances():
+    rng = np.random.default_rng(0)
+    quats, scales = normalise_quats(rng.normal(size=(300, 4)).astype(np.float32)), rng.normal(0, 1, (300, 3))
+    covariances, sizes = unit_covariances(quats.T, scales.T)
+    np.testing.assert_allclose(1.0, covariances[:3].sum(axis=0), rtol=1e-12)
+    rotation, found = canonicalise_shape(*mean_axes(covariances))
+    again, zero = unit_covariances(rotation, found)
+    np.testing.assert_allclose(covariances, again, atol=1e-6)
+    np.testing.assert_allclose(0.0, zero, atol=1e-6)
+    np.testing.assert_allclose(np.sort(scales - sizes[:, None], axis=1), np.sort(found.T, axis=1), atol=1e-3)
+
+
+def digests(threads):
+    """Return SHA-256s of clusters by two kinds of search, and of files with both kinds of codebooks."""
+    points, weights = blobs(1500, 45, 150, 12.0)
+    made = []
+    for near_groups, scale in ((0, 1), (6, 1), (0, 300)):
+        scaled = points.astype(np.int32) * scale
+        entries, index = cluster(scaled, weights, 100, seed=7, iterations=3, near_groups=near_groups, threads=threads)
+        made.append(entries.tobytes() + index.tobytes())
+    rng, n = np.random.default_rng(4), 1200
+    normal = lambda *shape: rng.standard_normal((n, *shape)).astype(np.float32)  # noqa: E731
+    model = csplat.SplatModel(means=normal(3), quats=normalise_quats(normal(4)), scales=normal(3) - 4,
+        opacities=rng.random(n).astype(np.float32), sh0=normal(3), shN=normal(8, 3))  # fmt: skip
+
+    def matrices(size):
+        roots = rng.normal(size=(n, size, 3))
+        rows, columns = np.triu_indices(size)
+        return (roots @ roots.transpose(0, 2, 1) / 3)[:, rows, columns]
+
+    options = EncodeOptions(
+        sh_coding="codebook", codebook_size=64, shape_codebook_size=150, tile_splats=800, threads=threads
+    )
+    for importance in (Importance(rng.random(n), rng.random(n), matrices(8), matrices(6)), None):
+        result = encode_with_report(model, options, importance=importance)
+        assert result.report.options["codebook_size"]
+        assert result.report.options["shape_codebook_size"]
+        made.append(result.data)
+    return [hashlib.sha256(one).hexdigest() for one in made]
+
+
+@pytest.mark.slow
+def test_threads_of_csplat_and_blas_do_not_change_the_bytes():
+    # The threads of an OpenBLAS that is not found cannot be set.
+    code = f"import runpy; m = runpy.run_path({__file__!r}); m['kmeans']._openblas = lambda: None"
+    environment = {"OPENBLAS_NUM_THREADS": "2", "OMP_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(sys.path)}
+    command = [sys.executable, "-c", f"{code}; print(m['digests'](3))"]
+    other = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=True)
+    assert digests(1) == digests(2) == ast.literal_eval(other.stdout)
+
+
+@pytest.mark.slow
+def test_the_javascript_decoder_reads_shape_codebooks(make_model):
+    if shutil.which("node") is None:
+        absent("the JavaScript decoder needs Node.js, which is not installed")
+    model = few_shapes(make_model, 600, degree=2)
+    importance = seen_more(model)
+    with JsDecoder() as decoder:
+        for options in (
+            {"shape_escape_fraction": 0.3, "tile_splats": 250},
+            {"shape_escape_fraction": 0.0, "sh_coding": "codebook", "codebook_size": 16},
+        ):
+            result, _ = encoded(model, importance, shape_codebook_size=40, **options)
+            assert books(result.data)
+            assert ("decoded", "") == compared(answer(result.data), decoder.ask(result.data), "JavaScript"), options

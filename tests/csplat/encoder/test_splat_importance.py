@@ -1,0 +1,152 @@
+"""Tests of csplat.encoder.splat_importance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checked import encoded
+from codebooks_cases import exact, few_shapes, scene
+from quantisation_cases import COUNT, important, unequal
+
+from csplat.encoder import (
+    EncodeOptions,
+    Importance,
+    encode_with_report,
+)
+from csplat.encoder.coding_parameters import choose_parameters
+from csplat.encoder.kmeans import (
+    refine_by_metric,
+)
+from csplat.encoder.splat_importance import (
+    CLASSED_ATTRIBUTES,
+    ErrorMetric,
+    GaussNewtonBlocks,
+    apply_weight_floor,
+    rounding_errors,
+)
+from csplat.errors import InputError
+
+
+def test_errors_agree_with_the_matrices():
+    points, matrices, metric, _ = scene()
+    for rows in (slice(None), np.array([5, 3, 3])):
+        expected = exact(points[rows], matrices[rows], metric.weights[rows])
+        np.testing.assert_allclose(expected, metric.errors(points[rows], rows), rtol=1e-5)
+    expected = exact(points[:, :2], matrices[:, :2, :2], metric.weights)
+    np.testing.assert_allclose(expected, metric.first(2).errors(points[:, :2], slice(None)), rtol=1e-5)
+
+
+def test_entries_of_points_without_weight_do_not_move():
+    points, _, metric, entries = scene(50, 2, 1, 5)
+    silent = ErrorMetric(np.zeros(50, np.float32), np.zeros_like(metric.triangles))
+    moved, _ = refine_by_metric(points, silent, entries, np.arange(50) % 5, 1)
+    assert {tuple(row) for row in moved.reshape(len(moved), -1)} <= {tuple(row) for row in entries.reshape(5, -1)}
+
+
+def test_invalid_matrices_are_refused(make_model):
+    model = few_shapes(make_model, 200)
+    for bad in (np.ones((200, 20)), np.ones((199, 21)), np.ones((200, 21), int), np.full((200, 21), np.nan)):
+        importance = Importance(np.ones(200), None, None, bad)
+        with pytest.raises(InputError, match="shape matrices"):
+            encode_with_report(model, EncodeOptions(shape_codebook_size=4), importance=importance)
+
+
+@pytest.fixture
+def model(make_model):
+    return make_model(COUNT, 0)
+
+
+def test_twice_the_step_gives_four_times_the_error(model):
+    curvatures = unequal(model)
+    fine, coarse = (
+        rounding_errors(model, curvatures, choose_parameters(model, EncodeOptions(**options), importance_given=True))
+        for options in (
+            {"position_step": 0.01, "scale_step": 0.01, "sh0_step": 0.01, "quat_levels": 200, "opacity_levels": 200},
+            {"position_step": 0.02, "scale_step": 0.02, "sh0_step": 0.02, "quat_levels": 100, "opacity_levels": 100},
+        )
+    )
+    bright = model.opacities > 0.01
+    np.testing.assert_allclose(coarse[bright], 4.0 * fine[bright], rtol=1e-5)
+
+
+def test_classes_have_steps_of_their_own(model):
+    result, _ = encoded(model, important(model))
+    classes = result.report.options["classes"]
+    assert sum(classes["splats"]) == COUNT
+    assert len(classes["splats"]) == result.report.tile_count > 1
+    for name in CLASSED_ATTRIBUTES:
+        assert min(classes[name]) == (1 if name in ("opacities", "quats") else 0)
+    assert any(max(classes[name]) > 1 for name in CLASSED_ATTRIBUTES)
+    assert result.report.notes == ()
+
+
+def test_important_splats_have_smaller_errors(model):
+    importance = important(model)
+    result, decoded = encoded(model, importance, attribute_psnr=45)
+    source = model.select(result.source_index)
+    source, decoded = (replace(one, scales=np.sort(one.scales, axis=1)) for one in (source, decoded))
+    order = np.argsort(importance.blocks.means[result.source_index])
+    for name in ("means", "opacities", "scales", "sh0"):
+        errors = np.abs(getattr(decoded, name) - getattr(source, name)).reshape(COUNT, -1).mean(axis=1)
+        assert errors[order[-COUNT // 10 :]].mean() < 0.75 * errors[order[: COUNT // 10]].mean(), name
+
+
+def test_explicit_options_apply_to_all_classes(model):
+    result, _ = encoded(model, important(model), scale_step=0.01, opacity_levels=100, position_bits=12)
+    said = result.report.options
+    assert (said["scale_step"], said["opacity_levels"]) == (float(np.float32(0.01)), 100)
+    assert set(said["classes"]["scales"]) == set(said["classes"]["means"]) == {0}
+    assert set(said["classes"]["opacities"]) == {1}
+    assert max(said["classes"]["sh0"]) > 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"max_classes": 1}, {"shape_codebook_size": 16}])
+def test_one_class_equals_an_encoding_without_blocks(model, options):
+    with_them, without = important(model), Importance(np.ones(COUNT))
+    assert encoded(model, with_them, **options)[0].data == encoded(model, without, **options)[0].data
+
+
+def test_small_scenes_equal_blocks_and_the_preset_fast_have_one_class(model):
+    few = model.select(slice(200))
+    zeros = GaussNewtonBlocks(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
+    for one, importance, options in (
+        (few, important(few), {}),
+        (model, Importance(np.ones(COUNT), blocks=zeros), {}),
+        (model, important(model), {"preset": "fast"}),
+    ):
+        result = encode_with_report(one, EncodeOptions(**options), importance=importance)
+        assert "classes" not in result.report.options
+    result = encode_with_report(model, EncodeOptions(preset="fast", max_classes=2), importance=important(model))
+    assert len(result.report.options["classes"]["splats"]) == 2
+
+
+def test_outliers_get_tiles_of_their_own(model):
+    sh0 = model.sh0.copy()
+    sh0[5] = 3e12
+    exploded = replace(model, sh0=sh0)
+    result, decoded = encoded(exploded, important(exploded))
+    place = np.argsort(result.source_index)
+    errors = np.abs(decoded.sh0[place] - sh0).max(axis=1)
+    assert np.delete(errors, 5).max() < 5.0  # the step of the coarsest class, not that of 3e12
+
+
+@pytest.mark.slow
+def test_scenes_and_steps_of_any_size_are_encoded(model):
+    for factor in (1e-30, 1e22, 1e37):
+        scaled = replace(model, means=(model.means * np.float32(factor)).astype(np.float32))
+        encoded(scaled, important(scaled))
+    result, _ = encoded(model, important(model), position_step=1e200)
+    assert result.report.options["position_step"] == 1e200
+
+
+def test_measured_weights_have_a_floor(model):
+    measured = np.zeros((COUNT, 2))
+    measured[:10] = 1.0
+    floored = apply_weight_floor(measured, model)
+    assert (floored >= measured).all()
+    assert floored[10:].min() > 0.0
+    np.testing.assert_allclose(floored[10:, 0], apply_weight_floor(measured[:, 0], model)[10:])
+    assert floored[10:].mean() < 0.6 * measured.mean()

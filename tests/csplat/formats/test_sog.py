@@ -1,0 +1,607 @@
+"""SOG, versions 1 and 2, in folders, zips and levels: files built byte by byte, and round trips."""
+
+import io
+import json
+import os
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checked import flipped, refusals
+from tables import failures
+
+import csplat
+from csplat.errors import InputError
+from csplat.formats import detect_format, open_scene, write_levels
+from csplat.formats.sog.sog_reader import read_leaf_numbers
+from csplat.model import SplatModel, normalise_quats
+from csplat.scene_source import source_from_model
+from csplat_conformance.manifest import VECTORS
+from csplat_conformance.validator import validate
+from csplat_tools.convert_file import Filters, convert_file
+from csplat_tools.encode_file import encode_file
+
+Image = pytest.importorskip("PIL.Image", reason="SOG is pictures")
+
+
+COUNT = 5
+
+
+RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
+
+
+def webp(pixels, *, lossless=True):
+    buffer = io.BytesIO()
+    image = Image.fromarray(pixels, "RGBA" if pixels.shape[2] == 4 else "RGB")
+    image.save(buffer, "WEBP", lossless=lossless, exact=True)
+    return buffer.getvalue()
+
+
+def pixels(seed, shape=(4, 4)):
+    return np.random.default_rng(seed).integers(0, 256, (*shape, 4), np.uint8)
+
+
+def splats(version=2, sh=True):
+    """Return the metadata and images of a SOG of five splats."""
+    names = ("means_l", "means_u", "quats", "scales", "sh0")
+    pictures = {f"{name}.webp": pixels(seed) for seed, name in enumerate(names)}
+    pictures["quats.webp"][..., 3] = 252 + np.arange(16).reshape(4, 4) % 4
+    meta = {
+        "means": {"mins": [-1, 0, 2.5], "maxs": [1, 0, 3], "files": ["means_l.webp", "means_u.webp"]},
+        "scales": {"files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
+        "sh0": {"files": ["sh0.webp"]},
+    }
+    if version == 2:
+        meta |= {"version": 2, "count": COUNT, "model": "antialiased"}
+        meta["scales"]["codebook"] = [index / 16 - 12 for index in range(256)]
+        meta["sh0"]["codebook"] = [index / 64 - 2 for index in range(256)]
+    else:
+        meta["means"]["shape"] = [COUNT, 3]
+        meta["scales"] |= {"mins": [-9, -8, -7], "maxs": [-3, -2, -1]}
+        meta["sh0"] |= {"mins": [-2, -1, 0, -5], "maxs": [2, 1, 3, 5]}
+    if sh:
+        pictures["palette.webp"] = pixels(7, (1, 192))
+        pictures["labels.webp"] = pixels(8)
+        pictures["labels.webp"][..., :2] = [63, 0]
+        meta["shN"] = {"files": ["palette.webp", "labels.webp"]}
+        if version == 2:
+            meta["shN"] |= {"count": 64, "bands": 1, "codebook": [index / 128 - 1 for index in range(256)]}
+        else:
+            meta["shN"] |= {"mins": -0.5, "maxs": 0.5}
+    return meta, pictures
+
+
+def files_of(meta, pictures):
+    return {"meta.json": json.dumps(meta).encode(), **{name: webp(one) for name, one in pictures.items()}}
+
+
+def zipped(path, files, folder="", how=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", how) as archive:
+        for name, data in files.items():
+            archive.writestr(folder + name, data)
+    return path
+
+
+def foldered(path, files):
+    for name, data in files.items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(data)
+    return path
+
+
+def means_of(pictures):
+    low, high = (pictures[f"means_{end}.webp"].reshape(-1, 4)[:COUNT, :3].astype(float) for end in "lu")
+    logs = [-1, 0, 2.5] + (low + 256 * high) / 65535 * [2, 0, 0.5]
+    return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_both_versions_are_read(tmp_path, version):
+    meta, pictures = splats(version)
+    model = csplat.read(zipped(tmp_path / "a.sog", files_of(meta, pictures)))
+    flat = {name: one.reshape(-1, 4)[:COUNT].astype(int) for name, one in pictures.items() if name != "palette.webp"}
+    scales, colours, palette = flat["scales.webp"][:, :3], flat["sh0.webp"], pictures["palette.webp"][0, -3:, :3]
+    if version == 2:
+        scales, sh0, shN = scales / 16 - 12, colours[:, :3] / 64 - 2, palette / 128 - 1
+        opacities = colours[:, 3] / 255
+    else:
+        scales, shN = scales / 255 * 6 + [-9, -8, -7], palette / 255 - 0.5
+        sh0 = colours[:, :3] / 255 * [4, 2, 3] - [2, 1, 0]
+        opacities = 1 / (1 + np.exp(5 - colours[:, 3] / 25.5))
+    np.testing.assert_allclose(model.means, means_of(pictures), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(model.scales, scales, rtol=1e-6)
+    np.testing.assert_allclose(model.sh0, sh0, atol=1e-6)
+    np.testing.assert_allclose(model.opacities, opacities, rtol=1e-5)
+    np.testing.assert_allclose(model.shN[[0, 4]], [shN, shN], atol=1e-6)
+    three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # x of splat 1 is omitted
+    quat = np.array([three[0], np.sqrt(max(0, 1 - (three**2).sum())), *three[1:]])
+    np.testing.assert_allclose(model.quats[1], quat / np.linalg.norm(quat), atol=1e-6)
+    assert (version == 2, False) == (model.antialiased, model.flat)
+
+
+def test_folder_json_and_zip_give_the_same_scene(tmp_path):
+    files = files_of(*splats())
+    folder = foldered(tmp_path / "a", files)
+    paths = [folder, folder / "meta.json", zipped(tmp_path / "b", files, "inside/", zipfile.ZIP_DEFLATED)]
+    models = [csplat.read(path) for path in paths]
+    assert ["sog"] * 3 == [detect_format(path).name for path in paths]
+    assert all((one.means == models[0].means).all() and (one.shN == models[0].shN).all() for one in models)
+
+
+def test_tags_of_rotations_and_the_first_entry_of_a_codebook_may_be_missing(tmp_path):
+    meta, pictures = splats()
+    pictures["quats.webp"][0, 0, 3] = 17
+    meta["scales"]["codebook"][0] = None
+    pictures["scales.webp"][:] = 0
+    with open_scene(zipped(tmp_path / "a.sog", files_of(meta, pictures))) as scene:
+        assert [1, 0, 0, 0] == scene.model().quats[0].tolist()
+        assert [("zero-quats", 1)] == [(one.id, one.count) for one in scene.findings]
+        np.testing.assert_allclose(scene.model().scales, 1 / 16 - 12 - 254 / 16 / 255, rtol=1e-6)  # extrapolated
+
+
+def levels(tmp_path, **changes):
+    """Write a streamed SOG: two files of the finest level, a coarser one, and an environment."""
+    files = {}
+    for number, name in enumerate(("0_0", "0_1", "1_0", "env")):
+        meta, pictures = splats(sh=number == 1)
+        meta["sh0"]["codebook"] = [float(number)] * 256
+        files |= {f"{name}/{part}": data for part, data in files_of(meta, pictures).items()}
+    one = {"0": {"file": 0, "offset": 0, "count": 5}, "1": {"file": 2, "offset": 0, "count": 3}}
+    two = {"0": {"file": 1, "offset": 1, "count": 3}, "1": {"file": 2, "offset": 3, "count": 2}}
+    meta = {
+        "lodLevels": 2, "environment": "env/meta.json",
+        "filenames": [f"{name}/meta.json" for name in ("0_0", "0_1", "1_0")],
+        "tree": {"children": [{"lods": one}, {"lods": two}]}, **changes,
+    }  # fmt: skip
+    return foldered(tmp_path / "a", {**files, "lod-meta.json": json.dumps(meta).encode()})
+
+
+def test_leaves_are_numbered_in_the_order_of_the_splats(tmp_path):
+    path = levels(tmp_path)
+    assert [0] * 5 + [1] * 3 + [2] * 5 == read_leaf_numbers(path).tolist()
+    assert [0] * 3 + [1] * 2 + [2] * 5 == read_leaf_numbers(path / "lod-meta.json", 1).tolist()
+    with pytest.raises(InputError, match="it is not streamed SOG"):
+        read_leaf_numbers(foldered(tmp_path / "b", files_of(*splats())))
+
+
+@pytest.mark.slow
+def test_levels_of_streamed_sog_become_nodes_of_a_file(tmp_path):
+    path, out = levels(tmp_path), tmp_path / "out.csplat"
+    encode_file(str(path), str(out), csplat.EncodeOptions(), levels=1)
+    assert () == tuple(validate(out.read_bytes()).violations)
+    with csplat.open(out) as file, open_scene(path, level=1) as coarse:
+        assert [(0, 3, 5), (0, 4, 3), (0, None, 5), (1, None, 3), (1, None, 2)] == [
+            (node.level, node.parent, node.splat_count) for node in file.nodes
+        ]
+        assert coarse.count == len(file.read(tiles=file.cut(level=1)))
+        assert all(node.error > 0 for node in file.nodes if node.level)
+
+
+def test_a_part_without_a_level_uses_its_nearest(tmp_path):
+    one = {"1": {"file": 0, "offset": 0, "count": 5}}
+    two = {"0": {"file": 1, "offset": 1, "count": 3}}
+    path = levels(tmp_path, tree={"children": [{"lods": one}, {"lods": two}]})
+    for level in (0, 1):
+        with open_scene(path, level=level) as scene:
+            assert [0] * 5 + [1] * 3 + [3] * 5 == scene.model().sh0[:, 0].tolist()
+
+
+def test_the_finest_level_is_read_by_default(tmp_path):
+    path = levels(tmp_path)
+    for place in (path, path / "lod-meta.json"):
+        with open_scene(place) as scene:
+            model = scene.model()
+            assert (13, 1, True) == (scene.count, model.sh_degree, model.antialiased)
+            assert [0] * 5 + [1] * 3 + [3] * 5 == model.sh0[:, 0].tolist()
+            assert not model.shN[:5].any()
+            assert model.shN[5:8].any()
+            assert (13, 10) == scene.levels
+        with open_scene(place, level=1) as scene:
+            assert [2] * 5 + [3] * 5 == scene.model().sh0[:, 0].tolist()
+            assert (13, 10) == scene.levels
+    with pytest.raises(InputError, match="level is 2, expected 0 to 1"), open_scene(path, level=2):
+        pass
+    (path / "env" / "meta.json").unlink()
+    with pytest.raises(InputError, match=r"there is no env/meta\.json"):
+        csplat.read(path)
+
+
+def all_of(folder):
+    """Return all files of a folder by name."""
+    return {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
+
+
+@pytest.mark.parametrize("within", ["", "a/b/"])
+def test_levels_in_a_zip_equal_those_in_a_folder(tmp_path, within):
+    folder = levels(tmp_path)
+    junk = {"__MACOSX/meta.json": b"", "__MACOSX/0_0/._meta.json": b""}
+    path = zipped(tmp_path / "a.zip", {within + name: data for name, data in all_of(folder).items()} | junk)
+    for level in (0, 1):
+        with open_scene(path, level=level) as scene, open_scene(folder, level=level) as expected:
+            assert (expected.count, expected.levels) == (scene.count, scene.levels)
+            assert np.array_equal(expected.model().means, scene.model().means)
+
+
+def test_zips_of_several_scenes_and_of_other_programs_are_refused(tmp_path):
+    folder, other = levels(tmp_path), files_of(*splats())
+    first = (folder / "lod-meta.json").read_bytes()
+    foreign = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
+    not_sog = "meta.json is not the one of SOG, which has means, quats, scales, sh0; .*"
+    within = {"lod-meta.json": first.replace(b"0_0/meta.json", b"0_0.sog"), "0_0/meta.json": None}
+    scene = {f"a/{name}": data for name, data in other.items()}
+    for files, message in (
+        ({f"{one}/{name}": data for one in ("one", "two") for name, data in other.items()},
+            r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
+        ({f"b/{name}": data for name, data in other.items()} | all_of(folder), r"2 scenes, .*b/meta.json, lod-meta"),
+        (all_of(folder) | {"lod-meta.json": within["lod-meta.json"]}, r"0_0/meta.json, lod-meta.json"),
+        (all_of(folder) | within, r"0_0.sog is a zip within a zip: unpack a.zip"),
+        ({"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}, "2 scenes"),
+        (scene | {"scene.ply": b"ply"}, r"it contains 2 scenes, expected one \(a/meta.json, scene.ply\)"),
+        (foreign, not_sog + r"a zip that contains room\.ply: unzip it"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            csplat.read(zipped(tmp_path / "a.zip", {name: data for name, data in files.items() if data is not None}))
+    report = []
+    assert COUNT == len(csplat.read(zipped(tmp_path / "a.zip", {**scene, "a/b/scene.PLY": b"ply"}), report=report))
+    assert [("other-scenes", "note", "the zip also holds a/b/scene.PLY: not read")] == [
+        (one.id, one.kind, one.text) for one in report
+    ]
+    with pytest.raises(InputError, match=not_sog + r"a folder, not a scene: name room\.ply"):
+        csplat.read(foldered(tmp_path / "foreign", foreign))
+    foldered(folder, other)
+    with pytest.raises(InputError, match=r"lod-meta.json, meta.json\): name one of these files"):
+        csplat.read(folder)
+    assert COUNT == len(csplat.read(folder / "meta.json"))
+    assert 13 == len(csplat.read(folder / "lod-meta.json"))
+
+
+def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
+    folder = levels(tmp_path, filenames=[rf"{name}\meta.json" for name in ("0_0", "0_1", "1_0")])
+    for path in (folder, zipped(tmp_path / "a.zip", all_of(folder))):
+        report = []
+        assert 13 == len(csplat.read(path, report=report))
+        assert ["backslashes in filenames, read as slashes"] == [one.text for one in report]
+    files = files_of(*splats())
+    expected = csplat.read(zipped(tmp_path / "a.sog", files))
+    loud = {name.upper() if name == "meta.json" else name: data for name, data in files.items()}
+    for name, found, folder, message in (
+        ("b.zip", files, "scene\\", "backslashes in the names of the zip, read as slashes"),
+        ("c.sog", loud, "", "META.JSON is read as meta.json"),
+        ("d.zip", loud, "scene/", "META.JSON is read as meta.json"),
+    ):
+        report = []
+        model = csplat.read(zipped(tmp_path / name, found, folder), report=report)
+        assert np.array_equal(expected.means, model.means)
+        assert [("zip-names", "note", message)] == [(one.id, one.kind, one.text) for one in report]
+    with pytest.raises(InputError, match="2 scenes"):
+        csplat.read(zipped(tmp_path / "e.sog", {**files, "META.JSON": files["meta.json"]}))
+    two = {**{name: data for name, data in files.items() if name != "sh0.webp"}, "SH0.webp": b"", "Sh0.webp": b""}
+    with pytest.raises(InputError, match=r"SH0\.webp and Sh0\.webp would both be sh0\.webp"):
+        csplat.read(zipped(tmp_path / "f.sog", two))
+
+
+@pytest.mark.parametrize(("changes", "message"), [
+    ({"version": 2}, "version 2 of streamed"),
+    ({"tree": {"lods": 3}}, "not an object"),
+    ({"filenames": ["../a", "b", "c"]}, "outside"),
+    ({"filenames": []}, "integer from 0"),
+    ({"tree": {"children": 3}}, "not a list"),
+    ({"tree": {"lods": {"0": {"file": 0, "offset": 4, "count": 2}}}}, "up to 6"),
+    ({"tree": {"lods": {"x": {"file": 0, "offset": 4, "count": 2}}}}, "level is 'x'"),
+    ({"tree": {"children": [{"lods": {"0": {"file": 0, "offset": 0, "count": 2}}}] * 2}}, "meta.json twice"),
+])  # fmt: skip
+def test_inconsistent_levels_are_refused(tmp_path, changes, message):
+    with pytest.raises(InputError, match=message):
+        csplat.read(levels(tmp_path, **changes))
+
+
+def changed(path, value, version=2, **pictures):
+    meta, more = splats(version)
+    place = meta
+    for key in path[:-1]:
+        place = place[key]
+    if path and value is None:
+        del place[path[-1]]
+    elif path:
+        place[path[-1]] = value
+    return {**files_of(meta, more), **{f"{name}.webp": data for name, data in pictures.items()}}
+
+
+BAD = {
+    "a later version": (changed(["version"], 3), "version 3"),
+    "more splats than pixels": (changed(["count"], 17), "pixels"),
+    "more splats than bytes can hold": (changed(["count"], 200_000_000), "declares 200,000,000 splats"),
+    "a huge number": (changed(["count"], 10**400), "an integer has 401 digits"),
+    "no integer": (changed(["count"], 5.0), "expected an integer"),
+    "a truth": (changed(["count"], True), "expected an integer"),
+    "no count": (changed(["count"], None), "count is missing"),
+    "no files": (changed(["quats", "files"], []), "quats files has 0 names"),
+    "files of no names": (changed(["quats", "files"], [7]), "not a string"),
+    "a way out": (changed(["quats", "files"], ["../quats.webp"]), "outside"),
+    "a part that is absent": (changed(["quats", "files"], ["q.webp"]), "no q"),
+    "two bounds": (changed(["means", "mins"], [1, 2]), "means mins has 2 numbers"),
+    "bounds of no end": (changed(["means", "mins"], [0, 0, float("inf")]), "finite"),
+    "bounds of a text": (changed(["means", "mins"], [0, 0, "0"]), "finite"),
+    "places beyond float32": (changed(["means", "maxs"], [0, 0, 300]), "float32"),
+    "bounds the wrong way round": (changed(["means", "mins"], [9, 9, 9]), "means has mins 9, expected at most maxs"),
+    "bounds of version 1 the wrong way round": (changed(["scales", "mins"], [9, 9, 9], 1), "scales has mins 9"),
+    "a pointer for a picture": (changed([], 0, quats=b"version https://git-lfs.github.com/spec/v1\noid"),
+        "quats.webp is a pointer of"),
+    "a list for an object": (changed(["means"], []), "means mins is missing"),
+    "a short codebook": (changed(["scales", "codebook"], [1.0]), "codebook is shorter"),
+    "no codebook": (changed(["sh0", "codebook"], []), "codebook has 0 numbers"),
+    "a short codebook of SH": (changed(["shN", "codebook"], [1.0]), "beyond the codebook"),
+    "SH of degree 4": (changed(["shN", "bands"], 4), "from 0 to 3"),
+    "SH of another degree": (changed(["shN", "bands"], 2), "192 x 1 pixels"),
+    "a small palette": (changed(["shN", "count"], 63), "SH label 63 in a palette of 63"),
+    "a large palette": (changed(["shN", "count"], 65), "192 x 1 pixels"),
+    "pictures of two sizes": (changed([], 0, quats=webp(pixels(1, (8, 4)))), "4 x 8 pixels"),
+    "far too many pixels": (changed([], 0, means_l=webp(np.zeros((900, 900, 4), np.uint8))), "900 x 900"),
+    "a text for a picture": (changed([], 0, means_l=b"no picture"), "means_l.webp is not an image"),
+    "a lossy picture": (changed([], 0, scales=webp(pixels(3), lossless=False)),
+        "scales.webp is a lossy WebP, expected"),
+    "half a picture": (changed([], 0, means_l=webp(pixels(0))[:50]), "means_l.webp is a WebP that is damaged"),
+    "brackets": (changed([], 0) | {"meta.json": b"[" * 100_000}, "nested too deep"),
+    "no JSON": (changed([], 0) | {"meta.json": b"{"}, "not JSON"),
+    "not an object": (changed([], 0) | {"meta.json": b"3"}, "is missing"),
+    "no UTF-8": (changed([], 0) | {"meta.json": b"\xff\xff\xff"}, "not JSON"),
+}  # fmt: skip
+
+
+def test_inconsistent_files_are_refused(tmp_path):
+    def check(case):
+        files, message = case
+        with pytest.raises(InputError, match=rf"^a\.sog: .*{message}"):
+            csplat.read(zipped(tmp_path / "a.sog", files))
+
+    assert [] == failures(BAD, check)
+    path = tmp_path / "a.sog"
+    data = path.read_bytes()
+    for size in (len(data) // 2, len(data) - 5):
+        path.write_bytes(data[:size])
+        with pytest.raises(InputError, match=r"a\.sog: a damaged zip: its end is missing, .*: copy or download it aga"):
+            csplat.read(path)
+    bomb = files_of(*splats()) | {"meta.json": b" " * 30_000_000}
+    with pytest.raises(InputError, match="unpacked size of 30,000,000"):
+        csplat.read(zipped(path, bomb, how=zipfile.ZIP_DEFLATED))
+
+
+def test_damage_is_refused_or_read(tmp_path):
+    files = files_of(*splats(1, sh=False))
+    path, folder = zipped(tmp_path / "a.sog", files), foldered(tmp_path / "b", files)
+    whole, picture = path.read_bytes(), files["sh0.webp"]
+    damaged = [whole[:size] for size in range(0, len(whole), 97)] + [*flipped(whole, range(0, len(whole), 31))]
+    messages = refusals(path, damaged, lambda path: csplat.read(path, "sog"))
+    assert sum(map(bool, messages)) > len(damaged) / 2
+    assert all(not one or (one.startswith("a.sog") and "\n" not in one) for one in messages)
+    damaged = flipped(picture, range(0, len(picture), 5), lambda at: 1 << at // 5 % 8)
+    messages = refusals(folder / "sh0.webp", damaged, lambda _: csplat.read(folder))
+    assert all(not one or one.startswith("b: sh0.webp") for one in messages)
+
+
+def assert_within_a_step(model, back, means):
+    """Assert that splats in the same order differ by the steps of SOG, in `means` by this tolerance."""
+    assert np.abs(model.means - back.means).max() < means
+    assert np.abs(model.opacities - back.opacities).max() <= 0.5 / 255 + 1e-7
+    assert np.abs((model.quats * back.quats).sum(axis=1)).min() > 1 - 4e-5
+    for name, most in (("scales", 0.02), ("sh0", 0.02), ("shN", 0.6)):
+        assert np.sqrt(np.mean((getattr(model, name) - getattr(back, name)) ** 2)) < most
+
+
+def test_written_files_read_back_within_a_step(tmp_path, make_model):
+    model = make_model(600, 1, antialiased=True)
+    csplat.write(tmp_path / "a.sog", model)
+    back = csplat.read(tmp_path / "a.sog")
+    assert back.antialiased
+    rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
+    assert 600 == len(set(rows))
+    # Half of the largest step: 65,535 steps divide the logarithms.
+    reach = np.abs(model.means.astype(float)).max()
+    assert_within_a_step(model.select(rows), back, np.log1p(reach) / 65535 * (1 + reach))
+
+
+def test_zip_and_folder_have_the_same_bytes(tmp_path, make_model):
+    model = make_model(300, 2, flat=True)
+    for name in ("a.sog", "b.sog", "c/meta.json"):
+        csplat.write(tmp_path / name, model)
+    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
+    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
+        assert {name: archive.read(name) for name in archive.namelist()} == {
+            one.name: one.read_bytes() for one in (tmp_path / "c").iterdir()
+        }
+    assert csplat.read(tmp_path / "c").flat
+
+
+@pytest.mark.parametrize(("count", "degree", "fields"), [
+    (0, 3, {}), (1, 0, {}), (1, 3, {}), (17, 1, {}), (3, 0, {"means": np.full((3, 3), 2.5, np.float32)}),
+])  # fmt: skip
+def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree, fields):
+    model = make_model(count, degree, **fields)
+    csplat.write(tmp_path / "a.sog", model)
+    back = csplat.read(tmp_path / "a.sog")
+    assert (count, degree if count else 0) == (len(back), back.sh_degree)
+    for name in ("means", "scales", "sh0", "shN") if count else ():
+        wanted, found = (np.sort(getattr(one, name).reshape(count, -1), 0) for one in (model, back))
+        np.testing.assert_allclose(wanted, found, atol=1e-3 if name == "shN" else 1e-4)
+
+
+SHAPES = {"quats": (4,), "scales": (3,), "sh0": (3,), "shN": (3, 3)}
+
+
+SIDE = 64  # positions are integers below, so that a splat is known by its place
+
+
+def places_of(model):
+    return np.rint(model.means).astype(int) @ [1, SIDE, SIDE**2]
+
+
+@pytest.fixture(scope="module")
+def streamed(tmp_path_factory):
+    """Three levels of a scene, the coarsest without splats in three quarters of space, and their streamed SOG."""
+    rng, count = np.random.default_rng(8), 18_000
+    cells = rng.permutation(SIDE**3)[:count]
+    means = np.stack([cells % SIDE, cells // SIDE % SIDE, cells // SIDE**2], axis=1).astype(np.float32)
+    normal = {name: rng.standard_normal((count, *shape), np.float32) for name, shape in SHAPES.items()}
+    normal |= {"quats": normalise_quats(normal["quats"]), "scales": normal["scales"] - 4}
+    finest = SplatModel(means=means, opacities=rng.random(count, np.float32), antialiased=True, **normal)
+    levels = [finest, finest.select(slice(0, 4_000)), finest.select((means[:, :2] < SIDE / 4).all(axis=1))]
+    path = tmp_path_factory.mktemp("streamed") / "scene" / "lod-meta.json"
+    write_levels(path, [source_from_model(one) for one in levels])
+    return path, levels
+
+
+def leaves_of(node):
+    """Return the leaves of a tree; each other node has two children, and its bounds are theirs."""
+    if "lods" in node:
+        return [node]
+    assert 2 == len(node["children"])
+    for side, extreme in (("min", min), ("max", max)):
+        low, high = (one["bound"][side] for one in node["children"])
+        assert node["bound"][side] == [extreme(pair) for pair in zip(low, high, strict=True)]
+    return [leaf for child in node["children"] for leaf in leaves_of(child)]
+
+
+def test_levels_of_streamed_sog_read_back_within_a_step(streamed):
+    path, levels = streamed
+    for number, level in enumerate(levels):
+        with open_scene(path.parent, level=number) as scene:
+            back = scene.model()
+        assert (tuple(map(len, levels)), 1, True) == (scene.levels, back.sh_degree, back.antialiased)
+        wanted, found = (one.select(np.argsort(places_of(one))) for one in (level, back))
+        assert np.array_equal(places_of(wanted), places_of(found))
+        assert_within_a_step(wanted, found, SIDE * np.log1p(SIDE) / 65535)
+
+
+def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
+    path, levels = streamed
+    meta = json.loads(path.read_text())
+    leaves = leaves_of(meta["tree"])
+    counts = list(map(len, levels))
+    assert (1, 3, counts, sum(counts)) == (meta["version"], meta["lodLevels"], meta["counts"], meta["count"])
+    assert {"lod-meta.json", "0_0", "1_0", "2_0"} == {one.name for one in path.parent.iterdir()}
+    assert 2 == len(leaves)
+    assert all(5_000 < leaf["lods"]["0"]["count"] <= 1 << 14 for leaf in leaves)
+    assert 0 in [leaf["lods"]["2"]["count"] for leaf in leaves]
+    for number in range(3):
+        runs = [leaf["lods"][str(number)] for leaf in leaves]
+        assert {number} == {run["file"] for run in runs}
+        assert np.cumsum([0, *(run["count"] for run in runs)]).tolist() == [
+            *(run["offset"] for run in runs),
+            counts[number],
+        ]
+        chunk = csplat.read(path.parent / meta["filenames"][number])
+        for leaf, run in zip(leaves, runs, strict=True):
+            splats = chunk.select(slice(run["offset"], run["offset"] + run["count"]))
+            # At least the centres; a large splat reaches further.
+            assert (splats.means >= np.array(leaf["bound"]["min"]) - 0.01).all()
+            assert (splats.means <= np.array(leaf["bound"]["max"]) + 0.01).all()
+    reach = max(np.exp(level.scales).max() for level in levels)
+    assert -reach <= min(meta["tree"]["bound"]["min"]) < 0
+
+
+@pytest.mark.slow
+def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
+    count = 530_000
+    csplat.write(tmp_path / "a" / "lod-meta.json", make_model(count, 0))
+    meta = json.loads((tmp_path / "a" / "lod-meta.json").read_text())
+    assert ["0_0/meta.json", "0_1/meta.json"] == meta["filenames"]
+    sizes = [0, 0]
+    for leaf in leaves_of(meta["tree"]):
+        assert sizes[leaf["lods"]["0"]["file"]] == leaf["lods"]["0"]["offset"]
+        sizes[leaf["lods"]["0"]["file"]] += leaf["lods"]["0"]["count"]
+    assert count == sum(sizes)
+    assert abs(sizes[0] - sizes[1]) < 2 << 14
+    with open_scene(tmp_path / "a") as scene:
+        assert count == sum(map(len, scene.blocks()))
+
+
+def test_splats_at_one_point_are_one_leaf(tmp_path, make_model):
+    model = make_model(17_000, 0, means=np.full((17_000, 3), 2.5, np.float32))
+    csplat.write(tmp_path / "a" / "lod-meta.json", model)
+    assert "lods" in json.loads((tmp_path / "a" / "lod-meta.json").read_text())["tree"]
+    assert 17_000 == len(csplat.read(tmp_path / "a"))
+
+
+def test_all_levels_of_a_file_are_converted(tmp_path):
+    source, out = RICH, tmp_path / "a" / "lod-meta.json"
+    made = convert_file(str(source), str(out), filters=Filters(scale=2.0))
+    assert len(made.levels) > 1
+    assert () == made.findings
+    for number, count in enumerate(made.levels):
+        with csplat.open(source) as file, open_scene(out, level=number) as scene:
+            cut, back = file.read(tiles=file.cut(level=number)), scene.model()
+        assert count == len(cut) == len(back)
+        np.testing.assert_allclose(np.sort(2 * cut.means, axis=0), np.sort(back.means, axis=0), rtol=1e-3, atol=1e-3)
+    coarser = convert_file(str(source), str(tmp_path / "b" / "lod-meta.json"), level=1)
+    assert made.levels[1:] == coarser.levels
+    with pytest.raises(InputError, match="floaters cannot be dropped from several levels"):
+        convert_file(str(source), str(tmp_path / "c" / "lod-meta.json"), filters=Filters(drop_floaters=True))
+    with pytest.raises(InputError, match="which has one level, found 2"), open_scene(source) as scene:
+        write_levels(tmp_path / "d.ply", [scene, scene])
+    assert {"a", "b"} == {one.name for one in tmp_path.iterdir()}
+
+
+def test_streamed_sog_replaces_only_streamed_sog(tmp_path, make_model):
+    path = tmp_path / "a" / "lod-meta.json"
+    with pytest.raises(InputError, match="no splats"):
+        csplat.write(path, make_model(0, 0))
+    (tmp_path / "a").mkdir()
+    csplat.write(path, make_model(20, 1))  # an empty folder
+    csplat.write(path, make_model(10, 0))
+    assert 10 == len(csplat.read(path))
+    with pytest.raises(InputError, match="is in the folder of"):
+        convert_file(str(path.parent / "0_0"), str(path))
+    (tmp_path / "a" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"a contains notes\.txt, and a new folder replaces it: name another"):
+        csplat.write(path, make_model(10, 0))
+    assert 10 == len(csplat.read(path))
+
+
+def test_a_failed_write_of_streamed_sog_leaves_the_older_one(tmp_path, make_model):
+    path = tmp_path / "a" / "lod-meta.json"
+    csplat.write(path, make_model(10, 0))
+    scene = source_from_model(make_model(20, 0))
+    reads = []
+
+    def blocks():
+        reads.append(1)
+        yield from scene.blocks()
+        if len(reads) == 3:
+            raise InputError("the disk was removed")
+
+    for target in (path, tmp_path / "b" / "lod-meta.json"):
+        reads.clear()
+        with pytest.raises(InputError, match="was removed"):
+            write_levels(target, [replace(scene, blocks=blocks)])
+    assert ["a"] == [one.name for one in tmp_path.iterdir()]
+    assert 10 == len(csplat.read(path))
+
+
+def test_real_files_are_read(data_dir):
+    for name, count, degree in (("angel.sog", 71_359, 0), ("statue", 289_444, 3)):
+        with open_scene(data_dir / "sog" / name) as scene:
+            assert (count, degree) == (scene.count, scene.metadata_model.sh_degree)
+            assert count == sum(map(len, scene.blocks()))
+
+
+@pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
+def test_parts_of_a_folder_are_webp_within_it(tmp_path):
+    folder = foldered(tmp_path / "scene", files_of(*splats()))
+    part, inside = folder / "sh0.webp", folder / "inside" / "sh0.webp"
+    inside.parent.mkdir()
+    part.rename(inside)
+    part.symlink_to("inside/sh0.webp")  # a link within the folder is followed
+    assert COUNT == len(csplat.read(folder))
+    inside.rename(tmp_path / "secret")
+    for target in ("../secret", str(tmp_path / "secret"), "inside/../../secret", "sh0.webp"):
+        part.unlink()
+        part.symlink_to(target)
+        with pytest.raises(InputError, match=r"a link that leads out of it|cannot be read|there is no sh0"):
+            csplat.read(folder)
+    part.unlink()
+    for data, title in ((b"%!PS-Adobe-3.0 EPSF-3.0\n", r"PostScript \(EPS\)"), (b"\x89PNG\r\n\x1a\n", "a PNG")):
+        part.write_bytes(data)
+        with pytest.raises(InputError, match=rf"scene: sh0\.webp is {title}, .*expected WebP"):
+            csplat.read(folder)

@@ -1,0 +1,343 @@
+"""PLY: columns, headers, comments and doubles, read and written; refusals; a limit of memory."""
+
+import gzip
+import io
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from checked import flipped, refusals
+from hypothesis import given
+from hypothesis import strategies as st
+from ply_cases import ARRAYS, assert_same_scene, columns_of, header_of
+from tables import failures
+
+from csplat import decode, encode
+from csplat.errors import InputError
+from csplat.ply import read_ply, write_ply
+from csplat.ply.columns import LOGIT_OF_0, LOGIT_OF_1, alpha_of_logits, logits_of_alpha
+from csplat.training_record import TrainingRecord
+
+
+def write_rows(path, names, rows, *, kind="binary_little_endian", comments=(), after=b""):
+    """Write a PLY of float columns without csplat's writer."""
+    lines = ["ply", f"format {kind} 1.0", *(f"comment {one}" for one in comments)]
+    lines += [f"element vertex {len(rows)}", *(f"property float {name}" for name in names)]
+    data = "\n".join([*lines, "end_header\n"]).encode()
+    rows = np.asarray(rows, np.float32).reshape(len(rows), len(names))
+    if kind == "ascii":
+        body = "".join(" ".join(f"{float(v)!r}" for v in row) + "\n" for row in rows).encode()
+    else:
+        body = rows.astype("<f4" if "little" in kind else ">f4").tobytes()
+    path.write_bytes(data + body + after)
+
+
+def written(path, degree, count=7, **options):
+    """Write a PLY of random rows; return its columns and rows."""
+    names = columns_of(degree)
+    rows = random_rows(names, count)
+    write_rows(path, names, rows, **options)
+    return names, rows
+
+
+def random_rows(names, count=7, seed=0):
+    rows = np.random.default_rng(seed).standard_normal((count, len(names))).astype(np.float32)
+    rows[:, [i for i, name in enumerate(names) if name in ("nx", "ny", "nz")]] = 0
+    return rows
+
+
+def assert_holds(model, names, rows):
+    """Assert that a model agrees with rows, by the definition of the columns."""
+    at = {name: rows[:, index].astype(np.float64) for index, name in enumerate(names)}
+    coefficients = sum(name.startswith("f_rest") for name in names) // 3
+    assert np.array_equal(model.means, np.stack([at[n] for n in ("x", "y", "z")], 1))
+    assert np.array_equal(model.sh0, np.stack([at[f"f_dc_{i}"] for i in range(3)], 1))
+    assert np.array_equal(model.scales, np.stack([at[f"scale_{i}"] for i in range(3)], 1))
+    assert (len(rows), coefficients, 3) == model.shN.shape
+    for channel in range(3):
+        for k in range(coefficients):
+            expected = at[f"f_rest_{channel * coefficients + k}"]
+            assert np.array_equal(model.shN[:, k, channel], expected)
+    quats = np.stack([at[f"rot_{i}"] for i in range(4)], 1)
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    np.testing.assert_allclose(model.quats, quats, atol=1e-7)
+    alpha = (1 / (1 + np.exp(-at["opacity"]))).astype(np.float32)
+    assert np.array_equal(model.opacities, alpha)
+
+
+@pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
+@pytest.mark.parametrize(("degree", "normals"), [(0, True), (1, False), (2, True), (3, True), (3, False)])
+def test_reads_every_degree_and_encoding(tmp_path, degree, normals, kind):
+    names = columns_of(degree, normals=normals)
+    rows = random_rows(names)
+    write_rows(tmp_path / "a.ply", names, rows, kind=kind)
+    report = []
+    model = read_ply(tmp_path / "a.ply", strict=True, report=report)
+    assert_holds(model, names, rows)
+    assert {one.id for one in report} <= {"unnormalised-quats"}
+    write_rows(tmp_path / "a.ply", names, rows[:0], kind=kind)
+    assert (0, degree) == (len(empty := read_ply(tmp_path / "a.ply", strict=True)), empty.sh_degree)
+
+
+def test_reads_more_rows_than_one_block(tmp_path):
+    names, rows = written(tmp_path / "a.ply", 3, 10_000)
+    assert_holds(read_ply(tmp_path / "a.ply"), names, rows)
+
+
+def test_reads_columns_by_name_in_any_order(tmp_path):
+    names = columns_of(2)
+    rows = random_rows(names)
+    order = np.random.default_rng(5).permutation(len(names))
+    shuffled = [names[i] for i in order]
+    write_rows(tmp_path / "a.ply", shuffled, rows[:, order])
+    report = []
+    assert_holds(read_ply(tmp_path / "a.ply", report=report), names, rows)
+    assert "shuffled-columns" in {one.id for one in report}
+
+
+@pytest.mark.parametrize("kind", ["binary_little_endian", "ascii"])
+def test_header_comments_are_kept_in_ascii(tmp_path, kind):
+    comments = ["made by", "a machine", "end_header", "é end_header", "café"]
+    names, rows = written(tmp_path / "a.ply", 0, kind=kind, comments=comments)
+    report = []
+    model = read_ply(tmp_path / "a.ply", strict=True, report=report)
+    assert_holds(model, names, rows)
+    assert ["made by", "a machine", "end_header", "?? end_header", "caf??"] == model.metadata["comments"]
+    assert {"non-ascii-header", "unnormalised-quats"} == {one.id for one in report}
+    write_ply(tmp_path / "b.ply", model)
+    assert model.metadata == read_ply(tmp_path / "b.ply").metadata
+
+
+def test_extra_columns_are_kept_on_request(tmp_path, make_model):
+    ids, classes = np.arange(10, dtype=np.int32), np.arange(10, dtype=np.uint8)
+    extra = {"object_id": ids, "class": classes, "weight": np.linspace(0, 1, 10)}
+    model = make_model(10, 3, extra=extra)
+    write_ply(tmp_path / "a.ply", model)
+    again = read_ply(tmp_path / "a.ply", keep_extra=True, strict=True)
+    assert_same_scene(model, again)
+    assert list(extra) == list(again.extra)
+    for name, column in extra.items():
+        assert column.dtype == again.extra[name].dtype
+        assert np.array_equal(again.extra[name], column)
+    assert {} == dict(read_ply(tmp_path / "a.ply").extra)
+
+
+@pytest.mark.parametrize(("comments", "up", "kept", "noted"), [
+    (["Vertical Axis: z"], [0, 0, 1], [], True),
+    (["Generated by Nerstudio", "vertical axis: Y"], [0, 1, 0], ["Generated by Nerstudio"], True),
+    (["  vertical axis : Z "], [0, 0, 1], [], True),
+    (["Vertical Axis: -x"], [-1, 0, 0], [], True),
+    (["Vertical Axis: up"], None, ["Vertical Axis: up"], False),
+    (["Vertical Axis: z", "Vertical Axis: y"], None, ["Vertical Axis: z", "Vertical Axis: y"], True),
+    (["Exported from Brush", "Vertical axis: y"], None, ["Exported from Brush", "Vertical axis: y"], False),
+    (["csplat up 0 -1 0", "Vertical Axis: z"], [0, -1, 0], ["Vertical Axis: z"], False),
+    (["csplat coordinate_system RUB", "Vertical Axis: z"], None, ["Vertical Axis: z"], False),
+])  # fmt: skip
+def test_a_comment_on_the_vertical_axis_sets_up(tmp_path, comments, up, kept, noted):
+    written(tmp_path / "a.ply", 0, comments=comments)
+    report = []
+    model = read_ply(tmp_path / "a.ply", strict=True, report=report)
+    assert (up, kept) == (model.metadata.get("up"), model.metadata.get("comments", []))
+    assert noted == any(one.id == "vertical-axis" for one in report)
+    write_ply(tmp_path / "b.ply", model)
+    assert model.metadata == read_ply(tmp_path / "b.ply").metadata
+
+
+def read_doubles(path, positions, **options):
+    """Read a PLY of these positions in doubles."""
+    names = columns_of(0, normals=False)
+    rows = np.zeros(len(positions), [(n, "<f8" if n in "xyz" else "<f4") for n in names])
+    for axis, name in enumerate("xyz"):
+        rows[name] = positions[:, axis]
+    rows["rot_0"] = 1
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    lines += [f"property {'double' if n in 'xyz' else 'float'} {n}" for n in names]
+    path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + rows.tobytes())
+    return read_ply(path, **options)
+
+
+@pytest.mark.parametrize("centre", [(0, 0, 0), (1e7, 5e6, -2e6), (3.0, 1e7, 0), (481_250.0, 5_467_100.0, 310.0)])
+def test_an_origin_keeps_positions_in_doubles(tmp_path, centre):
+    positions = np.random.default_rng(3).standard_normal((500, 3)) + centre
+    report = []
+    model = read_doubles(tmp_path / "a.ply", positions, strict=True, report=report)
+    assert "double-means" in {one.id for one in report}
+    assert any(centre) == any(model.origin)
+    assert np.abs(model.means.astype(np.float64) + model.origin - positions).max() < 1e-6
+    write_ply(tmp_path / "b.ply", model, absolute=True)
+    np.testing.assert_array_equal(positions, model.means_double)
+    np.testing.assert_array_equal(positions, read_ply(tmp_path / "b.ply").means_double)
+    positions[0] = -1e12  # an outlier does not move the origin
+    model = read_doubles(tmp_path / "a.ply", positions)
+    assert np.abs(np.array(model.origin) - centre).max() < 1
+    assert np.abs(model.means[1:].astype(np.float64) + model.origin - positions[1:]).max() < 1e-6
+
+
+@pytest.mark.parametrize(("positions", "origin"), [
+    (np.float32(1e7) + np.arange(30.0).reshape(10, 3), (0.0, 0.0, 0.0)),  # floats as doubles
+    (np.full((10, 3), 1e7 + 0.1), None),
+])  # fmt: skip
+def test_positions_that_floats_hold_about_their_origin_are_exact(tmp_path, positions, origin):
+    model = read_doubles(tmp_path / "a.ply", positions)
+    assert origin in (None, model.origin)
+    assert np.array_equal(model.means + np.array(model.origin), positions)
+
+
+COMMENTS = {
+    "training ": "csplat training.*is invalid: not JSON",
+    "training white": "csplat training.*is invalid: not JSON",
+    "training " + "[" * 10_000: "csplat training.*is invalid: .*nested too deep",
+    "training []": r"is invalid: training is \[\], expected an object",
+    "training {}": "training has no background",
+    'training {"background": [0, 0]}': "background of training is",
+    'training {"background": [0, 0, 1.5]}': "background of training is",
+    'training {"background": [0, 0, NaN]}': "background of training is",
+    'training {"background": [0, 0, true]}': "background of training is",
+    'training {"background": [0, 0, 0], "size": [3.5, 2]}': "size of training is",
+    'training {"background": [0, 0, 0], "test_every": 1}': "test_every of training is 1",
+    'training {"background": [0, 0, 0], "test_every": false}': "test_every of training is",
+    'training {"background": [0, 0, 0], "near": 1e999}': "near of training is",
+    'training {"background": [0, 0, 0], "images": 4}': "images of training is",
+    'training {"background": [0, 0, 0], "images": "\\ud800"}': "half of a surrogate pair",
+    **{
+        f"view {text}": "csplat view.*is invalid"
+        for text in ("", "0 0 1", "[]", '{"near": 1e999}', '{"near": NaN}', "[" * 10_000)
+    },
+    **dict.fromkeys(("origin 1 2", "origin a b c", "absolute_origin 1 2 inf"), "3 finite numbers"),
+}
+
+
+def test_invalid_comments_of_csplat_are_refused(tmp_path):
+    def check(case):
+        comment, message = case
+        written(tmp_path / "a.ply", 0, comments=[f"csplat {comment}"])
+        with pytest.raises(InputError, match=message):
+            read_ply(tmp_path / "a.ply")
+
+    assert [] == failures({one: (one, message) for one, message in COMMENTS.items()}, check)
+
+
+VIEW = {"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4, "image": "ä b.png"}
+
+
+TRAINED = TrainingRecord((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
+
+
+@pytest.mark.parametrize(("metadata", "line"), [
+    ({"view": VIEW}, 'view {"H": 4, "K": [[1, 0, 2]'),
+    ({"training": TRAINED.as_json()}, 'training {"background": [1.0, 1.0, 1.0], "test_every": 5'),
+])  # fmt: skip
+def test_the_training_record_and_the_first_view_survive_files(tmp_path, make_model, metadata, line):
+    write_ply(tmp_path / "a.ply", make_model(metadata=metadata))
+    model = read_ply(tmp_path / "a.ply")
+    assert metadata == model.metadata
+    write_ply(tmp_path / "b.ply", decode(encode(model)))
+    again = read_ply(tmp_path / "b.ply").metadata
+    assert metadata == again
+    assert "view" in metadata or TRAINED == TrainingRecord.of(again)
+    assert header_of(tmp_path / "b.ply")[-1].startswith(f"comment csplat {line}")
+
+
+def test_alphas_of_0_and_1_have_finite_logits():
+    logits = logits_of_alpha(np.array([0, 1], np.float32))
+    assert [LOGIT_OF_0, LOGIT_OF_1] == logits.tolist()
+    assert [0.0, 1.0] == alpha_of_logits(logits).tolist()
+    with np.errstate(over="ignore"):  # by both formulas that programs use, in float32
+        formulas = 1 / (1 + np.exp(-logits)), np.exp(logits) / (1 + np.exp(logits))
+    assert all(np.float32 == one.dtype and [0.0, 1.0] == one.tolist() for one in formulas)
+
+
+@pytest.mark.slow
+@given(st.floats(0, 1, width=32))
+def test_logits_of_alphas_are_invertible(alpha):
+    array = np.array([alpha], np.float32)
+    again = alpha_of_logits(logits_of_alpha(array))
+    # A logit of magnitude L carries alpha (1 - alpha) L 2**-24; near 1 alpha itself is coarser.
+    assert abs(float(again[0]) - float(array[0])) <= 8e-6 * min(alpha, 1 - alpha) + 2**-24 * alpha
+
+
+def zip_of(name):
+    """Return the bytes of a zip of one small file."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.writestr(name, "{}")
+    return out.getvalue()
+
+
+CONVERT = "convert it to PLY first, with.*"
+
+
+CODED = "\nproperty uchar opacity\nproperty uchar scaling\n"
+
+
+CODEBOOKS = f"element vertex_0 1{CODED}element codebook_centers 1{CODED}end_header\n\1\1\1\1"
+
+
+@pytest.mark.parametrize(("name", "data", "message"), [
+    ("a.spz", gzip.compress(b"NGSP\x02\0\0\0", mtime=0), f"SPZ.*{CONVERT}"),
+    ("renamed.ply", gzip.compress(b"NGSP\x02\0\0\0", mtime=0), f"SPZ.*{CONVERT}"),
+    ("v4.bin", b"NGSP\x04\0\0\0", f"SPZ.*{CONVERT}"),
+    ("a.splat", bytes(64), rf"is \.splat.*{CONVERT}"),
+    ("unnamed", b"\x80" * 64, rf"is .*\.splat.*{CONVERT}"),
+    ("a.ksplat", b"\x00\x01" + bytes(4096), rf"is \.ksplat.*{CONVERT}"),
+    ("a.spx", b"spx\x01", f"is .*spx.*{CONVERT}"),
+    ("a.bin", b"glTF\x02\0\0\0", f"glTF.*{CONVERT}"),
+    ("a.gltf", b'{"asset": {}}', f"glTF.*{CONVERT}"),
+    ("meta.json", b'{"means": {}}', f"SOG.*{CONVERT}"),
+    ("a.csplat", b"\x89CSP", f"{CONVERT}csplat decode"),
+    ("scene.ply", zip_of("meta.json"), r"is SOG, .* `csplat convert`.*csplat\.read"),
+    ("a.zip", zip_of("readme.txt"), r"is a zip without a scene: readme\.txt"),
+    ("a.ply", f"ply\nformat binary_little_endian 1.0\n{CODEBOOKS}".encode(), r"with codebooks .* without quantisation"),
+    ("a.ply", b"", r"a\.ply is"),
+    ("a.ply", b"plywood is no PLY", r"a\.ply is"),
+])  # fmt: skip
+def test_other_files_are_named_and_refused(tmp_path, name, data, message):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(InputError, match=message):
+        read_ply(tmp_path / name)
+
+
+def test_folders_and_missing_files_are_refused(tmp_path):
+    (tmp_path / "meta.json").write_text("{}")
+    with pytest.raises(InputError, match=r"is SOG, .* `csplat convert`.*csplat\.read"):
+        read_ply(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        read_ply(tmp_path / "none.ply")
+
+
+def test_damage_is_refused_or_read(tmp_path):
+    path, names = tmp_path / "a.ply", columns_of(0, normals=False)
+    write_rows(path, names, random_rows(names, 2))
+    data = path.read_bytes()
+    end = data.index(b"end_header\n") + 11
+    sizes = [*range(60), *range(60, end, 9), *range(end - 12, len(data), 5), len(data) - 1]
+    assert all(refusals(path, (data[:size] for size in sizes), read_ply))
+    places = [*range(60), *range(60, end - 20, 11), *range(end - 20, end)]
+    assert any(refusals(path, flipped(data, places), read_ply))
+
+
+@pytest.mark.slow
+def test_reading_allocates_little_more_than_the_arrays(tmp_path):
+    written(tmp_path / "a.ply", 3, 10_000)
+    head, rows = (tmp_path / "a.ply").read_bytes().split(b"end_header\n", 1)
+    with (tmp_path / "a.ply").open("wb") as stream:
+        stream.write(head.replace(b"vertex 10000\n", b"vertex 200000\n") + b"end_header\n")
+        stream.writelines([rows] * 20)
+    tracemalloc.start()
+    model = read_ply(tmp_path / "a.ply")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (200_000, 3) == (len(model), model.sh_degree)
+    size = sum(getattr(model, name).nbytes for name in (*ARRAYS, "opacities"))
+    assert peak < size + 16e6
+
+
+@pytest.mark.parametrize(("name", "count", "degree"), [
+    ("plane3", 13_982, 3), ("object_id", 4_560, 3), ("horse", 28_218, 0), ("trailing_bytes", 100, 3),
+])  # fmt: skip
+def test_real_scenes_are_read_and_written(data_dir, tmp_path, name, count, degree):
+    model = read_ply(data_dir / "ply" / f"{name}.ply")
+    assert (count, degree) == (len(model), model.sh_degree)
+    write_ply(tmp_path / "a.ply", model)
+    assert_same_scene(model, read_ply(tmp_path / "a.ply", strict=True))

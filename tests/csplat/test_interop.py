@@ -1,0 +1,430 @@
+"""Checkpoints and tensors of gsplat, splatfacto and INRIA as scenes; without torch an error names the extra."""
+
+import io
+import pickle
+import sys
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from checked import flipped, refusals
+
+import csplat
+from csplat.errors import InputError
+from csplat.interop import to_gsplat
+
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+STORED = {
+    name: Path(__file__).parents[1] / "helpers" / "checkpoints" / name for name in ("gsplat.pt", "splatfacto.ckpt")
+}
+
+
+class PlainTensor(np.ndarray):
+    """An array with the one tensor method that the reader calls."""
+
+    def numel(self):
+        return self.size
+
+
+def tensor(values):
+    return np.asarray(values).view(PlainTensor)
+
+
+def load_plainly(path, **_):
+    """Read the contiguous float32 tensors of a checkpoint as `torch.load` does."""
+
+    class Reader(pickle.Unpickler):  # noqa: S301  # a file of the project
+        def find_class(self, module, name):
+            if name == "_rebuild_tensor_v2":
+                return lambda values, at, shape, *_: tensor(values[at:][: np.prod(shape, dtype=int)]).reshape(shape)
+            if name == "_rebuild_parameter":
+                return lambda values, *_: values
+            return name if module.startswith("torch") else super().find_class(module, name)
+
+        def persistent_load(self, entry):
+            return np.frombuffer(archive.read(f"{folder}/data/{entry[2]}"), "<f4")
+
+    with zipfile.ZipFile(path) as archive:
+        folder = archive.namelist()[0].partition("/")[0]
+        return Reader(io.BytesIO(archive.read(f"{folder}/data.pkl"))).load()
+
+
+@pytest.fixture
+def torch():
+    return pytest.importorskip("torch", reason="checkpoints want torch (the train extra)")
+
+
+@pytest.fixture
+def no_torch(monkeypatch):
+    """Return a function that replaces torch by a module whose `load` reads checkpoints without it."""
+
+    def replace_by(load=load_plainly):
+        monkeypatch.setitem(sys.modules, "torch", SimpleNamespace(__version__="2.5.0", load=load))
+
+    return replace_by
+
+
+@pytest.fixture
+def read_holding(no_torch):
+    """Return a function that reads a checkpoint that holds an object."""
+
+    def read(said, **options):
+        no_torch(lambda *_, **__: said)
+        return csplat.read(STORED["gsplat.pt"], **options)
+
+    return read
+
+
+def made_splats(make_model, degree):
+    """Return a scene as gsplat's dictionary of tensors."""
+    return {name: tensor(values) for name, values in to_gsplat(make_model(5, degree)).items()}
+
+
+def saved(torch, checkpoint):
+    stream = io.BytesIO()
+    torch.save(checkpoint, stream)
+    return stream.getvalue()
+
+
+def of_splatfacto(splats, **changed):
+    names = {"sh0": "features_dc", "shN": "features_rest"}
+    named = {f"_model.gauss_params.{names.get(name, name)}": value for name, value in splats.items()}
+    named["_model.gauss_params.features_dc"] = splats["sh0"][:, 0]
+    named["_model.gauss_params.opacities"] = splats["opacities"][:, None]
+    return {"step": 29999, "pipeline": {**named, **changed, "_model.camera_optimizer.pose_adjustment": splats["means"]}}
+
+
+def of_checkpoint(path):
+    """Check the five stored splats: normals of NumPy's generator of seed 0."""
+    rng = np.random.default_rng(0)
+    means, _, scales = (rng.standard_normal((5, width)) for width in (3, 4, 3))
+    opacities = rng.random(5)
+    model = csplat.read(path)
+    np.testing.assert_allclose(means, model.means, atol=1e-6)
+    np.testing.assert_allclose(scales - 4.0, model.scales, atol=1e-6)
+    np.testing.assert_allclose(opacities, model.opacities, atol=1e-6)
+    np.testing.assert_allclose(rng.standard_normal((5, 3)), model.sh0, atol=1e-6)
+    np.testing.assert_allclose(rng.standard_normal((5, 3, 3)), model.shN, atol=1e-6)
+    np.testing.assert_allclose(1.0, np.linalg.norm(model.quats, axis=1), atol=1e-6)
+
+
+# without torch
+@pytest.mark.parametrize("name", STORED)
+def test_a_stored_checkpoint_is_read(no_torch, name):
+    no_torch()
+    of_checkpoint(STORED[name])
+
+
+def test_colours_that_splatfacto_trained_without_sh_are_logits(read_holding, make_model):
+    splats = made_splats(make_model, 0)
+    found = [read_holding(said) for said in ({"splats": splats}, of_splatfacto(splats))]
+    colours = 0.5 + 0.28209479177387814 * found[1].sh0
+    assert np.allclose(1.0 / (1.0 + np.exp(-found[0].sh0)), colours, atol=1e-6)
+    assert (found[0].means == found[1].means).all()
+
+
+def test_sh_bands_above_the_requested_degree_are_left_out(read_holding, make_model):
+    splats = made_splats(make_model, 3)
+    many = tensor(np.concatenate([splats["shN"], np.ones((5, 20, 3), np.float32)], axis=1))
+    for said in ({"splats": {**splats, "shN": many}}, of_splatfacto({**splats, "shN": many})):
+        with pytest.raises(InputError, match=r"shN has SH degree 5, expected at most 4: --sh-degree 4 of csplat"):
+            read_holding(said)
+        for degree in (4, 3, 1):
+            read = read_holding(said, sh_degree=degree)
+            assert np.array_equal(many[:, : (degree + 1) ** 2 - 1], read.shN)
+
+
+def test_a_checkpoint_without_splats_is_refused(read_holding, make_model):
+    splats = made_splats(make_model, 1)
+    many = np.broadcast_to(np.float32(0.0), (10**9, 3)).view(PlainTensor)
+    few = {name: values[:2] for name, values in splats.items()}
+    for said, expected in (
+        ([1], "it holds a list"),
+        (([1, 2], 3), "it holds a tuple"),
+        ({"model": 3}, "it holds model: neither"),
+        ({"splats": {**splats, "means": many}}, "means is not a tensor, or larger than the file"),
+        ({"splats": {**splats, "means": "many"}}, "means is not a tensor"),
+        ({"splats": {**splats, "means": tensor(np.full((5, 3), np.inf))}}, "NaN or infinite"),
+        ({"splats": {"means": splats["means"]}}, "no quats"),
+        (
+            {f"m.{name}": splats[name] for name in ("means", "quats", "scales", "opacities")}
+            | {"m.appearance_features": splats["sh0"]},
+            "no sh0, .*; it was trained with appearance features",
+        ),
+        (of_splatfacto(splats, **{"_model.gauss_params.scales": tensor(np.zeros((3, 3)))}), "scales"),
+        ({"pipeline": {**renamed(splats, "_model.gauss_params."), **renamed(few, "_model.background.gauss_params.")}},
+            r"2 models of splats, .*: _model\.gauss_params\.\* \(5 splats\), _model\.background\.gauss_params\.\* \(2"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=rf"^gsplat\.pt: .*{expected}"):
+            read_holding(said)
+
+
+def renamed(splats, prefix):
+    """Return the tensors of splatfacto under other names."""
+    return {
+        name.replace("_model.gauss_params.", prefix): one for name, one in of_splatfacto(splats)["pipeline"].items()
+    }
+
+
+def of_inria(splats):
+    """Return the pair that INRIA's trainer saves: the result of `GaussianModel.capture`, and the iteration."""
+    arrays = (splats[name] for name in ("means", "sh0", "shN", "scales", "quats"))
+    return ((3, *arrays, splats["opacities"][:, None], 0, 0, 0, {"state": {}}, 5.0), 30000)
+
+
+LIGHTNING = ("means", "rotations", "scales", "opacities", "shs_dc", "shs_rest")  # names in Gaussian Splatting Lightning
+
+
+INRIA_STATE = ("_xyz", "_rotation", "_scaling", "_opacity", "_features_dc", "_features_rest")
+
+
+def other_names(splats, prefix, names):
+    """Return tensors under the names of another program, in the order means, quats, scales, opacities, sh0, shN."""
+    order = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    return {prefix + name: splats[own] for own, name in zip(order, names, strict=True)}
+
+
+def test_checkpoints_of_other_programs_and_versions_give_the_same_scene(read_holding, make_model):
+    splats = made_splats(make_model, 3)
+    expected = read_holding({"splats": splats})
+    for said in (
+        {"step": 1, "pipeline": renamed(splats, "_model.")},  # nerfstudio before 1.1
+        {"step": 1, "pipeline": renamed(splats, "module._model.gauss_params.")},
+        {"state_dict": renamed(splats, "gauss_params.")},
+        renamed(splats, "_model."),
+        splats,
+        of_inria(splats),
+        {"state_dict": other_names(splats, "gaussian_model.gaussians.", LIGHTNING)},
+        other_names(splats, "", INRIA_STATE),
+    ):
+        read = read_holding(said)
+        assert all(np.array_equal(getattr(expected, name), getattr(read, name)) for name in ARRAYS)
+
+
+def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_path):
+    splats = made_splats(make_model, 1)
+    paths = [tmp_path / f"ckpt_29_rank{rank}.pt" for rank in range(3)]
+    for path in [*paths, tmp_path / "ckpt_6_rank7.pt"]:
+        path.write_bytes(STORED["gsplat.pt"].read_bytes())
+    no_torch(lambda path, **_: {"splats": {name: one[int(path.stem[-1]) :: 3] for name, one in splats.items()}})
+    report = []
+    model = csplat.read(paths[1], report=report)
+    assert np.array_equal(model.means, splats["means"][[0, 3, 1, 4, 2]])
+    assert ["the splats of 3 GPUs, from ckpt_29_rank0.pt, ckpt_29_rank1.pt, ckpt_29_rank2.pt"] == [
+        one.text for one in report
+    ]
+    paths[1].unlink()
+    words = r"ckpt_29_rank2\.pt has the splats of one of several GPUs, .*: no ckpt_29_rank1"
+    with pytest.raises(InputError, match=words):
+        csplat.read(paths[2])
+    paths[2].unlink()
+    assert 2 == len(csplat.read(paths[0], report=report))
+    assert ("ranks", "note", True) == (report[-1].id, report[-1].kind, report[-1].usual)
+
+
+def test_values_are_checked_like_those_of_a_ply(read_holding, make_model):
+    splats = made_splats(make_model, 0)
+
+    def read(**changed):
+        report = []
+        return read_holding({"splats": {**splats, **changed}}, report=report), {one.id: one for one in report}
+
+    rng = np.random.default_rng(0)
+    many = {name: tensor(rng.standard_normal((20, width), np.float32)) for name, width in (("means", 3), ("quats", 4))}
+    many |= {"sh0": tensor(rng.standard_normal((20, 1, 3), np.float32)), "shN": tensor(np.zeros((20, 0, 3), "f4"))}
+    many |= {"opacities": tensor(np.linspace(0, 1, 20, dtype="f4")), "scales": tensor(rng.random((20, 3), "f4") / 10)}
+    many["quats"][3] = 0
+    model, found = read(**many, filter_3D=tensor(np.ones(20)))
+    assert {"zero-quats", "opacities-are-alphas", "scales-are-linear", "filter-3d"} <= set(found)
+    assert "repair" == found["zero-quats"].kind == found["filter-3d"].kind
+    assert [1, 0, 0, 0] == model.quats[3].tolist()
+
+    scales = splats["scales"]
+    for one in (scales[:, :1], scales[:, 0]):
+        model, found = read(scales=one)
+        assert "one-scale" in found
+        assert np.array_equal(np.repeat(scales[:, :1], 3, axis=1), model.scales)
+    model, found = read(scales=scales[:, :2])
+    assert "flat-scales" in found
+    assert model.flat
+    assert np.array_equal(scales[:, :2], model.scales[:, :2])
+    np.testing.assert_allclose(model.scales[:, 2], scales[:, :2].min() - np.log(100), rtol=1e-6)
+    zero = scales.copy()
+    zero[1:, 2] = -np.inf
+    model, found = read(scales=zero)
+    assert "zero-scales" in found
+    assert (np.exp(model.scales[1:, 2].astype(float)) < 1e-37).all()
+
+    far = tensor(splats["means"].astype(np.float64) + 1e7 + 0.3)
+    model, found = read(means=far)
+    assert "double-means" in found
+    assert np.float32 == model.means.dtype
+    np.testing.assert_allclose(model.means + np.array(model.origin), far, rtol=0, atol=1e-6)
+
+
+def test_other_files_are_refused_before_torch_loads_them(no_torch, tmp_path):
+    no_torch(lambda *_, **__: pytest.fail("it was loaded"))
+    for data, expected in (
+        (b"404: Not Found", "not a checkpoint of torch: it begins with b'404: Not'"),
+        (b"version https://git-lfs.github.com/spec/v1\noid", "a pointer of Git LFS"),
+    ):
+        (tmp_path / "a.pt").write_bytes(data)
+        with pytest.raises(InputError, match=rf"^a\.pt is {expected}[^\n]*$"):
+            csplat.read(tmp_path / "a.pt")
+        (tmp_path / "b_rank0.pt").write_bytes(STORED["gsplat.pt"].read_bytes())
+        (tmp_path / "b_rank1.pt").write_bytes(data)
+        no_torch(lambda path, **_: load_plainly(path) if path.stem == "b_rank0" else pytest.fail("it was loaded"))
+        with pytest.raises(InputError, match=rf"^b_rank1\.pt is {expected}[^\n]*$"):
+            csplat.read(tmp_path / "b_rank0.pt")
+
+
+def test_files_that_torch_cannot_load_are_refused(no_torch, monkeypatch):
+    for error, expected in (
+        (pickle.UnpicklingError("Weights only load failed"), "contains objects that could run code"),
+        (RuntimeError("PytorchStreamReader failed"), "is a truncated or damaged checkpoint"),
+    ):
+
+        def load(*_, error=error, **__):
+            raise error
+
+        no_torch(load)
+        with pytest.raises(InputError, match=rf"^gsplat\.pt {expected}[^\n]*$"):
+            csplat.read(STORED["gsplat.pt"])
+    monkeypatch.setitem(sys.modules, "torch", None)
+    for name, path in STORED.items():
+        with pytest.raises(InputError, match=rf"{name} is a checkpoint of torch: .*csplat\[train\]"):
+            csplat.read(path)
+
+
+# with torch
+@pytest.mark.torch
+@pytest.mark.usefixtures("torch")
+@pytest.mark.parametrize("name", STORED)
+def test_torch_reads_a_stored_checkpoint_as_the_plain_reader_does(name):
+    of_checkpoint(STORED[name])
+
+
+@pytest.mark.torch
+@pytest.mark.parametrize("degree", [0, 3])
+def test_checkpoints_of_all_programs_are_read(torch, make_model, degree):
+    model = make_model(20, degree)
+    splats = {name: torch.nn.Parameter(torch.from_numpy(array)) for name, array in to_gsplat(model).items()}
+    loose = {**splats, "quats": splats["quats"] * 3.0}  # trainers normalise them on use
+    own = csplat.read(saved(torch, {"step": 7, "splats": loose}))
+    inria = csplat.read(saved(torch, of_inria(loose)))
+    assert all(np.array_equal(getattr(own, name), getattr(inria, name)) for name in ARRAYS)
+    theirs = csplat.read(saved(torch, of_splatfacto(loose)))
+    for name in ARRAYS if degree else ARRAYS[:-2]:
+        assert np.allclose(getattr(model, name), getattr(own, name), atol=1e-6), name
+        assert (getattr(own, name) == getattr(theirs, name)).all()
+    whole = saved(torch, {"schedulers": {"last": [np.float64(0.1), np.float32(0.2)]}, "splats": splats})
+    old = io.BytesIO()  # scalars as NumPy 1 writes them
+    with zipfile.ZipFile(io.BytesIO(whole)) as source, zipfile.ZipFile(old, "w") as target:
+        for name in source.namelist():
+            target.writestr(name, source.read(name).replace(b"numpy._core.multiarray", b"numpy.core.multiarray"))
+    assert 20 == len(csplat.read(whole)) == len(csplat.read(old.getvalue()))
+    if not degree:  # logits of colours
+        colours = 0.5 + 0.28209479177387814 * theirs.sh0
+        assert np.allclose(1.0 / (1.0 + np.exp(-model.sh0)), colours, atol=1e-6)
+
+
+@pytest.mark.torch
+def test_invalid_tensors_and_damage_are_refused(torch, make_model, tmp_path):
+    splats, path = to_gsplat(make_model(3, 0), device="cpu"), tmp_path / "a.pt"
+    for values, message in (
+        ({**splats, "means": torch.zeros(1).expand(10**9, 3)}, "means is not a tensor, or larger than the file"),
+        ({**splats, "means": torch.full((3, 3), torch.inf)}, "NaN or infinite"),
+        ({**splats, "sh0": torch.zeros(3, 2)}, "sh0 has shape"),
+        (print, "contains objects that could run code"),
+    ):
+        path.write_bytes(saved(torch, {"splats": values}))
+        with pytest.raises(InputError, match=rf"^a\.pt[^\n]*{message}[^\n]*$"):
+            csplat.read(path)
+    whole = saved(torch, {"splats": splats})
+    assert [""] == refusals(path, [whole])
+    assert all("a.pt" in one for one in refusals(path, (whole[:size] for size in range(0, len(whole), 311))))
+    refusals(path, flipped(whole, range(0, len(whole), 29)))
+
+
+@pytest.fixture
+def model(make_model):
+    made = make_model(20, 2)
+    made.opacities[:2] = 0.0, 1.0
+    return made
+
+
+def assert_near(a, b):
+    for name in ARRAYS:
+        assert np.allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=2e-7), name
+
+
+def test_splats_of_gsplat_are_parameters_or_activated(model):
+    splats, activated = csplat.to_gsplat(model), csplat.to_gsplat(model, form="activated")
+    assert ARRAYS == tuple(splats) == tuple(activated)
+    assert [(20, 3), (20, 4), (20, 3), (20,), (20, 1, 3), (20, 8, 3)] == [splats[name].shape for name in ARRAYS]
+    assert np.array_equal(model.scales, splats["scales"])
+    assert np.allclose(1.0 / (1.0 + np.exp(-splats["opacities"].astype(np.float64))), model.opacities, atol=1e-7)
+    assert np.isfinite(splats["opacities"]).all()
+    assert np.allclose(np.exp(model.scales), activated["scales"], rtol=1e-6)
+    assert np.array_equal(model.opacities, activated["opacities"])
+    assert_near(model, csplat.from_gsplat(splats))
+    assert_near(model, csplat.from_gsplat(activated, form="activated"))
+    loose = {**splats, "quats": 3 * splats["quats"], "opacities": splats["opacities"][:, None]}  # as in a checkpoint
+    assert_near(model, csplat.from_gsplat({"step": 30_000, "splats": loose}))
+    del splats["shN"]
+    assert 0 == csplat.from_gsplat(splats).sh_degree
+
+
+def test_no_memory_is_shared_with_the_model(model):
+    for array in csplat.to_gsplat(model).values():
+        array[:] = 9.0
+    again = csplat.to_gsplat(model)
+    made = csplat.from_gsplat(again)
+    before = made.means.copy()
+    again["means"] += 1.0
+    assert np.array_equal(before, made.means)
+    assert model.opacities.max() <= 1.0
+
+
+@pytest.mark.parametrize(("change", "expected"), [
+    ({"sh0": None}, "have no sh0"),
+    ({"sh0": None, "features": 1}, "appearance features"),
+    ({"means": np.zeros((20, 2))}, r"means has shape \[20, 2\]"),
+    ({"sh0": np.zeros((20, 2, 3))}, r"sh0 has shape \[20, 2, 3\], expected \[20, 1, 3\]"),
+    ({"opacities": np.full(20, np.nan)}, "NaN"),
+    ({"quats": np.full((20, 4), np.inf)}, "quats contains NaN"),
+    ({"quats": np.zeros((20, 3))}, r"quats has shape \[20, 3\]"),
+    ({"shN": "text"}, "shN is a str"),
+])  # fmt: skip
+def test_from_gsplat_refuses_invalid_arrays(model, change, expected):
+    splats = {**csplat.to_gsplat(model), **change}
+    splats = {name: value for name, value in splats.items() if value is not None}
+    with pytest.raises(InputError, match=expected):
+        csplat.from_gsplat(splats)
+
+
+def test_a_wrong_form_and_tensors_without_torch_are_refused(model, monkeypatch):
+    with pytest.raises(InputError, match="logarithms"):
+        csplat.from_gsplat(csplat.to_gsplat(model), form="activated")
+    for call, given in ((csplat.from_gsplat, {}), (csplat.to_gsplat, model)):
+        with pytest.raises(InputError, match="expected one of parameters, activated"):
+            call(given, form="logits")
+    with pytest.raises(InputError, match="expects a SplatModel"):
+        csplat.to_gsplat({})
+    monkeypatch.setitem(sys.modules, "torch", None)
+    with pytest.raises(InputError, match="use device=None for NumPy arrays"):
+        csplat.to_gsplat(model, device="cpu")
+
+
+def test_tensors_may_require_gradients_or_have_half_precision(model):
+    torch = pytest.importorskip("torch", reason="tensors want torch (the train extra)")
+    tensors = csplat.to_gsplat(model, device="cpu")
+    assert all(isinstance(one, torch.Tensor) and one.dtype == torch.float32 for one in tensors.values())
+    assert_near(model, csplat.from_gsplat(torch.nn.ParameterDict(tensors)))
+    half = replace(csplat.from_gsplat({name: one.bfloat16() for name, one in tensors.items()}), quats=model.quats)
+    assert np.allclose(model.means, half.means, rtol=1e-2)

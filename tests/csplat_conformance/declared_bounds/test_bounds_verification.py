@@ -1,0 +1,247 @@
+"""Verification of declared errors, in memory and tile by tile, and descriptions of files."""
+
+import json
+import re
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from itertools import cycle
+from mmap import mmap
+
+import numpy as np
+import pytest
+from tables import failures
+from typer.testing import CliRunner
+
+from csplat import _spec
+from csplat.decoder import decode, decode_scene, open_tiles, read_header
+from csplat.disk_files import read_array
+from csplat.encoder import EncodeOptions, encode, encode_with_report
+from csplat.errors import CsplatError
+from csplat.ply import write_ply
+from csplat.scene_source import source_from_model
+from csplat_conformance.declared_bounds import Source, verify_bounds, verify_bounds_by_tile
+from csplat_tools.cli.app import app
+from csplat_tools.inspect.file_description import describe_file
+from csplat_tools.inspect.verification import verify_file
+
+
+def verify(source, scene, index=None, declared=True):
+    """Verify the errors that a scene declares, or others."""
+    return verify_bounds(
+        Source.of(source), scene.model, scene.header, scene.declared_bounds if declared is True else declared, index
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("preset", ["fast", "balanced", "small"])
+def test_errors_declared_by_the_encoder_are_verified(make_model, preset):
+    source = make_model(1500, 3)
+    result = encode_with_report(source, EncodeOptions(preset=preset, tile_splats=400))
+    scene = decode_scene(result.data)
+    for index in (result.source_index, None):
+        proof = verify(source, scene, index)
+        assert ((), index is not None) == (proof.failures, proof.rms_verified)
+
+
+def test_declared_errors_that_are_too_small_or_inexact_are_not_verified(make_model):
+    # SER-5
+    source = make_model(200, 1)
+    result = encode_with_report(source)
+    scene, index = decode_scene(result.data), result.source_index
+    bounds = scene.declared_bounds
+
+    def holds(index, number, **wrong):
+        records = list(bounds.records)
+        records[number] = replace(records[number], **wrong)
+        return verify(source, scene, index, replace(bounds, records=tuple(records))).holds
+
+    assert len(bounds.records) == 5
+    for number, record in enumerate(bounds.records):
+        assert not holds(None, number, max=record.max * 0.99)
+        for wrong in (
+            {"max": record.max * 0.99}, {"max": record.max * 1.001}, {"rms": record.rms * 0.999},
+            {"rms": record.rms * 1.001},
+        ):  # fmt: skip
+            assert not holds(index, number, **wrong)
+    for factor, held in ((0.5, False), (1e200, True)):  # RMS needs an index
+        records = tuple(replace(one, max=one.max * factor, rms=one.rms * factor) for one in bounds.records)
+        for refitted in (False, True):
+            stated = replace(bounds, refitted=refitted, records=records)
+            assert held == verify(source, scene, declared=stated).holds
+            assert not verify(source, scene, index, stated).holds
+
+
+def test_refitted_or_undeclared_attributes_are_not_verified(make_model):
+    # SER-6
+    source = make_model(50, 0)
+    scene = decode_scene(encode(source))
+    assert scene.declared_bounds is not None
+    fewer = replace(scene.declared_bounds, records=scene.declared_bounds.records[:2])
+    refitted = verify(source, scene, declared=replace(fewer, refitted=True))
+    assert refitted.holds
+    assert refitted.unverified == ("opacities", "sh0")
+    assert "renders" in refitted.notes[-1]
+    silent = verify(source, scene, declared=fewer)
+    assert silent.failures == ("the file states no error of opacities", "the file states no error of sh0")
+    nothing = verify(source, scene, declared=None)
+    assert nothing.failures == ("the file states no errors",)
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_failure_names_splat_tile_source_and_error(make_model, indexed):
+    source = make_model(1500, 1)
+    result = encode_with_report(source, EncodeOptions(tile_splats=400))
+    scene = decode_scene(result.data)
+    sh0 = scene.model.sh0.copy()
+    sh0[700] += np.float32(5.0)
+    index = result.source_index if indexed else None
+    proof = verify(source, replace(scene, model=replace(scene.model, sh0=sh0)), index)
+    wrong = [one for one in proof.measures if one.holds is False]
+    assert ["sh0"] == [one.name for one in wrong]
+    worst = wrong[0].worst
+    tile = scene.header.tiles[worst.tile]
+    assert (700, result.source_index[700]) == (worst.splat, worst.source_splat)
+    assert tile.start <= 700 < tile.start + tile.splat_count
+    assert worst.found == pytest.approx(5.0, rel=0.1)
+    line = next(line for line in proof.failures if line.startswith("sh0: "))
+    assert f"splat 700 (tile {worst.tile})" in line
+    assert f"source splat {worst.source_splat}" in line
+    assert f"above the stated {wrong[0].declared_max:.9g}" in line
+
+
+def test_extra_columns_but_no_normals_are_verified(make_model):
+    label = {"label": np.arange(50, dtype=np.int16)}
+    source = make_model(50, 0, extra={**label, "nx": np.zeros(50, np.float32)})
+    result = encode_with_report(source, EncodeOptions(keep_extra=True))
+    scene = decode_scene(result.data)
+    assert verify(replace(source, extra=label), scene, result.source_index).holds
+    proof = verify(replace(source, extra={"label": np.zeros(50, np.int16)}), scene, result.source_index)
+    assert proof.failures == ("the extra column 'label' differs from that of the source",)
+    assert proof.clauses == ("SRC-3",)
+
+
+@pytest.mark.parametrize("options", [
+    EncodeOptions(),
+    EncodeOptions(preset="fast", tile_splats=64),
+    EncodeOptions(sh_coding="codebook", codebook_size=16, escape_fraction=0.1),
+    EncodeOptions(sh_coding="none"),
+    EncodeOptions(means_coding="axis", keep_extra=True),
+])  # fmt: skip
+def test_a_description_accounts_for_every_byte(make_model, options):
+    model = make_model(300, 3, extra={"label": np.arange(300, dtype=np.uint16)})
+    data = encode(model, options)
+    described = describe_file(data).as_json()
+    sizes = sum(one["size_bytes"] for one in described["attributes"].values())
+    assert sizes + sum(described["overhead"].values()) == len(data)
+    header = read_header(data)
+    frames = sum(len(tile.layers) for tile in header.tiles) * (_spec.CHUNK_HEADER_SIZE + _spec.TILE_HEAD_SIZE)
+    assert described["overhead"]["tile_frames"] == frames
+    layers = sum(one["size_bytes"] for one in described["layers"].values())
+    others = sum(chunk.size for chunk in header.directory if chunk.type != b"CODB")
+    assert layers + others + _spec.HEADER_SIZE + header.index_size == len(data)
+
+
+@pytest.mark.slow
+def test_damaged_files_are_described_or_refused(make_model):
+    data = encode(make_model(4, 1), EncodeOptions(sh_coding="codebook", codebook_size=2))
+    for place, change in zip(range(0, len(data), 2), cycle((0x01, 0xFF, 0x80)), strict=False):
+        damaged = bytearray(data)
+        damaged[place] ^= change
+        with suppress(CsplatError):
+            describe_file(bytes(damaged)).as_json()
+    for length in range(0, len(data), 11):
+        with pytest.raises(CsplatError):
+            describe_file(data[:length])
+
+
+OPTIONS = EncodeOptions(preset="fast", tile_splats=300, keep_extra=True)
+
+
+def both(source, data, index):
+    """Verify in memory and tile by tile, with equal results; return them as JSON, numbers rounded to nine digits."""
+    opened = open_tiles(data)
+
+    def blocks():
+        return (source.select(slice(start, start + 170)) for start in range(0, len(source), 170))
+
+    at_once = verify_bounds(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
+    by_tile = verify_bounds_by_tile(replace(source_from_model(source), blocks=blocks), opened, index, 400)
+    assert at_once.clauses == by_tile.clauses
+    found = rounded(at_once.as_json())
+    assert found == rounded(by_tile.as_json())
+    return found
+
+
+def rounded(value):
+    if isinstance(value, dict):
+        return {name: rounded(one) for name, one in value.items()}
+    return float(f"{value:.9g}") if isinstance(value, float) else value
+
+
+@pytest.mark.slow
+def test_files_are_verified_tile_by_tile(make_model):
+    model, origin = make_model(500, 0), (5e5, 4e6, 30.0)
+    doubles = model.means.astype(np.float64) + np.array(origin)
+    near = (doubles - origin).astype(np.float32)
+    scenes = {
+        "ordinary": make_model(950, 1, origin=(1e6, -2.0, 3.5), extra={"label": np.arange(950, dtype=np.int32)}),
+        "means in doubles": replace(model, means_double=doubles, means=near, origin=origin),
+        "empty": make_model(0, 1),
+    }
+
+    def check(source):
+        result = encode_with_report(source, OPTIONS)
+        found = both(source, result.data, result.source_index)
+        assert not found["failures"]
+        assert found["rms_and_counts_proved"] == bool(found["measures"])
+
+    assert [] == failures(scenes, check)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("attribute", ["means", "sh0", "extra", "count"])
+def test_failures_are_reported_tile_by_tile(make_model, attribute):
+    source = make_model(450, 1, extra={"label": np.arange(450, dtype=np.int32)})
+    result = encode_with_report(source, OPTIONS)
+    if attribute == "extra":
+        changed = replace(source, extra={"label": source.extra["label"] // 2})
+    elif attribute == "count":
+        changed = make_model(451, 0)
+    else:
+        array = getattr(source, attribute).copy()
+        array[[3, 200, 449]] += np.float32(0.7)
+        changed = replace(source, **{attribute: array})
+    assert both(changed, result.data, result.source_index)["failures"]
+
+
+@pytest.mark.slow
+def test_a_source_index_may_be_memory_mapped(make_model, tmp_path):
+    source = make_model(500, 1)
+    result = encode_with_report(source, OPTIONS)
+    np.save(tmp_path / "index.npy", result.source_index)
+    mapped = read_array(str(tmp_path / "index.npy"), most_bytes=0)
+    assert isinstance(mapped.base, mmap)
+    assert both(source, result.data, result.source_index) == both(source, result.data, mapped)
+
+
+@pytest.mark.slow
+def test_a_scene_beyond_the_memory_is_verified_with_an_index_alone(make_model, tmp_path):
+    ply, file, index = tmp_path / "scene.ply", tmp_path / "scene.csplat", tmp_path / "index.npy"
+    source = make_model(700, 1)
+    result = encode_with_report(source, OPTIONS)
+    write_ply(ply, source)
+    file.write_bytes(result.data)
+    np.save(index, result.source_index)
+    command = ["verify", str(file), "--source", str(ply), "--json", "--quiet"]
+    indexed = [*command, "--source-index", str(index)]
+    assert 0 == CliRunner().invoke(app, command).exit_code
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("csplat_tools.cli.verify.verify_file", partial(verify_file, memory_bytes=100_000))
+        alone, by_tile = (CliRunner().invoke(app, words) for words in (command, indexed))
+    assert 1 == alone.exit_code
+    assert re.search(
+        r"not checked: this takes 0 MB of memory, expected at most 0 MB; give --source-index", alone.stderr
+    )
+    assert 0 == by_tile.exit_code, by_tile.output
+    assert rounded(json.loads(CliRunner().invoke(app, indexed).stdout)) == rounded(json.loads(by_tile.stdout))

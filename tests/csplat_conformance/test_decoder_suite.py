@@ -1,0 +1,422 @@
+"""The conformance runner against decoders that are correct, misbehave, or have a planted fault."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from conformance_runner_cases import FAULTY, FAULTY_CUTS, RECORDED, VECTOR_LIST
+from tables import failures
+
+import csplat
+from csplat.errors import FormatError, InputError
+from csplat_authoring.builder import build
+from csplat_authoring.recipes import sound_recipes
+from csplat_conformance import adapter, decoder_suite
+from csplat_conformance.answers import Answer, check_payload_consistency, compare_answer
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_builtin, run_command
+from csplat_conformance.encoders.encoder_inputs import all_inputs
+from csplat_conformance.manifest import VECTORS, load, select_names
+from csplat_selftest.decoder_processes import missing_javascript
+from csplat_selftest.fuzzing.damage import built_from
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
+
+
+CUT_ADAPTER = f"{sys.executable} -m csplat_conformance.adapter --cuts {{input}} {{cuts}}"
+
+
+JS_ADAPTER = f"node '{ROOT / 'codec' / 'js' / 'test' / 'adapter.mjs'}' {{input}} {{outdir}}"
+
+
+needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
+
+
+#: Tests of the suite itself: they run when it changes.
+in_depth = pytest.mark.long
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A folder with the answers of our decoder: files of a vector, with its status and output as JSON next to them."""
+    folder = tmp_path_factory.mktemp("decoder")
+    for vector in VECTOR_LIST:
+        if vector.name in RECORDED:
+            outdir = folder / "recorded" / vector.name.split("/")[1]
+            outdir.mkdir(parents=True)
+            words = io.StringIO()
+            with contextlib.redirect_stdout(words):
+                status = adapter.main([str(VECTORS / vector.file), str(outdir)])
+            outdir.with_suffix(".json").write_text(json.dumps([status, words.getvalue()]))
+    (folder / "decoder.py").write_text(FAULTY)
+    cuts = {one.name.split("/")[1]: dict(one.expect["cuts"]) for one in VECTOR_LIST if "cuts" in one.expect}
+    (folder / "cuts.json").write_text(json.dumps(cuts))
+    (folder / "cuts.py").write_text(FAULTY_CUTS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def faulty(recorded):
+    """Return a function for the command line of our decoder with a fault."""
+    return lambda fault: f"{sys.executable} -I -S {recorded / 'decoder.py'} '{fault}' {{input}} {{outdir}}"
+
+
+@pytest.fixture(scope="module")
+def faulty_cuts(recorded):
+    """Return a function for the command line of a program for cuts with a fault."""
+    return lambda fault: f"{sys.executable} -I -S {recorded / 'cuts.py'} '{fault}' {{input}} {{cuts}}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adapter", [ADAPTER, pytest.param(JS_ADAPTER, marks=needs_node)], ids=["Python", "JavaScript"])
+def test_our_decoders_pass_by_the_protocol_with_codes_clauses_and_offsets_and_names_percent_encoded(adapter):
+    report = run_command(adapter, DecoderSuiteOptions(pattern="extreme/extra_names,invalid/quat_radicand", exact=True))
+    assert [] == report.failures
+    assert {"L1", "L2", "L3"} == set(report.levels())
+    assert {"extreme/extra_names", "invalid/quat_radicand"} == {outcome.name for outcome in report.outcomes}
+
+
+@pytest.mark.slow
+def test_our_cuts_pass_by_the_protocol():
+    report = run_command(None, DecoderSuiteOptions(pattern="valid/levels", levels=(5,)), cuts=CUT_ADAPTER)
+    assert [("valid/levels", "L5", Status.PASSED, "")] == [
+        (one.name, one.level, one.status, one.message) for one in report.outcomes
+    ]
+
+
+VALID_FAULTS = {
+    "crash": (Status.CRASHED, ("L1", "L2", "L3"), "signal 11"),
+    "hang": (Status.HUNG, ("L1", "L2", "L3"), "still running after 1.5 s"),
+    "status": (Status.WRONG_STATUS, ("L1", "L2", "L3"), "exit status 77"),
+    "traceback": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "KeyError: 'tile'"),
+    "silent": (Status.NO_OUTPUT, ("L1", "L2", "L3"), "nothing was written"),
+    "no code": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "without a line of JSON"),
+    "refusal": (Status.REFUSED, ("L1", "L2", "L3"), "refused"),
+    "no header": (Status.WRONG_ANSWER, ("L1",), "no header.json"),
+    "header": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "header.json is not a JSON object"),
+    "fact": (Status.FAILED, ("L1",), "header.splat_count is 3, expected 5"),
+    "missing": (Status.WRONG_ANSWER, ("L2",), "integers.means is missing"),
+    "extra": (Status.FAILED, ("L3",), "floats.colours: unexpected array"),
+    "unknown file": (Status.WRONG_ANSWER, ("L1", "L2", "L3"), "log.txt is not a file of the protocol"),
+    "partial": (Status.PARTIAL_OUTPUT, ("L3",), "floats.means has 59 bytes, expected 60"),
+    "longer": (Status.FAILED, ("L3",), "floats.means has 61 bytes, expected 60"),
+    "rounding": (Status.FAILED, ("L3",), "floats.means differs"),
+}
+
+
+@in_depth
+def test_a_fault_on_a_valid_file_has_an_outcome_of_its_own(faulty):
+    def check(fault):
+        status, levels, message = VALID_FAULTS[fault]
+        report = run_command(
+            faulty(fault), DecoderSuiteOptions(pattern="valid/quats", timeout=1.5 if fault == "hang" else 60)
+        )
+        assert levels == tuple(outcome.level for outcome in report.failures)
+        assert {status} == {outcome.status for outcome in report.failures}
+        assert all(message in outcome.message for outcome in report.failures)
+        assert all("QUA-1" in outcome.clauses for outcome in report.failures)
+
+    assert [] == failures({fault: fault for fault in VALID_FAULTS}, check)
+
+
+BROKEN_FAULTS = {
+    "none": (Status.PASSED, ""),
+    "refusal": (Status.PASSED, "by QUA-2, reported E_MAGIC"),
+    "leftovers": (Status.PARTIAL_OUTPUT, "refused, but left floats.means.bin"),
+    "silent": (Status.FAILED, "accepted"),
+    "crash": (Status.CRASHED, "signal 11"),
+    "status": (Status.WRONG_STATUS, "exit status 77"),
+    "no code": (Status.WRONG_ANSWER, "without a line of JSON"),
+}
+
+
+@in_depth
+def test_a_fault_on_a_broken_file_has_an_outcome_of_its_own(faulty):
+    def check(fault):
+        status, message = BROKEN_FAULTS[fault]
+        (outcome,) = run_command(faulty(fault), DecoderSuiteOptions(pattern="invalid/quat_radicand")).outcomes
+        assert (status, "L1", "QUA-2") == (outcome.status, outcome.level, outcome.clauses[0])
+        assert message in outcome.message
+
+    assert [] == failures({fault: fault for fault in BROKEN_FAULTS}, check)
+
+
+def test_an_exact_run_refuses_another_code(faulty):
+    report = run_command(faulty("refusal"), DecoderSuiteOptions(pattern="invalid/quat_radicand", exact=True))
+    assert [Status.FAILED] == [outcome.status for outcome in report.outcomes]
+
+
+@pytest.mark.slow
+def test_a_broken_payload_may_be_accepted_by_decoders_that_leave_it_unread_but_not_a_broken_frame(faulty):
+    payloads = ["json_open", "json_coded_garbage", "json_beyond_budget", "error_counts"]
+    frames = ["metadata_crc", "stated_errors_crc", "chunk_flags_differ", "metadata_twice"]
+
+    def failed(names, **options):
+        pattern = ",".join(f"invalid/{name}" for name in names)
+        report = run_command(faulty("silent"), DecoderSuiteOptions(pattern=pattern, **options))
+        return sorted(outcome.name.split("/")[1] for outcome in report.failures)
+
+    assert [] == failed(payloads)
+    assert sorted(payloads) == failed(payloads, exact=True)
+    assert sorted(frames) == failed(frames)
+
+
+CUT_FAULTS = {
+    "none": (Status.PASSED, ""),
+    "status": (Status.WRONG_STATUS, "exit status 77"),
+    "refusal": (Status.REFUSED, "refused"),
+    "silent": (Status.NO_OUTPUT, "0 cuts, expected 40, a line for each"),
+    "short": (Status.PARTIAL_OUTPUT, "39 cuts, expected 40"),
+    "long": (Status.FAILED, "41 cuts, expected 40"),
+    "words": (Status.WRONG_ANSWER, "line 2 is 'tile 2', expected numbers of tiles, or an error code"),
+    "one wrong": (Status.FAILED, "the cut 'level 1' is 1 0, expected 2"),
+    "empty cuts": (Status.FAILED, "the cut 'level 0' is empty, expected 0 1; 30 of the other 39 cuts are wrong, too"),
+    "no error code": (Status.FAILED, "the cut 'splats 2' is E_INPUT, expected E_LIMIT"),
+    "no sizes": (Status.PASSED, "the decoder offers no cut by pixel_size"),
+    "no list of sizes": (Status.FAILED, "is E_UNSUPPORTED, expected"),
+    "no boxes": (Status.PASSED, "the decoder offers no cut by box"),
+    "no cuts": (Status.SKIPPED, "the decoder offers no cut by box, level, pixel_size, splats"),
+}
+
+
+@pytest.mark.slow
+def test_a_fault_of_a_program_for_cuts_has_an_outcome_of_its_own(faulty_cuts):
+    def check(fault):
+        options = DecoderSuiteOptions(pattern="valid/levels", levels=(5,))
+        (outcome,) = run_command(None, options, cuts=faulty_cuts(fault)).outcomes
+        status, message = CUT_FAULTS[fault]
+        assert ("valid/levels", "L5", status) == (outcome.name, outcome.level, outcome.status)
+        assert message in outcome.message
+        assert bool(message) == bool(outcome.message)
+        assert "TRE-9" in outcome.clauses
+        assert outcome.code == ("E_INDEX" if fault == "refusal" else "")
+
+    assert [] == failures({fault: fault for fault in CUT_FAULTS}, check)
+    long_chain = DecoderSuiteOptions(pattern="extreme/levels_chain_of_256", levels=(5,))
+    (outcome,) = run_command(None, long_chain, cuts=faulty_cuts("no list of sizes")).outcomes
+    assert len(outcome.message) < 300
+
+
+def test_cuts_are_requested_of_valid_files_with_levels_alone(faulty, faulty_cuts):
+    options = DecoderSuiteOptions(pattern="valid/quats,valid/levels,invalid/level_below", levels=(1, 5))
+
+    alone = run_command(None, options, cuts=faulty_cuts("none"))
+    assert [("valid/levels", "L5")] == [(one.name, one.level) for one in alone.outcomes]
+    without = run_command(faulty("refusal"), options)
+    assert [("valid/levels", "no command for cuts was given")] == [
+        (one.name, one.message) for one in without.outcomes if one.status is Status.SKIPPED
+    ]
+
+
+def test_a_refusal_by_our_own_cuts_is_a_failure(monkeypatch):
+    def refuse(*_):
+        raise FormatError("E_INDEX", 0, "TRE-5")
+
+    monkeypatch.setattr(adapter, "cuts_of", refuse)
+    (failure,) = run_builtin(DecoderSuiteOptions(pattern="valid/levels", levels=(5,))).failures
+    assert (Status.REFUSED, "E_INDEX") == (failure.status, failure.code)
+
+
+MISTAKE = "each accepted one is an error if your decoder reads META (CHK-7)"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "failed", "notes"),
+    [
+        ("none", [], []),
+        ("silent", [], ["leaves META unread (CHK-6)", "leaves SERR unread (CHK-6)"]),
+        (
+            "believes json_open",
+            ["invalid/json_open"],
+            [f"reads META: 1 refused, 1 accepted: {MISTAKE}: invalid/json_open"],
+        ),
+    ],
+)
+def test_a_decoder_reads_all_payloads_of_a_chunk_type_or_none(faulty, fault, failed, notes):
+    names = ("json_open", "json_surrogate", "json_beyond_budget", "error_counts")
+    report = run_command(faulty(fault), DecoderSuiteOptions(pattern=",".join(f"invalid/{name}" for name in names)))
+    assert failed == [outcome.name for outcome in report.failures]
+    assert notes == report.notes
+
+
+def test_a_larger_budget_for_texts_does_not_show_that_they_are_left_unread():
+    vectors = [vector for vector in VECTOR_LIST if vector.error and vector.error["optional"] == "META"]
+    answers = {code: Answer(status, code=code) for code, status in (("", Status.PASSED), ("E_JSON", Status.REFUSED))}
+    outcomes = [
+        compare_answer(one, answers["" if one.error["code"] == "E_LIMIT" else "E_JSON"], (1,))[0] for one in vectors
+    ]
+    assert (outcomes, []) == check_payload_consistency(outcomes)
+
+
+@pytest.mark.parametrize(
+    "command", ["my-decoder-that-is-not-there {input} {outdir}", "decoder {input}", "", "'decoder {input} {outdir}"]
+)
+def test_a_command_that_cannot_be_run_is_refused_at_once(command):
+    with pytest.raises(InputError):
+        run_command(command, DecoderSuiteOptions(pattern="valid/quats"))
+    with pytest.raises(InputError):
+        run_command(None, DecoderSuiteOptions(pattern="valid/levels"), cuts=command)
+
+
+@pytest.mark.parametrize("wrong", [{"levels": ()}, {"levels": (7,)}, {"timeout": 0}, {"jobs": 0}, {"by": "fast"}])
+def test_contradictory_choices_are_refused(wrong):
+    with pytest.raises(InputError):
+        DecoderSuiteOptions(**wrong)
+
+
+@pytest.mark.slow
+def test_vectors_are_chosen_by_clause_or_chapter_of_clauses():
+    def names(clause):
+        return {outcome.name for outcome in run_builtin(DecoderSuiteOptions(clause=clause, levels=(1,))).outcomes}
+
+    about = {
+        chapter: {one.name for one in VECTOR_LIST if any(name.startswith(chapter) for name in one.clauses)}
+        for chapter in ("MOR", "COV")
+    }
+    assert about["MOR"] == names("MOR") == names("MOR-*")
+    assert about["MOR"] | about["COV"] == names("MOR, COV")
+
+
+@pytest.mark.parametrize(
+    ("choice", "message"),
+    [
+        (DecoderSuiteOptions(pattern="valid/*,nothing"), "no vector matches 'nothing'"),
+        (DecoderSuiteOptions(pattern="valid/*,"), "no vector matches ''"),
+        (DecoderSuiteOptions(clause="M"), "no clause of a vector matches 'M'"),
+    ],
+)
+def test_a_pattern_that_matches_nothing_is_named(choice, message):
+    with pytest.raises(InputError, match=message):
+        run_builtin(choice)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "by", "message"),
+    [
+        ("2 ulp", "renderer", ""),
+        ("3 ulp", "renderer", "floats.means: 15 of 15 values are too far"),
+        ("2 ulp", "exact", "floats.means differs"),
+        ("missing", "renderer", "integers.means is missing"),
+        ("longer", "renderer", "61 bytes, expected 60"),
+    ],
+)
+def test_the_class_sets_the_tolerance_of_floats(faulty, fault, by, message):
+    report = run_command(faulty(fault), DecoderSuiteOptions(pattern="valid/quats", by=by))
+    assert [message in outcome.message for outcome in report.failures] == ([True] if message else [])
+    assert (["compared with the tolerances of the class renderer"] if by == "renderer" else []) == [*report.notes]
+
+
+def test_faults_of_a_higher_level_are_not_looked_for(faulty):
+    assert run_command(faulty("rounding"), DecoderSuiteOptions(pattern="valid/quats", levels=(1,))).passed
+
+
+def test_patterns_of_the_guides_match_vectors():
+    """A word without quotes must mean the same to a shell."""
+    guides = ("conformance/IMPLEMENTERS.md", "conformance/README.md", "CONTRIBUTING.md")
+    text = "\n".join((ROOT / guide).read_text(encoding="utf-8") for guide in guides)
+    recommended = set(re.findall(r"--filter ('[^']+'|[\w/,*-]+)", text))
+    names = [vector.name for vector in VECTOR_LIST] + [one.name for one in all_inputs()]
+    names += [clause for vector in VECTOR_LIST for clause in vector.clauses]
+
+    def check(word):
+        assert word.startswith("'") or "*" not in word
+        assert select_names(word.strip("'"), names, "filter")
+
+    assert len(recommended) > 15
+    assert [] == failures({word: word for word in recommended}, check)
+
+
+VECTOR_LIST_CONFORMANCE = load()
+
+
+VALID = [vector for vector in VECTOR_LIST_CONFORMANCE if not vector.error]
+
+
+SCENES = {recipe.name: recipe.scene for recipe in sound_recipes() if recipe.scene is not None}
+
+
+def named(name):
+    return next(vector for vector in VECTOR_LIST_CONFORMANCE if vector.name == name)
+
+
+def test_the_built_in_run_passes_a_vector_once_per_level():
+    report = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="*/quat*,valid/rich"))
+    names = [
+        vector.name for vector in VECTOR_LIST_CONFORMANCE if vector.name.split("/")[1].startswith(("quat", "rich"))
+    ]
+    valid = [name for name in names if not name.startswith("invalid/")]
+    assert [] == report.failures
+    for level, passed in (("L1", names), ("L2", valid), ("L3", valid)):
+        assert passed == [one.name for one in report.outcomes if one.level == level]
+
+
+@pytest.mark.slow
+def test_cuts_are_those_of_the_manifest():
+    report = decoder_suite.run_builtin(DecoderSuiteOptions(levels=(5,)))
+    assert [] == report.failures
+    assert {"L5"} == {one.level for one in report.outcomes}
+    assert {vector.name for vector in VALID if "TRE-9" in vector.clauses} <= {one.name for one in report.outcomes}
+
+
+def test_a_wrong_hash_or_an_accepted_broken_file_fails_the_run(monkeypatch):
+    vector = named("valid/quats")
+    digest = vector.expect["floats"]["quats"]
+    wrong = vector.expect | {"floats": vector.expect["floats"] | {"quats": [*digest[:2], "0" * 64]}}
+    error = {"code": "E_RANGE", "clause": "QUA-2", "offset": 0, "also": [], "optional": ""}
+    for change, level, message, clause in (
+        ({"expect": wrong}, "L3", "floats.quats differs", "QUA-1"),
+        ({"expect": {}, "error": error}, "L1", "accepted", "QUA-2"),
+    ):
+        changed = [replace(vector, **change)]
+        monkeypatch.setattr(decoder_suite, "load", lambda vectors=changed: vectors)
+        (failure,) = decoder_suite.run_builtin().failures
+        assert (Status.FAILED, level, message) == (failure.status, failure.level, failure.message)
+        assert clause in failure.clauses
+
+
+def test_differing_decoding_functions_fail_the_run(monkeypatch):
+    monkeypatch.setattr(csplat.decoder, "decode_integers", csplat.decoder.decode)
+    report = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="invalid/quat_radicand"))
+    assert report.passed
+
+    def refuse(*_args, **_options):
+        raise csplat.FormatError("E_RANGE", 0, "QUA-2")
+
+    monkeypatch.setattr(csplat.decoder, "decode_integers", refuse)
+    failure = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="valid/quats")).failures[0]
+    assert "decode and decode_integers differ: accepted; E_RANGE" in failure.message
+
+
+FULL_TILE = "extreme/tile_of_65536"
+
+
+#: Vectors with too many splats or entries to read more than their index.
+OF_MANY = {"extreme/codebook_of_65536", "extreme/codebooks_of_many_splats", FULL_TILE}
+
+
+@pytest.fixture(scope="module")
+def valid():
+    """Return a function for the valid vectors with fields of a structure, and the places of these fields."""
+    found = {}
+    for name, made in SCENES.items():
+        built = built_from((VECTORS / f"{name}.csplat").read_bytes()) if name in OF_MANY else build(made)
+        by_structure = {}
+        for place, field in built.fields.items():
+            by_structure.setdefault(field.structure, {})[place] = field
+        # A block's coding determines the meaning of its streams.
+        codings = {place: field for place, field in built.fields.items() if place.endswith(".coding")}
+        for structure, fields in by_structure.items():
+            found.setdefault(structure, []).append(replace(built, fields=codings | fields))
+    return found.__getitem__

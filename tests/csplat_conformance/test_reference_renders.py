@@ -1,0 +1,190 @@
+"""L4: reference pictures, and renderers within and beyond the tolerance."""
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from tables import failures
+
+from csplat.errors import InputError
+from csplat_authoring import __main__ as recipes
+from csplat_authoring.recipes.rendered import rendered_recipes
+from csplat_authoring.reference import expected
+from csplat_conformance import reference_renders
+from csplat_conformance.conformance_report import Status
+from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_builtin, run_command
+from csplat_conformance.manifest import VECTORS, load
+from csplat_conformance.reference_renders import PSNR_CAP, psnr, read_png, write_png
+
+#: `make test` renders these pictures with our decoder and rasteriser, by the command.
+pytestmark = pytest.mark.long
+
+
+RENDERED = [vector for vector in load() if vector.views]
+
+
+# Copies the picture of a camera, with a selectable fault; no slow imports.
+COPIER = """
+import json, pathlib, sys
+
+fault, _, camera, out = sys.argv[1:]
+if fault == "status":
+    sys.exit(1)
+folder = pathlib.Path(__file__).parent
+wanted = json.loads(pathlib.Path(camera).read_text())
+(number,) = [number for number, one in enumerate(json.loads((folder / "cameras.json").read_text())) if [one] == wanted]
+if fault == "text":
+    pathlib.Path(out).write_text("P3")
+elif fault != "nothing":
+    pathlib.Path(out).write_bytes((folder / f"{fault}.{number}.png").read_bytes())
+"""
+
+
+PICTURES = {
+    "none": lambda picture: picture,
+    "shifted": lambda picture: np.roll(picture, -1, axis=1),
+    "small": lambda picture: picture[1:],
+}
+
+
+@pytest.fixture(scope="module")
+def copier(tmp_path_factory):
+    """Return a function for the command line of a renderer of `render/ellipsoids` with a fault."""
+    folder = tmp_path_factory.mktemp("renderer")
+    (vector,) = [vector for vector in RENDERED if vector.name == "render/ellipsoids"]
+    (folder / "cameras.json").write_text(json.dumps([view["camera"] for view in vector.views]))
+    for number, view in enumerate(vector.views):
+        picture = read_png((VECTORS / view["picture"]).read_bytes())
+        for fault, change in PICTURES.items():
+            (folder / f"{fault}.{number}.png").write_bytes(write_png(np.ascontiguousarray(change(picture))))
+    script = folder / "renderer.py"
+    script.write_text(COPIER)
+    return lambda fault: f"{sys.executable} -I -S {script} {fault} {{input}} {{camera}} {{out}}"
+
+
+def test_a_scene_is_seen_by_two_cameras_and_not_dark():
+    def check(vector):
+        assert 2 == len(vector.views)
+        for view in vector.views:
+            picture = read_png((VECTORS / view["picture"]).read_bytes())
+            assert (view["camera"]["H"], view["camera"]["W"], 3) == picture.shape
+            assert psnr(picture, np.zeros_like(picture)) < 25
+
+    assert [] == failures(RENDERED, check)
+
+
+def test_our_renderer_is_within_the_tolerance():
+    report = run_builtin(DecoderSuiteOptions(pattern="render/*", levels=(4,)))
+    assert report.passed
+    assert 8 == len(report.outcomes)
+    assert min(outcome.details["psnr"] for outcome in report.outcomes) > 60
+
+
+MISTAKES = {
+    "no harmonics": ("render/harmonics", lambda floats: floats | {"shN": floats["shN"][:, :0]}),
+    "no band 4": ("render/harmonics_4", lambda floats: floats | {"shN": floats["shN"][:, :15]}),
+    "x, y, z, w": ("render/ellipsoids", lambda floats: floats | {"quats": np.roll(floats["quats"], 1, axis=1)}),
+    "w negative": ("render/ellipsoids", lambda floats: floats | {"quats": floats["quats"] * np.float32([-1, 1, 1, 1])}),
+    "scales too large": ("render/ellipsoids", lambda floats: floats | {"scales": floats["scales"] + 0.05}),
+    "no low-pass filter": ("render/antialiased", None),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_faulty_renderer_is_below_the_required_psnr(mistake):
+    name, change = MISTAKES[mistake]
+    recipe = next(recipe for recipe in rendered_recipes() if recipe.name == name)
+    made = expected(recipe.scene)
+    floats = change(made.floats) if change else made.floats
+    antialiased = bool(made.header["scene_flags"]) and change is not None
+
+    def score(number, view):
+        reference = read_png((VECTORS / f"{name}.{number}.png").read_bytes())
+        return psnr(reference, reference_renders.reference_render(floats, view.camera, antialiased))
+
+    assert any(score(number, view) < view.psnr for number, view in enumerate(recipe.views))
+
+
+@pytest.mark.parametrize(
+    ("fault", "status", "message"),
+    [
+        ("none", Status.PASSED, ""),
+        ("shifted", Status.FAILED, "expected 45"),
+        ("small", Status.WRONG_ANSWER, "128x127 pixels, expected 128x128"),
+        ("text", Status.WRONG_ANSWER, "not a PNG"),
+        ("nothing", Status.NO_OUTPUT, "0 PNG files"),
+        ("status", Status.REFUSED, "exit status 1"),
+    ],
+)
+def test_each_fault_of_a_renderer_has_its_status(copier, fault, status, message):
+    report = run_command(None, DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,)), render=copier(fault))
+    assert {status} == {outcome.status for outcome in report.outcomes}
+    assert all(message in outcome.message for outcome in report.outcomes)
+
+
+def test_without_a_renderer_pictures_are_skipped_with_a_note(monkeypatch):
+    monkeypatch.setattr(reference_renders, "can_render", lambda: False)
+    (outcome, _) = run_builtin(DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,))).outcomes
+    assert (Status.SKIPPED, "needs the packages of the extra render") == (outcome.status, outcome.message)
+
+
+@pytest.fixture
+def ellipsoids(monkeypatch):
+    """`--check` of one recipe with pictures, the other files as they are: a step of the gate makes them all."""
+    (recipe,) = [one for one in rendered_recipes() if one.name.endswith("ellipsoids")]
+    made = [path for path in VECTORS.rglob("*") if path.suffix in (".csplat", ".png")]
+    monkeypatch.setattr(
+        recipes, "files", lambda: {path: path.read_bytes() for path in made} | recipes._pictures(recipe)
+    )
+    monkeypatch.setattr(sys, "argv", ["recipes", "--check"])
+
+
+@pytest.mark.usefixtures("ellipsoids")
+def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
+    monkeypatch.setattr(recipes, "can_render", lambda: False)
+    assert 0 == recipes.main()
+    assert "SKIPPED: reference pictures" in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("ellipsoids")
+def test_a_changed_picture_is_out_of_date(monkeypatch, capsys):
+    assert 0 == recipes.main()
+    right = recipes.reference_render
+    monkeypatch.setattr(recipes, "reference_render", lambda *args: 255 - right(*args))
+    assert 1 == recipes.main()
+    assert "ellipsoids.0.png" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])
+def test_pictures_of_other_writers_and_of_ours_are_read(tmp_path, mode):
+    image = pytest.importorskip("PIL.Image", reason="pictures require the extra [render]")
+    noise = np.random.default_rng(1).integers(0, 256, (40, 30, 3), np.uint8)
+    noise[10:] = np.arange(90, dtype=np.uint8).reshape(30, 3)  # the writer then chooses every filter
+    picture = image.fromarray(noise).convert(mode)
+    picture.save(tmp_path / "a.png")
+    pixels = np.asarray(picture.convert("RGB"))
+    assert np.array_equal(pixels, read_png((tmp_path / "a.png").read_bytes()))
+    assert np.array_equal(pixels, read_png(write_png(pixels)))
+
+
+@pytest.mark.parametrize("data", [b"", b"GIF89a", write_png(np.zeros((2, 2, 3), np.uint8))[:40]])
+def test_other_data_is_no_picture(data):
+    with pytest.raises(InputError):
+        read_png(data)
+
+
+def test_equal_pictures_score_the_cap_and_other_sizes_are_refused():
+    picture = np.zeros((2, 2, 3), np.uint8)
+    assert PSNR_CAP == psnr(picture, picture)
+    assert 0.0 == psnr(picture, picture + np.uint8(255))
+    with pytest.raises(InputError):
+        psnr(picture, picture[:1])
+
+
+def test_cameras_of_the_manifest_are_a_camera_file():
+    from csplat_render.camera import Camera
+
+    for vector in RENDERED:
+        for view in vector.views:
+            assert view["camera"] == json.loads(json.dumps(Camera.from_json(view["camera"]).to_json()))

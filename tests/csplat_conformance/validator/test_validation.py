@@ -1,0 +1,345 @@
+"""The strict validator: every violation by its clause, of vectors, of damaged files, and of files with many defects."""
+
+import json
+import random
+import subprocess
+import sys
+from dataclasses import replace
+
+import pytest
+from tables import failures
+from validator_cases import INVALID, SMALL, SPLATS_MAX, VECTOR_LIST, by_zlib
+
+import csplat
+from csplat import _spec
+from csplat_authoring.builder import build, repair
+from csplat_authoring.recipes import sound_recipes
+from csplat_authoring.recipes.deflate_streams import invalid_streams
+from csplat_authoring.samples import attributes, rich_scene, scene, tile
+from csplat_authoring.scene import Attribute, Chunk, Node, StatedErrors
+from csplat_conformance.validator import validate
+from csplat_conformance.validator.ancillary_chunks import JsonError, parse_json
+from csplat_conformance.validator.inflate import CodedError
+from csplat_conformance.validator.streams import undo_coder
+from csplat_selftest.fuzzing.damage import damaged_file
+
+VALID = [vector for vector in VECTOR_LIST if not vector.error]
+
+
+RICH = build(rich_scene())
+
+
+#: Vectors whose defect the validator reports at a better offset than the manifest: rms itself, not the max before it.
+ELSEWHERE = {
+    f"invalid/{name}": ("SERR/record[means].rms", "SERR/record[means].max")
+    for name in (
+        "stated_error_record_rms_below",
+        "stated_error_record_rms_above",
+        "error_rms_nan",
+        "error_rms_infinite",
+    )
+}
+
+
+def clauses_of(data, **options):
+    return {one.clause for one in validate(data, **options).violations}
+
+
+@pytest.fixture(scope="module")
+def sound():
+    """Return the validator's result for each valid vector, by name."""
+    return {vector.name: validate(vector.data) for vector in VALID}
+
+
+@pytest.fixture(scope="module")
+def broken():
+    """Return the violations in each invalid vector, by name, within the budget for which their errors are defined."""
+    return {vector.name: validate(vector.data, splats_max=SPLATS_MAX).violations for vector in INVALID}
+
+
+@pytest.mark.slow
+def test_valid_vectors_have_no_violations(sound):
+    def check(vector):
+        found, header = sound[vector.name], vector.expect["header"]
+        assert ((), ()) == (found.violations, found.unread)
+        assert (header["splat_count"], header["tile_count"]) == (found.splat_count, found.tile_count)
+
+    assert [] == failures(VALID, check)
+
+
+@pytest.mark.slow
+def test_invalid_vectors_violate_their_clause_at_their_offset(broken):
+    def check(vector):
+        offset = vector.error["offset"]
+        if vector.name in ELSEWHERE:
+            better, stated = ELSEWHERE[vector.name]
+            offset += RICH.fields[better].offset - RICH.fields[stated].offset
+        found = {(one.clause, one.code, one.offset) for one in broken[vector.name]}
+        assert (vector.error["clause"], vector.error["code"], offset) in found
+        assert len(broken[vector.name]) <= 9  # consequences must not bury the defect
+
+    assert [] == failures(INVALID, check)
+
+
+@pytest.mark.slow
+def test_recommendations_that_are_not_followed_are_remarked(sound):
+    remarked = {name: found.remarks for name, found in sound.items() if found.remarks}
+    parts = {
+        "valid/chunks_reversed": "recommended order",
+        "valid/levels_in_reverse": "recommended order",
+        "extreme/deflate_unused_bits": "unused bits after the final block",
+        "extreme/json_deep_again": "camera 0 has no K, viewmat, W, H",
+    }
+    assert set(parts) == set(remarked)
+    for name, part in parts.items():
+        assert [True] == [part in remark for remark in remarked[name]]
+
+
+def test_all_defects_of_a_file_are_reported_at_their_fields():
+    changes = {
+        "header.profile": 9,
+        "header.reserved_0": 1,
+        "index.scene_flags": 0x08,
+        "index.unit_metres": -1.0,
+        "attribute[means].levels": 3,
+        "codebook[2].reserved_0": 1,
+        "directory[META].reserved_0": 1,
+        "tile[0].level": 1,
+        "tile[0].max_scale": 7.5,
+        "META/header.reserved_0": 1,
+        "SERR/head.error_flags": 0x40,
+        "CODB.7.2/head.reserved_0": 1,
+        "TILE.0.0/head.layer": 1,
+        "TILE.0.0/opacities.stream.reserved_0": 1,
+        "TILE.0.0/sh0.params.reserved_0": 1,
+    }
+    elsewhere = {"tile[1].extent": (1, 2, 3), "attribute[sh1].chroma_shift": 17, "tile[1].layer[0].crc": 99}
+    violations = validate(RICH.patched(changes | elsewhere)).violations
+    found = {one.field: one.offset for one in violations}
+    assert {name: RICH.fields[name].offset for name in changes}.items() <= found.items()
+    assert {"tile[1].corner", "TILE.1.0"} <= set(found)  # the box's first field (TIL-10), and the chunk (CHK-1)
+    assert sorted(one.offset for one in violations) == [one.offset for one in violations]
+    assert all(one.message and "\n" not in str(one) for one in violations)
+
+
+def test_bytes_of_unknown_structure_are_listed_as_unread():
+    found = validate(RICH.patched({"TILE.0.0/scales.coding": 99}))
+    assert ["BLK-1"] == [one.clause for one in found.violations]
+    assert [f"TILE.0.0 from byte {RICH.fields['TILE.0.0/scales.coding'].offset + 3} on"] == [
+        one.field for one in found.unread
+    ]
+
+
+#: Two nodes of two tiles each, their parents, and the root.
+TREE = scene(
+    tiles=[tile(seed, 3 + seed, level=level) for seed, level in enumerate((0, 0, 0, 0, 1, 1, 2))],
+    nodes=(Node(2, 2), Node(3, 2), Node(4, 1, 0.5), Node(4, 1, 0.25), Node(_spec.NO_PARENT, 1, 0.5)),
+)
+
+
+def tree_violations(**changes):
+    """Return clauses and fields of the violations in TREE after changes: `n0_parent` is `node[0].parent`."""
+    fields = {f"TREE/node[{name[1]}].{name[3:]}": value for name, value in changes.items()}
+    return [(one.clause, one.field) for one in validate(build(TREE).patched(fields)).violations]
+
+
+def test_all_defects_of_a_tree_are_reported():
+    found = tree_violations(n0_parent=1, n1_error=-1.0, n2_error=0.75, n3_parent=9, n4_error=float("inf"))
+    expected = {0: "TRE-5 parent", 1: "TRE-8 error", 3: "TRE-5 parent", 4: "TRE-8 error"}
+    assert [(text.split()[0], f"TREE/node[{node}].{text.split()[1]}") for node, text in expected.items()] == found
+
+
+def test_consequences_of_a_defect_of_a_tree_are_not_reported():
+    cases = {
+        "another parent": ({"n0_parent": 3}, ["TRE-6"]),  # node 2 had no other child
+        "no such parent": ({"n0_parent": 7}, ["TRE-5"]),  # node 2 may be the one that was meant
+        "one child fewer": ({"n2_parent": _spec.NO_PARENT}, ["TRE-7"]),
+        "infinite error": ({"n3_error": float("inf")}, ["TRE-8"]),  # the error of the root may be right
+        "a tile fewer": ({"n0_tile_count": 1}, ["TRE-3"]),  # levels and splats of all nodes are unknown
+        "a tile more": ({"n1_tile_count": 3}, ["TRE-3", "TRE-4"]),
+        "a tile more, and a parent of a lower number": ({"n4_tile_count": 2, "n4_parent": 0}, ["TRE-3", "TRE-5"]),
+    }
+
+    def check(case):
+        changes, clauses = case
+        assert sorted(clauses) == sorted(clause for clause, _ in tree_violations(**changes))
+
+    assert [] == failures(cases, check)
+
+
+def test_tiles_of_all_levels_are_checked():
+    changes = {f"TILE.{i}.0/opacities.stream.count": 99 for i in (0, 4, 6)}
+    assert {*changes} == {one.field for one in validate(build(TREE).patched(changes)).violations}
+
+
+def test_no_more_nodes_are_read_than_there_are_tiles():
+    many = replace(TREE, nodes=TREE.nodes + (Node(_spec.NO_PARENT, 1, 1.0),) * 50)
+    found = validate(build(many).data)
+    assert ["TRE-3"] == [one.clause for one in found.violations]
+    assert ["there are more nodes than tiles"] == [one.reason for one in found.unread]
+
+
+def test_a_file_beyond_the_budget_of_splats_at_level_0_is_not_read():
+    for data, count in ((build(TREE).data, 18), (RICH.data, 5)):
+        assert set() == clauses_of(data, splats_max=count)
+        assert {"LIM-1"} == clauses_of(data, splats_max=count - 1)
+
+
+def stated(*records, pruned=0, degree=0):
+    errors = StatedErrors(2 + pruned, pruned, degree, 0, records)
+    return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))).data
+
+
+def test_impossible_declared_errors_are_found():
+    means, opacities, sh2 = _spec.MEASURE_MEANS, _spec.MEASURE_OPACITIES, _spec.MEASURE_SH2
+    assert set() == clauses_of(stated((means, 0.5, 0.5 / 2**0.5), (opacities, 1.0, 1.0)))
+    assert "SER-5" in clauses_of(stated((means, 0.5, 0.3)))  # one of two splats alone gives 0.35
+    assert "SER-5" in clauses_of(stated((opacities, 1.5, 1.5)))
+    assert "SER-5" in clauses_of(stated((sh2, 0.5, 0.5)))  # neither has such a band
+    assert set() == clauses_of(stated((sh2, 0.5, 0.5), degree=2))
+
+
+def test_a_text_beyond_the_budget_is_not_read():
+    assert "STR-8" in clauses_of(RICH.data, json_bytes_max=3)
+    assert "STR-8" in clauses_of(RICH.data, json_bytes_max=255)
+    assert set() == clauses_of(RICH.data, json_bytes_max=256)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        (b' {"a" : [1, -0.5e+2, true, null, "\\u00e9\\n\xc3\xa9"]}\r\n', {"a": [1.0, -50.0, True, None, "é\né"]}),
+        (b'{"\\ud83d\\ude00":"\xf0\x9f\x98\x80"}', {"😀": "😀"}),
+        (b"[" * 64 + b"]" * 64, json.loads("[" * 64 + "]" * 64)),
+        (b"0", 0.0),
+        (b'""', ""),
+    ],
+)
+def test_json_texts_are_parsed(text, value):
+    assert value == parse_json(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"", b"{", b'{"a"}', b"{a:1}", b"[1,]", b"[1 2]", b"+1", b".5", b"1.", b"0x1", b"tru", b"truefalse", b'"\\x"',
+        b'"\\u12"', b"'a'", b"1e400", b"[" * 65 + b"]" * 65, b"\xff", b"\xc0\x80", b"{}\0", b'"\x7f\x1f"', b"\xc2\xa01",
+        b'"\\udc00\\ud800"', b'{"a":1,"\\u0061":2}',
+    ],
+)  # fmt: skip
+def test_invalid_json_texts_are_refused(text):
+    with pytest.raises(JsonError):
+        parse_json(text)
+
+
+def flip(data, bit):
+    """Return the file with one bit flipped; bit 0 is the lowest bit of byte 0."""
+    damaged = bytearray(data)
+    damaged[bit // 8] ^= 1 << bit % 8
+    return bytes(damaged)
+
+
+def undetected(files):
+    """Return the numbers of the damaged files in which the validator finds nothing."""
+    return [number for number, data in enumerate(files) if validate(data).conforms]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("built", [SMALL, RICH], ids=["small", "rich"])
+def test_prefixes_are_found(built):
+    # All prefixes of the small file, as many of the rich: the decoder's tests read all of these, too.
+    last = len(built.data) - 1
+    steps = len(SMALL.data) - 1
+    found = [{one.clause for one in validate(built.data[: i * last // steps]).violations} for i in range(steps + 1)]
+    assert all(found)
+    assert {"HDR-5", "HDR-11"} == set().union(*found)
+
+
+@pytest.mark.slow
+def test_every_flipped_bit_of_a_small_file_is_found():
+    # Every seventh bit, so that each bit position within a byte occurs.
+    assert [] == undetected(flip(SMALL.data, bit) for bit in range(0, 8 * len(SMALL.data), 7))
+
+
+@pytest.mark.slow
+def test_the_validator_agrees_with_the_decoder_on_damaged_files():
+    small = {vector.name for vector in VALID if vector.name.startswith("valid/") and len(vector.data) < 3000}
+    bases = [build(recipe.scene) for recipe in sound_recipes() if recipe.name in small]
+    for number in range(120):
+        data, _ = damaged_file(random.Random(f"validator {number}"), bases)  # noqa: S311 - repeatable, no secret
+        found = {(one.clause, one.code) for one in validate(data).violations if one.clause != "SER-5"}
+        error = error_of(data)
+        if error is None or error[0] == "LIM-1":
+            assert error or set() == found, number
+        else:
+            assert error in found, number
+
+
+def error_of(data):
+    """Return the clause and code of the decoder's error, or None. Only integers are decoded at all levels (CHK-8)."""
+    try:
+        csplat.decode(data, threads=1)
+        csplat.decode_integers(data, threads=1)
+    except csplat.CsplatError as error:
+        return error.clause, error.code
+    return None
+
+
+def test_no_content_of_a_file_raises():
+    def check(seed):
+        rng = random.Random(seed)  # noqa: S311 - repeatable, no secret
+        data = bytearray(RICH.data)
+        for _ in range(30):
+            at = rng.randrange(_spec.HEADER_SIZE, len(data))
+            data[at : at + 8] = rng.randbytes(8)
+        validate(repair(bytes(data), RICH.records))
+        validate(_spec.MAGIC + rng.randbytes(300))
+        validate(rng.randbytes(seed))
+
+    assert [] == failures({f"seed {seed}": seed for seed in range(20)}, check)
+
+
+def test_any_buffer_is_validated():
+    assert all(validate(kind(SMALL.data)).conforms for kind in (bytes, bytearray, memoryview))
+
+
+def test_huge_counts_of_levels_do_not_overflow():
+    # A count of levels beyond ATT-4 whose square exceeds 64 bits.
+    made = attributes() | {3: Attribute(_spec.MAPPING_UNIT_W, levels=2**32 - 1)}
+    assert {"ATT-4"} == clauses_of(build(scene(attributes=made)).data)
+
+
+def test_overlapping_chunks_are_read_once():
+    # Otherwise an index could make a validator read the same megabytes a million times.
+    twins = build(scene(tiles=[tile(1), tile(2)]))
+    found = validate(twins.patched({"tile[1].layer[0].offset": twins.spans["TILE.0.0"][0]}))
+    assert ["TILE.1.0"] == [one.field for one in found.unread]
+
+
+@pytest.mark.slow
+def test_validator_and_encoder_suite_import_no_decoder_encoder_or_renderer():
+    code = (
+        "import sys, csplat_conformance.validator; print(*sorted(sys.modules))\n"
+        "import csplat_conformance.encoders; print(*sorted(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    by_validator, by_suite = (line.split() for line in done.stdout.splitlines())
+    loaded = {".".join(name.split(".")[:2]) for name in by_validator if name.startswith("csplat")}
+    # `csplat.file_source` releases memory that was read, `csplat.types` names array types: neither knows the format.
+    allowed = {"csplat", "csplat._spec", "csplat.file_source", "csplat.types", "csplat_conformance"}
+    assert allowed | {"csplat_conformance.tolerance", "csplat_conformance.validator"} == loaded
+    unwanted = ("csplat.encoder", "csplat.ply", "csplat_tools", "numba", "torch")
+    assert [] == [name for name in by_suite if name.startswith(unwanted)]
+
+
+DEFLATE = 1
+
+
+def test_invalid_deflate_streams_are_refused_with_their_clause():
+    def check(case):
+        assert "refused" == by_zlib(case.coded, len(case.output))
+        with pytest.raises(CodedError) as caught:
+            undo_coder(memoryview(case.coded), DEFLATE, len(case.output))
+        assert case.clause == caught.value.clause
+
+    assert [] == failures(invalid_streams(), check)

@@ -1,0 +1,175 @@
+"""Tests of csplat_render.conventions."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from oracle import (
+    GROUPS,
+    VIEW,
+    Case,
+    adversarial,
+    extreme_splats,
+    facing,
+    finite_differences,
+    float32_errors,
+    gradients_of,
+    random_gradients,
+    random_splats,
+    relative_error,
+)
+from rasteriser_cases import camera, one_splat
+from tables import failures
+
+from csplat.errors import LimitError
+from csplat_render import rasteriser, render
+from csplat_render.conventions import DILATION, UncheckedSplats
+
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
+
+
+def test_one_splat_has_the_values_worked_out_by_hand():
+    # σ = 0.5 at distance 4 with a focal length of 80 pixels is 10 pixels; the dilation is 0.3.
+    view = camera(65, 49, 80.0)
+    result = render(one_splat(alpha=0.5, scale=math.log(0.5)), view)
+    variance = 100.0 + DILATION
+    for dx, dy in [(0, 0), (5, 0), (0, 7), (-12, 9)]:
+        alpha = 0.5 * math.exp(-0.5 * (dx * dx + dy * dy) / variance)
+        x, y = 32 + dx, 24 + dy  # the centre of the image is the centre of a pixel
+        np.testing.assert_allclose(result.rgb[y, x], np.array([1.0, 0.5, 0.25]) * alpha, atol=1e-6)
+        assert result.alpha[y, x] == pytest.approx(alpha, abs=1e-6)
+        assert result.depth[y, x] == pytest.approx(4.0 * alpha, abs=1e-5)
+    assert result.radii[0] == pytest.approx(3.0 * math.sqrt(variance), rel=1e-6)
+    # 0.5 · exp(−½ r²/100.3) falls below 1/255 at r = 31.17 pixels.
+    reach = math.sqrt(2.0 * variance * math.log(0.5 * 255.0))
+    assert result.alpha[24, 32 + math.floor(reach)] > 0.0
+    assert result.alpha[24, 32 - math.floor(reach) - 1] == 0.0
+
+
+def assert_survives(case):
+    """Render forward and backward in both dtypes; assert finite results near the twin, and return the float32 render.
+
+    Unless they exceed float32, gradients of both dtypes agree, too.
+    """
+    splats, weights = UncheckedSplats(**case.arrays), random_gradients(case.view, seed=1)
+    options = {"antialiased": case.antialiased}
+    exact = render(splats, case.view, mode="exact", **options)
+    assert np.isfinite(exact.rgb).all()
+    pictures = []
+    for dtype in (np.float32, np.float64):
+        picture, gradients = gradients_of(splats, case.view, weights, dtype, **options)
+        values = {"rgb": picture.rgb, "alpha": picture.alpha, "depth": picture.depth, **vars(gradients)}
+        assert [] == [name for name, value in values.items() if not np.isfinite(value).all()]
+        off = np.abs(picture.rgb - exact.rgb).max(2) > 1 / 255 * max(1.0, np.abs(exact.rgb).max())
+        assert off.mean() <= 2e-3
+        assert exact.ignored == picture.ignored
+        pictures.append(picture)
+    if not case.beyond:
+        flipped, errors = float32_errors(splats, case.view, weights, **options)
+        assert flipped <= 1
+        assert max(errors.values()) <= 1e-2, errors
+    return pictures[0]
+
+
+def more_adversarial():
+    """Yield cases in addition to `adversarial`: log scales at the limits of float32, and renders of any size."""
+    for log_scale in (-60.0, 60.0, 88.0, -88.0, 3e38, -3e38):
+        for axes in ((1, 1, 1), (1, 0, 0), (1, 1, 0)):
+            arrays = extreme_splats()
+            arrays["scales"][:] = np.where(axes, np.float32(log_scale), arrays["scales"])
+            yield f"log scales {log_scale:g} on axes {axes}", Case(arrays, facing(), beyond=True)
+    for width, height in ((1, 1), (16, 16), (17, 15), (1, 100), (333, 1)):
+        yield f"{width} by {height} pixels", Case(extreme_splats(), facing(width=width, height=height), beyond=True)
+
+
+@pytest.mark.long
+def test_adversarial_splats_survive():
+    assert [] == failures({**dict(adversarial()), **dict(more_adversarial())}, assert_survives)
+
+
+@pytest.mark.parametrize("near", [1e-30, 1e-6, 0.2, 3.0])
+def test_splats_in_front_of_the_near_plane_are_not_drawn(near):
+    arrays = extreme_splats(count=4, degree=0, means=0.0, opacities=0.9)
+    arrays["means"][:, 2] = np.float32(near) * np.array([-1.0, 0.5, 0.99, 1.5])
+    assert 1 == render(UncheckedSplats(**arrays), facing(near=near, distance=0.0)).drawn
+
+
+def test_splats_of_alpha_0_are_not_drawn():
+    for alpha in (0.0, 1.0):
+        picture = render(UncheckedSplats(**extreme_splats(opacities=alpha)), facing())
+        assert (picture.alpha.max() > 0.0) == (alpha > 0.0)
+
+
+@pytest.mark.long
+def test_quaternions_of_any_length_survive():
+    arrays = extreme_splats()
+    arrays["quats"][1::3] *= np.float32(1e30)
+    arrays["quats"][2::3] *= np.float32(1e-30)
+    plain = {**arrays, "quats": arrays["quats"].copy()}
+    plain["quats"][::3] = [1.0, 0.0, 0.0, 0.0]
+    arrays["quats"][::3] = 0.0
+    found = assert_survives(Case(arrays, facing(), beyond=True))
+    np.testing.assert_array_equal(found.rgb, render(UncheckedSplats(**plain), facing()).rgb)
+
+
+@pytest.mark.long
+def test_non_finite_rows_are_ignored_and_counted():
+    def check(case):
+        name, bad = case
+        arrays = extreme_splats(count=30)
+        clean = UncheckedSplats(**{key: value[3:].copy() for key, value in arrays.items()})
+        arrays[name].reshape(30, -1)[:3, -1] = bad
+        found = assert_survives(Case(arrays, facing(), beyond=True))
+        assert 3 == found.ignored
+        np.testing.assert_array_equal(found.rgb, render(clean, facing()).rgb)
+
+    cases = itertools.product(GROUPS, (np.nan, np.inf, -np.inf))
+    assert [] == failures({f"{name} {bad}": (name, bad) for name, bad in cases}, check)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("degree", [0, 3])
+def test_an_empty_scene_renders_as_the_background(degree):
+    arrays = extreme_splats(count=0, degree=degree)
+    assert_survives(Case(arrays, facing(), beyond=True))
+    picture = render(UncheckedSplats(**arrays), facing(), background=(0.1, 0.2, 0.3))
+    np.testing.assert_array_equal(picture.rgb, np.broadcast_to(np.float32([0.1, 0.2, 0.3]), (37, 50, 3)))
+
+
+def test_too_many_intersections_are_refused(monkeypatch):
+    monkeypatch.setattr(rasteriser, "MAX_INTERSECTIONS", 100)
+    with pytest.raises(LimitError, match="MAX_INTERSECTIONS"):
+        render(UncheckedSplats(**extreme_splats(scales=2.0)), facing())
+
+
+def largest_error(gradients, wanted):
+    """Return the largest relative error of any group of parameters."""
+    return max(relative_error(getattr(gradients, group), wanted[group]) for group in GROUPS)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("degree", "antialiased"), [(0, False), (1, True), (2, False), (3, False), (4, True)])
+def test_gradients_agree_with_finite_differences_of_the_twin(degree, antialiased):
+    arrays, weights = random_splats(3, degree, seed=degree), random_gradients(VIEW, seed=1)
+    options = {"background": (0.2, 0.5, 0.7), "antialiased": antialiased}
+    picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
+    exact, differences = finite_differences(arrays, VIEW, weights, **options)
+    np.testing.assert_allclose(picture.rgb, exact.rgb, atol=1e-12)
+    assert largest_error(gradients, differences) <= 1e-6
+
+
+@pytest.mark.long
+@pytest.mark.torch
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("degree", [0, 1, 2, 3, 4])
+def test_gradients_agree_with_autograd(degree, antialiased):
+    pytest.importorskip("torch", reason="autograd is that of torch: pip install 'csplat[train]'")
+    from torch_twin import autograd_gradients
+
+    arrays, weights = random_splats(20, degree, seed=degree + 10), random_gradients(VIEW, seed=1)
+    options = {"background": (0.2, 0.5, 0.7), "antialiased": antialiased}
+    picture, gradients = gradients_of(UncheckedSplats(**arrays), VIEW, weights, **options)
+    other, wanted = autograd_gradients(arrays, VIEW, weights, **options)
+    np.testing.assert_allclose(picture.rgb, other, atol=1e-12)
+    assert largest_error(gradients, wanted) <= 1e-6

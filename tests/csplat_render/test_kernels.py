@@ -1,0 +1,291 @@
+"""Kernels: threads run every lane once and pass errors on; a fork gets its own; warming up compiles everything."""
+
+import importlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from csplat.errors import InputError
+from csplat_render import kernels
+from csplat_render.kernels import ParallelKernel, available_threads, kernel, lane_range, parallel_kernel, thread_count
+
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
+
+
+@parallel_kernel()
+def note(lane, lanes, seen):
+    first, end = lane_range(lane, lanes, len(seen))
+    for i in range(first, end):
+        seen[i] += lane + 1
+
+
+@parallel_kernel()
+def fail_at(lane, lanes, which):
+    if lane == min(which, lanes):
+        raise ValueError("this lane")
+
+
+def test_every_lane_runs_once():
+    for threads, count in ((1, 1000), (2, 5), (2, 1000), (None, 1000), (None, 100_000), (1, 0)):
+        seen = np.zeros(count, np.int64)
+        with thread_count(threads) as lanes:
+            note(seen)
+        counts = np.bincount(seen, minlength=lanes + 1)
+        assert counts[0] == 0
+        assert counts.sum() == counts[1 : lanes + 1].sum() == count
+
+
+def test_little_work_runs_in_one_thread_by_default():
+    # Every lane adds its number plus 1, so the largest value is the number of lanes.
+    several = available_threads()
+    for threads, count, lanes in ((None, 1000, 1), (None, 100_000, several), (several, 1000, several)):
+        seen = np.zeros(count, np.int64)
+        with thread_count(threads):
+            note(seen)
+        assert lanes == seen.max()
+
+
+@pytest.mark.slow
+def test_the_error_of_any_lane_reaches_the_caller():
+    with thread_count(available_threads()) as lanes:
+        for lane in range(lanes):
+            with pytest.raises(ValueError, match="this lane"):
+                fail_at(lane)
+        fail_at(-1)
+
+
+def test_an_error_waits_for_the_other_lanes():
+    # Nothing is written after the error, and no thread is left.
+
+    def slow(lane, _lanes, written):
+        if lane == 0:
+            raise MemoryError("the first lane")
+        time.sleep(0.05)
+        written[0] += 1
+
+    written = [0]
+    with thread_count(available_threads()) as lanes:
+        before = threading.active_count()
+        with pytest.raises(MemoryError, match="the first lane"):
+            ParallelKernel(slow)(written)
+        assert [lanes - 1] == written
+        assert threading.active_count() <= before + lanes - 1
+
+
+def test_the_number_of_threads_is_restored():
+    with thread_count(1):
+        with pytest.raises(InputError), thread_count(0):
+            pass
+        with thread_count(available_threads() + 1) as lanes:
+            assert lanes == available_threads()
+        with thread_count(None) as lanes:
+            assert lanes == 1
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
+def test_a_forked_child_has_its_own_threads_and_locks(tmp_path):
+    (tmp_path / "forks.py").write_text("""
+import os, signal, threading, time
+import numpy as np
+from csplat_render.kernels import parallel_kernel, thread_count
+@parallel_kernel()
+def note(lane, lanes, seen):
+    seen[lane] += 1
+def all_noted():
+    seen = np.zeros(2, np.int64)
+    with thread_count(2):
+        note(seen)
+    return 0 if seen.all() else 3
+def in_child(call):
+    if child := os.fork():
+        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    signal.alarm(20)  # ends a child that waits for ever
+    os._exit(call())
+def counted():
+    with thread_count(None):
+        return 7
+held = threading.Event()
+def hold():
+    with thread_count(1):
+        held.set()
+        time.sleep(100)
+all_noted()
+print(in_child(all_noted), flush=True)
+threading.Thread(target=hold, daemon=True).start()
+held.wait()
+print(in_child(counted), flush=True)
+os._exit(0)
+""")
+    words = [sys.executable, "-W", "ignore", str(tmp_path / "forks.py")]
+    run = subprocess.run(
+        words, env={**os.environ, "NUMBA_NUM_THREADS": "2"}, timeout=90, check=True, stdout=subprocess.PIPE, text=True
+    )
+    assert ["0", "7"] == run.stdout.split()
+
+
+def test_compilation_is_reported_once():
+    calls = []
+    plain = kernels.numba.njit(lambda x: x + 1)
+    with kernels.on_compiling(lambda: calls.append(1)):
+        assert (2, 2.5) == (plain(1), plain(1.5))  # two types, two compilations
+    assert [1] == calls
+    with kernels.on_compiling(lambda: calls.append(2)):
+        plain(3)
+    assert [1] == calls
+
+
+def unlucky(x):
+    return x + 1
+
+
+def kernel_with_cache(folder, monkeypatch):
+    monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", str(folder))
+    return kernel(unlucky)
+
+
+@pytest.mark.slow
+def test_an_unusable_cache_costs_a_compilation_not_the_run(tmp_path, monkeypatch):
+    def replace_by_folder(path):
+        path.unlink()
+        path.mkdir()
+
+    damages = {
+        "an empty index": lambda index, _: index.write_bytes(b""),
+        "an index that ends early": lambda index, _: index.write_bytes(index.read_bytes()[:-9]),
+        "an index of an older numba": lambda index, _: index.write_bytes(b"\x80\x04\x8c\x060.60.0\x94.garbage"),
+        "an index of another pickle": lambda index, _: index.write_bytes(index.read_bytes()[:-30] + b"N."),
+        "an index that is a folder": lambda index, _: replace_by_folder(index),
+        "data that are absent": lambda _, data: data.unlink(),
+        "data that end early": lambda _, data: data.write_bytes(data.read_bytes()[:-100]),
+        "data of another pickle": lambda _, data: data.write_bytes(b"\x80\x04K\x01."),
+    }
+    whole = tmp_path / "whole"
+    assert 2 == kernel_with_cache(whole, monkeypatch)(1)
+    healed = {}
+    for number, (what, damage) in enumerate(damages.items()):
+        folder = shutil.copytree(whole, tmp_path / str(number))
+        damage(next(folder.rglob("*.nbi")), next(folder.rglob("*.nbc")))
+        assert 2 == kernel_with_cache(folder, monkeypatch)(1), what
+        third = kernel_with_cache(folder, monkeypatch)
+        third(1)
+        healed[what] = bool(third.stats.cache_hits)
+        if "folder" in what:
+            assert kernels.cache_failure().endswith("Is a directory")
+    assert ["an index that is a folder"] == [what for what in healed if not healed[what]]
+
+    file = tmp_path / "file"
+    file.write_bytes(b"")
+    for folder in (file, file / "below"):  # the cache is next to the source instead, or in the home
+        assert 2 == kernel_with_cache(folder, monkeypatch)(1)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="limits the sizes of files by RLIMIT_FSIZE")
+def test_a_full_disk_costs_the_cache_not_the_run(tmp_path, monkeypatch):
+    from resource import RLIM_INFINITY, RLIMIT_FSIZE, setrlimit
+
+    full = kernel_with_cache(tmp_path, monkeypatch)
+    setrlimit(RLIMIT_FSIZE, (0, RLIM_INFINITY))
+    try:
+        assert 2 == full(1)
+    finally:
+        setrlimit(RLIMIT_FSIZE, (RLIM_INFINITY, RLIM_INFINITY))
+    assert kernels.cache_failure().endswith("File too large")
+    assert [] == [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a home of Windows is not found by HOME")
+def test_without_a_home_kernels_are_compiled_without_a_cache(tmp_path, monkeypatch):
+    # numba would create a folder of the name ~ in the working folder.
+    package, work = tmp_path / "package", tmp_path / "work"
+    package.mkdir()
+    work.mkdir()
+    (package / "__pycache__").write_bytes(b"")  # not even root can write below a file
+    (package / "uncached.py").write_text("def f(x):\n    return x + 1\n")
+    monkeypatch.syspath_prepend(package)
+    monkeypatch.chdir(work)
+    monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", "")
+    function = importlib.import_module("uncached").f
+    for name, value in (("HOME", "relative"), ("XDG_CACHE_HOME", ""), ("XDG_CACHE_HOME", "relative")):
+        monkeypatch.setenv(name, value)
+        compiled = kernel(function)
+        assert "no folder for numba's cache can be written" == kernels.cache_failure()
+        assert [] == list(work.iterdir())
+    assert 2 == compiled(1)
+
+
+# The compiled versions of each kernel after warming up, and those added by using it for a scene.
+_USE = """
+import json, os, sys
+import numpy as np
+import csplat, csplat_tools.optimise.simplify, csplat_render.scorer, csplat_render.lpips, csplat_render.metric_kernels
+from csplat.model import SplatModel
+from csplat_render.warmup import warm_up
+
+def compiled():
+    return {
+        f"{name}.{key}": len(value.signatures)
+        for name, module in list(sys.modules.items()) if name.startswith(("csplat_render", "csplat_trainer"))
+        for key, value in vars(module).items() if isinstance(getattr(value, "signatures", None), list)
+    }
+
+rng = np.random.default_rng(0)
+shapes = {"means": (40, 3), "quats": (40, 4), "scales": (40, 3), "opacities": (40,), "sh0": (40, 3), "shN": (40, 15, 3)}
+arrays = {name: rng.uniform(0.1, 0.9, shape).astype("<f4") for name, shape in shapes.items()}
+arrays["quats"] = np.tile(np.float32([1.0, 0.0, 0.0, 0.0]), (40, 1))
+model = SplatModel(**arrays)
+"""
+
+
+_PLAIN = """
+from csplat_tools.optional_packages import prepare_renderer
+prepare_renderer(quiet=True, simplify=False)
+plain = compiled()
+"""
+
+
+_SIMPLIFY = """
+prepare_renderer(quiet=True, simplify=True)
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.simplify import simplify
+before = compiled()
+simplify(model, csplat.Target(keep=0.5), options=SimplifyOptions(views=2, view_size=(32, 24), effort=1))
+"""
+
+
+_COMPARE = """
+plain = None
+warm_up(gradients=False, ssim=True, lpips=True)
+from csplat_render.metric_kernels import convolve
+from csplat_render.lpips import SCALE
+from csplat_render.scorer import Scorer
+from csplat_render.camera import intrinsics, look_at
+before = compiled()
+def lpips(a, b):
+    kernel = np.full((11, 11, 3, 64), 0.1, np.float32)
+    return float(convolve((a - b) / SCALE, kernel, np.zeros(64, np.float32), 4, 2).mean())
+camera = look_at((4.0, 4.0, 4.0), (0.5, 0.5, 0.5), (0.0, 0.0, 1.0), intrinsics(64, 48, 60.0), 64, 48)
+judge = Scorer.of_source(model, [camera], (0.0, 0.0, 0.0))
+judge.scores(model.select(np.arange(30)), lpips=lpips)
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is no fork on this system")
+def test_warming_up_compiles_all_kernels_of_simplify_and_compare():
+    for part in (_PLAIN + _SIMPLIFY, _COMPARE):
+        code = f"{_USE}{part}print(json.dumps([plain, before, compiled()]), flush=True)"
+        run = subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.PIPE, text=True)
+        plain, before, after = json.loads(run.stdout.splitlines()[-1])
+        assert sum(before.values()) > 5
+        assert {} == {name: count for name, count in after.items() if count != before.get(name, 0)}
+        if plain:
+            added = {name for name in after if after[name] > plain.get(name, 0)}
+            assert "csplat_render.contributions.sum_pruning" in added

@@ -1,0 +1,35 @@
+"""Tests of csplat_render.virtual_cameras."""
+
+import numpy as np
+import pytest
+from cameras_cases import ball, niche, same
+
+from csplat_render.scene_frame import scene_frame
+from csplat_render.virtual_cameras import SURROUNDING_DISTANCES, virtual_cameras
+
+
+@pytest.mark.slow
+def test_cameras_in_surroundings_look_at_the_subject():
+    model = niche()
+    frame = scene_frame(model)
+    for camera in virtual_cameras(model):
+        towards = frame.centre - camera.position
+        distance = np.linalg.norm(towards) / frame.extent
+        assert np.isclose(distance, SURROUNDING_DISTANCES).any()
+        assert np.allclose(camera.viewmat[2, :3], towards / np.linalg.norm(towards))
+
+
+def test_cameras_are_deterministic_and_depend_on_the_seed():
+    model = ball()
+    first = virtual_cameras(model)
+    assert same(first, virtual_cameras(model))
+    assert not same(first, virtual_cameras(model, seed=1))
+    carrying = ball(cameras=[{"K": np.eye(3).tolist()}])  # training cameras, which are ignored
+    assert same(first, virtual_cameras(carrying))
+
+
+def test_cameras_scale_with_the_scene():
+    small, large = ball(), ball(radius=128.0, sizes=0.03 * 128.0)
+    for a, b in zip(virtual_cameras(small), virtual_cameras(large), strict=True):
+        assert np.allclose(a.viewmat[:3, :3], b.viewmat[:3, :3], atol=1e-5)
+        assert np.allclose(128.0 * a.viewmat[:3, 3], b.viewmat[:3, 3], rtol=1e-4, atol=1e-2)

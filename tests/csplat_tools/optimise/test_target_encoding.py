@@ -1,0 +1,528 @@
+"""Targets: options, the command, and on real scenes the files of three searches, refits, measurements and reports.
+
+test_target_search.py tests the logic of the search on analytic scenes.
+"""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import extremes
+import numpy as np
+import pytest
+from analytic_search import AnalyticScene, analytic_removal
+from captures import around, cameras, crowded, found_within, judged_by, photograph, photographed, shell, views_of
+from checked import cloud, measure_errors
+from command_line import call, change_views, invoke
+
+from csplat import EncodeOptions, decode, write_ply
+from csplat.decoder import decode_scene
+from csplat.encoder import Importance, SearchReport, Target, encode_with_report, meet_bounds
+from csplat.errors import InputError
+from csplat_conformance.declared_bounds import Source, verify_bounds
+from csplat_render.camera import intrinsics, look_at, resized
+from csplat_render.camera_files import save_cameras
+from csplat_render.scene_frame import scene_frame
+from csplat_render.scorer import Scorer
+from csplat_tools.cli.command_output import Output
+from csplat_tools.cli.shared_options import parse_max_error
+from csplat_tools.console import parse_size_bytes
+from csplat_tools.optimise.candidates import WholeScene
+from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
+from csplat_tools.optimise.search_report import format_search, psnr_spread
+from csplat_tools.optimise.simplify import SimplifyOptions
+from csplat_tools.optimise.target_search import expected_renders
+from csplat_tools.views import BLACK, comparison_cameras, extra_test_cameras, with_validation_views
+from csplat_tools.views.view_sets import pose_key, render_seconds
+
+pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
+
+
+pytestmark = pytest.mark.usefixtures("small_views")
+
+
+SMALL = SimplifyOptions(effort=1, view_size=(960, 720))
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return shell(8)
+
+
+@pytest.fixture(scope="module")
+def many():
+    return crowded()
+
+
+@pytest.fixture(scope="module")
+def photographs(many):
+    return photographed(many)
+
+
+def search(*given, **how):
+    """Search without extra test cameras, which are only reported and take a second to place."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("csplat_tools.optimise.target_search.extra_test_cameras", lambda _: {})
+        return found_within(*given, **how)
+
+
+def test_the_spread_is_over_views():
+    assert 0.0 == psnr_spread(np.full(8, 1e-4))
+    assert 10 * math.log10(4) / 2 == pytest.approx(psnr_spread(np.array([1e-4, 4e-4])))
+    assert math.isnan(psnr_spread(np.array([1e-4])))
+
+
+@pytest.mark.slow
+def test_a_psnr_is_reached_with_fewer_splats(many, search_at_psnr):
+    found, views = search_at_psnr, with_validation_views(judged_by(cameras(40)))
+    decoded, report = decode_scene(found.data), found.report.search
+    assert 30.0 <= report.psnr <= 31.0  # the PSNR of such small files jumps
+    assert report.psnr == pytest.approx(views.test_scorer(many).psnr(decoded.model), abs=1e-4)
+    validation_psnr = views.validation_scorer(many).psnr(decoded.model)
+    assert report.chosen["validation_psnr"] == pytest.approx(validation_psnr, abs=1e-3)
+    assert (len(found.data), len(decoded.model)) == (report.size_bytes, report.splats)
+    assert report.splats < 600
+    assert 900 == found.report.options["simplified"]["splats"] == decoded.declared_bounds.source_count
+    assert len(np.unique(found.source_index)) == len(decoded.model)
+    # No candidate reaches it with fewer bytes.
+    assert report.size_bytes == min(one["size_bytes"] for one in report.tried if (one["psnr"] or 0.0) >= 30.0)
+    measured, declared = measure_errors(many, decoded.model, found.source_index), found.report.errors
+    assert [] == [name for name in declared if measured[name][0] > declared[name][0]]
+
+
+@pytest.mark.slow
+def test_a_small_size_is_met_with_fewer_splats(search_at_size):
+    assert 0.9 * 1500 <= len(search_at_size.data) <= 1500
+    assert search_at_size.report.search.splats < 900
+    assert search_at_size.report.search.psnr > 24.0
+
+
+@pytest.mark.parametrize("no_prune", [True, False])
+def test_a_size_that_no_file_needs_gives_the_finest_file_at_once(many, no_prune):
+    found = search(many, judged_by(cameras(40)), size_bytes=10**6, no_prune=no_prune).report.search
+    assert (1, 0, 0) == (found.encodes, found.pruning_views, found.sensitivity_views)
+    assert (900, 80.0) == (found.splats, found.chosen["attribute_psnr"])
+    assert found.psnr > 50.0
+    kept = f"{found.size_bytes / 1000:.1f} kB hold all splats at the finest precision"
+    assert f"the target is larger than this scene can use: {kept}" == found.why[-1]
+    assert found.size_bytes < 60 * 900
+
+
+@pytest.mark.slow
+def test_a_psnr_drop_against_images_prunes_splats(many, photographs, search_at_loss):
+    decoded, scores = decode(search_at_loss.data), search_at_loss.report.search.photographs
+    scorer = with_validation_views(photographs).image_validation_scorer()
+    assert scores["source"] < 28.0
+    assert scores["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
+    assert scores["file"] >= scores["source"] - 1.0  # the validation images decide
+    assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
+    assert search_at_loss.report.search.splats < 900
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["search_at_size", "search_at_loss"])
+def test_test_views_only_score_the_chosen_file_of_a_size_or_drop(request, name):
+    report = request.getfixturevalue(name).report.search
+    assert [report.chosen] == [one for one in report.tried if one["psnr"] is not None]
+
+
+@pytest.mark.slow
+def test_the_report_has_goal_reasons_and_spread(search_at_psnr):
+    report = search_at_psnr.report.search
+    assert ({"psnr": 30.0}, 10) == (report.goal, report.views)
+    assert len(report.tried) == report.encodes
+    assert report.worst_psnr <= report.psnr
+    assert {"beside", "nearer", "farther"} == set(report.elsewhere)
+    assert report.pruning_views > 0
+    json.dumps(report.as_json(), allow_nan=False)
+
+
+@pytest.mark.slow
+def test_the_number_of_threads_does_not_change_the_bytes(kept, alike):
+    other = search(alike, None, replace(SHAPES, threads=1), keep=0.6)
+    assert kept.data == other.data
+
+
+@pytest.mark.slow
+def test_bounds_in_addition_to_a_psnr_hold_without_pruning(scene):
+    found = search(scene, psnr=18.0, max_error={"means": 1e-3, "sh1": 1e-2})
+    for name, most in (("means", 1e-3), ("sh1", 1e-2)):  # although 18 dB need no SH
+        assert most >= found.report.errors[name][0] == found.report.search.reached[name]
+    assert found.report.search.psnr >= 18.0
+    assert 300 == found.report.search.splats
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "views"),
+    [
+        ("one splat", judged_by(cameras(40))),
+        *(
+            pytest.param(name, None, marks=pytest.mark.long)
+            for name in ("one splat", "exploded", "all transparent", "float32 limits")
+        ),
+    ],
+)
+def test_extreme_scenes_meet_a_psnr(name, views):
+    source = extremes.scene(name)[0]
+    find, views = (found_within, around(source)) if views is None else (search, views)
+    found = find(source, views, psnr=17.0)
+    assert views.test_scorer(source).psnr(decode(found.data)) >= 17.0
+    assert len(decode(found.data)) >= 1
+
+
+SHAPES = EncodeOptions(shape_codebook_size=64, threads=2)
+
+
+@pytest.fixture(scope="module")
+def alike(scene):
+    """A scene with eight distinct shapes."""
+    return replace(scene, quats=scene.quats[np.arange(300) % 8], scales=scene.scales[np.arange(300) % 8])
+
+
+@pytest.fixture(scope="module")
+def kept(alike):
+    """A file of six tenths of its splats, with a codebook of shapes."""
+    return search(alike, None, SHAPES, keep=0.6)
+
+
+@pytest.mark.slow
+def test_a_share_of_the_splats_is_refitted_and_verified(kept, alike):
+    decoded, index = decode_scene(kept.data), kept.source_index
+    assert 180 == kept.report.search.splats == len(decoded.model) == len(np.unique(index))
+    distances = np.linalg.norm(decoded.model.means.astype(np.float64) - alike.means[index], axis=1)
+    assert distances.max() <= kept.report.errors["means"][0]
+    assert verify_bounds(Source.of(alike), decoded.model, decoded.header, decoded.declared_bounds, index).holds
+    assert decoded.declared_bounds.refitted
+    assert 0 < kept.report.options["shape_codebook_size"] <= 60
+    bare = Scorer.of_source(alike, judged_by(cameras(40)).test, BLACK).psnr(alike.select(index))
+    assert kept.report.search.psnr > bare + 3.0
+
+
+@pytest.mark.slow
+def test_a_refit_through_the_quantisers_improves_test_views(scene):
+    # Coarse geometry, fine colours: a refit through the quantisers improves test views.
+    coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
+    bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
+    removal = replace(SMALL, effort=2).pruner(bare, views, use_classes=False, progress=None)
+    part, judge = removal.refit(300), views.test_scorer(bare)
+    quick, fitted = (part.encode(coarse, use_classes=False, draft=draft).write().data for draft in (True, False))
+    assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
+
+
+def test_two_refits_predict_the_error_of_others():
+    removal = analytic_removal(AnalyticScene())
+    counts, alone = removal.errors(1.0, {6000: 1e-4})
+    _, together = removal.errors(1.0, {5000: 9e-4, 6000: 1e-4})
+    rows = [int(np.flatnonzero(counts == count)[0]) for count in (5000, 6000)]
+    assert [9e-4, 1e-4] == pytest.approx(together[rows].tolist(), rel=0.05)
+    assert 1e-4 == pytest.approx(alone[rows[1]])
+    assert alone[rows[0]] < together[rows[0]]
+
+
+@pytest.mark.parametrize("kind", ["virtual", "cameras", "photographs"])
+def test_test_views_are_neither_validation_nor_training_views(many, photographs, kind):
+    given = {"virtual": around(many), "cameras": judged_by(cameras(40)), "photographs": photographs}[kind]
+    views = with_validation_views(given)
+    validation_scorers = [views.validation_scorer(many)]
+    validation_scorers += [views.image_validation_scorer()] if kind == "photographs" else []
+    test = poses(views.test_scorer(many).cameras)
+    validation = set.union(*(poses(one.cameras) for one in validation_scorers))
+    assert test == poses(given.test)
+    assert validation
+    assert not test & validation
+    assert not (test | validation) & poses(views.training)
+
+
+def poses(seen_from):
+    return {pose_key(camera) for camera in seen_from}
+
+
+def test_options_and_views_that_contradict_a_target_are_refused(scene):
+    views, K = judged_by(cameras(8)), intrinsics(48, 40, 60.0)
+    away = look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)
+    for source, seen, options, target, message in (
+        (scene.select(np.zeros(0, np.int64)), views, None, {"psnr": 30.0}, "without splats"),
+        (scene, views, EncodeOptions(attribute_psnr=40.0), {"psnr": 30.0}, "chosen by the target"),
+        (scene, views, None, {"keep": 0.5, "no_prune": True}, "excludes prune=False"),
+        (scene, replace(views_of(cameras(12)), test=[away]), None, {"psnr": 30.0}, "cameras belong to the scene"),
+        (scene, None, None, {"max_psnr_drop": 0.5}, "requires images"),
+    ):
+        with pytest.raises(InputError, match=message):
+            search(source, seen, options, **target)
+
+
+@pytest.fixture(scope="module")
+def surroundings():
+    source = shell(3).select(np.arange(100))
+    far = np.where(np.arange(len(source)) % 3, 1.0, 9.0)[:, None]
+    found = replace(source, means=(source.means * far).astype(np.float32))
+    assert scene_frame(found).kind == "surrounding"
+    return found
+
+
+@pytest.mark.slow
+def test_virtual_views_in_surroundings_cause_a_warning(surroundings):
+    views = replace(judged_by(cameras(40)), virtual=True)
+    views = replace(views, training=[resized(camera, 24, 20) for camera in views.training])
+    fewer = search(surroundings, views, keep=0.8, refit=False).report.search
+    assert "cameras inside of the surroundings" in fewer.why[-1]
+    assert "--no-prune" in fewer.why[-1]
+    kept = search(surroundings, views, psnr=22.0, no_prune=True).report.search
+    assert (100, 0, 0) == (kept.splats, kept.pruning_views, kept.sensitivity_views)
+    assert not any("surroundings" in line for line in kept.why)
+
+
+@pytest.fixture(scope="module")
+def unequal():
+    """An object of 9,000 mostly small splats."""
+    rng = np.random.default_rng(3)
+    means = rng.standard_normal((9000, 3))
+    means /= np.linalg.norm(means, axis=1, keepdims=True)
+    return cloud(
+        means, scales=np.repeat(rng.normal(-4.0, 0.8, (9000, 1)), 3, axis=1).astype(np.float32),
+        opacities=rng.uniform(0.05, 0.95, 9000).astype(np.float32), sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def measured(unequal):
+    """Importance of the splats, measured in twelve views."""
+    return measure_importance(unequal, cameras(12), BLACK, threads=None)
+
+
+@pytest.mark.slow
+def test_quantisation_classes_reduce_the_size_at_equal_psnr(unequal, measured):
+    judge, files = Scorer.of_source(unequal, cameras(6), BLACK), {}
+    for use_classes in (True, False):
+        options = EncodeOptions(attribute_psnr=48.0 if use_classes else 47.0)
+        whole = WholeScene(unequal, None, measured, None)
+        files[use_classes] = whole.encode(options, use_classes=use_classes, draft=False).write()
+    assert len(files[True].report.options["classes"]["splats"]) > 1
+    assert "classes" not in files[False].report.options
+    assert judge.psnr(decode(files[True].data)) >= judge.psnr(decode(files[False].data))
+    assert len(files[True].data) < 0.97 * len(files[False].data)
+
+
+@pytest.mark.slow
+def test_a_search_uses_measured_classes_in_addition_to_a_given_importance(unequal):
+    few = unequal.select(np.arange(5000))
+    weights = np.linspace(1.0, 2.0, len(few))
+    report = search(few, None, None, psnr=34.0, no_prune=True, importance=weights).report.search
+    assert {1, 2} == {one["classes"] for one in report.tried}
+    assert 26 == report.sensitivity_views
+
+
+@pytest.mark.slow
+def test_sensitivity_is_measured_if_it_has_an_effect(scene, unequal, measured):
+    # An importance with Gauss-Newton blocks is used unchanged, also in surroundings; one without keeps its weights.
+    given = replace(measured, blocks=None)
+    bare = replace(scene, shN=scene.shN[:, :0])
+    views, plain = views_of(cameras(12)), EncodeOptions()
+
+    def views_used(source, options=plain, importance=None, *, inside=False):
+        found, count = complete_importance(source, views, options, importance, inside=inside)
+        return found is not None, count
+
+    training = len(views.training)
+    assert {
+        "SH": (True, training), "small, without SH": (False, 0), "SH that is left out": (False, 0),
+        "preset fast": (False, 0), "inside": (False, 0), "curvatures": (True, 0), "curvatures inside": (True, 0),
+        "one class": (False, 0), "weights alone": (True, training), "weights inside": (False, 0),
+    } == {
+        "SH": views_used(scene), "small, without SH": views_used(bare),
+        "SH that is left out": views_used(scene, EncodeOptions(sh_degree=0)),
+        "preset fast": views_used(scene, EncodeOptions("fast")), "inside": views_used(scene, inside=True),
+        "curvatures": views_used(unequal, importance=measured),
+        "curvatures inside": views_used(unequal, importance=measured, inside=True),
+        "one class": views_used(unequal, EncodeOptions(max_classes=1), measured),
+        "weights alone": views_used(scene, importance=Importance(np.ones(300))),
+        "weights inside": views_used(unequal, importance=given, inside=True),
+    }  # fmt: skip
+    weights = np.linspace(1.0, 2.0, 300)
+    found, _ = complete_importance(scene, views, plain, weights, inside=False)
+    np.testing.assert_array_equal(weights, found.sh)
+
+
+def test_the_expected_number_of_renders_depends_on_the_target():
+    target, options = Target(psnr=30.0), EncodeOptions()
+    most, least = (expected_renders(options, replace(target, prune=prune)) for prune in (True, False))
+    assert 0.0 < least < most
+    fast, extra = EncodeOptions(preset="fast"), EncodeOptions(keep_extra=True)
+    assert [least, least] == [expected_renders(one, target) for one in (fast, extra)]
+    assert least == expected_renders(options, Target(psnr=30.0, max_error={"means": 1.0}))
+    assert most == expected_renders(fast, Target(keep=0.5))
+    assert most > expected_renders(options, replace(target, effort=1))
+
+
+def test_seconds_per_render_exclude_the_first(scene):
+    views, drawn, now = comparison_cameras(scene), [], [0.0]
+
+    def draw(camera):
+        drawn.append(camera.W)
+        now[0] += camera.W * camera.H / 1e6
+
+    source = SimpleNamespace(renderer=lambda *_, **__: draw)
+    assert pytest.approx(0.0192) == render_seconds(source, views, clock=lambda: now[0])
+    assert [160, 160, 160] == drawn
+    assert pytest.approx(0.0192) == render_seconds(source, views, mode="exact", clock=lambda: now[0])
+    assert [20] == drawn[3:]
+
+
+@pytest.mark.parametrize(("psnr", "note"), [(39.5, "39.50 at other"), (37.0, "positions: up to 3.0 dB less")])
+def test_the_psnr_of_extra_test_views_is_reported(psnr, note):
+    report = SearchReport({"psnr": 40.0}, 1, 1, 1, 1, 1.0, psnr=40.0, elsewhere={"beside": psnr})
+    assert 1 == sum(note in line for line in format_search(report))
+
+
+def test_extra_test_cameras_are_nearer_and_farther(scene):
+    # Nearer by 0.6, or by less if they would be within the scene.
+    centre = scene_frame(scene).centre
+    near, usual, far = (extra_test_cameras(scene)[kind] for kind in ("nearer", "beside", "farther"))
+    shares = []
+    for one, other, third in zip(near, usual, far, strict=True):
+        eyes = [np.linalg.inv(camera.viewmat)[:3, 3] - centre for camera in (one, other, third)]
+        shares.append(float(np.linalg.norm(eyes[0]) / np.linalg.norm(eyes[1])))
+        np.testing.assert_allclose(eyes[0], shares[-1] * eyes[1], atol=1e-9)
+        np.testing.assert_allclose(eyes[2], 2.0 * eyes[1], atol=1e-9)
+        np.testing.assert_array_equal(one.viewmat[:3, :3], third.viewmat[:3, :3])
+    assert 0.599 < min(shares) < 0.601
+    assert max(shares) <= 1.0 + 1e-9
+
+
+def test_sizes_are_parsed_or_refused():
+    sizes = {"5MB": 5_000_000, "1.5 MiB": 1_572_864, "300kB": 300_000, "300KiB": 307_200, "123456": 123_456}
+    assert sizes == {text: parse_size_bytes(text) for text in sizes}
+    for text in ("", "MB", "5 apples", "-3MB", "0", "1e30GB", "5 M B"):
+        with pytest.raises(InputError, match="a size is"):
+            parse_size_bytes(text)
+
+
+INVALID_BOUNDS = [
+    ("means", "is not an error bound"), ("means=", "is not an error bound"), ("weight=1", "not a measure"),
+    ("means=0", "above 0"), ("means=1,means=2", "twice"), ("sh0=1mm", "not a length"),
+    ("means=1parsec", "expected one of"),
+]  # fmt: skip
+
+
+def test_bounds_are_parsed_or_refused():
+    assert {"means": 0.001, "opacities": 0.01} == parse_max_error("means=0.001,opacities=1e-2", None)
+    assert {"means": 0.002} == parse_max_error("means=1mm", 0.5)
+    with pytest.raises(InputError, match="--unit-metres"):
+        parse_max_error("means=1mm", None)
+    for text, message in INVALID_BOUNDS:
+        with pytest.raises(InputError, match=message):
+            Target(max_error=parse_max_error(text, 1.0))
+
+
+@pytest.mark.slow
+def test_a_bound_of_the_means_holds_for_outliers(scene):
+    away = (scene.means[:20] * 3000.0).astype(np.float32)
+    far = replace(scene, means=np.concatenate([away, scene.means[20:]]))
+    coarse = encode_with_report(far, EncodeOptions(position_step=1e-4)).report.errors["means"][0]
+    bounded, _ = meet_bounds(far, EncodeOptions(), Target(max_error={"means": 1e-4}))
+    assert bounded.report.errors["means"][0] <= 1e-4 < coarse
+    finer, _ = meet_bounds(far, EncodeOptions(), Target(max_error={"means": 1e-6}))
+    assert any("tiles" in note for note in finer.report.notes)
+
+
+def test_an_option_that_contradicts_a_bound_is_refused(scene):
+    for fixed, measure, message in (
+        ({"position_step": 0.1}, "means", "position_step is determined"),
+        ({"sh_coding": "none"}, "sh1", "error"),
+        ({"adaptive": 0.5}, "sh1", "error"),
+        ({"sh_coding": "codebook"}, "sh1", "codebook excludes a bound"),
+    ):
+        with pytest.raises(InputError, match=message):
+            meet_bounds(scene, EncodeOptions(**fixed), Target(max_error={measure: 0.1}))
+
+
+@pytest.fixture
+def ply(tmp_path, scene):
+    write_ply(tmp_path / "scene.ply", scene)
+    return tmp_path / "scene.ply"
+
+
+@pytest.mark.slow
+def test_the_command_meets_a_size_with_reasons(tmp_path, ply, monkeypatch):
+    out = tmp_path / "scene.csplat"
+    change_views(monkeypatch, 16, (48, 36))
+    done = call("encode", ply, out, "--target-size", "5kB", "--no-prune")
+    assert 4850 <= out.stat().st_size <= 5000
+    for text in ("target: 5.0 kB", "chosen: SH degree", "measured on the file itself"):
+        assert text in done.stderr
+
+
+@pytest.mark.slow
+def test_the_command_reports_a_share_as_json_and_its_file_is_verified(tmp_path, ply):
+    out, index = tmp_path / "scene.csplat", tmp_path / "index.npy"
+    save_cameras(tmp_path / "cameras.json", cameras(40))
+    words = ("encode", ply, out, "--keep", "0.5", "--effort", "1", "--cameras", tmp_path / "cameras.json")
+    report = json.loads(call(*words, "--source-index", index, "--json").stdout)
+    assert (150, {"keep": 0.5}) == (report["splats"], report["target"]["goal"])
+    assert report["target"]["size_bytes"] == report["size_bytes"] == out.stat().st_size
+    assert report["target"]["splats"] == report["splats"]
+    call("verify", out, "--source", ply, "--source-index", index)
+    call("verify", out, "--source", ply)
+    assert "150 pruned" in call("info", out).stdout
+
+
+@pytest.mark.slow
+def test_the_command_meets_a_psnr_drop(tmp_path):
+    folder = photograph(shell(0), tmp_path)  # without SH there is only one coding
+    words = ("encode", folder / "scene.ply", tmp_path / "s.csplat", "--max-psnr-drop", "1dB", "--data", folder)
+    target = json.loads(call(*words, "--no-prune", "--json").stdout)["target"]
+    scores = target["photographs"]
+    # The validation images decide. At 62 dB, the limit of 8 bits, the two test images differ by more than the drop.
+    assert scores["source"] - 1.0 - target["spread"] <= scores["file"] < scores["source"]
+
+
+def test_only_long_work_is_announced_also_of_a_search(tmp_path, ply, monkeypatch, capsys):
+    messages = {}
+    for name, quiet, seconds in (("long", False, 170.0), ("short", False, 5.0), ("quiet", True, 170.0)):
+        Output(quiet=quiet).announce_time(lambda seconds=seconds: seconds, "a preset takes seconds")
+        messages[name] = capsys.readouterr().err
+    assert "this takes about 2 to 5 minutes here; a preset takes seconds" in messages.pop("long")
+    assert {"short": "", "quiet": ""} == messages
+    # The search itself fails: the test view shows nothing.
+    monkeypatch.setattr("csplat_tools.optimise.target_encoding.render_seconds", lambda *_, **__: 170.0 / 520.0)
+    K = intrinsics(48, 40, 60.0)
+    save_cameras(tmp_path / "away.json", [look_at((40.0, 0.0, 0.0), (80.0, 0.0, 0.0), (0, 0, 1), K, 48, 40)])
+    change_views(monkeypatch, 8, None)
+    done = invoke(
+        "encode", ply, tmp_path / "s.csplat", "--target-psnr", "30", "--cameras", tmp_path / "away.json", "--no-prune"
+    )
+    assert "this takes about 2 to 5 minutes here" in done.stderr
+    assert "cameras belong to the scene" in done.stderr
+
+
+REFUSED = [
+    (["--target-size", "many"], 2, "a size is"),
+    (["--target-psnr", "120"], 2, "at most 99"),
+    (["--max-error", "means=1mm"], 1, "--unit-metres"),
+    (["--keep", "0.5", "--max-error", "means=1"], 2, "no bounds"),
+    (["--target-size", "5kB", "--attribute-psnr", "40"], 2, "--attribute-psnr and --target-size: give one of them"),
+    (["--effort", "2"], 2, "--effort requires --target-psnr or"),
+    (["--effort", "12", "--target-size", "5kB"], 2, "the effort is 12, expected 1 to 9"),
+    (["--no-prune"], 2, "--no-prune requires --target-psnr or"),
+    (["--keep", "0.5", "--no-prune"], 2, "--keep and --no-prune: give one of them"),
+    (["--keep", "0.5", "--importance", "w.npy"], 2, "--keep and --importance: give one of them"),
+    (["--max-psnr-drop", "1", "--cameras", "c.json"], 2, "--max-psnr-drop requires --data"),
+    (["--background", "white", "--max-error", "means=1"], 2, "--background requires --cameras or --data"),
+    (["--cameras", "c.json"], 2, "--cameras requires --target-psnr or"),
+    (["--max-error", "means=1", "--data", "d"], 2, "--data requires --target-psnr or"),
+    (["--target-size", "10", "--no-prune"], 2, "no file"),
+    (["--target-psnr", "30", "--target-size", "5kB"], 2, "--target-psnr and --target-size: give one of them"),
+]
+
+
+@pytest.mark.slow
+def test_the_command_refuses_options_without_effect(tmp_path, ply):
+    out, wrong = tmp_path / "scene.csplat", {}
+    for words, status, message in REFUSED:
+        done = invoke("encode", ply, out, *words)
+        text = " ".join(done.stderr.replace("│", " ").split())
+        if (status, False) != (done.exit_code, out.exists()) or message not in text:
+            wrong[" ".join(words)] = (done.exit_code, text)
+    assert {} == wrong

@@ -1,0 +1,407 @@
+"""`csplat view`: answers and refusals of its server, and the end of the command."""
+
+import http.client
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+import typer
+from checked import cloud
+from chromium import ViewerPage
+from command_line import heed_interrupts, invoke
+
+from csplat import decode, encode, read_ply, write_ply
+from csplat.errors import FormatError, InputError
+from csplat_tools.cli.shared_options import parse_axes, parse_overrides, parse_up
+from csplat_tools.present.viewer_page import web_files
+from csplat_tools.present.viewer_server import byte_range, open_server, open_viewer_scene, page_parameters
+
+SIZE = 1000
+
+
+@pytest.fixture(scope="module")
+def scene_bytes():
+    return encode(cloud(np.random.default_rng(0).standard_normal((200, 3))))
+
+
+@pytest.fixture
+def scene_path(tmp_path, scene_bytes):
+    path = tmp_path / "a scene.csplat"
+    path.write_bytes(scene_bytes)
+    return path
+
+
+@contextmanager
+def served(path, **options):
+    with open_viewer_scene(str(path), preset="fast") as scene, open_server(scene, **options) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
+        thread.start()
+        try:
+            yield server
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def ask(server, path, method="GET", **headers):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
+    try:
+        connection.request(method, path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+        response = connection.getresponse()
+        return response.status, dict(response.getheaders()), response.read()
+    finally:
+        connection.close()
+
+
+RANGES = {
+    None: None,
+    "bytes=0-0": (0, 1),
+    "bytes=10-19": (10, 10),
+    "bytes=990-": (990, 10),
+    "bytes=-10": (990, 10),
+    "bytes=-5000": (0, 1000),
+    "bytes=999-5000": (999, 1),
+    "BYTES=0-9": (0, 10),
+    "bytes=9-3": None,  # a range that makes no sense is no range
+    "bytes=-": None,
+    "bytes=a-b": None,
+    "bytes=0-1,5-6": None,  # several ranges may be answered with everything
+    "items=0-1": None,
+    "bytes=\u0661-2": None,  # a digit, but none of ASCII
+    "bytes= 0-9 ": (0, 10),
+    "bytes=0 - 9": None,
+    "bytes=0-" + "9" * 5000: (0, 1000),
+    "bytes=-" + "9" * 5000: (0, 1000),
+    "bytes=" + "0" * 5000 + "7-9": (7, 3),
+    "bytes=" + "9" * 5000 + "-5": None,
+    "bytes=--1": None,
+    "Bytes=990-99999999999999999999999999": (990, 10),
+}
+
+
+def test_ranges():
+    assert RANGES == {header: byte_range(header, SIZE) for header in RANGES}
+    for header, size in (("bytes=1000-", SIZE), ("bytes=-0", SIZE), ("bytes=0-0", 0), ("bytes=-5", 0)):
+        with pytest.raises(ValueError, match="range"):
+            byte_range(header, size)
+
+
+def test_the_root_leads_to_the_page_and_the_page_to_the_scene(scene_path):
+    with served(scene_path, wishes={"axes": "RDF"}) as server:
+        status, headers, _ = ask(server, "/")
+        assert 302 == status
+        query = parse_qs(urlsplit(headers["Location"]).query)
+        assert ["RDF"] == query["axes"]
+        status, headers, _ = ask(server, headers["Location"])
+        assert (200, "text/html; charset=utf-8") == (status, headers["Content-Type"])
+        status, headers, body = ask(server, query["scene"][0])
+        assert (200, "model/vnd.csplat", scene_path.read_bytes()) == (status, headers["Content-Type"], body)
+
+
+def test_every_module_of_the_page_is_served_as_javascript(scene_path):
+    with served(scene_path) as server:
+        for name, path in web_files().items():
+            status, headers, body = ask(server, f"/{name}")
+            assert (200, path.read_bytes()) == (status, body)
+            if path.suffix == ".mjs":
+                assert headers["Content-Type"].startswith("text/javascript")
+        assert {"tools/viewer/main.mjs", "tools/viewer/worker.mjs", "codec/js/decoder.mjs"} <= set(web_files())
+        assert not [name for name in web_files() if "test" in name or "node_modules" in name]
+
+
+def test_ranges_of_the_scene(scene_path):
+    data, path = scene_path.read_bytes(), "/scene/a%20scene.csplat"
+    with served(scene_path) as server:
+        status, headers, body = ask(server, path)
+        assert (200, "bytes", data) == (status, headers["Accept-Ranges"], body)
+        etag = headers["ETag"]
+        for asked, expected, content_range in (
+            ("64-163", data[64:164], f"64-163/{len(data)}"),
+            ("-7", data[-7:], f"{len(data) - 7}-{len(data) - 1}/{len(data)}"),
+        ):
+            for method, content in (("GET", expected), ("HEAD", b"")):
+                status, headers, body = ask(server, path, method, Range=f"bytes={asked}")
+                assert (206, content, f"bytes {content_range}") == (status, body, headers["Content-Range"])
+                assert str(len(expected)) == headers["Content-Length"]
+        status, headers, body = ask(server, path, Range=f"bytes={len(data)}-")
+        assert (416, f"bytes */{len(data)}", b"") == (status, headers["Content-Range"], body)
+        assert 206 == ask(server, path, Range="bytes=0-9", If_Range=etag)[0]
+        assert (200, data) == ask(server, path, Range="bytes=0-9", If_Range='"another"')[::2]
+        assert (404, b"") == ask(server, "/nothing", "HEAD")[::2]
+
+
+def test_a_file_that_changes_has_another_tag(scene_path, make_model):
+    with served(scene_path) as server:
+        before = ask(server, "/scene/a%20scene.csplat", "HEAD")[1]["ETag"]
+        scene_path.write_bytes(encode(make_model(50)))
+        assert before != ask(server, "/scene/a%20scene.csplat", "HEAD")[1]["ETag"]
+        scene_path.unlink()
+        assert 404 == ask(server, "/scene/a%20scene.csplat")[0]
+
+
+ELSEWHERE = [
+    "/scene/", "/scene/other.csplat", "/scene/../secret.txt", "/scene/..%2fsecret.txt", "/scene/%2e%2e/secret.txt",
+    "/tools/viewer/", "/tools/viewer/../../../secret.txt", "/tools/viewer/..%5c..%5csecret.txt", "//etc/passwd",
+    "/etc/passwd", "/codec/js/package.json", "/codec/js/test/adapter.mjs", "/tools/viewer/main.mjs%00.html", "/%",
+]  # fmt: skip
+
+
+def test_other_paths_are_not_served(scene_path):
+    (scene_path.parent / "secret.txt").write_text("secret")
+    with served(scene_path) as server:
+        answers = {path: ask(server, path) for path in ELSEWHERE}
+    assert dict.fromkeys(ELSEWHERE, 404) == {path: status for path, (status, _, _) in answers.items()}
+    assert [] == [path for path, (_, _, body) in answers.items() if b"secret" in body]
+
+
+LOOPBACK = ["127.1", "LOCALHOST", "0:0:0:0:0:0:0:1", "::ffff:127.0.0.1"]
+
+
+ANYWHERE = "0.0.0.0"  # noqa: S104  # the documented value of --host
+
+
+GOOD = [
+    "localhost", "LOCALHOST:80", "localhost.", "localhost:", "127.0.0.1:9", "127.0.0.2", "[::1]", "[::1]:80",
+    "192.0.2.1",
+]  # fmt: skip
+
+
+BAD = [
+    "evil.example", "EVIL.example:80", "127.0.0.1.evil.example", "localhost.evil.example", "evil.example.", "[evil]",
+    "user@localhost", "localhost:80:80", "x[::1]", "evil.example:80]", "localhost\t.evil.example", "127.0.0.1..",
+    "[::1", "",
+]  # fmt: skip
+
+
+def host_statuses(server, hosts):
+    """Return the statuses of requests for several hosts, on one connection."""
+    connection = http.client.HTTPConnection(server.server_address[0], server.server_address[1], timeout=10)
+    found = {}
+    for host in hosts:
+        connection.putrequest("GET", "/", skip_host=True)
+        connection.putheader("Host", host)
+        connection.endheaders()
+        response = connection.getresponse()
+        response.read()
+        found[host] = response.status
+    connection.close()
+    return found
+
+
+def test_the_bound_address_decides_which_hosts_are_served(scene_path):
+    own = socket.gethostname()
+    served_at = []
+    for place in (*LOOPBACK, ANYWHERE):
+        good, bad = ([*GOOD, own, f"{own}.local:80"], BAD) if place == ANYWHERE else (GOOD, [*BAD, own])
+        try:
+            with served(scene_path, host=place) as server:
+                found = host_statuses(server, [*good, *bad])
+        except InputError:  # a system without IPv6
+            continue
+        assert dict.fromkeys(good, 302) | dict.fromkeys(bad, 421) == found, place
+        served_at.append(place)
+    assert {"LOCALHOST", ANYWHERE} <= set(served_at)
+
+
+def test_an_empty_host_and_one_that_is_no_name_are_refused(scene_path):
+    with open_viewer_scene(str(scene_path), preset="fast") as scene:
+        for host, message in ((" \t", "is empty"), ("a" * 300, "not an address"), (" 127.0.0.1", "not an address")):
+            with pytest.raises(InputError, match=message), open_server(scene, host=host):
+                pass
+
+
+def exchange(server, data):
+    """Send bytes, and return all that is answered until the server closes the connection."""
+    with socket.create_connection(server.server_address[:2], timeout=10) as connection:
+        connection.sendall(data)
+        return b"".join(iter(lambda: connection.recv(1 << 16), b""))
+
+
+def test_every_request_gets_one_answer_with_a_status(scene_path):
+    head = b"Host: localhost\r\nConnection: close\r\n"
+    follower = b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n"
+    heads = {
+        b"GET http://[ HTTP/1.1\r\n" + head: 400,
+        b"GET //[ HTTP/1.1\r\n" + head: 404,
+        b"GET * HTTP/1.1\r\n" + head: 400,
+        b"GET viewer.html HTTP/1.1\r\n" + head: 400,
+        b"GET ftp://localhost/ HTTP/1.1\r\n" + head: 400,
+        b"GET http://localhost/ HTTP/1.1\r\n" + head: 302,
+        b"GET http://evil.example/ HTTP/1.1\r\n" + head: 421,
+        b"GET https://user@localhost/ HTTP/1.1\r\n" + head: 421,
+        b"GET /%00 HTTP/1.1\r\n" + head: 404,
+        b"GET /\xff\xfe HTTP/1.1\r\n" + head: 404,
+        b"GET /%ff HTTP/1.1\r\n" + head: 404,
+        b"GET / HTTP/1.1\r\nConnection: close\r\n": 400,
+        b"GET / HTTP/1.0\r\n": 421,
+        b"GET / HTTP/1.1\r\nHost: localhost\r\n" + head: 400,
+        b"GET / HTTP/9.9\r\n" + head: 505,
+        b"GET / HTTP/x\r\n" + head: 400,
+        b"GET /\r\n": 400,
+        b"GET\r\n": 400,
+        b"GET / there HTTP/1.1\r\n" + head: 400,
+        b"get / HTTP/1.1\r\n" + head: 501,
+        b"PROPFIND / HTTP/1.1\r\n" + head: 501,
+        b"GET / HTTP/1.1\r\n" + head + b"X: " + b"a" * 70_000 + b"\r\n": 431,
+        b"GET / HTTP/1.1\r\n" + head + b"X: a\r\n" * 300: 431,
+        b"GET /" + b"a" * 70_000 + b" HTTP/1.1\r\n" + head: 414,
+        b"GET / HTTP/1.1\r\n" + head + b"Expect: 100-continue\r\nContent-Length: 5\r\n": 302,
+    }
+    bodies = {
+        b"Content-Length: %d\r\n\r\n" % len(follower) + follower: 404,
+        b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n" + follower: 404,
+        b"Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n" + follower: 404,
+        b"Content-Length: nonsense\r\n\r\n" + follower: 404,
+        b"Content-Length: 200000\r\n\r\n" + bytes(200_000): 404,
+        b"Content-Length: 0\r\n\r\n" + follower: (404, 302),  # no body: the connection stays open
+    }
+    requests = {words + b"\r\n": status for words, status in heads.items()}
+    requests |= {b"GET /nothing HTTP/1.1\r\nHost: localhost\r\n" + rest: status for rest, status in bodies.items()}
+    with served(scene_path) as server:
+        for request, status in requests.items():
+            found = tuple(map(int, re.findall(rb"HTTP/1\.1 (\d+) ", exchange(server, request))))
+            assert (status if isinstance(status, tuple) else (status,)) == found, request[:80]
+
+
+def test_a_ply_is_encoded_in_memory(tmp_path, make_model):
+    model = make_model(300)
+    write_ply(tmp_path / "scene.ply", model)
+    with served(tmp_path / "scene.ply") as server:
+        _, _, body = ask(server, "/scene/scene.csplat")
+        assert len(model) == len(decode(body))
+        assert 206 == ask(server, "/scene/scene.csplat", Range="bytes=0-63")[0]
+    assert ["scene.ply"] == sorted(path.name for path in tmp_path.iterdir())
+
+
+def test_cameras_are_served_with_the_scene(tmp_path, scene_path):
+    entry = {"K": [[500, 0, 320], [0, 500, 240], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 640, "H": 480}
+    cameras = tmp_path / "cameras.json"
+    cameras.write_text(json.dumps([entry, entry]))
+    with served(scene_path, wishes=page_parameters(str(cameras))) as server:
+        query = parse_qs(urlsplit(ask(server, "/")[1]["Location"]).query)
+        status, headers, body = ask(server, query["camera"][0])
+        assert (200, "application/json") == (status, headers["Content-Type"])
+        assert [500.0, 500.0] == [one["K"][0][0] for one in json.loads(body)]
+
+
+def test_invalid_axes_and_directions_are_refused():
+    for parse, message, texts in (
+        (parse_axes, "expected three letters", ["RL", "RDX", "RUD", "rdf", "RDFF"]),
+        (parse_up, "three numbers as", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"]),
+    ):
+        for text in texts:
+            with pytest.raises(typer.BadParameter, match=message):
+                parse(text)
+
+
+@pytest.mark.parametrize(
+    ("words", "wishes"),
+    [
+        ({"up": None, "axes": "RFU"}, {"axes": "RFU"}), ({"up": "+Z"}, {"up": "0,0,1"}),
+        ({"up": "0,-2,0.2", "axes": "RDF"}, {"up": "0,-0.995037,0.099504", "axes": "RDF"}),
+    ],
+)  # fmt: skip
+def test_the_page_receives_the_given_up_direction(words, wishes):
+    assert wishes == page_parameters(None, parse_overrides(**words))
+
+
+def test_damaged_files_and_other_formats_are_refused_before_they_are_served(scene_path, scene_bytes):
+    data = scene_bytes
+    for damaged, message in (
+        (data[:-1], "E_TRUNCATED"),
+        (data[:20], "E_TRUNCATED"),
+        (b"", "E_TRUNCATED"),
+        (data + b"x", "E_TRAILING"),
+        (data[:100] + bytes([data[100] ^ 1]) + data[101:], "E_CRC"),
+        (b"\0" + data[1:], "E_MAGIC"),
+    ):
+        scene_path.write_bytes(damaged)
+        with pytest.raises((FormatError, InputError), match=message), open_viewer_scene(str(scene_path), preset="fast"):
+            pass
+    text = scene_path.with_suffix(".txt")
+    text.write_text("no scene")
+    with pytest.raises(InputError, match="no format that csplat knows"), open_viewer_scene(str(text), preset="fast"):
+        pass
+
+
+def test_a_ply_may_have_any_name(tmp_path, make_model):
+    path = tmp_path / "scene.csplat"
+    write_ply(path, make_model(20, 1))
+    with open_viewer_scene(str(path), preset="fast") as scene:
+        assert 20 == scene.header.splat_count
+
+
+def test_a_port_in_use_and_an_address_of_another_machine_are_refused(scene_path):
+    with socket.socket() as other, open_viewer_scene(str(scene_path), preset="fast") as scene:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        elsewhere = r"203\.0\.113\.1 is not an address of this machine"
+        for place, message in (({"port": port}, f"port {port} is in use"), ({"host": "203.0.113.1"}, elsewhere)):
+            with pytest.raises(InputError, match=message), open_server(scene, **place):
+                pass
+
+
+@pytest.mark.slow
+def test_the_page_runs_from_the_server(tab, site, tmp_path, make_model):
+    write_ply(tmp_path / "a & b.ply", make_model(200, 1))
+    viewer = ViewerPage(tab, site)
+    with served(tmp_path / "a & b.ply", wishes={"axes": "RFU"}) as server:
+        viewer.visit(server.url)
+        assert "a & b.csplat" == viewer.text("#title")
+        assert "200 splats" in viewer.text("#summary")
+        assert [0, 0, 1] == viewer.pose["up"]
+        tab.page.goto("about:blank")  # hangs up, so that the server can end
+
+
+@contextmanager
+def command(*words):
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    streams = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = [sys.executable, "-m", "csplat_tools", "view", *map(str, words)]
+    process = subprocess.Popen(command, **streams, env=environment, preexec_fn=heed_interrupts)  # noqa: PLW1509
+    with process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
+    with command(sample_path, "--no-browser") as process:
+        url = process.stdout.readline().strip()
+        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
+        connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)
+        connection.request("GET", "/scene/sample.csplat")
+        assert len(read_ply(sample_path)) == len(decode(connection.getresponse().read()))
+        process.send_signal(signal.SIGINT)  # while the connection is still open
+        assert 0 == process.wait(timeout=10)
+        connection.close()
+        said = process.stderr.read()
+    assert "encoded with the preset fast" in said
+    assert "Ctrl-C" in said
+    assert "Traceback" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "expected"),
+    [
+        (["absent.csplat"], 1, "No such file"),
+        (["SAMPLE", "--up", "w"], 2, "up is 'w'"),
+        (["SAMPLE", "--cameras", "absent.json"], 1, "absent.json"),
+    ],
+)
+def test_errors_of_the_command_are_reported(sample_path, words, status, expected):
+    done = invoke("view", *(sample_path if word == "SAMPLE" else word for word in words), "--no-browser")
+    assert (status, "") == (done.exit_code, done.stdout)
+    assert expected in " ".join(done.stderr.split())

@@ -1,0 +1,619 @@
+"""`csplat convert`: conversion between all formats, filters, reports of losses."""
+
+import io
+import json
+import os
+import re
+import sys
+import tempfile
+import threading
+from contextlib import contextmanager
+from dataclasses import fields, replace
+from operator import itemgetter
+from pathlib import Path
+
+import numpy as np
+import pytest
+from checked import cloud
+from command_line import call, invoke
+from tables import failures
+from typer.testing import CliRunner
+
+import csplat
+from csplat import EncodeOptions, formats
+from csplat.decoder import decode, read_header
+from csplat.editing.transform import convert_axes
+from csplat.errors import CsplatError, InputError, LimitError
+from csplat.formats import spz
+from csplat.formats.format import ARRAYS
+from csplat.model import SplatModel, normalise_quats
+from csplat.out_of_core import OutOfCoreOptions
+from csplat.ply import read_ply, write_ply
+from csplat.scene_source import source_from_model
+from csplat_conformance.manifest import load
+from csplat_tools import scene_files
+from csplat_tools.cli.app import app
+from csplat_tools.convert_file import Filters, convert_file, decode_file, find_floaters
+from csplat_tools.encode_file import encode_file
+from csplat_tools.scene_files import open_scenes
+
+
+@pytest.fixture
+def ply(tmp_path, make_model):
+    write_ply(tmp_path / "in.ply", make_model(200, 2))
+    return tmp_path / "in.ply"
+
+
+def test_a_ply_is_converted_to_csplat_and_back(tmp_path, ply):
+    said = json.loads(call("convert", ply, tmp_path / "a.csplat", "--json").stdout)
+    assert ("ply", "csplat", 200, 2) == (said["source_format"], said["format"], said["splats"], said["sh_degree"])
+    assert ((tmp_path / "a.csplat").stat().st_size, []) == (said["size_bytes"], said["lost"])
+    assert {"means", "shN"} <= set(said["rounded"])
+    call("convert", tmp_path / "a.csplat", tmp_path / "b.ply")
+    assert (csplat.decode(tmp_path / "a.csplat").means == read_ply(tmp_path / "b.ply").means).all()
+
+
+def test_losses_are_reported_refused_and_predicted(tmp_path, ply):
+    out = tmp_path / "out.csplat"
+    assert "lost on the way: precision of means" in call("convert", ply, out, "--dry-run").stderr
+    assert "does not keep all of" in call("convert", ply, out, "--no-loss", status=1).stderr
+    assert not out.exists()
+    assert "lost" not in call("convert", ply, tmp_path / "out.ply", "--no-loss").stderr
+    expected = json.loads(call("convert", ply, tmp_path / "x.ply", "--dry-run", "--json").stdout)["size_bytes"]
+    assert expected == pytest.approx((tmp_path / "out.ply").stat().st_size, rel=0.05)
+
+
+def calm(model):
+    """Return the model with values that every format holds."""
+    return replace(
+        model, scales=model.scales.clip(-5.9, -2), sh0=model.sh0.clip(-1, 1), shN=model.shN.clip(-0.9, 0.9)
+    )  # fmt: skip
+
+
+def with_values(model, name, rows, value):
+    """Return the model with values that every format holds, and another value of an attribute in the first rows."""
+    model = calm(model)
+    values = getattr(model, name).copy()
+    values[:rows] = value
+    return replace(model, **{name: values})
+
+
+CLAMPED = [
+    # attribute, value in three splats, suffix, largest error
+    ("scales", 7.0, "spz", 1.0625), ("scales", -20.0, "v4.spz", 10.0), ("scales", -30.0, "compressed.ply", 10.0),
+    ("scales", 95.0, "splat", 7.0), ("scales", 95.0, "glb", 95 - np.log(np.finfo("f4").max)),
+    ("scales", -95.0, "csplat", 7.0),
+    ("sh0", 5.0, "spz", 5 - 0.5 / 0.15), ("sh0", -5.0, "splat", 5 - 0.5 / 0.28209479),
+    ("shN", 1.5, "spz", 1.5 - 127 / 128), ("shN", -4.5, "compressed.ply", 0.5),
+]  # fmt: skip
+
+
+def test_clamped_values_are_counted_by_attribute_with_the_largest_error(tmp_path, make_model):
+    ordinary = calm(make_model(40, 1, seed=1))
+
+    def check(case):
+        name, value, suffix, error = case
+        found = csplat.write(tmp_path / f"a.{suffix}", with_values(ordinary, name, 3, np.float32(value)))
+        clamped = [one for one in found if one.id == "clamped-values"]
+        assert [("loss", name, 3)] == [(one.kind, one.attribute, one.count) for one in clamped]
+        assert error == pytest.approx(clamped[0].largest_error, abs=1e-4)
+        decoded = getattr(csplat.read(tmp_path / f"a.{suffix}"), name)
+        assert np.abs(decoded).max() == pytest.approx(np.abs(value) - error, abs=0.02) or suffix == "csplat"
+        assert not [one for one in csplat.write(tmp_path / f"b.{suffix}", ordinary) if one.attribute]
+
+    assert [] == failures({f"{one[:3]}": one for one in CLAMPED}, check)
+    model = with_values(ordinary, "shN", 40, np.float32(1.0))  # rounded to 127/128, the largest of SPZ
+    assert not [one for one in csplat.write(tmp_path / "a.spz", model) if one.attribute]
+
+
+def test_a_conversion_reports_clamped_values_apart_from_rounding(tmp_path, make_model):
+    write_ply(tmp_path / "a.ply", with_values(make_model(40, 1), "sh0", 5, np.float32(5.0)))
+    for more in (("--dry-run",), ("--quiet",)):
+        said = call("convert", tmp_path / "a.ply", tmp_path / "a.spz", *more).stderr
+        assert "lost on the way: precision of means, quats, scales, opacities, shN" in said
+        assert "loss: clamped-values: 15 values of sh0 in 5 splats outside -3.333 to 3.333, the range of SPZ" in said
+    result = json.loads(call("convert", tmp_path / "a.ply", tmp_path / "b.splat", "--json").stdout)
+    assert [("clamped-values", "sh0", 5)] == [(one["id"], one["attribute"], one["count"]) for one in result["losses"]]
+    assert 5 - 0.5 / 0.28209479 == pytest.approx(result["losses"][0]["largest_error"])
+
+
+def far_scene(make_model, count, far):
+    """Return a scene with some splats far from the others."""
+    model = make_model(count, 1)
+    means = model.means.copy()
+    means[: len(far)] = far
+    return replace(calm(model), means=means, scales=np.full((count, 3), np.float32(-3.0)))
+
+
+def test_splats_that_rounding_moves_visibly_are_counted(tmp_path, make_model):
+    model = far_scene(make_model, 200, [[5e5, 0, 0]])
+    (found,) = csplat.write(tmp_path / "a.spz", model)
+    error = np.abs(csplat.read(tmp_path / "a.spz").means - model.means).max(axis=1)
+    assert ("moved-splats", np.count_nonzero(error > np.exp(-3.0) / 8)) == (found.id, found.count)
+    assert error.max() == pytest.approx(found.largest_error, rel=1e-4)
+    assert "--drop-floaters" in found.text
+    assert not csplat.write(tmp_path / "b.spz", model.select(slice(1, None)))
+    with pytest.raises(InputError, match="SPZ stores up to 8,388,607: --drop-floaters drops"):
+        csplat.write(tmp_path / "c.spz", far_scene(make_model, 20, [[9e6, 0, 0]]))
+
+
+def test_sog_reports_what_its_codes_do_not_reach(tmp_path, make_model):
+    rng = np.random.default_rng(0)
+    colours = rng.normal(0, 1, (3000, 3)).astype("f4")
+    model = replace(calm(make_model(3000, 0)), sh0=colours, opacities=np.ones(3000, "f4"))
+    assert not csplat.write(tmp_path / "a.sog", model)
+    colours[:2, 0] = 500, 1000
+    found = csplat.write(tmp_path / "b.sog", replace(model, opacities=np.full(3000, 1e-3, "f4"), sh0=colours))
+    error = np.abs(np.sort(csplat.read(tmp_path / "b.sog").sh0[:, 0])[-1] - 1000)
+    assert bool(found) == (error > 125)
+    flat = replace(model, antialiased=True, flat=True)
+    assert ["SOG cannot hold that splats are discs and antialiased"] == [
+        one.text for one in csplat.write(tmp_path / "c.sog", flat)
+    ]
+
+
+def test_dropped_columns_are_reported_by_every_command(tmp_path, make_model):
+    source = tmp_path / "a.ply"
+    write_ply(source, replace(make_model(40, 0), extra={"motion_0": np.ones(40, np.float32)}))
+    assert "lost on the way: extra columns motion_0" in call("convert", source, tmp_path / "a.spz").stderr
+    for words in (("encode", source, tmp_path / "a.csplat"), ("compare", source, source)):
+        assert "columns motion_0 are not splat attributes" in call(*words).stderr
+    assert "columns motion_0 are not splat attributes" in call("lint", source, status=1).stdout
+
+
+def test_degree_4_is_converted_and_encoded(tmp_path, make_model):
+    source = tmp_path / "4.ply"
+    write_ply(source, make_model(60, 4))
+    for more, degree in (("--sh-degree", 3), 3), ((), 4):
+        call("encode", source, tmp_path / "a.csplat", "--force", *more)
+        call("verify", tmp_path / "a.csplat", "--source", source)
+        call("convert", source, tmp_path / "a.ply", "--force", *more)
+        assert degree == csplat.decode(tmp_path / "a.csplat").sh_degree == read_ply(tmp_path / "a.ply").sh_degree
+    assert np.array_equal(read_ply(source).shN, read_ply(tmp_path / "a.ply").shN)
+    for suffix in ("sog", "spz", "glb"):
+        assert "SH band 4" in call("convert", source, tmp_path / f"c.{suffix}").stderr
+        assert 3 == csplat.read(tmp_path / f"c.{suffix}").sh_degree
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("a.xyz",), "no format has that ending"), (("a.html",), "`csplat export-html` writes pages"),
+        ((".",), ".: a folder, not the name of a file"), (("-",), "standard output"),
+        (("a.ply", "--to", "zzz"), "expected one of "), (("a.ply", "--rotate", "1,2"), "expected 3 numbers"),
+        (("a.ply", "--crop", "0,0,0,-1"), "radius"), (("a.ply", "--crop", "0,0,0,1,2"), "expected 6 or 4 numbers"),
+        (("a.ply", "--scale", "0"), "above 0"), (("a.ply", "--to-axes", "XYZ"), "axes are"),
+        (("in.ply", "--force"), "is the input"),
+    ],
+)  # fmt: skip
+def test_invalid_arguments_are_refused(tmp_path, ply, monkeypatch, words, message):
+    monkeypatch.chdir(tmp_path)
+    before = ply.read_bytes()
+    result = invoke("convert", "in.ply", *words)
+    assert result.exit_code in (1, 2)
+    assert message in result.stderr
+    assert before == ply.read_bytes()
+    assert ["in.ply"] == [one.name for one in tmp_path.iterdir()]
+
+
+def test_filters_are_applied_in_the_documented_order(tmp_path, ply):
+    call(
+        "convert", ply, tmp_path / "out.ply", "--rotate", "0,0,90", "--scale", "2", "--translate", "1,0,0",
+        "--crop", "-1,-1,-1,3,1,1", "--sh-degree", "1",
+    )  # fmt: skip
+    source, found = read_ply(ply), read_ply(tmp_path / "out.ply")
+    turned = np.stack([-source.means[:, 1], source.means[:, 0], source.means[:, 2]], axis=1)
+    wanted = (2.0 * turned + np.array([1.0, 0.0, 0.0])).astype(np.float32)
+    inside = ((wanted >= [-1, -1, -1]) & (wanted <= [3, 1, 1])).all(axis=1)
+    assert 0 < inside.sum() < 200
+    assert np.allclose(wanted[inside], found.means, atol=1e-5)
+    assert np.allclose(source.scales[inside] + np.log(2.0), found.scales, atol=1e-5)
+    assert 1 == found.sh_degree
+
+
+def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_model):
+    model = replace(make_model(30, 1), coordinate_system="RDF")
+    turned = {"glb": "LUF", "spz": "RUB", "ply": "RDF"}
+
+    def own(path, suffix):
+        return convert_axes(source_from_model(csplat.read(path)), turned[suffix]).model()
+
+    def check(case):
+        suffix, words, change = case
+        source, target = tmp_path / f"in.{suffix}", tmp_path / f"out.{suffix}"
+        csplat.write(source, model)
+        said = call("convert", source, target, "--force", *words).stderr
+        before, after = own(source, suffix), own(target, suffix)
+        option = next(word for word in words if word in ("--translate", "--rotate", "--crop"))
+        assert f"{option}: along the axes" in said
+        assert ("= RDF of --to-axes" if "--to-axes" in words else f"x, y, z = {turned[suffix]}; --to-axes") in said
+        wanted = change(before.means)
+        assert len(wanted) == len(after)
+        np.testing.assert_allclose(after.means, wanted, atol=1e-3)
+
+    def tilted(means):
+        c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
+        return np.stack([means[:, 0], c * means[:, 1] - s * means[:, 2], s * means[:, 1] + c * means[:, 2]], axis=1)
+
+    cases, upwards = {}, np.array([0, 1, 0])
+    for suffix in turned:
+        flips = np.array([1, -1, 1]) if suffix != "ply" else np.ones(3)
+        cases |= {
+            f"{suffix} translate": (suffix, ("--translate", "0,1,0"), lambda means: means + upwards),
+            f"{suffix} tilt": (suffix, ("--rotate", "30,0,0"), tilted),
+            f"{suffix} box": (suffix, ("--crop", "-9,0,-9,9,9,9"), lambda means: means[means[:, 1] >= 0]),
+            f"{suffix} sphere": (
+                suffix, ("--crop", "0,1,0,1.5"), lambda means: means[np.linalg.norm(means - [0, 1, 0], axis=1) <= 1.5]
+            ),
+            f"{suffix} chosen": (
+                suffix, ("--translate", "0,1,0", "--to-axes", "RDF"), lambda means, y=flips[1]: means + y * upwards
+            ),
+        }  # fmt: skip
+    assert not failures(cases, check)
+
+
+@contextmanager
+def piped(path):
+    """Yield the name of a pipe with the contents of a file; it can be read once."""
+    pipe = path.with_name("pipe")
+    os.mkfifo(pipe)
+    threading.Thread(target=lambda: pipe.write_bytes(path.read_bytes()), daemon=True).start()
+    yield pipe
+    pipe.unlink()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
+def test_commands_read_pipes(tmp_path, make_model):
+    def check(case):
+        command, suffix, status, words = case
+        path = tmp_path / f"a.{suffix}"
+        csplat.write(path, calm(make_model(20, 0)))
+        command = [tmp_path / word if "." in word else word for word in command.split()]
+        with piped(path) as pipe:
+            result = call(*[pipe if word == "IN" else word for word in command], status=status)
+        assert words in result.stdout + result.stderr
+        assert str(tempfile.gettempdir()) not in (result.stdout + result.stderr).replace(str(tmp_path), "")
+        result = run(*command, stdin=path.read_bytes())
+        assert status == result[0]
+        assert words in result[1]
+
+    def run(*command, stdin):
+        result = CliRunner().invoke(app, [str("-" if word == "IN" else word) for word in command], input=stdin)
+        return result.exit_code, result.stdout + result.stderr
+
+    cases = [
+        *(("info IN", suffix, 0, "20") for suffix in ("ply", "csplat", "spz", "glb", "sog", "compressed.ply")),
+        *(("lint IN", suffix, 0, "nothing found") for suffix in ("spz", "sog")),
+        *(
+            (f"{command} IN", "sog", 1, "is SOG, expected a .csplat file")
+            for command in ("verify", "merge a.csplat -o b.csplat")
+        ),
+        ("convert IN b.ply --force", "glb", 0, "20 splats: gltf"),
+        ("convert IN b.ply --force --from splat", "splat", 0, "20 splats: splat"),
+        ("info IN", "splat", 1, "--from splat reads it"),
+    ]
+    assert not failures({f"{one[0]}, {one[1]}": one for one in cases}, check)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
+@pytest.mark.parametrize("name", ["ply", "csplat", "compressed-ply", "spz", "splat", "gltf", "sog"])
+def test_every_format_is_written_to_a_pipe_and_to_a_device(tmp_path, ply, name):
+    os.mkfifo(tmp_path / "pipe")
+    read = []
+    reader = threading.Thread(target=lambda: read.append((tmp_path / "pipe").read_bytes()), daemon=True)
+    reader.start()
+    call("convert", ply, tmp_path / "pipe", "--to", name)
+    reader.join(10)
+    assert (tmp_path / "pipe").is_fifo()
+    (tmp_path / "copy").write_bytes(read[0])
+    with formats.open_scene(tmp_path / "copy", name) as scene:
+        assert 200 == scene.count
+    call("convert", ply, os.devnull, "--to", name)
+    assert Path(os.devnull).is_char_device()
+
+
+def test_a_crop_that_keeps_nothing_is_a_warning(tmp_path, ply):
+    for suffix in ("ply", "csplat", "spz", "splat", "compressed.ply", "sog"):
+        out = tmp_path / f"a.{suffix}"
+        done = call("convert", ply, out, "--crop", "90,90,90,1", "--quiet", "--json")
+        assert f"warning: --crop keeps none of 200 splats: {out} has no splats" in done.stderr
+        result = json.loads(done.stdout)
+        assert (200, 0) == (result["source_splats"], result["splats"])
+    assert "no splats are left" in call("convert", ply, tmp_path / "a.glb", "--crop", "90,90,90,1", status=1).stderr
+    assert "warning" not in call("convert", ply, tmp_path / "b.ply", "--crop", "0,0,0,1").stderr
+
+
+def test_a_crop_sphere_is_in_world_coordinates(make_model):
+    model = make_model(200, 0, origin=(100.0, 0.0, 0.0))
+    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).apply(source_from_model(model))
+    assert (np.linalg.norm(model.means, axis=1) <= 0.7).sum() == kept.count == len(kept.model())
+
+
+def test_axes_are_converted_and_recorded(tmp_path, ply):
+    call("convert", ply, tmp_path / "a.ply", "--to-axes", "RUB")
+    call("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--to-axes", "RDF")
+    source, there, back = read_ply(ply), read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply")
+    assert ("RUB", "RDF") == (there.coordinate_system, back.coordinate_system)
+    assert (source.means * np.float32([1, -1, -1]) == there.means).all()
+    assert all((getattr(source, name) == getattr(back, name)).all() for name in ("means", "quats", "shN"))
+    to = json.loads(call("convert", ply, tmp_path / "a.spz", "--json").stdout)  # which has fixed axes
+    of = json.loads(call("convert", tmp_path / "a.spz", tmp_path / "c.ply", "--json").stdout)
+    assert (["unspecified", "RUB"], ["RDF", "RDF"]) == (to["axes"], of["axes"])
+    found = read_ply(tmp_path / "c.ply")
+    assert np.allclose(source.means, found.means, atol=1e-3)
+    assert (np.abs(np.sum(source.quats * found.quats, axis=1)) > 0.999).all()
+    assert "axes         RUB, read as RDF" in call("info", tmp_path / "a.spz").stdout
+    assert "RUB" == json.loads(call("info", tmp_path / "a.spz", "--json").stdout)["file_axes"]
+
+
+def lonely(seed=0):
+    """Return a ball of fine splats and three floaters, one of them large enough to touch the ball."""
+    rng = np.random.default_rng(seed)
+    points = rng.standard_normal((3000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    return np.concatenate([points, [[3, 0, 0], [0, 50.0, 0], [2.5, 0, 0]]]), np.r_[np.full(3002, 0.03), 1.0]
+
+
+def test_floaters_are_splats_without_neighbours():
+    points, sizes = lonely()
+    assert [3000, 3001] == np.flatnonzero(find_floaters(points, sizes)).tolist()
+    assert not find_floaters(points[:5], sizes[:5]).any()
+    assert not find_floaters(np.zeros((20, 3)), np.ones(20)).any()
+    left = Filters(drop_floaters=True).apply(source_from_model(cloud(points, sizes)))
+    assert 3001 == left.count == len(left.model())
+
+
+@pytest.mark.parametrize("name", ["meta.json", "lod-meta.json"])
+def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply, name):
+    out = tmp_path / "new" / name
+    call("convert", ply, out)
+    assert 200 == len(csplat.read(tmp_path / "new"))
+    assert "exists: --force" in call("convert", ply, out, status=1).stderr
+    if name == "meta.json":
+        (out.parent / "other.bin").write_bytes(bytes(9_999_999))
+    assert " MB" not in call("convert", ply, out, "--sh-degree", "0", "--force").stderr
+    assert " MB" not in call("info", out.parent).stdout
+    assert 0 == csplat.read(tmp_path / "new").sh_degree
+    if name == "lod-meta.json":
+        assert "is in the folder of" in call("convert", ply, ply.parent / name, status=1).stderr
+    call("convert", ply, tmp_path / "no" / "such" / name, status=1)
+    assert not (tmp_path / "no").exists()
+
+
+#: Contents that the help and the guide call `header`, and the short words for them.
+HEADER = {
+    "coordinate_system": "axes", "origin": "origin", "unit_metres": "unit", "metadata": "metadata",
+    "antialiased": "antialiased", "flat": "flat",
+}  # fmt: skip
+
+
+def words_of(found):
+    """Return the table's words for contents of a format: a set."""
+    short = {HEADER.get(name, name) for name in found}
+    return short - set(HEADER.values()) | {"header"} if short >= set(HEADER.values()) else short
+
+
+def test_the_help_and_the_guide_list_all_formats(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    helped = call("convert", "--help").stdout.partition("Formats, ")[2].partition("Examples:")[0].splitlines()
+    of_help = [re.split(r" {2,}", line.strip()) for line in helped[2:] if line.strip()]
+    guide = (Path(__file__).parents[2] / "tools" / "docs" / "guide" / "formats.md").read_text("utf-8")
+    of_guide = [
+        [cell.strip() for cell in line.strip("|").split("|")]
+        for line in guide.partition("also holds |\n|---")[2].partition("\n\n")[0].splitlines()[1:]
+    ]
+    expected = [
+        (
+            one.name, ", ".join(one.suffixes), "read, write" if one.write else "read", str(one.degree), one.axes,
+            set(ARRAYS) if one.exact >= set(ARRAYS) else set(one.exact), words_of(one.carries),
+        )
+        for one in formats.formats()
+    ]  # fmt: skip
+
+    def split(text):
+        return set(ARRAYS) if text == "all" else {word for word in text.split(", ") if word}
+
+    expected.sort(key=itemgetter(0))
+    assert expected == sorted(((*row[:5], split(row[5]), split(row[6])) for row in of_guide), key=itemgetter(0))
+    columns = [(row[0], row[2], row[3], split("".join(row[4:]))) for row in of_help]
+    columns.sort(key=itemgetter(0))
+    assert columns == [(name, use, degree, holds) for name, _, use, degree, _, _, holds in expected]
+
+
+def test_info_and_lint_accept_any_format(tmp_path, ply):
+    text = call("info", ply).stdout
+    assert "200, SH degree 2" in text
+    assert text.startswith("PLY, ")
+    assert 200 == json.loads(call("info", ply, "--json").stdout)["splats"]
+    assert "nothing found" in call("lint", ply).stdout
+    assert "E_INPUT" in call("info", ply, "--page", tmp_path / "p.html", status=1).stderr
+
+
+BOTH = [one.name for one in formats.formats() if one.open is not None and one.write is not None]
+
+
+def made(number):
+    """Return a scene of a few splats, whose count, degree and sizes depend on the number."""
+    rng, count, degree = np.random.default_rng(number), 1 + number % 5, number % 4
+    return SplatModel(
+        means=((1e-3, 1.0, 50.0)[number % 3] * rng.standard_normal((count, 3))).astype(np.float32),
+        quats=normalise_quats(rng.standard_normal((count, 4))),
+        scales=rng.uniform(-6.0, 1.0, (count, 3)).astype(np.float32),
+        opacities=rng.uniform(0.02, 0.98, count).astype(np.float32),
+        sh0=rng.uniform(-1.5, 1.5, (count, 3)).astype(np.float32),
+        shN=rng.uniform(-0.5, 0.5, (count, (degree + 1) ** 2 - 1, 3)).astype(np.float32),
+    )
+
+
+@pytest.mark.slow
+def test_arrays_that_are_exact_in_two_formats_are_converted_exactly(tmp_path):
+    pairs = {f"{first} to {second}": (first, second) for first in BOTH for second in BOTH}
+    cases = {name: (*pair, made(number)) for number, (name, pair) in enumerate(pairs.items())}
+    assert [] == failures(cases, lambda case: assert_exact_arrays_are_kept(tmp_path, *case))
+
+
+def assert_exact_arrays_are_kept(tmp_path, first, second, model):
+    one, other = formats.format_by_name(first), formats.format_by_name(second)
+    a, b = tmp_path / f"a{one.suffixes[0]}", tmp_path / f"b{other.suffixes[0]}"
+    formats.write(a, model, first)
+    filters = Filters(to_axes=other.axes or "RDF")
+    converted = convert_file(str(a), str(b), read_as=first, write_as=second, filters=filters)
+    source, found = (
+        convert_axes(source_from_model(formats.read(path, name)), "RDF").model()
+        for path, name in ((a, first), (b, second))
+    )
+    assert len(source) == converted.count == len(found)
+    for name in one.exact & other.exact:
+        left, right = getattr(source, name), getattr(found, name)
+        if name == "shN":
+            left = left[:, : right.shape[1]]
+        if name == "quats":
+            left, right = (rows * np.sign(rows[:, :1] + 1e-30) for rows in (left, right))
+        if name == "opacities":
+            assert np.allclose(left, right, rtol=2e-7, atol=0)
+        else:
+            assert (left == right).all(), name
+    places = (np.sort(one.means, axis=0) for one in (source, found))  # some formats reorder splats
+    assert np.allclose(*places, atol=1e-2 * max(1.0, np.abs(source.means).max()))
+    assert min(source.sh_degree, other.degree) == found.sh_degree
+
+
+@pytest.mark.slow
+def test_encode_and_convert_take_the_format_of_a_file(tmp_path, ply):
+    call("convert", ply, tmp_path / "a.splat")
+    bare = tmp_path / "bare"
+    (tmp_path / "a.splat").rename(bare)
+    assert "--from splat" in call("info", bare, status=1).stderr
+    call("convert", bare, tmp_path / "b.ply", "--from", "splat")
+    call("encode", bare, tmp_path / "b.csplat", "--from", "splat")
+    assert "the format is 'x', expected one of" in call("encode", bare, "-", "--from", "x", status=1).stderr
+
+
+def test_a_packed_scene_is_unpacked_once(tmp_path, make_model, monkeypatch):
+    csplat.write(tmp_path / "a.spz", make_model(50, 1))
+    unpacked, read = [], spz.read_spz_file
+
+    def counting(*words):
+        unpacked.append(words)
+        return read(*words)
+
+    monkeypatch.setattr(spz, "read_spz_file", counting)
+    limits = OutOfCoreOptions(always=True)
+    encode_file(str(tmp_path / "a.spz"), str(tmp_path / "a.csplat"), EncodeOptions(), out_of_core=limits)
+    assert 1 == len(unpacked)
+    with open_scenes((tmp_path / "a.spz", tmp_path / "a.spz"), 1 << 30) as (one, _):
+        assert 50 == one.count
+    assert 3 == len(unpacked)
+    assert csplat.decode(tmp_path / "a.csplat").sh_degree == 1
+
+
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
+
+
+VECTORS = load()
+
+
+#: Vectors of several tiles or with extra columns, and some others; none with many splats.
+VALID = [
+    vector
+    for number, vector in enumerate(vector for vector in VECTORS if not vector.error)
+    if vector.expect["header"]["splat_count"] < 10_000
+    and (vector.expect["header"]["tile_count"] != 1 or vector.expect["extra"] or number % 4 == 0)
+]
+
+
+#: Two of each clause, without the one that is too large for memory at once, which decoding by tiles accepts, and those
+#: with damage in payloads of coarser levels, which neither way reads.
+INVALID = [
+    *{
+        (vector.error["clause"], turn): vector
+        for turn, order in enumerate((VECTORS, VECTORS[::-1]))
+        for vector in order
+        if vector.error
+        and vector.name not in ("invalid/arrays_beyond_budget", "invalid/coarse_tile_box", "invalid/coarse_tile_stream")
+    }.values()
+]
+
+
+def ply_of(model):
+    buffer = io.BytesIO()
+    write_ply(buffer, model)
+    return buffer.getvalue()
+
+
+def answer(make):
+    """Return the result, or the error's text if the input is refused: some column names are impossible in a PLY."""
+    try:
+        return make()
+    except csplat.InputError as error:
+        return str(error)
+
+
+def assert_same(expected, found):
+    for field in fields(expected):
+        ours, theirs = getattr(expected, field.name), getattr(found, field.name)
+        if isinstance(ours, np.ndarray):
+            assert (ours.dtype, ours.shape, ours.tobytes()) == (theirs.dtype, theirs.shape, theirs.tobytes())
+        elif field.name == "extra":
+            assert {name: column.tobytes() for name, column in ours.items()} == {
+                name: column.tobytes() for name, column in theirs.items()
+            }
+        else:
+            assert ours == theirs
+
+
+@pytest.fixture
+def many_tiles(make_model, tmp_path):
+    """Return the path of a file of ten tiles."""
+    data = csplat.encode(make_model(600, 2), csplat.EncodeOptions(preset="fast", tile_splats=60))
+    path = tmp_path / "scene.csplat"
+    path.write_bytes(data)
+    assert len(read_header(data).tiles) == 10
+    return path
+
+
+@pytest.mark.slow
+def test_tile_wise_scenes_and_plys_equal_those_of_one_decode(tmp_path):
+    path, ply = tmp_path / "scene.csplat", tmp_path / "scene.ply"
+
+    def check(vector):
+        path.write_bytes(vector.data)
+        expected = decode(vector.data, threads=1)
+        with formats.open_scene(path) as scene:
+            assert len(expected) == scene.count
+            assert_same(expected, scene.model())
+        wanted = answer(lambda: ply_of(expected))
+        found = answer(lambda: (decode_file(str(path), str(ply)), ply.read_bytes()))
+        assert (wanted if isinstance(wanted, str) else ((len(expected), expected.sh_degree), wanted)) == found
+
+    assert [] == failures(VALID, check)
+
+
+@pytest.mark.slow
+def test_invalid_files_give_the_same_error_and_leave_no_ply(tmp_path):
+    path = tmp_path / "scene.csplat"
+
+    def check(vector):
+        path.write_bytes(vector.data)
+        with pytest.raises(CsplatError) as expected:
+            decode(vector.data, threads=1)
+        with pytest.raises(CsplatError) as found:
+            decode_file(str(path), str(tmp_path / "scene.ply"))
+        assert str(expected.value) == str(found.value)
+        assert ["scene.csplat"] == [one.name for one in tmp_path.iterdir()]
+
+    assert [] == failures({vector.name: vector for vector in INVALID}, check)
+
+
+def test_loading_a_scene_that_exceeds_the_memory_is_refused(many_tiles, monkeypatch):
+    decode_file(str(many_tiles), str(many_tiles.with_suffix(".ply")))
+    monkeypatch.setattr(scene_files, "available_memory_bytes", lambda: 4000)
+    for suffix in (".csplat", ".ply"):
+        with pytest.raises(LimitError, match="allowed 4000"):
+            scene_files.load_model(many_tiles.with_suffix(suffix))
+
+
+@pytest.fixture
+def model(make_model):
+    cloud = make_model(1500, 1)
+    return replace(cloud, scales=cloud.scales * np.float32(0.3) - np.float32(1.5))

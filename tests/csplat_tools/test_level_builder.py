@@ -1,0 +1,544 @@
+"""Levels of detail: cuts through the nodes, reading, copying and encoding them, and the first builder."""
+
+import io
+import json
+import math
+import re
+import sys
+from dataclasses import replace
+from itertools import pairwise
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import typer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+import csplat
+import csplat_tools
+from csplat import InputError, LimitError, _spec, decode, read_header
+from csplat.decoder import decode_scene
+from csplat.decoder.container import SceneHeader
+from csplat.decoder.tree import Node, select_tiles
+from csplat.encoder import EncodeOptions, EncodePlan
+from csplat.encoder.levels import LevelNode, encode_levels
+from csplat.formats import open_scene
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.scene_source import source_from_model
+from csplat_conformance.declared_bounds import Source
+from csplat_conformance.encoders import all_inputs
+from csplat_conformance.encoders.file_checks import SplatPairs
+from csplat_conformance.encoders.render_checks import check_renders
+from csplat_conformance.manifest import VECTORS, load
+from csplat_conformance.validator import validate
+from csplat_render.camera_paths import orbit_cameras
+from csplat_render.scorer import Scorer
+from csplat_render.virtual_cameras import virtual_cameras
+from csplat_tools.cli.app import app
+from csplat_tools.cli.shared_options import parse_level
+from csplat_tools.convert_file import convert_file
+from csplat_tools.encode_file import choose_levels, encode_file
+from csplat_tools.level_builder import LevelBuilder, encode_with_levels, kd_groups
+from csplat_tools.level_fitting import LevelFitter, Work
+from csplat_tools.level_merging import merge_neighbours
+from csplat_tools.scene_files import LoadedModel
+
+TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
+
+
+RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
+
+
+NOTHING = next(VECTORS / one.file for one in load() if one.expect and one.expect["header"]["tile_count"] == 0)
+
+
+SPLATS = 400
+
+
+WORK = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
+
+
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
+
+
+@pytest.fixture(autouse=True)
+def little_work(monkeypatch):
+    """Fit levels with few steps and views."""
+
+    def fitter(*args, **options):
+        return LevelFitter(*args, **{**options, "work": WORK})
+
+    monkeypatch.setattr("csplat_tools.level_fitting.LevelFitter", fitter)
+
+
+@pytest.fixture(scope="module")
+def model(sample_path):
+    return csplat.read_ply(sample_path).select(slice(0, SPLATS))
+
+
+@pytest.fixture(scope="module")
+def larger_model(sample_path):
+    return csplat.read_ply(sample_path).select(slice(0, 1200))
+
+
+@pytest.fixture(scope="module")
+def data(model):
+    """A file of four leaves in two levels above, with errors that grow."""
+    leaves = kd_groups(model.means, 4)
+    halves = [quarter(model.select(np.concatenate(leaves[at : at + 2]))) for at in (0, 2)]
+    nodes = [LevelNode(0, 4 + number // 2, rows=rows) for number, rows in enumerate(leaves)]
+    nodes += [LevelNode(1, 6, splats=half, error=error) for half, error in zip(halves, (0.5, 0.25), strict=True)]
+    nodes.append(LevelNode(2, None, splats=quarter(halves[0]), error=1.0))
+    return encode_levels(EncodePlan.of(model), nodes).write().data
+
+
+def quarter(splats):
+    return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4))[1]
+
+
+def same(one, other):
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ARRAYS)
+
+
+@st.composite
+def trees(draw):
+    """Draw nodes of any shape; node k has tile k, of k + 1 splats for a leaf."""
+    like, nodes = read_header(TREE).tiles[0], []
+    levels = [0] * draw(st.integers(1, 6)) + sorted(draw(st.lists(st.integers(1, 4), max_size=6)))
+    for level in levels:
+        at, free = len(nodes), [k for k, node in enumerate(nodes) if node.parent is None and node.level < level]
+        if level and not free:
+            continue
+        below = tuple(sorted(draw(st.sets(st.sampled_from(free), min_size=1)))) if level else ()
+        for child in below:
+            nodes[child] = replace(nodes[child], parent=at)
+        tile = replace(like, index=at, level=level, corner=(draw(st.integers(-50, 50)), 0, 0), extent=(3, 3, 3))
+        splats = draw(st.integers(1, sum(nodes[child].splat_count for child in below))) if level else at + 1
+        error = max(nodes[child].error for child in below) + draw(st.sampled_from([0.0, 0.5, 1.0])) if level else 0.0
+        nodes.append(Node((tile,), None, below, level, splats, error))
+    return nodes
+
+
+def header_of(nodes) -> SceneHeader:
+    tiles = [node.tiles[0] for node in nodes]
+    split = sum(tile.level == 0 for tile in tiles)
+    return replace(read_header(TREE), tiles=tuple(tiles[:split]), coarse_tiles=tuple(tiles[split:]))
+
+
+@settings(max_examples=40)
+@given(nodes=trees(), level=st.integers(0, 5), budget=st.integers(0, 40), seed=st.integers(0, 9))
+def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):
+    header = header_of(nodes)
+    plain = [replace(node, parent=_spec.NO_PARENT if node.parent is None else node.parent) for node in nodes]
+    sizes = np.random.default_rng(seed).choice([0.0, 0.25, 0.5, 1.0, math.inf], len(nodes)).tolist()
+
+    def selected(**what):
+        return [tile.index for tile in select_tiles(header, nodes, **what)]
+
+    assert spec.cut_at_level(plain, level) == selected(level=level)
+    assert spec.cut_at_pixel_size(plain, sizes) == selected(pixel_size=sizes)
+    expected = spec.cut_within(plain, budget)
+    if expected is None:
+        with pytest.raises(LimitError, match="max_splats: needs"):
+            selected(max_splats=budget)
+    else:
+        assert expected == selected(max_splats=budget)
+
+
+@settings(max_examples=40)
+@given(nodes=trees(), level=st.integers(0, 5), low=st.floats(-0.06, 0.06), near=st.integers(-2, 2), data=st.data())
+def test_the_tiles_of_a_box_are_those_of_the_pseudo_code(spec, nodes, level, low, near, data):
+    header = header_of(nodes)
+    step = header.attribute(_spec.ATTRIBUTE_MEANS).step
+
+    def boxed(number, low, high, **more):
+        return SimpleNamespace(number=number, low=low, high=high, level=nodes[number].level, **more)
+
+    def corner(integers):
+        return [float(np.float32(float(n) * step)) for n in integers]
+
+    plain = []
+    for number, node in enumerate(nodes):  # with one tile each
+        tile = node.tiles[0]
+        own = boxed(number, corner(tile.corner), corner(np.add(tile.corner, tile.extent)))
+        below = [own, *(plain[child] for child in node.children)]
+        lows, highs = ([*zip(*ends, strict=True)] for ends in ([b.low for b in below], [b.high for b in below]))
+        plain.append(boxed(number, [*map(min, lows)], [*map(max, highs)], tiles=[own]))
+    sides = [side for one in plain for side in (one.low[0], one.high[0])]
+    edge = data.draw(st.sampled_from([low, *sides]))  # and the numbers next to a side
+    for _ in range(abs(near)):
+        edge = math.nextafter(edge, math.copysign(math.inf, near))
+    whole = [tile.index for tile in select_tiles(header, nodes, level=level)]
+    for box in ([[edge, -9, -9], [math.inf, 9, 9]], [[-math.inf, -9, -9], [edge, 9, 9]]):
+        part = [tile.index for tile in select_tiles(header, nodes, level=level, box=np.array(box))]
+        assert spec.tiles_in_box(plain, whole, SimpleNamespace(low=box[0], high=box[1])) == part
+
+
+@pytest.mark.parametrize(
+    ("what", "message"),
+    [
+        ({"level": 1, "max_splats": 9}, "level and max_splats exclude each other"),
+        ({"level": -1}, "level is -1, expected 0 to 255"),
+        ({"level": 256}, "level is 256, expected 0 to 255"),
+        ({"pixel_size": -0.5}, "pixel_size is -0.5, expected 0 or more"),
+        ({"pixel_size": math.nan}, "pixel_size is nan, expected 0 or more"),
+        ({"pixel_size": [1.0, 2.0]}, "pixel_size has 2 numbers, expected one, or one for each of 13 nodes"),
+        ({"max_splats": -1}, "max_splats is -1, expected 0 or more"),
+        ({"box": (1, 2, 3)}, "box is \\(1, 2, 3\\), expected six numbers other than NaN"),
+        ({"box": (0, 0, 0, 1, 1, math.nan)}, "expected six numbers other than NaN"),
+        ({"box": ((0, 0, 0), (1, 1, 1))}, "expected six numbers other than NaN"),
+        ({"box": "000111x"}, "expected six numbers other than NaN"),
+        ({"box": 1.0}, "expected six numbers other than NaN"),
+        ({"box": (10**400, 0, 0, 1, 1, 1)}, "expected six numbers other than NaN"),
+        ({"box": (9e9, 0, 0, 9e9, 1, 1)}, "no tile touches the box"),
+    ],
+)
+def test_refuses_arguments_of_a_cut(what, message):
+    with csplat.open(TREE) as file, pytest.raises(InputError, match=message):
+        file.cut(**what)
+
+
+def test_a_file_without_levels_is_one_node():
+    with csplat.open(VECTORS / "valid" / "two_tiles.csplat") as file:
+        assert [0, 1] == file.cut() == file.cut(level=3) == file.cut(pixel_size=9.0) == file.cut(max_splats=5)
+        with pytest.raises(LimitError, match="max_splats: needs 5, allowed 4"):
+            file.cut(max_splats=4)
+    with csplat.open(NOTHING) as file:
+        assert () == file.nodes
+        assert [] == file.cut(max_splats=0)
+
+
+def test_the_default_is_level_0_everywhere(data, model, tmp_path):
+    path = tmp_path / "levels.csplat"
+    path.write_bytes(data)
+    header = read_header(data)
+    assert len(model) == header.splat_count < sum(tile.splat_count for tile in header.all_tiles)
+    whole = decode(data)
+    with csplat.open(path) as file:
+        assert same(whole, file.read())
+        assert same(whole, file.read(tiles=file.cut()))
+        assert len(header.tiles) == len(list(file.tiles())) == len(file.boxes)
+    assert same(whole, csplat.read(path))
+
+
+def test_a_cut_has_the_values_of_its_tiles(data):
+    with csplat.open(data) as file:
+        tiles = file.cut(level=1)
+        assert {1} == {file.header.all_tiles[index].level for index in tiles}
+        coarse = file.read(tiles=tiles)
+        parts = [decode(data, tiles=[index]) for index in tiles]
+    for name in ARRAYS:
+        assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(coarse, name))
+    assert all(len(decode(data, tiles=file.cut(max_splats=count))) <= count for count in (50, 100, 230, SPLATS))
+
+
+def test_a_cut_reads_its_part_of_a_file(data):
+    with csplat.open(data) as file:
+        (coarsest,) = file.cut(level=2)
+        before = file.bytes_read
+        file.read(tiles=[coarsest])
+        assert file.bytes_read - before < len(data) / 2
+        tiles = file.header.all_tiles
+        first = tiles[coarsest].layers[0].offset
+        assert _spec.HEADER_SIZE + file.header.index_size == file.header.chunk(_spec.CHUNK_TREE).offset < first
+    assert all(first < tile.layers[0].offset for tile in tiles if tile.index != coarsest)
+
+
+def test_coarser_levels_have_no_extra_columns():
+    assert ["label"] == list(decode(RICH.read_bytes()).extra)
+    with open_scene(RICH, max_splats=read_header(RICH).splat_count - 1) as scene:
+        assert [{}] == [block.extra for block in scene.blocks()]
+    with csplat.open(RICH) as file:
+        assert {} == file.read(tiles=file.cut(level=1)).extra
+        assert {} == file.read(tiles=[0, 2]).extra
+        assert ["label"] == list(file.read(tiles=[0]).extra)
+
+
+def test_levels_of_a_file_are_scenes_to_convert(data, tmp_path):
+    path, ply = tmp_path / "levels.csplat", tmp_path / "coarse.ply"
+    path.write_bytes(data)
+    result = CliRunner().invoke(app, ["convert", str(path), str(ply), "--level", "1"])
+    assert 0 == result.exit_code, result.output
+    assert "2 coarser levels of detail: level 1 alone is read" in result.output
+    with csplat.open(data) as file:
+        assert len(file.read(tiles=file.cut(level=1))) == len(csplat.read_ply(ply))
+    result = CliRunner().invoke(app, ["convert", str(path), str(ply), "--level", "3", "--force"])
+    assert 1 == result.exit_code
+    assert "the level is 3, expected 0 to 2" in result.output
+
+
+def test_a_number_of_splats_selects_a_version(data, tmp_path):
+    path, streamed = tmp_path / "levels.csplat", tmp_path / "streamed" / "lod-meta.json"
+    path.write_bytes(data)
+    convert_file(str(path), str(streamed))
+    with csplat.open(data) as file:
+        counts = [len(file.read(tiles=file.cut(max_splats=most))) for most in (80, 240, 5000)]
+        coarser = [len(file.read(tiles=file.cut(level=level))) for level in range(3)]
+    assert len({*counts}) == 3
+    for most, wanted in zip((80, 240, 5000), counts, strict=True):
+        with open_scene(path, max_splats=most) as scene, open_scene(streamed, max_splats=most) as level:
+            assert (wanted, wanted) == (scene.count, sum(map(len, scene.blocks())))
+            assert max(one for one in coarser if one <= most) == level.count
+    for one in (path, streamed):
+        with pytest.raises(InputError, match=rf"the coarsest version has {coarser[2]} splats, expected at most 9$"):
+            csplat_tools.load_model(one, max_splats=9)
+    csplat.write(tmp_path / "a.ply", csplat.decode(data))
+    with pytest.raises(InputError, match="the scene, which has no other version, has 400 splats, expected at most 9"):
+        csplat_tools.load_model(tmp_path / "a.ply", max_splats=9)
+    with pytest.raises(InputError, match="level and max_splats exclude each other"):
+        csplat_tools.load_model(path, level=1, max_splats=900)
+
+
+@pytest.mark.slow
+def test_render_and_compare_draw_a_level(data, tmp_path):
+    path, plain, cameras = (tmp_path / name for name in ("levels.csplat", "coarse.ply", "cameras.json"))
+    path.write_bytes(data)
+    with csplat.open(data) as file:
+        tiles = file.cut(level=1)
+        coarse = file.read(tiles=tiles)
+        size = sum(layer.size for index in tiles for layer in file.header.all_tiles[index].layers.values())
+    cameras.write_text(json.dumps([camera.to_json() for camera in orbit_cameras(coarse, 2, 48, 36)]))
+    csplat.write(plain, coarse)
+
+    def call(*words):
+        result = CliRunner().invoke(app, [*map(str, words), "--cameras", str(cameras)])
+        assert 0 == result.exit_code, result.output
+        return result.stdout
+
+    def images(name, *words):
+        call("render", *words[:1], tmp_path / name, *words[1:])
+        return [image.read_bytes() for image in sorted((tmp_path / name).iterdir())]
+
+    assert images("a", path, "--level", "1") == images("b", plain) != images("c", path)
+    same, scene = (json.loads(call("compare", plain, path, "--json", *more)) for more in (("--level", "1"), ()))
+    assert 99 == same["psnr"] > scene["psnr"]
+    assert (len(coarse), size) == (same["b"]["splats"], same["b"]["size_bytes"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("framed_splats", [100, 10**6])
+def test_an_orbit_is_the_same_for_all_levels(data, tmp_path, monkeypatch, framed_splats):
+    monkeypatch.setattr("csplat_tools.scene_files.FRAMED_SPLATS", framed_splats)
+    path, seen = tmp_path / "levels.csplat", []
+    path.write_bytes(data)
+    monkeypatch.setattr("csplat_tools.cli.render.render_folder", lambda _, shots, *__, **___: seen.append(shots))
+    for level in ("0", "1", "256"):
+        CliRunner().invoke(app, ["render", str(path), str(tmp_path / level), "--orbit", "2", "--level", level])
+    first, *others = ([camera.to_json() for camera in shots] for shots in seen)
+    assert [first, first] == others
+
+
+def test_values_of_the_option_level():
+    wanted = {None: (0, None), "2": (2, None), "255": (255, None)}
+    wanted |= {"256": (0, 256), "3k": (0, 3000), "1.5M": (0, 1_500_000)}
+    assert wanted == {text: parse_level(text) for text in wanted}
+    for text in ("-1", "1.5", "k", "all", "5 k", ""):
+        with pytest.raises(typer.BadParameter, match="expected a level, as in 1, or a number of splats, as in 500k"):
+            parse_level(text)
+
+
+def test_info_lists_the_levels(data, tmp_path):
+    path = tmp_path / "levels.csplat"
+    path.write_bytes(data)
+    result = CliRunner().invoke(app, ["info", str(path), "--json"])
+    assert 0 == result.exit_code, result.output
+    levels = json.loads(result.stdout)["levels"]
+    assert [(0, 4), (1, 2), (2, 1)] == [(one["level"], one["nodes"]) for one in levels]
+    assert [[0.0, 0.0], [0.25, 0.5], [1.0, 1.0]] == [one["errors"] for one in levels]
+    tiles = [tile for tile in read_header(data).all_tiles if tile.level == 1]
+    assert sum(layer.size for tile in tiles for layer in tile.layers.values()) == levels[1]["size_bytes"]
+
+
+def extract(data, box):
+    stream = io.BytesIO()
+    return csplat.extract(data, box, stream), stream.getvalue()
+
+
+def test_a_part_has_whole_leaves_and_the_nodes_above_them(data):
+    with csplat.open(data) as file:
+        nodes, step = file.nodes, file.header.attributes[3].step
+    low, high = nodes[0].tiles[0].corners(step)
+    middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+    part, cut = extract(data, (*middle, *middle))
+    assert () == tuple(validate(cut).violations)
+    with csplat.open(cut) as file:
+        assert same(decode(data, tiles=part.tiles), decode(cut, tiles=range(len(part.tiles))))
+        kept = [node for node in file.nodes if node.level == 0]
+        assert sum(node.splat_count for node in kept) == part.splat_count == len(decode(cut))
+        assert 1 <= len(kept) < 4
+        for node in file.nodes:
+            assert node.level == 0 or 2 == len(node.children)
+    whole, copy = extract(data, (-1e6, -1e6, -1e6, 1e6, 1e6, 1e6))
+    assert [node.error for node in csplat.open(data).nodes] == [node.error for node in csplat.open(copy).nodes]
+    assert len(whole.tiles) == len(read_header(data).all_tiles)
+
+
+@pytest.mark.slow
+def test_merged_files_are_a_forest(data, model):
+    plain = csplat.encode(model.select(slice(0, 100)))
+    again = io.BytesIO()
+    merged = csplat.merge([data, data], again)
+    assert "" == merged.why
+    assert () == tuple(validate(again.getvalue()).violations)
+    with csplat.open(again.getvalue()) as file:
+        levels = [node.level for node in file.nodes]
+        assert sorted(levels) == levels
+        assert 2 == sum(node.parent is None for node in file.nodes)
+        once, twice = decode(data, tiles=csplat.open(data).cut(level=1)), file.read(tiles=file.cut(level=1))
+    assert np.array_equal(np.concatenate([once.means, once.means]), twice.means)
+    other = io.BytesIO()
+    why = csplat.merge([data, plain], other).why
+    assert re.fullmatch("file 2 .* different steps of .*; levels of detail are left out", why), why
+    assert () == read_header(other.getvalue()).coarse_tiles
+
+
+def test_groups_hold_each_point_once_and_are_of_equal_size():
+    for count, parts in ((1, 1), (2, 2), (7, 3), (40, 1), (40, 13), (40, 32), (40, 40)):
+        groups = kd_groups(np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32), parts)
+        sizes = [len(rows) for rows in groups]
+        assert parts == len(groups)
+        assert max(sizes) - min(sizes) <= 1
+        assert list(range(count)) == sorted(np.concatenate(groups).tolist())
+
+
+def test_each_level_has_a_quarter_of_the_splats_of_the_finer_one(model):
+    nodes = LevelBuilder(leaf_splats=40, root_splats=30).build(model)
+    counts = [0] * (nodes[-1].level + 1)
+    for node in nodes:
+        counts[node.level] += len(node.rows) if node.level == 0 else len(node.splats)
+    for finer, coarser in pairwise(counts):
+        assert finer / 4 <= coarser <= finer / 4 + 4
+    assert 1 == sum(node.parent is None for node in nodes)
+    assert SPLATS == counts[0]
+    assert counts[-1] <= 30
+
+
+def test_the_number_of_levels_is_the_one_asked_for(model):
+    nodes = LevelBuilder(1, leaf_splats=70).build(model)
+    assert {0, 1} == {node.level for node in nodes}
+    assert 2 == sum(node.parent is None for node in nodes)  # four leaves have one parent, and two have the other
+    assert 3 == LevelBuilder(3, leaf_splats=SPLATS).build(model)[-1].level
+
+
+def test_parts_of_a_very_large_scene_are_merged_alone(model):
+    builder = LevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
+    fitted, merged = (builder.build_part(model, count, 1)[1].splats for count in (5000, 5001))
+    assert same(quarter(model), merged)
+    assert not same(quarter(model), fitted)
+    assert builder.seconds(5001) < builder.seconds(5000)
+
+
+def test_levels_are_the_same_each_time_and_at_any_number_of_threads(model):
+    one, other = (LevelBuilder(leaf_splats=100, root_splats=30).build(model, threads) for threads in (1, 2))
+    assert len(one) == len(other)
+    for first, second in zip(one, other, strict=True):
+        assert first.level == second.level
+        assert first.parent == second.parent
+        assert first.splats is None or same(first.splats, second.splats)
+
+
+def test_a_scene_without_splats_has_no_levels(model):
+    data = LevelBuilder().encode(model.select(slice(0, 0))).write().data
+    assert (0, ()) == (read_header(data).splat_count, read_header(data).all_tiles)
+
+
+def test_the_suite_of_encoders_reports_how_levels_look(model, data):
+    case = next(one for one in all_inputs() if one.renders)
+    pairs = SplatPairs(np.arange(len(model)), 0, 0, 0)
+    verdict = check_renders(
+        case, Source.of(model), decode_scene(data), pairs, data, lambda _, shown: float(len(shown)), 100.0
+    )
+    with csplat.open(data) as file:
+        counts = {str(level): float(len(file.read(tiles=file.cut(level=level)))) for level in (1, 2)}
+    assert counts == verdict.details["levels"]
+    assert "; level 1 " in verdict.message
+
+
+@pytest.mark.slow
+def test_encode_writes_levels(tmp_path, model):
+    source, out = tmp_path / "scene.ply", tmp_path / "levels.csplat"
+    csplat.write_ply(source, model)
+    words = ["encode", str(source), str(out), "--force"]
+    result = CliRunner().invoke(app, [*words, "--levels", "2", "--json"])
+    assert 0 == result.exit_code, result.output
+    assert () == tuple(validate(out.read_bytes()).violations)
+    assert {0, 1, 2} == {tile.level for tile in read_header(out.read_bytes()).all_tiles}
+    recorded = json.loads(result.stdout)["options"]["levels"]
+    assert {"count": 2, "leaf_splats": 1 << 14, "splats": "fitted"} == recorded
+    for word in ("17", "none", "0", "-1"):
+        refused = CliRunner().invoke(app, [*words, f"--levels={word}"])
+        assert 2 == refused.exit_code
+        assert "expected auto or 1 to 16" in " ".join(refused.output.split())
+
+
+def test_scenes_have_levels_on_request_only(tmp_path, model):
+    out = tmp_path / "plain.csplat"
+    for levels in ({}, {"levels": "auto"}):  # one node of 4,096 splats has no coarser one
+        encode_file(LoadedModel(model, 1), str(out), EncodeOptions(), **levels)
+        assert csplat.encode(model) == out.read_bytes()
+    assert choose_levels(10**9, EncodeOptions(), None) is None
+    assert choose_levels(4096, EncodeOptions(), "auto") is None
+    assert choose_levels(4097, EncodeOptions(), "auto") == LevelBuilder()
+    assert choose_levels(9, EncodeOptions(), 2) == LevelBuilder(2)
+    for levels in (0, 17):
+        with pytest.raises(InputError, match=f"levels is {levels}, expected 1 to 16, or auto"):
+            choose_levels(9, EncodeOptions(), levels)
+
+
+def test_levels_without_the_renderer_are_an_error_that_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    assert choose_levels(10**6, EncodeOptions(), None) is None
+    with pytest.raises(InputError, match=r"numba: pip install 'csplat\[render\]'"):
+        choose_levels(10**6, EncodeOptions(), "auto")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fitted_splats", [400, 399])
+def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path, fitted_splats):
+    options = EncodeOptions(bucket_splats=300, threads=1)
+    builder = LevelBuilder(2, leaf_splats=300, whole_splats=300, fitted_splats=fitted_splats, bucket_splats=300)
+    assert ("fitted" if fitted_splats == 400 else "merged") == builder.settings(len(model))["splats"]
+    data = builder.encode(model, options).write({"levels": builder.settings(len(model))}).data
+    with csplat.open(data) as file:
+        assert [0, 0, 1, 1, 2] == [node.level for node in file.nodes]
+        errors = [node.error for node in file.nodes]
+        assert 0.0 == min(errors) < errors[2] <= errors[4]
+    assert () == tuple(validate(data).violations)
+    # Other processes would fit with all steps.
+    threads, memory_bytes = (1, 2_000_000_000) if fitted_splats == 400 else (2, None)
+    options, limits = replace(options, threads=threads), OutOfCoreOptions(memory_bytes=memory_bytes)
+    encode_scene(source_from_model(model), tmp_path / "out.csplat", options, limits, levels=builder)
+    assert bool(data == (tmp_path / "out.csplat").read_bytes())
+
+
+@pytest.mark.slow
+def test_a_size_counts_all_levels(larger_model):
+    target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
+    result = encode_with_levels(larger_model, EncodeOptions(), LevelBuilder(1), target=target)
+    assert 17_460 < len(result.data) == result.report.search.size_bytes <= 18_000
+    assert () == tuple(validate(result.data).violations)
+    with csplat.open(result.data) as file:
+        assert [1200, 1200 // 4] == [len(file.read(tiles=file.cut(level=level))) for level in (0, 1)]
+    alone = csplat.encode(larger_model, target=replace(target, size_bytes=int(0.72 * 18_000)))
+    scorer = Scorer.of_source(larger_model, virtual_cameras(larger_model, 3, 96, 72))
+    assert scorer.psnr(decode(result.data)) > scorer.psnr(decode(alone)) - 0.3  # as a search for the rest of the size
+
+
+@pytest.mark.slow
+def test_other_targets_and_an_importance_have_levels(larger_model, tmp_path):
+    weights, out = tmp_path / "weights.npy", tmp_path / "out.csplat"
+    np.save(weights, np.linspace(0.1, 1.0, 1200, dtype=np.float32))
+    kept = csplat.Target(keep=0.5, effort=1)
+    for what, count in (({"target": kept}, 1200 // 2), ({"importance": str(weights)}, 1200)):
+        encoded = encode_file(LoadedModel(larger_model, 1), str(out), EncodeOptions(), levels=1, **what)
+        assert () == tuple(validate(out.read_bytes()).violations)
+        with csplat.open(out) as file:
+            assert [count, count // 4] == [len(file.read(tiles=file.cut(level=level))) for level in (0, 1)]
+        assert encoded.report.options["levels"]["count"] == 1
+    target = csplat.Target(max_error={"means": 0.01})
+    bounded = encode_with_levels(larger_model, EncodeOptions(), LevelBuilder(1), target=target)
+    assert bounded.report.search.size_bytes == len(bounded.data)
+    assert 0.005 < bounded.report.errors["means"][0] <= 0.01
+    assert () == tuple(validate(bounded.data).violations)

@@ -1,0 +1,316 @@
+"""`csplat render`: images, and films in the formats that Pillow writes and as MP4; refusals."""
+
+import json
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import typer
+from checked import cloud
+from command_line import call
+
+from csplat import EncodeOptions, encode, read_ply, write_ply
+from csplat.errors import InputError
+from csplat_tools.cli.shared_options import parse_colour, parse_size
+from csplat_tools.render_files import (
+    _durations,
+    check_film,
+    image_names,
+    make_output_folder,
+    side_by_side,
+    to_uint8,
+    write_film,
+)
+
+pytest.importorskip("numba", reason="the renderer needs numba: pip install 'csplat[render]'")
+
+
+Image = pytest.importorskip("PIL.Image", reason="films need pillow: pip install 'csplat[render]'")
+
+
+@pytest.fixture
+def ply(tmp_path):
+    """One red, opaque ball of radius 0.2 around the origin."""
+    red, path = np.array([[1.7, -1.8, -1.8]], np.float32), tmp_path / "ball.ply"
+    write_ply(path, cloud([[0, 0, 0]], 0.2, opacities=np.ones(1, np.float32), sh0=red, metadata={"up": [0, -1, 0]}))
+    return path
+
+
+def camera(image):
+    """Return a camera two units in front of the origin."""
+    return {
+        "K": [[60, 0, 32], [0, 60, 24], [0, 0, 1]],
+        "viewmat": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]],
+        "W": 64,
+        "H": 48,
+        "image": image,
+    }
+
+
+@pytest.fixture
+def cameras(tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([camera("images/left.jpg"), camera("images/right.jpg")]))
+    return path
+
+
+def refused(*words):
+    stderr = call(*words, status=1).stderr
+    assert stderr.startswith("error: ")
+    assert stderr.count("\n") == 1
+    return stderr
+
+
+def pixels(path):
+    with Image.open(path) as picture:
+        return np.asarray(picture).astype(int)
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_the_background_surrounds_the_scene(ply, cameras, tmp_path):
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--background", "0,0,1")
+    picture = pixels(tmp_path / "out" / "left.png")
+    assert (48, 64, 3) == picture.shape
+    assert picture[24, 32, 0] > 240
+    assert picture[24, 32, 2] < 10
+    assert [0, 0, 255] == picture[0, 0].tolist()
+    trained = replace(read_ply(ply), metadata={"training": {"background": [1, 1, 1]}})
+    write_ply(ply, trained)
+    call("render", ply, "--cameras", cameras, tmp_path / "trained")
+    assert [255, 255, 255] == pixels(tmp_path / "trained" / "left.png")[0, 0].tolist()
+
+
+def test_alpha_and_depth_are_written_next_to_the_render(ply, cameras, tmp_path):
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--alpha", "--depth")
+    assert ["left.alpha.png", "left.depth.npy", "left.png"] == names(tmp_path / "out")[:3]
+    alpha, depth = pixels(tmp_path / "out" / "left.alpha.png"), np.load(tmp_path / "out" / "left.depth.npy")
+    assert alpha[24, 32] > 240
+    assert 0 == alpha[0, 0]
+    assert np.float32 == depth.dtype
+    assert depth[24, 32] == pytest.approx(2.0, rel=1e-4)
+    assert 0.0 == depth[0, 0]
+
+
+def test_renders_of_an_orbit_are_numbered_and_have_the_given_size(ply, tmp_path):
+    call("render", ply, "--orbit", 3, "--size", "40x30", tmp_path / "out")
+    assert ["0000.png", "0001.png", "0002.png"] == names(tmp_path / "out")
+    picture = pixels(tmp_path / "out" / "0002.png")
+    assert (30, 40, 3) == picture.shape
+    assert picture[15, 20, 0] > 200
+
+
+def test_an_orbit_follows_cameras(ply, cameras, tmp_path):
+    call("render", ply, "--orbit", 2, "--cameras", cameras, "--size", "64x48", tmp_path / "along")
+    call("render", ply, "--orbit", 2, "--size", "64x48", tmp_path / "around")
+    ball = {name: np.count_nonzero(pixels(tmp_path / name / "0001.png")[..., 0] > 128) for name in ("along", "around")}
+    assert 1.5 * ball["along"] < ball["around"]  # the cameras are ten radii away: the ball is small
+
+
+def test_a_csplat_file_renders_like_its_ply(cameras, tmp_path, make_model):
+    model = make_model(300, 1)
+    write_ply(tmp_path / "many.ply", model)
+    (tmp_path / "many.csplat").write_bytes(encode(model, EncodeOptions(preset="fast")))
+    for kind in ("ply", "csplat"):
+        call("render", tmp_path / f"many.{kind}", "--cameras", cameras, tmp_path / kind)
+    a, b = (pixels(tmp_path / kind / "left.png") for kind in ("ply", "csplat"))
+    assert a.max() > 50
+    assert np.abs(a - b).mean() < 2.0
+
+
+def test_a_resized_camera_renders_the_same_view(ply, cameras, tmp_path):
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--size", "128x96")
+    picture = pixels(tmp_path / "out" / "left.png")
+    assert (96, 128, 3) == picture.shape
+    assert picture[48, 64, 0] > 240
+    assert "distorted" in refused("render", ply, "--cameras", cameras, tmp_path / "no", "--size", "64x64")
+
+
+def test_nothing_is_replaced_without_force(ply, cameras, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "right.png").write_bytes(b"mine")
+    assert "right.png exists: --force replaces it" in refused("render", ply, "--cameras", cameras, tmp_path / "out")
+    assert ["right.png"] == names(tmp_path / "out")
+    call("render", ply, "--cameras", cameras, tmp_path / "out", "--force")
+    assert (48, 64, 3) == pixels(tmp_path / "out" / "right.png").shape
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("out",),
+        ("out", "--data", "set", "--cameras", "x.json"),
+        ("out", "--cameras", "x.json", "--up", "z"),
+        ("out", "--orbit", "0"),
+        ("out", "--orbit", "3", "--size", "12"),
+        ("out", "--orbit", "3", "--backend", "wrong"),
+        ("a.tif", "--orbit", "3"),
+        ("turn.webp", "--orbit", "2", "--depth"),
+        ("turn.webp", "--orbit", "2", "--fps", "101"),
+    ],
+)
+def test_a_wrong_command_line_has_status_2(ply, tmp_path, words):
+    call("render", ply, tmp_path / words[0], *words[1:], status=2)
+    assert ["ball.ply"] == names(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("module", "package", "extra", "output"),
+    [("numba", "numba", "render", "out"), ("PIL", "pillow", "render", "out"), ("av", "av", "film", "turn.mp4")],
+)
+def test_missing_packages_are_named(ply, cameras, tmp_path, monkeypatch, module, package, extra, output):
+    monkeypatch.setitem(sys.modules, module, None)
+    line = f"error: this needs {package}: pip install 'csplat[{extra}]' (E_INPUT)\n"
+    assert line == refused("render", ply, "--cameras", cameras, tmp_path / output)
+
+
+def test_a_report_never_replaces_the_film(ply, tmp_path):
+    film = tmp_path / "turn.webp"
+    assert "is given for two outputs" in refused("render", ply, film, "--orbit", 2, "--report", film)
+    assert not film.exists()
+
+
+def test_names_of_renders_are_unique_and_stay_inside_the_folder():
+    assert ["0000_a", "0001_a", "0002"] == image_names(["left/a.png", "right/a.png", None])
+    for image in ("../../evil.png", "..\\..\\evil.png", "/etc/evil.png", "C:\\evil.jpg"):
+        assert ["evil"] == image_names([image])
+    for image in ("", "..", "/", "...png", ".png"):
+        assert image_names([image])[0] in {"0000", "png"}
+
+
+def test_a_folder_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="not a folder"):
+        make_output_folder(str(tmp_path / "file"), ["a.png"], force=True)
+
+
+def test_bytes_are_rounded_and_clipped():
+    values = np.array([-1.0, 0.0, 0.5, 1.0, 7.0, np.nan, np.inf], np.float32)
+    assert [0, 0, 128, 255, 255, 0, 255] == to_uint8(values).tolist()
+
+
+def test_panels_show_both_renders_and_the_amplified_difference():
+    a, b = np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1, 3), 0.45, np.float32)
+    assert [[128] * 3, [115] * 3, [128] * 3] == side_by_side(a, b, 10.0)[0].tolist()
+
+
+def test_sizes_and_colours_are_parsed():
+    assert (640, 480) == parse_size("640x480")
+    assert (0.0, 0.25, 1.0) == parse_colour("0,0.25,1")
+    assert (1.0, 1.0, 1.0) == parse_colour("white")
+    for text in ("1,1", "0,0,2", "red", "nan,0,0", "0,0,0,0"):
+        with pytest.raises(typer.BadParameter, match="expected red,green,blue"):
+            parse_colour(text)
+
+
+ORBIT = ("--orbit", 4, "--size", "64x48")
+
+
+@pytest.fixture(scope="module")
+def film_scene(tmp_path_factory):
+    """A PLY with a recorded up direction, which would otherwise be estimated."""
+    path = tmp_path_factory.mktemp("film") / "scene.ply"
+    rng = np.random.default_rng(0)
+    colours = rng.standard_normal((200, 3)).astype(np.float32)
+    write_ply(path, cloud(rng.standard_normal((200, 3)), 0.14, sh0=colours, metadata={"up": [0, -1, 0]}))
+    return path
+
+
+@pytest.fixture(scope="module")
+def pictures(film_scene, tmp_path_factory):
+    """The renders of an orbit."""
+    folder = tmp_path_factory.mktemp("pictures") / "turn"
+    call("render", film_scene, *ORBIT, folder)
+    return [pixels(folder / f"{number:04d}.png") for number in range(4)]
+
+
+def frames_of(path):
+    """Return every frame as RGB, its duration in ms, and the loop count."""
+    with Image.open(path) as film:
+        frames, times = [], []
+        for number in range(film.n_frames):
+            film.seek(number)
+            frames.append(np.asarray(film.convert("RGB")).astype(int))
+            times.append(film.info.get("duration", 0))
+        return frames, times, film.info.get("loop")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("ending", "tolerance"), [("webp", 6.0), ("gif", 8.0), ("png", 0.0), ("apng", 0.0)])
+def test_a_film_equals_the_renders(film_scene, pictures, tmp_path, ending, tolerance):
+    film = tmp_path / f"turn.{ending}"
+    call("render", film_scene, *ORBIT, film, "--fps", 20)
+    frames, times, loop = frames_of(film)
+    assert ([50] * 4, 0) == (times, loop)
+    for expected, frame in zip(pictures, frames, strict=True):
+        assert (48, 64, 3) == frame.shape
+        assert np.abs(expected - frame).mean() <= tolerance
+    assert [film.name] == names(tmp_path)
+
+
+def test_the_same_command_writes_the_same_film(film_scene, tmp_path):
+    for name in ("one.webp", "two.webp"):
+        call("render", film_scene, "--orbit", 2, "--size", "32x24", tmp_path / name)
+    assert (tmp_path / "one.webp").read_bytes() == (tmp_path / "two.webp").read_bytes()
+
+
+@pytest.mark.slow
+def test_an_mp4_resembles_the_renders_and_is_reproducible(film_scene, tmp_path):
+    av = pytest.importorskip("av", reason="MP4 needs PyAV: pip install 'csplat[film]'")
+    words = ("render", film_scene, "--orbit", 3, "--size", "65x49", "--background", "0.9,0.2,0.1", "--fps", 12.5)
+    for name in ("one.mp4", "two.mp4", "turn"):
+        call(*words, tmp_path / name)
+    assert (tmp_path / "one.mp4").read_bytes() == (tmp_path / "two.mp4").read_bytes()
+    with av.open(tmp_path / "one.mp4") as film:
+        stream = film.streams.video[0]
+        said = (stream.codec_context.name, stream.pix_fmt, stream.width, stream.height, stream.average_rate)
+        frames = [frame.to_ndarray(format="rgb24").astype(int) for frame in film.decode(stream)]
+    assert ("h264", "yuv420p", 64, 48, 12.5) == said
+    assert 3 == len(frames)
+    for number, frame in enumerate(frames):
+        expected = pixels(tmp_path / "turn" / f"{number:04d}.png")[:48, :64]
+        assert np.abs(expected[0, 0] - frame[0, 0]).max() < 5
+        assert np.abs(expected - frame).mean() < 8.0
+
+
+def test_an_existing_film_is_kept_without_force(film_scene, tmp_path):
+    film = tmp_path / "turn.gif"
+    film.write_bytes(b"mine")
+    words = ("render", film_scene, "--orbit", 1, "--size", "32x24", film)
+    assert "turn.gif exists: --force replaces it" in refused(*words)
+    assert b"mine" == film.read_bytes()
+    call(*words, "--force")
+    (frame,), _, _ = frames_of(film)  # a still image
+    assert (24, 32, 3) == frame.shape
+
+
+@pytest.mark.parametrize(
+    ("name", "sizes", "message"),
+    [
+        ("a.gif", [(4, 4), (5, 4)], "the cameras have 2 sizes"),
+        ("a.webp", [(1920, 1080)] * 400, "more than 2 GiB: render into a folder"),
+        ("a.webp", [(20_000, 10)] * 2, "at most 16383 per side"),
+    ],
+)
+def test_films_of_invalid_sizes_are_refused(name, sizes, message):
+    with pytest.raises(InputError, match=message):
+        check_film(name, sizes, 25.0)
+
+
+def test_durations_do_not_drift():
+    assert [33, 34, 33] == _durations(3, 30.0, 1000)
+    assert 10_000 == sum(_durations(300, 30.0, 1000))
+    assert [30, 40, 30] == _durations(3, 30.0, 100)
+    assert 10_000 == sum(_durations(300, 30.0, 100))
+
+
+def test_a_film_that_pillow_cannot_write_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(Image, "SAVE_ALL", {})
+    monkeypatch.setattr(Image, "SAVE", {})
+    monkeypatch.setattr(Image, "init", lambda: None)
+    with pytest.raises(InputError, match="cannot write WEBP"):
+        write_film(str(tmp_path / "a.webp"), [np.zeros((2, 2, 3), np.uint8)] * 2, 25.0)
+    assert [] == list(tmp_path.iterdir())

@@ -1,0 +1,171 @@
+"""`csplat tradeoff`: grids, failures, the Pareto front, the table, JSON, the page, and commands that repeat a row."""
+
+import json
+import re
+import shlex
+import sys
+from collections import Counter
+from dataclasses import replace
+
+import pytest
+from captures import photograph, shell
+from command_line import call, invoke
+
+from csplat import EncodeOptions, Target
+from csplat.errors import InputError
+from csplat_tools import load_model, parse_grid, tradeoff
+from csplat_tools.tradeoffs import Tradeoff, TradeoffRow, format_tradeoff, make_tradeoff_page, measure_grid
+from csplat_tools.views import BLACK, ViewSet
+
+pytest.importorskip("numba", reason="requires the extra [render]")
+
+
+FAST = EncodeOptions("fast")
+
+
+GRID = {  # name: options of the encoder, target, words
+    "presets=small": (EncodeOptions("small"), None, "--preset small"),
+    "precision=36": (EncodeOptions("fast", 36.0), None, "--attribute-psnr 36 --preset fast"),
+    "targets=.38e2": (FAST, Target(psnr=38.0), "--target-psnr .38e2 --preset fast"),
+    "targets=1MB": (FAST, Target(size_bytes=10**6), "--target-size 1MB --preset fast"),
+    "simplify=0.5": (FAST, Target(keep=0.5), "--keep 0.5 --preset fast"),
+}
+
+
+WRONG = (
+    "", "presets,everything", "presets=3", "precision=forty", "precision=500", "precision=nan", "precision=36:",
+    "targets=100", "targets=5 parsecs", "simplify=0", "simplify=1.5",
+)  # fmt: skip
+
+
+def test_a_grid_lists_settings():
+    grid = parse_grid("presets=small, precision=36,targets=.38e2:1MB:1MB,simplify=0.5", "fast")
+    assert GRID == {one.name: (one.options, one.target, " ".join(one.words)) for one in grid}
+    assert {"presets": 3, "precision": 6, "targets": 3, "simplify": 3} == Counter(one.group for one in parse_grid())
+
+
+def test_a_wrong_grid_is_refused():
+    for text in WRONG:
+        with pytest.raises(InputError):
+            parse_grid(text)
+
+
+def row_of(setting, size_bytes=1000, psnr=40.0, images=None):
+    scores = None if images is None else {"a": {"psnr": 33.0}, "b": {"psnr": images}}
+    return TradeoffRow(setting, f"make '<{setting.name}>'", size_bytes, 9.0, 10, psnr, 0.99, scores, 1.5, 0.02)
+
+
+def test_a_failure_does_not_stop_the_others():
+    errors, said, done = {"40": InputError("too\nhigh"), "44": MemoryError()}, [], []
+
+    def measure(setting):
+        if setting.value in errors:
+            raise errors[setting.value]
+        return row_of(setting, 1000 * int(setting.value))
+
+    grid = parse_grid("precision=48:40:44:36")
+    rows, failures = measure_grid(grid, measure, said.append, lambda *now: done.append(now))
+    assert ["36", "48"] == [one.setting.value for one in rows]
+    assert {"precision=40": "too high", "precision=44": "out of memory"} == failures
+    assert ["1/4 precision=48: 48.0 kB, 40.00 dB, 1.5 s", "2/4 precision=40: too high"] == said[:2]
+    assert [0.0, 0.25, 0.5, 0.75] == [share for _, share in done]
+    with pytest.raises(InputError, match="nothing could be measured; precision=40: too high; precision=44: out of"):
+        measure_grid(grid[1:3], measure)
+    errors["40"] = RuntimeError("a defect")
+    with pytest.raises(RuntimeError, match="a defect"):
+        measure_grid(grid, measure)
+
+
+@pytest.fixture
+def measured(make_model):
+    """Return a function for made-up measurements: `measured((size, psnr), ..., images=PSNR)`."""
+
+    def make(*points, images=None):
+        source = replace(load_model(make_model(10)), name="a & b.ply")
+        grid = parse_grid(f"precision={':'.join(str(20 + number) for number in range(len(points)))}")
+        rows = [row_of(setting, *point, images) for setting, point in zip(grid, points, strict=True)]
+        return Tradeoff(source, ViewSet("lego", BLACK, (), (), ()), rows, {"targets=60": "out of <reach>"})
+
+    return make
+
+
+def test_the_front_has_the_files_that_no_other_beats(measured):
+    for points, front in (
+        ([(10, 30.0)], [0]), ([(10, 30.0), (15, 35.0), (20, 40.0)], [0, 1, 2]), ([(10, 30.0), (20, 29.0)], [0]),
+        ([(10, 30.0), (10, 31.0)], [1]), ([(10, 30.0), (20, 30.0)], [0]), ([(10, 30.0), (10, 30.0)], [0]),
+    ):  # fmt: skip
+        found = measured(*points)
+        assert front == [found.rows.index(row) for row in found.front]
+
+
+def test_table_and_json_have_all_rows(measured):
+    found = measured((10_000, 30.0), (20_000, 29.0), images=31.5)
+    lines = format_tradeoff(found).splitlines()
+    assert "10 splats, SH degree 3" in lines[0]
+    assert "the source itself has 33.00 dB" in lines[0]
+    assert ["*", "precision=20", "10,000", "9.0", "30.00", "0.9900", "31.50"] == lines[3].split()[:7]
+    assert lines[4].startswith("  precision=21")
+    assert "not measured: targets=60: out of <reach>" == lines[-1]
+    report = json.loads(json.dumps(found.as_json()))
+    assert ["precision=20"] == report["pareto"]
+    assert (20_000, 31.5) == (report["points"][1]["size_bytes"], report["points"][1]["photographs"]["b"]["psnr"])
+    assert "image PSNR" not in format_tradeoff(measured((10, 30.0)))
+
+
+@pytest.mark.slow
+def test_the_page_has_plots_and_commands_and_loads_nothing(measured):
+    pytest.importorskip("matplotlib", reason="plots require the extra [render]")
+    page = make_tradeoff_page(measured((10_000, 30.0), (2_000_000, 40.0), (3_000_000, 39.0), images=31.5))
+    assert 3 == page.count("<svg")
+    assert "<h1>a &amp; b.ply: size, quality and time</h1>" in page
+    assert "<code>make &#x27;&lt;precision=20&gt;&#x27;</code>" in page
+    assert "out of &lt;reach&gt;" in page
+    assert 2 == page.count('<tr class="front">')
+    assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", page))
+    ids = re.findall(r'\bid="([^"]*)"', page)
+    assert len(set(ids)) == len(ids)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small_views")
+def test_a_row_agrees_with_its_command_and_with_compare(tmp_path, monkeypatch):
+    folder = tmp_path / "my set"
+    folder.mkdir()
+    photograph(shell(3).select(slice(0, 100)), folder)
+    monkeypatch.chdir(tmp_path)
+    views = ("--data", "my set", "--json")
+    done = call("tradeoff", "my set/scene.ply", *views, "--what", "presets=fast,targets=3kB", "-o", "page.html")
+    assert "2/2 targets=3kB: " in done.stderr
+    assert (tmp_path / "page.html").read_text().startswith("<!doctype html>")
+    rows = json.loads(done.stdout)["points"]
+    assert {"presets=fast", "targets=3kB"} == {row["name"] for row in rows}
+    assert min(row["size_bytes"] for row in rows) <= 3000
+    for row in rows:
+        _, *words = shlex.split(row["command"])
+        call(*words, "--quiet")
+        assert row["size_bytes"] == (tmp_path / words[2]).stat().st_size
+        compared = json.loads(call("compare", *words[1:3], *views).stdout)
+        for key in ("psnr", "ssim", "photographs"):
+            assert compared[key] == row[key]
+
+
+def test_a_scene_without_splats_is_refused(make_model):
+    with pytest.raises(InputError, match="the scene has no splats"):
+        tradeoff(make_model(0))
+
+
+def test_wrong_words_are_refused_before_any_work(sample_path, tmp_path):
+    (tmp_path / "mine.html").write_text("mine")
+    for status, words in (
+        (2, ("--what", "presets=huge")), (2, ("--what", "presets", "--preset", "huge")), (2, ("-o", "-")),
+        (2, ("--data", "x", "--cameras", "y")), (1, ("-o", tmp_path / "mine.html")),
+    ):  # fmt: skip
+        assert status == invoke("tradeoff", sample_path, *words).exit_code, words
+
+
+@pytest.mark.parametrize(("module", "words"), [("numba", []), ("matplotlib", ["-o", "report.html"])])
+def test_missing_packages_are_named(tmp_path, sample_path, monkeypatch, module, words):
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.chdir(tmp_path)
+    done = invoke("tradeoff", sample_path, *words)
+    assert (1, f"error: this needs {module}: pip install 'csplat[render]' (E_INPUT)\n") == (done.exit_code, done.stderr)

@@ -1,0 +1,304 @@
+"""Scenes decoded tile by tile, and drawn and compared without being in memory: results equal those in memory."""
+
+import io
+import json
+import tempfile
+from dataclasses import replace
+from functools import partial
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+import csplat_tools
+from csplat import EncodeOptions, disk_files, file_source
+from csplat.decoder import Limits, decode, decode_api, open_tiles, read_header
+from csplat.encoder import encode_with_report
+from csplat.errors import CsplatError, InputError, LimitError
+from csplat.ply import write_ply
+from csplat.scene_source import source_from_model
+from csplat_render.camera import intrinsics, look_at
+from csplat_render.rasteriser import Rasteriser
+from csplat_render.scorer import renderer
+from csplat_tools.cli.app import app
+from csplat_tools.scene_files import LoadedModel, OpenedScene, open_scenes
+from csplat_tools.views import comparison_cameras
+from csplat_tools.views.sliced_renderer import SlicedScene, slice_limits
+
+pytest.importorskip("numba", reason="the renderer requires the extra [render]")
+
+
+def ply_of(model):
+    buffer = io.BytesIO()
+    write_ply(buffer, model)
+    return buffer.getvalue()
+
+
+@pytest.fixture
+def many_tiles(make_model, tmp_path):
+    """Return the path of a file of ten tiles."""
+    data = csplat.encode(make_model(600, 2), csplat.EncodeOptions(preset="fast", tile_splats=60))
+    path = tmp_path / "scene.csplat"
+    path.write_bytes(data)
+    assert len(read_header(data).tiles) == 10
+    return path
+
+
+def test_threads_and_released_pages_do_not_change_the_result(many_tiles, monkeypatch):
+    monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
+    expected = decode(many_tiles)
+    for threads in (1, 3):
+        opened = open_tiles(many_tiles, threads=threads)
+        for _ in range(2):
+            models = list(opened.models())
+            assert [tile.splat_count for tile in opened.header.tiles] == [len(model) for model in models]
+            for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+                together = np.concatenate([getattr(model, name) for model in models])
+                assert getattr(expected, name).tobytes() == together.tobytes()
+
+
+def test_tiles_before_a_damaged_one_are_decoded(many_tiles):
+    data = bytearray(many_tiles.read_bytes())
+    tiles = read_header(data).tiles
+    for place in (4, 6):
+        layer = tiles[place].layers[0]
+        data[layer.offset + layer.size - 1] ^= 1
+    for threads in (1, 3):
+        models = open_tiles(bytes(data), threads=threads).models()
+        assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
+        with pytest.raises(CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
+            next(models)
+
+
+@pytest.mark.slow
+def test_no_part_of_a_damaged_file_goes_to_standard_output(many_tiles):
+    data = bytearray(many_tiles.read_bytes())
+    whole = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
+    assert ply_of(decode(bytes(data))) == whole.stdout_bytes
+    data[-1] ^= 1
+    many_tiles.write_bytes(data)
+    found = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
+    assert (1, b"") == (found.exit_code, found.stdout_bytes)
+
+
+def test_the_limit_of_splats_is_per_file_and_that_of_bytes_per_tile(many_tiles):
+    with pytest.raises(LimitError, match="splats"):
+        open_tiles(many_tiles, limits=Limits(splats=599))
+    tile = max(one.splat_count for one in read_header(many_tiles.read_bytes()).tiles)
+    limits = Limits(bytes=tile * 4 * (11 + 27))
+    assert 600 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
+    with pytest.raises(LimitError, match="bytes"):
+        decode(many_tiles, limits=limits)
+
+
+UP = (0.0, -1.0, 0.0)
+
+
+BEHIND = (0.3, 0.6, 0.1)
+
+
+LITTLE = 1  # byte of memory
+
+
+@pytest.fixture
+def model(make_model):
+    cloud = make_model(1500, 1)
+    return replace(cloud, scales=cloud.scales * np.float32(0.3) - np.float32(1.5))
+
+
+@pytest.fixture
+def view():
+    return look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), UP, intrinsics(70, 53, 60.0), 70, 53)
+
+
+@pytest.fixture
+def camera_file(view, tmp_path):
+    path = tmp_path / "cameras.json"
+    path.write_text(json.dumps([view.to_json()]))
+    return str(path)
+
+
+@pytest.fixture
+def files_of_both(model, tmp_path):
+    """Return the paths of a PLY, its encoded file and the source index."""
+    result = encode_with_report(model, EncodeOptions(preset="fast"))
+    source, encoded, index = (tmp_path / name for name in ("scene.ply", "scene.csplat", "index.npy"))
+    write_ply(source, model)
+    encoded.write_bytes(result.data)
+    np.save(index, result.source_index)
+    return str(source), str(encoded), str(index)
+
+
+@pytest.fixture
+def no_least(monkeypatch):
+    """Accept any memory limit: small scenes fit into all that are accepted otherwise."""
+    monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
+
+
+def by_disk(model, every=1, progress=None):
+    """Return a scene in blocks of 300 splats that is drawn in slices of about 100."""
+
+    def blocks():
+        return (model.select(slice(start, start + 300)) for start in range(0, len(model), 300))
+
+    scene = replace(source_from_model(model), blocks=blocks)
+    sample = model.select(slice(None, None, every))
+    return SlicedScene(scene, sample, every, LITTLE, progress, slice_bytes=60_000)
+
+
+@pytest.fixture
+def counts(monkeypatch):
+    """Record the number of splats in each slice that is drawn."""
+    found, forward = [], Rasteriser.forward
+
+    def noted(rasteriser, splats, *words, state=None, **named):
+        if state is not None:
+            found.append(len(splats.means))
+        return forward(rasteriser, splats, *words, state=state, **named)
+
+    monkeypatch.setattr(Rasteriser, "forward", noted)
+    return found
+
+
+def assert_same_render(model, view, every=1, mode="standard"):
+    wanted = renderer(model, BEHIND, mode=mode)(view)
+    found = renderer(by_disk(model, every), BEHIND, mode=mode)(view)
+    for name in ("rgb", "alpha", "depth"):
+        np.testing.assert_array_equal(getattr(wanted, name), getattr(found, name))
+    assert wanted.ignored == found.ignored
+
+
+def test_sliced_renders_equal_those_in_memory(model, view, counts):
+    crowd, flat, far = model.means.copy(), model.means.copy(), model.means + np.float32([0, 0, -90])
+    crowd[:900, 2] = flat[:, 2] = 0.25
+    for scene, options in (
+        (model, {"mode": "fast"}),
+        (replace(model, antialiased=True), {}),
+        (model, {"every": 700}),  # the sample decides the slices
+        (replace(model, means=crowd), {}),  # splats of one depth are drawn in their order
+        (replace(model, means=flat), {}),
+        (replace(model, means=far), {}),  # out of view
+        (model.select(slice(0, 0)), {}),
+    ):
+        assert_same_render(scene, view, **options)
+    assert len(counts) > 5
+    assert max(counts) < 300
+
+
+def test_splats_behind_opaque_pixels_are_not_drawn(model, view, counts):
+    wall = np.arange(len(model)) < 20
+    means, scales, opacities = model.means.copy(), model.scales.copy(), model.opacities.copy()
+    means[wall], scales[wall], opacities[wall] = (0.0, 0.0, -2.5), 3.0, 0.99
+    assert_same_render(replace(model, means=means, scales=scales, opacities=opacities), view)
+    assert sum(counts) < 600
+
+
+def test_mode_exact_requires_scenes_in_memory(model, view):
+    with pytest.raises(InputError, match="exact"):
+        renderer(by_disk(model), BEHIND, mode="exact")(view)
+
+
+def test_slices_have_equal_costs_and_do_not_split_a_depth():
+    near = np.array([0, 5, 1, 2, 4, 3], np.float32)
+    taken = np.where(near > 0, 10.0, 0.0)
+    assert [] == slice_limits(near, taken, 1).tolist()
+    assert [] == slice_limits(0 * near, 0 * taken, 9).tolist()
+    assert [2.0, 4.0] == slice_limits(near, taken, 3).tolist()
+    same = np.float32(2.0)
+    assert [same, np.nextafter(same, np.float32(3.0))] == slice_limits(np.full(9, same), np.ones(9), 4).tolist()
+
+
+def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
+    with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
+        assert {LoadedModel} == {type(one) for one in loaded}
+        assert {OpenedScene} == {type(one) for one in opened}
+        assert [one.as_json() for one in loaded] == [one.as_json() for one in opened]
+        with open_scenes(opened) as again:
+            assert opened == again
+        with open_scenes((loaded[0], files_of_both[1]), LITTLE) as both:
+            assert {LoadedModel} == {type(one) for one in both}
+
+
+def test_a_sample_has_every_nth_splat(files_of_both, model):
+    with open_scenes(files_of_both[:2], LITTLE) as (source, _):
+        found, every = replace(source, sample_splats=220).sample()
+    assert 7 == every
+    np.testing.assert_array_equal(model.means[::7], found.means)
+    assert 0 == found.sh_degree
+
+
+def test_a_sample_gives_about_the_same_views(sample_path):
+    whole = csplat_tools.load_model(sample_path).model
+    part = comparison_cameras(whole.select(slice(None, None, 2)), every=2)
+    for wanted, found in zip(comparison_cameras(whole), part, strict=True):
+        distance = np.linalg.norm(wanted.position)
+        assert np.linalg.norm(found.position) == pytest.approx(distance, rel=0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_least")
+def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path, monkeypatch):
+    source, encoded, index = files_of_both
+    words = ["compare", source, encoded, "--cameras", camera_file]
+
+    def run(*more):
+        result = CliRunner().invoke(app, [*words, *more])
+        assert 0 == result.exit_code, result.stderr
+        return result
+
+    def report(name):
+        result = run("--source-index", index, "--json", "--pictures", str(tmp_path / name))
+        shown = json.loads(result.stdout)
+        return shown["attributes"].pop("errors"), shown | {"seconds": 0}, "rendered from the disk" in result.stderr
+
+    errors, report_in_memory, by_disk = report("memory")
+    assert not by_disk
+    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
+    others, report_of_disk, by_disk = report("disk")
+    assert by_disk
+    assert report_in_memory == report_of_disk
+    assert errors == {name: pytest.approx(error, rel=1e-12) for name, error in others.items()}
+    images = [[image.read_bytes() for image in sorted((tmp_path / name).iterdir())] for name in ("memory", "disk")]
+    assert bool(images[0] == images[1])
+    assert "the errors of splats are unknown" in run().stdout  # without an index
+    refused = CliRunner().invoke(app, ["compare", source, encoded, "--backend", "exact"])
+    assert 1 == refused.exit_code
+    assert "error: --backend exact requires both scenes in memory" in refused.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("no_least")
+def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, tmp_path):
+    source, moved = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
+    write_ply(source, model)
+    write_ply(moved, replace(model, means=model.means + np.float32(0.001)))
+    views = csplat_tools.find_view_set(model, cameras=camera_file, count=0)
+    wanted, shown = (csplat_tools.compare(source, moved, views=views, memory_bytes=most) for most in (None, LITTLE))
+    assert wanted.quality == shown.quality
+    assert "order" == shown.attributes.pairing
+    for name, error in shown.attributes.errors.items():
+        assert wanted.attributes.errors[name] == pytest.approx(error, rel=1e-12)
+
+
+def test_too_little_memory_or_disk_space_is_an_error_before_drawing(files_of_both, monkeypatch):
+    monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
+    with pytest.raises(InputError, match=r"^the memory is 0 MB, expected at least 482 MB to draw these scenes$"):
+        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+    monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
+    monkeypatch.setattr(disk_files.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    with pytest.raises(InputError, match="TMPDIR"):
+        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+
+
+def test_an_interrupted_render_leaves_no_files(model, view, monkeypatch, tmp_path):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+    def interrupted(_, share):
+        if share > 0.61:  # the first slice was read from the disk and drawn
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        renderer(by_disk(model, progress=interrupted), BEHIND)(view)
+    assert [] == list(tmp_path.iterdir())

@@ -1,0 +1,67 @@
+"""Tests of csplat_trainer.losses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from csplat_render.metrics import ssim
+from csplat_trainer.losses import LOSS_WEIGHTS, PhotometricLoss, photometric_loss_twin
+
+pytest.importorskip("numba", reason="requires the extra [render]")
+
+
+def random_images(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(height * width)
+    x = rng.random((height, width, 3), dtype=np.float32)
+    y = np.clip(x + 0.2 * rng.standard_normal((height, width, 3)), 0, 1).astype(np.float32)
+    return x, y
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 21), (64, 48)])
+@pytest.mark.parametrize("weights", LOSS_WEIGHTS.values(), ids=LOSS_WEIGHTS.keys())
+def test_the_loss_equals_its_twin(size, weights):
+    x, y = random_images(*size)
+    value, gradient = PhotometricLoss(*size, *weights)(x, y)
+    expected, slope = photometric_loss_twin(x, y, *weights)
+    assert value.loss == pytest.approx(expected.loss, rel=1e-5)
+    assert value.mse == pytest.approx(expected.mse, rel=1e-5)
+    assert np.abs(gradient - slope).max() <= 1e-5 * np.abs(slope).max()
+
+
+def test_the_gradient_of_the_twin_agrees_with_finite_differences():
+    x, y = (picture.astype(np.float64) for picture in random_images(13, 9))
+    _, slope = photometric_loss_twin(x, y)
+    direction = np.random.default_rng(1).standard_normal(x.shape)
+    step = 1e-6
+    up, down = (photometric_loss_twin(x + sign * step * direction, y)[0].loss for sign in (1, -1))
+    assert (slope * direction).sum() == pytest.approx((up - down) / (2 * step), rel=1e-6)
+
+
+def test_the_ssim_of_the_loss_agrees_with_the_metric():
+    x, y = random_images(40, 30)
+    value, _ = PhotometricLoss(40, 30)(x, y)
+    assert value.ssim == pytest.approx(ssim(y, x), abs=1e-5)
+
+
+def test_calls_of_a_loss_are_independent():
+    x, y = random_images(24, 24)
+    loss = PhotometricLoss(24, 24)
+    first = loss(x, y)[1].copy()
+    loss(y, x)
+    assert np.array_equal(first, loss(x, y)[1])
+
+
+@pytest.mark.parametrize("weights", LOSS_WEIGHTS.values(), ids=LOSS_WEIGHTS.keys())
+def test_masked_pixels_do_not_change_the_loss(weights):
+    x, y = random_images(32, 24)
+    mask = np.ones((32, 24), bool)
+    mask[5:20, 3:12] = False
+    other = np.where(mask[..., None], y, 1.0 - y)
+    value, gradient = PhotometricLoss(32, 24, *weights)(x, y.copy(), mask)
+    again, slope = PhotometricLoss(32, 24, *weights)(x, other, mask)
+    assert again == value or np.isnan(value.ssim)
+    assert np.array_equal(gradient, slope)
+    assert not gradient[~mask].any()
+    assert gradient[mask].all()
+    assert value.mse == pytest.approx(float(np.square(x - y)[mask].mean()), rel=1e-5)

@@ -1,0 +1,83 @@
+"""Tests of csplat_trainer.posed_images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from captures import training_images
+from train_cases import QUICK, SIZE
+
+from csplat_render.camera import Camera, intrinsics
+from csplat_trainer.data import DataSet
+from csplat_trainer.posed_images import PosedImage, compose, halve
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import TrainOptions
+
+pytest.importorskip("numba", reason="requires the extra [render]")
+
+
+@pytest.fixture
+def data(make_model):
+    return training_images(make_model)
+
+
+@pytest.fixture
+def opaque(make_model):
+    return training_images(make_model, alpha=False)
+
+
+def test_masked_pixels_do_not_influence_training(opaque):
+    mask = np.ones((SIZE, SIZE), bool)
+    mask[10:30, :20] = False
+
+    def hidden(value: int) -> DataSet:
+        def shown(picture: PosedImage) -> PosedImage:
+            return PosedImage(picture.camera, np.where(mask[..., None], picture.pixels, np.uint8(value)), mask)
+
+        return DataSet("masked", [shown(one) for one in opaque.train], [shown(one) for one in opaque.test])
+
+    options = TrainOptions(**{**QUICK, "iterations": 20}, init="box")
+    first, second = (train(hidden(value), options) for value in (0, 200))
+    assert np.array_equal(first.model.means, second.model.means)
+    assert np.array_equal(first.model.shN, second.model.shN)
+    assert first.metrics == second.metrics
+    assert first.log["entries"][-1]["psnr"] == second.log["entries"][-1]["psnr"]
+
+
+@pytest.mark.slow
+def test_large_units_do_not_change_the_scene(data):
+    def larger(picture: PosedImage) -> PosedImage:
+        viewmat = picture.camera.viewmat.copy()
+        viewmat[:3, 3] *= 1e5
+        return replace(picture, camera=replace(picture.camera, viewmat=viewmat))
+
+    millimetres = replace(data, train=[larger(one) for one in data.train], test=[larger(one) for one in data.test])
+    options = TrainOptions(**{**QUICK, "iterations": 200})
+    usual, large = (train(one, options).metrics["psnr"] for one in (data, millimetres))
+    assert large == pytest.approx(usual, abs=1.0)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_a_halved_image_agrees_with_its_camera(channels):
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (7, 10, channels), dtype=np.uint8)
+    mask = np.ones((7, 10), bool)
+    mask[3, 4] = False
+    camera = Camera(intrinsics(10, 7, 8.0), np.eye(4), 10, 7)
+    half, behind = halve(PosedImage(camera, pixels, mask)), np.array([0.2, 0.5, 0.9], np.float32)
+    whole = compose(PosedImage(camera, pixels), behind, np.empty((7, 10, 3), np.float32))
+    means = whole[:6].reshape(3, 2, 5, 2, 3).mean(axis=(1, 3))
+    assert np.abs(compose(half, behind, np.empty((3, 5, 3), np.float32)) - means).max() <= 1.01 / 255
+    point = np.array([0.1, -0.05, 1.0])
+    assert np.allclose(half.camera.K @ point, [0.5, 0.5, 1.0] * (camera.K @ point))
+    assert [[1, 2]] == np.argwhere(~half.mask).tolist()
+
+
+def test_an_image_without_pixels_at_half_the_size_is_kept():
+    lines, camera = np.zeros((6, 8), bool), Camera(intrinsics(8, 6, 8.0), np.eye(4), 8, 6)
+    lines[:, ::2] = True
+    masked = PosedImage(camera, np.zeros((6, 8, 3), np.uint8), lines)
+    narrow = PosedImage(Camera(intrinsics(1, 6, 8.0), np.eye(4), 1, 6), np.zeros((6, 1, 3), np.uint8))
+    assert all(halve(picture) is picture for picture in (masked, narrow))

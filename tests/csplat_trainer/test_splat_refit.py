@@ -1,0 +1,79 @@
+"""Tests of csplat_trainer.splat_refit."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from checked import cloud
+
+from csplat.model import normalise_quats
+from csplat_render.pruning_error import measure_pruning_error
+from csplat_render.scorer import renderer
+from csplat_tools.views import (
+    camera_sequence,
+)
+from csplat_trainer.splat_refit import refit_splats
+
+pytest.importorskip("numba", reason="simplification requires the extra [render]")
+
+
+pytestmark = pytest.mark.usefixtures("small_views")
+
+
+def render_all(model, seen_from):
+    draw = renderer(model, (0.0, 0.0, 0.0))
+    return [draw(camera).rgb for camera in seen_from]
+
+
+@pytest.fixture(scope="module")
+def source():
+    """A shell of opaque splats with hidden ones inside, and ten that are too transparent to be drawn."""
+    rng = np.random.default_rng(0)
+    n, count = 300, 450
+    at = rng.standard_normal((n, 3))
+    at /= np.linalg.norm(at, axis=1, keepdims=True)
+    means = np.concatenate([at, 0.3 * rng.standard_normal((n // 2, 3))])
+    quats = normalise_quats(rng.standard_normal((count, 4)))
+    opacities = rng.uniform(0.6, 1.0, count)
+    opacities[:10] = 0.003
+    arrays = {"opacities": opacities, "scales": rng.uniform(-2.3, -1.7, (count, 3))}
+    arrays["sh0"] = np.sin(3.0 * means) + rng.uniform(0.0, 1.0, (count, 3))
+    arrays["shN"] = 0.05 * rng.standard_normal((count, 8, 3))
+    return cloud(means, quats=quats, **{name: values.astype(np.float32) for name, values in arrays.items()})
+
+
+def test_unseen_splats_are_not_refitted(source):
+    cameras = camera_sequence(source, 4, (48, 36))[:1]
+    wanted = [picture + np.float32(0.1) for picture in render_all(source, cameras)]
+    adjusted = refit_splats(source, cameras, wanted, steps=8)
+    seen = measure_pruning_error(source, cameras).seen
+    assert 0 < np.count_nonzero(seen) < len(source)
+    np.testing.assert_array_equal(source.means, adjusted.means)
+    for name in ("opacities", "quats", "scales", "sh0", "shN"):
+        np.testing.assert_array_equal(getattr(source, name)[~seen], getattr(adjusted, name)[~seen])
+        assert (getattr(source, name)[seen] != getattr(adjusted, name)[seen]).mean() > 0.9
+
+
+@pytest.mark.slow
+def test_centres_move_back_if_a_refit_moves_them(source):
+    cameras = camera_sequence(source, 12, (96, 72))
+    wanted = render_all(source, cameras)
+    sizes = np.exp(source.scales.mean(axis=1, keepdims=True))
+    shifted = replace(source, means=source.means + 0.3 * sizes, means_double=None)
+    fixed, moved = (refit_splats(shifted, cameras, wanted, steps=120, moves=moves) for moves in (False, True))
+    np.testing.assert_array_equal(shifted.means, fixed.means)
+    errors = [
+        np.mean([(a - b) ** 2 for a, b in zip(render_all(model, cameras), wanted, strict=True)])
+        for model in (fixed, moved)
+    ]
+    assert errors[1] < 0.7 * errors[0]
+    assert (np.abs(moved.means - shifted.means) <= 30 * sizes).all()
+
+
+def test_alphas_of_a_refit_stay_within_0_and_1(source):
+    cameras = camera_sequence(source, 4, (48, 36))
+    wanted = render_all(source, cameras)
+    extreme = replace(source, opacities=np.where(np.arange(len(source)) % 2, 0.0, 1.0).astype(np.float32))
+    adjusted = refit_splats(extreme, cameras, wanted, steps=8)
+    assert np.isfinite(adjusted.scales).all()
+    assert 0.0 <= adjusted.opacities.min() <= adjusted.opacities.max() <= 1.0

@@ -1,0 +1,417 @@
+"""Training: the loop, resumed runs, `csplat train` to a PLY or a file; loss, parameters, strategies."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from captures import training_images
+from command_line import call
+from PIL import Image
+from posed_sets import to_opengl
+from train_cases import QUICK, SIZE, assert_resumes_identically
+
+from csplat import decode, read_ply, write_ply
+from csplat.encoder import EncodeOptions, EncodePlan, Target, fix_quantisation
+from csplat.errors import InputError
+from csplat.training_record import TrainingRecord
+from csplat_render.camera import Camera, relative_to
+from csplat_tools.training.training_run import plan_training, tuning_after
+from csplat_trainer.data import DataSet
+from csplat_trainer.engine import CpuEngine
+from csplat_trainer.fit_checkpoint import FitCheckpoint, load_checkpoint, save_checkpoint
+from csplat_trainer.image_gains import ImageGain, ImageGains
+from csplat_trainer.initial_splats import measure_extent, place_splats
+from csplat_trainer.losses import PhotometricLoss
+from csplat_trainer.parameters import GROUPS, Parameters, from_model
+from csplat_trainer.training_loop import fit_to_options, train
+from csplat_trainer.training_options import Outputs, TrainOptions
+from csplat_trainer.training_report import moving_average
+from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, tune
+
+pytest.importorskip("numba", reason="requires the extra [render]")
+
+
+@pytest.fixture
+def data(make_model):
+    return training_images(make_model)
+
+
+@pytest.fixture
+def opaque(make_model):
+    return training_images(make_model, alpha=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
+def test_training_prunes_to_the_final_share(data, strategy):
+    options = TrainOptions(**QUICK, strategy=strategy, final_share=0.5, refine_stop=0.5)
+    pruned, whole = (train(data, replace(options, final_share=share)) for share in (0.5, 1.0))
+    counts = [entry["splat_count"] for entry in pruned.log["entries"]]
+    assert counts[1] == counts[2] == len(pruned.model)
+    assert len(whole.model) / 2 == pytest.approx(counts[2], abs=3)
+
+
+def test_training_starts_with_images_of_half_the_size(data, tmp_path, monkeypatch):
+    widths: list[int] = []
+    step = CpuEngine.step
+    watched = lambda engine, picture, *rest: widths.append(picture.camera.W) or step(engine, picture, *rest)  # noqa: E731
+    monkeypatch.setattr(CpuEngine, "step", watched)
+    assert_resumes_identically(data, TrainOptions(**QUICK, half_size=0.5), tmp_path)
+    assert [SIZE // 2] * 30 + [SIZE] * 30 == widths[:60]  # sizes in the run without interruption
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
+def test_training_reduces_the_loss(data, strategy):
+    options = TrainOptions(**{**QUICK, "iterations": 150, "refine_every": 30}, strategy=strategy, lr_means=4e-3)
+    result = train(data, options)
+    losses = result.log["losses"]
+    assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:20])
+    assert result.metrics["psnr_mean"] > 15
+    assert len(result.model) <= 80
+
+
+def test_the_same_seed_gives_the_same_file(data, tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        write_ply(
+            tmp_path / name,
+            train(data, TrainOptions(**{**QUICK, "iterations": 30}, seed=seed, background="random")).model,
+        )
+    first, second, other = ((tmp_path / name).read_bytes() for name in "abc")
+    assert first == second
+    assert first != other
+
+
+def test_a_scene_has_the_origin_of_its_data_set(data, tmp_path):
+    # Also if the run is resumed with images that have another origin.
+    place = np.array((500123.0, 4649876.0, 214.0))
+    options = TrainOptions(**{**QUICK, "iterations": 30})
+    plain = train(data, options).model
+    moved = train(replace(data, origin=tuple(place)), options, outputs=Outputs(tmp_path / "c.npz")).model
+    assert tuple(place) == moved.origin
+    assert np.array_equal(plain.means, moved.means)
+    shift = np.array((1.0, -2.0, 0.5))
+    shifted = [replace(one, camera=relative_to(shift, one.camera)) for one in data.train]
+    other = DataSet("other", shifted, [], origin=tuple(place + shift))
+    again = train(other, options, outputs=Outputs(resume=tmp_path / "c.npz")).model
+    assert tuple(place + shift) == again.origin
+    assert np.allclose(plain.means - shift, again.means, atol=1e-5)
+
+
+def test_an_outlier_camera_does_not_change_the_extent(data):
+    away = replace(data.train[0], camera=relative_to((3e4, 0.0, 0.0), data.train[0].camera))
+    far = replace(data, train=[away, *data.train[1:]])
+    assert data.train == data.inliers
+    assert data.train[1:] == far.inliers
+    extent = train(far, TrainOptions(**QUICK)).log["scene_extent"]
+    assert measure_extent(data.train).extent == pytest.approx(extent, rel=0.2)
+
+
+def test_splats_start_within_the_hull_of_all_masks(data):
+    scene = measure_extent(data.train)
+    assert np.linalg.norm(scene.focus) < 0.1
+    hull, box = (
+        np.linalg.norm(place_splats(data.train, scene, 300, 0, np.random.default_rng(0), init=init)["means"], axis=1)
+        for init in ("hull", "box")
+    )
+    assert hull.mean() < box.mean()
+
+
+def test_images_without_alpha_start_in_a_box(opaque):
+    result = train(opaque, TrainOptions(**QUICK))
+    assert np.isfinite(result.model.means).all()
+    assert (0.0, 0.0, 0.0) == TrainingRecord.of(result.model.metadata).background
+    with pytest.raises(InputError, match="requires images with alpha"):
+        train(opaque, TrainOptions(**QUICK, init="hull"))
+    with pytest.raises(InputError, match="requires points"):
+        train(opaque, TrainOptions(**QUICK, init="points"))
+
+
+def test_the_first_view_of_surroundings_is_a_training_camera(data):
+    options = TrainOptions(**{**QUICK, "iterations": 1, "strategy": "none"})
+    assert "view" not in train(data, options).model.metadata  # an object
+    rng = np.random.default_rng(0)
+    far = rng.standard_normal((60, 3)) * 40.0
+    points = np.concatenate([0.1 * rng.standard_normal((200, 3)), far]).astype(np.float32)
+    given = DataSet("surrounded", data.train, data.test, points, np.full((260, 3), 0.5, np.float32))
+    view = Camera.from_json(train(given, replace(options, max_splats=260)).model.metadata["view"])
+    taken = [one.camera for one in data.train]
+    assert 1 == sum(np.allclose(view.viewmat, one.viewmat, atol=1e-5) for one in taken)
+    assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)
+
+
+def test_splats_start_at_the_points(data):
+    points = np.random.default_rng(0).standard_normal((20, 3)).astype(np.float32)
+    given = DataSet("made", data.train, [], points, np.full((20, 3), 0.25, np.float32))
+    result = train(given, TrainOptions(**{**QUICK, "iterations": 1}, lr_means=0.0, lr_means_final=0.0, noise=0.0))
+    assert {tuple(row) for row in points.tolist()} == {tuple(row) for row in result.model.means.tolist()}
+    assert result.metrics is None
+
+
+def test_points_outside_all_images_are_refused(data):
+    data = replace(data, points=np.full((5, 3), 4e6, np.float32))
+    with pytest.raises(InputError, match="no camera sees any of the data set's 5 points, expected both in the same"):
+        train(data, TrainOptions(**QUICK))
+    assert train(data, TrainOptions(**{**QUICK, "iterations": 1}, init="box")).log["losses"]
+
+
+@pytest.mark.slow
+def test_the_command_trains_from_a_folder(data, tmp_path):
+    write_set(tmp_path, data)
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
+    run = ("train", tmp_path, tmp_path / "o.ply", *FEW_WORDS, "--size", "24x24", "--seed", 3)
+    assert "" == call(*run, "--report", tmp_path / "log.json").stdout
+    model = read_ply(tmp_path / "o.ply")
+    assert (0, "RFU") == (model.sh_degree, model.coordinate_system)
+    assert 5 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
+    assert "mps is not supported" in " ".join(call(*run, "--device", "mps", status=2).stderr.split())
+
+
+def write_set(folder, data):
+    """Write the images as a transforms.json set without a split."""
+    frames = []
+    for number, picture in enumerate((*data.train, *data.test)):
+        Image.fromarray(picture.pixels).save(folder / f"{number:02}.png")
+        frames.append({"file_path": f"{number:02}.png", "transform_matrix": to_opengl(picture.camera)})
+    document = {"fl_x": data.train[0].camera.K[0, 0], "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(document))
+    return folder
+
+
+FEW_WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("alpha", "background", "every", "size"),
+    [(True, "random", 5, "24x20"), (False, "auto", 10, None), (False, "white", 8, None)],
+)
+def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, background, every, size):
+    folder = write_set(tmp_path, training_images(make_model, alpha=alpha))
+    reading = ["--test-every", every, *(() if size is None else ("--size", size))]
+    ply, log = tmp_path / "a.ply", tmp_path / "log.json"
+    result = call("train", folder, ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
+    record = TrainingRecord.of(read_ply(ply).metadata)
+    assert (every, size) == (record.test_every, None if record.size is None else "{}x{}".format(*record.size))
+    assert record.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
+    assert str(record) in result.stderr
+    colour = ",".join(str(value) for value in record.background)
+    again = call("compare", ply, ply, "--data", folder, "--background", colour, "--json", "--test-every", every)
+    scores, metrics = json.loads(again.stdout)["photographs"]["a"], json.loads(log.read_text())["metrics"]
+    for name in ("psnr", "psnr_mean"):
+        assert scores[name] == pytest.approx(metrics[name], abs=0.01)
+
+
+def test_the_training_record_survives_encode_and_decode(make_model, tmp_path):
+    record = TrainingRecord((0.0, 0.0, 0.0), 10, (24, 20), 0.05)
+    ply, file, back = (tmp_path / name for name in ("a.ply", "a.csplat", "b.ply"))
+    write_ply(ply, make_model(10, 0, metadata={"training": record.as_json()}))
+    call("encode", ply, file, "-q")
+    call("decode", file, back, "-q")
+    assert record == TrainingRecord.of(read_ply(back).metadata)
+    assert str(record) in call("info", file).stdout
+    assert record.as_json() == json.loads(call("info", file, "--json").stdout)["metadata"]["training"]
+
+
+@pytest.mark.slow
+def test_the_command_trains_to_a_file(file_runs):
+    data, report = (file_runs.folder / "a.csplat").read_bytes(), file_runs.report
+    model = decode(data)
+    assert 30 == len(report["training"]["losses"])
+    assert (len(model), len(data)) == (report["file"]["splats"], report["file"]["size_bytes"])
+    assert {"source", "before tuning", "file"} == set(report["file"]["scores"])
+    assert "held-out images" in file_runs.messages
+    assert (1.0, 1.0, 1.0) == TrainingRecord.of(model.metadata).background
+    assert (file_runs.folder / "run.tuning.npz").exists()
+
+
+@pytest.mark.slow
+def test_the_command_resumes(file_runs, tmp_path):
+    for name in ("run.npz", "run.tuning.npz"):
+        shutil.copy(file_runs.folder / name, tmp_path / name)
+    files = ("--keep", 1, "--checkpoint", tmp_path / "run.npz", "--resume", tmp_path / "run.npz")
+    file_runs.made("again.csplat", *files)
+    file_runs.made("further.csplat", *files, "--iterations", 40)
+    first, again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("a", "again", "further"))
+    assert first == again
+    assert first != further  # another scene: the existing tuning does not apply
+
+
+@pytest.mark.slow
+def test_one_training_gives_several_files(file_runs):
+    trained, usual = file_runs.checkpoint.read_bytes(), file_runs.report["file"]
+
+    def made(name, *more, **options):
+        return file_runs.made(name, "--resume", file_runs.checkpoint, *more, **options)[0]["file"]
+
+    few = made("few.csplat", "--keep", 0.75)
+    assert 0.75 * usual["splats"] == pytest.approx(few["splats"], abs=2)
+    bound = usual["size_bytes"] + 200
+    assert usual["size_bytes"] < made("larger.csplat", "--target-size", f"{bound}B")["size_bytes"] <= bound
+    wanted = usual["validation"]["psnr"] - 0.1  # 0.05 is out of reach on some processors
+    good = made("good.csplat", "--target-psnr", wanted, final_share=1.0)
+    assert wanted <= good["validation"]["psnr"] <= usual["validation"]["psnr"] + 0.05
+    assert trained == file_runs.checkpoint.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("target", "max_splats", "planned"),
+    [
+        (None, None, (20_000, 0.8)), (None, 500, (500, 0.8)), (Target(keep=0.5), 500, (500, 0.5)),
+        (Target(psnr=30.0), None, (20_000, 1.0)), (Target(size_bytes=80_000), None, (10_000, 0.8)),
+        (Target(size_bytes=80_000), 16_000, (16_000, 0.5)), (Target(size_bytes=80_000), 4_000, (4_000, 1.0)),
+    ],
+)  # fmt: skip
+def test_a_training_is_planned_by_its_target(target, max_splats, planned):
+    options = plan_training(TrainOptions(seed=7), target, max_splats=max_splats)
+    assert (*planned, 7) == (options.max_splats, options.final_share, options.seed)
+
+
+def test_a_training_for_a_drop_of_psnr_is_refused():
+    with pytest.raises(InputError, match="max_psnr_drop is no target of train"):
+        plan_training(TrainOptions(), Target(max_psnr_drop=1.0))
+
+
+def test_tuning_after_a_long_training_takes_more_and_smaller_steps():
+    brief, usual = (tuning_after(TrainOptions(iterations=steps, lr_exposure=0.01)) for steps in (2_000, 12_000))
+    assert FinetuneOptions(lr_exposure=0.01) == brief
+    assert (2_000, 0.01) == (usual.iterations, usual.lr_exposure)
+    assert usual.lr_scales / brief.lr_scales == pytest.approx(1 / 3)
+
+
+def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch):
+    file, damaged = write_set(tmp_path, data) / "transforms.json", tmp_path / "11.png"
+    damaged.write_bytes(damaged.read_bytes()[:100])
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: pytest.fail("kernels are compiled"))
+    assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.ply", status=1).stderr
+    document = json.loads(file.read_text())
+    for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
+        (tmp_path / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": document["frames"][rows]}))
+    assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.csplat", status=1).stderr
+    assert [] == [*tmp_path.glob("a.*")]
+
+
+@pytest.mark.parametrize(
+    "words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)]
+)
+def test_options_of_a_file_are_refused_for_a_ply(tmp_path, words):
+    result = call("train", tmp_path, tmp_path / "a.ply", *words, status=2)
+    assert "expected OUT.csplat" in " ".join(result.stderr.split())
+
+
+@pytest.fixture
+def parameters(make_model):
+    return Parameters.starting_at(from_model(make_model(40, 2), 2))
+
+
+def checkpoint_of(parameters: Parameters) -> FitCheckpoint:
+    state = np.random.default_rng(0).bit_generator.state
+    return FitCheckpoint("train", 7, False, state, [3, 1], [], {"seed": 0}, {"losses": []}, parameters)
+
+
+def test_a_checkpoint_is_saved_and_loaded(parameters, tmp_path):
+    save_checkpoint(tmp_path / "run.npz", checkpoint_of(parameters))
+    again = load_checkpoint(tmp_path / "run.npz")
+    assert (7, [3, 1]) == (again.iteration, again.queue)
+    for name in GROUPS:
+        assert np.array_equal(parameters.values[name], again.parameters.values[name])
+        assert np.array_equal(parameters.second[name], again.parameters.second[name])
+
+
+def test_a_checkpoint_of_the_previous_version_is_refused_in_one_line(parameters, tmp_path):
+    path = tmp_path / "run.npz"
+    save_checkpoint(path, checkpoint_of(parameters))
+    arrays = dict(np.load(path))
+    facts = json.loads(arrays["facts"].tobytes()) | {"version": 1}
+    del facts["kind"]  # as in checkpoints of training of version 1
+    np.savez(path, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
+    with pytest.raises(InputError, match=r"run\.npz is a checkpoint of version 1, expected 2: begin a new run$"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    ("cap", "degree", "strategy", "count"), [(25, 1, "mcmc", 25), (60, 3, "fixed", 60), (60, 0, "mcmc", 40)]
+)
+def test_a_checkpoint_adapts_to_other_options(parameters, cap, degree, strategy, count):
+    options = TrainOptions(max_splats=cap, sh_degree=degree, strategy=strategy)
+    adapted = fit_to_options(parameters, options, np.random.default_rng(0))
+    assert count == len(adapted)
+    assert (count, (degree + 1) ** 2 - 1, 3) == adapted.values["shN"].shape == adapted.second["shN"].shape
+
+
+def test_the_moving_average_covers_the_last_values():
+    assert [1.0, 1.5, 2.5, 3.5] == moving_average([1, 2, 3, 4], 2).tolist()
+
+
+GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # gains of training images
+
+
+LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
+
+
+@pytest.fixture
+def uneven(data):
+    shots = [
+        replace(one, source=np.rint(np.clip(one.pixels * [gain, gain, gain, 1.0], 0, 255)).astype(np.uint8))
+        for one, gain in zip(data.train, GAINS, strict=True)
+    ]
+    return DataSet("uneven", shots, data.test)
+
+
+def test_gradients_of_gains_agree_with_finite_differences():
+    rng = np.random.default_rng(0)
+    seen, photograph = (rng.random((20, 24, 3)).astype(np.float32) for _ in range(2))
+    exposures, loss = ImageGains(2), PhotometricLoss(20, 24)
+    exposures.values[0] = rng.uniform(-0.3, 0.3, (2, 3))
+    one, moved = ImageGain(exposures, 0, 0.0), []
+    exposures.step = lambda number, slope, rate: moved.append((number, slope, rate))  # type: ignore[method-assign]
+    slope = one.backward(seen, loss(one.apply(seen), photograph.copy())[1].copy()).copy()
+
+    def value(seen) -> float:
+        return float(loss(one.apply(seen), photograph.copy())[0].loss)
+
+    expected = np.zeros((2, 3))
+    for place in np.ndindex(2, 3):
+        for sign in (1.0, -1.0):
+            exposures.values[0][place] += sign * 1e-3
+            expected[place] += sign * value(seen) / 2e-3
+            exposures.values[0][place] -= sign * 1e-3
+    np.testing.assert_allclose(moved[0][1], expected, rtol=0.02, atol=2e-4)
+    step = np.float32(1e-3) * rng.standard_normal(seen.shape).astype(np.float32)
+    assert value(seen + step) - value(seen - step) == pytest.approx(2.0 * float(np.sum(slope * step)), rel=0.1)
+
+
+@pytest.mark.slow
+def test_gains_are_estimated_with_a_mean_of_0(uneven):
+    options = TrainOptions(**{**LONGER, "iterations": 450})
+    plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
+    assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # PSNR of training images
+    found = np.array(corrected.log["exposures"])
+    assert np.abs(found.mean(axis=0)).max() < 1e-4
+    assert np.corrcoef(np.exp(found[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.5  # 80 splats represent the scene poorly
+    assert "exposures" not in plain.log
+
+
+@pytest.mark.slow
+def test_a_resumed_run_keeps_its_gains(uneven, tmp_path):
+    options = TrainOptions(**QUICK, lr_exposure=0.02)
+    whole, stopped = assert_resumes_identically(uneven, options, tmp_path)
+    assert np.abs(whole.log["exposures"]).max() > 0.0
+    with pytest.raises(InputError, match="the checkpoint has exposures of 9 images, expected 8"):
+        train(DataSet("fewer", uneven.train[:8], uneven.test), options, outputs=Outputs(resume=stopped))
+
+
+@pytest.mark.slow
+def test_tuning_corrects_gains(make_model, uneven):
+    scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))  # the scene of the images
+    fixed = fix_quantisation(EncodePlan.of(scene, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
+    training, validation = ([TuningView(one.camera, one) for one in part] for part in (uneven.train, uneven.test))
+    views = TuningViews(training, validation, np.zeros(3, np.float32))
+    options = FinetuneOptions(iterations=200, validate_every=50, patience=0)
+    plain, corrected = (tune(fixed, views, replace(options, lr_exposure=rate)).log for rate in (0.0, 0.05))
+    assert corrected["validations"][-1]["psnr"] > plain["validations"][-1]["psnr"] + 0.5
+    assert np.corrcoef(np.exp(np.array(corrected["exposures"])[:, 0].mean(axis=1)), GAINS)[0, 1] > 0.95

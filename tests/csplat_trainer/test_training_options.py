@@ -1,0 +1,97 @@
+"""Tests of csplat_trainer.training_options."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from captures import training_images
+from train_cases import QUICK, assert_resumes_identically
+
+from csplat.errors import InputError
+from csplat_trainer.training_loop import train
+from csplat_trainer.training_options import Outputs, TrainOptions
+
+pytest.importorskip("numba", reason="requires the extra [render]")
+
+
+@pytest.fixture
+def data(make_model):
+    return training_images(make_model)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("steps", [38, 60])  # while splats are pruned, at the end
+def test_a_run_resumed_late_prunes_to_the_final_share(data, tmp_path, steps):
+    trunk = TrainOptions(**{**QUICK, "iterations": steps}, refine_stop=0.5)
+    whole = train(data, trunk, outputs=Outputs(tmp_path / "trunk.npz"))
+    options = TrainOptions(**QUICK, refine_stop=0.5, final_share=0.75)  # two prunings
+    left = train(data, options, outputs=Outputs(resume=tmp_path / "trunk.npz"))
+    assert 0.75 * len(whole.model) == pytest.approx(len(left.model), abs=3)
+
+
+@pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
+def test_a_resumed_run_equals_an_uninterrupted_one(data, tmp_path, strategy):
+    assert_resumes_identically(data, TrainOptions(**QUICK, strategy=strategy), tmp_path)
+
+
+def test_a_run_resumes_with_another_number_of_splats(data, tmp_path):
+    train(data, TrainOptions(**QUICK, strategy="fixed"), outputs=Outputs(checkpoint=tmp_path / "c.npz"))
+    for count in (50, 120):
+        options = TrainOptions(**{**QUICK, "max_splats": count, "iterations": 70, "sh_degree": 2}, strategy="fixed")
+        result = train(data, options, outputs=Outputs(resume=tmp_path / "c.npz"))
+        assert (count, 2) == (len(result.model), result.model.sh_degree)
+
+
+def test_progress_log_and_previews_are_written(data, tmp_path):
+    seen, previews = [], tmp_path / "p"
+    outputs = Outputs(previews=previews, preview_every=30)
+    result = train(data, TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
+    assert [20, 40, 60] == [now.iteration for now in seen]
+    assert ["000030.png", "000060.png"] == sorted(path.name for path in previews.iterdir())
+    log = json.loads(json.dumps(result.log, allow_nan=False))
+    assert 60 == len(log["losses"])
+    assert {"psnr", "ssim", "lpips", "psnr_mean"} <= set(log["metrics"])
+
+
+def test_options_out_of_range_are_refused():
+    wrong = {"max_splats": 0, "device": "mps", "sh_degree": 5, "loss": "l2", "lr_means": np.nan, "lr_means_final": 1.0}
+    for name, value in wrong.items():
+        with pytest.raises(InputError, match=r"expected|mps is not supported"):
+            TrainOptions(**{name: value})
+
+
+def test_learning_rates_decay():
+    options = TrainOptions(iterations=100, refine_stop=0.6, lr_decay=0.2)
+    assert options.lr_means * 2 == pytest.approx(options.learning_rates(0, 2.0)["means"])
+    assert options.lr_means_final * 2 == pytest.approx(options.learning_rates(100, 2.0)["means"])
+    shares = [options.learning_rates(step, 2.0)["scales"] / options.lr_scales for step in (1, 60, 80, 100)]
+    assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)  # after refinement
+    assert TrainOptions(refine_stop=1.0, lr_decay=0.2).learning_rates(7000, 2.0)["shN"] == TrainOptions.lr_shN
+
+
+def test_growth_reaches_the_cap_halfway():
+    options = TrainOptions(max_splats=1000, iterations=2000, refine_start=100)
+    count = 10.0
+    for step in range(1, options.refine_end // 2 + 1):
+        if options.refines_after(step):
+            count *= options.growth_from(10)
+    assert 1000 == pytest.approx(count)
+    assert 1.05 == options.growth_from(1000)
+    assert 1.5 == TrainOptions(growth=1.5).growth_from(10)
+
+
+def test_sh_degrees_are_activated_one_by_one():
+    options = TrainOptions(iterations=1500, sh_degree=2)
+    assert [0, 1, 2, 2] == [options.active_degree(step) for step in (0, 100, 200, 1400)]
+
+
+def test_prunings_are_spread_and_end_early():
+    options = TrainOptions(max_splats=1000, final_share=0.4, iterations=1000, refine_stop=0.6)
+    left = {step: options.prunings_left(step) for step in range(1, 1001) if options.prunings_left(step)}
+    assert dict(zip(range(624, 841, 24), range(10, 0, -1), strict=True)) == left  # splats move until step 600
+    for stop, last in ((0.5, 8), (0.8, 9), (1.0, 10)):  # few steps: fewer prunings
+        short = TrainOptions(final_share=0.4, iterations=10, refine_stop=stop)
+        assert [last] == [step for step in range(11) if short.prunings_left(step) == 1]
+    assert not any(TrainOptions(iterations=1000).prunings_left(step) for step in range(1, 1001))

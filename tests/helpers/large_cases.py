@@ -1,0 +1,71 @@
+"""Helpers of the tests of large, which several files share."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from csplat import EncodeOptions
+from csplat.encoder import LevelNode
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.scene_source import join_blocks
+
+WHOLE = 600  # splats per bucket
+
+
+COUNT = 6 * WHOLE
+
+
+FAST = EncodeOptions(
+    preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32, bucket_splats=WHOLE
+)  # fmt: skip
+
+
+def encode_large(scene, target, options, *, progress=None, levels=None, **limits):
+    return encode_scene(
+        scene, target, options, OutOfCoreOptions(always=True, **limits), levels=levels, progress=progress
+    )
+
+
+@dataclass(frozen=True)
+class EveryFourth:
+    """Levels of every fourth splat: a node for each bucket, and one above all of them; errors are the levels."""
+
+    whole_splats: int = WHOLE
+
+    def settings(self, count):
+        return {"splats": f"every fourth of {count}"}
+
+    def seconds(self, count):
+        return 1e-5 * count
+
+    def build_part(self, splats, scene_count, threads):
+        assert (COUNT, 1) == (scene_count, threads)
+        coarse = replace(splats.select(np.arange(0, len(splats), 4)), extra={}, means_double=None)
+        return [LevelNode(0, 1, rows=np.arange(len(splats))), LevelNode(1, None, splats=coarse)]
+
+    def build_top(self, roots, threads, progress):
+        assert threads in (1, 2)
+        parts = list(roots)
+        progress("building levels", 1.0)
+        scene = join_blocks(parts[0], parts)
+        return [0] * len(parts), [LevelNode(2, None, splats=scene.select(np.arange(0, len(scene), 4)))]
+
+    def measure(self, encoded, threads, progress):  # noqa: ARG002 - of the protocol
+        nodes = [replace(node, error=float(node.level), squares=(0.5,)) for node in encoded.nodes]
+        return replace(encoded, nodes=nodes)
+
+    def encode(self, model, options, progress):
+        raise NotImplementedError
+
+
+class Interrupt:
+    """Progress that raises an error in a stage."""
+
+    def __init__(self, stage, error=KeyboardInterrupt, after=0):
+        self.stage, self.error, self.after = stage, error, after
+
+    def __call__(self, stage, _done):
+        if stage == self.stage:
+            self.after -= 1
+            if self.after < 0:
+                raise self.error

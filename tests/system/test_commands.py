@@ -1,0 +1,250 @@
+"""The command line: output, statuses, messages; no partial files, no tracebacks."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from cli_cases import PROGRAM, call, damaged_ply, invoke, refused, status_of
+from command_line import heed_interrupts
+
+import csplat
+from csplat import _spec, read_ply, write_ply
+from csplat.errors import InputError
+from csplat_tools.file_streams import check_output, write_bytes
+
+
+@pytest.fixture
+def ply(tmp_path, make_model):
+    path = tmp_path / "scene.ply"
+    write_ply(path, make_model(200, 2))
+    return path
+
+
+@pytest.fixture(scope="module")
+def encoded_once():
+    """Return the files that `encode` writes for `ply`, by name; the first test that needs them fills it."""
+    return {}
+
+
+@pytest.fixture
+def csplat_file(tmp_path, ply, encoded_once):
+    names = ("scene.csplat", "index.npy")
+    if not encoded_once:
+        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
+        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
+    for name, data in encoded_once.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path / names[0]
+
+
+@pytest.fixture(autouse=True)
+def no_estimated_up(monkeypatch):
+    """Estimate no up direction after encoding, which takes longer than encoding small scenes."""
+    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
+
+
+@pytest.mark.slow
+def test_encoding_by_a_preset_does_not_import_the_renderer(ply, tmp_path):
+    code = f"""
+import sys
+from csplat_tools.cli.app import app
+app(["encode", {str(ply)!r}, {str(tmp_path / "out.csplat")!r}], standalone_mode=False)
+assert not {{"numba", "scipy", "rich"}} & set(sys.modules)
+assert not {{"csplat_tools.cli.info", "csplat_tools.cli.train"}} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
+    assert (tmp_path / "out.csplat").exists()
+
+
+def test_decodes_fewer_bands(tmp_path, csplat_file):
+    call("decode", csplat_file, tmp_path / "d1.ply", "--sh-degree", 1)
+    call("decode", csplat_file, tmp_path / "d2.ply", "--sh-degree", 3)
+    one, two = read_ply(tmp_path / "d1.ply"), read_ply(tmp_path / "d2.ply")
+    assert (one.sh_degree, two.sh_degree) == (1, 2)
+    np.testing.assert_array_equal(one.shN, two.shN[:, :3])
+
+
+def test_the_second_of_two_writers_of_a_name_is_refused(tmp_path, monkeypatch):
+    target, written, both = str(tmp_path / "new"), os.fsync, threading.Barrier(2, timeout=20)
+
+    def meet(number):
+        written(number)
+        both.wait()  # both files are complete, and neither has its name
+
+    monkeypatch.setattr(os, "fsync", meet)
+    check_output(target, force=False)
+    lost = []
+
+    def write(data):
+        try:
+            write_bytes(target, data)
+        except InputError as error:
+            lost.append((data, str(error)))
+
+    writers = [threading.Thread(target=write, args=(data,)) for data in (b"one", b"two")]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert 1 == len(lost)
+    data, message = lost[0]
+    assert "and it was not replaced; --force replaces it" in message
+    assert {b"one": b"two", b"two": b"one"}[data] == (tmp_path / "new").read_bytes()
+    assert ["new"] == [path.name for path in tmp_path.iterdir()]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_name_that_was_taken_meanwhile_is_replaced_only_by_force(tmp_path, monkeypatch, links):
+    if not links:  # a file system without hard links, such as FAT
+
+        def refuse(*_):
+            raise PermissionError(1, "Operation not permitted")
+
+        monkeypatch.setattr(os, "link", refuse)
+    target = tmp_path / "new"
+    check_output(str(target), force=False)
+    target.write_bytes(b"theirs")
+    with pytest.raises(InputError, match="another program wrote it meanwhile"):
+        write_bytes(str(target), b"ours")
+    assert b"theirs" == target.read_bytes()
+    check_output(str(target), force=True)
+    write_bytes(str(target), b"ours")
+    assert b"ours" == target.read_bytes()
+    target.unlink()
+    check_output(str(target), force=False)
+    write_bytes(str(target), b"first")
+    write_bytes(str(target), b"second")  # the name is ours now
+    assert b"second" == target.read_bytes()
+    assert ["new"] == [path.name for path in tmp_path.iterdir()]
+
+
+def test_files_of_the_other_kind_are_refused_with_the_command_for_them(tmp_path, ply, csplat_file):
+    renamed = tmp_path / "renamed.ply"
+    renamed.write_bytes(csplat_file.read_bytes())
+    for path in (csplat_file, renamed):
+        assert "csplat decode" in refused("encode", path, tmp_path / "out")
+        assert "csplat decode" in refused("lint", path)
+    for words in (("decode", ply, tmp_path / "out"), ("verify", ply)):
+        assert "csplat encode" in refused(*words)
+
+
+def test_lint_names_defects_with_their_counts_and_repairs_them(tmp_path, make_model):
+    path, good = damaged_ply(tmp_path / "bad.ply", make_model), tmp_path / "good.ply"
+    result = invoke("lint", path, "--json")
+    report = json.loads(result.stdout)
+    assert (1, False) == (result.exit_code, report["clean"])
+    assert {one["id"]: one["count"] for one in report["findings"]} == {"trailing-bytes": 8, "nonfinite-rows": 1}
+    assert "nonfinite-rows" in invoke("lint", path).stdout
+    call("lint", path, "--fix", good)
+    assert len(read_ply(good, strict=True)) == 49
+    assert call("lint", good) == "nothing found\n"
+    assert json.loads(call("lint", good, "--json"))["clean"]
+
+
+def test_lint_does_not_guess(tmp_path, ply):
+    data = ply.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n")
+    ply.write_bytes(data)
+    result = invoke("lint", ply, "--fix", tmp_path / "good.ply")
+    assert result.exit_code == 1
+    assert "missing-columns" in result.stdout
+    assert not (tmp_path / "good.ply").exists()
+
+
+def test_runs_the_conformance_suite():
+    report = json.loads(invoke("conformance", "decoder", "--filter", "valid/q*", "--json").stdout)
+    assert report["passed"] is True
+    assert ["L1", "L2", "L3"] == list(report["levels"])
+    assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
+
+
+def test_a_misspelt_command_gets_a_suggestion():
+    result = invoke("enocde")
+    assert 2 == result.exit_code
+    assert "'encode'" in result.stderr
+
+
+def test_completes_commands_and_options(monkeypatch, capfd):
+    def complete(*words):
+        monkeypatch.setenv("_CSPLAT_COMPLETE", "complete_bash")
+        monkeypatch.setenv("COMP_WORDS", " ".join(words))
+        monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+        assert 0 == status_of()
+        return capfd.readouterr().out.split()
+
+    assert ["encode"] == complete("csplat", "enc")
+    assert ["--preset"] == complete("csplat", "encode", "--pre")
+
+
+def test_csplat_as_a_module_is_the_program_and_prints_its_version():
+    done = subprocess.run([sys.executable, "-m", "csplat", "--version"], capture_output=True, text=True, check=True)
+    assert call("--version") == done.stdout
+    assert done.stdout.startswith(f"csplat {csplat.__version__}, format 0.3")
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("ply")
+def test_a_closed_or_full_standard_stream_is_an_error_of_one_line(tmp_path):
+    full = "error: standard output: No space left on device; the output is incomplete (ENOSPC)\n"
+    cases = {
+        "info scene.ply >&-": "error: standard output: Bad file descriptor; the output is incomplete (EBADF)\n",
+        "lint - <&-": "error: standard input: Bad file descriptor (EBADF)\n",
+        "encode scene.ply new.csplat <&- >&- 2>&-": "",
+        "lint absent.ply 2>/dev/full": "",
+        "--version >/dev/full": full,  # and nothing is added when the process ends
+    }
+    for line, message in cases.items():
+        command = f'exec "{sys.executable}" -m csplat_tools {line}'
+        run = subprocess.run(["/bin/sh", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert (int("encode" not in line), message) == (run.returncode, run.stderr), line
+    assert (tmp_path / "new.csplat").read_bytes().startswith(_spec.MAGIC)
+
+
+@pytest.mark.slow
+def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
+    target = tmp_path / "out.csplat"
+    with subprocess.Popen(
+        [*PROGRAM, "encode", "-", str(target)],
+        stdin=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
+    ) as running:
+        assert running.stdin is not None
+        running.stdin.write(bytes(1 << 20))  # more than a pipe holds: it has begun to read
+        running.send_signal(signal.SIGINT)
+        assert running.wait(20) == 130
+        assert running.stderr is not None
+        assert running.stderr.read() == b"interrupted\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_an_interrupt_while_the_program_loads_is_no_traceback(tmp_path):
+    def interrupted(module, script):
+        """Run a script that imports a module in whose import the interrupt becomes another error."""
+        folder = tmp_path / module
+        folder.mkdir()
+        (folder / f"{module}.py").write_text(
+            "import sys, time\n"
+            "print('loading', flush=True)\n"
+            "try:\n    time.sleep(20)\n"
+            "except KeyboardInterrupt as error:\n    raise ImportError('half of it') from error\n"
+        )
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
+        with subprocess.Popen(
+            [sys.executable, "-c", script, "info"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
+        ) as running:  # fmt: skip
+            assert running.stdout is not None
+            assert running.stdout.readline() == b"loading\n"
+            running.send_signal(signal.SIGINT)
+            _, errors = running.communicate(timeout=20)
+            return running.returncode, errors
+
+    run = "from csplat_program import main; main()"
+    assert (-signal.SIGINT, b"") == interrupted("contextlib", f"import sys; sys.modules.pop('contextlib', None); {run}")
+    assert (130, b"interrupted\n") == interrupted("typer", run)

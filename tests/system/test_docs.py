@@ -1,0 +1,202 @@
+"""README and documentation: links resolve, figures are the measured ones, examples run."""
+
+import itertools
+import json
+import re
+import shlex
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import InThisProcess
+from typer.testing import CliRunner
+
+import csplat
+from csplat_bench.pages import with_tables, write_pages
+from csplat_bench.tables import markdown_table, select_rows
+from csplat_tools import batch
+from csplat_tools.cli.app import app
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+DOCS = ROOT / "tools" / "docs"
+
+
+README = (ROOT / "README.md").read_text("utf-8")
+
+
+MEASURED = json.loads((DOCS / "measured.json").read_text("utf-8"))
+
+
+PRESETS = {row["name"]: row for row in MEASURED["rows"] if row["series"] == "preset"}
+
+
+@pytest.fixture(scope="module")
+def site():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(DOCS)
+        import make_site
+
+        yield make_site
+
+
+def blocks(text, language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+
+
+def test_links_of_pages_lead_to_files_and_headings(site):
+    for path in site.pages().values():
+        for match in site.links((ROOT / path).read_text("utf-8")):
+            if "://" in match[3]:
+                continue
+            target, anchor = site.target_of(path, match[3])
+            if anchor:
+                headings = re.findall(r"^#+ (.+)$", (ROOT / target).read_text("utf-8"), re.MULTILINE)
+                assert anchor in {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
+    with pytest.raises(FileNotFoundError, match=r"README\.md: nowhere\.md"):
+        site.rewritten("see [this](nowhere.md)", "README.md")
+
+
+def test_tables_show_templates_missing_values_and_labels():
+    rows = [{"name": "a", "bytes": 1_500_000, "count": 3, "psnr": {"file": 38.25, "source": 40.0}}, {"name": "b"}]
+    columns = [["", "{name}"], ["MB", "{bytes / 1e6:.2f}"], ["dB", "{psnr.file - psnr.source:+.1f}"]]
+    expected = "|  | MB | dB |\n| --- | --- | --- |\n| first | 1.50 | -1.8 |\n| b | – | – |"
+    assert expected == markdown_table(rows, columns, {"a": "first"})
+    assert "| 0.50 |" in markdown_table(rows, [{"key": "bytes", "title": "MB", "scale": 1 / 3e6, "format": ".2f"}])
+
+
+def test_rows_of_results_are_filtered_ordered_and_grouped(tmp_path):
+    rows = [{"scene": s, "encoder": e, "size": n} for n, (s, e) in enumerate(itertools.product("ab", "xyz"))]
+    (tmp_path / "r.json").write_text(json.dumps({"rows": rows}))
+    spec = {"source": "r.json", "where": {"scene": ["b", "a"], "encoder": ["x", "y"]}}
+    assert [3, 4, 0, 1] == [row["size"] for row in select_rows(spec, tmp_path)]
+    grouped = select_rows({**spec, "group": "scene", "by": "encoder"}, tmp_path)
+    assert [{"scene": "b", "x.size": 3, "y.size": 4}, {"scene": "a", "x.size": 0, "y.size": 1}] == grouped
+    with pytest.raises(ValueError, match="no row is left"):
+        select_rows({"source": "r.json", "where": {"scene": "c"}}, tmp_path)
+
+
+def test_markdown_of_github_is_converted_for_the_site(site):
+    text = "[a](../spec/format.md#1-scope), [b](js/decoder.d.ts), `[c](x.md)`, [d](https://example.org)"
+    expected = "[a](format.md#1-scope), b, `[c](x.md)`, [d](https://example.org)"
+    assert expected == site.rewritten(text, "codec/EMBEDDING.md")
+    text = "Words:\n- one\n- two\n<!-- begin -->\n```python spec-test\n- x\n```\n"
+    assert "Words:\n\n- one\n- two\n```python\n- x\n```\n" == site.for_python_markdown(text)
+
+
+def test_the_navigation_contains_every_page(site):
+    named = re.findall(r": ([\w-]+\.md)$", (DOCS / "mkdocs.yml").read_text("utf-8"), re.MULTILINE)
+    assert sorted({*site.pages(), "commands.md", "python.md"}) == sorted(named)
+
+
+@pytest.mark.slow
+def test_the_readme_shows_measured_figures_of_this_encoder(sample_path):
+    assert MEASURED["source"]["size_bytes"] == sample_path.stat().st_size
+    for name, one in PRESETS.items():
+        assert f"| `{name}` | {one['size_bytes']:,} | {one['psnr']:.1f} | {one['seconds']:.1f} |" in README
+        size = len(csplat.encode(csplat.read_ply(sample_path), csplat.EncodeOptions(name)))
+        assert one["size_bytes"] == pytest.approx(size, rel=0.02)
+    shown = PRESETS["balanced"]
+    assert f"`csplat encode`: {shown['size_bytes'] / 1000:.0f} kB, {shown['psnr']:.1f} dB" in README
+
+
+@pytest.mark.slow
+def test_tables_and_plots_are_up_to_date(tmp_path):
+    assert [] == write_pages(check=True), "run `python -m csplat_bench pages`"
+    with pytest.raises(ValueError, match="table sizes is not declared"):
+        with_tables("<!-- table: sizes -->\n<!-- end -->", {}, tmp_path)
+
+
+def test_the_readme_of_the_package_has_no_relative_links():
+    hook = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["hatch"]["metadata"]["hooks"]
+    text = README
+    for one in hook["fancy-pypi-readme"]["substitutions"]:
+        text = re.sub(one["pattern"], one["replacement"], text)
+    assert text.startswith("# csplat\n")
+    assert not re.search(r"\]\((?!https?:)", text)
+    assert len(text) > 0.7 * len(README)
+
+
+@pytest.fixture(scope="module")
+def commands():
+    """The commands of csplat, by name."""
+    from typer.main import get_command
+
+    group = get_command(app)
+    return {name: group.get_command(None, name) for name in group.list_commands(None)}
+
+
+def test_commands_in_readme_and_guides_are_valid(commands):
+    """Commands are parsed, not run, which reveals removed options."""
+    texts = [README, *(path.read_text("utf-8") for path in sorted((DOCS / "guide").glob("*.md")))]
+    lines = [line for text in texts for block in blocks(text, "sh") for line in block.splitlines()]
+    lines = [line.split("||")[0].strip() for line in lines if line.strip().startswith("csplat ")]
+    assert len(lines) > 20
+    for line in lines:
+        name, *words = shlex.split(line, comments=True)[1:]
+        commands[name].make_context(name, words, resilient_parsing=False)
+
+
+def test_options_on_result_pages_exist(commands):
+    options = {option for command in commands.values() for parameter in command.params for option in parameter.opts}
+    for path in (DOCS / "results").glob("*.md"):
+        prose = re.sub(r"<!-- table.*?<!-- end -->", "", path.read_text("utf-8"), flags=re.DOTALL)
+        words = " ".join(re.findall(r"`([^`]+)`", prose)).split()
+        assert set() == {word for word in words if word.startswith("--")} - options, path.name
+
+
+@pytest.mark.slow
+def test_python_examples_run(sample_path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(batch, "ProcessPoolExecutor", InThisProcess)
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "encoded").mkdir()
+    model = csplat.read_ply(sample_path)
+    for name in ("scene.ply", "scenes/one.ply"):
+        csplat.write_ply(tmp_path / name, model.select(range(200)))
+    (tmp_path / "scenes" / "two.ply").write_bytes(b"not a PLY")
+    names = {}
+    exec(blocks(README, "python")[0], names)  # noqa: S102  # the README's own lines
+    assert 200 == len(names["decoded"])
+    exec(blocks((DOCS / "guide" / "batch.md").read_text("utf-8"), "python")[0], {"__name__": "__main__"})  # noqa: S102  # likewise
+    one, two = capsys.readouterr().out.splitlines()
+    assert re.fullmatch(r"scenes/one\.ply: \d+\.\d% of its size", one)
+    assert two.startswith("scenes/two.ply: ")
+    assert {"index.html", "one.csplat"} == {path.name for path in (tmp_path / "encoded").iterdir()}
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("small_views")
+def test_the_tutorial_runs(tmp_path, monkeypatch):
+    """Its commands run in order, with fewer and smaller images of a square, and fewer steps."""
+    pytest.importorskip("numba", reason="training needs numba: pip install 'csplat[render]'")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(ROOT / "tools" / "lab" / "sample")
+    text = (DOCS / "guide" / "tutorial.md").read_text("utf-8")
+    lines = list(itertools.chain.from_iterable(block.splitlines() for block in blocks(text, "sh")))
+    first, *others = [shlex.split(line) for line in lines]
+    assert ["python", "tools/lab/sample/make_sample.py"] == first[:2]
+    import make_sample
+
+    monkeypatch.setattr(make_sample, "photograph", square)
+    make_sample.main(smaller(first[2:], {"--views": "3", "--size": "16"}))
+    for line in others:
+        words = smaller(line, {"--iterations": "6", "--max-splats": "50"})
+        result = CliRunner().invoke(app, [*words[1:], "--quiet"])
+        assert 0 == result.exit_code, (words, result.output, result.exception)
+    assert {"photographs", "garden.ply", "garden.csplat", "garden.html", "about.html", "back.ply"} == {
+        path.name for path in tmp_path.iterdir()
+    }
+
+
+def square(_garden, camera):
+    """Return an image of a square and 3D points on it, without compiling the renderer."""
+    pixels = np.zeros((camera.H, camera.W, 4), np.uint8)
+    pixels[camera.H // 3 : -camera.H // 3, camera.W // 3 : -camera.W // 3] = (200, 120, 40, 255)
+    return pixels, np.random.default_rng(0).uniform(-0.5, 0.5, (camera.H, camera.W, 3))
+
+
+def smaller(words, numbers):
+    return [numbers.get(before, word) for before, word in zip(["", *words], words, strict=False)]

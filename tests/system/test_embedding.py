@@ -1,0 +1,560 @@
+"""The unchanged samples of codec/EMBEDDING.md, and `<csplat-view>` in other pages."""
+
+import gzip
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from checked import covariances
+from chromium import absent, read_pixels
+from command_line import call, invoke
+
+from csplat import EncodeOptions, decode, encode, read_ply
+from csplat.spherical_harmonics import evaluate_sh
+from csplat_tools.present.viewer_page import export_element
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
+
+
+FAST = EncodeOptions(preset="fast")
+
+
+# The parts of three.js that `points.mjs` uses. Types of the arguments are checked, but not what three.js draws.
+THREE = """
+const typed = (value, kind) => { if (!(value instanceof kind)) throw new TypeError(`${value} is no ${kind.name}`); };
+export const SRGBColorSpace = 'srgb';
+const linear = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
+export class Color {
+  setRGB(r, g, b, space) {
+    if (space !== SRGBColorSpace) throw new TypeError('no colour space');
+    return Object.assign(this, { r: linear(r), g: linear(g), b: linear(b) });
+  }
+  toArray(array, at) { array.set([this.r, this.g, this.b], at); }
+}
+export class BufferAttribute {
+  constructor(array, itemSize) { typed(array, Float32Array); Object.assign(this, { array, itemSize }); }
+}
+export class BufferGeometry {
+  attributes = {};
+  setAttribute(name, attribute) { typed(attribute, BufferAttribute); this.attributes[name] = attribute; }
+}
+export class PointsMaterial { constructor(options) { Object.assign(this, options); } }
+export class Points {
+  constructor(geometry, material) {
+    typed(geometry, BufferGeometry);
+    typed(material, PointsMaterial);
+    Object.assign(this, { geometry, material });
+  }
+}
+"""
+
+
+RUN = """
+import { decode } from 'csplat-decoder';
+import { toThree } from './axes.mjs';
+import { colour } from './colour.mjs';
+import { covariances } from './covariances.mjs';
+import { loadPoints } from './points.mjs';
+import { stream } from './stream.mjs';
+
+const [url, directions] = JSON.parse(process.argv[2]);
+const scene = await decode(await (await fetch(url)).arrayBuffer(), { workers: 2 });
+const points = await loadPoints(url);
+const tiles = [];
+const bands = [];
+await stream(url, {
+  addTile: (first, part) => tiles.push([first, part.count, Array.from(part.means)]),
+  addBand: (first, layer, sh) => bands.push([first, layer, sh.length]),
+});
+console.log(JSON.stringify({
+  workers: scene.workers,
+  position: Array.from(points.geometry.attributes.position.array),
+  colour: Array.from(points.geometry.attributes.color.array),
+  sizes: Object.values(points.geometry.attributes).map(({ itemSize }) => itemSize),
+  covariances: Array.from(covariances(scene)),
+  colours: directions.map((direction, i) => colour(scene, i, direction)),
+  axes: ['', 'RDF', 'RUB', 'RFU'].map(toThree),
+  tiles,
+  bands,
+}));
+"""
+
+
+def samples(language):
+    return re.findall(rf"^```{language}\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def model(request):
+    """The first 800 splats of the sample with SH band 4, after a round trip."""
+    part = read_ply(request.getfixturevalue("sample_path")).select(slice(0, 800))
+    band = np.random.default_rng(4).normal(0.0, 0.05, (len(part), 9, 3)).astype(np.float32)
+    return decode(encode(replace(part, shN=np.concatenate([part.shN, band], axis=1)), FAST))
+
+
+@pytest.fixture(
+    params=[
+        "copied",
+        # The package for users: npm alone decides which files it contains, and takes seconds.
+        pytest.param("installed", marks=pytest.mark.engines),
+    ]
+)
+def results(request, site, tmp_path, model):
+    """What the samples print on a scene, and the scene."""
+    node = shutil.which("node")
+    if node is None:
+        absent("the samples in JavaScript need Node.js, which is not installed")
+    for text in samples("js"):
+        (tmp_path / re.match(r"// (\w+\.mjs)\n", text)[1]).write_text(text, "utf-8")
+    (copy_decoder if request.param == "copied" else install_decoder)(tmp_path)
+    three = tmp_path / "node_modules" / "three"
+    three.mkdir()
+    (three / "package.json").write_text('{"name": "three", "type": "module", "main": "three.mjs"}')
+    (three / "three.mjs").write_text(THREE)
+    (tmp_path / "run.mjs").write_text(RUN)
+    data = encode(model, replace(FAST, tile_splats=200))
+    words = json.dumps([site.add("/scene.csplat", data), directions(20).tolist()])
+    done = subprocess.run([node, "run.mjs", words], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert 0 == done.returncode, done.stderr
+    assert {200, 206} == set(site.statuses("/scene.csplat"))
+    return json.loads(done.stdout), decode(data)
+
+
+def copy_decoder(folder):
+    """Copy the files that the package of the decoder ships."""
+    source, target = ROOT / "codec" / "js", folder / "node_modules" / "csplat-decoder"
+    target.mkdir(parents=True)
+    for pattern in ["package.json", *json.loads((source / "package.json").read_text("utf-8"))["files"]]:
+        for path in source.glob(pattern):
+            (shutil.copytree if path.is_dir() else shutil.copy)(path, target / path.name)
+
+
+def install_decoder(folder):
+    """Install the package of the decoder from its packed form, without files that are not shipped."""
+    npm = shutil.which("npm")
+    if npm is None:
+        absent("the package of the decoder needs npm, which is not installed")
+    words = [npm, "--silent", "--offline", "--no-audit", "--no-fund"]
+    packed = subprocess.run(
+        [*words, "pack", ROOT / "codec" / "js"], cwd=folder, check=True, capture_output=True, text=True
+    )
+    subprocess.run([*words, "install", f"./{packed.stdout.strip()}"], cwd=folder, check=True)
+
+
+def directions(count):
+    values = np.random.default_rng(5).standard_normal((count, 3))
+    return values / np.linalg.norm(values, axis=1, keepdims=True)
+
+
+@pytest.mark.slow
+def test_the_samples_in_javascript(results):
+    given, scene = results
+    count = len(scene)
+    assert 2 == given["workers"]
+    assert [3, 4] == given["sizes"]
+    np.testing.assert_array_equal(scene.means.ravel(), np.array(given["position"], np.float32))
+    colours = np.array(given["colour"]).reshape(count, 4)
+    np.testing.assert_array_equal(scene.opacities, colours[:, 3].astype(np.float32))
+    shown = np.maximum(0.0, 0.5 + 0.28209479 * scene.sh0.astype(np.float64))
+    linear = np.where(shown <= 0.04045, shown / 12.92, ((shown + 0.055) / 1.055) ** 2.4)
+    np.testing.assert_allclose(linear, colours[:, :3], rtol=1e-4, atol=1e-6)
+    check_covariances(np.array(given["covariances"]).reshape(count, 6), scene)
+    check_colours(np.array(given["colours"]), scene)
+    assert [[1, 0, 0], [0, -1, 0], [0, 0, -1]] == given["axes"][0] == given["axes"][1]
+    assert [[1, 0, 0], [0, 1, 0], [0, 0, 1]] == given["axes"][2]
+    assert [[1, 0, 0], [0, 0, 1], [0, -1, 0]] == given["axes"][3]
+    check_stream(given, scene)
+
+
+def check_covariances(found, scene):
+    wanted = covariances(scene.quats, scene.scales)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    largest = np.exp(2.0 * scene.scales.astype(np.float64)).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(found / largest, wanted / largest, atol=1e-6)
+
+
+def check_colours(found, scene):
+    ways = directions(len(found))
+    basis = evaluate_sh(4, ways)
+    count = len(ways)
+    coefficients = np.concatenate([scene.sh0[:count, None], scene.shN[:count]], axis=1).astype(np.float64)
+    wanted = np.maximum(0.0, 0.5 + np.einsum("nk,nkc->nc", basis, coefficients))
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
+
+
+def check_stream(given, scene):
+    assert len(given["tiles"]) > 1
+    for first, count, means in given["tiles"]:
+        np.testing.assert_array_equal(scene.means[first : first + count].ravel(), np.array(means, np.float32))
+    assert len(scene) == sum(count for _, count, _ in given["tiles"])
+    assert {1, 2, 3, 4} == {layer for _, layer, _ in given["bands"]}
+    counts = {first: count for first, count, _ in given["tiles"]}
+    assert all(size == 3 * (2 * layer + 1) * counts[first] for first, layer, size in given["bands"])
+
+
+def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=80)))
+    said = []
+    for program in samples("python"):
+        exec(program, {"__name__": "__main__"})  # noqa: S102  # the guide's own lines
+        said.append(capsys.readouterr().out)
+    whole, part, cut = said
+    assert f"{len(model)} float32 4 {model.coordinate_system}\n" == whole
+    first, *tiles, last = part.splitlines()
+    assert first.startswith(f"{len(model)} {model.coordinate_system} {{")
+    assert [str(place) for place in range(10)] == [line.split()[0] for line in tiles if not line.startswith(" ")]
+    assert last.endswith(f" of {(tmp_path / 'scene.csplat').stat().st_size}")
+    assert 0 < len(decode(tmp_path / "part.csplat")) < len(model)
+    assert f"{len(model)} [(0, 0.0)]\n" == cut
+
+
+@pytest.mark.browser
+def test_the_engine_without_a_page(tab, site, model):
+    (sample,) = (text for text in samples("js") if text.startswith("// show.mjs"))
+    site.add("/show.mjs", sample.encode())
+    site.add("/scene.csplat", encode(model, FAST))
+    page = b"<!doctype html><title>x</title><link rel=icon href=data:,><canvas width=160 height=120></canvas>"
+    tab.page.goto(site.add("/page.html", page))
+    pixels = (
+        "import('/show.mjs').then(async ({ show }) =>"
+        " (await show(document.querySelector('canvas'), '/scene.csplat')).readPixels())"
+    )
+    shown = read_pixels(tab.page, pixels, 160, 120)[..., :3].max(axis=2) > 40
+    assert 0.1 < shown.mean() < 0.9
+
+
+def test_the_guide_contains_the_unchanged_examples():
+    examples = ROOT / "tools" / "examples"
+    for name in ("babylon", "playcanvas", "spark", "three"):
+        assert f"```js\n{(examples / name).with_suffix('.mjs').read_text('utf-8')}```\n" in TEXT
+
+
+POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src blob:; connect-src 'self'; img-src data:"
+
+
+STYLE = "csplat-view { width: 160px; height: 120px }"
+
+
+ONE_FILE = '<script src="../scripts/csplat-view.js"></script>'
+
+
+MODULE = '<script type="module" src="/tools/viewer/element.mjs"></script>'
+
+
+# Events of elements, without progress: [[id, type, detail], ...].
+RECORD = """
+globalThis.told = [];
+for (const type of ['load', 'error']) {
+  const record = ({ target, detail }) => target.localName === 'csplat-view' && told.push([target.id, type, detail]);
+  document.addEventListener(type, record, { capture: true });
+}
+"""
+
+
+@pytest.fixture
+def blog(tab, site, make_model):
+    """Return a function that opens a page with a text; scenes are /scene.csplat (60 splats) and /other.csplat (90)."""
+    for name, count in (("scene", 60), ("other", 90)):
+        site.add(f"/{name}.csplat", encode(make_model(count, 0, scales=np.full((count, 3), -2, "f")), FAST))
+    site.add("/scripts/csplat-view.js", export_element())
+    site.add("/blog/style.css", STYLE.encode())
+
+    tab.page.add_init_script(RECORD)
+
+    def opened(text, script=ONE_FILE, policy=POLICY):
+        head = f'<meta http-equiv="Content-Security-Policy" content="{policy}; style-src \'self\'">' if policy else ""
+        links = "<link rel=icon href=data:,><link rel=stylesheet href=style.css>"
+        page = f"<!doctype html><meta charset=utf-8>{head}<title>x</title>{links}{text}{script}"
+        tab.page.goto(site.add("/blog/post.html", page.encode()))
+        return tab.page
+
+    return opened
+
+
+def told(tab, identity=""):
+    """Wait for an event of an element; return its type and its detail."""
+    tab.until(f"told.some(([id]) => id === '{identity}')")
+    return tab.page.evaluate(f"told.splice(told.findIndex(([id]) => id === '{identity}'), 1)[0].slice(1)")
+
+
+def shown(page, element="csplat-view"):
+    """Return a mask of the pixels that are not black in the settled picture, [120, 160]."""
+    pixels = f"document.querySelector('{element}').engine.readPixels()"
+    return read_pixels(page, pixels, 160, 120)[..., :3].max(axis=2) > 20
+
+
+@pytest.mark.browser
+def test_scenes_are_shown_replaced_and_removed(tab, blog):
+    page = blog('<csplat-view alt="A garden"></csplat-view>')
+    page.evaluate("globalThis.view = document.querySelector('csplat-view')")
+    page.evaluate("globalThis.progress = 0; view.addEventListener('progress', () => progress++)")
+    page.evaluate("view.src = '../scene.csplat'")
+    kind, stats = told(tab)
+    assert ("load", 60) == (kind, stats["splatCount"])
+    assert page.evaluate("progress") > 0
+    assert 0.02 < shown(page).mean() < 0.9
+    canvas = page.locator("csplat-view canvas")
+    assert canvas.get_attribute("aria-label").startswith("A garden. Arrow keys")
+    assert 0 == page.evaluate("performance.getEntriesByType('resource').filter(({ name }) => /mjs/.test(name)).length")
+
+    page.evaluate("view.setAttribute('background', '#ff0000')")
+    assert [255, 0, 0] == page.evaluate("view.engine.readPixels().then((pixels) => Array.from(pixels.slice(0, 3)))")
+
+    page.evaluate("globalThis.old = view.shadowRoot.querySelector('canvas').getContext('webgl2')")
+    page.evaluate("view.src = '/other.csplat'")
+    kind, stats = told(tab)
+    assert ("load", 90) == (kind, stats["splatCount"])
+    assert page.evaluate("old.isContextLost()")
+    assert 1 == len(page.workers)
+
+    page.evaluate("document.body.append(document.createElement('main')); document.querySelector('main').append(view)")
+    assert page.evaluate("Promise.resolve().then(() => view.engine !== null)")  # it was moved, not removed
+    page.evaluate("old = view.shadowRoot.querySelector('canvas').getContext('webgl2'); view.remove()")
+    assert page.evaluate("view.engine === null && old.isContextLost()")
+    tab.page.wait_for_timeout(50)
+    assert [] == page.workers
+
+
+@pytest.mark.browser
+def test_the_wheel_scrolls_the_page_until_a_scene_is_clicked_and_scenes_load_when_they_are_near(tab, site, blog):
+    scenes = [
+        f'<csplat-view id="{name}" src="/{file}.csplat"></csplat-view>'
+        for name, file in (("a", "scene"), ("b", "other"))
+    ]
+    page = blog((90 * "<br>x").join(scenes), MODULE, policy="")
+    assert "load" == told(tab, "a")[0]
+    page.evaluate("globalThis.pixels = async () => (await a.engine.readPixels()).reduce((sum, one) => sum + one, 0)")
+    before = page.evaluate("pixels()")
+    page.mouse.move(80, 60)
+    page.mouse.wheel(0, 30)
+    tab.until("scrollY === 30")
+    assert before == page.evaluate("pixels()")
+    assert "pan-y" == page.eval_on_selector("#a canvas", "(canvas) => getComputedStyle(canvas).touchAction")
+
+    page.mouse.click(80, 60)
+    page.mouse.wheel(0, 30)
+    tab.until(f"pixels().then((sum) => sum !== {before})")
+    assert 30 == page.evaluate("scrollY")
+    page.keyboard.press("Escape")
+    page.mouse.wheel(0, 30)
+    tab.until("scrollY === 60")
+    before = page.evaluate("pixels()")
+    page.evaluate("a.focus()")
+    page.keyboard.press("Shift+ArrowRight", delay=100)
+    tab.until(f"pixels().then((sum) => sum !== {before})")
+
+    assert [] == site.statuses("/other.csplat")
+    page.evaluate("b.scrollIntoView()")
+    assert "load" == told(tab, "b")[0]
+    assert (2, True) == (len(page.workers), shown(page, "#b").any())
+
+
+@pytest.mark.browser
+def test_errors_are_shown_as_text(tab, site, blog):
+    site.add("/cut.csplat", site._files["/scene.csplat"][:-20])
+    cases = [
+        ("/cut.csplat", "E_TRUNCATED", "is incomplete", POLICY),
+        ("/none.csplat", "E_INPUT", "could not be read.*404", POLICY),
+        ("/scene.csplat", "E_WORKER", "could not start.*worker-src", POLICY.replace("blob:", "'none'")),
+        ("/scene.csplat", "E_WEBGL2", "no WebGL 2", POLICY),
+    ]
+    for src, code, words, policy in cases:
+        if code == "E_WEBGL2":
+            tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+        page = blog("<csplat-view></csplat-view>", policy=policy)
+        page.eval_on_selector("csplat-view", f"(view) => view.src = '{src}'")
+        kind, report = told(tab)
+        assert ("error", code, True) == (kind, report["code"], report["fatal"])
+        assert re.search(words, page.inner_text("csplat-view [role=alert]"), re.DOTALL)
+    tab.problems.clear()  # browsers report a status, and what a policy forbids
+
+
+def rights(data):
+    """Return a script that answers ranges of a file, for others to build on."""
+
+    def answer(headers, **more):
+        asked = re.fullmatch(r"bytes=(\d+)-(\d*)", headers.get("Range") or "")
+        if not asked:
+            return 200, more, data
+        first, last = int(asked[1]), min(int(asked[2] or len(data)), len(data) - 1)
+        return 206, {"Content-Range": f"bytes {first}-{last}/{len(data)}", **more}, data[first : last + 1]
+
+    return answer
+
+
+@pytest.mark.browser
+def test_properties_count_that_were_set_before_the_script_had_run(tab, blog):
+    before = """
+    <csplat-view src="/none.csplat"></csplat-view><script>
+    globalThis.view = document.querySelector('csplat-view');
+    Object.assign(view, { src: '/scene.csplat', alt: 'A garden', background: 'ff0000', up: [0, -1, 0] });
+    const viewmat = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 9, 0, 0, 0, 1];
+    view.camera = { K: [[100, 0, 80], [0, 100, 60], [0, 0, 1]], viewmat, W: 160, H: 120 };
+    view.request = { headers: { 'x-key': 'k' } };
+    </script>"""
+    page = blog(before, policy="")
+    kind, stats = told(tab)
+    assert ("load", 60) == (kind, stats["splatCount"])
+    assert page.locator("csplat-view canvas").get_attribute("aria-label").startswith("A garden.")
+    assert [255, 0, 0] == page.evaluate("view.engine.readPixels().then((pixels) => Array.from(pixels.slice(0, 3)))")
+    assert [[], "0,-1,0", "k"] == page.evaluate("[Object.keys(view), view.up, view.request.headers['x-key']]")
+    page.evaluate("view.src = '/other.csplat'")
+    assert 90 == told(tab)[1]["splatCount"]
+    page.evaluate("view.background = null; view.alt = undefined")
+    assert page.evaluate("!view.hasAttribute('background') && view.background === '' && !view.hasAttribute('alt')")
+
+
+@pytest.mark.browser
+def test_setting_an_address_again_retries_after_an_error_and_a_script_may_run_twice(tab, site, blog):
+    page = blog('<csplat-view src="/late.csplat"></csplat-view>' + ONE_FILE)
+    page.evaluate("globalThis.view = document.querySelector('csplat-view')")
+    for again in ("view.src = view.src", "view.setAttribute('src', view.getAttribute('src'))"):
+        report = told(tab)[1]
+        expected = {"code": "E_INPUT", "reason": "refused", "status": 404, "fatal": True}
+        assert expected.items() <= report.items()
+        assert "no file at this address" in page.inner_text("csplat-view [role=alert]")
+        if "setAttribute" in again:
+            site.add("/late.csplat", site._files["/scene.csplat"])
+        page.evaluate(again)
+    assert 60 == told(tab)[1]["splatCount"]
+    assert page.evaluate("view.shadowRoot.querySelector('#error').hidden")
+    tab.problems.clear()  # the browser reports each 404
+
+
+@pytest.mark.browser
+def test_a_page_decides_on_the_requests_of_an_element(tab, site, blog):
+    right = rights(site._files["/scene.csplat"])
+    keys = []
+
+    def signed(headers, number):
+        keys.append(headers.get("X-Key"))
+        return (403, {}, b"") if number > 1 else right(headers)
+
+    site.scripts["/signed.csplat"] = signed
+    page = blog("<csplat-view></csplat-view>")
+    page.evaluate(
+        """{ globalThis.view = document.querySelector('csplat-view'); globalThis.asked = [];
+        view.request = { headers: { 'x-key': 'k' } }; view.crossOrigin = 'use-credentials'; view.timeoutMs = 5000;
+        view.fetch = (url, init) => (asked.push([new URL(url).pathname, init.credentials]), fetch(url, init));
+        view.renew = async ({ status }) => (asked.push(status), '/scene.csplat');
+        view.src = '/signed.csplat'; }"""
+    )
+    assert 60 == told(tab)[1]["splatCount"]
+    assert ["/signed.csplat", "include"] == page.evaluate("asked[0]")
+    assert "k" == keys[0]
+    page.evaluate("void (view.src = '/signed.csplat?2')")
+    assert 60 == told(tab)[1]["splatCount"]
+    renewed = page.evaluate("asked.slice(asked.indexOf(403), asked.indexOf(403) + 2)")
+    assert [403, ["/scene.csplat", "include"]] == renewed
+    assert "use-credentials" == page.get_attribute("csplat-view", "crossorigin")
+    tab.problems.clear()  # the browser reports the status
+
+
+@pytest.mark.browser
+def test_a_file_that_is_replaced_while_it_is_read_is_opened_anew(tab, site, blog, make_model):
+    old, new = (
+        encode(make_model(count, 3, scales=np.full((count, 3), -2, "f")), replace(FAST, tile_splats=2000))
+        for count in (6000, 6500)
+    )
+    assert len(old) > 2**17
+    for name, tags in (("tagged", ({"ETag": '"a"'}, {"ETag": '"b"'})), ("untagged", ({}, {}))):
+        path = f"/{name}.csplat"
+        site.scripts[path] = lambda headers, number, tags=tags: (
+            rights(old)(headers, **tags[0]) if number == 1 else rights(new)(headers, **tags[1])
+        )
+        site.add(path, new)
+        page = blog(f'<csplat-view src="{path}"></csplat-view>')
+        kind, report = told(tab)
+        assert ("error", "replaced", False) == (kind, report["reason"], report["fatal"])
+        assert "the file was replaced on the server" in report["message"]
+        assert 6500 == told(tab)[1]["splatCount"]
+        assert page.evaluate("document.querySelector('csplat-view').shadowRoot.querySelector('#error').hidden")
+
+
+@pytest.mark.browser
+def test_servers_that_fail_once_or_send_coded_bodies_suffice(tab, site, blog):
+    data = site._files["/scene.csplat"]
+    right = rights(data)
+    coded = {"Content-Encoding": "gzip"}
+    cases = {
+        "busy": lambda headers, number: (503, {"Retry-After": "0"}, b"") if number == 1 else right(headers),
+        "coded": lambda *_: (200, coded, gzip.compress(data)),
+        "coded_parts": lambda headers, _: (
+            (206, {**right(headers)[1], **coded}, data[:50])
+            if headers.get("Range")
+            else (200, coded, gzip.compress(data))
+        ),
+    }
+    for name, script in cases.items():
+        site.scripts[f"/{name}.csplat"] = script
+        site.add(f"/{name}.csplat", data)
+        blog(f'<csplat-view src="/{name}.csplat"></csplat-view>')
+        kinds = [told(tab)]
+        while kinds[-1][0] == "error":
+            assert not kinds[-1][1]["fatal"], kinds
+            kinds.append(told(tab))
+        assert 60 == kinds[-1][1]["splatCount"]
+    tab.problems.clear()  # the browser reports the status, and coded bodies
+
+
+@pytest.mark.browser
+def test_a_blob_may_be_revoked_at_once(tab, blog):
+    page = blog('<br style="line-height:300vh"><csplat-view></csplat-view>', policy="")
+    page.evaluate(
+        """fetch('/scene.csplat').then((response) => response.blob()).then((blob) => {
+          const view = document.querySelector('csplat-view');
+          const url = URL.createObjectURL(blob);
+          view.src = url;
+          URL.revokeObjectURL(url);
+          view.scrollIntoView();
+        })"""
+    )
+    assert 60 == told(tab)[1]["splatCount"]
+
+
+@pytest.mark.browser
+def test_a_policy_of_trusted_types_allows_the_worker_by_its_name(tab, blog):
+    types = "; require-trusted-types-for 'script'; trusted-types"
+    blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{POLICY}{types} csplat")
+    assert 60 == told(tab)[1]["splatCount"]
+    blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{POLICY}{types} 'none'")
+    report = told(tab)[1]
+    assert ("E_WORKER", True) == (report["code"], "trusted-types" in report["message"])
+    tab.problems.clear()  # the browser reports what a policy forbids
+
+
+@pytest.mark.browser
+def test_a_page_from_disk_says_what_to_do(tab, tmp_path):
+    (tmp_path / "csplat-view.js").write_bytes(export_element())
+    (tmp_path / "page.html").write_text(
+        f"<!doctype html><script>{RECORD}</script><script src=csplat-view.js></script>"
+        '<csplat-view src="scene.csplat"></csplat-view>'
+    )
+    tab.page.goto((tmp_path / "page.html").as_uri())
+    report = told(tab)[1]
+    assert ("E_INPUT", "local", True) == (report["code"], report["reason"], report["fatal"])
+    assert "csplat export-html" in tab.page.inner_text("csplat-view [role=alert]")
+    tab.problems.clear()  # the browser reports the access
+
+
+@pytest.mark.slow
+def test_the_script_is_written_once(tmp_path):
+    out = tmp_path / "csplat-view.js"
+    call("export-element", out)
+    assert out.read_bytes() == export_element()
+    assert export_element().isascii()
+    said = re.search(r"self-contained script \((\d+) kB, (\d+) kB gzipped\)", TEXT)
+    assert [pytest.approx(int(kilobytes), rel=0.05) for kilobytes in said.groups()] == [
+        len(data) / 1000 for data in (export_element(), gzip.compress(export_element()))
+    ]
+    assert "--force replaces it" in call("export-element", out, status=1).stderr
+    wrong = invoke("export-element", "scene.csplat")
+    assert "did you mean `csplat export-element scene.js`" in wrong.stderr

@@ -1,0 +1,576 @@
+import errno
+import gzip
+import io
+import json
+import os
+import pty
+import resource
+import select
+import stat
+import subprocess
+import sys
+import tempfile
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import typer
+from cli_cases import PROGRAM, call, damaged_ply, invoke, refused, status_of
+from large_cases import COUNT, FAST, EveryFourth, encode_large
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from csplat import decode, read_ply, write_ply
+from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.scene_source import source_from_model
+from csplat_tools.cli.app import app
+
+
+@pytest.fixture
+def ply(tmp_path, make_model):
+    path = tmp_path / "scene.ply"
+    write_ply(path, make_model(200, 2))
+    return path
+
+
+@pytest.fixture(scope="module")
+def encoded_once():
+    """Return the files that `encode` writes for `ply`, by name; the first test that needs them fills it."""
+    return {}
+
+
+@pytest.fixture
+def csplat_file(tmp_path, ply, encoded_once):
+    names = ("scene.csplat", "index.npy")
+    if not encoded_once:
+        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
+        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
+    for name, data in encoded_once.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path / names[0]
+
+
+@pytest.fixture(autouse=True)
+def no_estimated_up(monkeypatch):
+    """Estimate no up direction after encoding, which takes longer than encoding small scenes."""
+    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
+
+
+def program(*words, **options):
+    return subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, check=False, **options)
+
+
+@contextmanager
+def limited_files(size):
+    """Let files have a limited size, as on a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_reports_as_json(tmp_path, ply):
+    out = tmp_path / "out.csplat"
+    report = json.loads(call("encode", ply, out, "--json", "--preset", "fast"))
+    size = out.stat().st_size
+    assert (200, size, size / 200) == (report["splats"], report["size_bytes"], report["bytes_per_splat"])
+    assert report["ratio"] == ply.stat().st_size / size
+    assert {"means", "covariance", "opacities", "sh0", "sh1", "sh2"} == set(report["stated_errors"])
+    assert report["options"]["asked"] == {"preset": "fast"}
+    quiet = invoke("encode", ply, out, "--quiet", "--force")
+    assert (quiet.stdout, quiet.stderr) == ("", "")
+
+
+def commands():
+    """Yield the names and commands of the program."""
+    group = get_command(app)
+    context = typer.Context(group, info_name="csplat")
+    for name in group.list_commands(context):
+        one = group.get_command(context, name)
+        for inner, each in getattr(one, "commands", {"": one}).items():
+            yield f"{name} {inner}".split(), each
+
+
+COMMON = {"--force", "--report", "--json", "--quiet", "--help-all"}
+
+
+def test_every_command_has_the_five_common_options_and_help_for_all(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    count = 0
+    for name, command in commands():
+        options = [one for one in command.params if one.param_type_name == "option"]
+        spelt = [{*one.opts, *one.secondary_opts} for one in options]
+        assert COMMON <= set().union(*spelt), name
+        assert [] == [one.opts for one in options if not one.help], name
+        count += sum(not one & COMMON for one in spelt)
+        hidden = [one.opts[0] for one in options if one.hidden]
+        if name == ["encode"]:
+            shown, everything = call(*name, "--help"), call(*name, "--help-all")
+            assert [] == [one for one in hidden if one not in everything]
+            assert "--threads" in hidden
+            assert "--threads" not in shown
+    assert count <= 150
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--preset", "slow"),
+        ("--sh-degree", "5"),
+        ("--up", "0,0,0"),
+        ("--max-psnr-drop", "much"),
+        ("--memory", "1GB", "--keep", "0.5"),
+        ("--no-prune",),
+        ("--no-such-option",),
+        ("--json", "-"),
+    ],
+)
+def test_wrong_options_are_usage_errors(tmp_path, ply, words):
+    target = [] if "-" in words else [tmp_path / "out.csplat"]
+    line = refused("encode", ply, *target, *words, status=2)
+    assert line.startswith("error: csplat encode: ")
+    assert line.endswith("; `csplat encode --help` lists the options (E_USAGE)\n")
+    assert not (tmp_path / "out.csplat").exists()
+
+
+def test_encode_takes_metadata_that_a_ply_lacks(tmp_path, ply):
+    metadata = ("--up", "z", "--unit-metres", "0.5", "--antialiased", "--licence", "CC0")
+    call("encode", ply, tmp_path / "out.csplat", *metadata)
+    model = decode(tmp_path / "out.csplat")
+    assert ([0, 0, 1], "CC0") == (model.metadata["up"], model.metadata["licence"])
+    assert (0.5, True) == (model.unit_metres, model.antialiased)
+
+
+def test_repairs_are_reported_even_if_quiet(tmp_path, make_model):
+    source = tmp_path / "extra.ply"
+    write_ply(source, make_model(20, 0, extra={"object_id": np.arange(20, dtype=np.int32)}))
+    quiet = invoke("encode", source, tmp_path / "q.csplat", "--quiet")
+    assert "extra-columns" in quiet.stderr
+    assert 1 == len(quiet.stderr.splitlines())
+    call("encode", source, tmp_path / "c.csplat", "--keep-extra")
+    assert sorted(decode(tmp_path / "c.csplat").extra["object_id"]) == list(range(20))
+
+
+def test_encode_reports_lengths_of_rotations_that_no_training_produces(tmp_path, ply):
+    line = "1 rotation not of unit length"
+    for length, reported in ((0.3, False), (5.0, False), (1e-6, True), (1e6, True)):
+        data = bytearray(ply.read_bytes())
+        data[-16:] = np.array([length, 0, 0, 0], "<f4").tobytes()  # the last rotation
+        ply.write_bytes(data)
+        encoded = invoke("encode", ply, tmp_path / "out.csplat", "--preset", "fast", "--force")
+        assert (length, reported) == (length, line in encoded.stderr)
+        assert line in call("lint", ply)
+
+
+def test_a_command_replaces_none_of_its_own_files(tmp_path, ply, csplat_file):
+    weights, out = tmp_path / "weights.npy", tmp_path / "out.csplat"
+    np.save(weights, np.ones(5))
+    before = [path.read_bytes() for path in (ply, csplat_file, weights)]
+    for words in (("encode", ply, ply), ("decode", csplat_file, csplat_file), ("encode", ply, weights)):
+        line = refused(*words, *(("--importance", weights) if weights in words else ()), "--force")
+        assert "is the input" in line
+    assert before == [path.read_bytes() for path in (ply, csplat_file, weights)]
+    assert "two outputs" in refused("encode", ply, out, "--source-index", tmp_path / "." / "out.csplat")
+    assert not out.exists()
+
+
+def test_importance_is_taken_from_a_file(tmp_path, ply):
+    weights = tmp_path / "weights.npy"
+    np.save(weights, np.linspace(0, 1, 200))
+    call("encode", ply, tmp_path / "out.csplat", "--importance", weights)
+    for wrong, message in (
+        (np.ones(3), "importance"), (np.array([{}], dtype=object), ""), (None, "weights.npy is not a NumPy array file"),
+    ):  # fmt: skip
+        weights.write_text("not an array") if wrong is None else np.save(weights, wrong, allow_pickle=True)
+        assert message in refused("encode", ply, tmp_path / "no.csplat", "--importance", weights, "--quiet")
+
+
+def test_decodes_absolute_positions(tmp_path, make_model):
+    model = make_model(20, 0, origin=(1e7, -2e6, 3.0))
+    write_ply(tmp_path / "geo.ply", model)
+    call("encode", tmp_path / "geo.ply", tmp_path / "geo.csplat")
+    call("decode", tmp_path / "geo.csplat", tmp_path / "abs.ply", "--absolute")
+    absolute, relative = read_ply(tmp_path / "abs.ply"), decode(tmp_path / "geo.csplat")
+    assert absolute.origin == relative.origin == model.origin
+    np.testing.assert_array_equal(absolute.means, relative.means)
+    assert b"property double x" in (tmp_path / "abs.ply").read_bytes()
+
+
+@pytest.mark.parametrize("command", ["encode", "decode"])
+def test_replaces_nothing_without_force(tmp_path, ply, csplat_file, command):
+    source = ply if command == "encode" else csplat_file
+    target = tmp_path / "there"
+    target.write_text("precious")
+    assert "--force" in refused(command, source, target)
+    assert target.read_text() == "precious"
+    call(command, source, target, "--force")
+    assert target.read_bytes() != b"precious"
+
+
+def test_files_have_the_usual_permissions(csplat_file):
+    mask = os.umask(0o022)
+    os.umask(mask)
+    assert csplat_file.stat().st_mode & 0o777 == 0o666 & ~mask
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (("encode", "absent.ply", "out.csplat"), "absent.ply: No such file"),
+        (("decode", "absent.csplat", "out.ply"), "absent.csplat: No such file"),
+        (("info", "absent.csplat"), "No such file"),
+        (("verify", "absent.csplat"), "No such file"),
+        (("lint", "absent.ply"), "No such file"),
+        (("info", "."), "is a folder, not a scene"),
+        (("encode", "scene.ply", "."), "is a folder"),
+        (("encode", "scene.ply", "no/such/folder/out.csplat"), "No such file"),
+    ],
+)
+def test_absent_files_are_refused_in_one_line(tmp_path, ply, monkeypatch, words, part):
+    assert ply.name == "scene.ply"
+    monkeypatch.chdir(tmp_path)
+    assert part in refused(*words)
+
+
+def test_a_full_disk_leaves_the_old_file_and_the_error_names_it(tmp_path, ply, monkeypatch):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    old = folder / "old.csplat"
+    old.write_text("precious")
+    with limited_files(1000):
+        line = refused("encode", ply, old, "--force")
+    assert line.startswith(f"error: {old}: File too large; no partial file was left")
+    assert line.endswith("(EFBIG)\n")
+
+    def fail(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    assert "No space left" in refused("encode", ply, old, "--force", "--quiet")
+    assert [old] == list(folder.iterdir())
+    assert old.read_text() == "precious"
+
+
+def test_the_default_output_is_next_to_its_source(tmp_path, ply):
+    call("encode", ply)
+    call("export-html", tmp_path / "scene.csplat")
+    assert {"scene.ply", "scene.csplat", "scene.html"} <= {one.name for one in tmp_path.iterdir()}
+    assert "scene.ply exists" in refused("decode", tmp_path / "scene.csplat")
+    assert "expected an output" in refused("encode", "-", status=2)
+
+
+def test_unreadable_formats_are_refused_with_a_converter(tmp_path):
+    path = tmp_path / "a.lcc"
+    path.write_bytes(bytes(60))
+    for words in [("encode", path, tmp_path / "out.csplat"), ("lint", path), ("info", path)]:
+        line = refused(*words)
+        assert line.startswith("error: a.lcc is LCC, which csplat does not read: convert it to PLY first, with splat-t")
+        assert line.endswith("(E_INPUT)\n")
+    (tmp_path / "a.spz").write_bytes(gzip.compress(b"NGSP" + bytes(60)))
+    for words in [("decode", tmp_path / "a.spz", tmp_path / "out.ply"), ("verify", tmp_path / "a.spz")]:
+        assert "convert it with `csplat encode`" in refused(*words)
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("encode", "scene.ply", "out.ply"), "csplat encode scene.ply out.csplat"),
+        (("encode", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
+        (("encode", "scene.ply", "page.html"), "csplat export-html scene.ply page.html"),
+        (("encode", "scene.ply", "out.spz"), "csplat convert scene.ply out.spz"),
+        (("decode", "scene.csplat", "out.csplat"), "csplat decode scene.csplat out.ply"),
+        (("decode", "scene.ply", "out.csplat"), "csplat encode scene.ply out.csplat"),
+        (("export-html", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
+        (("render", "scene.ply", "out.ply", "--orbit", "2"), "csplat render scene.ply out.webp"),
+        (("lint", "scene.ply", "--fix", "out.csplat"), "csplat encode scene.ply out.csplat"),
+        (("info", "scene.csplat", "--page", "out.png"), "--page out.html"),
+        (("tradeoff", "scene.ply", "-o", "out.png"), "-o out.html"),
+        (("encode", "scene.ply", "out.csplat", "--report", "out.csv"), "--report out.json"),
+    ],
+)
+def test_a_name_of_another_kind_is_refused_with_a_suggestion(tmp_path, ply, csplat_file, monkeypatch, words, meant):
+    assert {ply.name, csplat_file.name} == {"scene.ply", "scene.csplat"}
+    monkeypatch.chdir(tmp_path)
+    assert f"did you mean `{meant}`? (E_INPUT)" in refused(*words)
+    assert {"scene.ply", "scene.csplat", "index.npy"} == {path.name for path in tmp_path.iterdir()}
+
+
+def test_errors_name_the_file_that_was_read(tmp_path, make_model, csplat_file):
+    path = damaged_ply(tmp_path / "bad.ply", make_model)
+    path.write_bytes(path.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n"))
+    line = refused("encode", path, tmp_path / "out.csplat")
+    assert line.startswith(f"error: {path}: missing-columns: no column opacity")
+    (tmp_path / "cut.csplat").write_bytes(csplat_file.read_bytes()[:200])
+    line = refused("compare", csplat_file, tmp_path / "cut.csplat")
+    assert line.startswith(f"error: {tmp_path / 'cut.csplat'}: the file ends too early: E_TRUNCATED")
+    (tmp_path / "none.csplat").write_bytes(b"nothing of ours" * 20)
+    line = refused("decode", tmp_path / "none.csplat", tmp_path / "out.ply")
+    assert line.startswith(f"error: {tmp_path / 'none.csplat'}: not a .csplat file: E_MAGIC at byte 0")
+    assert "`csplat encode` makes one of a PLY" in line
+
+
+def test_errors_of_omitted_bands_are_verified_against_zero(tmp_path, ply):
+    target, index = tmp_path / "d0.csplat", tmp_path / "d0.npy"
+    call("encode", ply, target, "--sh-degree", 0, "--source-index", index)
+    call("verify", target, "--source", ply, "--source-index", index)
+    call("verify", target, "--source", ply)
+
+
+@pytest.mark.slow
+def test_works_in_pipes_and_gives_the_same_bytes_in_every_process(ply, csplat_file):
+    encoded = program("encode", "-", "-", "--quiet", "--threads", 1, input=ply.read_bytes())
+    assert (0, b"", csplat_file.read_bytes()) == (encoded.returncode, encoded.stderr, encoded.stdout)
+
+
+def test_writes_no_binary_to_a_terminal(ply, csplat_file, monkeypatch, capsys):
+    near, far = pty.openpty()
+    with os.fdopen(far, "w") as terminal, os.fdopen(near, "rb", buffering=0) as shown:
+        for words in (("encode", ply, "-"), ("decode", csplat_file, "-")):
+            monkeypatch.setattr(sys, "stdout", terminal)
+            status = status_of(*words)
+            monkeypatch.undo()
+            assert 1 == status
+            assert "terminal" in capsys.readouterr().err
+        assert not select.select([shown], [], [], 0)[0]
+
+
+@pytest.mark.slow
+def test_a_replaced_output_keeps_its_permissions(tmp_path, ply, csplat_file):
+    page, folder = tmp_path / "page.html", tmp_path / "streamed" / "lod-meta.json"
+    report, modes = tmp_path / "report.json", (0o640, 0o755, 0o400, 0o2660)
+    outputs = {
+        csplat_file: ("encode", ply, csplat_file, "--preset", "fast"),
+        page: ("info", csplat_file, "--page", page),
+        tmp_path / "back.ply": ("decode", csplat_file, tmp_path / "back.ply"),
+        report: ("lint", ply, "--report", report),
+    }
+    for output, words in outputs.items():
+        for mode in (0o600, *(modes if output == report else ())):
+            output.touch()
+            output.chmod(mode)
+            call(*words, "--force", "--quiet")
+            assert mode == stat.S_IMODE(output.stat().st_mode), output
+            assert output.stat().st_size
+            output.chmod(0o600)
+    folder.parent.mkdir()
+    folder.parent.chmod(0o700)
+    for force in ((), ("--force",)):
+        call("convert", ply, folder, "--quiet", *force)
+        assert 0o700 == stat.S_IMODE(folder.parent.stat().st_mode)
+    if os.getuid() == 0:
+        os.chown(page, 65534, 65534)
+        call(*outputs[page], "--force", "--quiet")
+        assert (65534, 65534) == (page.stat().st_uid, page.stat().st_gid)
+
+
+def test_an_output_that_is_a_link(tmp_path, ply, csplat_file):
+    data = csplat_file.read_bytes()
+    link, hard = tmp_path / "link.csplat", tmp_path / "hard.csplat"
+    link.symlink_to(csplat_file.name)
+    hard.hardlink_to(csplat_file)
+    call("encode", ply, link, "--force", "--quiet", "--preset", "fast")
+    assert link.is_symlink()
+    assert data == hard.read_bytes() != csplat_file.read_bytes()
+    new, nowhere = tmp_path / "new.csplat", tmp_path / "nowhere.csplat"
+    link.unlink()
+    link.symlink_to(new)
+    call("encode", ply, link, "--quiet")
+    assert data == new.read_bytes()
+    nowhere.symlink_to(tmp_path / "absent" / "x.csplat")
+    assert f"{nowhere}: No such file" in refused("encode", ply, nowhere)
+
+
+@pytest.mark.slow
+def test_a_loop_of_links_is_an_error_of_one_line(tmp_path, ply, csplat_file):
+    loop, other = tmp_path / "loop", tmp_path / "other"
+    loop.symlink_to(other)
+    other.symlink_to(loop)
+    new = tmp_path / "new"
+    lines = [
+        ("encode", ply, loop), ("encode", ply, loop, "--force"), ("encode", loop, new), ("encode", ply, loop / "new"),
+        ("encode", ply, new, "--report", f"{loop}.json"), ("encode", ply, new, "--source-index", f"{loop}.npy"),
+        ("decode", csplat_file, loop), ("info", loop), ("info", csplat_file, "--page", f"{loop}.html"),
+        ("convert", ply, loop / "lod-meta.json"), ("convert", ply, f"{loop}.sog"), ("convert", loop, new),
+        ("merge", csplat_file, csplat_file, "-o", loop), ("merge", csplat_file, loop, "-o", new), ("lint", loop),
+        ("extract", csplat_file, loop, "--box", "0,0,0,1,1,1"), ("verify", csplat_file, "--source", loop),
+        ("compare", ply, loop), ("render", ply, loop, "--orbit", 1), ("view", loop), ("export-html", loop, new),
+        ("export-html", csplat_file, loop), ("export-element", loop),
+    ]  # fmt: skip
+    for ending in (".json", ".npy", ".html", ".sog"):
+        tmp_path.joinpath(f"loop{ending}").symlink_to(f"loop{ending}")
+    before = sorted(tmp_path.rglob("*"))
+    for words in lines:
+        line = refused(*words)
+        assert "loop" in line, words
+        assert "(ELOOP)" in line, words
+        assert before == sorted(tmp_path.rglob("*")), words
+
+
+@pytest.mark.slow
+def test_names_may_be_as_long_as_the_file_system_allows(tmp_path, ply, csplat_file, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for letter, count in (("n", 255), ("n", 230), ("ö", 126), ("\U0001f600", 62)):
+        for ending, words in ((".csplat", ["encode", ply]), (".html", ["info", csplat_file, "--page"])):
+            name = letter * (count - len(os.fsencode(ending)) // len(os.fsencode(letter))) + ending
+            call(*words, name, "--quiet")
+            call(*words, name, "--quiet", "--force")
+            longer = letter * 30 + name
+            assert f"{longer}: File name too long; choose a shorter name" in refused(*words, longer)
+    call("encode", ply, f"{'n' * 248}.csplat", "--force", "--memory", "1GB", "--quiet")  # has a folder .work
+    assert [] == [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="reading this file of Linux fails with EIO")
+def test_a_read_error_names_the_input(tmp_path, ply, csplat_file):
+    bad, new = Path("/proc/self/mem"), tmp_path / "new"
+    lines = [
+        ("encode", bad, new), ("decode", bad, new), ("convert", bad, f"{new}.ply"), ("info", bad), ("lint", bad),
+        ("verify", bad), ("verify", csplat_file, "--source", bad), ("compare", ply, bad), ("compare", bad, ply),
+        ("merge", csplat_file, bad, "-o", new), ("extract", bad, new, "--box", "0,0,0,1,1,1"), ("view", bad),
+        ("export-html", bad, new), ("render", bad, new, "--orbit", 1), ("simplify", bad, f"{new}.ply", "--keep", 0.5),
+        ("encode", ply, new, "--importance", bad), ("verify", csplat_file, "--source", ply, "--source-index", bad),
+        ("encode", bad, "-"),
+    ]  # fmt: skip
+    before = sorted(tmp_path.iterdir())
+    for words in lines:
+        line = refused(*words)
+        assert f"{bad}: Input/output error" in line, words
+        assert "standard output" not in line
+    assert before == sorted(tmp_path.iterdir())
+
+
+class FailingInput(io.BytesIO):
+    """A file that fails in the middle."""
+
+    def read(self, size=-1, /):
+        if size < 0 or self.tell():
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().read(min(size, 1000))
+
+    read1 = read
+
+
+def test_commands_read_standard_input_and_name_it(ply, csplat_file, monkeypatch, capsys):
+    data = csplat_file.read_bytes()
+    encoded = invoke("encode", "-", "-", input=ply.read_bytes())
+    assert (0, data) == (encoded.exit_code, encoded.stdout_bytes)
+    for name in ("info", "verify"):
+        assert call(name, csplat_file).partition("\n")[2] == call(name, "-", input=data).partition("\n")[2]
+    back = invoke("decode", "-", "-", "--quiet", input=data)
+    assert (0, b"") == (back.exit_code, back.stderr_bytes)
+    assert json.loads(call("lint", "-", "--json", input=back.stdout_bytes))["clean"]
+    assert "standard input" in invoke("encode", "-", "-", input=b"nonsense").stderr
+    for words, path in ((("encode", "-", "-"), ply), (("lint", "-"), ply), (("info", "-"), csplat_file)):
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "stdin", SimpleNamespace(buffer=FailingInput(path.read_bytes())))
+            assert 1 == status_of(*words)
+        assert "error: standard input: Input/output error" == capsys.readouterr().err.partition(";")[0]
+
+
+def test_a_full_folder_of_temporary_files_is_named(tmp_path, ply, csplat_file, monkeypatch):
+    with limited_files(1000):
+        results = [
+            invoke("encode", "-", "-", input=ply.read_bytes()),
+            invoke("merge", csplat_file, csplat_file, "-o", tmp_path / "new.csplat"),
+            invoke("convert", ply, tmp_path / "new.csplat"),
+        ]
+    for result, name in zip(results, (f"temporary files in {tempfile.gettempdir()}", "", "new.csplat"), strict=True):
+        assert (1, 1) == (result.exit_code, result.stderr.count("\n"))
+        assert f"{name}: File too large" in result.stderr
+    assert "TMPDIR names another folder (EFBIG)" in results[0].stderr
+    assert not (tmp_path / "new.csplat").exists()
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    with limited_files(0):  # no folder passes the test of the module
+        result = invoke("encode", "-", "-", input=ply.read_bytes())
+    assert result.stderr.startswith("error: No usable temporary directory")
+    assert "set TMPDIR to a folder that can be written (E_INPUT)" in result.stderr
+
+
+def test_control_characters_of_names_do_not_reach_the_terminal(tmp_path, ply):
+    name = "a\x1b[31m\x07\x9b\nb"
+    path = tmp_path / f"{name}.ply"
+    path.write_bytes(ply.read_bytes())
+    result = invoke("encode", path, tmp_path / "new.csplat")
+    shown = result.stderr + refused("info", tmp_path / f"{name}.absent")
+    assert [] == [letter for letter in shown if not letter.isprintable() and letter != "\n"]
+    assert "a\\x1b[31m\\x07\\x9b" in shown
+
+
+@pytest.mark.parametrize("digits", ["9" * 5000, "9" * 400 + "M", "١", "²"])
+def test_numbers_of_any_length_are_refused(ply, tmp_path, digits):
+    for words in (("encode", ply, tmp_path / "b.csplat", "--levels"), ("convert", ply, tmp_path / "b.ply", "--level")):
+        refused(*words, digits, status=2)
+
+
+@pytest.fixture(scope="module")
+def model(sample_path):
+    sample, rng = read_ply(sample_path), np.random.default_rng(5)
+    many = sample.select(rng.integers(0, len(sample), COUNT))
+    means = many.means + rng.normal(0, 0.05, many.means.shape).astype(np.float32)
+    extra = {"confidence": np.arange(COUNT, dtype=np.uint16)}
+    return replace(many, means=means, extra=extra, metadata={"licence": "CC0"})
+
+
+@pytest.fixture(scope="module")
+def with_levels(model, tmp_path_factory):
+    """The file of the scene with levels of detail."""
+    path = tmp_path_factory.mktemp("levels") / "out.csplat"
+    encode_large(source_from_model(model), path, FAST, levels=EveryFourth())
+    return path.read_bytes()
+
+
+@pytest.fixture
+def ply_of_large(model, tmp_path):
+    write_ply(tmp_path / "scene.ply", replace(model, extra={}, metadata={}))
+    return tmp_path / "scene.ply"
+
+
+def test_the_command_passes_out_of_core_options(ply_of_large, tmp_path, monkeypatch):
+    target, limits = tmp_path / "out.csplat", []
+
+    def encode_here(scene, target, options, asked, **others):
+        limits.append(asked)
+        return encode_scene(scene, target, options, asked, **others)
+
+    monkeypatch.setattr("csplat_tools.encode_file.encode_scene", encode_here)
+    run = CliRunner().invoke
+    dry = run(app, ["encode", str(ply_of_large), str(target), "--memory", "300MB", "--dry-run", "--json"])
+    assert 0 == dry.exit_code
+    cost = json.loads(dry.stdout)
+    assert (COUNT, 3, True) == (cost["splats"], cost["sh_degree"], cost["in_memory"])
+    assert not target.exists()
+    words = ["--memory", "300MB", "--resume", "--preset", "fast", "--quiet"]
+    done = run(app, ["encode", str(ply_of_large), str(target), *words])
+    assert 0 == done.exit_code, done.output
+    assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == limits
+    refused = run(app, ["encode", str(ply_of_large), str(target), "--resume", "--target-psnr", "40", "--force"])
+    assert 2 == refused.exit_code
+
+
+def test_a_large_scene_needs_little_memory_unless_levels_are_requested(model, tmp_path):
+    """The splats of this file are a hole in it; an estimate does not read them."""
+    ply_of_large = tmp_path / "large.ply"
+    write_ply(ply_of_large, replace(model.select(slice(1)), extra={}, metadata={}))
+    header, _, splat = ply_of_large.read_bytes().partition(b"end_header\n")
+    header = header.replace(b"element vertex 1\n", b"element vertex 3000000\n") + b"end_header\n"
+    ply_of_large.write_bytes(header)
+    os.truncate(ply_of_large, len(header) + 3_000_000 * len(splat))
+    words = ["encode", str(ply_of_large), "--dry-run", "--json", "--memory"]
+    small, large = (CliRunner().invoke(app, [*words, size]) for size in ("500MB", "8GB"))
+    assert (0, 0) == (small.exit_code, large.exit_code), small.output
+    assert 400_000_000 < json.loads(small.stdout)["memory_bytes"] <= 500_000_000
+    assert "" == small.stderr  # the levels do not fit
+    with_levels = CliRunner().invoke(app, [*words, "8GB", "--levels", "auto"])
+    cost, more = json.loads(large.stdout), json.loads(with_levels.stdout)
+    assert 1.35 == pytest.approx(more["file_bytes"] / cost["file_bytes"], abs=0.001)
+    assert more["seconds"] > cost["seconds"]
+    assert large.stderr.startswith(
+        "viewers show a scene of 3,000,000 splats sooner with levels of detail: --levels auto"
+    )
+    assert large.stderr.endswith(" more, 35 % more bytes)\n")
+    assert "" == with_levels.stderr == CliRunner().invoke(app, [*words, "8GB", "--quiet"]).stderr

@@ -1,0 +1,109 @@
+import json
+import os
+import sys
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from cli_cases import call, refused, status_of
+
+from csplat import read_ply, write_ply
+from csplat_conformance.manifest import VECTORS
+
+
+@pytest.fixture
+def ply(tmp_path, make_model):
+    path = tmp_path / "scene.ply"
+    write_ply(path, make_model(200, 2))
+    return path
+
+
+@pytest.fixture(scope="module")
+def encoded_once():
+    """Return the files that `encode` writes for `ply`, by name; the first test that needs them fills it."""
+    return {}
+
+
+@pytest.fixture
+def csplat_file(tmp_path, ply, encoded_once):
+    names = ("scene.csplat", "index.npy")
+    if not encoded_once:
+        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
+        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
+    for name, data in encoded_once.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path / names[0]
+
+
+@pytest.fixture(autouse=True)
+def no_estimated_up(monkeypatch):
+    """Estimate no up direction after encoding, which takes longer than encoding small scenes."""
+    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
+
+
+@pytest.mark.parametrize("name", ["info", "verify", "lint", "decode"])
+def test_the_report_is_what_json_prints(tmp_path, csplat_file, ply, name):
+    words = {"lint": (ply,), "decode": (csplat_file, tmp_path / "back.ply")}.get(name, (csplat_file,))
+    printed = call(name, *words, "--json", "--report", tmp_path / "report.json")
+    assert json.loads(printed) == json.loads((tmp_path / "report.json").read_text())
+    assert "exists: --force replaces it" in refused(name, *words, "--report", tmp_path / "report.json")
+
+
+def test_an_empty_scene_round_trips(tmp_path, make_model):
+    source, file = tmp_path / "empty.ply", tmp_path / "empty.csplat"
+    write_ply(source, make_model(0, 1))
+    assert json.loads(call("encode", source, file, "--json"))["bytes_per_splat"] is None
+    for words in (("info", file), ("verify", file, "--source", source), ("decode", file, tmp_path / "back.ply")):
+        call(*words)
+    assert len(read_ply(tmp_path / "back.ply")) == 0
+
+
+def test_a_full_standard_output_is_one_line(csplat_file, monkeypatch, capsys):
+    line = "error: standard output: No space left on device; the output is incomplete (ENOSPC)\n"
+    for words in (("info", csplat_file), ("--version",)):
+        full = Path("/dev/full").open("w", encoding="utf-8")  # noqa: SIM115  # what closes it fails as well
+        monkeypatch.setattr(sys, "stdout", full)
+        status = status_of(*words)
+        monkeypatch.undo()
+        with suppress(OSError):
+            full.close()
+        assert (1, line) == (status, capsys.readouterr().err)
+    assert refused("decode", csplat_file, "/dev/full").startswith("error: /dev/full: No space left")
+
+
+def test_a_url_instead_of_a_file_is_reported(tmp_path):
+    for words in (["info"], ["lint"], ["encode"]):
+        line = refused(words[0], "https://example.com/a/b.ply", *[tmp_path / "c.csplat"][: words == ["encode"]])
+        assert line.startswith("error: https://example.com/a/b.ply is a URL, expected a file: download it first")
+
+
+def test_info_accounts_for_every_byte_and_prints_text(tmp_path, csplat_file):
+    described = json.loads(call("info", csplat_file, "--json"))
+    attributes = sum(one["size_bytes"] for one in described["attributes"].values())
+    assert attributes + sum(described["overhead"].values()) == csplat_file.stat().st_size == described["size_bytes"]
+    assert list(described["attributes"]) == ["opacities", "scales", "quats", "means", "sh0", "sh1", "sh2"]
+    assert list(described["layers"]) == ["geometry", "sh1", "sh2"]
+    assert described["stated_errors"]["source_splats"] == 200
+    assert described["options"]["asked"]["preset"] == "balanced"
+    assert "splats       200, SH degree 2" in call("info", csplat_file)
+    data = csplat_file.read_bytes()
+    for wrong, code in ((data[:1], "wrong is"), (data[:-1], "E_TRUNCATED"), (data + b"x", "E_TRAILING")):
+        (tmp_path / "wrong").write_bytes(wrong)
+        assert code in refused("info", tmp_path / "wrong")
+
+
+def test_a_closed_pipe_is_no_traceback(csplat_file, monkeypatch, capsys):
+    near, far = os.pipe()
+    os.close(near)
+    with os.fdopen(far, "w") as pipe:
+        monkeypatch.setattr(sys, "stdout", pipe)
+        status = status_of("info", csplat_file, "--json")
+        monkeypatch.undo()
+        assert (1, "") == (status, capsys.readouterr().err)
+        pipe.write("what the interpreter flushes when it ends")
+
+
+def test_a_file_with_too_much_metadata_is_not_called_a_large_scene():
+    line = refused("info", VECTORS / "invalid" / "json_values_beyond_budget.csplat")
+    assert "its metadata or cameras take more memory than is allowed here" in line
+    assert "Limits(json_bytes=...)" in line

@@ -1,0 +1,365 @@
+"""The Python interface: names, imports, errors, `SplatModel`, forms of files, and the commands that call it."""
+
+from __future__ import annotations
+
+import doctest
+import gzip
+import io
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import csplat
+import csplat_render
+import csplat_tools
+import csplat_tools.level_builder
+import csplat_trainer
+from csplat.errors import CsplatError, InputError
+from csplat.model import SplatModel, normalise_quats
+from csplat.plugins import load_plugins
+from csplat_tools.cli.app import app
+
+
+@pytest.fixture
+def files(make_model, tmp_path):
+    """A ball as a model, a PLY and a .csplat file."""
+    model = make_model(60, 1, scales=np.full((60, 3), -1.5, np.float32))
+    model = replace(model, means=model.means / np.linalg.norm(model.means, axis=1, keepdims=True))
+    csplat.write_ply(tmp_path / "scene.ply", model)
+    (tmp_path / "scene.csplat").write_bytes(csplat.encode(model))
+    return model, tmp_path / "scene.ply", tmp_path / "scene.csplat"
+
+
+FORMS = {
+    "str": str,
+    "path": lambda path: path,
+    "bytes": lambda path: path.read_bytes(),
+    "bytearray": lambda path: bytearray(path.read_bytes()),
+    "memoryview": lambda path: memoryview(path.read_bytes()),
+    "BytesIO": lambda path: io.BytesIO(path.read_bytes()),
+    "gzip": lambda path: gzip.GzipFile(fileobj=io.BytesIO(gzip.compress(path.read_bytes()))),
+}
+
+
+def assert_same(a, b):
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert np.array_equal(getattr(a, name), getattr(b, name)), name
+
+
+def test_every_listed_name_exists():
+    for package in (csplat, csplat_render, csplat_tools, csplat_trainer):
+        assert set(package.__all__) <= set(dir(package))
+        assert all(getattr(package, name) is not None for name in package.__all__)
+    assert sorted(csplat.__all__) == dir(csplat)
+    with pytest.raises(AttributeError, match="no attribute 'nonsense'"):
+        csplat.nonsense  # noqa: B018 -- the access is the test
+
+
+@pytest.fixture(scope="module")
+def documented(tmp_path_factory, sample_path):
+    """A folder with the files of the examples."""
+    folder = tmp_path_factory.mktemp("documented")
+    model = csplat.read_ply(sample_path).select(slice(0, 1000))
+    csplat.write_ply(folder / "scene.ply", model)
+    (folder / "scene.csplat").write_bytes(csplat.encode(model, csplat.EncodeOptions(preset="fast")))
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("package", [csplat, csplat_render, csplat_tools])
+def test_examples_of_the_documentation_run(package, documented, monkeypatch):
+    monkeypatch.chdir(documented)
+    shown = {id(one): one for one in (package, *(getattr(package, name) for name in package.__all__))}
+    examples = 0
+    for one in shown.values():
+        for test in doctest.DocTestFinder(recurse=False).find(one, getattr(one, "__name__", "?"), globs={}):
+            assert 0 == doctest.DocTestRunner().run(test).failed, test.name
+            examples += len(test.examples)
+    assert examples >= 3
+
+
+@pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
+def test_files_may_be_paths_streams_or_bytes(files, form):
+    model, ply, coded = files
+    assert_same(csplat.read_ply(ply), csplat.read_ply(form(ply)))
+    assert_same(csplat.decode(coded.read_bytes()), csplat.decode(form(coded)))
+    assert len(model) == csplat.read_header(form(coded)).splat_count
+    assert csplat.lint_ply(ply) == csplat.lint_ply(form(ply))
+    for path in (ply, coded):
+        loaded = csplat_tools.load_model(form(path))
+        assert (len(model), path.stat().st_size) == (len(loaded.model), loaded.size_bytes)
+
+
+def test_open_files_are_written_read_from_their_position_and_named(files, tmp_path):
+    model, ply, _ = files
+    stream = io.BytesIO()
+    csplat.write_ply(stream, model)
+    assert ply.read_bytes() == stream.getvalue()
+    stream = io.BytesIO(b"before" + ply.read_bytes())
+    stream.seek(6)
+    assert_same(csplat.read_ply(ply), csplat.read_ply(stream))
+    (tmp_path / "wrong.ply").write_bytes(b"nothing of the kind")
+    with (tmp_path / "wrong.ply").open("rb") as stream, pytest.raises(InputError, match=r"wrong\.ply is not a PLY"):
+        csplat.read_ply(stream)
+
+
+def test_other_objects_than_models_are_refused_with_a_remedy(tmp_path):
+    calls = [csplat.encode, csplat.encode_with_report, lambda model: csplat.write_ply(tmp_path / "out.ply", model)]
+    for call in calls:
+        for wrong in ("scene.ply", b"ply", None, 5):
+            with pytest.raises(InputError, match=r"expects a SplatModel.*csplat\.read_ply"):
+                call(wrong)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_preset_in_place_of_options_is_refused_with_a_remedy(files):
+    with pytest.raises(InputError, match=r"EncodeOptions\(preset="):
+        csplat.encode(files[0], "small")
+
+
+def test_files_of_the_other_kind_are_typed_errors(files):
+    _, ply, coded = files
+    for call, wrong in ((csplat.read_ply, coded), (csplat.decode, ply)):
+        for form in FORMS.values():
+            with pytest.raises(CsplatError):
+                call(form(wrong))
+    with pytest.raises(csplat.FormatError, match=r"a PLY, which csplat\.read_ply reads"):
+        csplat.decode(ply)
+
+
+@pytest.mark.slow
+def test_the_program_starts_without_extras_and_names_missing_ones(files):
+    code = f"""
+import sys
+from csplat_tools.cli.app import app
+app(["--help"], standalone_mode=False)  # which imports every command
+assert "csplat_tools.cli.render" in sys.modules
+loaded = {{"numba", "PIL", "scipy", "matplotlib", "torch"}} & set(sys.modules)
+assert not loaded, loaded
+sys.modules["numba"] = None
+import csplat, csplat_render, csplat_tools, csplat_trainer
+from csplat_render import Camera, render
+from csplat_render.virtual_cameras import virtual_cameras
+assert not {{"scipy", "torch"}} & set(sys.modules)
+path = {str(files[1])!r}
+model = csplat.read_ply(path)
+bounds = csplat.Target(max_error={{"means": 0.01}})
+csplat.encode(model, target=bounds)
+for call in (
+    lambda: csplat.encode(model, target=csplat.Target(psnr=40.0)),
+    lambda: csplat_tools.simplify(path, csplat.Target(keep=0.5)),
+    lambda: csplat_tools.compare(path, path),
+    lambda: csplat_tools.tradeoff(path),
+    lambda: csplat_trainer.train(path),
+    lambda: csplat_trainer.finetune(model, None),
+    lambda: csplat_render.render(model, virtual_cameras(model, 1, 8, 8)[0]),
+):
+    try:
+        call()
+    except csplat.InputError as error:
+        assert "this needs numba: pip install 'csplat[render]'" == str(error), error
+    else:
+        raise SystemExit("nothing was said")
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_a_target_of_largest_errors_needs_no_search(files, tmp_path):
+    model, stages = files[0], []
+    target = csplat.Target(max_error={"means": 0.01})
+    found = csplat.encode_with_report(model, target=target)
+    assert found.data == csplat.encode(model, target=target, progress=lambda *stage: stages.append(stage))
+    assert found.report.search.reached["means"] <= 0.01
+    assert (len(found.data), None) == (found.size_bytes, found.psnr)
+    found.save(tmp_path / "found.csplat")
+    assert found.data == (tmp_path / "found.csplat").read_bytes()
+    assert stages
+    assert all(isinstance(stage, str) and 0.0 <= done <= 1.0 for stage, done in stages)
+
+
+def test_a_search_is_called_by_its_entry_point(files, monkeypatch):
+    from csplat_tools.optimise.target_encoding import meet_target
+
+    assert {"target": meet_target} == load_plugins("csplat.search")
+
+    def search(*given, **named):
+        raise Called(given, named)
+
+    place = "csplat.encoder.encode_api.load_plugins"
+    monkeypatch.setattr(place, lambda group: {"csplat.search": {"target": search}}[group])
+    target, weights = csplat.Target(psnr=40.0), np.ones(60)
+    with pytest.raises(Called) as raised:
+        csplat.encode_with_report(files[0], target=target, views="views", importance=weights)
+    (model, options), named = raised.value.args
+    assert (files[0], csplat.EncodeOptions()) == (model, options)
+    assert {"target": target, "views": "views", "importance": weights, "progress": None} == named
+    monkeypatch.setattr(place, lambda _: {})
+    with pytest.raises(InputError, match=r"no search for targets is installed.*pip install 'csplat\[render\]'"):
+        csplat.encode(files[0], target=target)
+
+
+@pytest.mark.parametrize(("named", "message"), [
+    ({"target": 40.0}, r"target is 40.0, expected csplat\.Target\(psnr=\.\.\.\)"),
+    ({"views": "views"}, "views are given without a target"),
+    ({"target": csplat.Target(psnr=40.0), "metadata": {"a": 1}}, "a target excludes origin and metadata"),
+    ({"target": csplat.Target(psnr=40.0), "options": "small"}, r"EncodeOptions\(preset="),
+])  # fmt: skip
+def test_arguments_that_contradict_a_target_are_refused(files, named, message):
+    with pytest.raises(InputError, match=message):
+        csplat.encode_with_report(files[0], **named)
+
+
+@pytest.fixture(scope="module")
+def views_once():
+    """Place virtual cameras once: all commands get the same scene."""
+    pytest.importorskip("numba", reason="virtual cameras require the extra [render]")
+    from csplat_tools.views import view_sets
+
+    search, known = view_sets.virtual_cameras, {}
+
+    def find(model, *args, **named):
+        key = (*args, *sorted(named.items()))
+        if key not in known:
+            known[key] = search(model, *args, **named)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(view_sets, "virtual_cameras", find)
+        yield
+
+
+class Called(Exception):  # noqa: N818  # not an error
+    """Ends a command when it calls the interface; carries the arguments."""
+
+
+def arguments_of(monkeypatch, module, name, words):
+    """Run a command until it calls a public function; return the arguments."""
+    monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: None)
+
+    def called(*args, **named):
+        raise Called(args, named)
+
+    monkeypatch.setattr(module, name, called)
+    raised = CliRunner().invoke(app, [*words, "--quiet"]).exception
+    assert isinstance(raised, Called), raised
+    return raised.args
+
+
+@pytest.mark.parametrize(("words", "name", "given"), [
+    (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {}),
+    (["compare", "scene.ply", "scene.csplat", "--backend", "fast"], "compare", {"mode": "fast", "backend": "cpu"}),
+    (["tradeoff", "scene.ply", "--what", "presets"], "tradeoff", {"say": None}),
+])  # fmt: skip
+@pytest.mark.usefixtures("views_once")
+def test_commands_call_the_public_functions(files, monkeypatch, words, name, given):
+    monkeypatch.chdir(files[1].parent)
+    (scene, *_), named = arguments_of(monkeypatch, csplat_tools, name, words)
+    assert_same(csplat.read_ply(files[1]), getattr(scene, "model", getattr(scene, "source", scene)))
+    assert given.items() <= named.items()
+
+
+@pytest.mark.parametrize(("words", "target"), [
+    (["--max-error", "means=0.01"], {"max_error": {"means": 0.01}}),
+    (["--target-psnr", "40"], {"psnr": 40.0}),
+    (["--keep", "0.5", "--effort", "1"], {"keep": 0.5, "effort": 1}),
+    (["--target-size", "5kB", "--no-prune"], {"size_bytes": 5000, "prune": False}),
+])  # fmt: skip
+@pytest.mark.usefixtures("views_once")
+def test_encode_calls_the_encoder_with_its_target(files, monkeypatch, words, target):
+    monkeypatch.chdir(files[1].parent)
+    words = ["encode", "scene.ply", "o", *words]
+    (scene, _), named = arguments_of(monkeypatch, csplat_tools.level_builder, "encode_with_report", words)
+    assert_same(csplat.read_ply(files[1]), scene)
+    assert csplat.Target(**target) == named["target"]
+    assert ("max_error" in target) == (named["views"] is None)
+
+
+def test_the_size_of_a_model_is_that_of_a_plain_ply(files):
+    pytest.importorskip("numba", reason="comparing requires the extra [render]")
+    model, ply, coded = files
+    size = ply.stat().st_size - len(ply.read_bytes().partition(b"end_header\n")[0]) - len(b"end_header\n")
+    assert size == csplat_tools.load_model(model).size_bytes
+    loaded = csplat_tools.load_model(coded)
+    assert loaded is csplat_tools.load_model(loaded)
+    assert replace(loaded, size_bytes=1).header == csplat.read_header(coded)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("statement", "unwanted"), [
+    ("import csplat", r"csplat\..*"),
+    ("import csplat, csplat_tools, csplat_trainer", "numba|numpy|typer|rich|torch|csplat_render"),
+    ("import sys; sys.modules['plyfile'] = None; import csplat.decoder; csplat.decode; del sys.modules['plyfile']",
+        r"(plyfile|torch|numba|deflate|typer|rich|csplat_tools|csplat\.(encoder|ply|lint|detect|disk_files)).*"),
+    ("from csplat import read_ply", r"csplat\.(encoder|decoder).*"),
+    ("import csplat_render.rasteriser, csplat_render.reference_rasteriser",
+        r"(torch|csplat_trainer|csplat_tools|plyfile)(\..*)?"),
+], ids=["csplat", "packages", "decoder", "reader", "renderer"])  # fmt: skip
+def test_an_import_loads_no_other_part(statement, unwanted):
+    if "rasteriser" in statement:
+        pytest.importorskip("numba", reason="the renderer requires the extra [render]")
+    code = f"{statement}\nimport sys\nprint(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert [] == [name for name in done.stdout.split() if re.fullmatch(unwanted, name)]
+
+
+def test_fields_have_defaults_and_arrays_are_not_copied(make_model):
+    model = make_model(4, 0)
+    arrays = {name: getattr(model, name) for name in ("means", "quats", "scales", "opacities", "sh0")}
+    bare = SplatModel(**arrays)
+    assert all(getattr(bare, name) is array for name, array in arrays.items())
+    assert (4, 0, (4, 0, 3)) == (len(bare), bare.sh_degree, bare.shN.shape)
+    assert ((0.0, 0.0, 0.0), "unspecified") == (bare.origin, bare.coordinate_system)
+    assert (None, None, False, False) == (bare.unit_metres, bare.cameras, bare.antialiased, bare.flat)
+    assert ({}, {}) == (dict(bare.metadata), dict(bare.extra))
+    assert [0, 1, 2, 3] == [make_model(5, degree).sh_degree for degree in range(4)]
+
+
+@pytest.mark.parametrize(("words", "name", "kind"), [
+    (["train", ".", "out.ply", "--iterations", "3"], "train", "DataSet"),
+    (["finetune", "scene.ply", "out.csplat", "--data", "."], "finetune", "SplatModel"),
+])  # fmt: skip
+def test_train_and_finetune_call_the_public_functions(tmp_path, monkeypatch, words, name, kind):
+    pytest.importorskip("numba", reason="these commands require the extra [render]")
+    pytest.importorskip("scipy", reason="data sets require the extra [render]")
+    from captures import photograph, shell
+
+    monkeypatch.chdir(photograph(shell(3), tmp_path))
+    (given, *_), _ = arguments_of(monkeypatch, csplat_trainer, name, words)
+    assert kind == type(given).__name__
+
+
+def test_values_at_their_limits_are_accepted(make_model):
+    means = np.full((10, 3), 3e38, np.float32)  # their sum overflows
+    assert np.array_equal(make_model(means=means).means, means)
+    assert 2 == len(make_model(2, opacities=np.array([0, 1], np.float32)))
+    assert (1e7, 2.0, 3.0) == make_model(origin=np.array([1e7, 2, 3])).origin
+    for letters in ("RDF", "RUB", "LUF", "FRU", "BLD"):
+        assert letters == make_model(coordinate_system=letters).coordinate_system
+
+
+@pytest.mark.parametrize("index", [slice(2, 5), np.array([4, 1, 1]), np.arange(10) % 3 == 0, slice(0, 0)])
+def test_select_keeps_rows_of_every_array(make_model, index):
+    model = make_model(10, extra={"id": np.arange(10)}, origin=(1.0, 2.0, 3.0), coordinate_system="RDF")
+    part = model.select(index)
+    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+        assert np.array_equal(getattr(part, name), getattr(model, name)[index])
+    assert np.array_equal(part.extra["id"], model.extra["id"][index])
+    assert (model.origin, model.coordinate_system) == (part.origin, part.coordinate_system)
+
+
+def test_normalised_quats_have_unit_length_and_stay_unchanged():
+    rng = np.random.default_rng(1)
+    quats = (rng.standard_normal((10_000, 4)) * rng.choice([1e-30, 1, 1e30], (10_000, 1))).astype(np.float32)
+    once = normalise_quats(quats)
+    length = np.sqrt(np.sum(once.astype(np.float64) ** 2, 1))
+    assert np.abs(length - 1).max() < 2**-23
+    assert np.array_equal(normalise_quats(once), once)
+    extremes = np.array([[0, 0, 0, 0], [3e38, 0, 3e38, 0], [0, 1e-45, 0, 0], [0, 0, 0, -2]], np.float32)
+    half = np.float32(np.sqrt(0.5))
+    expected = [[1, 0, 0, 0], [half, 0, half, 0], [0, 1, 0, 0], [0, 0, 0, -1]]
+    assert np.array_equal(normalise_quats(extremes), np.array(expected, np.float32))
