@@ -22,9 +22,13 @@ PYTEST=("$BIN/python" -m pytest -q -n auto --dist loadfile --no-loadscope-reorde
 # CONTRIBUTING.md has a table of what each marker guards.
 EVERYDAY="not (browser or engines or peers or torch or gpu or remote or long)"
 
+# Two processes, each of which collects and imports half of the tests: workers would collect all of them twice.
 check_tier() {
+    local words=(-m pytest -q -n 0 --maxfail 25 -m "$EVERYDAY and not slow and not shared_data" "$@")
+    background "unmarked tests, codec and suite" "$BIN/python" "${words[@]}" tests/csplat tests/csplat_conformance
     static_checks
-    step "unmarked tests" "${PYTEST[@]}" --maxfail 25 -m "$EVERYDAY and not slow and not shared_data" "$@"
+    step "unmarked tests, others" "$BIN/python" "${words[@]}" tests/csplat_render tests/csplat_trainer tests/csplat_tools tests/system
+    joined
 }
 
 # test_tier EXPRESSION [WORDS...]: EXPRESSION selects tests by their markers.

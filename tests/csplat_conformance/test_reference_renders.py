@@ -8,7 +8,6 @@ import pytest
 from tables import failures
 
 from csplat.errors import InputError
-from csplat_authoring import __main__ as recipes
 from csplat_authoring.recipes.rendered import rendered_recipes
 from csplat_authoring.reference import expected
 from csplat_conformance import reference_renders
@@ -127,33 +126,6 @@ def test_without_a_renderer_pictures_are_skipped_with_a_note(monkeypatch):
     monkeypatch.setattr(reference_renders, "can_render", lambda: False)
     (outcome, _) = run_builtin(DecoderSuiteOptions(pattern="render/ellipsoids", levels=(4,))).outcomes
     assert (Status.SKIPPED, "needs the packages of the extra render") == (outcome.status, outcome.message)
-
-
-@pytest.fixture
-def ellipsoids(monkeypatch):
-    """`--check` of one recipe with pictures, the other files as they are: a step of the gate makes them all."""
-    (recipe,) = [one for one in rendered_recipes() if one.name.endswith("ellipsoids")]
-    made = [path for path in VECTORS.rglob("*") if path.suffix in (".csplat", ".png")]
-    monkeypatch.setattr(
-        recipes, "files", lambda: {path: path.read_bytes() for path in made} | recipes._pictures(recipe)
-    )
-    monkeypatch.setattr(sys, "argv", ["recipes", "--check"])
-
-
-@pytest.mark.usefixtures("ellipsoids")
-def test_vectors_are_checked_without_the_renderer_too(monkeypatch, capsys):
-    monkeypatch.setattr(recipes, "can_render", lambda: False)
-    assert 0 == recipes.main()
-    assert "SKIPPED: reference pictures" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("ellipsoids")
-def test_a_changed_picture_is_out_of_date(monkeypatch, capsys):
-    assert 0 == recipes.main()
-    right = recipes.reference_render
-    monkeypatch.setattr(recipes, "reference_render", lambda *args: 255 - right(*args))
-    assert 1 == recipes.main()
-    assert "ellipsoids.0.png" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA"])

@@ -35,13 +35,15 @@ def main() -> int:
     """Write or compare the generated files; return exit status 1 if --check finds a difference."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--check", action="store_true", help="write nothing, fail if a file is outdated")
-    check = parser.parse_args().check
-    generated = files()
+    parser.add_argument("--renders", action="store_true", help="draw reference images, too: half a minute")
+    args = parser.parse_args()
+    check = args.check
+    generated = files(renders=args.renders)
     stale = [path for path, data in generated.items() if not path.exists() or path.read_bytes() != data]
     found = sorted([*VECTORS.rglob("*.csplat"), *VECTORS.rglob("*.png")])
     extra = [path for path in found if path not in generated]
-    if not can_render():
-        sys.stderr.write("SKIPPED: reference pictures, which need the packages of the extra render\n")
+    if args.renders and not can_render():
+        sys.stderr.write("SKIPPED: reference images, which need the packages of the extra render\n")
     if not check:
         for path in stale:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -54,13 +56,17 @@ def main() -> int:
     return 1 if check and (stale or extra) else 0
 
 
-def files() -> dict[Path, bytes]:
-    """Return every generated file: the vectors, the manifest, the spec with its annexes."""
+def files(*, renders: bool = False) -> dict[Path, bytes]:
+    """Return every generated file: the vectors, the manifest, the spec with its annexes.
+
+    Args:
+        renders: draw reference images again; by default existing images stay.
+    """
     result: dict[Path, bytes] = {}
     vectors = []
     for recipe in all_recipes():
         data = recipe.data()
-        pictures = _pictures(recipe)
+        pictures = _pictures(recipe, renders)
         vector = describe(recipe, data, list(pictures.values()))
         result |= pictures
         path = VECTORS / vector.file
@@ -120,13 +126,13 @@ def describe(recipe: Recipe, data: bytes, pictures: Sequence[bytes] = ()) -> Vec
     )
 
 
-def _pictures(recipe: Recipe) -> dict[Path, bytes]:
-    """Return the reference pictures of a recipe: the existing ones, unless they are missing or outdated."""
+def _pictures(recipe: Recipe, renders: bool) -> dict[Path, bytes]:
+    """Return the reference images of a recipe: existing ones, unless they are missing or, with `renders`, outdated."""
     result = {}
     for number, view in enumerate(recipe.views):
         path = VECTORS / picture_name(recipe.name, number)
         old = path.read_bytes() if path.exists() else b""
-        if can_render() and recipe.scene is not None:
+        if (renders or not old) and can_render() and recipe.scene is not None:
             made = expected(recipe.scene)
             flags = made.header["scene_flags"]
             picture = reference_render(made.floats, view.camera, "antialiased" in flags)

@@ -293,12 +293,12 @@ def lattice_value(n: int, step: float, exponent: int) -> np.float32:
 
 def _lattice(scene: Scene, attribute: int, rows: list[list[list[int]]]) -> Array:
     step, columns = scene.attributes[attribute].step, _spec.ATTRIBUTE_COLUMNS[attribute]
-    values = [
-        [lattice_value(n, step, _exponent(tile, attribute)) for n in row]
-        for tile, tile_rows in zip(scene.tiles, rows, strict=True)
-        for row in tile_rows
-    ]
-    return np.array(values, "<f4").reshape(len(values), columns)
+    products: list[list[float]] = []
+    for tile, tile_rows in zip(scene.tiles, rows, strict=True):
+        scale = math.ldexp(step, _exponent(tile, attribute))
+        products += [[float(n) * scale for n in row] for row in tile_rows]
+    with np.errstate(over="ignore"):  # as in `lattice_value`, but rounded together
+        return np.array(products, np.float64).reshape(len(products), columns).astype("<f4")
 
 
 def max_scale(scene: Scene, tile: Tile) -> float:
