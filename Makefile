@@ -37,7 +37,7 @@ examples: $(VENV)/.core ## the sample scene, or SCENE=yours.csplat, in each engi
 	$(BIN)/csplat export-element tools/examples/public/csplat-view.js --force
 	cd tools/examples && npm install --silent --no-audit --no-fund && npm start
 
-check: $(VENV)/.dev ## a minute: style, types, import contracts, generated files, unmarked tests, on the checkout
+check: $(VENV)/.dev ## half a minute: style, types, import contracts, generated files, unmarked tests, on the checkout
 	tests/run.sh check
 
 test: $(VENV)/.dev ## everything that an ordinary change can break, on the built wheel; .ci/run calls it

@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # The tiers of tests; `make check`, `make test`, `make lab-test` and `make test-all` set up .venv and call this.
 #
-#   tests/run.sh check   the checkout: style, types, import contracts, generated files, unmarked tests; a minute
+#   tests/run.sh check   the checkout: style, types, import contracts, generated files, unmarked tests; half a minute
 #   tests/run.sh test    the built wheel: everything that an ordinary change can break; minutes
 #   tests/run.sh lab     the laboratories: authoring, planted faults, fuzzing, benchmarks
 #   tests/run.sh part M  the tests with marker M

@@ -28,6 +28,7 @@ def test_an_array_file_is_compared_with_its_size(tmp_path):
         assert 4 == len(read_array(path))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "message"), [
     ("[" * 100_000, "nested too deep"),
     ("1" * 5000, "an integer has 5,000 digits, expected at most 300"),

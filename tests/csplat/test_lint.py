@@ -140,6 +140,7 @@ VALUES = {  # rows, findings, and an array of the model that is read
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_unusual_values_are_counted_and_repaired_unless_reading_is_strict(path):
     def check(case):
         rows, findings, name, values = case
@@ -273,6 +274,7 @@ def test_three_bytes_of_colour_declared_as_one_are_read(path, name):
     assert_refused(path, {"a byte more": (data + b"x", "f_dc_0")})
 
 
+@pytest.mark.slow
 def test_degree_5_is_read_with_fewer_bands(path):
     rows = good_rows(names=[*PLAIN, *(f"f_rest_{i}" for i in range(105))])
     put(path, rows)
@@ -339,6 +341,7 @@ def coloured(kind, values, names=COLOURS, count=3):
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "unit", "values", "names", "text"), [
     ("|u1", 255, (0, 255, 51), COLOURS, ""),
     ("<u2", 65535, (0, 65535, 13107), ("diffuse_red", "diffuse_green", "diffuse_blue"), ""),
@@ -397,6 +400,7 @@ def test_extreme_filters_stay_finite(path):
     np.testing.assert_allclose(model.opacities[3], alpha_of_logits(rows["opacity"])[3] / 2**1.5, rtol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("changes", "noted"), [
     ({"opacity": (0, 1)}, {"opacities-are-alphas"}),
     ({"opacity": (-0.1, 1)}, set()),
@@ -434,6 +438,7 @@ def test_other_elements_and_dynamic_splats_are_named_and_dropped(path):
         assert f"{', '.join(names)} {message}" in found(path)["extra-columns"].text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("text", "message"), [
     (LINES.replace(".", ","), "decimal commas"),
     (LINES.replace(".", ",").replace(" ", ";"), "decimal commas"),
@@ -484,6 +489,7 @@ def test_ambiguous_rows_of_text_are_refused(path):
     assert_refused(path, {**cases, "UTF-16": (utf16, "is a PLY in UTF-16, expected ASCII: save it as UTF-8")})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
 @pytest.mark.parametrize(("written", "message"), [
     (lambda head: b"\xef\xbb\xbf" + head, "a byte order mark"),
@@ -695,6 +701,7 @@ def peak_of(read, path):
         tracemalloc.stop()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("comes_first", [True, False])
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_other_elements_are_skipped_without_an_object_per_row(path, kind, comes_first):
@@ -736,6 +743,7 @@ def test_other_elements_that_the_file_does_not_have_are_refused(path):
     assert_refused(path, {**BAD_ELEMENTS, "no properties": (first, "face")})
 
 
+@pytest.mark.slow
 def test_lists_of_splats_are_dropped_without_an_object_per_list(path):
     body = b"".join(row.tobytes() + bytes([index]) + bytes(4 * index) for index, row in enumerate(ROWS))
     text = "\n".join(f"{line} {'2 1 1' if row % 2 else '0'}" for row, line in enumerate(lines_of(ROWS)))

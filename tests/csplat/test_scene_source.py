@@ -31,6 +31,7 @@ def large(make_model):
     return model.select(np.arange(BLOCK_SPLATS + 1000) % 60)
 
 
+@pytest.mark.slow
 def test_a_ply_in_blocks_is_the_ply_at_once(tmp_path, large):
     path = tmp_path / "a.ply"
     write_ply(path, large)
@@ -88,6 +89,7 @@ def whole(model):
     return encode(model, FAST)
 
 
+@pytest.mark.slow
 def test_out_of_core_encoding_gives_the_bytes_of_memory(model, whole, tmp_path):
     stages = {}
     note = lambda stage, done: stages.update({stage: done})  # noqa: E731
@@ -107,6 +109,7 @@ def with_levels(model, tmp_path_factory):
     return path.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("memory", [None, 900_000_000])
 def test_levels_do_not_depend_on_processes_or_memory(model, with_levels, tmp_path, memory):
     target = tmp_path / "out.csplat"
@@ -114,6 +117,7 @@ def test_levels_do_not_depend_on_processes_or_memory(model, with_levels, tmp_pat
     assert with_levels == target.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "after"), [("sorting", 0), ("coding", 3), ("writing", 0)])
 def test_an_interrupted_encoding_with_levels_is_resumed(model, with_levels, tmp_path, stage, after):
     target, scene = tmp_path / "out.csplat", source_from_model(model)
@@ -127,6 +131,7 @@ def test_an_interrupted_encoding_with_levels_is_resumed(model, with_levels, tmp_
     assert [target] == list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_up_while_levels_are_written_is_reported(model, with_levels, tmp_path):
     target, before = tmp_path / "out.csplat", resource.getrlimit(resource.RLIMIT_FSIZE)
 
@@ -152,11 +157,13 @@ def test_a_scene_built_in_one_piece_requires_its_memory(model, tmp_path):
         )
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
     encode_large(source_from_model(model), tmp_path / "out.csplat", replace(FAST, threads=2))
     assert whole == (tmp_path / "out.csplat").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -170,6 +177,7 @@ def test_options_give_the_bytes_of_memory(model, options, tmp_path):
     assert encode(model, options) == (tmp_path / "out.csplat").read_bytes()
 
 
+@pytest.mark.slow
 def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
     origin = (4.5e5, 5.4e6, 100.0)
     doubles = model.means.astype(np.float64) + np.array(origin) + 1e-9
@@ -182,6 +190,7 @@ def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
     assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stage", "after"), [("looking", 0), ("sorting", 0), ("codebook", 0), ("coding", 3)])
 def test_an_interrupted_encoding_is_resumed(model, whole, tmp_path, stage, after):
     target, scene = tmp_path / "out.csplat", source_from_model(model)
@@ -203,6 +212,7 @@ def test_an_interrupted_encoding_is_resumed(model, whole, tmp_path, stage, after
     assert [target] == list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_an_encoding_with_a_killed_worker_is_resumed(model, whole, tmp_path):
     target, two = tmp_path / "out.csplat", replace(FAST, threads=2)
 
@@ -243,6 +253,7 @@ def test_a_full_disk_is_reported_and_the_encoding_resumed(model, whole, tmp_path
     assert whole == target.read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sample", "section-000003", "tiles-000001", "state.json"])
 def test_a_damaged_work_file_is_named(model, tmp_path, kind):
     target = tmp_path / "out.csplat"

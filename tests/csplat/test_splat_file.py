@@ -77,6 +77,7 @@ def test_a_part_equals_that_of_a_whole_decode_with_fewer_bytes_read(data, box, t
         assert_same(whole, file.read())
 
 
+@pytest.mark.slow
 def test_boxes_of_tiles_are_exact(data):
     with csplat.open(data) as file:
         assert (len(file.header.tiles), 2, 3) == file.boxes.shape
@@ -85,6 +86,7 @@ def test_boxes_of_tiles_are_exact(data):
             np.testing.assert_array_equal(box[1], tile.means.max(axis=0))
 
 
+@pytest.mark.slow
 def test_tiles_are_iterated_and_released(data, box):
     with opened(io.BytesIO(data)) as file:
         for degree in (None, 0):
@@ -205,6 +207,7 @@ def test_a_damaged_file_is_named(store, data, tmp_path):
         assert name == raised.value.path
 
 
+@pytest.mark.slow
 def test_parts_are_read_from_a_store(store, data, box):
     for store.protocol, url in (
         ("store", "store://scenes/scene.csplat"),
@@ -297,6 +300,7 @@ def test_without_the_extra_a_url_is_an_error_with_a_remedy(monkeypatch):
         csplat.open("https://example.org/scene.csplat")
 
 
+@pytest.mark.slow
 def test_extract_reads_a_url_and_leaves_no_partial_file(store, data, box, tmp_path):
     out, local = tmp_path / "part.csplat", tmp_path / "local.csplat"
     words = ["extract", "store://scenes/scene.csplat", str(out), f"--box={','.join(map(repr, box))}"]

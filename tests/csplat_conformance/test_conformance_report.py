@@ -30,8 +30,6 @@ from csplat_conformance.encoders.file_checks import check_content, pair_splats
 from csplat_conformance.protocol import ProcessEnd
 from csplat_tools.cli.app import app
 
-pytestmark = pytest.mark.long
-
 
 @pytest.fixture(scope="module")
 def encoded(tmp_path_factory):

@@ -207,6 +207,7 @@ def test_a_fault_of_a_program_for_cuts_has_an_outcome_of_its_own(faulty_cuts):
     assert len(outcome.message) < 300
 
 
+@pytest.mark.slow
 def test_cuts_are_requested_of_valid_files_with_levels_alone(faulty, faulty_cuts):
     options = DecoderSuiteOptions(pattern="valid/quats,valid/levels,invalid/level_below", levels=(1, 5))
 

@@ -131,6 +131,7 @@ os._exit(0)
     assert ["0", "7"] == run.stdout.split()
 
 
+@pytest.mark.slow
 def test_compilation_is_reported_once():
     calls = []
     plain = kernels.numba.njit(lambda x: x + 1)

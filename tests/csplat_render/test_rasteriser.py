@@ -53,6 +53,7 @@ def assert_same_render(model, view, **options):
     assert fast.ignored == exact.ignored
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_renders_of_random_scenes_agree_with_the_twin(degree):
     assert_same_render(scene(degree=degree, seed=degree), camera(70, 53), background=(0.3, 0.6, 0.1))

@@ -48,6 +48,7 @@ def tower():
     return cloud(np.random.default_rng(0).random((5000, 3)) * [0.3, 3.0, 0.3], 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("make", "count", "seed"), [(ball, 8, 0), (tower, 3, 0), (ball, 1, 3)])
 def test_an_object_covers_half_of_each_render(make, count, seed):
     model = make()

@@ -19,6 +19,7 @@ def test_cameras_in_surroundings_look_at_the_subject():
         assert np.allclose(camera.viewmat[2, :3], towards / np.linalg.norm(towards))
 
 
+@pytest.mark.slow
 def test_cameras_are_deterministic_and_depend_on_the_seed():
     model = ball()
     first = virtual_cameras(model)

@@ -75,6 +75,7 @@ def test_a_manifest_names_scenes_outputs_and_options(scenes):
             names(scenes / "l.jsonl")
 
 
+@pytest.mark.slow
 def test_outputs_equal_those_of_the_command_and_are_not_made_again(scenes, tmp_path):
     out, alone = tmp_path / "out", tmp_path / "alone.csplat"
     assert "2 done, 0 done before, 1 failed" in call("batch", scenes, out, "--", *FAST, status=1).stdout
@@ -103,6 +104,7 @@ def test_other_damaged_and_old_files_are_kept(scenes, tmp_path):
     assert (whole, True) == ((out / "a.csplat").read_bytes(), "1 of 1" in page.read_text())
 
 
+@pytest.mark.slow
 def test_a_wrong_command_line_ends_the_batch(scenes, tmp_path):
     for words in ("encode --preset tiny", "encode --target-psnr 4 --target-size 1MB", "convert", "info"):
         assert 1 == call("batch", scenes, tmp_path / "out", "--", *words.split(), status=2).stderr.count("\n")
@@ -119,6 +121,7 @@ def test_scenes_may_be_read_from_and_written_to_urls(scenes, tmp_path):
     assert store.cat("/out/a.csplat") == (tmp_path / "out" / "a.csplat").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_killed_process_fails_its_scene_alone_and_an_interrupt_is_not_lost(scenes, tmp_path, monkeypatch):
     killed, submit = Future(), InThisProcess.submit
     killed.set_exception(BrokenProcessPool())

@@ -88,6 +88,7 @@ CLAMPED = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_clamped_values_are_counted_by_attribute_with_the_largest_error(tmp_path, make_model):
     ordinary = calm(make_model(40, 1, seed=1))
 
@@ -137,6 +138,7 @@ def test_splats_that_rounding_moves_visibly_are_counted(tmp_path, make_model):
         csplat.write(tmp_path / "c.spz", far_scene(make_model, 20, [[9e6, 0, 0]]))
 
 
+@pytest.mark.slow
 def test_sog_reports_what_its_codes_do_not_reach(tmp_path, make_model):
     rng = np.random.default_rng(0)
     colours = rng.normal(0, 1, (3000, 3)).astype("f4")
@@ -152,6 +154,7 @@ def test_sog_reports_what_its_codes_do_not_reach(tmp_path, make_model):
     ]
 
 
+@pytest.mark.slow
 def test_dropped_columns_are_reported_by_every_command(tmp_path, make_model):
     source = tmp_path / "a.ply"
     write_ply(source, replace(make_model(40, 0), extra={"motion_0": np.ones(40, np.float32)}))
@@ -161,6 +164,7 @@ def test_dropped_columns_are_reported_by_every_command(tmp_path, make_model):
     assert "columns motion_0 are not splat attributes" in call("lint", source, status=1).stdout
 
 
+@pytest.mark.slow
 def test_degree_4_is_converted_and_encoded(tmp_path, make_model):
     source = tmp_path / "4.ply"
     write_ply(source, make_model(60, 4))
@@ -175,6 +179,7 @@ def test_degree_4_is_converted_and_encoded(tmp_path, make_model):
         assert 3 == csplat.read(tmp_path / f"c.{suffix}").sh_degree
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -211,6 +216,7 @@ def test_filters_are_applied_in_the_documented_order(tmp_path, ply):
     assert 1 == found.sh_degree
 
 
+@pytest.mark.slow
 def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_model):
     model = replace(make_model(30, 1), coordinate_system="RDF")
     turned = {"glb": "LUF", "spz": "RUB", "ply": "RDF"}
@@ -262,6 +268,7 @@ def piped(path):
     pipe.unlink()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
 def test_commands_read_pipes(tmp_path, make_model):
     def check(case):
@@ -295,6 +302,7 @@ def test_commands_read_pipes(tmp_path, make_model):
     assert not failures({f"{one[0]}, {one[1]}": one for one in cases}, check)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no named pipes")
 @pytest.mark.parametrize("name", ["ply", "csplat", "compressed-ply", "spz", "splat", "gltf", "sog"])
 def test_every_format_is_written_to_a_pipe_and_to_a_device(tmp_path, ply, name):
@@ -312,6 +320,7 @@ def test_every_format_is_written_to_a_pipe_and_to_a_device(tmp_path, ply, name):
     assert Path(os.devnull).is_char_device()
 
 
+@pytest.mark.slow
 def test_a_crop_that_keeps_nothing_is_a_warning(tmp_path, ply):
     for suffix in ("ply", "csplat", "spz", "splat", "compressed.ply", "sog"):
         out = tmp_path / f"a.{suffix}"
@@ -329,6 +338,7 @@ def test_a_crop_sphere_is_in_world_coordinates(make_model):
     assert (np.linalg.norm(model.means, axis=1) <= 0.7).sum() == kept.count == len(kept.model())
 
 
+@pytest.mark.slow
 def test_axes_are_converted_and_recorded(tmp_path, ply):
     call("convert", ply, tmp_path / "a.ply", "--to-axes", "RUB")
     call("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--to-axes", "RDF")
@@ -363,6 +373,7 @@ def test_floaters_are_splats_without_neighbours():
     assert 3001 == left.count == len(left.model())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["meta.json", "lod-meta.json"])
 def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply, name):
     out = tmp_path / "new" / name
@@ -393,6 +404,7 @@ def words_of(found):
     return short - set(HEADER.values()) | {"header"} if short >= set(HEADER.values()) else short
 
 
+@pytest.mark.slow
 def test_the_help_and_the_guide_list_all_formats(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     helped = call("convert", "--help").stdout.partition("Formats, ")[2].partition("Examples:")[0].splitlines()

@@ -127,6 +127,7 @@ def header_of(nodes) -> SceneHeader:
     return replace(read_header(TREE), tiles=tuple(tiles[:split]), coarse_tiles=tuple(tiles[split:]))
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(nodes=trees(), level=st.integers(0, 5), budget=st.integers(0, 40), seed=st.integers(0, 9))
 def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):
@@ -147,6 +148,7 @@ def test_cuts_are_those_of_the_pseudo_code(spec, nodes, level, budget, seed):
         assert expected == selected(max_splats=budget)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(nodes=trees(), level=st.integers(0, 5), low=st.floats(-0.06, 0.06), near=st.integers(-2, 2), data=st.data())
 def test_the_tiles_of_a_box_are_those_of_the_pseudo_code(spec, nodes, level, low, near, data):
@@ -210,6 +212,7 @@ def test_a_file_without_levels_is_one_node():
         assert [] == file.cut(max_splats=0)
 
 
+@pytest.mark.slow
 def test_the_default_is_level_0_everywhere(data, model, tmp_path):
     path = tmp_path / "levels.csplat"
     path.write_bytes(data)
@@ -269,6 +272,7 @@ def test_levels_of_a_file_are_scenes_to_convert(data, tmp_path):
     assert "the level is 3, expected 0 to 2" in result.output
 
 
+@pytest.mark.slow
 def test_a_number_of_splats_selects_a_version(data, tmp_path):
     path, streamed = tmp_path / "levels.csplat", tmp_path / "streamed" / "lod-meta.json"
     path.write_bytes(data)
@@ -415,6 +419,7 @@ def test_each_level_has_a_quarter_of_the_splats_of_the_finer_one(model):
     assert counts[-1] <= 30
 
 
+@pytest.mark.slow
 def test_the_number_of_levels_is_the_one_asked_for(model):
     nodes = LevelBuilder(1, leaf_splats=70).build(model)
     assert {0, 1} == {node.level for node in nodes}
@@ -430,6 +435,7 @@ def test_parts_of_a_very_large_scene_are_merged_alone(model):
     assert builder.seconds(5001) < builder.seconds(5000)
 
 
+@pytest.mark.slow
 def test_levels_are_the_same_each_time_and_at_any_number_of_threads(model):
     one, other = (LevelBuilder(leaf_splats=100, root_splats=30).build(model, threads) for threads in (1, 2))
     assert len(one) == len(other)
@@ -473,6 +479,7 @@ def test_encode_writes_levels(tmp_path, model):
         assert "expected auto or 1 to 16" in " ".join(refused.output.split())
 
 
+@pytest.mark.slow
 def test_scenes_have_levels_on_request_only(tmp_path, model):
     out = tmp_path / "plain.csplat"
     for levels in ({}, {"levels": "auto"}):  # one node of 4,096 splats has no coarser one

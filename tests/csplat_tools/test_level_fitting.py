@@ -55,6 +55,7 @@ def test_fitted_levels_look_better_than_merged_ones(larger_model):
     assert merged + 0.5 < moved < chosen
 
 
+@pytest.mark.slow
 def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(model):
     """Behind a wall of opaque splats, no camera sees the others."""
     rng = np.random.default_rng(0)

@@ -69,6 +69,7 @@ def test_pairs_that_look_alike_are_merged_first_and_never_across_nodes():
     assert [0.5, 2.5] == sorted(merged.means[:, 0].tolist())
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(seed=st.integers(0, 1000), count=st.integers(1, 60), spread=st.sampled_from([0.0, 1e-3, 1.0, 1e5]))
 def test_any_splats_are_merged_to_the_number_asked_for(seed, count, spread):

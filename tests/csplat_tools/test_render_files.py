@@ -138,6 +138,7 @@ def test_nothing_is_replaced_without_force(ply, cameras, tmp_path):
     assert (48, 64, 3) == pixels(tmp_path / "out" / "right.png").shape
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -251,6 +252,7 @@ def test_a_film_equals_the_renders(film_scene, pictures, tmp_path, ending, toler
     assert [film.name] == names(tmp_path)
 
 
+@pytest.mark.slow
 def test_the_same_command_writes_the_same_film(film_scene, tmp_path):
     for name in ("one.webp", "two.webp"):
         call("render", film_scene, "--orbit", 2, "--size", "32x24", tmp_path / name)

@@ -55,6 +55,7 @@ def test_training_prunes_to_the_final_share(data, strategy):
     assert len(whole.model) / 2 == pytest.approx(counts[2], abs=3)
 
 
+@pytest.mark.slow
 def test_training_starts_with_images_of_half_the_size(data, tmp_path, monkeypatch):
     widths: list[int] = []
     step = CpuEngine.step
@@ -75,6 +76,7 @@ def test_training_reduces_the_loss(data, strategy):
     assert len(result.model) <= 80
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_file(data, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         write_ply(

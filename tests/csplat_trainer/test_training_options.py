@@ -31,6 +31,7 @@ def test_a_run_resumed_late_prunes_to_the_final_share(data, tmp_path, steps):
     assert 0.75 * len(whole.model) == pytest.approx(len(left.model), abs=3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "gradient"])
 def test_a_resumed_run_equals_an_uninterrupted_one(data, tmp_path, strategy):
     assert_resumes_identically(data, TrainOptions(**QUICK, strategy=strategy), tmp_path)

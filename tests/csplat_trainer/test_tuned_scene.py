@@ -180,6 +180,7 @@ def test_non_finite_values_end_a_run_with_an_error(coarse, views, monkeypatch):
         tune(coarse, views, FEW)
 
 
+@pytest.mark.slow
 def test_every_learning_rate_warms_up(coarse, views, tmp_path):
     fixed, file, moved = coarse, tmp_path / "c.npz", []
     start = {name: values.copy() for name, values in TunedScene(fixed).parameters.values.items() if values.size}

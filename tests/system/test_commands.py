@@ -162,6 +162,7 @@ def test_runs_the_conformance_suite():
     assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
 
 
+@pytest.mark.slow
 def test_a_misspelt_command_gets_a_suggestion():
     result = invoke("enocde")
     assert 2 == result.exit_code
@@ -180,6 +181,7 @@ def test_completes_commands_and_options(monkeypatch, capfd):
     assert ["--preset"] == complete("csplat", "encode", "--pre")
 
 
+@pytest.mark.slow
 def test_csplat_as_a_module_is_the_program_and_prints_its_version():
     done = subprocess.run([sys.executable, "-m", "csplat", "--version"], capture_output=True, text=True, check=True)
     assert call("--version") == done.stdout

@@ -48,6 +48,7 @@ def halves(sample):
     return [encode(model.select(half), options) for half in np.array_split(order, 2)]
 
 
+@pytest.mark.slow
 def test_the_command_merges_and_reports(halves, make_model, tmp_path):
     for name, data in zip("abc", [*halves, encode(make_model(40, 3))], strict=True):
         (tmp_path / f"{name}.csplat").write_bytes(data)

@@ -199,6 +199,7 @@ def check_stream(given, scene):
     assert all(size == 3 * (2 * layer + 1) * counts[first] for first, layer, size in given["bands"])
 
 
+@pytest.mark.slow
 def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.csplat").write_bytes(encode(model, replace(FAST, tile_splats=80)))

@@ -99,6 +99,7 @@ def commands():
 COMMON = {"--force", "--report", "--json", "--quiet", "--help-all"}
 
 
+@pytest.mark.slow
 def test_every_command_has_the_five_common_options_and_help_for_all(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     count = 0
@@ -117,6 +118,7 @@ def test_every_command_has_the_five_common_options_and_help_for_all(monkeypatch)
     assert count <= 150
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [
@@ -156,6 +158,7 @@ def test_repairs_are_reported_even_if_quiet(tmp_path, make_model):
     assert sorted(decode(tmp_path / "c.csplat").extra["object_id"]) == list(range(20))
 
 
+@pytest.mark.slow
 def test_encode_reports_lengths_of_rotations_that_no_training_produces(tmp_path, ply):
     line = "1 rotation not of unit length"
     for length, reported in ((0.3, False), (5.0, False), (1e-6, True), (1e6, True)):
@@ -218,6 +221,7 @@ def test_files_have_the_usual_permissions(csplat_file):
     assert csplat_file.stat().st_mode & 0o777 == 0o666 & ~mask
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "part"),
     [
@@ -256,6 +260,7 @@ def test_a_full_disk_leaves_the_old_file_and_the_error_names_it(tmp_path, ply, m
     assert old.read_text() == "precious"
 
 
+@pytest.mark.slow
 def test_the_default_output_is_next_to_its_source(tmp_path, ply):
     call("encode", ply)
     call("export-html", tmp_path / "scene.csplat")
@@ -276,6 +281,7 @@ def test_unreadable_formats_are_refused_with_a_converter(tmp_path):
         assert "convert it with `csplat encode`" in refused(*words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
@@ -368,6 +374,7 @@ def test_a_replaced_output_keeps_its_permissions(tmp_path, ply, csplat_file):
         assert (65534, 65534) == (page.stat().st_uid, page.stat().st_gid)
 
 
+@pytest.mark.slow
 def test_an_output_that_is_a_link(tmp_path, ply, csplat_file):
     data = csplat_file.read_bytes()
     link, hard = tmp_path / "link.csplat", tmp_path / "hard.csplat"
@@ -425,6 +432,7 @@ def test_names_may_be_as_long_as_the_file_system_allows(tmp_path, ply, csplat_fi
     assert [] == [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="reading this file of Linux fails with EIO")
 def test_a_read_error_names_the_input(tmp_path, ply, csplat_file):
     bad, new = Path("/proc/self/mem"), tmp_path / "new"
@@ -455,6 +463,7 @@ class FailingInput(io.BytesIO):
     read1 = read
 
 
+@pytest.mark.slow
 def test_commands_read_standard_input_and_name_it(ply, csplat_file, monkeypatch, capsys):
     data = csplat_file.read_bytes()
     encoded = invoke("encode", "-", "-", input=ply.read_bytes())
@@ -552,6 +561,7 @@ def test_the_command_passes_out_of_core_options(ply_of_large, tmp_path, monkeypa
     assert 2 == refused.exit_code
 
 
+@pytest.mark.slow
 def test_a_large_scene_needs_little_memory_unless_levels_are_requested(model, tmp_path):
     """The splats of this file are a hole in it; an estimate does not read them."""
     ply_of_large = tmp_path / "large.ply"

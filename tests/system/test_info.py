@@ -41,6 +41,7 @@ def no_estimated_up(monkeypatch):
     monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["info", "verify", "lint", "decode"])
 def test_the_report_is_what_json_prints(tmp_path, csplat_file, ply, name):
     words = {"lint": (ply,), "decode": (csplat_file, tmp_path / "back.ply")}.get(name, (csplat_file,))

@@ -83,6 +83,7 @@ def test_examples_of_the_documentation_run(package, documented, monkeypatch):
     assert examples >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
 def test_files_may_be_paths_streams_or_bytes(files, form):
     model, ply, coded = files
@@ -250,6 +251,7 @@ def arguments_of(monkeypatch, module, name, words):
     return raised.args
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "name", "given"), [
     (["simplify", "scene.ply", "o", "--keep", "0.5"], "simplify", {}),
     (["compare", "scene.ply", "scene.csplat", "--backend", "fast"], "compare", {"mode": "fast", "backend": "cpu"}),
@@ -263,6 +265,7 @@ def test_commands_call_the_public_functions(files, monkeypatch, words, name, giv
     assert given.items() <= named.items()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "target"), [
     (["--max-error", "means=0.01"], {"max_error": {"means": 0.01}}),
     (["--target-psnr", "40"], {"psnr": 40.0}),
@@ -319,6 +322,7 @@ def test_fields_have_defaults_and_arrays_are_not_copied(make_model):
     assert [0, 1, 2, 3] == [make_model(5, degree).sh_degree for degree in range(4)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "name", "kind"), [
     (["train", ".", "out.ply", "--iterations", "3"], "train", "DataSet"),
     (["finetune", "scene.ply", "out.csplat", "--data", "."], "finetune", "SplatModel"),

@@ -77,6 +77,7 @@ def compared(*words):
     return json.loads(call("compare", *words, "--json").stdout)
 
 
+@pytest.mark.slow
 def test_both_scenes_are_scored_on_the_test_images(files, data):
     result = compared(*files, "--data", data)
     assert ["view0.png", "view8.png"] == [view["image"].removeprefix("images/") for view in result["views"]]
@@ -170,6 +171,7 @@ def test_masked_pixels_are_not_scored(scene):
     assert [mask.sum(), H * W] == [one.pixels for one in scores.each]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [

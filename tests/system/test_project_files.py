@@ -22,6 +22,7 @@ def listed(*words):
     return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
 
 
+@pytest.mark.slow
 @in_a_checkout
 def test_attributes_of_git_know_binary_files():
     wrong = []
@@ -34,6 +35,7 @@ def test_attributes_of_git_know_binary_files():
     assert [] == wrong
 
 
+@pytest.mark.slow
 @in_a_checkout
 @pytest.mark.parametrize(("page", "least"), [("ARCHITECTURE.md", 50), ("CONTRIBUTING.md", 20)])
 def test_every_file_that_a_page_about_the_code_names_exists(page, least):

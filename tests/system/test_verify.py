@@ -77,6 +77,7 @@ def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
     assert invoke("verify", csplat_file, "--quiet").stdout == ""
 
 
+@pytest.mark.slow
 def test_verify_proves_the_declared_errors_of_their_source(tmp_path, ply, csplat_file):
     index = ("--source-index", tmp_path / "index.npy")
     assert "the declared errors hold" in call("verify", csplat_file, "--source", ply, *index)

@@ -83,12 +83,14 @@ def test_an_empty_scene_is_decoded():
     assert (0, 15, 3) == model.shN.shape
 
 
+@pytest.mark.slow
 def test_every_degree_and_colour_mapping_is_decoded():
     for degree, ycocg in itertools.product(range(5), (False, True)):
         described = scene(degree, (tile(1, 3, degree), tile(2, 5, degree)))
         assert_decodes(replace(described, attributes=attributes(degree, ycocg=ycocg, chroma_shift=3 * ycocg)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("escaped", [False, True])
 def test_one_codebook_may_serve_all_bands(escaped):
     entries = {band: rows_of(band, 5, 3 * (2 * band + 1), -60, 60) for band in (1, 2, 3, 4)}
@@ -142,6 +144,7 @@ def test_tiles_longer_than_a_run_of_the_decoder_are_decoded():
             assert array[rows].tolist() == short[name].tolist(), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coder", ["stored", "deflate_fixed", "deflate_dynamic"])
 def test_every_transform_and_coder_is_decoded(coder):
     described = scene(1, (tile(1, 6, 1),))
@@ -182,6 +185,7 @@ def test_any_buffer_path_or_stream_is_decoded(tmp_path):
             decode(data)
 
 
+@pytest.mark.slow
 def test_parts_equal_the_same_parts_of_the_whole():
     full, header, whole = decode(RICH), read_header(RICH), decode_integers(RICH)
     places = [range(one.start, one.start + one.splat_count) for one in header.tiles]

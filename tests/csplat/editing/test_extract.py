@@ -36,6 +36,7 @@ def data(sample):
     return encode(sample, EncodeOptions(tile_splats=120))
 
 
+@pytest.mark.slow
 def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
     header = read_header(data)
     low, high = box_of(header.tiles[2], header)
@@ -71,6 +72,7 @@ COPIED = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*COPIED, "empty"])
 def test_a_part_of_all_tiles_and_two_merged_copies_of_a_vector_decode_to_the_same(name):
     path = VECTORS / f"{name}.csplat"
@@ -115,6 +117,7 @@ SCENES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_a_box_that_touches_a_decoded_centre_returns_its_splat(name):
     data = encode(_scene(**SCENES[name]), EncodeOptions(tile_splats=64))
@@ -174,6 +177,7 @@ def halves(sample):
     return [encode(model.select(half), options) for half in np.array_split(order, 2)]
 
 
+@pytest.mark.slow
 def test_copied_bytes_are_checked(data, halves):
     def damaged(file):
         record = read_header(file).tiles[0].layers[0]
@@ -205,6 +209,7 @@ def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(sample, h
     assert len(sample) == len(decode(data))
 
 
+@pytest.mark.slow
 def test_parts_of_a_file_share_their_codebooks_again(sample):
     sample = sample.select(slice(0, 1000))
     whole = encode(sample, EncodeOptions(preset="balanced", tile_splats=120))
@@ -262,6 +267,7 @@ def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
 
 
 # Re-encoded scenes.
+@pytest.mark.slow
 @pytest.mark.parametrize(("degree", "fields", "options", "reason"), [
     (1, {}, {"scale_step": 0.1}, "different steps of scales"),
     (3, {}, {}, "file 2 has SH of degree 3, file 1 of 1"),
@@ -288,6 +294,7 @@ def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, de
     assert distance.min(axis=0).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_scenes_that_contradict_each_other_or_have_no_partner_are_refused(make_model, tmp_path):
     def check(case):
         fields, message = case

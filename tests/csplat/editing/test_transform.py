@@ -69,12 +69,14 @@ def photographed_from(up, **fields):
     return cloud(places[kept], sizes, **fields)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("up", AXES)
 def test_an_object_was_photographed_from_above(up):
     assert list(up) == with_estimated_up(photographed_from(up)).metadata["up"]  # what `estimate_up` returns
     assert up == parse_up(up_word(up))
 
 
+@pytest.mark.slow
 def test_no_up_is_estimated_without_evidence_or_if_one_is_recorded():
     assert estimate_up(photographed_from((0, 0, 0))) is None  # seen from all sides
     assert estimate_up(photographed_from((0.6, 0.6, 0.6))) is None  # between the axes

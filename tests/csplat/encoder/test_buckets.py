@@ -21,6 +21,7 @@ def model(sample_path):
     return replace(many, means=means, extra=extra, metadata={"licence": "CC0"})
 
 
+@pytest.mark.slow
 def test_the_sample_of_a_plan_has_refitted_colours(model):
     other = encode_plan.EncodePlan.of(model, FAST).with_colours(model.sh0 + 0.5, -model.shN)
     assert other.sample is not None

@@ -36,6 +36,7 @@ def round_trip(model: SplatModel, importance: np.ndarray | None = None, **option
     return decoded, result
 
 
+@pytest.mark.slow
 def test_scenes_decode_within_declared_errors(make_model):
     # CNF-5, SRC-4
     cases = [*zip(range(5), itertools.cycle(PRESET_NAMES)), *((3, preset) for preset in PRESET_NAMES)]
@@ -62,6 +63,7 @@ def test_scenes_of_any_count_decode(make_model):
         round_trip(make_model(count, 1), tile_splats=100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coding", ["codebook", "scalar", "none"])
 def test_every_sh_coding_decodes(make_model, coding):
     for degree in (1, 2, 3, 4):
@@ -143,6 +145,7 @@ def test_band_4_of_few_splats_is_sparse(make_model):
     assert layers[4].size < 2000
 
 
+@pytest.mark.slow
 def test_the_id_of_shape_codebooks_does_not_depend_on_the_degree(make_model):
     # Files of degree 3 keep their bytes.
     for degree in (3, 4):
@@ -204,6 +207,7 @@ def test_values_on_a_grid_of_powers_of_two_are_exact(make_model):
     assert coarse.report.options["scale_step"] > 2.0**-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESET_NAMES)
 def test_extreme_values_decode(make_model, preset):
     model = make_model(64, 3)
@@ -321,6 +325,7 @@ def test_important_splats_have_smaller_errors(make_model):
     assert float(errors[~chosen].mean()) < float((model.shN**2).sum(axis=(1, 2)).mean())
 
 
+@pytest.mark.slow
 def test_coarse_chroma_does_not_wrap_at_the_end_of_its_type(make_model):
     importance = np.where(np.arange(300) < 60, 1.0, 1e-8)
     for shift, reach in itertools.product((0, 1, 2), (0.62, 163.8)):

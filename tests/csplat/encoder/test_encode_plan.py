@@ -68,6 +68,7 @@ def sparse_model(source, share):
     return replace(source, shN=shN.astype(np.float32))
 
 
+@pytest.mark.slow
 def test_absent_bands_are_decoded_as_zeros(make_model):
     model, scalar = sparse_model(make_model(400, 3), 0.9), {"sh_coding": "scalar"}
     for options in ({}, {"tile_splats": 50}, {"deflate_level": 1}, {"adaptive": 0.5}):

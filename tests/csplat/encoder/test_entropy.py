@@ -55,6 +55,7 @@ UNSIGNED = {
 }
 
 
+@pytest.mark.slow
 def test_unsigned_streams_read_back():
     for values, library in itertools.product(UNSIGNED.values(), ("libdeflate", "zlib")):
         for mode in ({}, {"delta": True}, {"signed_delta": True}):

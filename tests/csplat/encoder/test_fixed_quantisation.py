@@ -111,6 +111,7 @@ def test_the_sample_is_decoded_as_dequantised(sample_path, options):
     assert_dequantised_as_decoded(fixed, values, fixed.encode(values).write())
 
 
+@pytest.mark.slow
 def test_bytes_do_not_depend_on_threads(make_model):
     files = []
     for threads in (1, 2):

@@ -116,6 +116,7 @@ def test_large_points_are_assigned_to_nearly_nearest_entries():
     assert np.all(np.sqrt(found) <= np.sqrt(exact.min(1)) + 60 * np.sqrt(5))
 
 
+@pytest.mark.slow
 def test_searching_near_groups_loses_less_than_two_per_cent_and_all_groups_nothing():
     points, _ = blobs(1000, 12, 300, 8.0)
     entries = points[:400].astype(np.int32)
@@ -332,6 +333,7 @@ def test_important_shapes_have_smaller_errors(make_model):
     assert np.median(relative[chosen]) < 0.8 * np.median(relative[~chosen])
 
 
+@pytest.mark.slow
 def test_huge_scales_only_affect_their_tile(make_model):
     model = few_shapes(make_model, 1200)
     scales = model.scales.copy()

@@ -59,6 +59,7 @@ def same(one, other):
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ARRAYS)
 
 
+@pytest.mark.slow
 def test_level_0_of_a_file_is_the_scene_with_the_errors_of_a_plain_file(data, model):
     plain = csplat.encode_with_report(model)
     nodes = [LevelNode(0, None, rows=rows) for rows in kd_groups(model.means, 4)]
@@ -71,6 +72,7 @@ def test_level_0_of_a_file_is_the_scene_with_the_errors_of_a_plain_file(data, mo
     assert np.array_equal(np.sort(cut.source_index), np.arange(len(model)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"preset": "small"}, {"preset": "fast", "sh_degree": 0}, {"means_coding": "axis"}])
 def test_files_with_levels_are_valid_with_any_options(model, options):
     leaves = kd_groups(model.means, 2)

@@ -19,6 +19,7 @@ GEOMETRY = ("means", "quats", "scales", "opacities")
 COLOURS = ("sh0", "shN")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "options",
     [
@@ -40,6 +41,7 @@ def test_a_plan_holds_decoded_geometry_and_the_source_colours(make_model, option
         assert getattr(model, name).tobytes() == getattr(plan.scene, name).tobytes(), name
 
 
+@pytest.mark.slow
 def test_new_colours_change_only_colours(make_model):
     model = make_model(260, 2)
     plan = EncodePlan.of(model, EncodeOptions(attribute_psnr=80.0))

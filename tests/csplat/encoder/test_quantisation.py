@@ -254,6 +254,7 @@ def test_trial_rows_cover_all_classes(model):
     assert set(trial_rows(model, tiles, None)) == set(tiles[len(tiles) // 2].rows)
 
 
+@pytest.mark.slow
 def test_one_splat_does_not_change_the_steps_of_others(model, graded):
     weights = unequal(model).means.copy()
     weights[7] *= 1e20

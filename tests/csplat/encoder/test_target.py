@@ -70,6 +70,7 @@ def test_invalid_targets_are_refused(asked, message):
         Target(**asked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bounds", [
     {"means": 1e-4}, {"opacities": 0.004, "covariance": 0.02}, {"sh0": 0.01}, {"sh1": 0.02, "sh2": 0.05},
     {"sh4": 0.02},

@@ -90,6 +90,7 @@ def test_splats_far_away_do_not_make_others_coarse(tmp_path, make_model):
         assert [] == [one for one in csplat.write(tmp_path / "b.compressed.ply", read) if one.id == "filling-splats"]
 
 
+@pytest.mark.slow
 def test_written_files_read_back_within_a_step(tmp_path, make_model):
     model = make_model(700, 3, antialiased=True, origin=(1.0, 2.0, 3.0), metadata={"licence": "CC0"})
     csplat.write(tmp_path / "a.compressed.ply", model)
@@ -165,6 +166,7 @@ def test_unusual_files_are_read_and_reported(tmp_path, data, found):
     assert found == [one.id for one in report]
 
 
+@pytest.mark.slow
 def test_damage_is_refused_or_read(tmp_path):
     damaged = [SMALL[:size] for size in range(0, len(SMALL), 29)] + [*flipped(SMALL, range(0, len(SMALL), 7))]
     messages = refusals(tmp_path / "a.ply", damaged, lambda path: csplat.read(path, "compressed-ply"))

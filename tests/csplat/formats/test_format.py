@@ -35,6 +35,7 @@ def large(make_model):
     return model.select(np.arange(BLOCK_SPLATS + 1000) % 60)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [1e6 + 0.123, 0.0])
 def test_positions_in_doubles_keep_their_origin_in_every_block(tmp_path, large, far):
     origin = (far, -far, 0.0)
@@ -149,6 +150,7 @@ def test_scenes_of_other_programs_are_named_with_the_way_out(tmp_path, make_mode
     assert "sog" == detect_format(tmp_path / "sog").name
 
 
+@pytest.mark.slow
 def test_a_zip_is_recognised_by_its_contents(tmp_path):
     for names, message in (
         (["x.npy"], "NumPy"),
@@ -203,6 +205,7 @@ def test_of_a_folder_that_a_trainer_wrote_the_newest_scene_is_named(tmp_path):
         csplat.read(tmp_path / "splat")
 
 
+@pytest.mark.slow
 def test_fewer_bands_are_read_of_any_format(tmp_path, make_model):
     model = make_model(40, 2)
     for name in ("a.ply", "a.compressed.ply", "a.spz", "a.v4.spz", "a.sog", "a.glb", "a.csplat"):
@@ -277,6 +280,7 @@ def scene_in(shown):
     return csplat.decode(base64.b64decode(coded))
 
 
+@pytest.mark.slow
 def test_a_model_and_an_opened_file_show_themselves(make_model, tmp_path, monkeypatch):
     model = make_model(40, 1)
     shown = model._repr_html_()
@@ -382,6 +386,7 @@ HOSTILE_ARCHIVES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_archives_that_need_more_than_their_size_allows_are_refused(tmp_path):
     def check(case):
         data, message = case

@@ -213,6 +213,7 @@ def all_of(folder):
     return {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("within", ["", "a/b/"])
 def test_levels_in_a_zip_equal_those_in_a_folder(tmp_path, within):
     folder = levels(tmp_path)
@@ -282,6 +283,7 @@ def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
         csplat.read(zipped(tmp_path / "f.sog", two))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("changes", "message"), [
     ({"version": 2}, "version 2 of streamed"),
     ({"tree": {"lods": 3}}, "not an object"),
@@ -368,6 +370,7 @@ def test_inconsistent_files_are_refused(tmp_path):
         csplat.read(zipped(path, bomb, how=zipfile.ZIP_DEFLATED))
 
 
+@pytest.mark.slow
 def test_damage_is_refused_or_read(tmp_path):
     files = files_of(*splats(1, sh=False))
     path, folder = zipped(tmp_path / "a.sog", files), foldered(tmp_path / "b", files)
@@ -402,6 +405,7 @@ def test_written_files_read_back_within_a_step(tmp_path, make_model):
     assert_within_a_step(model.select(rows), back, np.log1p(reach) / 65535 * (1 + reach))
 
 
+@pytest.mark.slow
 def test_zip_and_folder_have_the_same_bytes(tmp_path, make_model):
     model = make_model(300, 2, flat=True)
     for name in ("a.sog", "b.sog", "c/meta.json"):
@@ -414,6 +418,7 @@ def test_zip_and_folder_have_the_same_bytes(tmp_path, make_model):
     assert csplat.read(tmp_path / "c").flat
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "degree", "fields"), [
     (0, 3, {}), (1, 0, {}), (1, 3, {}), (17, 1, {}), (3, 0, {"means": np.full((3, 3), 2.5, np.float32)}),
 ])  # fmt: skip
@@ -463,6 +468,7 @@ def leaves_of(node):
     return [leaf for child in node["children"] for leaf in leaves_of(child)]
 
 
+@pytest.mark.slow
 def test_levels_of_streamed_sog_read_back_within_a_step(streamed):
     path, levels = streamed
     for number, level in enumerate(levels):
@@ -517,6 +523,7 @@ def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
         assert count == sum(map(len, scene.blocks()))
 
 
+@pytest.mark.slow
 def test_splats_at_one_point_are_one_leaf(tmp_path, make_model):
     model = make_model(17_000, 0, means=np.full((17_000, 3), 2.5, np.float32))
     csplat.write(tmp_path / "a" / "lod-meta.json", model)
@@ -524,6 +531,7 @@ def test_splats_at_one_point_are_one_leaf(tmp_path, make_model):
     assert 17_000 == len(csplat.read(tmp_path / "a"))
 
 
+@pytest.mark.slow
 def test_all_levels_of_a_file_are_converted(tmp_path):
     source, out = RICH, tmp_path / "a" / "lod-meta.json"
     made = convert_file(str(source), str(out), filters=Filters(scale=2.0))

@@ -97,6 +97,7 @@ def test_implausible_splat_files_are_refused_unless_the_format_is_given(tmp_path
             assert "splat" == scene.format
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [1e-9, 1.0, 1e6])
 @pytest.mark.parametrize("count", [1, 2, 30])
 def test_scenes_of_any_size_are_plausible(tmp_path, make_model, size, count):
@@ -198,6 +199,7 @@ def test_ksplat_rows_of_each_level_are_read(level, degree):
     assert "unspecified" == model.coordinate_system
 
 
+@pytest.mark.slow
 def test_sections_of_several_degrees_are_one_scene():
     sections = [
         section(rows(1, n, degree), 1, degree, bucket=n) for n, degree in ((3, 0), (BLOCK_SPLATS + 2, 2), (0, 0))
@@ -242,6 +244,7 @@ def test_invalid_ksplat_files_are_refused(tmp_path, data, message):
         csplat.read(tmp_path / "a.ksplat")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_a_damaged_file_is_refused_or_read(tmp_path, level):
     whole, path = simple(level, 1), tmp_path / "a.ksplat"

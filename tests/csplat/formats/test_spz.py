@@ -157,6 +157,7 @@ def test_invalid_or_oversized_files_are_refused(tmp_path, data, message):
         checked(tmp_path / "a.spz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", [2, 3, 4])
 def test_a_damaged_file_is_refused_or_read(tmp_path, version):
     whole = spz(version, splats(version, degree=1), degree=1, flags=2, extensions=AXES)

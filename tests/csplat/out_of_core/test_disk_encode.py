@@ -31,6 +31,7 @@ def whole(model):
     return encode(model, FAST)
 
 
+@pytest.mark.slow
 def test_a_file_of_many_buckets_is_valid_with_declared_errors(model, whole):
     assert validate(whole).conforms
     result = encode_with_report(model, FAST)
@@ -49,6 +50,7 @@ def with_levels(model, tmp_path_factory):
     return path.read_bytes()
 
 
+@pytest.mark.slow
 def test_each_bucket_is_a_subtree_of_the_levels(whole, with_levels):
     assert validate(with_levels).conforms
     with csplat_open(with_levels) as file:
@@ -61,6 +63,7 @@ def test_each_bucket_is_a_subtree_of_the_levels(whole, with_levels):
         assert np.array_equal(getattr(decode(whole), name), getattr(decode(with_levels), name))
 
 
+@pytest.mark.slow
 def test_an_out_of_core_encoding_is_resumed_with_more_memory(model, whole, tmp_path):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
@@ -80,6 +83,7 @@ def ply(model, tmp_path):
     return tmp_path / "scene.ply"
 
 
+@pytest.mark.slow
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)

@@ -66,6 +66,7 @@ def assert_holds(model, names, rows):
     assert np.array_equal(model.opacities, alpha)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
 @pytest.mark.parametrize(("degree", "normals"), [(0, True), (1, False), (2, True), (3, True), (3, False)])
 def test_reads_every_degree_and_encoding(tmp_path, degree, normals, kind):
@@ -306,6 +307,7 @@ def test_folders_and_missing_files_are_refused(tmp_path):
         read_ply(tmp_path / "none.ply")
 
 
+@pytest.mark.slow
 def test_damage_is_refused_or_read(tmp_path):
     path, names = tmp_path / "a.ply", columns_of(0, normals=False)
     write_rows(path, names, random_rows(names, 2))

@@ -44,6 +44,7 @@ def test_errors_declared_by_the_encoder_are_verified(make_model, preset):
         assert ((), index is not None) == (proof.failures, proof.rms_verified)
 
 
+@pytest.mark.slow
 def test_declared_errors_that_are_too_small_or_inexact_are_not_verified(make_model):
     # SER-5
     source = make_model(200, 1)
@@ -88,6 +89,7 @@ def test_refitted_or_undeclared_attributes_are_not_verified(make_model):
     assert nothing.failures == ("the file states no errors",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("indexed", [True, False])
 def test_a_failure_names_splat_tile_source_and_error(make_model, indexed):
     source = make_model(1500, 1)
@@ -121,6 +123,7 @@ def test_extra_columns_but_no_normals_are_verified(make_model):
     assert proof.clauses == ("SRC-3",)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [
     EncodeOptions(),
     EncodeOptions(preset="fast", tile_splats=64),

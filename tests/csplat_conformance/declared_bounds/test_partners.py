@@ -30,6 +30,7 @@ def bounds_of(source, decoded, index):
     return {name: pair[0] for name, pair in measure_pairs(source, decoded, index).items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma", [0.0, 1e-4, 0.1])
 def test_finds_partners(make_model, sigma):
     source, count = make_model(1500, 1), 1500
@@ -47,6 +48,7 @@ def test_finds_partners(make_model, sigma):
     assert {UNMATCHED} == {*match(make_model(0, 1), some, bounds, np.zeros(100)).tolist()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("attribute", ["means", "scales", "opacities", "sh0", "shN"])
 def test_a_splat_without_a_partner_is_reported(make_model, attribute):
     source = make_model(300, 1)

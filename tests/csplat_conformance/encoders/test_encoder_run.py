@@ -19,8 +19,6 @@ from csplat_conformance.encoders.file_checks import check_content
 from csplat_conformance.protocol import ProcessEnd, run_program
 from csplat_tools.cli.app import app
 
-pytestmark = pytest.mark.long
-
 
 def invoke(*words):
     return CliRunner().invoke(app, ["conformance", "encoder", *map(str, words)])
@@ -52,6 +50,7 @@ def test_a_refusal_leaves_nothing(encoded, name):
     assert (Status.FAILED, (), message) == outcome_of(encoded, refuse, EncoderSuiteOptions(name, ("L1",)))
 
 
+@pytest.mark.slow
 def test_the_working_directory_stays_empty():
     writes = program("import sys; open('core', 'w'); open(sys.argv[2], 'w'); sys.exit(0)")
     refuses = program("import sys; open('log', 'w'); sys.exit('error: no')")
@@ -78,6 +77,7 @@ def test_a_command_may_name_files_relative_to_the_callers_directory(tmp_path, mo
     assert f"{tmp_path}/other\n" == program_output
 
 
+@pytest.mark.slow
 def test_processes_run_again_in_another_second(encoded, tmp_path):
     (tmp_path / "sound.csplat").write_bytes(encoded[0])
     code = f"""import sys, time
@@ -139,6 +139,7 @@ def test_declined_unusual_inputs_are_counted():
     assert (Status.DECLINED, (), "refused: error: unusual") == first(some)
 
 
+@pytest.mark.slow
 def test_inputs_are_written_as_files_with_a_list(tmp_path):
     listed = write_inputs(tmp_path)["inputs"]
     assert listed == json.loads((tmp_path / "inputs.json").read_text())["inputs"]

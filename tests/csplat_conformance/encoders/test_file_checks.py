@@ -15,6 +15,7 @@ INPUTS = {one.name: one for one in all_inputs()}
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
 
 
+@pytest.mark.slow
 def test_pairs_are_found_however_the_file_is_ordered():
     source = ENCODABLE["ordinary/two_tiles"].source().means.astype(np.float64)
     order = np.random.default_rng(1).permutation(len(source))[:60_000]

@@ -378,6 +378,7 @@ def test_what_a_gpu_cannot_do_is_refused():
         GpuScene(device, [model], sh_degree=-1)
 
 
+@pytest.mark.slow
 def test_without_a_gpu_auto_warns_and_gpu_is_an_error(monkeypatch):
     def none(**_options):
         raise InputError("no GPU was found, only a toaster")

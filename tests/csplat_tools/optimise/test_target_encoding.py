@@ -98,6 +98,7 @@ def test_a_small_size_is_met_with_fewer_splats(search_at_size):
     assert search_at_size.report.search.psnr > 24.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("no_prune", [True, False])
 def test_a_size_that_no_file_needs_gives_the_finest_file_at_once(many, no_prune):
     found = search(many, judged_by(cameras(40)), size_bytes=10**6, no_prune=no_prune).report.search
@@ -221,6 +222,7 @@ def test_two_refits_predict_the_error_of_others():
     assert alone[rows[0]] < together[rows[0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["virtual", "cameras", "photographs"])
 def test_test_views_are_neither_validation_nor_training_views(many, photographs, kind):
     given = {"virtual": around(many), "cameras": judged_by(cameras(40)), "photographs": photographs}[kind]
@@ -376,6 +378,7 @@ def test_the_psnr_of_extra_test_views_is_reported(psnr, note):
     assert 1 == sum(note in line for line in format_search(report))
 
 
+@pytest.mark.slow
 def test_extra_test_cameras_are_nearer_and_farther(scene):
     # Nearer by 0.6, or by less if they would be within the scene.
     centre = scene_frame(scene).centre

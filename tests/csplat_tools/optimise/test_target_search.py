@@ -325,6 +325,7 @@ def test_unneeded_splats_are_pruned_unless_pruning_is_off():
     assert 8000 == found_in("no splat to spare", no_prune=False, psnr=45.0).file.contents.splats
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mended", "goal"), [(1.0, 42.0), (3.0, 38.0), (12.0, 34.0)])
 def test_the_gain_of_a_refit_predicts_the_next_number_of_splats(mended, goal):
     scene = replace(PLAIN, mended=mended)

@@ -36,6 +36,7 @@ def cameras(tmp_path):
     return tmp_path / "cameras.json"
 
 
+@pytest.mark.slow
 def test_the_command_puts_cameras_and_axes_into_the_page(sample, cameras, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(sample)
     export(tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", cameras, "--up", "z")
@@ -117,6 +118,7 @@ def test_refusals_leave_the_page_unchanged(sample, sample_path, tmp_path):
     assert ["broken.csplat", "page.html"] == sorted(path.name for path in tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_page_can_be_written_to_a_pipe(sample, tmp_path):
     (tmp_path / "scene.csplat").write_bytes(sample)
     done = export(tmp_path / "scene.csplat", "-", "--quiet")

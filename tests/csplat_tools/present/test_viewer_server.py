@@ -107,6 +107,7 @@ def test_the_root_leads_to_the_page_and_the_page_to_the_scene(scene_path):
         assert (200, "model/vnd.csplat", scene_path.read_bytes()) == (status, headers["Content-Type"], body)
 
 
+@pytest.mark.slow
 def test_every_module_of_the_page_is_served_as_javascript(scene_path):
     with served(scene_path) as server:
         for name, path in web_files().items():
@@ -155,6 +156,7 @@ ELSEWHERE = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_other_paths_are_not_served(scene_path):
     (scene_path.parent / "secret.txt").write_text("secret")
     with served(scene_path) as server:
@@ -197,6 +199,7 @@ def host_statuses(server, hosts):
     return found
 
 
+@pytest.mark.slow
 def test_the_bound_address_decides_which_hosts_are_served(scene_path):
     own = socket.gethostname()
     served_at = []
@@ -272,6 +275,7 @@ def test_every_request_gets_one_answer_with_a_status(scene_path):
             assert (status if isinstance(status, tuple) else (status,)) == found, request[:80]
 
 
+@pytest.mark.slow
 def test_a_ply_is_encoded_in_memory(tmp_path, make_model):
     model = make_model(300)
     write_ply(tmp_path / "scene.ply", model)

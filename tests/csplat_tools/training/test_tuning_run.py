@@ -74,6 +74,7 @@ def test_a_tuning_that_outgrows_its_size_begins_smaller(source):
     assert (30.0, 2) == (made.psnr, len(tuner.untuned))
 
 
+@pytest.mark.slow
 def test_importance_is_per_source_splat(capture, tmp_path, monkeypatch):
     words = ("finetune", capture / "scene.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
     weighted = partial(tuning_run.run_finetuning, importance=str(tmp_path / "w.npy"))

@@ -46,6 +46,7 @@ def many_tiles(make_model, tmp_path):
     return path
 
 
+@pytest.mark.slow
 def test_threads_and_released_pages_do_not_change_the_result(many_tiles, monkeypatch):
     monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
     expected = decode(many_tiles)
@@ -83,6 +84,7 @@ def test_no_part_of_a_damaged_file_goes_to_standard_output(many_tiles):
     assert (1, b"") == (found.exit_code, found.stdout_bytes)
 
 
+@pytest.mark.slow
 def test_the_limit_of_splats_is_per_file_and_that_of_bytes_per_tile(many_tiles):
     with pytest.raises(LimitError, match="splats"):
         open_tiles(many_tiles, limits=Limits(splats=599))

@@ -58,6 +58,7 @@ def numbers(seen_from):
 
 
 # Roles.
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "every", "size"), [("rgb", 5, None), ("rgba", 10, (24, 20)), ("colmap", 5, (24, 20))])
 def test_each_image_has_one_role(sets, scene, kind, every, size):
     views = find_view_set(scene, data=DataOptions(str(sets[kind]), size, test_every=every))
@@ -72,6 +73,7 @@ def test_each_image_has_one_role(sets, scene, kind, every, size):
     assert numbers(views.test) == numbers(views.image_test_scorer().cameras)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("count", "judging", "virtual"), [(3, 3, True), (39, 39, True), (40, 10, False), (120, 24, False)]
 )
@@ -85,6 +87,7 @@ def test_a_camera_file_is_split_if_it_has_enough_views(scene, tmp_path, count, j
     assert virtual or count == sum(map(len, roles))
 
 
+@pytest.mark.slow
 def test_virtual_test_views_have_a_black_background(scene):
     views = find_view_set(scene, count=5, validation_count=2, background=WHITE)
     assert (21, 2, 8) == tuple(map(len, poses(views)))
@@ -151,6 +154,7 @@ def test_recorded_training_options_are_the_defaults(sets, scene):
     ] == [line for line in views.notes if "trained" in line]
 
 
+@pytest.mark.slow
 def test_a_scene_without_a_training_record_is_noted_once(sets, scene):
     for kind in ("rgb", "rgba"):
         views = find_view_set(scene, data=DataOptions(str(sets[kind])))

@@ -21,6 +21,7 @@ def test_names_with_control_characters_are_refused(tmp_path):
         read_images(file)
 
 
+@pytest.mark.slow
 def test_every_prefix_of_colmap_files_is_refused(tmp_path):
     write_colmap(tmp_path, cameras(2))
     for name, read in (("images.bin", read_images), ("points3D.bin", read_points)):

@@ -227,6 +227,7 @@ def test_factors_of_other_lens_models_are_refused(tmp_path):
             load(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("radial", "tangential"),
     [
@@ -496,6 +497,7 @@ COMMAS = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_decimal_commas_are_read_or_named(tmp_path):
     write_colmap_set(tmp_path / "set", text=True)
     expected = load(tmp_path / "set")
@@ -555,6 +557,7 @@ FOREIGN = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_sets_of_other_programs_are_named_with_a_way_out(tmp_path):
     def check(case):
         name, begin, message = case

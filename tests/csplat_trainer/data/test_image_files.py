@@ -107,6 +107,7 @@ def transforms(tmp_path):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("folder", "note"),
     [
@@ -129,6 +130,7 @@ def test_originals_belong_to_the_distorted_model(colmap_set):
     assert "images from input" in load(colmap_set).report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", ["IM {:03}.PNG", "photos/im {:03}.png", "D:\\photos\\im {:03}.png", "im {:03}.jpg", "./im {:03}.png"]
 )
@@ -157,6 +159,7 @@ def test_the_message_names_the_folders_that_were_tried(colmap_set):
     assert "there are other images, such as im 000.png" in message
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("path", "folder"),
     [
@@ -219,6 +222,7 @@ CODE_PAGES = {
 }
 
 
+@pytest.mark.slow
 def test_names_in_other_code_pages_are_matched_by_their_bytes():
     def check(case):
         form, page, title = case
@@ -241,6 +245,7 @@ def test_bytes_that_fit_no_file_or_several_are_no_match():
         match_names(listed, ["Köln.png", "K÷ln.png"], "x")
 
 
+@pytest.mark.slow
 def test_sets_with_names_in_another_code_page_are_read(colmap_set):
     names = [f"図面表{i}.png" for i in range(9)]  # in code page 932, some bytes are backslashes
     model = colmap_set / "sparse" / "0" / "images.bin"
@@ -260,6 +265,7 @@ def test_sets_with_names_in_another_code_page_are_read(colmap_set):
     assert [names[2]] == [image.camera.image for image in load(colmap_set).test]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "form"), [("cp932", "表{}.png"), ("cp1252", "Größe{}.png")])
 def test_a_transforms_json_may_be_in_another_code_page(transforms, page, form):
     names = [form.format(i) for i in range(10)]
@@ -350,6 +356,7 @@ def test_a_set_reports_how_its_pixels_are_read(transforms):
     assert (data.train[0].pixels == (255, 0, 0)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("orientation", "square", "reported"), [(1, 0, 0), (3, 0, 1), (6, 0, 0), (6, 1, 1)])
 def test_an_ambiguous_exif_rotation_is_reported(transforms, orientation, square, reported):
     exif = Image.Exif()

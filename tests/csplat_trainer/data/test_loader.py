@@ -290,6 +290,7 @@ def test_intrinsics_of_other_programs_are_read(ngp):
     assert np.isclose(document["fl_x"], load(ngp).train[0].camera.K[0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "text", "split"),
     [
@@ -355,6 +356,7 @@ def test_text_replaces_an_empty_binary_file_of_a_model(colmap_set):
     assert 7 == len(load(colmap_set).train)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-32"])
 def test_text_files_may_begin_with_a_byte_order_mark(tmp_path, encoding):
     write_colmap_set(tmp_path, text=True)
@@ -384,6 +386,7 @@ def test_text_in_another_encoding_is_refused(colmap_set, data, message):
         load(colmap_set)
 
 
+@pytest.mark.slow
 def test_the_smallest_sufficient_folder_of_images_is_read(tmp_path):
     shots = cameras(9, 96, 64)
     for scale, folder in ((1, "images"), (2, "images_2"), (4, "images_4")):
@@ -445,6 +448,7 @@ def test_the_near_plane_follows_the_distance_of_the_cameras(blender):
     assert 0.011 == load(blender, near=0.011).train[0].camera.near
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "at"),
     [
@@ -518,6 +522,7 @@ def test_other_files_and_folders_and_invalid_json_are_refused(tmp_path):
             load(tmp_path / name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", ["sparse", "sparse/model", "colmap/sparse/0", "distorted/sparse/0", "."])
 def test_models_are_found_in_several_folders(colmap_set, model):
     target = colmap_set / model
@@ -574,6 +579,7 @@ def test_missing_invalid_and_truncated_images_are_refused(ngp):
         load(ngp)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["blender", "ngp", "colmap"])
 @pytest.mark.parametrize("size", [None, (24, 16)])
 def test_images_are_decoded_lazily(request, monkeypatch, kind, size):
@@ -594,6 +600,7 @@ def test_images_are_decoded_lazily(request, monkeypatch, kind, size):
     assert len(data.train) + len(data.test) == len(decoded)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orientation", [6, 8])
 def test_exif_rotation_is_applied_if_the_camera_is_upright(ngp, orientation):
     for path in sorted((ngp / "images").glob("*.png")):
@@ -619,6 +626,7 @@ def _hide(path, size):
     Image.fromarray(values).save(path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ngp", "colmap"])
 @pytest.mark.parametrize(("size", "sides"), [(None, (W, H)), ((24, 16), (W, H)), (None, (2 * W, 2 * H))])
 def test_a_mask_excludes_pixels(request, kind, size, sides):
@@ -672,6 +680,7 @@ def test_transparency_of_a_palette_is_known_before_decoding(blender):
     assert (H, W, 4) == picture.pixels.shape
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "options", "expected"),
     [

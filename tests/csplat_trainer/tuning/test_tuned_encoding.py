@@ -61,6 +61,7 @@ def capture(source, tmp_path_factory):
     return photograph(source, tmp_path_factory.mktemp("capture"))
 
 
+@pytest.mark.slow
 def test_a_file_that_decodes_differently_is_not_written(capture, tmp_path, monkeypatch):
     def wrong(data):
         model = decode(data)

@@ -435,6 +435,7 @@ def test_the_command_resumes(capture, tmp_path, monkeypatch):
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "message"),
     [
