@@ -221,7 +221,7 @@ def test_the_validator_finds_values_beyond_a_range(beyond):
     assert [] == failures(beyond, check)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_valid_vectors_hold_both_ends_of_each_range(valid):
     full = SCENES[FULL_TILE].tiles[0].blocks
     in_streams = {"sparse_params.present_count": {sum(full[_spec.ATTRIBUTE_SH0 + 1].mask)}}
@@ -272,7 +272,7 @@ def entry_named(name):
     return next(entry for entry in MANIFEST["vectors"] if entry["name"] == name)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_manifest_is_valid_by_its_schema():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
     jsonschema.Draft202012Validator(SCHEMA).validate(MANIFEST)

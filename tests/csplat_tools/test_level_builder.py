@@ -533,7 +533,7 @@ def test_a_size_counts_all_levels(larger_model):
     assert scorer.psnr(decode(result.data)) > scorer.psnr(decode(alone)) - 0.3  # as a search for the rest of the size
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_other_targets_and_an_importance_have_levels(larger_model, tmp_path):
     weights, out = tmp_path / "weights.npy", tmp_path / "out.csplat"
     np.save(weights, np.linspace(0.1, 1.0, 1200, dtype=np.float32))

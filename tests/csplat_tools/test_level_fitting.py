@@ -44,7 +44,7 @@ def quarter(splats):
     return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4))[1]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_fitted_levels_look_better_than_merged_ones(larger_model):
     model = larger_model
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))

@@ -40,10 +40,11 @@ T = TypeVar("T")
 
 #: Files with the longest tests: pytest-xdist starts them first, so that no worker is left with one at the end.
 LONGEST = (
-    "test_finetune",
-    "test_conformance_encoder",
-    "test_viewer_page",
-    "test_cli",
+    "test_encoder_suite",
+    "test_level_builder",
+    "test_tradeoffs",
+    "test_batch",
+    "test_target_encoding",
     "test_viewer_pictures",
 )
 
@@ -62,10 +63,13 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark tests with `data_dir` as shared_data, and put the longest files first."""
+    """Mark tests with `data_dir` as shared_data and tests in Chromium as browser, and put the longest files first."""
     for item in items:
-        if "data_dir" in getattr(item, "fixturenames", ()):
+        fixtures = getattr(item, "fixturenames", ())
+        if "data_dir" in fixtures:
             item.add_marker("shared_data")
+        if "browser" in fixtures:
+            item.add_marker("browser")
     ranks = {name: rank for rank, name in enumerate(LONGEST)}
     items.sort(key=lambda item: ranks.get(item.path.stem, len(ranks)))
 

@@ -77,6 +77,7 @@ def assert_render_is_finite(result):
     assert 0.0 <= result.alpha.min() <= result.alpha.max() <= 1.0
 
 
+@pytest.mark.long
 def test_reading_repairs_defects_and_strict_reading_refuses_them(chains):
     def check(name, chain):
         repairs = CONDITIONS[name].repairs

@@ -82,7 +82,7 @@ def without_up(**fields):
     return lambda _folder, make_model: make_model(60, 1, **fields)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("make", "words", "axes", "up"), [
     (trained(write_blender, (0, 0, 1)), [], "RFU", (0, 0, 1)),
     (trained(write_colmap_set, (0, -1, 0)), [], "unspecified", (0, -1, 0)),

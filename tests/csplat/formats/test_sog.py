@@ -507,7 +507,7 @@ def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
     assert -reach <= min(meta["tree"]["bound"]["min"]) < 0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
     count = 530_000
     csplat.write(tmp_path / "a" / "lod-meta.json", make_model(count, 0))

@@ -98,7 +98,7 @@ def test_our_encoder_passes_on_every_input():
     assert all(one.status is Status.PASSED for one in taken)  # ours refuses nothing else that it can encode
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("preset", [preset for preset in PRESETS if preset != csplat.EncodeOptions().preset])
 def test_our_encoder_passes_at_other_presets(preset):
     # CNF-5, CNF-6, SRC-3

@@ -52,7 +52,7 @@ def test_every_clause_about_files_has_its_code():
     assert [] == wrong
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_clause_is_reached_by_a_vector_or_a_test_of_this_file(broken):
     reached = {one.clause for violations in broken.values() for one in violations}
     here = Path(__file__).read_text(encoding="utf-8")
