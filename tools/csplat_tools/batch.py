@@ -125,7 +125,7 @@ def run_batch(
     Scripts must guard their own code by `if __name__ == "__main__":`, because worker processes import it.
 
     Args:
-        scenes: a folder, searched with its subfolders for the endings that `csplat formats` lists; or a manifest: lines
+        scenes: a folder, searched with its subfolders for the endings that `convert --help` lists; or a manifest: lines
             of JSON (.jsonl), or of path, output and options (.csv, .txt) with commas, semicolons or tabs between them.
         folder: the folder for outputs and the page of results; it is made if missing.
         command: the command with its options: `encode` skips .csplat files, `decode` and `extract` skip all others.
