@@ -520,7 +520,7 @@ def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tm
     assert bool(data == (tmp_path / "out.csplat").read_bytes())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_size_counts_all_levels(larger_model):
     target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
     result = encode_with_levels(larger_model, EncodeOptions(), LevelBuilder(1), target=target)

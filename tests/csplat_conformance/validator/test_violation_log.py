@@ -60,7 +60,7 @@ def test_every_clause_is_reached_by_a_vector_or_a_test_of_this_file(broken):
     assert set(UNBREAKABLE) == set(CODES) - reached - tested
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_number_of_violations_is_bounded():
     data = bytearray(SMALL.data)
     header = _spec.unpack_header(data)
