@@ -47,7 +47,7 @@ test_tier() {
     step "Python tests" "${PYTEST[@]}" -m "$1" --deselect tests/system/test_behaviour.py "${@:2}"
 }
 
-# lab_tier CASES: fuzz each target with so many cases. Unguided: without coverage cases take a third of the time.
+# lab_tier N [WORDS...]: fuzz each target with N cases, without coverage, which would triple their time.
 lab_tier() {
     step "fuzzing" "$BIN/python" conformance/lab/fuzz.py --target all --count "$1" --jobs 1 --plain
     step "tests of the laboratories" "${PYTEST[@]}" conformance/lab/tests tools/lab/tests "${@:2}"

@@ -45,14 +45,8 @@ def tiff(*entries, next_at=0):
 
 
 JPEG = saved("JPEG")
-
-
 DEFLATED, LZW = (saved("TIFF", compression=kind) for kind in ("tiff_adobe_deflate", "tiff_lzw"))
-
-
 LARGE_TEXT = zlib.compress(b"a" * (1 << 25))
-
-
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\n%%EndComments\nshowpage\n%%EOF\n"
 
 

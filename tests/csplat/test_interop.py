@@ -17,8 +17,6 @@ from csplat.errors import InputError
 from csplat.interop import to_gsplat
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
 STORED = {
     name: Path(__file__).parents[1] / "helpers" / "checkpoints" / name for name in ("gsplat.pt", "splatfacto.ckpt")
 }
@@ -178,8 +176,6 @@ def of_inria(splats):
 
 
 LIGHTNING = ("means", "rotations", "scales", "opacities", "shs_dc", "shs_rest")  # names in Gaussian Splatting Lightning
-
-
 INRIA_STATE = ("_xyz", "_rotation", "_scaling", "_opacity", "_features_dc", "_features_rest")
 
 

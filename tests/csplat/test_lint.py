@@ -14,8 +14,6 @@ from csplat.ply import lint_ply, read_ply
 from csplat.ply.columns import alpha_of_logits
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
 NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 
 
@@ -60,8 +58,6 @@ def lines_of(rows):
 
 
 ROWS = good_rows(4)  # an x of 3.0 in the last row
-
-
 LINES = "\n".join(lines_of(ROWS))
 
 
@@ -117,8 +113,6 @@ def retyped(kind, names, **columns):
 
 
 GOOD_SH = np.stack([good_rows()[f"f_dc_{channel}"] for channel in range(3)], 1)
-
-
 BAD_VALUES = [("x", np.nan), ("x", -np.inf), ("f_dc_1", np.inf), ("f_rest_8", np.nan), ("f_rest_8", -np.inf),
     ("scale_2", np.nan), ("scale_2", np.inf), ("rot_3", np.nan), ("rot_3", np.inf)]  # fmt: skip
 
@@ -466,11 +460,7 @@ def test_nan_and_infinity_are_read_in_other_spellings(path, word):
 
 
 SEPARATED = good_rows(2, names=without("nx", "ny", "nz"))
-
-
 BIG_LABELS = f"1 2{' 0' * len(NAMES)}\n{10**30} 2{' 0' * len(NAMES)}\n"
-
-
 BAD_TEXT = {
     "a decimal comma": (LINES.replace("\n3.0 ", "\n3,0 "), ROWS, "row 3 of vertex: x is '3,0', expected a number"),
     "two points": (LINES.replace("\n3.0 ", "\n3.0.0 "), ROWS, r"row 3 of vertex: x is '3\.0\.0', expected a number"),
@@ -593,8 +583,6 @@ def test_extra_columns_are_named_and_dropped(path):
 
 
 FACES = ["element face 0", "property list uchar int vertex_indices"]
-
-
 BAD_COLUMNS = {
     "no finite row": (ply(good_rows(x=np.nan)), "nonfinite-rows: 5 splats with NaN or infinity: none is left"),
     **{
@@ -640,8 +628,6 @@ def test_a_file_without_columns_of_splats_is_refused_from_its_header(path):
 
 
 GOOD = ply(good_rows())
-
-
 BAD_HEADERS = {
     f"{new[:20].decode()}, {len(new)} bytes": (GOOD.replace(old, new), message)
     for old, new, message in [
@@ -666,11 +652,7 @@ def test_headers_that_declare_too_much_are_refused(path):
 
 
 _LISTS = 12_000
-
-
 _HEADER_PEAK = 1_100_000  # bytes; up to 1 MiB of the file is searched for the end of the header
-
-
 _UNUSED = {  # other elements, their rows in binary, and their lines in ASCII
     "empty lists": ([f"element tags {_LISTS}", "property list uchar int a"], bytes(_LISTS), "0\n" * _LISTS),
     "lists of two kinds": (
@@ -719,8 +701,6 @@ def test_other_elements_are_skipped_without_an_object_per_row(path, kind, comes_
 
 
 LIST, PAIR = "property list uchar int a", ["element tags 2", "property int a", "property int b"]
-
-
 BAD_ELEMENTS = {
     f"{lines[-1]}, rows {rows}": (
         with_element("ascii" if lines == PAIR else "binary_little_endian", lines, rows, comes_first=False), message)

@@ -15,8 +15,6 @@ from csplat_render import render
 from csplat_render.conventions import ALPHA_CAP
 
 RNG = np.random.default_rng(4)
-
-
 DIRECTIONS = RNG.standard_normal((500, 3))
 
 

@@ -7,12 +7,13 @@ import io
 import json
 import re
 import sys
+import xml.etree.ElementTree as ET
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from conformance_runner_cases import FAULTY, FAULTY_CUTS, RECORDED, VECTOR_LIST
 from tables import failures
+from typer.testing import CliRunner
 
 import csplat
 from csplat.errors import FormatError, InputError
@@ -21,24 +22,102 @@ from csplat_authoring.recipes import sound_recipes
 from csplat_conformance import adapter, decoder_suite
 from csplat_conformance.answers import Answer, check_payload_consistency, compare_answer
 from csplat_conformance.conformance_report import Status
-from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_builtin, run_command
-from csplat_conformance.encoders.encoder_inputs import all_inputs
+from csplat_conformance.decoder_suite import DecoderSuiteOptions, parse_levels, run_builtin, run_command
+from csplat_conformance.encoders import all_inputs
 from csplat_conformance.manifest import VECTORS, load, select_names
 from csplat_selftest.decoder_processes import missing_javascript
 from csplat_selftest.fuzzing.damage import built_from
+from csplat_tools.cli.app import app
+
+VECTOR_LIST = load()
+
+
+# Recorded answers of our decoder by the protocol, with a selectable fault; no slow imports.
+FAULTY = """
+import json, os, pathlib, shutil, signal, struct, sys, time
+
+fault, source, outdir = sys.argv[1], sys.argv[2], pathlib.Path(sys.argv[3])
+instead = {
+    "crash": lambda: os.kill(os.getpid(), signal.SIGSEGV),
+    "hang": lambda: time.sleep(60),
+    "status": lambda: sys.exit(77),
+    "traceback": lambda: {}["tile"],
+    "silent": lambda: sys.exit(0),
+    "believes json_open": lambda: "json_open." in source and sys.exit(0),
+    "no code": lambda: print("it is broken") or sys.exit(1),
+    "refusal": lambda: print('{"code": "E_MAGIC"}') or sys.exit(1),
+}
+instead.get(fault, int)()
+recorded = pathlib.Path(__file__).parent / "recorded" / pathlib.Path(source).stem
+status, words = json.loads(recorded.with_suffix(".json").read_text())
+sys.stdout.write(words)
+for path in recorded.iterdir():
+    shutil.copy(path, outdir)
+header, means = outdir / "header.json", outdir / "floats.means.bin"
+raw = means.read_bytes() if means.exists() else b""
+bits = [value for (value,) in struct.iter_unpack("<I", raw)]
+change = {
+    "leftovers": lambda: means.write_bytes(b"part"),
+    "no header": header.unlink,
+    "header": lambda: header.write_text("[]"),
+    "fact": lambda: header.write_text(json.dumps(json.loads(header.read_text()) | {"splat_count": 3})),
+    "missing": (outdir / "integers.means.bin").unlink,
+    "extra": (outdir / "floats.colours.bin").touch,
+    "unknown file": (outdir / "log.txt").touch,
+    "partial": lambda: means.write_bytes(raw[:-1]),
+    "longer": lambda: means.write_bytes(raw + b"0"),
+    "rounding": lambda: means.write_bytes(bytes([raw[0] ^ 1]) + raw[1:]),
+    "2 ulp": lambda: means.write_bytes(struct.pack(f"<{len(bits)}I", *(value + 2 for value in bits))),
+    "3 ulp": lambda: means.write_bytes(struct.pack(f"<{len(bits)}I", *(value + 3 for value in bits))),
+}
+change.get(fault, int)()
+sys.exit(status)
+"""
+
+
+FAULTY_CUTS = """
+import json, pathlib, sys
+
+fault, source, cuts = sys.argv[1:]
+known = json.loads((pathlib.Path(__file__).parent / "cuts.json").read_text())[pathlib.Path(source).stem]
+given = [known[cut] for cut in pathlib.Path(cuts).read_text().splitlines()]
+lines = [tiles if isinstance(tiles, str) else " ".join(map(str, tiles)) for tiles in given]
+if fault == "status":
+    sys.exit(77)
+if fault == "refusal":
+    print(json.dumps({"code": "E_INDEX", "clause": "TRE-5"}))
+    sys.exit(1)
+unsupported = {
+    "no sizes": lambda cut: "pixel_size" in cut,
+    "no list of sizes": lambda cut: len(cut.split(" box ")[0].split()) > 2,
+    "no boxes": lambda cut: " box " in cut,
+    "no cuts": lambda cut: True,
+}.get(fault, lambda cut: False)
+lines = ["E_UNSUPPORTED" if unsupported(cut) else line for cut, line in zip(known, lines)]
+changed = {
+    "silent": [],
+    "short": lines[:-1],
+    "long": [*lines, "0"],
+    "words": [lines[0], "tile 2", *lines[2:]],
+    "one wrong": [lines[0], "1 0", *lines[2:]],
+    "empty cuts": [""] * len(lines),
+    "no error code": ["E_INPUT" if line == "E_LIMIT" else line for line in lines],
+}
+for line in changed.get(fault, lines):
+    print(line)
+"""
+
+
+#: Vectors whose answers are recorded.
+RECORDED = (
+    "valid/quats", "invalid/quat_radicand", "invalid/json_open", "invalid/json_surrogate",
+    "invalid/json_beyond_budget", "invalid/error_counts",
+)  # fmt: skip
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
-
-
 CUT_ADAPTER = f"{sys.executable} -m csplat_conformance.adapter --cuts {{input}} {{cuts}}"
-
-
 JS_ADAPTER = f"node '{ROOT / 'codec' / 'js' / 'test' / 'adapter.mjs'}' {{input}} {{outdir}}"
-
-
 needs_node = pytest.mark.skipif(bool(missing_javascript()), reason=f"skipped: {missing_javascript()}")
 
 
@@ -339,24 +418,17 @@ def test_patterns_of_the_guides_match_vectors():
     assert [] == failures({word: word for word in recommended}, check)
 
 
-VECTOR_LIST_CONFORMANCE = load()
-
-
-VALID = [vector for vector in VECTOR_LIST_CONFORMANCE if not vector.error]
-
-
+VALID = [vector for vector in VECTOR_LIST if not vector.error]
 SCENES = {recipe.name: recipe.scene for recipe in sound_recipes() if recipe.scene is not None}
 
 
 def named(name):
-    return next(vector for vector in VECTOR_LIST_CONFORMANCE if vector.name == name)
+    return next(vector for vector in VECTOR_LIST if vector.name == name)
 
 
 def test_the_built_in_run_passes_a_vector_once_per_level():
     report = decoder_suite.run_builtin(DecoderSuiteOptions(pattern="*/quat*,valid/rich"))
-    names = [
-        vector.name for vector in VECTOR_LIST_CONFORMANCE if vector.name.split("/")[1].startswith(("quat", "rich"))
-    ]
+    names = [vector.name for vector in VECTOR_LIST if vector.name.split("/")[1].startswith(("quat", "rich"))]
     valid = [name for name in names if not name.startswith("invalid/")]
     assert [] == report.failures
     for level, passed in (("L1", names), ("L2", valid), ("L3", valid)):
@@ -421,3 +493,64 @@ def valid():
         for structure, fields in by_structure.items():
             found.setdefault(structure, []).append(replace(built, fields=codings | fields))
     return found.__getitem__
+
+
+def test_a_level_includes_the_lower_levels_and_a_list_names_its_own():
+    texts = {"1": (1,), "3": (1, 2, 3), "1,3": (1, 3), "L4": (1, 2, 3, 4), "5": (1, 2, 3, 4, 5), "3,1": (1, 3)}
+    assert texts == {text: parse_levels(text) for text in texts}
+    for text in ("0", "6", "x", "1,9", ""):
+        with pytest.raises(InputError):
+            parse_levels(text)
+    result = invoke("--level", "9")
+    assert (2, 1) == (result.exit_code, len(result.stderr.splitlines()))
+
+
+def invoke(*words):
+    return CliRunner().invoke(app, ["conformance", "decoder", *map(str, words)])
+
+
+@pytest.mark.slow
+def test_the_command_writes_table_json_and_junit(faulty, tmp_path):
+    reports = ("--report", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
+    result = invoke("--cmd", faulty("rounding"), "--filter", "valid/quats", *reports)
+    assert 1 == result.exit_code
+    assert "L3  FAILED  valid/quats  floats.means differs" in result.stdout
+    found = json.loads((tmp_path / "r.json").read_text())
+    assert (False, 1) == (found["passed"], found["levels"]["L3"]["failed"])
+    suites = ET.parse(tmp_path / "r.xml").getroot()  # noqa: S314 - ours
+    assert ("3", "1") == (suites.get("tests"), suites.get("failures"))
+    assert "exists" in invoke("--filter", "valid/quats", *reports).stderr
+    assert 0 == invoke("--filter", "valid/quats", *reports, "--force").exit_code
+    assert invoke("--filter", "valid/quats", "--junit", "-").stdout.startswith("<?xml")
+    assert 2 == invoke("--filter", "valid/quats", "--json", "--junit", "-").exit_code
+
+
+def chosen(*words):
+    """Return the names of the vectors that the command runs, at level 1."""
+    report = invoke(*words, "--level", "1", "--json").stdout
+    return {outcome["name"] for outcome in json.loads(report)["outcomes"]}
+
+
+def test_a_filter_repeats_and_combines_patterns_of_names_and_of_clauses():
+    valid = {vector.name for vector in VECTOR_LIST if "MOR-1" in vector.clauses and vector.name.startswith("valid/")}
+    assert {"valid/one_splat", "valid/quats", "valid/rich"} == chosen(
+        "--filter", "valid/quats,valid/one_*", "--filter", "valid/rich"
+    )
+    assert valid == chosen("--filter", "valid/*", "--filter", "MOR-1,LIM")
+    assert "no vector is chosen" in invoke("--filter", "valid/empty,MOR-*").stderr
+
+
+def test_a_command_for_cuts_alone_is_tested_at_l5_alone(faulty_cuts):
+    result = invoke("--cmd", faulty_cuts("one wrong"), "--filter", "valid/levels,valid/rich", "--json")
+    assert 1 == result.exit_code
+    assert {"L5"} == {outcome["level"] for outcome in json.loads(result.stdout)["outcomes"]}
+    assert 0 == invoke("--filter", "valid/levels", "--level", "5").exit_code  # our own
+
+
+def test_reports_for_one_place_are_refused_before_anything_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    command = f"touch {tmp_path / 'ran'}"
+    result = invoke("--cmd", command + " {input} {outdir}", "--report", "same.json", "--junit", "same.json")
+    assert 1 == result.exit_code
+    assert "is given for two outputs" in result.stderr
+    assert [] == list(tmp_path.iterdir())

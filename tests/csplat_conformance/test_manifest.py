@@ -36,17 +36,9 @@ from csplat_selftest.decoder_processes import JsDecoder, missing_javascript
 from csplat_selftest.fuzzing.damage import built_from
 
 VECTOR_LIST = load()
-
-
 VALID = [vector for vector in VECTOR_LIST if not vector.error]
-
-
 SCENES = {recipe.name: recipe.scene for recipe in sound_recipes() if recipe.scene is not None}
-
-
 INVALID = [vector for vector in VECTOR_LIST if vector.error]
-
-
 FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
@@ -247,20 +239,10 @@ def test_valid_vectors_hold_each_value_of_an_enum_and_no_other(valid):
 
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
-
-
 GUIDE_AS_WRITTEN = (ROOT / "conformance" / "IMPLEMENTERS.md").read_text(encoding="utf-8")
-
-
 SCHEMA = json.loads((VECTORS / "manifest.schema.json").read_text(encoding="utf-8"))
-
-
 MANIFEST = json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))
-
-
 UNBREAKABLE = {
     "AXI-1": "the width that STR-2 allows ensures it",
     "CBK-6": "its refusals name QUA-1, QUA-2 or LAT-4",
@@ -395,8 +377,6 @@ def test_every_attribute_that_a_codebook_may_serve_has_escapes():
 
 
 GUIDE = GUIDE_AS_WRITTEN.replace("−", "-")
-
-
 LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
 
 
@@ -484,8 +464,6 @@ def test_the_code_of_the_guide_gives_the_stated_errors(row, source, file):
 
 
 CLAUSES = clause_ids(TEXT)
-
-
 COVERED = {clause for vector in VECTOR_LIST for clause in vector.clauses}
 
 

@@ -18,8 +18,6 @@ from csplat_conformance.reference_renders import PSNR_CAP, psnr, read_png, write
 
 #: `make test` renders these pictures with our decoder and rasteriser, by the command.
 pytestmark = pytest.mark.long
-
-
 RENDERED = [vector for vector in load() if vector.views]
 
 

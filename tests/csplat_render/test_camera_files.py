@@ -33,8 +33,6 @@ def test_near_and_image_may_be_left_out(tmp_path):
 
 
 FAR_TOO_LARGE = r"c\.json is not a JSON file: an integer has \d[\d,]* digits"
-
-
 NO_CAMERAS = {
     b"{": "not a JSON file", b"\xff\xfe": "not a JSON file", b"[]": "not a camera file", b"{}": "not a camera file",
     b"[1]": "camera 0", b'[{"K": 1}]': "camera 0.*viewmat",
@@ -77,8 +75,6 @@ def inria(**fields):
 
 
 OPENGL = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
-
-
 ENTRY = {
     "camera_to_world": [value for row in OPENGL for value in row],
     "fov": math.degrees(2 * math.atan(24 / 50)),
@@ -87,11 +83,7 @@ ENTRY = {
 
 
 NERFSTUDIO = {"camera_type": "perspective", "render_width": 64, "render_height": 48, "camera_path": [ENTRY], "fps": 24}
-
-
 FRAME = {"file_path": "images/a.png", "transform_matrix": OPENGL}
-
-
 TRANSFORMS = {"w": 64, "h": 48, "fl_x": 50.0, "frames": [FRAME]}
 
 

@@ -18,8 +18,6 @@ from csplat_render.scene_frame import scene_frame
 from csplat_render.virtual_cameras import virtual_cameras
 
 SMALL_K = intrinsics(64, 48, 60.0)
-
-
 SLANTED = [0.0, -0.8, 0.6]
 
 

@@ -79,7 +79,7 @@ def test_a_stage_may_have_its_own_text(clock, capsys):
 def test_long_runs_announce_their_time(clock, capsys):
     for iterations, announced in ((range(1000, 1300, 100), True), (range(4600, 5000, 200), False)):
         with step_progress("training", lambda _: "", clock=clock) as show:
-            for iteration in iterations:  # of a resumed run
+            for iteration in iterations:  # a run that resumes
                 show(SimpleNamespace(iteration=iteration, iterations=5000))
                 clock.now += 4.0
         assert announced == ("2 to 5 minutes" in capsys.readouterr().err)

@@ -155,7 +155,7 @@ def test_display_views_show_detail(sample_path):
     cloud, nearest = sample_cloud(source, 20_000, np.random.default_rng(1)), 0.4 * scene_frame(source).extent
     best = max(detail(cloud, camera, nearest) for camera in comparison_cameras(source))
     assert all(detail(cloud, camera, nearest) > 0.6 * best for camera in shown)
-    own = cameras(3)  # of the user, which are displayed unchanged
+    own = cameras(3)  # given by the user: displayed unchanged
     assert display_cameras(source, ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
 
 

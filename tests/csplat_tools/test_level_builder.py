@@ -41,36 +41,16 @@ from csplat_tools.cli.shared_options import parse_level
 from csplat_tools.convert_file import convert_file
 from csplat_tools.encode_file import choose_levels, encode_file
 from csplat_tools.level_builder import LevelBuilder, encode_with_levels, kd_groups
-from csplat_tools.level_fitting import LevelFitter, Work
 from csplat_tools.level_merging import merge_neighbours
 from csplat_tools.scene_files import LoadedModel
 
+pytestmark = pytest.mark.usefixtures("little_level_work")
+
 TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
-
-
 RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
-
-
 NOTHING = next(VECTORS / one.file for one in load() if one.expect and one.expect["header"]["tile_count"] == 0)
-
-
 SPLATS = 400
-
-
-WORK = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
-
-
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
-@pytest.fixture(autouse=True)
-def little_work(monkeypatch):
-    """Fit levels with few steps and views."""
-
-    def fitter(*args, **options):
-        return LevelFitter(*args, **{**options, "work": WORK})
-
-    monkeypatch.setattr("csplat_tools.level_fitting.LevelFitter", fitter)
 
 
 @pytest.fixture(scope="module")

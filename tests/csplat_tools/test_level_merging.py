@@ -8,20 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import csplat
-from csplat_tools.level_fitting import LevelFitter, Work
 from csplat_tools.level_merging import merge_neighbours
 
-WORK = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
-
-
-@pytest.fixture(autouse=True)
-def little_work(monkeypatch):
-    """Fit levels with few steps and views."""
-
-    def fitter(*args, **options):
-        return LevelFitter(*args, **{**options, "work": WORK})
-
-    monkeypatch.setattr("csplat_tools.level_fitting.LevelFitter", fitter)
+pytestmark = pytest.mark.usefixtures("little_level_work")
 
 
 def splats_at(means, opacities, log_sizes, colours):

@@ -21,8 +21,6 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 FAST = EncodeOptions("fast")
-
-
 GRID = {  # name: options of the encoder, target, words
     "presets=small": (EncodeOptions("small"), None, "--preset small"),
     "precision=36": (EncodeOptions("fast", 36.0), None, "--attribute-psnr 36 --preset fast"),

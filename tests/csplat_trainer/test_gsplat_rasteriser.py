@@ -39,11 +39,7 @@ from csplat_trainer.tuning.gsplat_tuning import GsplatTuning
 from csplat_trainer.tuning.tuning_engine import CpuTuning
 
 torch = pytest.importorskip("torch", reason="the GPU engine requires torch (the train extra)")
-
-
 pytestmark = pytest.mark.torch
-
-
 CPU, BLACK = torch.device("cpu"), np.zeros(3, np.float32)
 
 

@@ -29,8 +29,6 @@ pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[
 
 
 pytestmark = pytest.mark.usefixtures("small_views")
-
-
 STEP = 1e-5
 
 

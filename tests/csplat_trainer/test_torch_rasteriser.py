@@ -10,8 +10,6 @@ from csplat_trainer import torch_rasteriser
 from csplat_trainer.losses import PerceptualLoss
 
 torch = pytest.importorskip("torch", reason="the torch wrapper requires torch (the train extra)")
-
-
 pytestmark = pytest.mark.torch
 
 

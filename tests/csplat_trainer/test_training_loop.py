@@ -350,8 +350,6 @@ def test_the_moving_average_covers_the_last_values():
 
 
 GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # gains of training images
-
-
 LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
 
 

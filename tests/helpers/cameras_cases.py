@@ -8,8 +8,6 @@ from csplat_render.camera import (
 )
 
 K = intrinsics(640, 480, 60.0)
-
-
 UP = np.array([0.0, 0.0, 1.0])
 
 

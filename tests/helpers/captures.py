@@ -284,3 +284,19 @@ class FileRuns:
             words = ("train", self.data, self.folder / name, *self.WORDS, "--report", report, *more)
             messages = call(*words).stderr
         return json.loads(report.read_text()), messages
+
+
+def shell_with_hidden_splats():
+    """Return a shell of opaque splats with hidden ones inside, and ten that are too transparent to be drawn."""
+    rng = np.random.default_rng(0)
+    n, count = 300, 450
+    at = rng.standard_normal((n, 3))
+    at /= np.linalg.norm(at, axis=1, keepdims=True)
+    means = np.concatenate([at, 0.3 * rng.standard_normal((n // 2, 3))])
+    quats = normalise_quats(rng.standard_normal((count, 4)))
+    opacities = rng.uniform(0.6, 1.0, count)
+    opacities[:10] = 0.003
+    arrays = {"opacities": opacities, "scales": rng.uniform(-2.3, -1.7, (count, 3))}
+    arrays["sh0"] = np.sin(3.0 * means) + rng.uniform(0.0, 1.0, (count, 3))
+    arrays["shN"] = 0.05 * rng.standard_normal((count, 8, 3))
+    return cloud(means, quats=quats, **{name: values.astype(np.float32) for name, values in arrays.items()})

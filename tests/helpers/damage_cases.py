@@ -9,11 +9,7 @@ from csplat_authoring.scene import Chunk
 from csplat_conformance.manifest import VECTORS
 
 SMALL = (VECTORS / "valid" / "worked_example.csplat").read_bytes()
-
-
 BUILT = build(rich_scene())
-
-
 RICH = BUILT.data
 
 

@@ -13,17 +13,9 @@ from csplat_conformance.encoders.file_checks import check_content
 from csplat_conformance.protocol import ProcessEnd
 
 INPUTS = {one.name: one for one in all_inputs()}
-
-
 COMMAND = "encoder {ply} {out} {index}"
-
-
 PLAIN = "ordinary/degree_1"
-
-
 FILES = EncoderSuiteOptions(PLAIN, ("L1",), jobs=1)
-
-
 MAPS = EncoderSuiteOptions(PLAIN, ("L2",), jobs=1)
 
 

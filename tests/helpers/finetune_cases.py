@@ -18,14 +18,8 @@ from csplat_trainer.tuning import FinetuneOptions
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 BLACK = np.zeros(3, np.float32)
-
-
 QUICK = FinetuneOptions(iterations=30, warm_up=5, validate_every=10, log_every=5)
-
-
 FEW = FinetuneOptions(iterations=12, warm_up=2, validate_every=4, log_every=2)
-
-
 COARSE = EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16)
 
 

@@ -13,14 +13,8 @@ from posed_sets import (
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 RAMP = np.linspace(0.0, 1.0, W * H).reshape(H, W)
-
-
 GREY = np.rint(255.0 * RAMP).astype(np.uint8)
-
-
 RGB = np.stack([GREY, GREY[::-1], GREY[:, ::-1]], axis=2)
-
-
 UINT16 = np.rint(65535.0 * RAMP).astype(np.uint16)
 
 
@@ -34,6 +28,4 @@ def png_16(path, colours):
 
 
 SHAPE = RAMP > 0.4
-
-
 LABELS = SHAPE.astype(np.uint8)

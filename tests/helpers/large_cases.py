@@ -10,11 +10,7 @@ from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene_source import join_blocks
 
 WHOLE = 600  # splats per bucket
-
-
 COUNT = 6 * WHOLE
-
-
 FAST = EncodeOptions(
     preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32, bucket_splats=WHOLE
 )  # fmt: skip

@@ -145,6 +145,19 @@ def small_views():
 
 
 @pytest.fixture
+def little_level_work(monkeypatch):
+    """Fit levels with few steps and views."""
+    from csplat_tools.level_fitting import LevelFitter, Work
+
+    work = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
+
+    def fitter(*args, **options):
+        return LevelFitter(*args, **{**options, "work": work})
+
+    monkeypatch.setattr("csplat_tools.level_fitting.LevelFitter", fitter)
+
+
+@pytest.fixture
 def make_model():
     """Return a function for small random models: `make_model(count, degree, **fields)`."""
 

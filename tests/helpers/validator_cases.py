@@ -12,18 +12,12 @@ from csplat_conformance.manifest import load
 from csplat_conformance.validator.inflate import CodedError, Inflater
 
 VECTOR_LIST = load()
-
-
 INVALID = [vector for vector in VECTOR_LIST if vector.error]
-
-
 SMALL = build(scene())
 
 
 #: Vectors whose arrays, at SH degree 3, fill the decoders' default budget.
 SPLATS_MAX = _spec.BUDGET_BYTES // (4 * (11 + 48))
-
-
 SIZE = 2000
 
 

@@ -17,20 +17,10 @@ from csplat_conformance.decoder_suite import DecoderSuiteOptions, run_command
 from csplat_conformance.protocol import ProcessEnd
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 C = ROOT / "codec" / "c"
-
-
 VECTORS = Path(csplat_conformance.__file__).parent / "vectors"
-
-
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror")
-
-
 COMPILER = shutil.which("cc")
-
-
 SANITIZED = ("-g", "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
 
 

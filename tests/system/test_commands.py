@@ -13,39 +13,11 @@ from cli_cases import PROGRAM, call, damaged_ply, invoke, refused, status_of
 from command_line import heed_interrupts
 
 import csplat
-from csplat import _spec, read_ply, write_ply
+from csplat import _spec, read_ply
 from csplat.errors import InputError
 from csplat_tools.file_streams import check_output, write_bytes
 
-
-@pytest.fixture
-def ply(tmp_path, make_model):
-    path = tmp_path / "scene.ply"
-    write_ply(path, make_model(200, 2))
-    return path
-
-
-@pytest.fixture(scope="module")
-def encoded_once():
-    """Return the files that `encode` writes for `ply`, by name; the first test that needs them fills it."""
-    return {}
-
-
-@pytest.fixture
-def csplat_file(tmp_path, ply, encoded_once):
-    names = ("scene.csplat", "index.npy")
-    if not encoded_once:
-        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
-        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
-    for name, data in encoded_once.items():
-        (tmp_path / name).write_bytes(data)
-    return tmp_path / names[0]
-
-
-@pytest.fixture(autouse=True)
-def no_estimated_up(monkeypatch):
-    """Estimate no up direction after encoding, which takes longer than encoding small scenes."""
-    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
+pytestmark = pytest.mark.usefixtures("no_estimated_up")
 
 
 @pytest.mark.slow

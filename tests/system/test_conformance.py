@@ -1,5 +1,3 @@
-import contextlib
-import io
 import json
 import shlex
 import sys
@@ -7,16 +5,12 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from conformance_runner_cases import FAULTY, FAULTY_CUTS, RECORDED, VECTOR_LIST
 from typer.testing import CliRunner
 
 import csplat
 from csplat.encoder import encode_with_report
 from csplat.errors import InputError
-from csplat_conformance import adapter
-from csplat_conformance.decoder_suite import parse_levels
 from csplat_conformance.encoders import all_inputs
-from csplat_conformance.manifest import VECTORS
 from csplat_tools.cli.app import app
 from encoder_faults.run import FAULTS
 
@@ -100,99 +94,3 @@ def test_without_a_renderer_pictures_are_skipped_with_a_note(tmp_path, monkeypat
     assert 0 == result.exit_code
     assert "L4 SKIPPED: this needs numba" in result.stdout
     assert "L4  skipped  ordinary/degree_1  this needs numba" in result.stdout
-
-
-@pytest.fixture(scope="module")
-def recorded(tmp_path_factory):
-    """A folder with the answers of our decoder: files of a vector, with its status and output as JSON next to them."""
-    folder = tmp_path_factory.mktemp("decoder")
-    for vector in VECTOR_LIST:
-        if vector.name in RECORDED:
-            outdir = folder / "recorded" / vector.name.split("/")[1]
-            outdir.mkdir(parents=True)
-            words = io.StringIO()
-            with contextlib.redirect_stdout(words):
-                status = adapter.main([str(VECTORS / vector.file), str(outdir)])
-            outdir.with_suffix(".json").write_text(json.dumps([status, words.getvalue()]))
-    (folder / "decoder.py").write_text(FAULTY)
-    cuts = {one.name.split("/")[1]: dict(one.expect["cuts"]) for one in VECTOR_LIST if "cuts" in one.expect}
-    (folder / "cuts.json").write_text(json.dumps(cuts))
-    (folder / "cuts.py").write_text(FAULTY_CUTS)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def faulty(recorded):
-    """Return a function for the command line of our decoder with a fault."""
-    return lambda fault: f"{sys.executable} -I -S {recorded / 'decoder.py'} '{fault}' {{input}} {{outdir}}"
-
-
-@pytest.fixture(scope="module")
-def faulty_cuts(recorded):
-    """Return a function for the command line of a program for cuts with a fault."""
-    return lambda fault: f"{sys.executable} -I -S {recorded / 'cuts.py'} '{fault}' {{input}} {{cuts}}"
-
-
-def test_a_level_includes_the_lower_levels_and_a_list_names_its_own():
-    texts = {"1": (1,), "3": (1, 2, 3), "1,3": (1, 3), "L4": (1, 2, 3, 4), "5": (1, 2, 3, 4, 5), "3,1": (1, 3)}
-    assert texts == {text: parse_levels(text) for text in texts}
-    for text in ("0", "6", "x", "1,9", ""):
-        with pytest.raises(InputError):
-            parse_levels(text)
-    result = invoke_of_conformance_runner("--level", "9")
-    assert (2, 1) == (result.exit_code, len(result.stderr.splitlines()))
-
-
-def invoke_of_conformance_runner(*words):
-    return CliRunner().invoke(app, ["conformance", "decoder", *map(str, words)])
-
-
-@pytest.mark.slow
-def test_the_command_writes_table_json_and_junit(faulty, tmp_path):
-    reports = ("--report", tmp_path / "r.json", "--junit", tmp_path / "r.xml")
-    result = invoke_of_conformance_runner("--cmd", faulty("rounding"), "--filter", "valid/quats", *reports)
-    assert 1 == result.exit_code
-    assert "L3  FAILED  valid/quats  floats.means differs" in result.stdout
-    found = json.loads((tmp_path / "r.json").read_text())
-    assert (False, 1) == (found["passed"], found["levels"]["L3"]["failed"])
-    suites = ET.parse(tmp_path / "r.xml").getroot()  # noqa: S314 - ours
-    assert ("3", "1") == (suites.get("tests"), suites.get("failures"))
-    assert "exists" in invoke_of_conformance_runner("--filter", "valid/quats", *reports).stderr
-    assert 0 == invoke_of_conformance_runner("--filter", "valid/quats", *reports, "--force").exit_code
-    assert invoke_of_conformance_runner("--filter", "valid/quats", "--junit", "-").stdout.startswith("<?xml")
-    assert 2 == invoke_of_conformance_runner("--filter", "valid/quats", "--json", "--junit", "-").exit_code
-
-
-def chosen(*words):
-    """Return the names of the vectors that the command runs, at level 1."""
-    report = invoke_of_conformance_runner(*words, "--level", "1", "--json").stdout
-    return {outcome["name"] for outcome in json.loads(report)["outcomes"]}
-
-
-def test_a_filter_repeats_and_combines_patterns_of_names_and_of_clauses():
-    valid = {vector.name for vector in VECTOR_LIST if "MOR-1" in vector.clauses and vector.name.startswith("valid/")}
-    assert {"valid/one_splat", "valid/quats", "valid/rich"} == chosen(
-        "--filter", "valid/quats,valid/one_*", "--filter", "valid/rich"
-    )
-    assert valid == chosen("--filter", "valid/*", "--filter", "MOR-1,LIM")
-    assert "no vector is chosen" in invoke_of_conformance_runner("--filter", "valid/empty,MOR-*").stderr
-
-
-def test_a_command_for_cuts_alone_is_tested_at_l5_alone(faulty_cuts):
-    result = invoke_of_conformance_runner(
-        "--cmd", faulty_cuts("one wrong"), "--filter", "valid/levels,valid/rich", "--json"
-    )
-    assert 1 == result.exit_code
-    assert {"L5"} == {outcome["level"] for outcome in json.loads(result.stdout)["outcomes"]}
-    assert 0 == invoke_of_conformance_runner("--filter", "valid/levels", "--level", "5").exit_code  # our own
-
-
-def test_reports_for_one_place_are_refused_before_anything_runs(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    command = f"touch {tmp_path / 'ran'}"
-    result = invoke_of_conformance_runner(
-        "--cmd", command + " {input} {outdir}", "--report", "same.json", "--junit", "same.json"
-    )
-    assert 1 == result.exit_code
-    assert "is given for two outputs" in result.stderr
-    assert [] == list(tmp_path.iterdir())

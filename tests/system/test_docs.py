@@ -19,17 +19,9 @@ from csplat_tools import batch
 from csplat_tools.cli.app import app
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 DOCS = ROOT / "tools" / "docs"
-
-
 README = (ROOT / "README.md").read_text("utf-8")
-
-
 MEASURED = json.loads((DOCS / "measured.json").read_text("utf-8"))
-
-
 PRESETS = {row["name"]: row for row in MEASURED["rows"] if row["series"] == "preset"}
 
 

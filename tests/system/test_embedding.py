@@ -19,11 +19,7 @@ from csplat.spherical_harmonics import evaluate_sh
 from csplat_tools.present.viewer_page import export_element
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 TEXT = (ROOT / "codec" / "EMBEDDING.md").read_text("utf-8")
-
-
 FAST = EncodeOptions(preset="fast")
 
 
@@ -108,7 +104,7 @@ def model(request):
     ]
 )
 def results(request, site, tmp_path, model):
-    """What the samples print on a scene, and the scene."""
+    """Return the output of the samples for a scene, and the scene."""
     node = shutil.which("node")
     if node is None:
         absent("the samples in JavaScript need Node.js, which is not installed")
@@ -239,14 +235,8 @@ def test_the_guide_contains_the_unchanged_examples():
 
 
 POLICY = "default-src 'none'; script-src 'self' 'wasm-unsafe-eval'; worker-src blob:; connect-src 'self'; img-src data:"
-
-
 STYLE = "csplat-view { width: 160px; height: 120px }"
-
-
 ONE_FILE = '<script src="../scripts/csplat-view.js"></script>'
-
-
 MODULE = '<script type="module" src="/tools/viewer/element.mjs"></script>'
 
 

@@ -28,35 +28,7 @@ from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene_source import source_from_model
 from csplat_tools.cli.app import app
 
-
-@pytest.fixture
-def ply(tmp_path, make_model):
-    path = tmp_path / "scene.ply"
-    write_ply(path, make_model(200, 2))
-    return path
-
-
-@pytest.fixture(scope="module")
-def encoded_once():
-    """Return the files that `encode` writes for `ply`, by name; the first test that needs them fills it."""
-    return {}
-
-
-@pytest.fixture
-def csplat_file(tmp_path, ply, encoded_once):
-    names = ("scene.csplat", "index.npy")
-    if not encoded_once:
-        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
-        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
-    for name, data in encoded_once.items():
-        (tmp_path / name).write_bytes(data)
-    return tmp_path / names[0]
-
-
-@pytest.fixture(autouse=True)
-def no_estimated_up(monkeypatch):
-    """Estimate no up direction after encoding, which takes longer than encoding small scenes."""
-    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
+pytestmark = pytest.mark.usefixtures("no_estimated_up")
 
 
 def program(*words, **options):

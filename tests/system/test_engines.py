@@ -25,11 +25,7 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.engines]
-
-
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools" / "examples"
-
-
 FAST = EncodeOptions(preset="fast")
 
 

@@ -46,17 +46,9 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_views")]
-
-
 QUALITIES = {None: None, 10.0: 12.0, 120.0: 44.0}  # attribute_psnr, and the least PSNR of renders, dB
-
-
 QUICK = ("needles", "half the rows NaN")  # crossed with presets and qualities outside the area, too
-
-
 LONG = pytest.mark.long
-
-
 EACH = [pytest.param(name, marks=() if name in QUICK else LONG) for name in DRAWN]
 
 

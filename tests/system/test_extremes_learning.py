@@ -44,8 +44,6 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("small_views")]
-
-
 LONG = pytest.mark.long
 
 

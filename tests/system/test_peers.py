@@ -151,8 +151,6 @@ PROGRAMS = {"spz": Spz(), "splat-transform": SplatTransform(), "gsply": Gsply()}
 
 # --- Formats and tolerances
 ENDINGS = {"compressed-ply": ".compressed.ply", "spz4": ".v4.spz", "gltf": ".glb"}
-
-
 WRITE = {
     "spz": ["spz", "spz4"],
     "splat-transform": ["ply", "compressed-ply", "sog", "spz", "spz4", "gltf"],

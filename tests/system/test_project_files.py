@@ -12,8 +12,6 @@ import pytest
 import csplat
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
 in_a_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a checkout: git knows nothing of it")
 
 

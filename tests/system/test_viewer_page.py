@@ -14,8 +14,6 @@ from csplat_conformance.validator import validate
 from csplat_tools.level_builder import LevelBuilder
 
 pytestmark = pytest.mark.slow
-
-
 FAST = EncodeOptions(preset="fast", tile_splats=500)
 
 

@@ -28,8 +28,6 @@ pytestmark = [pytest.mark.slow, pytest.mark.browser]
 
 #: Well above the required 38 dB: leaving out all SH gives 33, 8-bit rounding alone 59.
 GOOD = 50.0
-
-
 FAST = EncodeOptions(preset="fast")
 
 

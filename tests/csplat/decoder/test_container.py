@@ -120,11 +120,7 @@ def test_the_header_reader_checks_the_whole_index():
 
 
 STORED, DEFLATE = _spec.CODER_STORED, _spec.CODER_DEFLATE
-
-
 RUNS = bytes([_spec.TRANSFORM_RUN_LENGTH, 0, 0, 0])
-
-
 NONE = bytes(4)
 
 

@@ -44,11 +44,7 @@ from csplat_authoring.samples import (
 from csplat_authoring.scene import Chunk, Codebook, Stream
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
 RICH = build(rich_scene()).data
-
-
 SH0 = _spec.ATTRIBUTE_SH0
 
 

@@ -18,11 +18,7 @@ from csplat.decoder.tiles import codebook_references
 from csplat_conformance.validator import validate
 
 VECTORS = Path(csplat_conformance.__file__).parent / "vectors" / "valid"
-
-
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
 ALL = (-1e6, -1e6, -1e6, 1e6, 1e6, 1e6)
 
 

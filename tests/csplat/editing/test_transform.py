@@ -105,8 +105,6 @@ def test_the_estimate_is_right_for_real_objects(data_dir, name, up):
 
 
 LEVEL_K = intrinsics(64, 48, 60.0)
-
-
 UP = np.array([0.6, -0.8, 0.0])
 
 
@@ -157,17 +155,9 @@ def test_rolls_of_a_camera_move_the_estimate_little():
 
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
 FLIPS = [np.diag(signs) for signs in product((1.0, -1.0), repeat=3)]
-
-
 WHOLE = [flips @ np.eye(3)[list(order)] for order in permutations(range(3)) for flips in FLIPS]
-
-
 ANY = np.linalg.qr(np.random.default_rng(5).standard_normal((3, 3)))[0]
-
-
 CAMERA = {"K": [[50.0, 0, 30], [0, 50.0, 20], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 64, "H": 48, "near": 0.1}
 
 

@@ -17,11 +17,7 @@ from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.inspect.file_description import describe_file
 
 ROOT = Path(__file__).resolve().parents[3]
-
-
 GEOMETRY = ("means", "quats", "scales", "opacities")
-
-
 COLOURS = ("sh0", "shN")
 
 

@@ -41,8 +41,6 @@ def read(stream: bytes) -> tuple[_spec.StreamHead, list[int]]:
 
 
 RNG = np.random.default_rng(0)
-
-
 UNSIGNED = {
     "one": np.array([7]),
     "zeros": np.zeros(600, np.int64),
@@ -84,8 +82,6 @@ def test_a_constant_plane_costs_a_few_bytes():
 
 #: Like the SH of a scene where some splats have none: noise interrupted by runs of zeros.
 NOISE = RNG.integers(-20, 20, 15_000).astype(np.int8)
-
-
 CUT = np.where(np.repeat(RNG.random(5_000) < 0.6, 3), np.int8(0), NOISE)
 
 

@@ -13,26 +13,12 @@ from csplat.encoder.levels import LevelNode, encode_levels
 from csplat_conformance.validator import validate
 from csplat_tools.level_builder import kd_groups
 from csplat_tools.level_errors import measure_errors
-from csplat_tools.level_fitting import LevelFitter, Work
 from csplat_tools.level_merging import merge_neighbours
 
+pytestmark = pytest.mark.usefixtures("little_level_work")
+
 SPLATS = 400
-
-
-WORK = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
-
-
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-
-
-@pytest.fixture(autouse=True)
-def little_work(monkeypatch):
-    """Fit levels with few steps and views."""
-
-    def fitter(*args, **options):
-        return LevelFitter(*args, **{**options, "work": WORK})
-
-    monkeypatch.setattr("csplat_tools.level_fitting.LevelFitter", fitter)
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,6 @@ from csplat.encoder import EncodePlan, Origin, encode_tiles
 from csplat_conformance.declared_bounds import Source, verify_bounds
 
 GEOMETRY = ("means", "quats", "scales", "opacities")
-
-
 COLOURS = ("sh0", "shN")
 
 

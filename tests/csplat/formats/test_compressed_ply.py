@@ -14,11 +14,7 @@ from csplat.ply import read_ply
 from csplat.scene_source import BLOCK_SPLATS
 
 BOUNDS = "min_x min_y min_z max_x max_y max_z min_scale_x min_scale_y min_scale_z max_scale_x max_scale_y max_scale_z"
-
-
 COLOURS = "min_r min_g min_b max_r max_g max_b"
-
-
 WORDS = "packed_position packed_rotation packed_scale packed_color"
 
 
@@ -40,8 +36,6 @@ ROW = [0, 10, -1, 4, 10, 1, -8, -7, -6, -4, -3, -2, 0.5, 0, 0, 1.5, 1, 1]
 
 # The index of the largest component, then three components of ten bits; 511.5 would be 0.
 WORD = (2047 << 21 | 1023 << 11 | 0, 1 << 30 | 1023 << 20 | 511 << 10 | 512, 0, 255 << 24 | 0 << 16 | 255 << 8 | 51)
-
-
 SMALL = built([ROW], [WORD, (0, 0, 0xFFFFFFFF, 0)], [[0, 255, 128, *range(3, 9)], range(9)], comments=["made by hand"])
 
 

@@ -322,8 +322,6 @@ def test_the_frame_draws_and_is_kept_from_the_notebook(tab, site, make_model):
 
 
 KIND = "a file of tests"
-
-
 BROKEN = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape': ("
 
 
@@ -357,8 +355,6 @@ DEFLATED = zip_of([("a.npy", npy(header_of("'<f8'", "(400,)"), np.random.default
 
 
 LARGE = zip_of([("a.npy", npy(header_of(shape="(300000000,)"), bytes(1000)))], zipfile.ZIP_DEFLATED)
-
-
 HOSTILE_ARCHIVES = {
     "no array": (zip_of([("facts.npy", b"hello")]), "facts is not an array"),
     **{f"damage at {place}": (DEFLATED[:place] + bytes([DEFLATED[place] ^ 0x55]) + DEFLATED[place + 1 :], "")

@@ -17,20 +17,10 @@ from csplat.formats import formats, lint_file
 from csplat.formats.gltf import gltf_document
 
 ARRAYS = ("means", "quats", "opacities", "sh0", "shN")
-
-
 PREFIX = "KHR_gaussian_splatting"
-
-
 TYPES = {"i1": 5120, "u1": 5121, "i2": 5122, "u2": 5123, "f4": 5126}
-
-
 KINDS = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-
-
 FORMAT = next(one for one in formats() if one.name == "gltf")
-
-
 TWO = {
     "POSITION": np.array([[1, 2, 3], [-1, 0, 0.5]], "<f4"),
     f"{PREFIX}:ROTATION": np.array([[0, 0, 0, 1], [1, 0, 0, 0]], "<f4"),  # x y z w

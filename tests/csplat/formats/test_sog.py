@@ -23,11 +23,7 @@ from csplat_tools.convert_file import Filters, convert_file
 from csplat_tools.encode_file import encode_file
 
 Image = pytest.importorskip("PIL.Image", reason="SOG is pictures")
-
-
 COUNT = 5
-
-
 RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
 
 
@@ -433,8 +429,6 @@ def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree, fi
 
 
 SHAPES = {"quats": (4,), "scales": (3,), "sh0": (3,), "shN": (3, 3)}
-
-
 SIDE = 64  # positions are integers below, so that a splat is known by its place
 
 

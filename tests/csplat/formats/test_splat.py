@@ -135,8 +135,6 @@ def test_lint_reports_unusual_values_of_a_splat(tmp_path, data, findings, scales
 
 
 LEVELS = (("<f4", "<f4", "<f4"), ("<u2", "<f2", "<f2"), ("<u2", "<f2", "u1"))
-
-
 CENTRES = np.array([[10, 20, 30], [-4, 0, 4], [100, 0, 0]], "<f4")
 
 

@@ -17,8 +17,6 @@ from csplat.formats import format_by_name, open_scene
 from csplat.scene_source import source_from_model
 
 WIDTHS = {1: (6, 1, 3, 3, 3), 2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}
-
-
 AXES = struct.pack("<IIII", 0xABCD0001, 4, 7, 0xADBE0003) + struct.pack("<II", 4, 6)
 
 

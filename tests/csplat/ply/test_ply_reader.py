@@ -220,8 +220,6 @@ def test_invalid_comments_of_csplat_are_refused(tmp_path):
 
 
 VIEW = {"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4, "image": "ä b.png"}
-
-
 TRAINED = TrainingRecord((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für alle")
 
 
@@ -267,11 +265,7 @@ def zip_of(name):
 
 
 CONVERT = "convert it to PLY first, with.*"
-
-
 CODED = "\nproperty uchar opacity\nproperty uchar scaling\n"
-
-
 CODEBOOKS = f"element vertex_0 1{CODED}element codebook_centers 1{CODED}end_header\n\1\1\1\1"
 
 

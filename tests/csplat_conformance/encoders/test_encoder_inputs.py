@@ -7,8 +7,6 @@ from tables import failures
 from csplat_conformance.encoders import all_inputs
 
 INPUTS = {one.name: one for one in all_inputs()}
-
-
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
 
 

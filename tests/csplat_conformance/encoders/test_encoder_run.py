@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from encoder_runs_cases import COMMAND, FILES, INPUTS, L3, MAPS, PLAIN, first, model_of, outcome_of, running
+from encoder_runs_cases import COMMAND, FILES, INPUTS, MAPS, PLAIN, first, outcome_of, running
 from typer.testing import CliRunner
 
 import csplat
@@ -27,16 +27,6 @@ def invoke(*words):
 def program(code):
     """Return a command line that runs Python code on {ply} and {out}."""
     return f"{shlex.quote(sys.executable)} -c {shlex.quote(code)} {{ply}} {{out}}"
-
-
-@pytest.fixture(scope="module")
-def encoded(tmp_path_factory):
-    """The plain input, encoded by our encoder, and its source index."""
-    folder = tmp_path_factory.mktemp("encoded")
-    (folder / "in.ply").write_bytes(INPUTS[PLAIN].make())
-    words = ["encode", folder / "in.ply", folder / "out.csplat", "--source-index", folder / "out.npy", "--quiet"]
-    assert 0 == CliRunner().invoke(app, list(map(str, words))).exit_code
-    return (folder / "out.csplat").read_bytes(), np.load(folder / "out.npy")
 
 
 @pytest.mark.parametrize("name", ["nasty/empty", "broken/cut"])
@@ -174,12 +164,6 @@ def test_writing_inputs_accepts_no_option_of_a_run(tmp_path, words):
     assert not (tmp_path / "new").exists()
 
 
-@pytest.fixture(scope="module")
-def plain(tmp_path_factory):
-    """The plain input, after reading."""
-    return model_of(PLAIN, tmp_path_factory.mktemp("plain"))
-
-
 def test_centres_in_doubles_are_compared_in_doubles():
     # Four million units away binary32 is a quarter of a unit off, more than splats are apart.
     one = INPUTS[PLAIN]
@@ -189,27 +173,6 @@ def test_centres_in_doubles_are_compared_in_doubles():
     scene = decode_scene(csplat.encode(model))
     content, pairs = check_content(replace(one, source=lambda: far), far, scene, None)
     assert (Status.PASSED, 0) == (content.status, pairs.missing)
-
-
-@pytest.fixture
-def altered(monkeypatch, plain):
-    """Run the suite over our file with altered statements."""
-    data = csplat.encode(plain)
-
-    def run(_command, places, _seconds):
-        Path(places["out"]).write_bytes(data)
-        return ProcessEnd(None, 0, b"", b"", 0.0)
-
-    def report(change, levels=L3, render_score=None, name=PLAIN, **fields):
-        one = replace(INPUTS[name], **fields)
-        monkeypatch.setattr(
-            "csplat_conformance.encoders.file_checks.decode_scene", lambda data: change(decode_scene(data))
-        )
-        monkeypatch.setattr("csplat_conformance.encoders.encoder_suite.all_inputs", lambda: [one])
-        return run_encoder("x {ply} {out}", EncoderSuiteOptions(name, levels), run=run, render_score=render_score,
-            no_render_reason="no numba")  # fmt: skip
-
-    return report
 
 
 def test_sizes_and_figures_of_others_stand_next_to_the_picture(altered, monkeypatch):

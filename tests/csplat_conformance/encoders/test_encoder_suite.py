@@ -26,20 +26,10 @@ from csplat_tools.encode_file import encode_file
 from encoder_faults.run import psnr
 
 INPUTS = {one.name: one for one in all_inputs()}
-
-
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
-
-
 PLACES = "{ply} {out} {index}"
-
-
 INTEGRITY = ("L1", "L2", "L3")
-
-
 HAS_RENDERER = find_spec("numba") is not None
-
-
 DEGREE_5 = "nasty/degree_5"  # ours refuses it, and nothing else that can be encoded
 
 

@@ -6,8 +6,7 @@ from unittest import mock
 
 import numpy as np
 import pytest
-from encoder_runs_cases import COMMAND, INPUTS, PLAIN, judged, model_of, running
-from typer.testing import CliRunner
+from encoder_runs_cases import COMMAND, INPUTS, judged, model_of, running
 
 import csplat
 from csplat.decoder import decode_scene
@@ -16,17 +15,6 @@ from csplat_conformance.declared_bounds import verify_bounds
 from csplat_conformance.encoders import EncoderSuiteOptions, run_encoder
 from csplat_conformance.encoders.error_checks import find_truncation
 from csplat_conformance.encoders.file_checks import check_content, pair_splats
-from csplat_tools.cli.app import app
-
-
-@pytest.fixture(scope="module")
-def encoded(tmp_path_factory):
-    """The plain input, encoded by our encoder, and its source index."""
-    folder = tmp_path_factory.mktemp("encoded")
-    (folder / "in.ply").write_bytes(INPUTS[PLAIN].make())
-    words = ["encode", folder / "in.ply", folder / "out.csplat", "--source-index", folder / "out.npy", "--quiet"]
-    assert 0 == CliRunner().invoke(app, list(map(str, words))).exit_code
-    return (folder / "out.csplat").read_bytes(), np.load(folder / "out.npy")
 
 
 def test_errors_are_proved_by_the_encoders_own_index(monkeypatch):

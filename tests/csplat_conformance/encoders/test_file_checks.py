@@ -10,8 +10,6 @@ from csplat_conformance.encoders import all_inputs
 from csplat_conformance.encoders.file_checks import check_stream, pair_splats
 
 INPUTS = {one.name: one for one in all_inputs()}
-
-
 ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
 
 

@@ -24,8 +24,6 @@ from csplat_conformance.validator.streams import undo_coder
 from csplat_selftest.fuzzing.damage import damaged_file
 
 VALID = [vector for vector in VECTOR_LIST if not vector.error]
-
-
 RICH = build(rich_scene())
 
 

@@ -11,8 +11,6 @@ from csplat_conformance.validator import validate
 from csplat_conformance.validator.violation_log import CODES, VIOLATIONS_MAX
 
 ROOT = Path(__file__).resolve().parents[3]
-
-
 TEXT = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
 
 

@@ -11,8 +11,6 @@ pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[
 
 
 pytestmark = pytest.mark.usefixtures("small_views")
-
-
 LINE = RateLine(RatePoint(40.0, 1e-4, 1000), -0.23, 0.045)
 
 

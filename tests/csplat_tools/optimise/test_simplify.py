@@ -3,15 +3,14 @@
 import json
 from dataclasses import replace
 
+import captures
 import numpy as np
 import pytest
 from captures import views_of
-from checked import cloud
 from command_line import call, change_options, change_views
 
 from csplat.encoder import Target
 from csplat.errors import InputError
-from csplat.model import normalise_quats
 from csplat.ply import read_ply, write_ply
 from csplat_render.camera_files import save_cameras
 from csplat_render.pruning_error import measure_pruning_error
@@ -35,8 +34,6 @@ pytest.importorskip("numba", reason="simplification requires the extra [render]"
 
 
 pytestmark = pytest.mark.usefixtures("small_views")
-
-
 SMALL = SimplifyOptions(views=12, view_size=(48, 36), effort=1)
 
 
@@ -47,19 +44,7 @@ def render_all(model, seen_from):
 
 @pytest.fixture(scope="module")
 def source():
-    """A shell of opaque splats with hidden ones inside, and ten that are too transparent to be drawn."""
-    rng = np.random.default_rng(0)
-    n, count = 300, 450
-    at = rng.standard_normal((n, 3))
-    at /= np.linalg.norm(at, axis=1, keepdims=True)
-    means = np.concatenate([at, 0.3 * rng.standard_normal((n // 2, 3))])
-    quats = normalise_quats(rng.standard_normal((count, 4)))
-    opacities = rng.uniform(0.6, 1.0, count)
-    opacities[:10] = 0.003
-    arrays = {"opacities": opacities, "scales": rng.uniform(-2.3, -1.7, (count, 3))}
-    arrays["sh0"] = np.sin(3.0 * means) + rng.uniform(0.0, 1.0, (count, 3))
-    arrays["shN"] = 0.05 * rng.standard_normal((count, 8, 3))
-    return cloud(means, quats=quats, **{name: values.astype(np.float32) for name, values in arrays.items()})
+    return captures.shell_with_hidden_splats()
 
 
 @pytest.fixture(scope="module")

@@ -40,8 +40,6 @@ pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[
 
 
 pytestmark = pytest.mark.usefixtures("small_views")
-
-
 SMALL = SimplifyOptions(effort=1, view_size=(960, 720))
 
 

@@ -14,23 +14,11 @@ pytest.importorskip("numba", reason="targets require the extra [render]")
 
 
 PLAIN = AnalyticScene()
-
-
 UNNEEDED = AnalyticScene(unneeded=4000)
-
-
 NONE_TO_SPARE = AnalyticScene(removal_psnr=2.0)
-
-
 NO_CODEBOOK = AnalyticScene(book_psnr=20.0, book_octave=0.1)
-
-
 WITHOUT_SH = AnalyticScene(sh_degree=0, shown=())
-
-
 JUMPING = AnalyticScene(jump=0.5)
-
-
 SCENES = {
     "plain": PLAIN, "many unneeded splats": UNNEEDED, "no splat to spare": NONE_TO_SPARE,
     "useless codebooks": NO_CODEBOOK, "without SH": WITHOUT_SH, "jumps": JUMPING,
@@ -40,8 +28,6 @@ SCENES = {
 
 
 MOST_TRIES = 25  # candidates; a codebook that has to grow takes some more
-
-
 LARGER = 1.12  # times the size of the smallest possible file; the limit of a search for a PSNR
 
 

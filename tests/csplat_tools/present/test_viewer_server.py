@@ -166,11 +166,7 @@ def test_other_paths_are_not_served(scene_path):
 
 
 LOOPBACK = ["127.1", "LOCALHOST", "0:0:0:0:0:0:0:1", "::ffff:127.0.0.1"]
-
-
 ANYWHERE = "0.0.0.0"  # noqa: S104  # the documented value of --host
-
-
 GOOD = [
     "localhost", "LOCALHOST:80", "localhost.", "localhost:", "127.0.0.1:9", "127.0.0.2", "[::1]", "[::1]:80",
     "192.0.2.1",

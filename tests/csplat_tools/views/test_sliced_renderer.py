@@ -96,11 +96,7 @@ def test_the_limit_of_splats_is_per_file_and_that_of_bytes_per_tile(many_tiles):
 
 
 UP = (0.0, -1.0, 0.0)
-
-
 BEHIND = (0.3, 0.6, 0.1)
-
-
 LITTLE = 1  # byte of memory
 
 

@@ -35,11 +35,7 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 LENS_W, LENS_H = 120, 90
-
-
 FOCAL = [100.0, 98.0, 62.0, 44.0]
-
-
 ONE_FOCAL = [100.0, 61.0, 44.0]
 
 
@@ -244,11 +240,7 @@ def test_undistortion_stays_within_the_image(radial, tangential):
 
 
 POSE = np.array(to_opengl(cameras(10)[0]))
-
-
 SHEARED = POSE @ np.array([[1, 0.2, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
-
-
 PIXELS = 51.47  # pixels; the approximate focal length of the set
 
 

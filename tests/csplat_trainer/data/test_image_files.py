@@ -35,8 +35,6 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 NFC, NFD = (unicodedata.normalize(form, "Köln.png") for form in ("NFC", "NFD"))
-
-
 POSES = [to_opengl(camera) for camera in cameras(10)]  # poses of the frames of `write_transforms`
 
 

@@ -19,14 +19,8 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 HALF_SEEN = np.where(RAMP < 0.5, 0, 200).astype(np.uint8)
-
-
 RGBA = np.dstack([RGB, HALF_SEEN])
-
-
 RGB_16 = RGB.astype(np.uint16) * 257
-
-
 SWAPPED = UINT16.astype(">u2").tobytes()
 
 

@@ -312,8 +312,6 @@ def test_keep_prunes_splats_with_the_least_effect(capture, tmp_path):
 
 
 SMALL = ("--preset", "small", "--iterations", 10)
-
-
 SCALAR = {"sh_coding": "scalar", "shape_codebook_size": 0}
 
 

@@ -1,0 +1,52 @@
+"""Our file of the plain input, and the suite over it with altered statements."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from encoder_runs_cases import INPUTS, L3, PLAIN, model_of
+from typer.testing import CliRunner
+
+import csplat
+from csplat.decoder import decode_scene
+from csplat_conformance.encoders import EncoderSuiteOptions, run_encoder
+from csplat_conformance.protocol import ProcessEnd
+from csplat_tools.cli.app import app
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """The plain input, after reading."""
+    return model_of(PLAIN, tmp_path_factory.mktemp("plain"))
+
+
+@pytest.fixture(scope="module")
+def encoded(tmp_path_factory):
+    """The plain input, encoded by our encoder, and its source index."""
+    folder = tmp_path_factory.mktemp("encoded")
+    (folder / "in.ply").write_bytes(INPUTS[PLAIN].make())
+    words = ["encode", folder / "in.ply", folder / "out.csplat", "--source-index", folder / "out.npy", "--quiet"]
+    assert 0 == CliRunner().invoke(app, list(map(str, words))).exit_code
+    return (folder / "out.csplat").read_bytes(), np.load(folder / "out.npy")
+
+
+@pytest.fixture
+def altered(monkeypatch, plain):
+    """Run the suite over our file with altered statements."""
+    data = csplat.encode(plain)
+
+    def run(_command, places, _seconds):
+        Path(places["out"]).write_bytes(data)
+        return ProcessEnd(None, 0, b"", b"", 0.0)
+
+    def report(change, levels=L3, render_score=None, name=PLAIN, **fields):
+        one = replace(INPUTS[name], **fields)
+        monkeypatch.setattr(
+            "csplat_conformance.encoders.file_checks.decode_scene", lambda data: change(decode_scene(data))
+        )
+        monkeypatch.setattr("csplat_conformance.encoders.encoder_suite.all_inputs", lambda: [one])
+        return run_encoder("x {ply} {out}", EncoderSuiteOptions(name, levels), run=run, render_score=render_score,
+            no_render_reason="no numba")  # fmt: skip
+
+    return report

@@ -1,0 +1,38 @@
+"""A small scene, its file and its source index, for tests of commands."""
+
+import pytest
+from cli_cases import call
+
+from csplat import write_ply
+
+
+@pytest.fixture
+def ply(tmp_path, make_model):
+    """A PLY of 200 splats of degree 2."""
+    path = tmp_path / "scene.ply"
+    write_ply(path, make_model(200, 2))
+    return path
+
+
+@pytest.fixture(scope="session")
+def encoded_once():
+    """The files that `encode` writes for `ply`, by name; the first test that needs them fills it."""
+    return {}
+
+
+@pytest.fixture
+def csplat_file(tmp_path, ply, encoded_once):
+    """The file of `ply`, with its source index next to it."""
+    names = ("scene.csplat", "index.npy")
+    if not encoded_once:
+        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
+        encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
+    for name, data in encoded_once.items():
+        (tmp_path / name).write_bytes(data)
+    return tmp_path / names[0]
+
+
+@pytest.fixture
+def no_estimated_up(monkeypatch):
+    """Estimate no up direction after encoding, which takes longer than encoding small scenes."""
+    monkeypatch.setattr("csplat_tools.cli.encode.estimate_up", lambda _model, _every: None)
