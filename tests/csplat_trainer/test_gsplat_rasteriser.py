@@ -41,6 +41,7 @@ from csplat_trainer.tuning.tuning_engine import CpuTuning
 torch = pytest.importorskip("torch", reason="the GPU engine requires torch (the train extra)")
 pytestmark = pytest.mark.torch
 CPU, BLACK = torch.device("cpu"), np.zeros(3, np.float32)
+needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a GPU")
 
 
 @pytest.fixture
@@ -213,9 +214,11 @@ def views():
     return split_views(renders_of(shell(8), cameras(6), BLACK, None), BLACK, validation_count=2)
 
 
-def test_the_loss_sees_what_a_decoder_returns(fixed, views):
-    options = FinetuneOptions(iterations=9)
-    gpu = GsplatTuning(fixed, options, BLACK, rasterization=rasterization, device="cpu")
+@pytest.mark.parametrize(
+    "engine", [{"rasterization": rasterization, "device": "cpu"}, pytest.param({}, marks=[pytest.mark.gpu, needs_gpu])]
+)
+def test_the_loss_sees_what_a_decoder_returns(fixed, views, engine):
+    gpu = GsplatTuning(fixed, FinetuneOptions(iterations=9), BLACK, **engine)
     rates = dict.fromkeys(gpu.parameters.values, 0.02)
     for view in views.train:
         gpu.step(view, None, rates, gpu.count(1e-3))
@@ -297,10 +300,6 @@ def test_pruning_errors_agree_with_the_measured_ones(make_model, camera):
     assert np.allclose(estimate.error / 60, exact.error, rtol=0.5, atol=0.1 * exact.error.max())
 
 
-# On a GPU.
-needs_gpu = pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs a GPU")
-
-
 @pytest.mark.gpu
 @needs_gpu
 @pytest.mark.parametrize("antialiased", [False, True])
@@ -310,12 +309,3 @@ def test_gsplat_renders_as_the_cpu_does(make_model, camera, antialiased):
     found, _ = rasteriser.render(splats_of(rasteriser, model), camera, rasteriser.upload(BLACK), 3)
     expected = render(replace(model, antialiased=antialiased), camera).rgb
     assert np.abs(found.detach().cpu().numpy() - expected).mean() < 2e-3
-
-
-@pytest.mark.gpu
-@needs_gpu
-def test_a_gpu_quantises_as_the_encoder(fixed, views):
-    gpu = GsplatTuning(fixed, FinetuneOptions(), BLACK)
-    for view in views.train:
-        gpu.step(view, None, dict.fromkeys(gpu.parameters.values, 0.02), gpu.count(1e-3))
-        gpu.free_values()

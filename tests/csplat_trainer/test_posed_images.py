@@ -18,28 +18,18 @@ from csplat_trainer.training_options import TrainOptions
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 
-@pytest.fixture
-def data(make_model):
-    return training_images(make_model)
-
-
-@pytest.fixture
-def opaque(make_model):
-    return training_images(make_model, alpha=False)
-
-
-def test_masked_pixels_do_not_influence_training(opaque):
-    mask = np.ones((SIZE, SIZE), bool)
+def test_masked_pixels_do_not_influence_training(make_model):
+    data, mask = training_images(make_model, alpha=False), np.ones((SIZE, SIZE), bool)
     mask[10:30, :20] = False
 
-    def hidden(value: int) -> DataSet:
-        def shown(picture: PosedImage) -> PosedImage:
-            return PosedImage(picture.camera, np.where(mask[..., None], picture.pixels, np.uint8(value)), mask)
-
-        return DataSet("masked", [shown(one) for one in opaque.train], [shown(one) for one in opaque.test])
+    def hidden(pictures, value):
+        values = (np.where(mask[..., None], picture.pixels, np.uint8(value)) for picture in pictures)
+        return [PosedImage(one.camera, pixels, mask) for one, pixels in zip(pictures, values, strict=True)]
 
     options = TrainOptions(**{**QUICK, "iterations": 20}, init="box")
-    first, second = (train(hidden(value), options) for value in (0, 200))
+    first, second = (
+        train(DataSet("masked", hidden(data.train, value), hidden(data.test, value)), options) for value in (0, 200)
+    )
     assert np.array_equal(first.model.means, second.model.means)
     assert np.array_equal(first.model.shN, second.model.shN)
     assert first.metrics == second.metrics
@@ -47,13 +37,14 @@ def test_masked_pixels_do_not_influence_training(opaque):
 
 
 @pytest.mark.slow
-def test_large_units_do_not_change_the_scene(data):
-    def larger(picture: PosedImage) -> PosedImage:
+def test_large_units_do_not_change_the_scene(make_model):
+    def larger(picture):
         viewmat = picture.camera.viewmat.copy()
         viewmat[:3, 3] *= 1e5
         return replace(picture, camera=replace(picture.camera, viewmat=viewmat))
 
-    millimetres = replace(data, train=[larger(one) for one in data.train], test=[larger(one) for one in data.test])
+    data = training_images(make_model)
+    millimetres = replace(data, train=[*map(larger, data.train)], test=[*map(larger, data.test)])
     options = TrainOptions(**{**QUICK, "iterations": 200})
     usual, large = (train(one, options).metrics["psnr"] for one in (data, millimetres))
     assert large == pytest.approx(usual, abs=1.0)

@@ -10,7 +10,9 @@ from sensitivity_cases import cameras, small_scene
 from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.ply import read_ply, write_ply
+from csplat_render.scene_frame import scene_frame
 from csplat_tools.encode_file import encode_file
+from csplat_tools.importance_file import encoder_importance
 from csplat_trainer.sensitivity import measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, read_sensitivity, write_sensitivity
 
@@ -20,14 +22,33 @@ pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[
 pytestmark = pytest.mark.usefixtures("small_views")
 
 
+def written(path, model, source="cameras"):
+    """Measure a scene and write the file; return the sensitivities."""
+    found = measure_sensitivity(model, cameras(), metric=True)
+    with path.open("wb") as stream:
+        write_sensitivity(stream, model, found, source)
+    return found
+
+
 @pytest.fixture
 def stored(tmp_path):
-    model = small_scene(30, 2)
-    found = measure_sensitivity(model, cameras(), metric=True)
-    path = tmp_path / "scene.npz"
-    with path.open("wb") as stream:
-        write_sensitivity(stream, model, found, "cameras")
-    return path, model, found
+    path, model = tmp_path / "scene.npz", small_scene(30, 2)
+    return path, model, written(path, model)
+
+
+def test_virtual_views_in_surroundings_give_no_blocks(stored):
+    path, model, _ = stored
+    read = read_sensitivity(path, model)
+    angles = np.linspace(0.0, 20.0 * np.pi, len(model))[:, None]
+    ring = 500.0 * np.concatenate([np.cos(angles), np.sin(angles), 0.0 * angles], axis=1)
+    near = np.arange(len(model))[:, None] % 2 == 1
+    scales = np.repeat(np.where(near, np.float32(-5.0), np.float32(3.0)), 3, axis=1)
+    inside = replace(model, means=np.where(near, model.means, ring).astype(np.float32), scales=scales)
+    assert scene_frame(inside).kind == "surrounding"
+    virtual = replace(read, source="virtual")
+    assert encoder_importance(virtual, inside).blocks is None
+    assert encoder_importance(read, inside).blocks is not None
+    assert encoder_importance(virtual, model).blocks is not None
 
 
 def test_a_file_is_written_and_read(stored):
@@ -68,8 +89,7 @@ def test_damaged_files_are_refused(stored):
 def test_flipped_bits_are_refused_or_read(tmp_path, packed):
     # Bits of the archive's directory at a small stride, bits of the arrays at a large one.
     model, path = small_scene(1, 1), tmp_path / "one.npz"
-    with path.open("wb") as stream:
-        write_sensitivity(stream, model, measure_sensitivity(model, cameras(), metric=True), "cameras")
+    written(path, model)
     if packed:
         with np.load(path) as file:
             arrays = dict(file)
@@ -87,29 +107,25 @@ def test_flipped_bits_are_refused_or_read(tmp_path, packed):
     assert refused > 0.3 * directory * 8 / 1201
 
 
-@pytest.mark.parametrize(
-    ("name", "array"),
-    [
-        ("views", np.array(["1"] * 30)), ("colour", np.ones(30, np.complex64)), ("view_count", np.array(np.inf)),
-        ("shape_matrices", np.ones((29, 21), np.float32)), ("matrices", np.ones(30, np.float16)),
-        ("views", np.array(1)), ("colour", np.full(30, np.nan, np.float32)),
-    ],
-)  # fmt: skip
-def test_invalid_arrays_are_refused(stored, name, array):
+def test_invalid_arrays_are_refused(stored):
     path, model, _ = stored
     with np.load(path) as file:
         arrays = dict(file)
-    np.savez(path, **(arrays | {name: array}))
-    with pytest.raises(InputError, match="not a file of sensitivities"):
-        read_sensitivity(path, model)
+    for name, array in (
+        ("views", np.array(["1"] * 30)), ("colour", np.ones(30, np.complex64)), ("view_count", np.array(np.inf)),
+        ("shape_matrices", np.ones((29, 21), np.float32)), ("matrices", np.ones(30, np.float16)),
+        ("views", np.array(1)), ("colour", np.full(30, np.nan, np.float32)),
+    ):  # fmt: skip
+        np.savez(path, **(arrays | {name: array}))
+        with pytest.raises(InputError, match="not a file of sensitivities"):
+            read_sensitivity(path, model)
 
 
 def test_unseen_splats_have_a_small_weight(stored):
     path, model, _ = stored
     away = np.where(np.arange(30)[:, None] < 3, np.float32(100.0), model.means)
     model = replace(model, means=away)
-    with path.open("wb") as stream:
-        write_sensitivity(stream, model, measure_sensitivity(model, cameras(), metric=True), "virtual")
+    written(path, model, "virtual")
     read = read_sensitivity(path, model)
     weights = read.importance().sh
     assert 3 == np.count_nonzero(~read.seen)
@@ -117,22 +133,19 @@ def test_unseen_splats_have_a_small_weight(stored):
     assert np.isfinite(read.importance().sh_metric).all()
 
 
-@pytest.fixture
-def seen_in_part(tmp_path):
-    """A PLY of opaque splats that a few views see only in part."""
-    model = small_scene(400, 0)
-    means = model.means / np.linalg.norm(model.means, axis=1, keepdims=True)
-    write_ply(tmp_path / "part.ply", replace(model, means=means, opacities=np.full(400, 0.999, np.float32)))
-    return tmp_path / "part.ply"
-
-
 @pytest.mark.slow
-def test_pruning_reports_the_share_that_other_views_see(tmp_path, seen_in_part, monkeypatch):
-    npz, out = tmp_path / "s.npz", tmp_path / "o.csplat"
+def test_pruning_reports_the_share_that_other_views_see(tmp_path, monkeypatch):
+    ply, npz, out = (tmp_path / name for name in ("part.ply", "s.npz", "o.csplat"))
+    model = small_scene(400, 0)  # opaque splats on a sphere, which a few views see only in part
+    means = model.means / np.linalg.norm(model.means, axis=1, keepdims=True)
+    write_ply(ply, replace(model, means=means, opacities=np.full(400, 0.999, np.float32)))
+    monkeypatch.setattr("csplat_tools.views.view_sets.render_seconds", lambda *_, **__: 4.0)
     change_views(monkeypatch, 2, None)
-    invoke("sensitivity", seen_in_part, npz)
-    missed = read_sensitivity(npz, read_ply(seen_in_part)).missed_share
+    announced = invoke("sensitivity", ply, npz).stderr
+    assert "2 virtual views" in announced
+    assert "this takes about" in announced
+    missed = read_sensitivity(npz, read_ply(ply)).missed_share
     assert missed > 0.0
-    pruned = encode_file(str(seen_in_part), str(out), EncodeOptions(), importance=str(npz), prune_unseen=True)
+    pruned = encode_file(str(ply), str(out), EncodeOptions(), importance=str(npz), prune_unseen=True)
     assert f"{100 * missed:.1f} % of the splats were pruned although" in " ".join(pruned.report.notes)
-    assert "left out" not in invoke("encode", seen_in_part, out, "--importance", npz, "--force", "-q").stderr
+    assert "left out" not in invoke("encode", ply, out, "--importance", npz, "--force", "-q").stderr

@@ -1,4 +1,4 @@
-"""Training: the loop, resumed runs, `csplat train` to a PLY or a file; loss, parameters, strategies."""
+"""Training: the loop, resumed runs, `csplat train` to a PLY or a file; checkpoints, gains of images."""
 
 from __future__ import annotations
 
@@ -35,14 +35,13 @@ from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, tune
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 
+def brief(iterations=1, **options):
+    return TrainOptions(**{**QUICK, "iterations": iterations, **options})
+
+
 @pytest.fixture
 def data(make_model):
     return training_images(make_model)
-
-
-@pytest.fixture
-def opaque(make_model):
-    return training_images(make_model, alpha=False)
 
 
 @pytest.mark.slow
@@ -57,8 +56,7 @@ def test_training_prunes_to_the_final_share(data, strategy):
 
 @pytest.mark.slow
 def test_training_starts_with_images_of_half_the_size(data, tmp_path, monkeypatch):
-    widths: list[int] = []
-    step = CpuEngine.step
+    widths, step = [], CpuEngine.step
     watched = lambda engine, picture, *rest: widths.append(picture.camera.W) or step(engine, picture, *rest)  # noqa: E731
     monkeypatch.setattr(CpuEngine, "step", watched)
     assert_resumes_identically(data, TrainOptions(**QUICK, half_size=0.5), tmp_path)
@@ -68,8 +66,7 @@ def test_training_starts_with_images_of_half_the_size(data, tmp_path, monkeypatc
 @pytest.mark.slow
 @pytest.mark.parametrize("strategy", ["mcmc", "fixed", "gradient", "none"])
 def test_training_reduces_the_loss(data, strategy):
-    options = TrainOptions(**{**QUICK, "iterations": 150, "refine_every": 30}, strategy=strategy, lr_means=4e-3)
-    result = train(data, options)
+    result = train(data, brief(150, refine_every=30, strategy=strategy, lr_means=4e-3))
     losses = result.log["losses"]
     assert np.mean(losses[-20:]) < 0.5 * np.mean(losses[:20])
     assert result.metrics["psnr_mean"] > 15
@@ -79,10 +76,7 @@ def test_training_reduces_the_loss(data, strategy):
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_file(data, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        write_ply(
-            tmp_path / name,
-            train(data, TrainOptions(**{**QUICK, "iterations": 30}, seed=seed, background="random")).model,
-        )
+        write_ply(tmp_path / name, train(data, brief(30, seed=seed, background="random")).model)
     first, second, other = ((tmp_path / name).read_bytes() for name in "abc")
     assert first == second
     assert first != other
@@ -90,16 +84,15 @@ def test_the_same_seed_gives_the_same_file(data, tmp_path):
 
 def test_a_scene_has_the_origin_of_its_data_set(data, tmp_path):
     # Also if the run is resumed with images that have another origin.
-    place = np.array((500123.0, 4649876.0, 214.0))
-    options = TrainOptions(**{**QUICK, "iterations": 30})
-    plain = train(data, options).model
-    moved = train(replace(data, origin=tuple(place)), options, outputs=Outputs(tmp_path / "c.npz")).model
-    assert tuple(place) == moved.origin
+    place, shift = np.array((500123.0, 4649876.0, 214.0)), np.array((1.0, -2.0, 0.5))
+    plain = train(data, brief(30)).model
+    placed = replace(data, origin=tuple(place), coordinate_system="RFU")
+    moved = train(placed, brief(30), outputs=Outputs(tmp_path / "c.npz")).model
+    assert (tuple(place), "RFU") == (moved.origin, moved.coordinate_system)
     assert np.array_equal(plain.means, moved.means)
-    shift = np.array((1.0, -2.0, 0.5))
     shifted = [replace(one, camera=relative_to(shift, one.camera)) for one in data.train]
     other = DataSet("other", shifted, [], origin=tuple(place + shift))
-    again = train(other, options, outputs=Outputs(resume=tmp_path / "c.npz")).model
+    again = train(other, brief(30), outputs=Outputs(resume=tmp_path / "c.npz")).model
     assert tuple(place + shift) == again.origin
     assert np.allclose(plain.means - shift, again.means, atol=1e-5)
 
@@ -113,7 +106,7 @@ def test_an_outlier_camera_does_not_change_the_extent(data):
     assert measure_extent(data.train).extent == pytest.approx(extent, rel=0.2)
 
 
-def test_splats_start_within_the_hull_of_all_masks(data):
+def test_splats_start_within_the_hull_of_all_masks_or_in_a_box(data, make_model):
     scene = measure_extent(data.train)
     assert np.linalg.norm(scene.focus) < 0.1
     hull, box = (
@@ -121,56 +114,37 @@ def test_splats_start_within_the_hull_of_all_masks(data):
         for init in ("hull", "box")
     )
     assert hull.mean() < box.mean()
-
-
-def test_images_without_alpha_start_in_a_box(opaque):
-    result = train(opaque, TrainOptions(**QUICK))
-    assert np.isfinite(result.model.means).all()
-    assert (0.0, 0.0, 0.0) == TrainingRecord.of(result.model.metadata).background
-    with pytest.raises(InputError, match="requires images with alpha"):
-        train(opaque, TrainOptions(**QUICK, init="hull"))
-    with pytest.raises(InputError, match="requires points"):
-        train(opaque, TrainOptions(**QUICK, init="points"))
+    opaque = training_images(make_model, alpha=False)
+    model = train(opaque, brief(60)).model
+    assert np.isfinite(model.means).all()
+    assert (0.0, 0.0, 0.0) == TrainingRecord.of(model.metadata).background
+    for init, message in (("hull", "requires images with alpha"), ("points", "requires points")):
+        with pytest.raises(InputError, match=message):
+            train(opaque, brief(init=init))
 
 
 def test_the_first_view_of_surroundings_is_a_training_camera(data):
-    options = TrainOptions(**{**QUICK, "iterations": 1, "strategy": "none"})
-    assert "view" not in train(data, options).model.metadata  # an object
+    assert "view" not in train(data, brief(strategy="none")).model.metadata  # an object
     rng = np.random.default_rng(0)
     far = rng.standard_normal((60, 3)) * 40.0
     points = np.concatenate([0.1 * rng.standard_normal((200, 3)), far]).astype(np.float32)
     given = DataSet("surrounded", data.train, data.test, points, np.full((260, 3), 0.5, np.float32))
-    view = Camera.from_json(train(given, replace(options, max_splats=260)).model.metadata["view"])
+    view = Camera.from_json(train(given, brief(strategy="none", max_splats=260)).model.metadata["view"])
     taken = [one.camera for one in data.train]
     assert 1 == sum(np.allclose(view.viewmat, one.viewmat, atol=1e-5) for one in taken)
     assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)
 
 
-def test_splats_start_at_the_points(data):
+def test_splats_start_at_the_points_unless_they_are_outside_all_images(data):
     points = np.random.default_rng(0).standard_normal((20, 3)).astype(np.float32)
     given = DataSet("made", data.train, [], points, np.full((20, 3), 0.25, np.float32))
-    result = train(given, TrainOptions(**{**QUICK, "iterations": 1}, lr_means=0.0, lr_means_final=0.0, noise=0.0))
+    result = train(given, brief(lr_means=0.0, lr_means_final=0.0, noise=0.0))
     assert {tuple(row) for row in points.tolist()} == {tuple(row) for row in result.model.means.tolist()}
     assert result.metrics is None
-
-
-def test_points_outside_all_images_are_refused(data):
-    data = replace(data, points=np.full((5, 3), 4e6, np.float32))
+    away = replace(data, points=np.full((5, 3), 4e6, np.float32))
     with pytest.raises(InputError, match="no camera sees any of the data set's 5 points, expected both in the same"):
-        train(data, TrainOptions(**QUICK))
-    assert train(data, TrainOptions(**{**QUICK, "iterations": 1}, init="box")).log["losses"]
-
-
-@pytest.mark.slow
-def test_the_command_trains_from_a_folder(data, tmp_path):
-    write_set(tmp_path, data)
-    (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
-    run = ("train", tmp_path, tmp_path / "o.ply", *FEW_WORDS, "--size", "24x24", "--seed", 3)
-    assert "" == call(*run, "--report", tmp_path / "log.json").stdout
-    model = read_ply(tmp_path / "o.ply")
-    assert (0, "RFU") == (model.sh_degree, model.coordinate_system)
-    assert 5 == len(json.loads((tmp_path / "log.json").read_text())["losses"])
-    assert "mps is not supported" in " ".join(call(*run, "--device", "mps", status=2).stderr.split())
+        train(away, brief())
+    assert train(away, brief(init="box")).log["losses"]
 
 
 def write_set(folder, data):
@@ -197,6 +171,7 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
     reading = ["--test-every", every, *(() if size is None else ("--size", size))]
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
     result = call("train", folder, ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
+    assert ("", 5) == (result.stdout, len(json.loads(log.read_text())["losses"]))
     record = TrainingRecord.of(read_ply(ply).metadata)
     assert (every, size) == (record.test_every, None if record.size is None else "{}x{}".format(*record.size))
     assert record.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
@@ -206,17 +181,6 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
     scores, metrics = json.loads(again.stdout)["photographs"]["a"], json.loads(log.read_text())["metrics"]
     for name in ("psnr", "psnr_mean"):
         assert scores[name] == pytest.approx(metrics[name], abs=0.01)
-
-
-def test_the_training_record_survives_encode_and_decode(make_model, tmp_path):
-    record = TrainingRecord((0.0, 0.0, 0.0), 10, (24, 20), 0.05)
-    ply, file, back = (tmp_path / name for name in ("a.ply", "a.csplat", "b.ply"))
-    write_ply(ply, make_model(10, 0, metadata={"training": record.as_json()}))
-    call("encode", ply, file, "-q")
-    call("decode", file, back, "-q")
-    assert record == TrainingRecord.of(read_ply(back).metadata)
-    assert str(record) in call("info", file).stdout
-    assert record.as_json() == json.loads(call("info", file, "--json").stdout)["metadata"]["training"]
 
 
 @pytest.mark.slow
@@ -260,20 +224,14 @@ def test_one_training_gives_several_files(file_runs):
     assert trained == file_runs.checkpoint.read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("target", "max_splats", "planned"),
-    [
+def test_a_training_is_planned_by_its_target():
+    for target, max_splats, planned in (
         (None, None, (20_000, 0.8)), (None, 500, (500, 0.8)), (Target(keep=0.5), 500, (500, 0.5)),
         (Target(psnr=30.0), None, (20_000, 1.0)), (Target(size_bytes=80_000), None, (10_000, 0.8)),
         (Target(size_bytes=80_000), 16_000, (16_000, 0.5)), (Target(size_bytes=80_000), 4_000, (4_000, 1.0)),
-    ],
-)  # fmt: skip
-def test_a_training_is_planned_by_its_target(target, max_splats, planned):
-    options = plan_training(TrainOptions(seed=7), target, max_splats=max_splats)
-    assert (*planned, 7) == (options.max_splats, options.final_share, options.seed)
-
-
-def test_a_training_for_a_drop_of_psnr_is_refused():
+    ):  # fmt: skip
+        options = plan_training(TrainOptions(seed=7), target, max_splats=max_splats)
+        assert (*planned, 7) == (options.max_splats, options.final_share, options.seed)
     with pytest.raises(InputError, match="max_psnr_drop is no target of train"):
         plan_training(TrainOptions(), Target(max_psnr_drop=1.0))
 
@@ -297,12 +255,10 @@ def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch)
     assert [] == [*tmp_path.glob("a.*")]
 
 
-@pytest.mark.parametrize(
-    "words", [("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)]
-)
-def test_options_of_a_file_are_refused_for_a_ply(tmp_path, words):
-    result = call("train", tmp_path, tmp_path / "a.ply", *words, status=2)
-    assert "expected OUT.csplat" in " ".join(result.stderr.split())
+def test_options_of_a_file_are_refused_for_a_ply(tmp_path):
+    for words in (("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)):
+        result = call("train", tmp_path, tmp_path / "a.ply", *words, status=2)
+        assert "expected OUT.csplat" in " ".join(result.stderr.split())
 
 
 @pytest.fixture
@@ -310,26 +266,16 @@ def parameters(make_model):
     return Parameters.starting_at(from_model(make_model(40, 2), 2))
 
 
-def checkpoint_of(parameters: Parameters) -> FitCheckpoint:
-    state = np.random.default_rng(0).bit_generator.state
-    return FitCheckpoint("train", 7, False, state, [3, 1], [], {"seed": 0}, {"losses": []}, parameters)
-
-
-def test_a_checkpoint_is_saved_and_loaded(parameters, tmp_path):
-    save_checkpoint(tmp_path / "run.npz", checkpoint_of(parameters))
-    again = load_checkpoint(tmp_path / "run.npz")
+def test_a_checkpoint_is_saved_and_loaded_and_refused_in_another_version(parameters, tmp_path):
+    path, state = tmp_path / "run.npz", np.random.default_rng(0).bit_generator.state
+    save_checkpoint(path, FitCheckpoint("train", 7, False, state, [3, 1], [], {"seed": 0}, {"losses": []}, parameters))
+    again = load_checkpoint(path)
     assert (7, [3, 1]) == (again.iteration, again.queue)
     for name in GROUPS:
         assert np.array_equal(parameters.values[name], again.parameters.values[name])
         assert np.array_equal(parameters.second[name], again.parameters.second[name])
-
-
-def test_a_checkpoint_of_the_previous_version_is_refused_in_one_line(parameters, tmp_path):
-    path = tmp_path / "run.npz"
-    save_checkpoint(path, checkpoint_of(parameters))
     arrays = dict(np.load(path))
     facts = json.loads(arrays["facts"].tobytes()) | {"version": 1}
-    del facts["kind"]  # as in checkpoints of training of version 1
     np.savez(path, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
     with pytest.raises(InputError, match=r"run\.npz is a checkpoint of version 1, expected 2: begin a new run$"):
         load_checkpoint(path)
@@ -350,7 +296,6 @@ def test_the_moving_average_covers_the_last_values():
 
 
 GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # gains of training images
-LONGER = {**QUICK, "iterations": 300, "refine_every": 50, "lr_means": 2e-3, "background": "black"}
 
 
 @pytest.fixture
@@ -387,7 +332,7 @@ def test_gradients_of_gains_agree_with_finite_differences():
 
 @pytest.mark.slow
 def test_gains_are_estimated_with_a_mean_of_0(uneven):
-    options = TrainOptions(**{**LONGER, "iterations": 450})
+    options = brief(450, refine_every=50, lr_means=2e-3, background="black")
     plain, corrected = (train(uneven, replace(options, lr_exposure=rate)) for rate in (0.0, 0.05))
     assert corrected.log["entries"][-1]["psnr"] > plain.log["entries"][-1]["psnr"]  # PSNR of training images
     found = np.array(corrected.log["exposures"])

@@ -72,20 +72,15 @@ def test_learning_rates_decay():
     assert TrainOptions(refine_stop=1.0, lr_decay=0.2).learning_rates(7000, 2.0)["shN"] == TrainOptions.lr_shN
 
 
-def test_growth_reaches_the_cap_halfway():
-    options = TrainOptions(max_splats=1000, iterations=2000, refine_start=100)
-    count = 10.0
+def test_growth_reaches_the_cap_halfway_and_sh_degrees_are_activated_one_by_one():
+    options, count = TrainOptions(max_splats=1000, iterations=2000, refine_start=100), 10.0
     for step in range(1, options.refine_end // 2 + 1):
         if options.refines_after(step):
             count *= options.growth_from(10)
     assert 1000 == pytest.approx(count)
-    assert 1.05 == options.growth_from(1000)
-    assert 1.5 == TrainOptions(growth=1.5).growth_from(10)
-
-
-def test_sh_degrees_are_activated_one_by_one():
-    options = TrainOptions(iterations=1500, sh_degree=2)
-    assert [0, 1, 2, 2] == [options.active_degree(step) for step in (0, 100, 200, 1400)]
+    assert (1.05, 1.5) == (options.growth_from(1000), TrainOptions(growth=1.5).growth_from(10))
+    degrees = TrainOptions(iterations=1500, sh_degree=2)
+    assert [0, 1, 2, 2] == [degrees.active_degree(step) for step in (0, 100, 200, 1400)]
 
 
 def test_prunings_are_spread_and_end_early():

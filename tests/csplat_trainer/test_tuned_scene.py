@@ -5,53 +5,27 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from captures import H, W, cameras, shell
-from command_line import change_options
-from finetune_cases import BLACK, COARSE, FEW, unchecked
+from captures import H, W
+from finetune_cases import BLACK, FEW, SOURCE, coarse, fixed_by, unchecked, views_of_source
 
 from csplat import EncodeOptions
-from csplat.encoder import EncodePlan, fix_quantisation
 from csplat.encoder.quantisation import quantise_sh
 from csplat.errors import InputError
 from csplat_render.rasteriser import Rasteriser
+from csplat_trainer import tuned_scene
 from csplat_trainer.losses import PhotometricLoss
 from csplat_trainer.training_options import Outputs
-from csplat_trainer.tuned_scene import (
-    RateTerm,
-    TunedScene,
-    colour_integers_of,
-    count_integers,
-    slopes_of,
-    sum_by_entry,
-    sum_by_entry_twin,
-)
-from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
+from csplat_trainer.tuned_scene import TunedScene
+from csplat_trainer.tuning import FinetuneOptions, tune
 
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 
-@pytest.fixture(scope="module")
-def source():
-    return shell(8)
-
-
-@pytest.fixture(scope="module")
-def coarse(source):
-    """The fixed quantisation of a coarse file with a codebook."""
-    return fix_quantisation(EncodePlan.of(source, COARSE))
-
-
-@pytest.fixture(scope="module")
-def views(source):
-    return split_views(renders_of(source, cameras(14), BLACK, None), BLACK, validation_count=3)
-
-
 @pytest.mark.long
-def test_the_gradient_of_an_entry_is_the_sum_over_its_users(source, views):
+def test_the_gradient_of_an_entry_is_the_sum_over_its_users():
     # The sum over users, against finite differences of the loss by an entry's values.
-    encoding = EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16)
-    fixed = fix_quantisation(EncodePlan.of(source, encoding))
-    scene, view = TunedScene(fixed), views.train[0]
+    fixed = fixed_by(EncodeOptions(attribute_psnr=60.0, sh_coding="codebook", codebook_size=16))
+    scene, view = TunedScene(fixed), views_of_source().train[0]
     rasteriser = Rasteriser(dtype=np.float64)
     seen, _ = scene.dequantise()
 
@@ -78,16 +52,15 @@ def test_sums_by_entry_agree_with_their_twin():
     order, starts = np.argsort(index, kind="stable"), np.searchsorted(np.sort(index), np.arange(9))
     values = rng.standard_normal((200, 7)).astype(np.float32)
     fast, slow = np.empty((8, 7), np.float32), np.empty((8, 7), np.float32)
-    sum_by_entry(values, order, starts, fast)
-    sum_by_entry_twin(values, order, starts, slow)
+    tuned_scene.sum_by_entry(values, order, starts, fast)
+    tuned_scene.sum_by_entry_twin(values, order, starts, slow)
     assert np.allclose(slow, fast, atol=1e-5)
     assert np.allclose(slow[3], values[index == 3].sum(axis=0), atol=1e-5)
 
 
-def test_a_step_moves_values_through_their_quantisers(coarse, views):
-    scene = TunedScene(coarse)
+def test_a_step_moves_values_through_their_quantisers():
+    scene, rasteriser, view = TunedScene(coarse()), Rasteriser(), views_of_source().train[0]
     before = {name: values.copy() for name, values in scene.parameters.values.items()}
-    rasteriser, view = Rasteriser(), views.train[0]
     seen, alphas = scene.dequantise()
     wanted = view.image(BLACK, np.empty((H, W, 3), np.float32))
     _, slope = PhotometricLoss(H, W)(rasteriser.forward(unchecked(seen), view.camera, background=BLACK).rgb, wanted)
@@ -101,7 +74,7 @@ def test_a_step_moves_values_through_their_quantisers(coarse, views):
 
 def test_costs_are_the_entropy_with_slopes_away_from_common_values():
     columns = np.repeat([0, 1, -1, 2], [800, 100, 90, 10])[:, None]
-    slopes, bits = slopes_of(count_integers([columns[:700], columns[700:]]))
+    slopes, bits = tuned_scene.slopes_of(tuned_scene.count_integers([columns[:700], columns[700:]]))
     shares = np.array([800, 100, 90, 10]) / 1000
     assert bits == pytest.approx(-1000 * (shares * np.log2(shares)).sum())
     assert slopes[0, 128 + 1] > 0.5  # towards 2 the cost rises
@@ -110,31 +83,27 @@ def test_costs_are_the_entropy_with_slopes_away_from_common_values():
     assert np.abs(slopes).max() <= 4.0
 
 
-def test_costs_use_the_encoded_integers(source):
-    fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", chroma_shift=1)))
+def test_costs_use_the_encoded_integers():
+    fixed = fixed_by(EncodeOptions(sh_coding="scalar", chroma_shift=1))
     seen, _ = TunedScene(fixed).dequantise()
     columns, _, _ = quantise_sh(fixed.start().sh, fixed.parameters, None)
-    integers = colour_integers_of(seen.shN, fixed.parameters.sh_step, 1)
+    integers = tuned_scene.colour_integers_of(seen.shN, fixed.parameters.sh_step, 1)
     assert np.array_equal(columns.transpose(2, 1, 0), integers)
 
 
 @pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
-def test_gradients_of_costs_agree_with_the_definition(source, group):
+def test_gradients_of_costs_agree_with_the_definition(group):
     # The slopes of a cost that is quadratic in the integers are known.
-    fixed = fix_quantisation(EncodePlan.of(source, EncodeOptions(sh_coding="scalar", attribute_psnr=60.0)))
-    scene = TunedScene(fixed)
+    fixed = fixed_by(EncodeOptions(sh_coding="scalar", attribute_psnr=60.0))
+    scene, plan = TunedScene(fixed), fixed.parameters
     seen, _ = scene.dequantise()
     stored = scene.stream_values(seen)
-    name = {"logits": "opacities"}.get(group, group)
-    integers = np.arange(-128, 129, dtype=np.float32)
-    costs = scene.count(seen, weight=float(len(source)))
+    costs = scene.count(seen, weight=float(len(SOURCE)))
     costs.tables = {key: np.zeros_like(table) for key, table in costs.tables.items()}
-    costs.tables[name] += 0.01 * integers  # the slope of 0.005 n²
+    costs.tables["opacities" if group == "logits" else group] += 0.01 * np.arange(-128, 129)  # the slope of 0.005 n²
     steps = {key: np.zeros_like(values) for key, values in scene.parameters.values.items()}
     costs.add_to(steps, stored)
-    for other, slopes in steps.items():
-        assert slopes.any() == (other == group)
-    plan = fixed.parameters
+    assert [group] == [name for name, slopes in steps.items() if slopes.any()]
     if group == "scales":
         assert np.allclose(steps["scales"], 0.01 * stored.scales / plan.scale_step**2, rtol=1e-4)
     elif group == "quats":
@@ -149,25 +118,23 @@ def test_gradients_of_costs_agree_with_the_definition(source, group):
         assert np.allclose(steps["logits"][small], expected[small], rtol=1e-3, atol=1e-4)
     else:
         values, step = (stored.sh0[:, None], plan.sh0_step) if group == "sh0" else (stored.sh, plan.sh_step)
-        gradient = steps[group].reshape(values.shape)
-        n = (values / step).astype(np.float64)
-        y, co, cg = (n[..., 0] + 2 * n[..., 1] + n[..., 2]) / 4, n[..., 0] - n[..., 2], 0.0
-        cg = n[..., 1] - (n[..., 0] + n[..., 2]) / 2
+        r, g, b = np.moveaxis((values / step).astype(np.float64), -1, 0)
         scale = 2.0**plan.chroma_shift
-        by_y, by_co, by_cg = 0.01 * y, 0.01 * co / scale**2, 0.01 * cg / scale**2
+        by_y, by_co, by_cg = 0.01 * (r + 2 * g + b) / 4, 0.01 * (r - b) / scale**2, 0.01 * (g - (r + b) / 2) / scale**2
         expected = np.stack([by_y / 4 + by_co - by_cg / 2, by_y / 2 + by_cg, by_y / 4 - by_co - by_cg / 2], axis=-1)
+        gradient = steps[group].reshape(values.shape)
         assert np.abs(gradient - expected / step).max() < 0.05 / step  # the expected values are not rounded
 
 
-def test_lambda_is_loss_per_bit_and_splat(coarse):
-    scene = TunedScene(coarse)
+def test_lambda_is_loss_per_bit_and_splat():
+    scene = TunedScene(coarse())
     seen, _ = scene.dequantise()
-    costs = RateTerm.count(scene.fixed, scene.stream_values(seen), 2e-4)
+    costs = tuned_scene.RateTerm.count(scene.fixed, scene.stream_values(seen), 2e-4)
     assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
     assert 5 < costs.bits / 300 < 200
 
 
-def test_non_finite_values_end_a_run_with_an_error(coarse, views, monkeypatch):
+def test_non_finite_values_end_a_run_with_an_error(monkeypatch):
     # Kernels survive NaN, so the loss may be finite; a file cannot represent it.
     step = TunedScene.step
 
@@ -177,29 +144,18 @@ def test_non_finite_values_end_a_run_with_an_error(coarse, views, monkeypatch):
 
     monkeypatch.setattr(TunedScene, "step", spoilt)
     with np.errstate(invalid="ignore"), pytest.raises(InputError, match="a value is not finite at step 4"):
-        tune(coarse, views, FEW)
+        tune(coarse(), views_of_source(), FEW)
 
 
 @pytest.mark.slow
-def test_every_learning_rate_warms_up(coarse, views, tmp_path):
-    fixed, file, moved = coarse, tmp_path / "c.npz", []
+def test_every_learning_rate_warms_up(tmp_path):
+    fixed, file, moved = coarse(), tmp_path / "c.npz", []
     start = {name: values.copy() for name, values in TunedScene(fixed).parameters.values.items() if values.size}
     for warm_up in (0, 100):
         options = FinetuneOptions(iterations=1, warm_up=warm_up, byte_cost=0.0)
-        tune(fixed, views, options, outputs=Outputs(file))
+        tune(fixed, views_of_source(), options, outputs=Outputs(file))
         with np.load(file) as stored:
             steps = {name: np.abs(stored[f"values_{name}"] - start[name]).max() for name in start}
             moved.append({name: step / options.learning_rate_factor(1) for name, step in steps.items()})
     assert {"means", "quats", "scales", "logits", "sh0", "shN"} <= moved[0].keys()
-    for name in start:
-        assert moved[0][name] == pytest.approx(moved[1][name], rel=0.05), name
-
-
-# the command
-ENCODE_OPTIONS = "csplat_tools.cli.finetune.EncodeOptions"
-
-
-@pytest.fixture(autouse=True)
-def bare(monkeypatch):
-    """Make the command encode neither SH nor codebooks, which take time."""
-    change_options(monkeypatch, ENCODE_OPTIONS, sh_coding="none", shape_codebook_size=0)
+    assert moved[0] == pytest.approx(moved[1], rel=0.05)

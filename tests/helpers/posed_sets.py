@@ -4,10 +4,13 @@ import json
 import struct
 
 import numpy as np
+import pytest
 from checked import quaternion_of
 from PIL import Image
 
+from csplat.errors import InputError
 from csplat_render.camera import intrinsics, look_at, relative_to
+from csplat_trainer.data import load
 
 W, H = 48, 32
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -48,6 +51,25 @@ def assert_dots_are_where_points_fall(pictures, points=POINTS):
             assert (picture.pixels[int(v), int(u), :3] == colour).all()
 
 
+def assert_refused(message, folder, **options):
+    with pytest.raises(InputError, match=message):
+        load(folder, **options)
+
+
+def report_of(folder, **options):
+    """Return the lines that a set reports, as one text."""
+    return "\n".join(load(folder, **options).report)
+
+
+def sizes(data):
+    """Return the numbers of training, validation and test images."""
+    return len(data.train), len(data.val), len(data.test)
+
+
+def names(pictures):
+    return [picture.camera.image for picture in pictures]
+
+
 def to_opengl(camera):
     return (np.linalg.inv(camera.viewmat) @ FLIP).tolist()
 
@@ -60,6 +82,7 @@ def write_blender(folder, up=(0, 0, 1)):
             frames.append({"file_path": f"./{part}/r_{i}", "transform_matrix": to_opengl(camera)})
         document = {"camera_angle_x": float(np.radians(50.0)), "frames": frames}
         (folder / f"transforms_{part}.json").write_text(json.dumps(document))
+    return folder
 
 
 def write_transforms(folder, missing=(), up=(0, 0, 1), at=(0, 0, 0)):
@@ -72,8 +95,8 @@ def write_transforms(folder, missing=(), up=(0, 0, 1), at=(0, 0, 0)):
         frames.append({"file_path": f"images/{i:04}.png", "transform_matrix": pose.tolist()})
     K = intrinsics(W, H, 50.0)
     intrinsic = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H}
-    document = {**intrinsic, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document))
+    (folder / "transforms.json").write_text(json.dumps({**intrinsic, "frames": frames}))
+    return folder
 
 
 MODELS = {"PINHOLE": 1, "FULL_OPENCV": 6}
@@ -119,6 +142,7 @@ def write_colmap_set(folder, text=False, up=(0, 0, 1), at=(0, 0, 0)):
     for i, camera in enumerate(shots):
         write_picture(folder / "images" / f"im {i:03}.png", camera)
     write_colmap(folder / "sparse" / "0", shots, text=text, at=at)
+    return folder
 
 
 def rename_in_images_txt(folder, name):

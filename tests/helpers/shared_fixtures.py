@@ -180,6 +180,34 @@ def make_model():
     return make
 
 
+@pytest.fixture
+def blender_set(tmp_path):
+    from posed_sets import write_blender
+
+    return write_blender(tmp_path)
+
+
+@pytest.fixture
+def transforms_set(tmp_path):
+    from posed_sets import write_transforms
+
+    return write_transforms(tmp_path)
+
+
+@pytest.fixture
+def colmap_set(tmp_path):
+    from posed_sets import write_colmap_set
+
+    return write_colmap_set(tmp_path)
+
+
+@pytest.fixture
+def colmap_text_set(tmp_path):
+    from posed_sets import write_colmap_set
+
+    return write_colmap_set(tmp_path, text=True)
+
+
 @pytest.fixture(scope="session")
 def trained_scene(once, tmp_path_factory):
     """A scene trained for 300 steps on small photographs, see captures.py; all workers share its files."""

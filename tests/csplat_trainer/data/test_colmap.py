@@ -2,10 +2,7 @@
 
 import numpy as np
 import pytest
-from posed_sets import (
-    cameras,
-    write_colmap,
-)
+from posed_sets import cameras, write_colmap
 
 from csplat.errors import InputError
 from csplat_trainer.data.colmap import read_images, read_points

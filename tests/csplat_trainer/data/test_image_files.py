@@ -7,24 +7,11 @@ import unicodedata
 import zlib
 
 import numpy as np
+import posed_sets as sets
 import pytest
 from image_files_cases import GREY, LABELS, RGB, SHAPE, UINT16, png_16
 from PIL import ExifTags, Image, ImageFile
-from posed_sets import (
-    H,
-    W,
-    assert_dots_are_where_points_fall,
-    cameras,
-    change_frames,
-    change_transforms,
-    rename_in_images_txt,
-    to_opengl,
-    write_blender,
-    write_colmap,
-    write_colmap_set,
-    write_picture,
-    write_transforms,
-)
+from posed_sets import H, W, assert_refused, cameras, names, report_of, sizes
 from tables import failures
 
 from csplat.errors import InputError
@@ -35,7 +22,6 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 NFC, NFD = (unicodedata.normalize(form, "Köln.png") for form in ("NFC", "NFD"))
-POSES = [to_opengl(camera) for camera in cameras(10)]  # poses of the frames of `write_transforms`
 
 
 #: Listed name, existing names, the one that matches or the text of the error, words of the note.
@@ -82,161 +68,12 @@ def test_names_are_matched_loosely_only_without_an_exact_match():
     assert [] == failures(NAMES, check)
 
 
-def test_a_missing_name_is_not_searched_in_other_folders_if_others_are_found():
-    known = ["images/1.png", "images_2/1.png", "images_2/2.png", "2.png"]
+def test_names_of_a_list_are_matched_together():
+    known = ["images/1.png", "images_2/1.png", "images_2/2.png", "2.png"]  # a missing name is not searched elsewhere
     assert ({"images/1.png": "images/1.png"}, []) == match_names(["images/1.png", "images/2.png"], known, "x")
-
-
-def test_two_names_of_one_file_are_refused():
     with pytest.raises(InputError, match=r"x: A\.png and A\.PNG both match a\.png"):
         match_names(["A.png", "A.PNG"], ["a.png"], "x")
     assert {"1.png": "1.png"} == match_names(["1.jpg", "1.png"], ["1.png"], "x")[0]
-
-
-@pytest.fixture
-def colmap_set(tmp_path):
-    write_colmap_set(tmp_path)
-    return tmp_path
-
-
-@pytest.fixture
-def transforms(tmp_path):
-    write_transforms(tmp_path)
-    return tmp_path
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("folder", "note"),
-    [
-        ("Images", "images from Images"), ("input", "images from input"), ("images_2", "images from images_2"),
-        (".", "images from the folder itself"), ("images/deeper", "9 names of images.txt found in folders below"),
-    ],
-)  # fmt: skip
-def test_images_of_colmap_are_found_in_several_folders(colmap_set, folder, note):
-    rename_in_images_txt(colmap_set, "im {:03}.png".format)
-    move(colmap_set / "images", colmap_set / folder)
-    data = load(colmap_set)
-    assert any(note in line for line in data.report)
-    assert_dots_are_where_points_fall([*data.train, *data.test])
-
-
-def test_originals_belong_to_the_distorted_model(colmap_set):
-    for camera, i in zip(cameras(9), range(9), strict=True):
-        write_picture(colmap_set / "input" / f"im {i:03}.png", camera)
-    move(colmap_set / "sparse", colmap_set / "distorted" / "sparse")
-    assert "images from input" in load(colmap_set).report
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", ["IM {:03}.PNG", "photos/im {:03}.png", "D:\\photos\\im {:03}.png", "im {:03}.jpg", "./im {:03}.png"]
-)
-def test_names_of_images_of_another_machine_are_found(colmap_set, name):
-    rename_in_images_txt(colmap_set, name.format)
-    data = load(colmap_set)
-    assert (7, 2) == (len(data.train), len(data.test))
-    assert_dots_are_where_points_fall([*data.train, *data.test])
-    assert any("9 names of images.txt found" in line for line in data.report) == (not name.startswith("."))
-
-
-def test_spaces_within_names_are_kept(colmap_set):
-    rename_in_images_txt(colmap_set, "im  {:03}.png".format)
-    for path in (colmap_set / "images").iterdir():
-        path.rename(path.with_name(path.name.replace("im ", "im  ")))
-    assert 7 == len(load(colmap_set).train)
-
-
-def test_the_message_names_the_folders_that_were_tried(colmap_set):
-    rename_in_images_txt(colmap_set, "other{}.png".format)
-    with pytest.raises(InputError) as raised:
-        load(colmap_set)
-    message = str(raised.value)
-    assert "none of its 9 images exists (other0.png, …)" in message
-    assert f"searched {colmap_set}/images, {colmap_set}/input, {colmap_set} itself" in message
-    assert "there are other images, such as im 000.png" in message
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("path", "folder"),
-    [
-        ("images\\{:04}.png", "images"), ("./uploads\\images/{:04}.png", "uploads/images"),
-        ("C:\\Users\\me\\scan\\images\\{:04}.png", "images"), ("/home/me/scan/images/{:04}.png", "images"),
-        ("../scan/images/{:04}.png", "images"), ("images/{:04}.png", "images_4"), ("images/{:04}.png", "Images"),
-        ("images/{:04}.png", "input"), ("images/{:04}.png", "."), ("{:04}.png", "images"),
-        ("photos/{:04}.JPG", "photos"), ("photos/{:04}", "PHOTOS"),
-    ],
-)  # fmt: skip
-def test_paths_of_frames_of_another_machine_are_found(transforms, path, folder):
-    move(transforms / "images", transforms / folder)
-    frames = [{"file_path": path.format(i), "transform_matrix": matrix} for i, matrix in enumerate(POSES)]
-    change_transforms(transforms, frames=frames)
-    data = load(transforms, test_every=0)
-    assert 10 == len(data.train)
-    assert_dots_are_where_points_fall(data.train)
-    assert any("10 names of transforms.json found" in line or "images from images" in line for line in data.report)
-
-
-def test_training_and_test_images_must_be_different_files(tmp_path):
-    write_blender(tmp_path)
-    move(tmp_path / "train", tmp_path)
-    move(tmp_path / "test", tmp_path / "away")
-    with pytest.raises(InputError, match=r"train/r_0\.png and test/r_0\.png are both found as r_0\.png"):
-        load(tmp_path)
-    (tmp_path / "transforms_test.json").unlink()
-    assert 5 == len(load(tmp_path).train)
-
-
-def test_another_folder_of_images_may_be_chosen(transforms):
-    for i, camera in enumerate(cameras(10)):
-        write_picture(transforms / "images_2" / f"{i:04}.png", camera, scale=2)
-    assert W // 2 == load(transforms, images="images_2").train[0].camera.W
-    assert W == load(transforms).train[0].camera.W
-
-
-def test_masks_are_found_like_images(transforms):
-    for i, camera in enumerate(cameras(10)):
-        write_picture(transforms / "masks" / f"{i:04}.png", camera)
-    assert any("folder masks is ignored, since transforms.json does not" in line for line in load(transforms).report)
-    for i in range(10):
-        change_frames(transforms, [i], mask_path=f"masks\\{i:04}.png")
-    report = load(transforms).report
-    assert "masks hide parts of 10 images, which do not count" in report
-    assert any("10 names of transforms.json found with / for \\" in line for line in report)
-
-
-#: Names on disk, and the code page in which a list has them, with its title.
-CODE_PAGES = {
-    "GBK": ("图像{}.png", "gbk", "GBK"),
-    "Shift-JIS": ("写真表示{}.png", "cp932", "Shift-JIS"),
-    "Shift-JIS with bytes of backslashes": ("ソース{}.JPG", "cp932", "Shift-JIS"),
-    "Big5": ("圖像功能{}.png", "big5", "Big5"),
-    "EUC-KR": ("사진{}.png", "euc_kr", "EUC-KR"),
-    "Windows-1252": ("Gebäude_{}.png", "cp1252", "Windows-1252"),
-    "Windows-1251": ("Дом_{}.png", "cp1251", "Windows-1251"),
-    "Windows-1250": ("Łódź_{}.png", "cp1250", "Windows-1250"),
-    "code page of zips": ("Größe_{}.png", "cp437", "CP437"),
-}
-
-
-@pytest.mark.slow
-def test_names_in_other_code_pages_are_matched_by_their_bytes():
-    def check(case):
-        form, page, title = case
-        names = [form.format(i) for i in range(3)]
-        raw = [name.encode(page).decode("utf-8", "surrogateescape") for name in names]
-        misread = [name.encode("utf-8").decode("cp437") for name in names]
-        for listed, files in ((raw, names), (names, raw), (misread, names), (names, misread)):
-            matched, (note,) = match_names(listed, files, "images.bin")
-            assert dict(zip(listed, files, strict=True)) == matched
-            assert f"found in the code page {title if raw in (listed, files) else ''}" in note
-            note.encode("utf-8")
-
-    assert [] == failures(CODE_PAGES, check)
-
-
-def test_bytes_that_fit_no_file_or_several_are_no_match():
     listed = ["K\xf6ln.png".encode("cp1252").decode("utf-8", "surrogateescape")]
     assert ({}, []) == match_names(listed, ["Koeln.png", "a.png"], "x")
     with pytest.raises(InputError, match="names match different files in Windows-1252 and CP437: rename"):
@@ -244,57 +81,141 @@ def test_bytes_that_fit_no_file_or_several_are_no_match():
 
 
 @pytest.mark.slow
-def test_sets_with_names_in_another_code_page_are_read(colmap_set):
-    names = [f"図面表{i}.png" for i in range(9)]  # in code page 932, some bytes are backslashes
-    model = colmap_set / "sparse" / "0" / "images.bin"
-    data = model.read_bytes()
-    for i, name in enumerate(names):
-        (colmap_set / "images" / f"im {i:03}.png").rename(colmap_set / "images" / name)
+@pytest.mark.parametrize(
+    ("name", "folder", "note"),
+    [
+        ("im {:03}.png", "Images", "images from Images"), ("im {:03}.png", "images_2", "images from images_2"),
+        ("im {:03}.png", "input", "images from input"), ("im {:03}.png", ".", "images from the folder itself"),
+        ("im {:03}.png", "images/deeper", "9 names of images.txt found in folders below"),
+        ("D:\\photos\\im {:03}.jpg", "images", "9 names of images.txt found"), ("./im {:03}.png", "images", "images"),
+    ],
+)  # fmt: skip
+def test_images_of_colmap_are_found_in_several_folders(colmap_set, name, folder, note):
+    sets.rename_in_images_txt(colmap_set, name.format)
+    move(colmap_set / "images", colmap_set / folder)
+    data = load(colmap_set)
+    assert (7, 0, 2) == sizes(data)
+    assert any(note in line for line in data.report)
+    sets.assert_dots_are_where_points_fall([*data.train, *data.test])
+
+
+def test_originals_belong_to_the_distorted_model(colmap_set):
+    (colmap_set / "input").symlink_to(colmap_set / "images")
+    move(colmap_set / "sparse", colmap_set / "distorted" / "sparse")
+    assert "images from input" in report_of(colmap_set)
+
+
+def test_the_message_names_the_folders_that_were_tried(colmap_set):
+    sets.rename_in_images_txt(colmap_set, "other{}.png".format)
+    folders = "searched {0}/images, {0}/input, {0} itself".format(re.escape(str(colmap_set)))
+    assert_refused(rf"none of its 9 images exists \(other0\.png, …\).*{folders}.*such as im 000\.png", colmap_set)
+
+
+@pytest.mark.slow
+def test_paths_of_frames_of_another_machine_are_found(transforms_set):
+    last = "images"
+    for path, folder in (
+        ("images\\{:04}.png", "images"), ("./uploads\\images/{:04}.png", "uploads/images"),
+        ("C:\\Users\\me\\scan\\images\\{:04}.png", "images"), ("../scan/images/{:04}.png", "images"),
+        ("images/{:04}.png", "images_4"), ("images/{:04}.png", "Images"), ("images/{:04}.png", "input"),
+        ("images/{:04}.png", "."), ("photos/{:04}.JPG", "photos"), ("photos/{:04}", "PHOTOS"),
+    ):  # fmt: skip
+        move(transforms_set / last, transforms_set / folder, "*.png")
+        last = folder
+        for i in range(10):
+            sets.change_frames(transforms_set, [i], file_path=path.format(i))
+        data = load(transforms_set, test_every=0)
+        assert 10 == len(data.train)
+        sets.assert_dots_are_where_points_fall(data.train)
+        assert any("10 names of transforms.json found" in line or "images from images" in line for line in data.report)
+
+
+def test_training_and_test_images_must_be_different_files(blender_set):
+    move(blender_set / "train", blender_set)
+    move(blender_set / "test", blender_set / "away")
+    assert_refused(r"train/r_0\.png and test/r_0\.png are both found as r_0\.png", blender_set)
+    (blender_set / "transforms_test.json").unlink()
+    assert 5 == len(load(blender_set).train)
+
+
+def test_masks_are_found_like_images(transforms_set):
+    for i, camera in enumerate(cameras(10)):
+        sets.write_picture(transforms_set / "masks" / f"{i:04}.png", camera)
+    assert "folder masks is ignored, since transforms.json does not" in report_of(transforms_set)
+    for i in range(10):
+        sets.change_frames(transforms_set, [i], mask_path=f"masks\\{i:04}.png")
+    report = report_of(transforms_set)
+    assert "masks hide parts of 10 images, which do not count" in report
+    assert "10 names of transforms.json found with / for \\" in report
+
+
+#: Title of a code page, its name, and names of files.
+CODE_PAGES = [
+    ("GBK", "gbk", "图像{}.png"), ("Shift-JIS", "cp932", "写真表示{}.png"),
+    ("Shift-JIS", "cp932", "ソース{}.JPG"),  # with bytes of backslashes
+    ("Big5", "big5", "圖像功能{}.png"), ("EUC-KR", "euc_kr", "사진{}.png"),
+    ("Windows-1252", "cp1252", "Gebäude_{}.png"), ("Windows-1251", "cp1251", "Дом_{}.png"),
+    ("Windows-1250", "cp1250", "Łódź_{}.png"), ("CP437", "cp437", "Größe_{}.png"),
+]  # fmt: skip
+
+
+@pytest.mark.slow
+def test_names_in_other_code_pages_are_matched_by_their_bytes():
+    def check(case):
+        title, page, form = case
+        files = [form.format(i) for i in range(3)]
+        raw = [name.encode(page).decode("utf-8", "surrogateescape") for name in files]
+        misread = [name.encode("utf-8").decode("cp437") for name in files]
+        for listed, known in ((raw, files), (files, raw), (misread, files), (files, misread)):
+            matched, (note,) = match_names(listed, known, "images.bin")
+            assert dict(zip(listed, known, strict=True)) == matched
+            assert f"found in the code page {title if raw in (listed, known) else ''}" in note
+            note.encode("utf-8")
+
+    assert [] == failures({case[2]: case for case in CODE_PAGES}, check)
+
+
+@pytest.mark.slow
+def test_sets_with_names_in_another_code_page_are_read(colmap_text_set):
+    files = [f"図面表{i}.png" for i in range(9)]  # in code page 932, some bytes are backslashes
+    model = colmap_text_set / "sparse" / "0"
+    sets.rename_in_images_txt(colmap_text_set, files.__getitem__)
+    (model / "images.txt").write_bytes((model / "images.txt").read_text("utf-8").encode("cp932"))
+    (colmap_text_set / "test.txt").write_bytes(files[2].encode("cp932"))
+    for i, name in enumerate(files):
+        (colmap_text_set / "images" / f"im {i:03}.png").rename(colmap_text_set / "images" / name)
+    assert [files[2]] == names(load(colmap_text_set).test)
+    sets.write_colmap(model, cameras(9))
+    data = (model / "images.bin").read_bytes()
+    for i, name in enumerate(files):
         data = data.replace(b"im %03d.png\0" % i, name.encode("cp932") + b"\0")
-    model.write_bytes(data)
-    (colmap_set / "test.txt").write_bytes(names[2].encode("cp932"))
-    read = load(colmap_set)
-    assert [names[2]] == [image.camera.image for image in read.test]
-    assert names[3] in [image.camera.image for image in read.train]
+    (model / "images.bin").write_bytes(data)
+    read = load(colmap_text_set)
+    assert ([files[2]], True) == (names(read.test), files[3] in names(read.train))
     assert any("9 names of images.bin found in the code page" in line for line in read.report)
-    rename_in_images_txt(colmap_set, names.__getitem__)
-    text = model.with_suffix(".txt")
-    text.write_bytes(text.read_text("utf-8").encode("cp932"))
-    assert [names[2]] == [image.camera.image for image in load(colmap_set).test]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "form"), [("cp932", "表{}.png"), ("cp1252", "Größe{}.png")])
-def test_a_transforms_json_may_be_in_another_code_page(transforms, page, form):
-    names = [form.format(i) for i in range(10)]
-    for i, name in enumerate(names):
-        (transforms / "images" / f"{i:04}.png").rename(transforms / "images" / name)
-        change_frames(transforms, [i], file_path=f"images/{name}")
-    file = transforms / "transforms.json"
+def test_a_transforms_json_may_be_in_another_code_page(transforms_set, page, form):
+    for i in range(10):
+        (transforms_set / "images" / f"{i:04}.png").rename(transforms_set / "images" / form.format(i))
+        sets.change_frames(transforms_set, [i], file_path=f"images/{form.format(i)}")
+    file = transforms_set / "transforms.json"
     file.write_bytes(json.dumps(json.loads(file.read_text()), ensure_ascii=False).encode(page))
-    data = load(transforms, test_every=0)
-    assert [f"images/{name}" for name in names] == sorted(image.camera.image for image in data.train)
-
-
-def test_a_link_to_nowhere_is_a_missing_image(colmap_set):
-    (colmap_set / "images" / "im 003.png").unlink()
-    (colmap_set / "images" / "im 003.png").symlink_to(colmap_set / "absent.png")
-    assert "images.bin: 1 of 9 images are missing and dropped: im 003.png" in load(colmap_set).report
-
-
-def test_masks_next_to_the_images_are_reported(colmap_set):
-    write_picture(colmap_set / "images" / "im 003_mask.png", cameras(9)[3])
-    assert any("masks next to the images, such as im 003_mask.png" in line for line in load(colmap_set).report)
+    expected = [f"images/{form.format(i)}" for i in range(10)]
+    assert expected == sorted(names(load(transforms_set, test_every=0).train))
 
 
 def test_masks_that_fit_no_image_are_reported(colmap_set):
-    (colmap_set / "masks").mkdir()
-    write_picture(colmap_set / "masks" / "other.png", cameras(9)[0])
-    assert any("masks/ has no masks for 9 of 9 images" in line for line in load(colmap_set).report)
-    write_picture(colmap_set / "masks" / "IM 003.png", cameras(9)[3])
-    report = load(colmap_set).report
-    assert any("masks/ has no masks for 8 of 9 images: all pixels of im 000.png count" in line for line in report)
-    assert any("1 name of masks/ found in another case: im 003.png is IM 003.png" in line for line in report)
+    sets.write_picture(colmap_set / "images" / "im 003_mask.png", cameras(9)[3])
+    assert "masks next to the images, such as im 003_mask.png" in report_of(colmap_set)
+    sets.write_picture(colmap_set / "masks" / "other.png", cameras(9)[0])
+    assert "masks/ has no masks for 9 of 9 images" in report_of(colmap_set)
+    sets.write_picture(colmap_set / "masks" / "IM 003.png", cameras(9)[3])
+    report = report_of(colmap_set)
+    assert "masks/ has no masks for 8 of 9 images: all pixels of im 000.png count" in report
+    assert "1 name of masks/ found in another case: im 003.png is IM 003.png" in report
 
 
 MASK_NAMES = [
@@ -308,31 +229,31 @@ MASK_NAMES = [
 def test_masks_have_names_of_several_programs(colmap_set):
     def check(name):
         (colmap_set / name).parent.mkdir(exist_ok=True)
-        write_picture(colmap_set / name, cameras(9)[3])
+        sets.write_picture(colmap_set / name, cameras(9)[3])
         data = load(colmap_set)
         (colmap_set / name).unlink()
         if not name.startswith("images"):
             (colmap_set / name).parent.rmdir()
-        assert 9 == len(data.train) + len(data.test)
+        assert (7, 0, 2) == sizes(data)
         assert "masks hide parts of 1 image, which do not count" in data.report
-        assert ["im 003.png"] == [picture.camera.image for picture in data.train if picture.masked is not None]
+        assert ["im 003.png"] == names(picture for picture in data.train if picture.masked is not None)
 
     assert [] == failures({name: name for name in MASK_NAMES}, check)
 
 
-def test_hidden_files_are_ignored(tmp_path):
-    shots = cameras(3)
-    write_colmap(tmp_path / "sparse" / "0", shots)
-    for i, camera in enumerate(shots):
-        for folder in (".cache", "__MACOSX", "images/set"):
-            write_picture(tmp_path / folder / f"im {i:03}.png", camera)
-        write_picture(tmp_path / "images" / "set" / f"._im {i:03}.png", camera)
-    assert 3 == len(load(tmp_path, test_every=0).train)
+def test_hidden_files_are_ignored(colmap_set):
+    for folder in (".cache", "__MACOSX", "images/set"):
+        (colmap_set / folder).mkdir()
+    for path in list((colmap_set / "images").glob("*.png")):
+        for name in (f".cache/{path.name}", f"__MACOSX/{path.name}", f"images/set/._{path.name}"):
+            (colmap_set / name).write_bytes(path.read_bytes())
+        path.rename(path.parent / "set" / path.name)
+    assert 9 == len(load(colmap_set, test_every=0).train)
 
 
-def move(source, target):
+def move(source, target, pattern="*"):
     """Move the files of a folder."""
-    files = list(source.iterdir())
+    files = list(source.glob(pattern))
     target.mkdir(parents=True, exist_ok=True)
     for path in files:
         path.rename(target / path.name)
@@ -340,88 +261,94 @@ def move(source, target):
         source.rmdir()
 
 
-def test_a_set_reports_how_its_pixels_are_read(transforms):
+def test_a_set_reports_how_its_pixels_are_read(transforms_set):
     red, blue = (Image.new("RGB", (W, H), colour) for colour in ("red", "blue"))
     for write, line in (
         (lambda path: Image.fromarray((UINT16 // 16)).save(path), "10 images of 16-bit grey: 0 to 65535 is read as"),
         (lambda path: png_16(path, (RGB.astype(">u2") << 4).astype(">u2")), "10 images of 16-bit colours: 0 to 255 is"),
         (lambda path: red.save(path, save_all=True, append_images=[blue]), "10 files with several images: the first"),
     ):
-        for path in (transforms / "images").iterdir():
+        for path in (transforms_set / "images").iterdir():
             write(path)
-        data = load(transforms)
+        data = load(transforms_set)
         assert any(note.startswith(line) for note in data.report)
     assert (data.train[0].pixels == (255, 0, 0)).all()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("orientation", "square", "reported"), [(1, 0, 0), (3, 0, 1), (6, 0, 0), (6, 1, 1)])
-def test_an_ambiguous_exif_rotation_is_reported(transforms, orientation, square, reported):
-    exif = Image.Exif()
+@pytest.mark.parametrize(
+    ("orientation", "kind"),
+    [(1, "stored"), (3, "ambiguous"), (6, "stored"), (6, "square"), (6, "lying"), (8, "lying")],
+)
+def test_exif_rotation_is_applied_if_it_is_unambiguous_and_the_camera_is_upright(transforms_set, orientation, kind):
+    exif, turned = Image.Exif(), {6: Image.Transpose.ROTATE_90, 8: Image.Transpose.ROTATE_270}
     exif[ExifTags.Base.Orientation] = orientation
-    for path in (transforms / "images").iterdir():
+    for path in (transforms_set / "images").iterdir():
         with Image.open(path) as image:
-            (Image.new("RGB", (W, W)) if square else image).save(path, exif=exif)
-    if square:  # otherwise, 6 would swap the sides, which contradicts the cameras
-        change_transforms(transforms, h=W, cy=W / 2)
-    data = load(transforms)
-    if not square:
-        assert_dots_are_where_points_fall([*data.train, *data.test])
+            image.load()
+        image = Image.new("RGB", (W, W)) if kind == "square" else image
+        (image.transpose(turned[orientation]) if kind == "lying" else image).save(path, exif=exif)
+    if kind == "square":  # otherwise, 6 would swap the sides, which contradicts the cameras
+        sets.change_transforms(transforms_set, h=W, cy=W / 2)
+    data = load(transforms_set)
+    if kind != "square":
+        assert {(W, H)} == {(picture.camera.W, picture.camera.H) for picture in data.train}
+        sets.assert_dots_are_where_points_fall([*data.train, *data.test])
+    if kind == "lying":
+        sets.change_transforms(transforms_set, w=H, h=W, cx=H / 2, cy=W / 2)
+        assert (H, W) == load(transforms_set).train[0].pixels.shape[1::-1]
+        return
     line = f"EXIF turns 10 images (0001.png: orientation {orientation}): read as stored"
-    assert reported == sum(line in note for note in data.report) == sum("EXIF" in note for note in data.report)
+    notes = [note for note in data.report if "EXIF" in note]
+    assert [line in note for note in notes] == [True] * (kind in ("ambiguous", "square"))
 
 
-VOC = Image.fromarray(LABELS, "P")
-
-
-VOC.putpalette([0, 0, 0, 128, 0, 0])
-
-
-def test_images_and_masks_much_larger_than_their_cameras_are_refused_before_decoding(transforms, monkeypatch):
-    path, large = transforms / "images" / "0003.png", Image.new("1", (6000, 4000))
+def test_images_and_masks_much_larger_than_their_cameras_are_refused_before_decoding(transforms_set, monkeypatch):
+    path, large = transforms_set / "images" / "0003.png", Image.new("1", (6000, 4000))
     original = path.read_bytes()
-    for name in (path, transforms / "mask.png"):
+    for name in (path, transforms_set / "mask.png"):
         large.save(name)
     monkeypatch.setattr(ImageFile.ImageFile, "load", lambda file: pytest.fail(f"{file.filename} is decoded"))
-    with pytest.raises(InputError, match=r"0003\.png has 6000×4000 pixels, expected about 48×32 as its camera"):
-        load(transforms)
+    assert_refused(r"0003\.png has 6000×4000 pixels, expected about 48×32 as its camera", transforms_set)
     path.write_bytes(original)
-    change_frames(transforms, range(10), mask_path="mask.png")
-    with pytest.raises(InputError, match=r"mask\.png has 6000×4000 pixels, expected about 48×32 as its image"):
-        load(transforms)
+    sets.change_frames(transforms_set, range(10), mask_path="mask.png")
+    assert_refused(r"mask\.png has 6000×4000 pixels, expected about 48×32 as its image", transforms_set)
 
 
-def test_images_without_a_camera_have_a_budget(transforms):
-    document = json.loads((transforms / "transforms.json").read_text())
-    kept = {name: value for name, value in document.items() if name not in ("w", "h", "cx", "cy")}
-    (transforms / "transforms.json").write_text(json.dumps({**kept, "fl_x": 9000.0, "fl_y": 9000.0}))
-    file = transforms / "images" / "0000.png"
-    head, data = b"IHDR" + struct.pack(">II", 13_300, 13_300), file.read_bytes()
-    head += data[24:29]
+def test_images_without_a_camera_have_a_budget(transforms_set):
+    document = {"fl_x": 9000.0, "fl_y": 9000.0, "frames": sets.frames_of(transforms_set)}
+    (transforms_set / "transforms.json").write_text(json.dumps(document))
+    file = transforms_set / "images" / "0000.png"
+    data = file.read_bytes()
+    head = b"IHDR" + struct.pack(">II", 13_300, 13_300) + data[24:29]
     file.write_bytes(data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:])
-    with pytest.raises(InputError, match=r"0000\.png has 13300×13300 pixels in [0-9,]+ bytes, expected at most 67,1"):
-        load(transforms)
+    assert_refused(r"0000\.png has 13300×13300 pixels in [0-9,]+ bytes, expected at most 67,1", transforms_set)
 
 
-def test_other_formats_in_a_set_are_named(transforms):
-    eps = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\nshowpage\n"
-    (transforms / "mask.png").write_bytes(eps)
-    change_frames(transforms, range(10), mask_path="mask.png")
-    with pytest.raises(InputError, match=r"mask\.png is PostScript"):
-        load(transforms)
-    (transforms / "images" / "0003.png").write_bytes(eps)
-    with pytest.raises(InputError, match=r"0003\.png is PostScript \(EPS\), which is not read"):
-        load(transforms)
+def test_other_formats_in_a_set_are_named(transforms_set):
+    sets.change_frames(transforms_set, range(10), mask_path="mask.png")
+    for name in ("mask.png", "images/0003.png"):
+        (transforms_set / name).write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\nshowpage\n")
+        assert_refused(rf"{name[-8:]} is PostScript \(EPS\), which is not read", transforms_set)
 
 
-def test_masks_of_0_and_1_are_reported_and_grey_ones_refused(transforms):
-    Image.fromarray(LABELS).save(transforms / "mask.png")
-    change_frames(transforms, range(10), mask_path="mask.png")
-    data = load(transforms)
+def test_masks_of_other_values_or_sizes_are_read_or_refused(transforms_set):
+    file = transforms_set / "mask.png"
+    sets.change_frames(transforms_set, range(10), mask_path="mask.png")
+    assert_refused(r"mask 'mask\.png' of images/0000\.png does not exist", transforms_set)
+    Image.new("L", (W, H)).save(file)
+    with pytest.raises(InputError, match=r"the mask of images/000\d\.png hides all of it"):
+        load(transforms_set).read()
+    for values, message in (
+        (GREY // 4, r"mask\.png is a mask of values from 0 to 63, expected at least 128"),
+        (np.full((W, W), 255, np.uint8), r"mask\.png has 48×48 pixels, expected the aspect ratio of 48×32, that of"),
+    ):
+        Image.fromarray(values).save(file)
+        assert_refused(message, transforms_set)
+    for values in (np.full((H // 2, W // 2), 255, np.uint8), np.ones((H, W), np.uint8)):
+        Image.fromarray(values).save(file)
+        assert load(transforms_set).train[0].mask.all()
+    Image.fromarray(LABELS).save(file)
+    data = load(transforms_set)
     assert "masks such as mask.png: values are 0 and 1: 1 counts as white" in data.report
     assert (data.train[0].mask == SHAPE).all()
-    Image.fromarray(GREY // 4).save(transforms / "mask.png")
-    with pytest.raises(InputError, match=r"mask\.png is a mask of values from 0 to 63, expected at least 128"):
-        load(transforms)
-    Image.fromarray(np.ones((H, W), np.uint8)).save(transforms / "mask.png")
-    assert load(transforms).train[0].mask.all()

@@ -2,24 +2,15 @@
 
 import os
 import shutil
+import tempfile
 from pathlib import Path
 
+import posed_sets as sets
 import pytest
-from posed_sets import (
-    cameras,
-    change_frames,
-    change_transforms,
-    frames_of,
-    rename_in_images_txt,
-    write_blender,
-    write_colmap_set,
-    write_picture,
-    write_transforms,
-)
+from posed_sets import assert_refused, cameras, change_frames, report_of
 from tables import failures
 from typer.testing import CliRunner
 
-from csplat.errors import InputError
 from csplat_tools.cli.app import app
 from csplat_trainer.data import load
 from csplat_trainer.data.set_folder import SetFolder
@@ -27,15 +18,13 @@ from csplat_trainer.data.set_folder import SetFolder
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 
-PLY = "ply\nformat ascii 1.0\nelement vertex 1\n" + "property float {}\n" * 3 + "end_header\n1 2 3\n"
+COLUMNS = "property float x\nproperty float y\nproperty float z\n"
+PLY = f"ply\nformat ascii 1.0\nelement vertex 1\n{COLUMNS}end_header\n1 2 3\n"
 
 
-def copied(write, parent):
-    """Return a new copy of the set that `write` writes, alone in a folder."""
-    master = parent / write.__name__
-    if not master.exists():
-        write(master)
-    return Path(shutil.copytree(master, parent / str(len(list(parent.iterdir()))) / "set"))
+def written(write, parent):
+    """Write a set alone in a new folder."""
+    return write(Path(tempfile.mkdtemp(dir=parent)) / "set")
 
 
 def swap_for_link(path, target):
@@ -49,7 +38,7 @@ def renamed(form):
     """Return a change of the names of all frames: {name} and {folder} are what they were."""
 
     def change(folder):
-        for i, frame in enumerate(frames_of(folder)):
+        for i, frame in enumerate(sets.frames_of(folder)):
             change_frames(folder, [i], file_path=form.format(name=frame["file_path"], folder=folder))
 
     return change
@@ -60,107 +49,71 @@ def dots(folder):
     change_frames(folder, [3], file_path="../secret.png")
 
 
-def absolute(folder):
-    dots(folder)
-    change_frames(folder, [3], file_path=str(folder.parent / "secret.png"))
-
-
-def all_outside(folder):
-    shutil.move(folder / "images", folder.parent / "images")
-    renamed("../{name}")(folder)
-
-
 def mask(folder):
-    write_picture(folder.parent / "mask.png", cameras(1)[0])
+    sets.write_picture(folder.parent / "mask.png", cameras(1)[0])
     change_frames(folder, range(10), mask_path="../mask.png")
 
 
-def mask_link(folder):
-    write_picture(folder / "mask.png", cameras(1)[0])
-    swap_for_link(folder / "mask.png", folder.parent / "mask.png")
-    change_frames(folder, range(10), mask_path="mask.png")
-
-
-def mask_of_colmap(folder):
-    write_picture(folder / "masks" / "im 003.png", cameras(9)[3])
-    swap_for_link(folder / "masks", folder.parent / "masks")
-
-
-def mask_next_to_image(folder):
-    write_picture(folder / "images" / "im 003.png.mask.png", cameras(9)[3])
-    swap_for_link(folder / "images" / "im 003.png.mask.png", folder.parent / "mask.png")
-
-
 def points(folder):
-    (folder.parent / "points.ply").write_text(PLY.format(*"xyz"))
-    change_transforms(folder, ply_file_path=str(folder.parent / "points.ply"))
-
-
-def points_link(folder):
-    (folder / "sparse_pc.ply").write_text(PLY.format(*"xyz"))
-    swap_for_link(folder / "sparse_pc.ply", folder.parent / "points.ply")
-
-
-def listed(folder):
-    (folder.parent / "list.txt").write_text("im 002.png\n")
-    (folder / "test.txt").symlink_to(folder.parent / "list.txt")
+    (folder.parent / "points.ply").write_text(PLY)
+    sets.change_transforms(folder, ply_file_path=str(folder.parent / "points.ply"))
 
 
 def colmap_name(folder):
     (folder / "images" / "im 003.png").rename(folder.parent / "im 003.png")
-    rename_in_images_txt(folder, lambda i: f"{'../../' * (i == 3)}im {i:03}.png")
+    sets.rename_in_images_txt(folder, lambda i: f"{'../../' * (i == 3)}im {i:03}.png")
 
 
-def link_to(*names):
+def link_to(name, *, mask=None, text=None):
+    """Return a change that replaces a file or folder by a link, after writing it as a mask or a text."""
+
     def change(folder):
-        for name in names:
-            swap_for_link(folder / name, folder.parent / "elsewhere" / name)
+        if mask is not None:
+            sets.write_picture(folder / mask, cameras(9)[3])
+        if text is not None:
+            (folder / name).write_text(text)
+        swap_for_link(folder / name, folder.parent / "elsewhere" / name)
+        if mask == "mask.png":
+            change_frames(folder, range(10), mask_path=mask)
 
     return change
 
 
-#: Kind of the set, and a change that makes it read a file next to its folder.
+#: Changes of each kind of set that make it read a file next to its folder.
 OUTSIDE = {
-    "..": (write_transforms, dots),
-    "an absolute path": (write_transforms, absolute),
-    "all images": (write_transforms, all_outside),
-    "a device": (write_transforms, lambda folder: change_frames(folder, [3], file_path="/dev/zero")),
-    "points are a device": (write_transforms, lambda folder: change_transforms(folder, ply_file_path="/dev/zero")),
-    "an image is a link": (write_transforms, link_to("images/0003.png")),
-    "the folder of images is a link": (write_transforms, link_to("images")),
-    "a mask": (write_transforms, mask),
-    "a mask is a link": (write_transforms, mask_link),
-    "points": (write_transforms, points),
-    "points are a link": (write_transforms, points_link),
-    "transforms.json is a link": (write_transforms, link_to("transforms.json")),
-    "transforms_train.json is a link": (write_blender, link_to("transforms_train.json")),
-    "transforms_test.json is a link": (write_blender, link_to("transforms_test.json")),
-    "training images are a link": (write_blender, link_to("train")),
-    "a name of COLMAP": (write_colmap_set, colmap_name),
-    "an image of COLMAP is a link": (write_colmap_set, link_to("images/im 003.png")),
-    "images of COLMAP are a link": (write_colmap_set, link_to("images")),
-    "the model is a link": (write_colmap_set, link_to("sparse")),
-    "cameras.bin is a link": (write_colmap_set, link_to("sparse/0/cameras.bin")),
-    "images.bin is a link": (write_colmap_set, link_to("sparse/0/images.bin")),
-    "points3D.bin is a link": (write_colmap_set, link_to("sparse/0/points3D.bin")),
-    "masks of COLMAP are a link": (write_colmap_set, mask_of_colmap),
-    "a mask next to an image is a link": (write_colmap_set, mask_next_to_image),
-    "the list of test images is a link": (write_colmap_set, listed),
-}
+    sets.write_transforms: {
+        "..": dots, "a mask": mask, "points": points,
+        "a device": lambda folder: change_frames(folder, [3], file_path="/dev/zero"),
+        "points are a device": lambda folder: sets.change_transforms(folder, ply_file_path="/dev/zero"),
+        "an image is a link": link_to("images/0003.png"), "images are a link": link_to("images"),
+        "a mask is a link": link_to("mask.png", mask="mask.png"),
+        "points are a link": link_to("sparse_pc.ply", text=PLY),
+        "transforms.json is a link": link_to("transforms.json"),
+    },
+    sets.write_blender: {
+        name: link_to(name) for name in ("transforms_train.json", "transforms_test.json", "train")
+    },
+    sets.write_colmap_set: {
+        "a name": colmap_name, "an image is a link": link_to("images/im 003.png"), "images": link_to("images"),
+        "the model": link_to("sparse"), "cameras.bin": link_to("sparse/0/cameras.bin"),
+        "images.bin": link_to("sparse/0/images.bin"), "points3D.bin": link_to("sparse/0/points3D.bin"),
+        "masks": link_to("masks", mask="masks/im 003.png"), "a list": link_to("test.txt", text="im 002.png\n"),
+        "a mask": link_to("images/im 003.png.mask.png", mask="images/im 003.png.mask.png"),
+    },
+}  # fmt: skip
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
-def test_sets_that_read_outside_of_their_folder_are_refused_unless_trusted(tmp_path):
-    def check(case):
-        write, change = case
-        folder = copied(write, tmp_path)
+@pytest.mark.parametrize("write", OUTSIDE)
+def test_sets_that_read_outside_of_their_folder_are_refused_unless_trusted(tmp_path, write):
+    def check(change):
+        folder = written(write, tmp_path)
         change(folder)
-        with pytest.raises(InputError, match="the folder of the data set: move it there, or allow it with --trust-pat"):
-            load(folder)
+        assert_refused("the folder of the data set: move it there, or allow it with --trust-pat", folder)
         assert len(load(folder, trust_paths=True).train) >= 5
 
-    assert [] == failures(OUTSIDE, check)
+    assert [] == failures(OUTSIDE[write], check)
 
 
 def into_link(folder):
@@ -186,7 +139,7 @@ INSIDE = {
     "a URL of a file": renamed("file:///home/me/{name}"),
     "a home folder": renamed("~/{name}"),
     "paths of the original set": other_copy,
-    "a long name": lambda folder: change_transforms(folder, ply_file_path="x" * 5000),
+    "a long name": lambda folder: sets.change_transforms(folder, ply_file_path="x" * 5000),
 }
 
 
@@ -194,31 +147,28 @@ INSIDE = {
 @pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
 def test_sets_within_their_folder_need_no_trust(tmp_path):
     def check(change):
-        folder = copied(write_transforms, tmp_path)
+        folder = written(sets.write_transforms, tmp_path)
         change(folder)
         assert 10 == len(load(folder, test_every=0).train)
 
     assert [] == failures(INSIDE, check)
 
 
-def test_names_that_no_file_can_have_are_missing(tmp_path):
-    write_transforms(tmp_path)
+def test_names_that_no_file_can_have_are_missing(transforms_set):
     for name in ("x" * 5000 + ".png", "a/" * 3000 + "b.png", "../" * 2000 + "b.png", "", "images"):
-        change_frames(tmp_path, [3], file_path=name)
-        data = load(tmp_path, test_every=0)
+        change_frames(transforms_set, [3], file_path=name)
+        data = load(transforms_set, test_every=0)
         assert 9 == len(data.train)
         assert max(map(len, data.report)) < 300
 
 
 @pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
 def test_a_folder_of_images_that_the_user_names_may_be_a_link(tmp_path):
-    write_colmap_set(tmp_path / "set")
-    swap_for_link(tmp_path / "set" / "images", tmp_path / "photos")
-    assert 7 == len(load(tmp_path / "set" / "images").train)
-    with pytest.raises(InputError, match="is a link that leads out of"):
-        load(tmp_path / "set", images="images")  # as from the metadata of a scene
-    with pytest.raises(InputError, match=r"\.\./photos is outside of"):
-        load(tmp_path / "set", images="../photos")
+    folder = sets.write_colmap_set(tmp_path / "set")
+    swap_for_link(folder / "images", tmp_path / "photos")
+    assert 7 == len(load(folder / "images").train)
+    assert_refused("is a link that leads out of", folder, images="images")  # as from the metadata of a scene
+    assert_refused(r"\.\./photos is outside of", folder, images="../photos")
 
 
 def test_no_server_is_asked_for_a_path(monkeypatch):
@@ -231,27 +181,26 @@ def test_no_server_is_asked_for_a_path(monkeypatch):
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes on Windows")
-def test_pipes_in_a_set_are_no_files(tmp_path):
-    write_colmap_set(tmp_path)
-    (tmp_path / "images" / "im 003.png").unlink()
+def test_pipes_and_links_to_nowhere_are_no_files(colmap_set):
+    (colmap_set / "images" / "im 003.png").unlink()
     for name in ("images/im 003.png", "images/IM 003.png", "test.txt", "points3D.ply"):
-        os.mkfifo(tmp_path / name)
-    data = load(tmp_path)
-    assert "images.bin: 1 of 9 images are missing and dropped: im 003.png" in data.report
+        os.mkfifo(colmap_set / name)
+    (colmap_set / "images" / "im 005.png").unlink()
+    (colmap_set / "images" / "im 005.png").symlink_to(colmap_set / "absent.png")
+    assert "images.bin: 2 of 9 images are missing and dropped: im 003.png" in report_of(colmap_set)
 
 
 @pytest.mark.slow
 def test_the_option_is_taken_anywhere_on_the_command_line(tmp_path):
-    write_transforms(tmp_path / "set")
-    dots(tmp_path / "set")
+    dots(sets.write_transforms(tmp_path / "set"))
     words = ["train", str(tmp_path / "set"), str(tmp_path / "o.ply"), "--iterations", "1", "--quiet"]
     refused = CliRunner().invoke(app, words)
-    assert 1 == refused.exit_code
+    assert (1, 1) == (refused.exit_code, len(refused.stderr.splitlines()))
     assert "--trust-paths (E_INPUT)" in refused.stderr
-    assert 1 == len(refused.stderr.splitlines())
     assert not (tmp_path / "o.ply").exists()
-    assert 0 == CliRunner().invoke(app, [*words[:2], "--trust-paths", *words[2:]]).exit_code
     views = ["render", words[2], str(tmp_path / "r"), "--data", words[1]]
-    assert 1 == CliRunner().invoke(app, views).exit_code
-    assert 0 == CliRunner().invoke(app, ["--trust-paths", *views]).exit_code
-    assert 2 == CliRunner().invoke(app, ["info", str(tmp_path / "o.ply"), "--trust-paths"]).exit_code
+    for status, run in (
+        (0, [*words[:2], "--trust-paths", *words[2:]]), (1, views), (0, ["--trust-paths", *views]),
+        (2, ["info", words[2], "--trust-paths"]),
+    ):  # fmt: skip
+        assert status == CliRunner().invoke(app, run).exit_code

@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from captures import H, W, cameras, shell
-from command_line import call, change_options
-from finetune_cases import BLACK, COARSE, FEW
+from captures import H, W, cameras
+from command_line import call
+from finetune_cases import BLACK, FEW, SOURCE, coarse, views_of_source
 
-from csplat.encoder import EncodePlan, fix_quantisation
 from csplat.errors import InputError
 from csplat_render import render
 from csplat_trainer.posed_images import PosedImage
@@ -18,49 +17,29 @@ from csplat_trainer.tuning import TuningView, TuningViews, renders_of, split_vie
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 
-@pytest.fixture(scope="module")
-def source():
-    return shell(8)
-
-
-@pytest.fixture(scope="module")
-def coarse(source):
-    """The fixed quantisation of a coarse file with a codebook."""
-    return fix_quantisation(EncodePlan.of(source, COARSE))
-
-
-@pytest.fixture(scope="module")
-def views(source):
-    return split_views(renders_of(source, cameras(14), BLACK, None), BLACK, validation_count=3)
-
-
 @pytest.mark.slow
-def test_masked_pixels_do_not_influence_tuning(coarse, views):
-    taken = [one.camera for one in views.train]
-    mask = np.ones((taken[0].H, taken[0].W), bool)
+def test_masked_pixels_do_not_influence_tuning():
+    mask = np.ones((H, W), bool)
     mask[:, ::3] = False
 
     def hidden(value):
         shown = []
-        for one in views.train:
-            buffer = np.empty((*mask.shape, 3), np.float32)
-            pixels = np.rint(255.0 * np.clip(one.image(BLACK, buffer), 0.0, 1.0)).astype(np.uint8)
+        for one in views_of_source().train:
+            pixels = np.rint(255.0 * np.clip(one.image(BLACK, np.empty((H, W, 3), np.float32)), 0.0, 1.0))
             pixels[~mask] = value
-            shown.append(TuningView(one.camera, PosedImage(one.camera, pixels, mask)))
+            shown.append(TuningView(one.camera, PosedImage(one.camera, pixels.astype(np.uint8), mask)))
         return TuningViews(shown, shown[:2], BLACK)
 
-    first, second = (tune(coarse, hidden(value), FEW) for value in (0, 250))
+    first, second = (tune(coarse(), hidden(value), FEW) for value in (0, 250))
     assert np.array_equal(first.best_values.sh0, second.best_values.sh0)
     assert first.log["validations"] == second.log["validations"]
 
 
-def test_training_renders_are_those_of_the_source(source):
-    bright = replace(source, sh0=source.sh0 * np.float32(1e6))
-    for model in (source, bright):
-        camera = cameras(1)[0]
+def test_training_renders_are_those_of_the_source():
+    camera = cameras(1)[0]
+    for model in (SOURCE, replace(SOURCE, sh0=SOURCE.sh0 * np.float32(1e6))):
         wanted = render(model, camera, background=BLACK).rgb
-        view = renders_of(model, [camera], BLACK, None)[0]
-        found = view.image(BLACK, np.empty((H, W, 3), np.float32))
+        found = renders_of(model, [camera], BLACK, None)[0].image(BLACK, np.empty((H, W, 3), np.float32))
         assert np.allclose(found, np.clip(wanted, -6e4, 6e4), rtol=6e-4, atol=1e-6)
     with pytest.raises(InputError, match="reference image has shape"):
         TuningView(camera, np.zeros((1, 1, 3), np.float32))
@@ -75,16 +54,6 @@ def test_validation_views_are_training_views_by_default():
         split_views(views, BLACK, validation_count=20)
     with pytest.raises(InputError, match="at least one training view"):
         TuningViews([], [], BLACK)
-
-
-# the command
-ENCODE_OPTIONS = "csplat_tools.cli.finetune.EncodeOptions"
-
-
-@pytest.fixture(autouse=True)
-def bare(monkeypatch):
-    """Make the command encode neither SH nor codebooks, which take time."""
-    change_options(monkeypatch, ENCODE_OPTIONS, sh_coding="none", shape_codebook_size=0)
 
 
 @pytest.mark.slow
