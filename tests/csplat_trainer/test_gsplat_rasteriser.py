@@ -183,16 +183,13 @@ def test_a_loss_that_is_not_finite_is_reported_with_its_step():
         Fitter(4, 50, 0).run(SimpleNamespace(step=step, after_step=lambda: None))
 
 
-def test_a_missing_gpu_is_refused():
+def test_a_full_or_missing_gpu_is_reported():
+    with pytest.raises(InputError, match=r"--max-splats.*--size"), gsplat_rasteriser.memory_errors():
+        raise torch.OutOfMemoryError("2 GiB")
     if torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
     with pytest.raises(InputError, match="finds no GPU"):
         gsplat_rasteriser.gsplat_rasterization()
-
-
-def test_a_full_gpu_is_reported_with_the_options():
-    with pytest.raises(InputError, match=r"--max-splats.*--size"), gsplat_rasteriser.memory_errors():
-        raise torch.OutOfMemoryError("2 GiB")
 
 
 # Tuning.

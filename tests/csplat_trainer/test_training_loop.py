@@ -184,25 +184,20 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
 
 
 @pytest.mark.slow
-def test_the_command_trains_to_a_file(file_runs):
-    data, report = (file_runs.folder / "a.csplat").read_bytes(), file_runs.report
-    model = decode(data)
+def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path):
+    first, report = (file_runs.folder / "a.csplat").read_bytes(), file_runs.report
+    model = decode(first)
     assert 30 == len(report["training"]["losses"])
-    assert (len(model), len(data)) == (report["file"]["splats"], report["file"]["size_bytes"])
+    assert (len(model), len(first)) == (report["file"]["splats"], report["file"]["size_bytes"])
     assert {"source", "before tuning", "file"} == set(report["file"]["scores"])
     assert "held-out images" in file_runs.messages
     assert (1.0, 1.0, 1.0) == TrainingRecord.of(model.metadata).background
-    assert (file_runs.folder / "run.tuning.npz").exists()
-
-
-@pytest.mark.slow
-def test_the_command_resumes(file_runs, tmp_path):
     for name in ("run.npz", "run.tuning.npz"):
         shutil.copy(file_runs.folder / name, tmp_path / name)
     files = ("--keep", 1, "--checkpoint", tmp_path / "run.npz", "--resume", tmp_path / "run.npz")
     file_runs.made("again.csplat", *files)
     file_runs.made("further.csplat", *files, "--iterations", 40)
-    first, again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("a", "again", "further"))
+    again, further = ((file_runs.folder / f"{name}.csplat").read_bytes() for name in ("again", "further"))
     assert first == again
     assert first != further  # another scene: the existing tuning does not apply
 
@@ -224,7 +219,7 @@ def test_one_training_gives_several_files(file_runs):
     assert trained == file_runs.checkpoint.read_bytes()
 
 
-def test_a_training_is_planned_by_its_target():
+def test_a_training_is_planned_by_its_target_and_its_tuning_by_its_length():
     for target, max_splats, planned in (
         (None, None, (20_000, 0.8)), (None, 500, (500, 0.8)), (Target(keep=0.5), 500, (500, 0.5)),
         (Target(psnr=30.0), None, (20_000, 1.0)), (Target(size_bytes=80_000), None, (10_000, 0.8)),
@@ -234,16 +229,13 @@ def test_a_training_is_planned_by_its_target():
         assert (*planned, 7) == (options.max_splats, options.final_share, options.seed)
     with pytest.raises(InputError, match="max_psnr_drop is no target of train"):
         plan_training(TrainOptions(), Target(max_psnr_drop=1.0))
-
-
-def test_tuning_after_a_long_training_takes_more_and_smaller_steps():
-    brief, usual = (tuning_after(TrainOptions(iterations=steps, lr_exposure=0.01)) for steps in (2_000, 12_000))
-    assert FinetuneOptions(lr_exposure=0.01) == brief
+    short, usual = (tuning_after(TrainOptions(iterations=steps, lr_exposure=0.01)) for steps in (2_000, 12_000))
+    assert FinetuneOptions(lr_exposure=0.01) == short
     assert (2_000, 0.01) == (usual.iterations, usual.lr_exposure)
-    assert usual.lr_scales / brief.lr_scales == pytest.approx(1 / 3)
+    assert usual.lr_scales / short.lr_scales == pytest.approx(1 / 3)
 
 
-def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch):
+def test_damaged_images_and_options_of_a_file_for_a_ply_are_refused_before_training(data, tmp_path, monkeypatch):
     file, damaged = write_set(tmp_path, data) / "transforms.json", tmp_path / "11.png"
     damaged.write_bytes(damaged.read_bytes()[:100])
     monkeypatch.setattr("csplat_render.warmup.warm_up", lambda *_, **__: pytest.fail("kernels are compiled"))
@@ -252,21 +244,14 @@ def test_damaged_images_are_refused_before_training(data, tmp_path, monkeypatch)
     for part, rows in (("train", slice(9)), ("val", slice(9, 12))):
         (tmp_path / f"transforms_{part}.json").write_text(json.dumps({**document, "frames": document["frames"][rows]}))
     assert "11.png is a PNG that is truncated" in call("train", tmp_path, tmp_path / "a.csplat", status=1).stderr
+    for words in (("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)):
+        refused = call("train", tmp_path, tmp_path / "a.ply", *words, status=2).stderr
+        assert "expected OUT.csplat" in " ".join(refused.split())
     assert [] == [*tmp_path.glob("a.*")]
 
 
-def test_options_of_a_file_are_refused_for_a_ply(tmp_path):
-    for words in (("--keep", 0.5), ("--preset", "small"), ("--target-size", "1MB"), ("--target-psnr", 30)):
-        result = call("train", tmp_path, tmp_path / "a.ply", *words, status=2)
-        assert "expected OUT.csplat" in " ".join(result.stderr.split())
-
-
-@pytest.fixture
-def parameters(make_model):
-    return Parameters.starting_at(from_model(make_model(40, 2), 2))
-
-
-def test_a_checkpoint_is_saved_and_loaded_and_refused_in_another_version(parameters, tmp_path):
+def test_a_checkpoint_is_loaded_and_adapts_to_other_options_and_is_refused_in_another_version(make_model, tmp_path):
+    parameters = Parameters.starting_at(from_model(make_model(40, 2), 2))
     path, state = tmp_path / "run.npz", np.random.default_rng(0).bit_generator.state
     save_checkpoint(path, FitCheckpoint("train", 7, False, state, [3, 1], [], {"seed": 0}, {"losses": []}, parameters))
     again = load_checkpoint(path)
@@ -274,21 +259,16 @@ def test_a_checkpoint_is_saved_and_loaded_and_refused_in_another_version(paramet
     for name in GROUPS:
         assert np.array_equal(parameters.values[name], again.parameters.values[name])
         assert np.array_equal(parameters.second[name], again.parameters.second[name])
+    for cap, degree, strategy, count in ((25, 1, "mcmc", 25), (60, 3, "fixed", 60), (60, 0, "mcmc", 40)):
+        options = TrainOptions(max_splats=cap, sh_degree=degree, strategy=strategy)
+        adapted = fit_to_options(load_checkpoint(path).parameters, options, np.random.default_rng(0))
+        assert count == len(adapted)
+        assert (count, (degree + 1) ** 2 - 1, 3) == adapted.values["shN"].shape == adapted.second["shN"].shape
     arrays = dict(np.load(path))
     facts = json.loads(arrays["facts"].tobytes()) | {"version": 1}
     np.savez(path, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
     with pytest.raises(InputError, match=r"run\.npz is a checkpoint of version 1, expected 2: begin a new run$"):
         load_checkpoint(path)
-
-
-@pytest.mark.parametrize(
-    ("cap", "degree", "strategy", "count"), [(25, 1, "mcmc", 25), (60, 3, "fixed", 60), (60, 0, "mcmc", 40)]
-)
-def test_a_checkpoint_adapts_to_other_options(parameters, cap, degree, strategy, count):
-    options = TrainOptions(max_splats=cap, sh_degree=degree, strategy=strategy)
-    adapted = fit_to_options(parameters, options, np.random.default_rng(0))
-    assert count == len(adapted)
-    assert (count, (degree + 1) ** 2 - 1, 3) == adapted.values["shN"].shape == adapted.second["shN"].shape
 
 
 def test_the_moving_average_covers_the_last_values():

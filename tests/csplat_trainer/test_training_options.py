@@ -37,14 +37,6 @@ def test_a_resumed_run_equals_an_uninterrupted_one(data, tmp_path, strategy):
     assert_resumes_identically(data, TrainOptions(**QUICK, strategy=strategy), tmp_path)
 
 
-def test_a_run_resumes_with_another_number_of_splats(data, tmp_path):
-    train(data, TrainOptions(**QUICK, strategy="fixed"), outputs=Outputs(checkpoint=tmp_path / "c.npz"))
-    for count in (50, 120):
-        options = TrainOptions(**{**QUICK, "max_splats": count, "iterations": 70, "sh_degree": 2}, strategy="fixed")
-        result = train(data, options, outputs=Outputs(resume=tmp_path / "c.npz"))
-        assert (count, 2) == (len(result.model), result.model.sh_degree)
-
-
 def test_progress_log_and_previews_are_written(data, tmp_path):
     seen, previews = [], tmp_path / "p"
     outputs = Outputs(previews=previews, preview_every=30)
@@ -56,20 +48,17 @@ def test_progress_log_and_previews_are_written(data, tmp_path):
     assert {"psnr", "ssim", "lpips", "psnr_mean"} <= set(log["metrics"])
 
 
-def test_options_out_of_range_are_refused():
+def test_learning_rates_decay_and_options_out_of_range_are_refused():
+    options = TrainOptions(iterations=100, refine_stop=0.6, lr_decay=0.2)
+    ends = [options.learning_rates(step, 2.0)["means"] for step in (0, 100)]
+    assert [options.lr_means * 2, options.lr_means_final * 2] == pytest.approx(ends)
+    shares = [options.learning_rates(step, 2.0)["scales"] / options.lr_scales for step in (1, 60, 80, 100)]
+    assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)  # after refinement
+    assert TrainOptions(refine_stop=1.0, lr_decay=0.2).learning_rates(7000, 2.0)["shN"] == TrainOptions.lr_shN
     wrong = {"max_splats": 0, "device": "mps", "sh_degree": 5, "loss": "l2", "lr_means": np.nan, "lr_means_final": 1.0}
     for name, value in wrong.items():
         with pytest.raises(InputError, match=r"expected|mps is not supported"):
             TrainOptions(**{name: value})
-
-
-def test_learning_rates_decay():
-    options = TrainOptions(iterations=100, refine_stop=0.6, lr_decay=0.2)
-    assert options.lr_means * 2 == pytest.approx(options.learning_rates(0, 2.0)["means"])
-    assert options.lr_means_final * 2 == pytest.approx(options.learning_rates(100, 2.0)["means"])
-    shares = [options.learning_rates(step, 2.0)["scales"] / options.lr_scales for step in (1, 60, 80, 100)]
-    assert [1.0, 1.0, 0.6, 0.2] == pytest.approx(shares)  # after refinement
-    assert TrainOptions(refine_stop=1.0, lr_decay=0.2).learning_rates(7000, 2.0)["shN"] == TrainOptions.lr_shN
 
 
 def test_growth_reaches_the_cap_halfway_and_sh_degrees_are_activated_one_by_one():

@@ -11,7 +11,6 @@ import posed_sets as sets
 import pytest
 from PIL import Image
 from posed_sets import H, W, assert_refused, cameras, report_of
-from tables import failures
 
 from csplat.errors import InputError
 from csplat_trainer.data import load
@@ -36,7 +35,7 @@ MODELS = {
     "SIMPLE_RADIAL_FISHEYE": [*ONE_FOCAL, -0.04], "RADIAL_FISHEYE": [*ONE_FOCAL, 0.04, -0.01],
     "THIN_PRISM_FISHEYE": [*FOCAL, 0.03, -0.01, 0.001, -0.002, 0.01, -0.004, 0.003, -0.002],
     "RAD_TAN_THIN_PRISM_FISHEYE": None, "SIMPLE_DIVISION": None, "DIVISION": None, "SIMPLE_FISHEYE": ONE_FOCAL,
-    "FISHEYE": FOCAL, "EUCM": None, "EQUIRECTANGULAR": None,
+    "FISHEYE": FOCAL, "EUCM": None, "EQUIRECTANGULAR": None, "ABSENT": None,
 }  # fmt: skip
 
 
@@ -77,31 +76,24 @@ def read_lens(folder, model, parameters):
     return read_cameras(path)[1]
 
 
-def test_lens_models_agree_with_the_documentation_of_colmap(tmp_path):
-    points, file = np.random.default_rng(3).uniform(-0.6, 0.6, (40, 2)), tmp_path / "cameras.bin"
-
-    def check(case):
-        number, (model, parameters) = case
-        values = parameters or [1.0] * 4
-        file.write_bytes(struct.pack(f"<QiiQQ{len(values)}d", 1, 1, number, LENS_W, LENS_H, *values))
-        if parameters is None:
-            remedy = "split panoramas" if model == "EQUIRECTANGULAR" else "use `colmap image_undistorter"
-            with pytest.raises(InputError, match=f"the lens is {model}, expected one of .*: {remedy}"):
-                read_lens(tmp_path, model, values)
-            with pytest.raises(InputError, match=f"camera 1: the lens is {model},"):
-                read_cameras(file)
-            return
-        lens = read_lens(tmp_path, model, parameters)
-        assert read_cameras(file)[1] == lens
-        assert lens.distorts == (model not in ("SIMPLE_PINHOLE", "PINHOLE"))
-        straight = Lens(LENS_W, LENS_H, 1.0, 1.0, 0.0, 0.0)
-        found = np.stack(distorted(points[:, 0], points[:, 1], lens, straight), axis=1)
-        assert np.allclose([colmap_pixel(model, parameters, x, y) for x, y in points], found, rtol=0, atol=1e-9)
-
-    assert [] == failures(dict(zip(MODELS, enumerate(MODELS.items()), strict=True)), check)
-    file.write_bytes(struct.pack("<QiiQQ4d", 1, 1, 99, LENS_W, LENS_H, *FOCAL))
-    with pytest.raises(InputError, match="camera 1: the lens is of number 99,"):
-        read_cameras(file)
+@pytest.mark.parametrize(("number", "model"), [*enumerate(MODELS)])
+def test_lens_models_agree_with_the_documentation_of_colmap(tmp_path, number, model):
+    points, file, parameters = np.random.default_rng(3).uniform(-0.6, 0.6, (40, 2)), tmp_path / "a.bin", MODELS[model]
+    values = parameters or [1.0] * 4
+    file.write_bytes(struct.pack(f"<QiiQQ{len(values)}d", 1, 1, number, LENS_W, LENS_H, *values))
+    if parameters is None:
+        remedy = "split panoramas" if model == "EQUIRECTANGULAR" else "use `colmap image_undistorter"
+        with pytest.raises(InputError, match=f"the lens is {model}, expected one of .*: {remedy}"):
+            read_lens(tmp_path, model, values)
+        with pytest.raises(InputError, match=f"camera 1: the lens is {model.replace('ABSENT', 'of number 18')},"):
+            read_cameras(file)
+        return
+    lens = read_lens(tmp_path, model, parameters)
+    assert read_cameras(file)[1] == lens
+    assert lens.distorts == (model not in ("SIMPLE_PINHOLE", "PINHOLE"))
+    straight = Lens(LENS_W, LENS_H, 1.0, 1.0, 0.0, 0.0)
+    found = np.stack(distorted(points[:, 0], points[:, 1], lens, straight), axis=1)
+    assert np.allclose([colmap_pixel(model, parameters, x, y) for x, y in points], found, rtol=0, atol=1e-9)
 
 
 def scene(x, y):
@@ -152,22 +144,18 @@ LENSES = [
 ]  # fmt: skip
 
 
-@pytest.mark.slow
-def test_images_of_every_kind_of_lens_are_undistorted(tmp_path):
-    def check(number):
-        folder, (model, parameters, values) = tmp_path / str(number), LENSES[number]
-        lens = read_lens(tmp_path, model, parameters)
-        photograph(lens, folder / "images" / "im 000.png")
-        if values is None:
-            sets.write_colmap(folder / "sparse", cameras(1), model, parameters, text=True, width=LENS_W, height=LENS_H)
-        else:
-            write_lens_transforms(folder, **values)
-        data = load(folder, test_every=0)
-        assert_is_straight(data.train[0])
-        notes = [line for line in data.report if "distortion is undone" in line or "fisheye images are cropped" in line]
-        assert (0 if not lens.distorts else 2 if "FISHEYE" in model else 1) == len(notes)
-
-    assert [] == failures({str(number): number for number in range(len(LENSES))}, check)
+@pytest.mark.parametrize(("model", "parameters", "values"), LENSES)
+def test_images_of_every_kind_of_lens_are_undistorted(tmp_path, model, parameters, values):
+    lens, folder = read_lens(tmp_path, model, parameters), tmp_path / "set"
+    photograph(lens, folder / "images" / "im 000.png")
+    if values is None:
+        sets.write_colmap(folder / "sparse", cameras(1), model, parameters, text=True, width=LENS_W, height=LENS_H)
+    else:
+        write_lens_transforms(folder, **values)
+    data = load(folder, test_every=0)
+    assert_is_straight(data.train[0])
+    notes = [line for line in data.report if "distortion is undone" in line or "fisheye images are cropped" in line]
+    assert (0 if not lens.distorts else 2 if "FISHEYE" in model else 1) == len(notes)
 
 
 def test_factors_of_other_lens_models_are_refused(tmp_path):
@@ -245,16 +233,11 @@ INVALID = {
 }  # fmt: skip
 
 
-def test_invalid_or_contradictory_fields_are_refused(transforms_set):
-    document = (transforms_set / "transforms.json").read_text()
-
-    def check(case):
-        fields, message = case
-        (transforms_set / "transforms.json").write_text(document)
-        sets.change_transforms(transforms_set, **fields)
-        assert_refused(message, transforms_set)
-
-    assert [] == failures(INVALID, check)
+@pytest.mark.slow
+@pytest.mark.parametrize(("fields", "message"), INVALID.values(), ids=INVALID)
+def test_invalid_or_contradictory_fields_are_refused(transforms_set, fields, message):
+    sets.change_transforms(transforms_set, **fields)
+    assert_refused(message, transforms_set)
 
 
 def test_an_image_of_another_shape_than_its_camera_is_reported_or_refused(colmap_set):
@@ -403,28 +386,21 @@ LINES = {
 
 
 @pytest.mark.slow
-def test_decimal_commas_are_read_or_named_and_invalid_lines_refused(colmap_text_set):
-    expected = load(colmap_text_set)
-
-    def check(case):
-        name, pattern, replacement, message = case
-        path = colmap_text_set / "sparse" / "0" / f"{name}.txt"
-        before = path.read_text()
-        path.write_text(re.sub(pattern, replacement, before))
-        try:
-            if COMMA not in message:
-                assert_refused(re.escape(message), colmap_text_set)
-                return
-            read = load(colmap_text_set)
-        finally:
-            path.write_text(before)
-        assert any(line.startswith(message) for line in read.report)
-        assert (read.points == expected.points).all()
-        for one, other in zip(read.train, expected.train, strict=True):
-            assert (one.camera.viewmat == other.camera.viewmat).all()
-            assert (one.camera.K == other.camera.K).all()
-
-    assert [] == failures(LINES, check)
+@pytest.mark.parametrize(("name", "pattern", "replacement", "message"), LINES.values(), ids=LINES)
+def test_decimal_commas_are_read_or_named_and_invalid_lines_refused(
+    colmap_text_set, name, pattern, replacement, message
+):
+    expected, path = load(colmap_text_set), colmap_text_set / "sparse" / "0" / f"{name}.txt"
+    path.write_text(re.sub(pattern, replacement, path.read_text()))
+    if COMMA not in message:
+        assert_refused(re.escape(message), colmap_text_set)
+        return
+    read = load(colmap_text_set)
+    assert any(line.startswith(message) for line in read.report)
+    assert (read.points == expected.points).all()
+    for one, other in zip(read.train, expected.train, strict=True):
+        assert (one.camera.viewmat == other.camera.viewmat).all()
+        assert (one.camera.K == other.camera.K).all()
 
 
 def test_decimal_commas_in_json_are_named(transforms_set):
@@ -456,21 +432,16 @@ FOREIGN = {
 }  # fmt: skip
 
 
-@pytest.mark.slow
-def test_sets_of_other_programs_are_named_with_a_way_out(tmp_path):
-    def check(case):
-        name, begin, message = case
-        folder = tmp_path / str(len(list(tmp_path.iterdir())))
-        (folder / name).parent.mkdir(parents=True)
-        (folder / name).write_text(begin)
-        Image.new("RGB", (8, 8)).save(folder / "photo.png")
-        with pytest.raises(InputError, match=re.escape(message)) as raised:
-            load(folder)
-        assert "\n" not in str(raised.value)
-        if "Polycam" not in message and "polycam" not in message:
-            assert_refused(re.escape(message), folder / name)
-
-    assert [] == failures(FOREIGN, check)
+@pytest.mark.parametrize(("name", "begin", "message"), FOREIGN.values(), ids=FOREIGN)
+def test_sets_of_other_programs_are_named_with_a_way_out(tmp_path, name, begin, message):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text(begin)
+    Image.new("RGB", (8, 8)).save(tmp_path / "photo.png")
+    with pytest.raises(InputError, match=re.escape(message)) as raised:
+        load(tmp_path)
+    assert "\n" not in str(raised.value)
+    if "Polycam" not in message and "polycam" not in message:
+        assert_refused(re.escape(message), tmp_path / name)
 
 
 def test_other_files_do_not_hide_a_set(tmp_path):

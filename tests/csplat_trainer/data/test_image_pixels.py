@@ -7,7 +7,6 @@ import pytest
 from image_files_cases import GREY, LABELS, RAMP, RGB, SHAPE, UINT16, png_16
 from PIL import Image
 from posed_sets import H, W
-from tables import failures
 
 from csplat.errors import InputError
 from csplat_trainer.data.image_pixels import mask_values, open_image, read_image_header, rgb_pixels
@@ -88,44 +87,26 @@ KINDS = {
 }  # fmt: skip
 
 
-def test_pixels_of_every_kind_are_read_or_refused(tmp_path):
-    def check(case):
-        name, write, expected, tolerance = case
-        path = tmp_path / name
-        write(path)
-        if isinstance(expected, str):
-            with pytest.raises(InputError, match=expected):
-                pixels_of(path)
-            return
-        found = pixels_of(path)
-        assert np.uint8 == found.dtype
-        assert read_image_header(path).has_alpha == (found.shape[2] == 4)
-        assert (W, H) == read_image_header(path).size
-        expected = np.repeat(expected[..., None], 3, axis=2) if expected.ndim == 2 else expected
-        assert expected.shape == found.shape
-        assert np.abs(found.astype(int) - expected).max() <= tolerance
-
-    assert [] == failures(KINDS, check)
+@pytest.mark.parametrize(("name", "write", "expected", "tolerance"), KINDS.values(), ids=KINDS)
+def test_pixels_of_every_kind_are_read_or_refused(tmp_path, name, write, expected, tolerance):
+    path = tmp_path / name
+    write(path)
+    if isinstance(expected, str):
+        with pytest.raises(InputError, match=expected):
+            pixels_of(path)
+        return
+    found = pixels_of(path)
+    assert np.uint8 == found.dtype
+    assert read_image_header(path).has_alpha == (found.shape[2] == 4)
+    assert (W, H) == read_image_header(path).size
+    expected = np.repeat(expected[..., None], 3, axis=2) if expected.ndim == 2 else expected
+    assert expected.shape == found.shape
+    assert np.abs(found.astype(int) - expected).max() <= tolerance
 
 
 def pixels_of(path):
     with open_image(path) as image:
         return rgb_pixels(image, path)
-
-
-def test_masks_of_every_kind_are_read_alike(tmp_path):
-    def check(name):
-        (values, is_reported), path = MASKS[name], tmp_path / "mask.tif"
-        image = Image.fromarray(values)
-        if "palette" in name:
-            image.putpalette([0, 0, 0, 128, 0, 0])
-        image.save(path)
-        with open_image(path) as opened:
-            found = mask_values(opened, path)
-        assert ((found.values >= 128) == SHAPE).all()
-        assert is_reported == bool(found.taken_as)
-
-    assert [] == failures({name: name for name in MASKS}, check)
 
 
 #: Images of a mask, and whether its interpretation is reported.
@@ -139,3 +120,16 @@ MASKS = {
     "alpha of white": (np.dstack([np.full((H, W, 3), 255, np.uint8), 255 * LABELS]), True),
     "a palette of labels": (LABELS, True),
 }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_masks_of_every_kind_are_read_alike(tmp_path, name):
+    (values, is_reported), path = MASKS[name], tmp_path / "mask.tif"
+    image = Image.fromarray(values)
+    if "palette" in name:
+        image.putpalette([0, 0, 0, 128, 0, 0])
+    image.save(path)
+    with open_image(path) as opened:
+        found = mask_values(opened, path)
+    assert ((found.values >= 128) == SHAPE).all()
+    assert is_reported == bool(found.taken_as)

@@ -57,12 +57,20 @@ def test_blender_sets_keep_their_split_and_their_transparency(blender_set):
     assert any("usually have other axes" in line for line in data.report)
 
 
-def test_missing_images_are_reported_and_every_eighth_is_a_test_image(ngp):
-    data = load(ngp)
-    assert (7, ["images/0000.png", "images/0009.png"]) == (len(data.train), names(data.test))
+def test_missing_images_are_reported_and_invalid_ones_refused(ngp):
+    data, path = load(ngp), ngp / "images" / "0001.png"
+    assert (7, ["images/0000.png", "images/0009.png"]) == (len(data.train), names(data.test))  # every eighth
     assert any("1 of 10 images are missing" in line and "images/0004.png" in line for line in data.report)
     sets.assert_dots_are_where_points_fall([*data.train, *data.test])
     assert 9 == len(load(ngp / "transforms.json", test_every=0).train)
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(InputError, match=r"0001\.png is a PNG that is truncated: copy or export it again"):
+        load(ngp).read()
+    path.write_text("not a picture")
+    assert_refused(r"0001\.png", ngp)
+    for path in (ngp / "images").iterdir():
+        path.unlink()
+    assert_refused("none of its 10 images", ngp)
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -172,9 +180,18 @@ def test_points_are_read_from_ply_file_path_or_next_to_transforms_json(ngp):
     assert_refused(r"absent\.ply has columns y, expected x, y, z", ngp)
 
 
-def test_points_of_a_blender_set_are_read_if_nothing_is_transparent(blender_set):
+def test_transparent_pixels_do_not_bleed_and_points_are_read_if_there_are_none(blender_set):
+    pixels = np.zeros((H, W, 4), np.uint8)
+    pixels[:, : W // 2] = (200, 100, 50, 255)
+    pixels[:, W // 2 :] = (0, 255, 0, 0)
+    Image.fromarray(pixels).save(blender_set / "train" / "r_0.png")
+    (blender_set / "transforms_test.json").unlink()
     write_points(blender_set / "points3d.ply", XYZ, "1 2 3")
-    assert "points3d.ply is ignored" in report_of(blender_set)
+    data = load(blender_set, (17, 11))
+    small = data.train[0].pixels
+    assert np.abs(small[small[..., 3] > 60][:, :3].astype(int) - (200, 100, 50)).max() <= 8
+    assert any("no transforms_test.json" in line for line in data.report)
+    assert any("points3d.ply is ignored" in line for line in data.report)
     for path in blender_set.glob("t*/*.png"):
         Image.new("RGB", (W, H)).save(path)
     assert [[1.0, 2.0, 3.0]] == load(blender_set).points.tolist()
@@ -328,18 +345,6 @@ def test_a_folder_of_images_may_be_given_for_its_set(tmp_path, monkeypatch):
     assert_refused("lists no frames", "garden/images")
 
 
-def test_colours_of_transparent_pixels_do_not_bleed(blender_set):
-    pixels = np.zeros((H, W, 4), np.uint8)
-    pixels[:, : W // 2] = (200, 100, 50, 255)
-    pixels[:, W // 2 :] = (0, 255, 0, 0)
-    Image.fromarray(pixels).save(blender_set / "train" / "r_0.png")
-    (blender_set / "transforms_test.json").unlink()
-    data = load(blender_set, (17, 11))
-    small = data.train[0].pixels
-    assert np.abs(small[small[..., 3] > 60][:, :3].astype(int) - (200, 100, 50)).max() <= 8
-    assert any("no transforms_test.json" in line for line in data.report)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("write", "at"),
@@ -350,20 +355,18 @@ def test_colours_of_transparent_pixels_do_not_bleed(blender_set):
     ids=["ECEF", "one axis", "UTM"],
 )  # fmt: skip
 def test_a_set_far_from_0_gets_an_origin(tmp_path, write, at):
-    write(tmp_path / "near", at=(20.0, -30.0, 10.0))
-    write(tmp_path / "far", at=at)
-    near, far = load(tmp_path / "near"), load(tmp_path / "far")
+    beside = np.array((20.0, -30.0, 10.0))
+    near, far = load(write(tmp_path / "near", at=beside)), load(write(tmp_path / "far", at=at))
     assert (0.0, 0.0, 0.0) == near.origin
     assert any("coordinates are far from 0" in line for line in far.report)
     assert np.abs(np.subtract(at, far.origin)).max() < 4.0
     assert all(float(value).is_integer() for value in far.origin)
-    shift = np.subtract(at, (20.0, -30.0, 10.0)) - far.origin
     for one, other in zip((*near.train, *near.test), (*far.train, *far.test), strict=True):
-        assert np.allclose(one.camera.position + shift, other.camera.position, atol=1e-6)
+        assert np.allclose(one.camera.position + at - beside - far.origin, other.camera.position, atol=1e-6)
         assert near.train[0].camera.near == pytest.approx(other.camera.near)
     sets.assert_dots_are_where_points_fall([*far.train, *far.test], sets.POINTS + at - far.origin)
     if near.points is not None:
-        assert np.array_equal((sets.POINTS + np.array((20.0, -30.0, 10.0))).astype(np.float32), near.points)
+        assert np.array_equal((sets.POINTS + beside).astype(np.float32), near.points)
         assert np.allclose(sets.POINTS + at, far.points + np.array(far.origin), atol=1e-6)
         assert np.float32 == far.points.dtype
 
@@ -388,18 +391,6 @@ def test_outlier_cameras_are_reported_and_ignored_and_refused_beyond_float32(col
     shots[3] = relative_to((1e39, 0.0, 0.0), cameras(9)[3])
     sets.write_colmap(colmap_set / "sparse" / "0", shots)
     assert_refused(r"camera of im 003.png is .* units from 0", colmap_set)
-
-
-def test_missing_invalid_and_truncated_images_are_refused(ngp):
-    path = ngp / "images" / "0001.png"
-    path.write_bytes(path.read_bytes()[:60])
-    with pytest.raises(InputError, match=r"0001\.png is a PNG that is truncated: copy or export it again"):
-        load(ngp).read()
-    path.write_text("not a picture")
-    assert_refused(r"0001\.png", ngp)
-    for path in (ngp / "images").iterdir():
-        path.unlink()
-    assert_refused("none of its 10 images", ngp)
 
 
 @pytest.mark.slow
@@ -452,23 +443,21 @@ def test_opaque_alpha_is_ignored(ngp):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("write", "options", "expected"),
-    [
-        (sets.write_blender, {"test_every": 5}, {"background": [1.0] * 3}),
-        (sets.write_transforms, {}, {"background": [0.0] * 3, "test_every": 8}),
-        (sets.write_transforms, {"test_every": 0}, {"background": [0.0] * 3, "test_every": 0}),
-        (sets.write_colmap_set, {"test_every": 5, "images": "images"}, {"test_every": 5, "images": "images"}),
-        (sets.write_colmap_set, {"size": (24, 16), "near": 0.004}, {"size": [24, 16], "near": 0.004, "test_every": 8}),
-    ],
-)
-def test_a_set_records_its_options(tmp_path, write, options, expected):
-    data, is_blender = load(write(tmp_path), **options), write is sets.write_blender
-    record = data.trained_on(data.background).as_json()
-    assert expected == {name: record[name] for name in expected}
-    assert {"background", "near", *expected, *(() if is_blender else ("test_every",))} == set(record)
-    assert ("RFU" if is_blender else "unspecified", (0, 0, 1)) == (data.coordinate_system, data.up)
-    assert any("up is 0 0 1 by the cameras" in line for line in data.report) != is_blender
+def test_a_set_records_its_options(tmp_path):
+    black, white = {"background": [0.0] * 3}, {"background": [1.0] * 3}
+    for number, (write, options, expected) in enumerate((
+        (sets.write_blender, {"test_every": 5}, white),
+        (sets.write_transforms, {}, {**black, "test_every": 8}),
+        (sets.write_transforms, {"test_every": 0}, {**black, "test_every": 0}),
+        (sets.write_colmap_set, {"test_every": 5, "images": "images"}, {**black, "test_every": 5, "images": "images"}),
+        (colmap_text, {"size": (24, 16), "near": 0.04}, {**black, "size": [24, 16], "near": 0.04, "test_every": 8}),
+    )):  # fmt: skip
+        data, is_blender = load(write(tmp_path / str(number)), **options), write is sets.write_blender
+        record = data.trained_on(data.background).as_json()
+        assert expected == {name: record[name] for name in record if name in expected or name != "near"}
+        assert "near" in record
+        assert ("RFU" if is_blender else "unspecified", (0, 0, 1)) == (data.coordinate_system, data.up)
+        assert any("up is 0 0 1 by the cameras" in line for line in data.report) != is_blender
 
 
 @pytest.mark.slow

@@ -2,13 +2,11 @@
 
 import os
 import shutil
-import tempfile
 from pathlib import Path
 
 import posed_sets as sets
 import pytest
 from posed_sets import assert_refused, cameras, change_frames, report_of
-from tables import failures
 from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
@@ -20,11 +18,6 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 
 COLUMNS = "property float x\nproperty float y\nproperty float z\n"
 PLY = f"ply\nformat ascii 1.0\nelement vertex 1\n{COLUMNS}end_header\n1 2 3\n"
-
-
-def written(write, parent):
-    """Write a set alone in a new folder."""
-    return write(Path(tempfile.mkdtemp(dir=parent)) / "set")
 
 
 def swap_for_link(path, target):
@@ -105,15 +98,12 @@ OUTSIDE = {
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
-@pytest.mark.parametrize("write", OUTSIDE)
-def test_sets_that_read_outside_of_their_folder_are_refused_unless_trusted(tmp_path, write):
-    def check(change):
-        folder = written(write, tmp_path)
-        change(folder)
-        assert_refused("the folder of the data set: move it there, or allow it with --trust-pat", folder)
-        assert len(load(folder, trust_paths=True).train) >= 5
-
-    assert [] == failures(OUTSIDE[write], check)
+@pytest.mark.parametrize(("write", "name"), [(write, name) for write, changes in OUTSIDE.items() for name in changes])
+def test_sets_that_read_outside_of_their_folder_are_refused_unless_trusted(tmp_path, write, name):
+    folder = write(tmp_path / "set")
+    OUTSIDE[write][name](folder)
+    assert_refused("the folder of the data set: move it there, or allow it with --trust-pat", folder)
+    assert len(load(folder, trust_paths=True).train) >= 5
 
 
 def into_link(folder):
@@ -145,13 +135,11 @@ INSIDE = {
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="links require privileges on Windows")
-def test_sets_within_their_folder_need_no_trust(tmp_path):
-    def check(change):
-        folder = written(sets.write_transforms, tmp_path)
-        change(folder)
-        assert 10 == len(load(folder, test_every=0).train)
-
-    assert [] == failures(INSIDE, check)
+@pytest.mark.parametrize("change", INSIDE.values(), ids=INSIDE)
+def test_sets_within_their_folder_need_no_trust(tmp_path, change):
+    folder = sets.write_transforms(tmp_path / "set")
+    change(folder)
+    assert 10 == len(load(folder, test_every=0).train)
 
 
 def test_names_that_no_file_can_have_are_missing(transforms_set):
