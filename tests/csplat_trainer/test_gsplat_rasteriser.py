@@ -1,7 +1,4 @@
-"""Training, tuning and measuring through gsplat's interface, against the same on the CPU.
-
-`gsplat_twin` renders instead of gsplat, on the CPU.
-"""
+"""Training, tuning and measuring through gsplat's interface, for which `gsplat_twin` stands in, against the CPU."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -56,7 +53,6 @@ def image(camera) -> PosedImage:
     return PosedImage(camera, np.random.default_rng(0).integers(0, 255, (20, 24, 4)).astype(np.uint8))
 
 
-# The loss.
 @pytest.mark.parametrize("size", [(1, 1), (3, 40), (37, 21)])
 @pytest.mark.parametrize("name", LOSS_WEIGHTS)
 def test_the_loss_equals_its_twin(size, name):
@@ -92,7 +88,6 @@ def test_images_are_kept_on_the_device_as_far_as_they_fit(image):
     assert 1 == len(images._kept)
 
 
-# Training.
 @pytest.mark.parametrize("gains", [False, True])
 @pytest.mark.parametrize("loss", ["inria", "study"])
 def test_the_engine_takes_the_same_steps(make_model, image, loss, gains):
@@ -192,7 +187,6 @@ def test_a_full_or_missing_gpu_is_reported():
         gsplat_rasteriser.gsplat_rasterization()
 
 
-# Tuning.
 ENCODINGS = {
     "codebook": EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16),
     "shapes": EncodeOptions(attribute_psnr=28.0, sh_coding="codebook", codebook_size=16, shape_codebook_size=32),
@@ -269,7 +263,6 @@ def test_a_scene_is_pruned_and_tuned_to_a_size(views, monkeypatch):
         choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size_bytes=300))
 
 
-# Estimates.
 def spread(make_model, **fields):
     """Return a model of eight large splats, and gsplat's rasteriser."""
     model = make_model(8, 1, seed=5, scales=np.full((8, 3), -1.0, np.float32), **fields)

@@ -128,15 +128,6 @@ def test_nothing_cancels_within_a_view_whatever_the_number_of_threads():
     assert (one.shape > 1.5 * one.shape_net).any()
 
 
-def test_unseen_splats_have_no_sensitivity():
-    model = small_scene(10)
-    away = np.where(np.arange(10)[:, None] < 3, np.float32(100.0), model.means)
-    found = measure_sensitivity(replace(model, means=away), cameras())
-    assert [False] * 3 + [True] * 7 == found.seen.tolist()
-    assert 0.3 == pytest.approx(found.unseen_share)
-    assert 0.0 == max(found.colour[:3].max(), found.shape[:3].max(), found.opacity[:3].max())
-
-
 @pytest.fixture
 def camera_file(tmp_path):
     path = tmp_path / "cameras.json"

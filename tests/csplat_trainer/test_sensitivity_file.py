@@ -66,19 +66,24 @@ def test_a_file_is_written_and_read(stored):
     np.testing.assert_allclose(importance.blocks.shapes, found.shape_metric / 3.0, rtol=1e-4, atol=1e-9)
 
 
-def test_a_file_is_refused_for_another_scene(stored):
+def test_damaged_files_and_those_of_another_scene_are_refused(stored):
     path, model, _ = stored
     with pytest.raises(InputError, match="of 30 splats, but the scene has 29"):
         read_sensitivity(path, model.select(np.arange(29)))
     with pytest.raises(InputError, match="another scene"):
         read_sensitivity(path, replace(model, sh0=model.sh0 + np.float32(0.5)))
-
-
-def test_damaged_files_are_refused(stored):
-    path, model, _ = stored
-    data = path.read_bytes()
+    data, contents = path.read_bytes(), []
+    with np.load(path) as file:
+        arrays = dict(file)
+    for changed in (
+        {"views": np.array(["1"] * 30)}, {"colour": np.ones(30, np.complex64)}, {"view_count": np.array(np.inf)},
+        {"shape_matrices": np.ones((29, 21), np.float32)}, {"matrices": np.ones(30, np.float16)},
+        {"views": np.array(1)}, {"colour": np.full(30, np.nan, np.float32)},
+    ):  # fmt: skip
+        np.savez(path, **(arrays | changed))
+        contents.append(path.read_bytes())
     np.savez(path, colour=np.ones(30))
-    for bad in (path.read_bytes(), b"", b"PK", data[: len(data) // 2], data[:-30], b"nonsense" * 10):
+    for bad in (*contents, path.read_bytes(), b"", b"PK", data[: len(data) // 2], data[:-30], b"nonsense" * 10):
         path.write_bytes(bad)
         with pytest.raises(InputError, match="not a file of sensitivities"):
             read_sensitivity(path, model)
@@ -107,28 +112,15 @@ def test_flipped_bits_are_refused_or_read(tmp_path, packed):
     assert refused > 0.3 * directory * 8 / 1201
 
 
-def test_invalid_arrays_are_refused(stored):
-    path, model, _ = stored
-    with np.load(path) as file:
-        arrays = dict(file)
-    for name, array in (
-        ("views", np.array(["1"] * 30)), ("colour", np.ones(30, np.complex64)), ("view_count", np.array(np.inf)),
-        ("shape_matrices", np.ones((29, 21), np.float32)), ("matrices", np.ones(30, np.float16)),
-        ("views", np.array(1)), ("colour", np.full(30, np.nan, np.float32)),
-    ):  # fmt: skip
-        np.savez(path, **(arrays | {name: array}))
-        with pytest.raises(InputError, match="not a file of sensitivities"):
-            read_sensitivity(path, model)
-
-
-def test_unseen_splats_have_a_small_weight(stored):
+def test_unseen_splats_have_no_sensitivity_and_a_small_weight(stored):
     path, model, _ = stored
     away = np.where(np.arange(30)[:, None] < 3, np.float32(100.0), model.means)
     model = replace(model, means=away)
-    written(path, model, "virtual")
-    read = read_sensitivity(path, model)
+    found, read = written(path, model, "virtual"), read_sensitivity(path, model)
+    assert [False] * 3 + [True] * 27 == found.seen.tolist() == read.seen.tolist()
+    assert 0.1 == pytest.approx(found.unseen_share)
+    assert 0.0 == max(found.colour[:3].max(), found.shape[:3].max(), found.opacity[:3].max())
     weights = read.importance().sh
-    assert 3 == np.count_nonzero(~read.seen)
     assert 0.0 < weights[:3].max() < np.median(weights[3:])
     assert np.isfinite(read.importance().sh_metric).all()
 

@@ -83,12 +83,16 @@ def test_costs_are_the_entropy_with_slopes_away_from_common_values():
     assert np.abs(slopes).max() <= 4.0
 
 
-def test_costs_use_the_encoded_integers():
+def test_costs_use_the_encoded_integers_and_lambda_is_loss_per_bit_and_splat():
     fixed = fixed_by(EncodeOptions(sh_coding="scalar", chroma_shift=1))
     seen, _ = TunedScene(fixed).dequantise()
     columns, _, _ = quantise_sh(fixed.start().sh, fixed.parameters, None)
     integers = tuned_scene.colour_integers_of(seen.shN, fixed.parameters.sh_step, 1)
     assert np.array_equal(columns.transpose(2, 1, 0), integers)
+    scene = TunedScene(coarse())
+    costs = tuned_scene.RateTerm.count(scene.fixed, scene.stream_values(scene.dequantise()[0]), 2e-4)
+    assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
+    assert 5 < costs.bits / 300 < 200
 
 
 @pytest.mark.parametrize("group", ["scales", "sh0", "logits", "quats", "shN"])
@@ -124,14 +128,6 @@ def test_gradients_of_costs_agree_with_the_definition(group):
         expected = np.stack([by_y / 4 + by_co - by_cg / 2, by_y / 2 + by_cg, by_y / 4 - by_co - by_cg / 2], axis=-1)
         gradient = steps[group].reshape(values.shape)
         assert np.abs(gradient - expected / step).max() < 0.05 / step  # the expected values are not rounded
-
-
-def test_lambda_is_loss_per_bit_and_splat():
-    scene = TunedScene(coarse())
-    seen, _ = scene.dequantise()
-    costs = tuned_scene.RateTerm.count(scene.fixed, scene.stream_values(seen), 2e-4)
-    assert costs.loss == pytest.approx(2e-4 * costs.bits / 300)
-    assert 5 < costs.bits / 300 < 200
 
 
 def test_non_finite_values_end_a_run_with_an_error(monkeypatch):

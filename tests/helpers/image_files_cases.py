@@ -5,10 +5,7 @@ import zlib
 
 import numpy as np
 import pytest
-from posed_sets import (
-    H,
-    W,
-)
+from posed_sets import H, W
 
 pytest.importorskip("numba", reason="requires the extra [render]")
 

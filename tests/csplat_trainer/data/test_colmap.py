@@ -10,29 +10,24 @@ from csplat_trainer.data.colmap import read_images, read_points
 pytest.importorskip("numba", reason="requires the extra [render]")
 
 
-def test_names_with_control_characters_are_refused(tmp_path):
+@pytest.mark.slow
+def test_every_prefix_of_colmap_files_and_names_with_control_characters_are_refused(tmp_path):
+    write_colmap(tmp_path, cameras(2))
+    for name, read in (("images.bin", read_images), ("points3D.bin", read_points)):
+        file, data = tmp_path / name, (tmp_path / name).read_bytes()
+        for end in range(len(data)):
+            file.write_bytes(data[:end])
+            with pytest.raises(InputError):
+                read(file)
+        for content, message in ((data + b"\0", "follow"), (b"\xff" * 8 + data[8:], "ends at byte")):
+            file.write_bytes(content)
+            with pytest.raises(InputError, match=message):
+                read(file)
     write_colmap(tmp_path, cameras(2))
     file = tmp_path / "images.bin"
     file.write_bytes(file.read_bytes().replace(b"im 001", b"im\n001"))
     with pytest.raises(InputError, match=r"the name at byte .* has control characters"):
         read_images(file)
-
-
-@pytest.mark.slow
-def test_every_prefix_of_colmap_files_is_refused(tmp_path):
-    write_colmap(tmp_path, cameras(2))
-    for name, read in (("images.bin", read_images), ("points3D.bin", read_points)):
-        data = (tmp_path / name).read_bytes()
-        for end in range(len(data)):
-            (tmp_path / name).write_bytes(data[:end])
-            with pytest.raises(InputError):
-                read(tmp_path / name)
-        (tmp_path / name).write_bytes(data + b"\0")
-        with pytest.raises(InputError, match="follow"):
-            read(tmp_path / name)
-        (tmp_path / name).write_bytes(b"\xff" * 8 + data[8:])
-        with pytest.raises(InputError, match="ends at byte"):
-            read(tmp_path / name)
 
 
 def test_points_with_non_finite_values_are_left_out(tmp_path):

@@ -104,8 +104,9 @@ def test_training_and_test_images_must_be_different_files(blender_set):
 
 
 def test_masks_are_found_like_images(transforms_set):
-    for i, camera in enumerate(cameras(10)):
-        sets.write_picture(transforms_set / "masks" / f"{i:04}.png", camera)
+    (transforms_set / "masks").mkdir()
+    for i in range(10):
+        Image.fromarray(255 * LABELS).save(transforms_set / "masks" / f"{i:04}.png")
     assert "folder masks is ignored, since transforms.json does not" in report_of(transforms_set)
     for i in range(10):
         sets.change_frames(transforms_set, [i], mask_path=f"masks\\{i:04}.png")
@@ -261,21 +262,18 @@ def test_images_and_masks_much_larger_than_their_cameras_are_refused_before_deco
     assert_refused(r"mask\.png has 6000×4000 pixels, expected about 48×32 as its image", transforms_set)
 
 
-def test_images_without_a_camera_have_a_budget(transforms_set):
-    document = {"fl_x": 9000.0, "fl_y": 9000.0, "frames": sets.frames_of(transforms_set)}
-    (transforms_set / "transforms.json").write_text(json.dumps(document))
-    file = transforms_set / "images" / "0000.png"
+def test_other_formats_are_named_and_images_without_a_camera_have_a_budget(transforms_set):
+    file, frames = transforms_set / "images" / "0000.png", sets.frames_of(transforms_set)
     data = file.read_bytes()
+    sets.change_frames(transforms_set, range(10), mask_path="mask.png")
+    for name in ("mask.png", "images/0000.png"):
+        (transforms_set / name).write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\nshowpage\n")
+        assert_refused(rf"{name[-8:]} is PostScript \(EPS\), which is not read", transforms_set)
+    document = {"fl_x": 9000.0, "fl_y": 9000.0, "frames": frames}
+    (transforms_set / "transforms.json").write_text(json.dumps(document))
     head = b"IHDR" + struct.pack(">II", 13_300, 13_300) + data[24:29]
     file.write_bytes(data[:12] + head + struct.pack(">I", zlib.crc32(head)) + data[33:])
     assert_refused(r"0000\.png has 13300×13300 pixels in [0-9,]+ bytes, expected at most 67,1", transforms_set)
-
-
-def test_other_formats_in_a_set_are_named(transforms_set):
-    sets.change_frames(transforms_set, range(10), mask_path="mask.png")
-    for name in ("mask.png", "images/0003.png"):
-        (transforms_set / name).write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\nshowpage\n")
-        assert_refused(rf"{name[-8:]} is PostScript \(EPS\), which is not read", transforms_set)
 
 
 def test_masks_of_other_values_or_sizes_are_read_or_refused(transforms_set):

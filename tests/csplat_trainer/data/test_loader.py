@@ -28,10 +28,6 @@ def ngp(tmp_path):
     return sets.write_transforms(tmp_path, missing=(4,))
 
 
-def with_size(pictures):
-    return {(picture.camera.W, picture.camera.H) for picture in pictures}
-
-
 def test_blender_sets_keep_their_split_and_their_transparency(blender_set):
     data = load(blender_set)
     assert (5, 0, 3) == sizes(data)
@@ -210,30 +206,25 @@ def test_points_of_colmap_may_be_absent_or_a_ply(colmap_set):
     assert data.points_rgb is None
 
 
-def test_lines_of_keypoints_may_be_absent(colmap_text_set):
+def test_images_of_a_model_may_lack_keypoints_and_be_listed_twice_with_one_pose(colmap_text_set):
     file = colmap_text_set / "sparse" / "0" / "images.txt"
     lines = file.read_text().splitlines()
-    poses = [line for line in lines if "png" in line]
-    for text, reported in (
-        (poses, True), ([line for line in lines if line.strip()], True), ([f"{line}\r" for line in lines], False),
+    poses, note = [line for line in lines if "png" in line], "without a line of keypoints"
+    for rows, words in (
+        (poses, note), ([line for line in lines if line.strip()], note), ([f"{line}\r" for line in lines], None),
+        ([*lines, poses[3]], "images.txt: 1 image twice: read once"),
     ):  # fmt: skip
-        file.write_text("\n".join(text), newline="")
+        file.write_text("\n".join(rows), newline="")
         data = load(colmap_text_set)
         assert (7, 0, 2) == sizes(data)
-        assert reported == ("without a line of keypoints" in " ".join(data.report))
-    file.write_text("\n".join([poses[0], "1 2 3", "4 5 6", *poses[1:]]))
-    assert_refused("line 3: these are keypoints", colmap_text_set)
-
-
-def test_a_duplicated_image_of_a_model_is_refused_if_poses_differ(colmap_text_set):
-    file = colmap_text_set / "sparse" / "0" / "images.txt"
-    text = file.read_text()
-    file.write_text(text + next(line for line in text.splitlines() if "im 003" in line))
-    data = load(colmap_text_set)
-    assert (7, 0, 2) == sizes(data)
-    assert "images.txt: 1 image twice: read once" in data.report
-    file.write_text(text.replace("im 003", "im 001"))
-    assert_refused(r"im 001\.png occurs twice, with different poses", colmap_text_set)
+        report = "\n".join(data.report)
+        assert note not in report if words is None else words in report
+    for rows, message in (
+        ([poses[0], "1 2 3", "4 5 6", *poses[1:]], "line 3: these are keypoints"),
+        ([line.replace("im 003", "im 001") for line in lines], r"im 001\.png occurs twice, with different poses"),
+    ):
+        file.write_text("\n".join(rows))
+        assert_refused(message, colmap_text_set)
 
 
 def test_intrinsics_of_other_programs_are_read(ngp):
@@ -321,11 +312,10 @@ def test_the_smallest_sufficient_folder_of_images_is_read(tmp_path):
     ):  # fmt: skip
         data, wanted = load(tmp_path, size), size or (96, 64)
         assert f"images from {folder}" in data.report
-        assert {wanted} == with_size(data.train)
-        assert wanted == data.train[0].pixels.shape[1::-1]
+        assert wanted == (data.train[0].camera.W, data.train[0].camera.H) == data.train[0].pixels.shape[1::-1]
         assert np.allclose(np.diag([wanted[0] / 96, wanted[1] / 64, 1]) @ shots[0].K, data.train[0].camera.K)
     named = load(tmp_path, images="images_4")
-    assert {(24, 16)} == with_size(named.train)
+    assert (24, 16) == (named.train[0].camera.W, named.train[0].camera.H)
     sets.assert_dots_are_where_points_fall([*load(tmp_path, (48, 32)).train, *named.train])
     assert_refused("images_8", tmp_path, images="images_8")
 

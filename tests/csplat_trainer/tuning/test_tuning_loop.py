@@ -1,7 +1,4 @@
-"""Fine-tuning: learning, determinism, resumed runs, ends of a run, and the reports and files of the command.
-
-The fixture `tuned_file` was tuned for a hundred steps; other tests use as few steps as possible.
-"""
+"""Fine-tuning: learning, determinism, resumed runs, ends of a run, and the reports and files of the command."""
 
 import json
 import math
@@ -145,9 +142,9 @@ def test_the_rate_controller_adds_the_excess_of_a_file_to_the_loss_and_raises_la
     assert 0.98 * 100_000 < 37_500 + bits / 8
 
 
-def test_a_checkpoint_of_another_run_is_refused(tmp_path):
-    file, fixed, views = tmp_path / "c.npz", coarse(), views_of_source()
-    tune(fixed, views, replace(QUICK, iterations=5), outputs=Outputs(file))
+def test_a_damaged_checkpoint_and_those_of_other_runs_are_refused(tmp_path):
+    file, bad, fixed, views = tmp_path / "c.npz", tmp_path / "bad.npz", coarse(), views_of_source()
+    tune(fixed, views, replace(QUICK, iterations=1), outputs=Outputs(file))
     lighter = replace(views, background=views.background + np.float32(0.5))
     for message, scene, seen, options, size_bytes in (
         ("another byte_cost", fixed, views, replace(QUICK, byte_cost=0.5), None),
@@ -158,11 +155,6 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             tune(scene, seen, options, size_bytes=size_bytes, outputs=Outputs(resume=file))
-
-
-def test_a_damaged_checkpoint_is_refused(tmp_path):
-    file, bad = tmp_path / "c.npz", tmp_path / "bad.npz"
-    tune(coarse(), views_of_source(), replace(QUICK, iterations=1), outputs=Outputs(file))
     np.savez(tmp_path / "n.npz", facts=np.frombuffer(b'{"version": 2}', np.uint8))
     np.save(tmp_path / "n.npy", np.zeros(3))
     data, entry = file.read_bytes(), file.read_bytes().index(b"PK\x01\x02")
@@ -172,7 +164,7 @@ def test_a_damaged_checkpoint_is_refused(tmp_path):
     for content in (b"", b"no checkpoint", data[:-500], locked, unknown, *arrays):
         bad.write_bytes(content)
         with pytest.raises(InputError, match="not a checkpoint") as caught:
-            tune(coarse(), views_of_source(), QUICK, outputs=Outputs(resume=bad))
+            tune(fixed, views, QUICK, outputs=Outputs(resume=bad))
         assert "pickle" not in str(caught.value)
 
 
