@@ -29,7 +29,6 @@ from csplat_trainer.losses import PhotometricLoss
 from csplat_trainer.parameters import GROUPS, Parameters, from_model
 from csplat_trainer.training_loop import fit_to_options, train
 from csplat_trainer.training_options import Outputs, TrainOptions
-from csplat_trainer.training_report import moving_average
 from csplat_trainer.tuning import FinetuneOptions, TuningView, TuningViews, tune
 
 pytest.importorskip("numba", reason="requires the extra [render]")
@@ -172,6 +171,8 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
     assert (every, size) == (record.test_every, None if record.size is None else "{}x{}".format(*record.size))
     assert record.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
     assert str(record) in result.stderr
+    untested = call("train", folder, tmp_path / "b.ply", "--test-every", 0, *FEW_WORDS)
+    assert "; no test images" in untested.stderr
     colour = ",".join(str(value) for value in record.background)
     again = call("compare", ply, ply, "--data", folder, "--background", colour, "--json", "--test-every", every)
     scores, metrics = json.loads(again.stdout)["photographs"]["a"], json.loads(log.read_text())["metrics"]
@@ -187,7 +188,9 @@ def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path):
     assert (len(model), len(first)) == (report["file"]["splats"], report["file"]["size_bytes"])
     assert {"source", "before tuning", "file"} == set(report["file"]["scores"])
     assert "held-out images" in file_runs.messages
-    assert (1.0, 1.0, 1.0) == TrainingRecord.of(model.metadata).background
+    record = TrainingRecord.of(model.metadata)
+    assert (1.0, 1.0, 1.0) == record.background
+    assert str(record) in call("info", file_runs.folder / "a.csplat").stdout
     for name in ("run.npz", "run.tuning.npz"):
         shutil.copy(file_runs.folder / name, tmp_path / name)
     files = ("--keep", 1, "--checkpoint", tmp_path / "run.npz", "--resume", tmp_path / "run.npz")
@@ -265,10 +268,6 @@ def test_a_checkpoint_is_loaded_and_adapts_to_other_options_and_is_refused_in_an
     np.savez(path, **{**arrays, "facts": np.frombuffer(json.dumps(facts).encode(), np.uint8)})
     with pytest.raises(InputError, match=r"run\.npz is a checkpoint of version 1, expected 2: begin a new run$"):
         load_checkpoint(path)
-
-
-def test_the_moving_average_covers_the_last_values():
-    assert [1.0, 1.5, 2.5, 3.5] == moving_average([1, 2, 3, 4], 2).tolist()
 
 
 GAINS = np.array([0.7, 1.3, 0.8, 1.2, 0.9, 1.1, 0.75, 1.25, 1.0])  # gains of training images

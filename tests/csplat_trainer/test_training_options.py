@@ -12,6 +12,7 @@ from train_cases import QUICK, assert_resumes_identically
 from csplat.errors import InputError
 from csplat_trainer.training_loop import train
 from csplat_trainer.training_options import Outputs, TrainOptions
+from csplat_trainer.training_report import moving_average
 
 pytest.importorskip("numba", reason="requires the extra [render]")
 
@@ -43,6 +44,7 @@ def test_progress_log_and_previews_are_written(data, tmp_path):
     result = train(data, TrainOptions(**QUICK), on_step=seen.append, outputs=outputs)
     assert [20, 40, 60] == [now.iteration for now in seen]
     assert ["000030.png", "000060.png"] == sorted(path.name for path in previews.iterdir())
+    assert [1.0, 1.5, 2.5, 3.5] == moving_average([1, 2, 3, 4], 2).tolist()
     log = json.loads(json.dumps(result.log, allow_nan=False))
     assert 60 == len(log["losses"])
     assert {"psnr", "ssim", "lpips", "psnr_mean"} <= set(log["metrics"])

@@ -38,3 +38,6 @@ def test_points_with_non_finite_values_are_left_out(tmp_path):
     np.testing.assert_allclose([[1.0, 0.0, 0.2], [0.0, 0.0, 0.0]], colours)
     (tmp_path / "points3D.txt").write_text("")
     assert 0 == len(read_points(tmp_path / "points3D.txt")[0])
+    (tmp_path / "points3D.txt").write_bytes(b"\xff")
+    with pytest.raises(InputError, match="byte 0 is 0xff, which is not UTF-8"):
+        read_points(tmp_path / "points3D.txt")

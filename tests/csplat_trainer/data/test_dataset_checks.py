@@ -144,6 +144,7 @@ LENSES = [
 ]  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "parameters", "values"), LENSES)
 def test_images_of_every_kind_of_lens_are_undistorted(tmp_path, model, parameters, values):
     lens, folder = read_lens(tmp_path, model, parameters), tmp_path / "set"
@@ -411,6 +412,7 @@ FOREIGN = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "begin", "message"), FOREIGN.values(), ids=FOREIGN)
 def test_sets_of_other_programs_are_named_with_a_way_out(tmp_path, name, begin, message):
     (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

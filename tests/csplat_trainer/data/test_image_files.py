@@ -175,6 +175,7 @@ def test_masks_that_fit_no_image_are_reported(colmap_set):
     assert "1 name of masks/ found in another case: im 003.png is IM 003.png" in report
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [
     "masks/im 003.png", "masks/im 003.png.png", "masks/im 003.jpg", "Masks/im 003.png", "mask/im 003_mask.png",
     "masks/mask_im 003.jpg", "masks/im 003.mask.png", "masks/im 003.png.mask.png", "masks/IM 003.PNG.MASK.PNG",

@@ -58,7 +58,7 @@ def test_missing_images_are_reported_and_invalid_ones_refused(ngp):
     assert (7, ["images/0000.png", "images/0009.png"]) == (len(data.train), names(data.test))  # every eighth
     assert any("1 of 10 images are missing" in line and "images/0004.png" in line for line in data.report)
     sets.assert_dots_are_where_points_fall([*data.train, *data.test])
-    assert 9 == len(load(ngp / "transforms.json", test_every=0).train)
+    assert 9 == len(load(ngp / "transforms.json", test_every=0, images="images").train)
     path.write_bytes(path.read_bytes()[:60])
     with pytest.raises(InputError, match=r"0001\.png is a PNG that is truncated: copy or export it again"):
         load(ngp).read()
