@@ -1,5 +1,7 @@
 """Helpers of the tests of encoder runs, which several files share."""
 
+import shlex
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,10 +15,17 @@ from csplat_conformance.encoders.file_checks import check_content
 from csplat_conformance.protocol import ProcessEnd
 
 INPUTS = {one.name: one for one in all_inputs()}
+ENCODABLE = {name: one for name, one in INPUTS.items() if one.source is not None}
 COMMAND = "encoder {ply} {out} {index}"
 PLAIN = "ordinary/degree_1"
 FILES = EncoderSuiteOptions(PLAIN, ("L1",), jobs=1)
+L3 = ("L1", "L2", "L3")
 MAPS = EncoderSuiteOptions(PLAIN, ("L2",), jobs=1)
+
+
+def program(code):
+    """Return a command line that runs Python code on {ply} and {out}; the standard library alone starts quickly."""
+    return f"{shlex.quote(sys.executable)} -I -S -c {shlex.quote(code)} {{ply}} {{out}}"
 
 
 def running(encoded, change):
@@ -45,9 +54,6 @@ def outcome_of(encoded, change, choice=FILES):
 def refuse(at):
     at.out.unlink()
     return 1
-
-
-L3 = ("L1", "L2", "L3")
 
 
 def model_of(name, folder):
