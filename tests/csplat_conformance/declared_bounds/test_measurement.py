@@ -7,44 +7,43 @@ import pytest
 from checked import covariances, disturbed, measure_errors
 
 from csplat.errors import InputError
-from csplat_conformance.declared_bounds import Source, check_source_index
-from csplat_conformance.declared_bounds.measurement import measure_pairs as measured
-from csplat_conformance.declared_bounds.measurement import pair_differences as differences_of
+from csplat_conformance.declared_bounds import Source, check_source_index, measurement
 
 
-def differences(source, *rest):
-    return differences_of(Source.of(source), *rest)
+def differences(source, decoded):
+    rows = np.arange(len(source))
+    return measurement.pair_differences(Source.of(source), decoded, rows, rows)
 
 
 def measure_pairs(source, *rest, **options):
     """Return (max, rms) by measure."""
-    return {name: found[:2] for name, found in measured(Source.of(source), *rest, **options).items()}
+    pairs = measurement.measure_pairs(Source.of(source), *rest, **options)
+    return {name: found[:2] for name, found in pairs.items()}
 
 
 def test_covariance_errors_agree_with_the_definition(make_model):
-    source, rows = make_model(60, 0), np.arange(60)
+    source = make_model(60, 0)
     decoded = disturbed(source, np.random.default_rng(1), 0.1)
-    found = differences(source, decoded, rows, rows)["covariance"][:, 0]
+    found = differences(source, decoded)["covariance"][:, 0]
     theirs, ours = (covariances(one.quats, one.scales) for one in (source, decoded))
     expected = np.linalg.norm(ours - theirs, axis=(1, 2)) / np.linalg.norm(theirs, axis=(1, 2))
     np.testing.assert_allclose(found, expected, rtol=1e-9)
     negated = replace(source, quats=-source.quats)  # the same rotations
-    assert measure_pairs(source, negated, rows)["covariance"][0] < 1e-15
+    assert measure_pairs(source, negated, np.arange(60))["covariance"][0] < 1e-15
 
 
 def test_log_scales_of_any_size_have_covariance_errors(make_model):
     source = make_model(3, 0, scales=np.array([[60, 60, 60], [-60, -60, -60], [60, -60, 0]], np.float32))
     decoded = replace(source, scales=source.scales + np.float32(0.0078125))
-    found = differences(source, decoded, np.arange(3), np.arange(3))["covariance"]
-    np.testing.assert_allclose(found, np.expm1(2 * 0.0078125), rtol=1e-12)
+    np.testing.assert_allclose(differences(source, decoded)["covariance"], np.expm1(2 * 0.0078125), rtol=1e-12)
     # An RMS beyond float64 is infinite.
     low, high = (make_model(9000, 0, scales=np.full((9000, 3), scale, np.float32)) for scale in (-88.0, 88.0))
     assert measure_pairs(low, high, np.arange(9000))["covariance"][1] == np.inf
 
 
-@pytest.mark.parametrize(
-    ("source", "decoded", "clipped"), [(-1e6, 1e6, (-88, 88)), (90, 3e38, (1, 1)), (-1, 99, (-1, 88))]
-)
+@pytest.mark.parametrize(("source", "decoded", "clipped"), [
+    (-1e6, 1e6, (-88, 88)), (90, 3e38, (1, 1)), (-1, 99, (-1, 88)),
+])  # fmt: skip
 def test_scales_beyond_float32_are_clipped_to_its_range(make_model, source, decoded, clipped):
     def error(*scales):
         pair = [make_model(1, 0, scales=np.full((1, 3), scale, np.float32)) for scale in scales]
@@ -75,19 +74,16 @@ def test_bands_that_one_model_lacks_are_zero_there(make_model):
     assert errors["sh2"][0] == np.abs(source.shN[:, 3:]).max()
 
 
-def test_an_index_beyond_the_source_is_refused(make_model):
+def test_invalid_source_indices_are_refused_in_blocks_of_any_size(make_model):
     model = make_model(5, 0)
     for index in (np.array([0, 1, 2, 3, 5]), np.array([-1, 0, 1, 2, 3]), np.arange(4), np.arange(5.0)):
         with pytest.raises(InputError, match="source index"):
             measure_pairs(model, model, index)
-
-
-@pytest.mark.parametrize(("index", "message"), [
-    (np.array([0, 1, 1]), "splats 1 and 2 both have the source index 1"),
-    (np.array([2, 0, 2]), "splats 0 and 2 both have the source index 2"),
-    (np.array([0, 1, 5]), "splat 2 is 5"),
-])  # fmt: skip
-def test_invalid_source_indices_are_found_in_blocks(index, message):
-    for block in (1, 2, 3):
-        with pytest.raises(InputError, match=message):
-            check_source_index(index, 5, 3, block=block)
+    for index, message in {
+        (0, 1, 1): "splats 1 and 2 both have the source index 1",
+        (2, 0, 2): "splats 0 and 2 both have the source index 2",
+        (0, 1, 5): "splat 2 is 5",
+    }.items():
+        for block in (1, 2, 3):
+            with pytest.raises(InputError, match=message):
+                check_source_index(np.array(index), 5, 3, block=block)

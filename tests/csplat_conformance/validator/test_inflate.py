@@ -5,7 +5,11 @@ from tables import failures
 from validator_cases import by_validator, by_zlib, damaged
 
 from csplat_authoring.coders import Deflate
-from csplat_authoring.recipes.deflate_streams import valid_streams
+from csplat_authoring.recipes.deflate_streams import invalid_streams, valid_streams
+from csplat_conformance.validator.inflate import CodedError
+from csplat_conformance.validator.streams import undo_coder
+
+DEFLATE = 1
 
 
 def test_valid_deflate_streams_give_their_output():
@@ -27,3 +31,13 @@ def test_inflate_accepts_the_same_streams_as_zlib():
 def test_a_code_of_code_lengths_without_codewords_is_refused():
     nothing = Deflate().number(1, 1).number(2, 2).number(0, 14 + 4 * 3 + 258 + 3).end()
     assert "refused" == by_zlib(nothing) == by_validator(nothing)
+
+
+def test_invalid_deflate_streams_are_refused_with_their_clause():
+    def check(case):
+        assert "refused" == by_zlib(case.coded, len(case.output))
+        with pytest.raises(CodedError) as caught:
+            undo_coder(memoryview(case.coded), DEFLATE, len(case.output))
+        assert case.clause == caught.value.clause
+
+    assert [] == failures(invalid_streams(), check)

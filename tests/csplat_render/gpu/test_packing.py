@@ -28,13 +28,8 @@ class Reader:
         return float(np.uint32(value).view(np.float32)) if width == 32 else value
 
 
-def floats(words):
-    return words.view(np.float32).astype(np.float64)
-
-
 def test_packed_words_hold_every_field():
-    data = build(rich_scene()).data
-    for tile in iter_packed(data):
+    for tile in iter_packed(build(rich_scene()).data):
         words = pack_tile(tile, SharedTables(1 << 20), np.zeros(3), antialiased=False)
         bits = [int(word) >> shift & 255 for word in words.constants[1, :2] for shift in (0, 8, 16, 24)]
         for splat in range(len(tile.opacities)):
@@ -42,17 +37,11 @@ def test_packed_words_hold_every_field():
             means = words.corner + words.step * np.array([reader.field(width) for width in bits[:3]])
             np.testing.assert_allclose(tile.means.integers[splat] * tile.means.step, means)
             assert tile.opacities[splat] == reader.field(bits[3])
-            for packed, width, row in ((tile.scales, bits[4], 2), (None, bits[5], 0), (tile.sh0, bits[6], 3)):
-                found = np.array([reader.field(width) for _ in range(3)])
-                if packed is None:
-                    assert (tile.quats[splat] + tile.quat_levels).tolist() == found.tolist()
-                else:
-                    *offsets, step = floats(words.constants[row])
-                    np.testing.assert_allclose(packed.integers[splat] * packed.step, offsets + found * step, rtol=1e-6)
-
-
-def float32_splats(arrays):
-    return UncheckedSplats(**{name: np.asarray(array, np.float32) for name, array in arrays.items()})
+            scales, quats, sh0 = (np.array([reader.field(width) for _ in range(3)]) for width in bits[4:7])
+            assert (tile.quats[splat] + tile.quat_levels).tolist() == quats.tolist()
+            for packed, row, found in ((tile.scales, 2, scales), (tile.sh0, 3, sh0)):
+                *offsets, step = words.constants[row].view(np.float32).astype(np.float64)
+                np.testing.assert_allclose(packed.integers[splat] * packed.step, offsets + found * step, rtol=1e-6)
 
 
 def test_splats_with_nan_have_no_opacity():
@@ -60,12 +49,12 @@ def test_splats_with_nan_have_no_opacity():
     arrays["shN"][1, 2, 0] = np.nan
     arrays["means"][2, 0] = np.inf
     arrays["sh0"][3] = 2e38
-    for degree, bad in ((3, (0, 1, 1, 0)), (0, (0, 0, 1, 0))):
-        words = pack_splats(float32_splats(arrays), slice(0, 4), np.zeros(3), antialiased=True, sh_degree=degree)
-        assert sum(bad) == words.ignored
-        assert [0.0 if one else alpha for alpha, one in zip(np.float32(arrays["opacities"]), bad, strict=True)] == [
-            np.float32(words.words[3 * BLOCK + splat].view(np.float32)) for splat in range(4)
-        ]
+    splats = UncheckedSplats(**{name: np.asarray(array, np.float32) for name, array in arrays.items()})
+    for degree, good in ((3, [1, 0, 0, 1]), (0, [1, 1, 0, 1])):
+        packed = pack_splats(splats, slice(0, 4), np.zeros(3), antialiased=True, sh_degree=degree)
+        assert 4 - sum(good) == packed.ignored
+        found = packed.words[3 * BLOCK : 3 * BLOCK + 4].view(np.float32)
+        np.testing.assert_array_equal(np.where(good, splats.opacities, 0.0), found)
 
 
 def test_codebooks_that_do_not_fit_are_refused():
