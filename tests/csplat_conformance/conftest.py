@@ -3,16 +3,14 @@
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 from encoder_runs_cases import INPUTS, L3, PLAIN, model_of
-from typer.testing import CliRunner
 
 import csplat
 from csplat.decoder import decode_scene
+from csplat.encoder import encode_with_report
 from csplat_conformance.encoders import EncoderSuiteOptions, run_encoder
 from csplat_conformance.protocol import ProcessEnd
-from csplat_tools.cli.app import app
 
 
 @pytest.fixture(scope="module")
@@ -22,13 +20,10 @@ def plain(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def encoded(tmp_path_factory):
+def encoded(plain):
     """The plain input, encoded by our encoder, and its source index."""
-    folder = tmp_path_factory.mktemp("encoded")
-    (folder / "in.ply").write_bytes(INPUTS[PLAIN].make())
-    words = ["encode", folder / "in.ply", folder / "out.csplat", "--source-index", folder / "out.npy", "--quiet"]
-    assert 0 == CliRunner().invoke(app, list(map(str, words))).exit_code
-    return (folder / "out.csplat").read_bytes(), np.load(folder / "out.npy")
+    result = encode_with_report(plain)
+    return result.data, result.source_index
 
 
 @pytest.fixture

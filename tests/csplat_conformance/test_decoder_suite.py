@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import re
+import shlex
 import sys
 import xml.etree.ElementTree as ET
 from dataclasses import replace
@@ -73,44 +74,28 @@ sys.exit(status)
 """
 
 
-FAULTY_CUTS = """
+# Answers with the right lines, or those of an expression.
+CUTS = """
 import json, pathlib, sys
 
-fault, source, cuts = sys.argv[1:]
+answer, source, cuts = sys.argv[1:]
 known = json.loads((pathlib.Path(__file__).parent / "cuts.json").read_text())[pathlib.Path(source).stem]
 given = [known[cut] for cut in pathlib.Path(cuts).read_text().splitlines()]
 lines = [tiles if isinstance(tiles, str) else " ".join(map(str, tiles)) for tiles in given]
-if fault == "status":
-    sys.exit(77)
-if fault == "refusal":
+
+def refuse():
     print(json.dumps({"code": "E_INDEX", "clause": "TRE-5"}))
     sys.exit(1)
-unsupported = {
-    "no sizes": lambda cut: "pixel_size" in cut,
-    "no list of sizes": lambda cut: len(cut.split(" box ")[0].split()) > 2,
-    "no boxes": lambda cut: " box " in cut,
-    "no cuts": lambda cut: True,
-}.get(fault, lambda cut: False)
-lines = ["E_UNSUPPORTED" if unsupported(cut) else line for cut, line in zip(known, lines)]
-changed = {
-    "silent": [],
-    "short": lines[:-1],
-    "long": [*lines, "0"],
-    "words": [lines[0], "tile 2", *lines[2:]],
-    "one wrong": [lines[0], "1 0", *lines[2:]],
-    "empty cuts": [""] * len(lines),
-    "no error code": ["E_INPUT" if line == "E_LIMIT" else line for line in lines],
-}
-for line in changed.get(fault, lines):
+
+def without(is_unsupported):
+    return ["E_UNSUPPORTED" if is_unsupported(cut) else line for cut, line in zip(known, lines)]
+
+for line in eval(answer):
     print(line)
 """
 
-
-#: Vectors whose answers are recorded.
-RECORDED = (
-    "valid/quats", "invalid/quat_radicand", "invalid/json_open", "invalid/json_surrogate",
-    "invalid/json_beyond_budget", "invalid/error_counts",
-)  # fmt: skip
+PAYLOADS = ("invalid/json_open", "invalid/json_surrogate", "invalid/json_beyond_budget", "invalid/error_counts")
+RECORDED = ("valid/quats", "invalid/quat_radicand", *PAYLOADS)
 
 ROOT = Path(__file__).resolve().parents[2]
 ADAPTER = f"{sys.executable} -m csplat_conformance.adapter {{input}} {{outdir}}"
@@ -134,7 +119,7 @@ def recorded(tmp_path_factory):
     (folder / "decoder.py").write_text(FAULTY)
     cuts = {one.name.split("/")[1]: dict(one.expect["cuts"]) for one in VECTOR_LIST if "cuts" in one.expect}
     (folder / "cuts.json").write_text(json.dumps(cuts))
-    (folder / "cuts.py").write_text(FAULTY_CUTS)
+    (folder / "cuts.py").write_text(CUTS)
     return folder
 
 
@@ -151,8 +136,8 @@ def faulty(recorded):
 
 @pytest.fixture(scope="module")
 def faulty_cuts(recorded):
-    """Return a function for the command line of a program for cuts with a fault."""
-    return lambda fault: f"{sys.executable} -I -S {recorded / 'cuts.py'} '{fault}' {{input}} {{cuts}}"
+    """Return a function for the command line of a program for cuts that prints the lines of an expression."""
+    return lambda lines: f"{sys.executable} -I -S {recorded / 'cuts.py'} {shlex.quote(lines)} {{input}} {{cuts}}"
 
 
 @pytest.mark.slow
@@ -226,33 +211,22 @@ def test_an_exact_run_refuses_another_code_and_a_low_level_ignores_faults_of_hig
     assert faulty("rounding", levels=(1,)).passed
 
 
-@pytest.mark.slow
-def test_a_broken_payload_may_be_accepted_by_decoders_that_leave_it_unread_but_not_a_broken_frame(faulty):
-    payloads = ["json_open", "json_coded_garbage", "json_beyond_budget", "error_counts"]
-    frames = ["metadata_crc", "stated_errors_crc", "chunk_flags_differ", "metadata_twice"]
-
-    def failed(names, **options):
-        report = faulty("silent", ",".join(f"invalid/{name}" for name in names), **options)
-        return sorted(outcome.name.split("/")[1] for outcome in report.failures)
-
-    assert [[], sorted(payloads), sorted(frames)] == [failed(payloads), failed(payloads, exact=True), failed(frames)]
-
-
+LISTS_OF_SIZES = "without(lambda cut: len(cut.split(' box ')[0].split()) > 2)"
 CUT_FAULTS = {
-    "none": (Status.PASSED, ""),
-    "status": (Status.WRONG_STATUS, "exit status 77"),
-    "refusal": (Status.REFUSED, "refused"),
-    "silent": (Status.NO_OUTPUT, "0 cuts, expected 40, a line for each"),
-    "short": (Status.PARTIAL_OUTPUT, "39 cuts, expected 40"),
-    "long": (Status.FAILED, "41 cuts, expected 40"),
-    "words": (Status.WRONG_ANSWER, "line 2 is 'tile 2', expected numbers of tiles, or an error code"),
-    "one wrong": (Status.FAILED, "the cut 'level 1' is 1 0, expected 2"),
-    "empty cuts": (Status.FAILED, "the cut 'level 0' is empty, expected 0 1; 30 of the other 39 cuts are wrong, too"),
-    "no error code": (Status.FAILED, "the cut 'splats 2' is E_INPUT, expected E_LIMIT"),
-    "no sizes": (Status.PASSED, "the decoder offers no cut by pixel_size"),
-    "no list of sizes": (Status.FAILED, "is E_UNSUPPORTED, expected"),
-    "no boxes": (Status.PASSED, "the decoder offers no cut by box"),
-    "no cuts": (Status.SKIPPED, "the decoder offers no cut by box, level, pixel_size, splats"),
+    "lines": (Status.PASSED, ""),
+    "sys.exit(77)": (Status.WRONG_STATUS, "exit status 77"),
+    "refuse()": (Status.REFUSED, "refused"),
+    "[]": (Status.NO_OUTPUT, "0 cuts, expected 40, a line for each"),
+    "lines[:-1]": (Status.PARTIAL_OUTPUT, "39 cuts, expected 40"),
+    "[*lines, '0']": (Status.FAILED, "41 cuts, expected 40"),
+    "[lines[0], 'tile 2', *lines[2:]]": (Status.WRONG_ANSWER, "line 2 is 'tile 2', expected numbers of tiles, or an e"),
+    "[lines[0], '1 0', *lines[2:]]": (Status.FAILED, "the cut 'level 1' is 1 0, expected 2"),
+    "[''] * len(lines)": (Status.FAILED, "the cut 'level 0' is empty, expected 0 1; 30 of the other 39 cuts are wrong"),
+    "[line.replace('LIMIT', 'INPUT') for line in lines]": (Status.FAILED, "'splats 2' is E_INPUT, expected E_LIMIT"),
+    "without(lambda cut: 'pixel_size' in cut)": (Status.PASSED, "the decoder offers no cut by pixel_size"),
+    LISTS_OF_SIZES: (Status.FAILED, "is E_UNSUPPORTED, expected"),
+    "without(lambda cut: ' box ' in cut)": (Status.PASSED, "the decoder offers no cut by box"),
+    "without(str)": (Status.SKIPPED, "the decoder offers no cut by box, level, pixel_size, splats"),
 }
 
 
@@ -266,18 +240,18 @@ def test_a_fault_of_a_program_for_cuts_has_an_outcome_of_its_own(faulty_cuts):
         assert message in outcome.message
         assert bool(message) == bool(outcome.message)
         assert "TRE-9" in outcome.clauses
-        assert outcome.code == ("E_INDEX" if fault == "refusal" else "")
+        assert outcome.code == ("E_INDEX" if fault == "refuse()" else "")
 
     assert [] == failures({fault: fault for fault in CUT_FAULTS}, check)
     long_chain = DecoderSuiteOptions(pattern="extreme/levels_chain_of_256", levels=(5,))
-    (outcome,) = run_command(None, long_chain, cuts=faulty_cuts("no list of sizes")).outcomes
+    (outcome,) = run_command(None, long_chain, cuts=faulty_cuts(LISTS_OF_SIZES)).outcomes
     assert len(outcome.message) < 300
 
 
 @pytest.mark.slow
 def test_cuts_are_requested_of_valid_files_with_levels_alone(faulty, faulty_cuts):
     chosen = {"pattern": "valid/quats,valid/levels,invalid/level_below", "levels": (1, 5)}
-    alone = run_command(None, DecoderSuiteOptions(**chosen), cuts=faulty_cuts("none"))
+    alone = run_command(None, DecoderSuiteOptions(**chosen), cuts=faulty_cuts("lines"))
     assert [("valid/levels", "L5")] == [(one.name, one.level) for one in alone.outcomes]
     skipped = [one for one in faulty("refusal", **chosen).outcomes if one.status is Status.SKIPPED]
     assert [("valid/levels", "no command for cuts was given")] == [(one.name, one.message) for one in skipped]
@@ -299,9 +273,16 @@ MISTAKE = "each accepted one is an error if your decoder reads META (CHK-7)"
     ("believes json_open", ["invalid/json_open"], [f"reads META: 1 refused, 1 accepted: {MISTAKE}: invalid/json_open"]),
 ])  # fmt: skip
 def test_a_decoder_reads_all_payloads_of_a_chunk_type_or_none(faulty, fault, failed, notes):
-    report = faulty(fault, ",".join(name for name in RECORDED[2:]))
+    report = faulty(fault, ",".join(PAYLOADS))
     assert failed == [outcome.name for outcome in report.failures]
     assert notes == report.notes
+
+
+@pytest.mark.slow
+def test_a_broken_frame_must_be_refused_and_in_an_exact_run_a_broken_payload_too(faulty):
+    frames = {"invalid/metadata_crc", "invalid/stated_errors_crc", "invalid/chunk_flags_differ"}
+    assert frames == {outcome.name for outcome in faulty("silent", ",".join(frames)).failures}
+    assert {*PAYLOADS} == {outcome.name for outcome in faulty("silent", ",".join(PAYLOADS), exact=True).failures}
 
 
 def test_a_larger_budget_for_texts_does_not_show_that_they_are_left_unread():
@@ -451,23 +432,20 @@ def test_the_command_writes_table_json_and_junit(recorded, tmp_path):
     assert 2 == invoke(*quats, "--json", "--junit", "-").exit_code
 
 
-def chosen(*words):
-    """Return the names of the vectors that the command runs, at level 1."""
-    report = invoke(*words, "--level", "1", "--json").stdout
-    return {outcome["name"] for outcome in json.loads(report)["outcomes"]}
-
-
 def test_a_filter_repeats_and_combines_patterns_of_names_and_of_clauses():
+    def chosen(*words):
+        report = json.loads(invoke(*words, "--level", "1", "--json").stdout)
+        return {outcome["name"] for outcome in report["outcomes"]}
+
     valid = {vector.name for vector in VECTOR_LIST if "MOR-1" in vector.clauses and vector.name.startswith("valid/")}
-    assert {"valid/one_splat", "valid/quats", "valid/rich"} == chosen(
-        "--filter", "valid/quats,valid/one_*", "--filter", "valid/rich"
-    )
+    repeated = ("--filter", "valid/quats,valid/one_*", "--filter", "valid/rich")
+    assert {"valid/one_splat", "valid/quats", "valid/rich"} == chosen(*repeated)
     assert valid == chosen("--filter", "valid/*", "--filter", "MOR-1,LIM")
     assert "no vector is chosen" in invoke("--filter", "valid/empty,MOR-*").stderr
 
 
 def test_a_command_for_cuts_alone_is_tested_at_l5_alone(faulty_cuts):
-    result = invoke("--cmd", faulty_cuts("one wrong"), "--filter", "valid/levels,valid/rich", "--json")
+    result = invoke("--cmd", faulty_cuts("lines[::-1]"), "--filter", "valid/levels,valid/rich", "--json")
     assert 1 == result.exit_code
     assert {"L5"} == {outcome["level"] for outcome in json.loads(result.stdout)["outcomes"]}
     assert 0 == invoke("--filter", "valid/levels", "--level", "5").exit_code  # our own

@@ -17,6 +17,20 @@ from csplat_render.virtual_cameras import virtual_cameras
 SMALL_K = intrinsics(64, 48, 60.0)
 
 
+def project(points, camera):
+    p = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
+    return p[:, :2] / p[:, 2:] * [camera.K[0, 0], camera.K[1, 1]] + [camera.K[0, 2], camera.K[1, 2]]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(240, 320), (400, 100)])
+def test_an_orbit_shows_an_object_entirely(size):
+    model, count = figure()
+    places = np.concatenate([project(model.means[:count], camera) for camera in orbit_cameras(model, 6, *size)])
+    assert ((places > 0) & (places < size)).all()
+    assert np.abs(2 * places / size - 1).max() > 0.8  # floaters do not increase the distance
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -0.8, 0.6]])
 def test_an_orbit_goes_around_the_recorded_up(up):

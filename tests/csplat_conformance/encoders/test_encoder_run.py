@@ -184,13 +184,14 @@ def test_declined_unusual_inputs_are_counted():
             Path(places["out"]).write_bytes(b"csplat?")
         return ProcessEnd(None, int(refuses), b"error: unusual\n", b"", 0.0)  # on standard output: the error is empty
 
-    report = run_encoder("x {ply} {out}", EncoderSuiteOptions(",".join(unusual), ("L1",)), run=run)
+    report, some = (
+        run_encoder("x {ply} {out}", EncoderSuiteOptions(pattern, ("L1",)), run=run)
+        for pattern in (",".join(unusual), "nasty/empty*")
+    )
     assert report.passed
-    assert ["warning: nasty: 2 of 2 declined"] == list(report.notes)
     assert {"checks": 3, "passed": 1, "declined": 2}.items() <= report.levels()["L1"].items()
     assert {"refused: error: unusual"} == {one.message for one in report.outcomes}
-    some = run_encoder("x {ply} {out}", EncoderSuiteOptions("nasty/empty*", ("L1",)), run=run)
-    assert ["nasty: 1 of 2 declined"] == list(some.notes)
+    assert ["warning: nasty: 2 of 2 declined", "nasty: 1 of 2 declined"] == [*report.notes, *some.notes]
     assert (Status.DECLINED, (), "refused: error: unusual") == runs.first(some)
 
 
@@ -201,15 +202,11 @@ def test_inputs_are_written_as_files_with_a_list(tmp_path):
     assert list(runs.INPUTS) == [entry["name"] for entry in listed]
     for entry in listed:
         one = runs.INPUTS[entry["name"]]
-        assert one.make() == (tmp_path / entry["file"]).read_bytes()
         refusal = "must" if one.must_refuse else "may" if one.may_refuse else "no"
         assert (one.why, refusal, one.must_refuse) == (entry["why"], entry["refusal"], entry["expected"] is None)
-    by_name = {entry["name"]: entry["expected"] for entry in listed}
-    for name, facts in {
-        "nasty/not_a_number": {"splats": 61, "rows": 64, "renders": False, "psnr_min": None},
-        "ordinary/extra_columns": {"sh_degree": 1, "extra_columns": ["confidence", "object_id", "red"], "psnr_min": 30},
-    }.items():
-        assert facts.items() <= by_name[name].items()
+        assert one.make() == (tmp_path / entry["file"]).read_bytes()
+    (nan,) = (entry["expected"] for entry in listed if entry["name"] == "nasty/not_a_number")
+    assert {"splats": 61, "rows": 64, "renders": False, "psnr_min": None}.items() <= nan.items()
 
 
 def test_the_command_writes_inputs_and_runs_nothing(tmp_path):
@@ -219,8 +216,7 @@ def test_the_command_writes_inputs_and_runs_nothing(tmp_path):
         assert not new.exists()
     result = invoke("--write-inputs", new, "--filter", "ordinary/degree_*,broken/cut")
     assert (0, f"6 inputs in {new}\n") == (result.exit_code, result.stdout)
-    files = {path.relative_to(new).as_posix() for path in new.rglob("*.*")}
-    assert {*(f"ordinary/degree_{d}.ply" for d in range(5)), "broken/cut.ply", "inputs.json"} == files
+    assert 7 == len([*new.rglob("*.*")])
     assert "is not empty" in invoke("--write-inputs", new).stderr
     assert 0 == invoke("--write-inputs", new, "--force", "--filter", "broken/*").exit_code
 

@@ -48,13 +48,15 @@ def unchanged(scene):
 REFITTED = stating(without("sh0", "sh1"), refitted=True)
 
 
-def test_errors_are_not_proved_if_they_are_not_stated_or_attributes_are_refitted(plain):
-    for change, status, message, alone in (
-        (silent, Status.NOT_PROVED, "the file states no errors", "the file states no errors"),
-        (REFITTED, Status.NOT_PROVED, "sh0, sh1: refitted, no error is stated", "sh0, sh1 refitted"),
-        (stating(without("sh1")), Status.FAILED, "the file states no error of sh1", ""),
+def test_errors_are_not_proved_if_they_are_not_stated_or_attributes_are_refitted(plain, tmp_path):
+    empty = model_of("nasty/empty", tmp_path)
+    for name, model, change, status, message, alone in (
+        (PLAIN, plain, silent, Status.NOT_PROVED, "the file states no errors", "the file states no errors"),
+        (PLAIN, plain, REFITTED, Status.NOT_PROVED, "sh0, sh1: refitted, no error is stated", "sh0, sh1 refitted"),
+        ("nasty/empty", empty, silent, Status.PASSED, "", ""),
+        (PLAIN, plain, stating(without("sh1")), Status.FAILED, "the file states no error of sh1", ""),
     ):
-        _, errors, found = judged(PLAIN, plain, change)
+        _, errors, found = judged(name, model, change)
         assert (status, message, alone) == (errors.status, errors.message, found)
     assert ("SER-6",) == errors.clauses
 
@@ -67,11 +69,6 @@ def test_stated_errors_hold_for_refitted_attributes_too(plain):
     assert ", source splat " in errors.message
     assert errors.message.endswith("; and 8 more")
     assert {"splat", "tile", "source_splat", "found"} == set(errors.details["sh1"]["worst"])
-
-
-def test_an_empty_scene_has_no_errors(tmp_path):
-    _, errors, alone = judged("nasty/empty", model_of("nasty/empty", tmp_path), silent)
-    assert (Status.PASSED, "") == (errors.status, alone)
 
 
 def honest(model):
@@ -88,24 +85,19 @@ def honest(model):
     return change
 
 
-@pytest.mark.parametrize(("name", "change", "message"), [
-    ("opacities", lambda alpha: 1 / (1 + np.exp(-alpha)), "opacities: an error of 0.49"),
-    ("scales", np.exp, "covariance: an error of "),
-    ("sh0", lambda sh0: np.clip(sh0, -0.5, 0.5), "sh0: an error of 0."),
-    ("shN", lambda shN: 0 * shN, "sh1: an error of 0."),
-])  # fmt: skip
-def test_large_errors_that_are_stated_cause_a_warning(plain, name, change, message):
-    wrong = replace(plain, **{name: np.asarray(change(getattr(plain, name)), np.float32)})
-    _, errors, _ = judged(PLAIN, wrong, honest(plain), attribute_psnr=60.0)
-    assert Status.WARNED is errors.status
-    for words in (message, "beyond", "source splat"):
-        assert words in errors.message
-
-
-def test_a_coarse_file_causes_a_warning(plain):
+def test_coarse_files_and_large_errors_that_are_stated_cause_a_warning(plain):
     _, errors, _ = judged(PLAIN, plain, attribute_psnr=14.0, sh_coding="none")
-    assert Status.WARNED is errors.status
-    assert "is coarse: splat " in errors.message
+    assert (Status.WARNED, True) == (errors.status, "is coarse: splat " in errors.message)
+    for name, change, message in (
+        ("opacities", lambda alpha: 1 / (1 + np.exp(-alpha)), "opacities: an error of 0.49"),
+        ("scales", np.exp, "covariance: an error of "),
+        ("sh0", lambda sh0: np.clip(sh0, -0.5, 0.5), "sh0: an error of 0."),
+        ("shN", lambda shN: 0 * shN, "sh1: an error of 0."),
+    ):
+        wrong = replace(plain, **{name: np.asarray(change(getattr(plain, name)), np.float32)})
+        _, errors, _ = judged(PLAIN, wrong, honest(plain), attribute_psnr=60.0)
+        assert Status.WARNED is errors.status
+        assert all(words in errors.message for words in (message, "beyond", "source splat")), name
 
 
 def statuses(report):

@@ -142,14 +142,10 @@ def test_all_defects_of_a_tree_but_not_their_consequences_are_reported():
     assert [] == failures(cases, check)
 
 
-def test_tiles_of_all_levels_are_checked():
+def test_tiles_of_all_levels_are_checked_but_no_more_nodes_than_there_are_tiles():
     changes = {f"TILE.{i}.0/opacities.stream.count": 99 for i in (0, 4, 6)}
     assert {*changes} == {one.field for one in validate(build(TREE).patched(changes)).violations}
-
-
-def test_no_more_nodes_are_read_than_there_are_tiles():
-    many = replace(TREE, nodes=TREE.nodes + (Node(_spec.NO_PARENT, 1, 1.0),) * 50)
-    found = validate(build(many).data)
+    found = validate(build(replace(TREE, nodes=TREE.nodes + (Node(_spec.NO_PARENT, 1, 1.0),) * 50)).data)
     assert ["TRE-3"] == [one.clause for one in found.violations]
     assert ["there are more nodes than tiles"] == [one.reason for one in found.unread]
 
@@ -242,7 +238,7 @@ def error_of(data):
     return None
 
 
-def test_no_content_of_a_file_raises():
+def test_no_content_of_any_buffer_raises():
     for seed in range(20):
         rng = random.Random(seed)  # noqa: S311 - repeatable, no secret
         data = bytearray(RICH.data)
@@ -252,9 +248,6 @@ def test_no_content_of_a_file_raises():
         validate(repair(bytes(data), RICH.records))
         validate(_spec.MAGIC + rng.randbytes(300))
         validate(rng.randbytes(seed))
-
-
-def test_any_buffer_is_validated():
     assert all(validate(kind(SMALL.data)).conforms for kind in (bytes, bytearray, memoryview))
 
 
