@@ -1,4 +1,4 @@
-"""Plans of files, tiles of a scene, and streams read back by the definition of the transforms in the spec."""
+"""Plans of files, their colours and origins, and what the files that they give declare."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import measure_errors
 
 from csplat import EncodeOptions, decode, encode
 from csplat.decoder import decode_scene, read_options
@@ -21,6 +22,37 @@ GEOMETRY = ("means", "quats", "scales", "opacities")
 COLOURS = ("sh0", "shN")
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [
+    {}, {"means_coding": "axis", "tile_splats": 50, "threads": 2}, {"attribute_psnr": 30.0},
+    {"shape_codebook_size": 32},
+])  # fmt: skip
+def test_a_plan_holds_decoded_geometry_and_the_source_colours(make_model, options):
+    model = make_model(260, 2)
+    plan = EncodePlan.of(model, EncodeOptions(**options))
+    result = encode_tiles(plan).write()
+    assert bool(encode(model, EncodeOptions(**options)) == result.data)
+    decoded = decode(result.data)
+    for name in GEOMETRY:
+        assert getattr(decoded, name).tobytes() == getattr(plan.scene, name)[result.source_index].tobytes(), name
+    for name in COLOURS:
+        assert getattr(model, name).tobytes() == getattr(plan.scene, name).tobytes(), name
+
+
+@pytest.mark.slow
+def test_new_colours_change_only_colours(make_model):
+    model = make_model(260, 2)
+    plan = EncodePlan.of(model, EncodeOptions(attribute_psnr=80.0))
+    fitted = plan.with_colours(model.sh0 + 1, 0 * model.shN)
+    before, after = (decode_scene(encode_tiles(one).write().data) for one in (plan, fitted))
+    for name in GEOMETRY:
+        assert np.array_equal(getattr(before.model, name), getattr(after.model, name)), name
+    np.testing.assert_allclose(before.model.sh0 + 1, after.model.sh0, atol=0.02)
+    assert not after.model.shN.any()
+    assert (False, True) == (before.declared_bounds.refitted, after.declared_bounds.refitted)
+    assert model.sh0 is plan.model.sh0  # the plan is unchanged
+
+
 def test_colours_and_an_origin_of_other_splats_are_refused(make_model):
     model = make_model(4, 1)
     with pytest.raises(InputError):
@@ -29,32 +61,50 @@ def test_colours_and_an_origin_of_other_splats_are_refused(make_model):
         EncodePlan.of(model, origin=Origin(9, np.arange(5)))
 
 
+def test_a_part_with_other_colours_or_shapes_declares_the_errors_of_the_rest(make_model):
+    source, rows = make_model(400, 3), np.arange(100, 300)
+    plan = EncodePlan.of(source.select(rows), origin=Origin(400, rows))
+    refitted = encode_tiles(plan.with_colours(plan.scene.sh0 + 1, plan.scene.shN)).write()
+    shapes = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
+    adjusted = encode_with_report(shapes, origin=Origin(400, rows, refitted=True, adjusted=True))
+    for result, declared in ((refitted, ["means", "covariance", "opacities"]), (adjusted, ["means"])):
+        scene = decode_scene(result.data)
+
+        def verify(source, index=None, scene=scene):
+            return verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, index)
+
+        whole = verify(source, result.source_index)
+        assert (True, True) == (whole.holds, whole.rms_verified)
+        assert declared == [one.name for one in whole.measures if one.holds]
+        assert declared == [record.measure for record in scene.declared_bounds.records]
+        assert {"sh0", "sh1", "sh2", "sh3"} <= {*whole.unverified}
+        assert verify(source).holds
+        assert not verify(replace(source, means=source.means + np.float32(0.1)), result.source_index).holds
+        assert "the file states 400" in verify(source.select(slice(0, 399))).failures[0]
+
+
+def test_errors_may_be_declared_against_another_scene(make_model):
+    source = make_model(150, 1)
+    drawn = replace(source, means=source.means + np.float32(0.25))
+    coded = encode_tiles(EncodePlan.of(drawn))
+    decoded = decode(coded.write().data)
+    result = coded.against(source, decoded).write()
+    truth = measure_errors(source, decoded, result.source_index)
+    assert 0.4 < truth["means"][0] < 0.5
+    for name, pair in truth.items():
+        for error, stated in zip(pair, result.report.errors[name], strict=True):
+            assert error <= stated <= error * 1.0001 + 1e-11
+
+
 def test_a_file_is_written_twice_with_the_same_splats(make_model):
-    model = make_model(200, 2)
-    coded = encode_tiles(EncodePlan.of(model, EncodeOptions(tile_splats=70)))
-    first = coded.write()
-    second = coded.write({"fitted": {"psnr": 41.5}})
+    coded = encode_tiles(EncodePlan.of(make_model(200, 2), EncodeOptions(tile_splats=70)))
+    first, second = coded.write(), coded.write({"fitted": {"psnr": 41.5}})
     assert first.data == coded.write().data
     assert {"fitted": {"psnr": 41.5}, **read_options(first.data)} == read_options(second.data)
     one, other = decode(first.data), decode(second.data)
     for name in (*GEOMETRY, *COLOURS):
         assert np.array_equal(getattr(one, name), getattr(other, name)), name
     assert np.array_equal(first.source_index, second.source_index)
-
-
-def test_a_file_with_adjusted_shapes_declares_only_errors_of_means(make_model):
-    source, rows = make_model(400, 3), np.arange(100, 300)
-    adjusted = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
-    result = encode_with_report(adjusted, origin=Origin(len(source), rows, refitted=True, adjusted=True))
-    scene = decode_scene(result.data)
-
-    def holds(source, index=None):
-        return verify_bounds(Source.of(source), scene.model, scene.header, scene.declared_bounds, index).holds
-
-    assert ["means"] == [record.measure for record in scene.declared_bounds.records]
-    assert holds(source, result.source_index)
-    assert holds(source)
-    assert not holds(replace(source, means=source.means + np.float32(0.1)))
 
 
 def sparse_model(source, share):
@@ -65,29 +115,22 @@ def sparse_model(source, share):
 
 
 @pytest.mark.slow
-def test_absent_bands_are_decoded_as_zeros(make_model):
+def test_absent_bands_are_decoded_as_zeros_and_cost_almost_nothing(make_model):
+    def codings(data):
+        return set(describe_file(data).as_json()["attributes"]["sh2"]["codings"])
+
     model, scalar = sparse_model(make_model(400, 3), 0.9), {"sh_coding": "scalar"}
     for options in ({}, {"tile_splats": 50}, {"deflate_level": 1}, {"adaptive": 0.5}):
         result = encode_with_report(model, EncodeOptions(**scalar, **options), importance=np.ones(400))
         decoded, expected = decode(result.data), model.shN[result.source_index]
         np.testing.assert_allclose(expected, decoded.shN, atol=0.2)
         assert not decoded.shN[~expected[:, 3:].any(axis=(1, 2)), 3:].any()
-        assert {"sparse"} == codings_of_band_2(result.data)
-    assert {"signed"} == codings_of_band_2(encode(make_model(400, 3), EncodeOptions(**scalar)))
-
-
-def codings_of_band_2(data):
-    return set(describe_file(data).as_json()["attributes"]["sh2"]["codings"])
-
-
-@pytest.mark.slow
-def test_absent_bands_cost_almost_nothing(make_model):
-    big, sizes, scalar = make_model(6_000, 3), {}, EncodeOptions(sh_coding="scalar")
-    for share in (0.0, 0.95, 1.0):
-        sizes[share] = len(encode(sparse_model(big, share), scalar))
-    full = sizes[0.0] - sizes[1.0]
+        assert {"sparse"} == codings(result.data)
+    assert {"signed"} == codings(encode(make_model(400, 3), EncodeOptions(**scalar)))
+    big, options = make_model(6_000, 3), EncodeOptions(sh_coding="scalar")
+    full, few, none = (len(encode(sparse_model(big, share), options)) for share in (0.0, 0.95, 1.0))
     # One twentieth of the values, and for each of two bands a mask of at most half a bit per splat.
-    assert sizes[0.95] - sizes[1.0] < 0.05 * full + 2 * 6_000 * 0.5 / 8
+    assert few - none < 0.05 * (full - none) + 2 * 6_000 * 0.5 / 8
 
 
 def test_other_packages_import_no_modules_of_the_encoder():

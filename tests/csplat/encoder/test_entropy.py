@@ -41,21 +41,16 @@ def read(stream: bytes) -> tuple[_spec.StreamHead, list[int]]:
 
 
 RNG = np.random.default_rng(0)
-UNSIGNED = {
-    "one": np.array([7]),
-    "zeros": np.zeros(600, np.int64),
-    "long runs": np.repeat([3, 200], [70_000, 300]),
-    "bytes": RNG.integers(0, 255, 300),
-    "two bytes": RNG.integers(0, 65535, 300),
-    "three bytes": RNG.integers(0, 2**24, 300),
-    "seven bytes": RNG.integers(0, 2**51, 300),
-    "ascending": np.sort(RNG.integers(0, 2**48, 300)),
-}
+UNSIGNED = (
+    np.array([7]), np.zeros(600, np.int64), np.repeat([3, 200], [70_000, 300]), RNG.integers(0, 255, 300),
+    RNG.integers(0, 65535, 300), RNG.integers(0, 2**24, 300), RNG.integers(0, 2**51, 300),
+    np.sort(RNG.integers(0, 2**48, 300)),
+)  # fmt: skip
 
 
 @pytest.mark.slow
 def test_unsigned_streams_read_back():
-    for values, library in itertools.product(UNSIGNED.values(), ("libdeflate", "zlib")):
+    for values, library in itertools.product(UNSIGNED, ("libdeflate", "zlib")):
         for mode in ({}, {"delta": True}, {"signed_delta": True}):
             stream = unsigned_stream(values.astype(np.int64), DeflateSettings(6, library), **mode)
             assert bool(values.tolist() == read(stream)[1]), (values[:9], library, mode)
@@ -70,30 +65,23 @@ def test_signed_streams_read_back_at_every_width():
         assert [int(v) % 2 ** (8 * head.width) for v in values] == read_back
 
 
-def test_elements_have_the_smallest_sufficient_width():
-    assert 1 == read(signed_stream(np.array([-128, 127], np.int32), DeflateSettings()))[0].width
-    assert 2 == read(signed_stream(np.array([-129], np.int32), DeflateSettings()))[0].width
+def test_elements_have_the_smallest_sufficient_width_and_constant_planes_cost_a_few_bytes():
+    for values, width in (([-128, 127], 1), ([-129], 2)):
+        assert width == read(signed_stream(np.array(values, np.int32), DeflateSettings()))[0].width
     assert 3 == read(unsigned_stream(np.array([1 << 16]), DeflateSettings()))[0].width
-
-
-def test_a_constant_plane_costs_a_few_bytes():
     assert len(unsigned_stream(np.full(65536, 200), DeflateSettings(1))) <= _spec.STREAM_HEAD_SIZE + 3
 
 
-#: Like the SH of a scene where some splats have none: noise interrupted by runs of zeros.
-NOISE = RNG.integers(-20, 20, 15_000).astype(np.int8)
-CUT = np.where(np.repeat(RNG.random(5_000) < 0.6, 3), np.int8(0), NOISE)
-
-
-def test_run_lengths_are_used_if_smaller():
+def test_run_lengths_are_used_if_smaller_and_by_the_lowest_level():
+    noise = RNG.integers(-20, 20, 15_000).astype(np.int8)
     pairs = np.repeat(RNG.integers(-100, 100, 6_000).astype(np.int8), RNG.integers(1, 4, 6_000))
-    assert _spec.TRANSFORM_RUN_LENGTH in read(signed_stream(pairs, DeflateSettings(12)))[0].transforms
-    assert _spec.TRANSFORM_RUN_LENGTH not in read(signed_stream(NOISE, DeflateSettings(12)))[0].transforms
-
-
-def test_the_lowest_level_finds_runs_and_no_matches_in_noise():
-    assert len(signed_stream(CUT, DeflateSettings(1))) < 1.15 * len(signed_stream(CUT, DeflateSettings(12)))
-    assert len(signed_stream(NOISE, DeflateSettings(1))) < 1.05 * len(signed_stream(NOISE, DeflateSettings(12)))
+    for values, used in ((pairs, True), (noise, False)):
+        assert used == (_spec.TRANSFORM_RUN_LENGTH in read(signed_stream(values, DeflateSettings(12)))[0].transforms)
+    # Like the SH of a scene where some splats have none: noise interrupted by runs of zeros.
+    cut = np.where(np.repeat(RNG.random(5_000) < 0.6, 3), np.int8(0), noise)
+    for values, most in ((cut, 1.15), (noise, 1.05)):
+        low, high = (len(signed_stream(values, DeflateSettings(level))) for level in (1, 12))
+        assert low < most * high
 
 
 def test_unknown_levels_and_libraries_are_refused():

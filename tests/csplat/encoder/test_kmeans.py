@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -13,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import encoded
-from chromium import absent
 from codebooks_cases import exact, few_shapes, scene
 
 import csplat
@@ -33,9 +31,6 @@ from csplat.encoder.quantisation import canonicalise_shape
 from csplat.encoder.shape_codebook import mean_axes, unit_covariances
 from csplat.errors import InputError
 from csplat.model import normalise_quats
-from csplat_conformance.adapter import answer
-from csplat_selftest.decoder_processes import JsDecoder
-from csplat_selftest.fuzzing.decoder_targets import compared
 
 
 def blobs(count=3000, width=9, centres=40, spread=3.0, seed=0):
@@ -61,27 +56,20 @@ def distortion(points, weights, entries, index):
     return float((squares * weights).sum() / weights.sum(dtype=np.float64))
 
 
-def assert_search_is_exact(points, entries):
-    expected = squared_distances(points, entries)
-    index, error = search_nearest(points, entries)
-    assert index.dtype == np.uint32
-    np.testing.assert_array_equal(expected.argmin(1), index)
-    np.testing.assert_array_equal(expected.min(1), error)
-
-
-def test_assign_finds_the_first_nearest_entry():
+def test_search_finds_the_first_nearest_entry():
     rng = np.random.default_rng(1)
-    for entry_count in (1, 2, 300, kmeans._PRODUCT_COLUMNS + 3):
-        points = rng.integers(-3, 4, (200, 4)).astype(np.int16)  # many equal distances
-        assert_search_is_exact(points, rng.integers(-3, 4, (entry_count, 4)).astype(np.int32))
-
-
-def test_search_is_exact_just_below_the_bound():
-    rng = np.random.default_rng(2)
-    points = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
-    entries = points[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)
-    assert kmeans._shift(points, entries) == 0
-    assert_search_is_exact(points, entries)
+    many = rng.integers(-3, 4, (200, 4)).astype(np.int16)  # many equal distances
+    sizes = (1, 2, 300, kmeans._PRODUCT_COLUMNS + 3)
+    cases = [(many, rng.integers(-3, 4, (entry_count, 4)).astype(np.int32)) for entry_count in sizes]
+    wide = (rng.integers(0, 2, (500, 45)) * 690 - 345 + rng.integers(-2, 3, (500, 45))).astype(np.int16)
+    cases.append((wide, wide[:100].astype(np.int32) + rng.integers(-1, 2, (100, 45)).astype(np.int32)))
+    assert kmeans._shift(*cases[-1]) == 0  # just below the bound of exact products
+    for points, entries in cases:
+        expected, (index, error) = squared_distances(points, entries), search_nearest(points, entries)
+        assert index.dtype == np.uint32
+        np.testing.assert_array_equal(expected.argmin(1), index)
+        np.testing.assert_array_equal(expected.min(1), error)
+    assert assign(np.empty((0, 3), np.int16), np.zeros((1, 3), np.int32)).shape == (0,)
 
 
 def test_shift_keeps_every_partial_sum_below_the_bound():
@@ -127,46 +115,43 @@ def test_searching_near_groups_loses_less_than_two_per_cent_and_all_groups_nothi
     np.testing.assert_array_equal(exact, search_nearest(points, entries, near_groups=20)[1])
 
 
-def test_assign_gives_no_index_for_no_points():
-    assert assign(np.empty((0, 3), np.int16), np.zeros((1, 3), np.int32)).shape == (0,)
-
-
-def check_clusters(points, entries, index, size):
-    assert entries.dtype == np.int32
-    assert index.dtype == np.uint32
+def clustered(points, weights, size, *, iterations=3, **options):
+    """Cluster points; assert that the entries are distinct and used."""
+    entries, index = cluster(points, weights, size, seed=0, iterations=iterations, **options)
+    assert (np.int32, np.uint32) == (entries.dtype, index.dtype)
     assert len(index) == len(points)
-    assert len(entries) <= size
-    assert len(np.unique(entries, axis=0)) == len(entries)
+    assert len(np.unique(entries, axis=0)) == len(entries) <= size
     np.testing.assert_array_equal(np.arange(len(entries)), np.unique(index))
+    return entries, index
 
 
 def test_clusters_are_distinct_used_and_close():
     points, weights = blobs()
     for dtype, near_groups in ((np.int16, 0), (np.int32, 0), (np.int16, 5)):
         points = points.astype(dtype)
-        entries, index = cluster(points, weights, 40, seed=0, iterations=6, near_groups=near_groups)
-        check_clusters(points, entries, index, 40)
+        entries, index = clustered(points, weights, 40, iterations=6, near_groups=near_groups)
         assert len(entries) == 40
         assert distortion(points, weights, entries, index) < 2.0 * 9 * 3.0**2
+    points, weights = blobs(2000, 9, 30, 2.0)
+    large = points.astype(np.int32) * 1000  # beyond the exact norm, on a coarser lattice
+    assert distortion(large, weights, *clustered(large, weights, 30, iterations=5)) < 2.0 * 9 * 2000.0**2
 
 
 def test_more_iterations_and_entries_lower_the_distortion():
     points, weights = blobs(spread=30.0)
-
-    def run(size, iterations):
-        found = cluster(points, weights, size, seed=0, iterations=iterations)
-        return distortion(points, weights, *found)
-
-    assert run(64, 10) < run(64, 0)
-    assert run(256, 4) < 0.9 * run(64, 4)
+    few, short, long, many = (
+        distortion(points, weights, *clustered(points, weights, size, iterations=iterations))
+        for size, iterations in ((64, 0), (64, 4), (64, 10), (256, 4))
+    )
+    assert long < few
+    assert many < 0.9 * short
 
 
 def test_first_entries_beat_uniform_ones():
     points, _ = blobs(6000, 9, 200, 2.0)
     points[:4000] = points[0] + np.random.default_rng(4).integers(-2, 3, (4000, 9))
     uniform = points[np.random.default_rng(5).choice(6000, 200, replace=False)].astype(np.int32)
-    entries, index = cluster(points, ones(points), 200, seed=0, iterations=0)
-    found = distortion(points, ones(points), entries, index)
+    found = distortion(points, ones(points), *clustered(points, ones(points), 200, iterations=0))
     assert found < 0.5 * distortion(points, ones(points), uniform, assign(points, uniform))
 
 
@@ -175,24 +160,16 @@ def test_heavy_points_keep_their_values():
     weights = np.full(5000, 1e-12, np.float32)
     heavy = np.arange(0, 5000, 250)
     weights[heavy] = 1e6
-    entries, index = cluster(points, weights, 64, seed=0, iterations=4, sample_per_entry=8)
-    check_clusters(points, entries, index, 64)
+    entries, index = clustered(points, weights, 64, iterations=4, sample_per_entry=8)
     np.testing.assert_array_equal(points[heavy], entries[index[heavy]])
 
 
 def test_weights_matter_by_ratio_and_zeros_are_equal_weights():
     points, weights = blobs(1000)
     for one, same in ((weights, weights * np.float32(2**-40)), (ones(points), 0 * ones(points))):
-        first, second = (cluster(points, each, 30, seed=0, iterations=3) for each in (one, same))
-        np.testing.assert_equal(second, first)
-
-
-def test_few_positive_weights_give_no_unused_entry():
-    points, _ = blobs(500)
-    for positive in (0, 1, 5, 20):
-        weights = np.where(np.arange(500) < positive, np.float32(2.0), np.float32(0.0))
-        entries, index = cluster(points, weights, 16, seed=0, iterations=3, sample_per_entry=2)
-        check_clusters(points, entries, index, 16)
+        np.testing.assert_equal(clustered(points, same, 30), clustered(points, one, 30))
+    for positive in (0, 1, 5, 20):  # few positive weights give no unused entry
+        clustered(points[:500], (np.arange(500) < positive) * np.float32(2.0), 16, sample_per_entry=2)
 
 
 def test_fewer_values_than_entries_are_kept_exactly():
@@ -200,34 +177,21 @@ def test_fewer_values_than_entries_are_kept_exactly():
     for value_count, point_count in ((0, 0), (1, 1), (7, 7), (16, 16), (1, 900), (10, 900)):
         points = values[np.arange(point_count) % max(value_count, 1)]
         for near_groups in (0, 2):
-            entries, index = cluster(points, ones(points), 16, seed=0, iterations=3, near_groups=near_groups)
-            check_clusters(points, entries, index, 16)
+            entries, index = clustered(points, ones(points), 16, near_groups=near_groups)
             assert len(entries) <= max(value_count, 1)
             np.testing.assert_array_equal(points, entries[index])
 
 
-def test_points_beyond_the_exact_norm_are_clustered_on_a_coarser_lattice():
-    points, weights = blobs(2000, 9, 30, 2.0)
-    large = points.astype(np.int32) * 1000
-    entries, index = cluster(large, weights, 30, seed=0, iterations=5)
-    check_clusters(large, entries, index, 30)
-    assert distortion(large, weights, entries, index) < 2.0 * 9 * 2000.0**2
-
-
 def test_invalid_arguments_are_refused():
     points, weights = blobs(50)
-    for bad in (weights[:-1], -weights, weights * np.inf, weights * np.nan):
-        with pytest.raises(InputError, match="weights"):
-            cluster(points, bad, 8, seed=0, iterations=1)
-    for bad in (points.astype(np.float32), points[0], points[:, :0]):
-        with pytest.raises(InputError, match="points"):
-            cluster(bad, weights, 8, seed=0, iterations=1)
-    with pytest.raises(InputError, match="size"):
-        cluster(points, weights, 0, seed=0, iterations=1)
-    with pytest.raises(InputError, match="no entries"):
-        assign(points, np.empty((0, 9), np.int32))
-    with pytest.raises(InputError, match="entries"):
-        assign(points, np.empty((4, 8), np.int32))
+    cases = [(points, bad, 8, "weights") for bad in (weights[:-1], -weights, weights * np.inf, weights * np.nan)]
+    cases += [(bad, weights, 8, "points") for bad in (points.astype(np.float32), points[0], points[:, :0])]
+    for given, by, size, message in (*cases, (points, weights, 0, "size")):
+        with pytest.raises(InputError, match=message):
+            cluster(given, by, size, seed=0, iterations=1)
+    for shape, message in (((0, 9), "no entries"), ((4, 8), "entries")):
+        with pytest.raises(InputError, match=message):
+            assign(points, np.empty(shape, np.int32))
 
 
 def test_ranks_follow_frequency_and_keep_the_order_of_equals():
@@ -268,15 +232,19 @@ def test_refining_reduces_errors_without_unused_entries():
     assert len(moved) == len(np.unique(moved.reshape(len(moved), -1), axis=0))
 
 
-def seen_more(model, seed=1):
+def seen_more(model):
     """Return random weights and matrices."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(1)
     roots = rng.normal(size=(len(model), 6, 3))
     matrices = roots @ roots.transpose(0, 2, 1)
     matrices *= (6 / np.einsum("nii->n", matrices))[:, None, None]
     weights = rng.lognormal(0, 2, len(model))
-    rows, columns = np.triu_indices(6)
-    return Importance(weights, weights, None, matrices[:, rows, columns])
+    return Importance(weights, weights, None, triangles(matrices))
+
+
+def triangles(matrices):
+    rows, columns = np.triu_indices(matrices.shape[1])
+    return matrices[:, rows, columns]
 
 
 def books(data):
@@ -287,11 +255,8 @@ def books(data):
 def test_shape_codebooks_make_files_smaller_within_declared_errors(make_model):
     model = few_shapes(make_model, 1200)
     for importance, tile_splats, escapes in (
-        (None, 65536, None),
-        (None, 500, 0.0),
-        (seen_more(model), 65536, 0.3),
-        (seen_more(model), 500, None),
-    ):
+        (None, 65536, None), (None, 500, 0.0), (seen_more(model), 65536, 0.3), (seen_more(model), 500, None),
+    ):  # fmt: skip
         options = {"sh_coding": "none", "tile_splats": tile_splats}
         plain = encode_with_report(model, EncodeOptions(**options), importance=importance)
         result, _ = encoded(model, importance, shape_codebook_size=64, shape_escape_fraction=escapes, **options)
@@ -312,8 +277,7 @@ def test_a_shape_codebook_never_makes_a_file_larger(make_model):
 def test_splats_of_one_shape_share_an_entry(make_model):
     model = few_shapes(make_model, 1000, 1)
     result, decoded = encoded(model, shape_codebook_size=1, shape_escape_fraction=0.0, sh_coding="none")
-    rotations = {tuple(row) for row in decoded.quats}
-    assert 1 == len(rotations)
+    assert 1 == len({tuple(row) for row in decoded.quats})
     trace = [0.5 * np.log(np.exp(2.0 * m.scales.astype(np.float64)).sum(axis=1)) for m in (model, decoded)]
     step = result.report.options["scale_step"]
     assert np.abs(trace[0][result.source_index] - trace[1]).max() <= 0.5 * step * (1 + 1e-6)
@@ -323,12 +287,12 @@ def test_important_shapes_have_smaller_errors(make_model):
     model = make_model(3000, 0)
     heavy = np.arange(3000) % 10 == 0
     importance = Importance(np.ones(3000), np.where(heavy, 1.0, 1e-4))
-    options = {"shape_codebook_size": 100, "shape_escape_fraction": 0.0}
-    result, decoded = encoded(model, importance, **options)
-    errors = covariance_entries(decoded.quats.T, np.exp(2.0 * decoded.scales.T.astype(np.float64)))
+    result, decoded = encoded(model, importance, shape_codebook_size=100, shape_escape_fraction=0.0)
     source = model.select(result.source_index)
-    wanted = covariance_entries(source.quats.T, np.exp(2.0 * source.scales.T.astype(np.float64)))
-    relative = np.linalg.norm(errors - wanted, axis=0) / np.linalg.norm(wanted, axis=0)
+    found, wanted = (
+        covariance_entries(one.quats.T, np.exp(2.0 * one.scales.T.astype(np.float64))) for one in (decoded, source)
+    )
+    relative = np.linalg.norm(found - wanted, axis=0) / np.linalg.norm(wanted, axis=0)
     chosen = heavy[result.source_index]
     assert np.median(relative[chosen]) < 0.8 * np.median(relative[~chosen])
 
@@ -363,22 +327,17 @@ def digests(threads):
         entries, index = cluster(scaled, weights, 100, seed=7, iterations=3, near_groups=near_groups, threads=threads)
         made.append(entries.tobytes() + index.tobytes())
     rng, n = np.random.default_rng(4), 1200
-    normal = lambda *shape: rng.standard_normal((n, *shape)).astype(np.float32)  # noqa: E731
-    model = csplat.SplatModel(means=normal(3), quats=normalise_quats(normal(4)), scales=normal(3) - 4,
-        opacities=rng.random(n).astype(np.float32), sh0=normal(3), shN=normal(8, 3))  # fmt: skip
-
-    def matrices(size):
-        roots = rng.normal(size=(n, size, 3))
-        rows, columns = np.triu_indices(size)
-        return (roots @ roots.transpose(0, 2, 1) / 3)[:, rows, columns]
-
-    options = EncodeOptions(
-        sh_coding="codebook", codebook_size=64, shape_codebook_size=150, tile_splats=800, threads=threads
-    )
-    for importance in (Importance(rng.random(n), rng.random(n), matrices(8), matrices(6)), None):
+    shapes = {"means": (3,), "quats": (4,), "scales": (3,), "sh0": (3,), "shN": (8, 3)}
+    fields = {name: rng.standard_normal((n, *shape)).astype(np.float32) for name, shape in shapes.items()}
+    fields |= {"quats": normalise_quats(fields["quats"]), "opacities": rng.random(n).astype(np.float32)}
+    model = csplat.SplatModel(**fields)
+    sizes = {"codebook_size": 64, "shape_codebook_size": 150}
+    options = EncodeOptions(sh_coding="codebook", tile_splats=800, threads=threads, **sizes)
+    roots = [rng.normal(size=(n, size, 3)) for size in (8, 6)]
+    matrices = [triangles(one @ one.transpose(0, 2, 1) / 3) for one in roots]
+    for importance in (Importance(rng.random(n), rng.random(n), *matrices), None):
         result = encode_with_report(model, options, importance=importance)
-        assert result.report.options["codebook_size"]
-        assert result.report.options["shape_codebook_size"]
+        assert all(result.report.options[name] for name in sizes)
         made.append(result.data)
     return [hashlib.sha256(one).hexdigest() for one in made]
 
@@ -391,19 +350,3 @@ def test_threads_of_csplat_and_blas_do_not_change_the_bytes():
     command = [sys.executable, "-c", f"{code}; print(m['digests'](3))"]
     other = subprocess.run(command, env={**os.environ, **environment}, capture_output=True, text=True, check=True)
     assert digests(1) == digests(2) == ast.literal_eval(other.stdout)
-
-
-@pytest.mark.slow
-def test_the_javascript_decoder_reads_shape_codebooks(make_model):
-    if shutil.which("node") is None:
-        absent("the JavaScript decoder needs Node.js, which is not installed")
-    model = few_shapes(make_model, 600, degree=2)
-    importance = seen_more(model)
-    with JsDecoder() as decoder:
-        for options in (
-            {"shape_escape_fraction": 0.3, "tile_splats": 250},
-            {"shape_escape_fraction": 0.0, "sh_coding": "codebook", "codebook_size": 16},
-        ):
-            result, _ = encoded(model, importance, shape_codebook_size=40, **options)
-            assert books(result.data)
-            assert ("decoded", "") == compared(answer(result.data), decoder.ask(result.data), "JavaScript"), options

@@ -10,15 +10,9 @@ from checked import encoded
 from codebooks_cases import exact, few_shapes, scene
 from quantisation_cases import COUNT, important, unequal
 
-from csplat.encoder import (
-    EncodeOptions,
-    Importance,
-    encode_with_report,
-)
+from csplat.encoder import EncodeOptions, Importance, encode_with_report
 from csplat.encoder.coding_parameters import choose_parameters
-from csplat.encoder.kmeans import (
-    refine_by_metric,
-)
+from csplat.encoder.kmeans import refine_by_metric
 from csplat.encoder.splat_importance import (
     CLASSED_ATTRIBUTES,
     ErrorMetric,
@@ -59,19 +53,16 @@ def model(make_model):
 
 
 def test_twice_the_step_gives_four_times_the_error(model):
-    curvatures = unequal(model)
-    fine, coarse = (
-        rounding_errors(model, curvatures, choose_parameters(model, EncodeOptions(**options), importance_given=True))
-        for options in (
-            {"position_step": 0.01, "scale_step": 0.01, "sh0_step": 0.01, "quat_levels": 200, "opacity_levels": 200},
-            {"position_step": 0.02, "scale_step": 0.02, "sh0_step": 0.02, "quat_levels": 100, "opacity_levels": 100},
-        )
-    )
+    def errors(step, levels):
+        steps = dict.fromkeys(("position_step", "scale_step", "sh0_step"), step)
+        options = EncodeOptions(**steps, quat_levels=levels, opacity_levels=levels)
+        return rounding_errors(model, unequal(model), choose_parameters(model, options, importance_given=True))
+
     bright = model.opacities > 0.01
-    np.testing.assert_allclose(coarse[bright], 4.0 * fine[bright], rtol=1e-5)
+    np.testing.assert_allclose(errors(0.02, 100)[bright], 4.0 * errors(0.01, 200)[bright], rtol=1e-5)
 
 
-def test_classes_have_steps_of_their_own(model):
+def test_classes_have_steps_of_their_own_except_for_explicit_options(model):
     result, _ = encoded(model, important(model))
     classes = result.report.options["classes"]
     assert sum(classes["splats"]) == COUNT
@@ -80,6 +71,12 @@ def test_classes_have_steps_of_their_own(model):
         assert min(classes[name]) == (1 if name in ("opacities", "quats") else 0)
     assert any(max(classes[name]) > 1 for name in CLASSED_ATTRIBUTES)
     assert result.report.notes == ()
+    result, _ = encoded(model, important(model), scale_step=0.01, opacity_levels=100, position_bits=12)
+    said = result.report.options
+    assert (said["scale_step"], said["opacity_levels"]) == (float(np.float32(0.01)), 100)
+    assert set(said["classes"]["scales"]) == set(said["classes"]["means"]) == {0}
+    assert set(said["classes"]["opacities"]) == {1}
+    assert max(said["classes"]["sh0"]) > 0
 
 
 def test_important_splats_have_smaller_errors(model):
@@ -93,34 +90,21 @@ def test_important_splats_have_smaller_errors(model):
         assert errors[order[-COUNT // 10 :]].mean() < 0.75 * errors[order[: COUNT // 10]].mean(), name
 
 
-def test_explicit_options_apply_to_all_classes(model):
-    result, _ = encoded(model, important(model), scale_step=0.01, opacity_levels=100, position_bits=12)
-    said = result.report.options
-    assert (said["scale_step"], said["opacity_levels"]) == (float(np.float32(0.01)), 100)
-    assert set(said["classes"]["scales"]) == set(said["classes"]["means"]) == {0}
-    assert set(said["classes"]["opacities"]) == {1}
-    assert max(said["classes"]["sh0"]) > 0
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("options", [{"max_classes": 1}, {"shape_codebook_size": 16}])
-def test_one_class_equals_an_encoding_without_blocks(model, options):
-    with_them, without = important(model), Importance(np.ones(COUNT))
-    assert encoded(model, with_them, **options)[0].data == encoded(model, without, **options)[0].data
-
-
-def test_small_scenes_equal_blocks_and_the_preset_fast_have_one_class(model):
+def test_small_scenes_equal_blocks_and_some_options_give_one_class(model):
+    for options in ({"max_classes": 1}, {"shape_codebook_size": 16}):
+        one, other = (encoded(model, by, **options)[0] for by in (important(model), Importance(np.ones(COUNT))))
+        assert one.data == other.data
     few = model.select(slice(200))
     zeros = GaussNewtonBlocks(np.zeros(COUNT), np.zeros((COUNT, 21)), np.zeros(COUNT), np.zeros(COUNT))
-    for one, importance, options in (
-        (few, important(few), {}),
-        (model, Importance(np.ones(COUNT), blocks=zeros), {}),
-        (model, important(model), {"preset": "fast"}),
+    for splats, importance, options, count in (
+        (few, important(few), {}, 0),
+        (model, Importance(np.ones(COUNT), blocks=zeros), {}, 0),
+        (model, important(model), {"preset": "fast"}, 0),
+        (model, important(model), {"preset": "fast", "max_classes": 2}, 2),
     ):
-        result = encode_with_report(one, EncodeOptions(**options), importance=importance)
-        assert "classes" not in result.report.options
-    result = encode_with_report(model, EncodeOptions(preset="fast", max_classes=2), importance=important(model))
-    assert len(result.report.options["classes"]["splats"]) == 2
+        result = encode_with_report(splats, EncodeOptions(**options), importance=importance)
+        assert count == len(result.report.options.get("classes", {}).get("splats", ())), options
 
 
 def test_outliers_get_tiles_of_their_own(model):
@@ -128,8 +112,7 @@ def test_outliers_get_tiles_of_their_own(model):
     sh0[5] = 3e12
     exploded = replace(model, sh0=sh0)
     result, decoded = encoded(exploded, important(exploded))
-    place = np.argsort(result.source_index)
-    errors = np.abs(decoded.sh0[place] - sh0).max(axis=1)
+    errors = np.abs(decoded.sh0[np.argsort(result.source_index)] - sh0).max(axis=1)
     assert np.delete(errors, 5).max() < 5.0  # the step of the coarsest class, not that of 3e12
 
 
@@ -138,8 +121,7 @@ def test_scenes_and_steps_of_any_size_are_encoded(model):
     for factor in (1e-30, 1e22, 1e37):
         scaled = replace(model, means=(model.means * np.float32(factor)).astype(np.float32))
         encoded(scaled, important(scaled))
-    result, _ = encoded(model, important(model), position_step=1e200)
-    assert result.report.options["position_step"] == 1e200
+    assert encoded(model, important(model), position_step=1e200)[0].report.options["position_step"] == 1e200
 
 
 def test_measured_weights_have_a_floor(model):
