@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import flipped, refusals
+from formats_cases import same, zip_of
 from tables import failures
 
 import csplat
@@ -29,8 +30,7 @@ RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
 
 def webp(pixels, *, lossless=True):
     buffer = io.BytesIO()
-    image = Image.fromarray(pixels, "RGBA" if pixels.shape[2] == 4 else "RGB")
-    image.save(buffer, "WEBP", lossless=lossless, exact=True)
+    Image.fromarray(pixels, "RGBA").save(buffer, "WEBP", lossless=lossless, exact=True)
     return buffer.getvalue()
 
 
@@ -43,29 +43,22 @@ def splats(version=2, sh=True):
     names = ("means_l", "means_u", "quats", "scales", "sh0")
     pictures = {f"{name}.webp": pixels(seed) for seed, name in enumerate(names)}
     pictures["quats.webp"][..., 3] = 252 + np.arange(16).reshape(4, 4) % 4
-    meta = {
-        "means": {"mins": [-1, 0, 2.5], "maxs": [1, 0, 3], "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"files": ["scales.webp"]},
-        "quats": {"files": ["quats.webp"]},
-        "sh0": {"files": ["sh0.webp"]},
-    }
+    meta = {name: {"files": [f"{name}.webp"]} for name in ("scales", "quats", "sh0")}
+    meta["means"] = {"mins": [-1, 0, 2.5], "maxs": [1, 0, 3], "files": ["means_l.webp", "means_u.webp"]}
     if version == 2:
         meta |= {"version": 2, "count": COUNT, "model": "antialiased"}
         meta["scales"]["codebook"] = [index / 16 - 12 for index in range(256)]
         meta["sh0"]["codebook"] = [index / 64 - 2 for index in range(256)]
+        rest = {"count": 64, "bands": 1, "codebook": [index / 128 - 1 for index in range(256)]}
     else:
         meta["means"]["shape"] = [COUNT, 3]
         meta["scales"] |= {"mins": [-9, -8, -7], "maxs": [-3, -2, -1]}
         meta["sh0"] |= {"mins": [-2, -1, 0, -5], "maxs": [2, 1, 3, 5]}
+        rest = {"mins": -0.5, "maxs": 0.5}
     if sh:
-        pictures["palette.webp"] = pixels(7, (1, 192))
-        pictures["labels.webp"] = pixels(8)
+        pictures |= {"palette.webp": pixels(7, (1, 192)), "labels.webp": pixels(8)}
         pictures["labels.webp"][..., :2] = [63, 0]
-        meta["shN"] = {"files": ["palette.webp", "labels.webp"]}
-        if version == 2:
-            meta["shN"] |= {"count": 64, "bands": 1, "codebook": [index / 128 - 1 for index in range(256)]}
-        else:
-            meta["shN"] |= {"mins": -0.5, "maxs": 0.5}
+        meta["shN"] = {"files": ["palette.webp", "labels.webp"], **rest}
     return meta, pictures
 
 
@@ -74,9 +67,7 @@ def files_of(meta, pictures):
 
 
 def zipped(path, files, folder="", how=zipfile.ZIP_STORED):
-    with zipfile.ZipFile(path, "w", how) as archive:
-        for name, data in files.items():
-            archive.writestr(folder + name, data)
+    path.write_bytes(zip_of([(folder + name, data) for name, data in files.items()], how))
     return path
 
 
@@ -85,12 +76,6 @@ def foldered(path, files):
         (path / name).parent.mkdir(parents=True, exist_ok=True)
         (path / name).write_bytes(data)
     return path
-
-
-def means_of(pictures):
-    low, high = (pictures[f"means_{end}.webp"].reshape(-1, 4)[:COUNT, :3].astype(float) for end in "lu")
-    logs = [-1, 0, 2.5] + (low + 256 * high) / 65535 * [2, 0, 0.5]
-    return np.sign(logs) * (np.exp(np.abs(logs)) - 1)
 
 
 @pytest.mark.parametrize("version", [1, 2])
@@ -106,7 +91,9 @@ def test_both_versions_are_read(tmp_path, version):
         scales, shN = scales / 255 * 6 + [-9, -8, -7], palette / 255 - 0.5
         sh0 = colours[:, :3] / 255 * [4, 2, 3] - [2, 1, 0]
         opacities = 1 / (1 + np.exp(5 - colours[:, 3] / 25.5))
-    np.testing.assert_allclose(model.means, means_of(pictures), rtol=1e-6, atol=1e-9)
+    low, high = (flat[f"means_{end}.webp"][:, :3] for end in "lu")
+    logs = [-1, 0, 2.5] + (low + 256 * high) / 65535 * [2, 0, 0.5]
+    np.testing.assert_allclose(model.means, np.sign(logs) * np.expm1(np.abs(logs)), rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(model.scales, scales, rtol=1e-6)
     np.testing.assert_allclose(model.sh0, sh0, atol=1e-6)
     np.testing.assert_allclose(model.opacities, opacities, rtol=1e-5)
@@ -121,9 +108,9 @@ def test_folder_json_and_zip_give_the_same_scene(tmp_path):
     files = files_of(*splats())
     folder = foldered(tmp_path / "a", files)
     paths = [folder, folder / "meta.json", zipped(tmp_path / "b", files, "inside/", zipfile.ZIP_DEFLATED)]
-    models = [csplat.read(path) for path in paths]
     assert ["sog"] * 3 == [detect_format(path).name for path in paths]
-    assert all((one.means == models[0].means).all() and (one.shN == models[0].shN).all() for one in models)
+    for path in paths[1:]:
+        same(csplat.read(folder), csplat.read(path))
 
 
 def test_tags_of_rotations_and_the_first_entry_of_a_codebook_may_be_missing(tmp_path):
@@ -175,33 +162,28 @@ def test_levels_of_streamed_sog_become_nodes_of_a_file(tmp_path):
         assert all(node.error > 0 for node in file.nodes if node.level)
 
 
-def test_a_part_without_a_level_uses_its_nearest(tmp_path):
-    one = {"1": {"file": 0, "offset": 0, "count": 5}}
-    two = {"0": {"file": 1, "offset": 1, "count": 3}}
-    path = levels(tmp_path, tree={"children": [{"lods": one}, {"lods": two}]})
-    for level in (0, 1):
-        with open_scene(path, level=level) as scene:
-            assert [0] * 5 + [1] * 3 + [3] * 5 == scene.model().sh0[:, 0].tolist()
+def files_read(path, level):
+    """Return the file of `levels` from which each splat comes, by its first colour."""
+    with open_scene(path, level=level) as scene:
+        return scene.model().sh0[:, 0].tolist()
 
 
-def test_the_finest_level_is_read_by_default(tmp_path):
-    path = levels(tmp_path)
+def test_a_level_is_read_with_the_nearest_of_parts_without_it(tmp_path):
+    path, finest = levels(tmp_path), [0] * 5 + [1] * 3 + [3] * 5
     for place in (path, path / "lod-meta.json"):
-        with open_scene(place) as scene:
-            model = scene.model()
-            assert (13, 1, True) == (scene.count, model.sh_degree, model.antialiased)
-            assert [0] * 5 + [1] * 3 + [3] * 5 == model.sh0[:, 0].tolist()
-            assert not model.shN[:5].any()
-            assert model.shN[5:8].any()
-            assert (13, 10) == scene.levels
-        with open_scene(place, level=1) as scene:
-            assert [2] * 5 + [3] * 5 == scene.model().sh0[:, 0].tolist()
-            assert (13, 10) == scene.levels
-    with pytest.raises(InputError, match="level is 2, expected 0 to 1"), open_scene(path, level=2):
-        pass
+        assert (finest, [2] * 5 + [3] * 5) == (files_read(place, 0), files_read(place, 1))
+    with open_scene(path) as scene:
+        model = scene.model()
+        assert (13, (13, 10), 1, True) == (scene.count, scene.levels, model.sh_degree, model.antialiased)
+    assert [5, 6, 7] == np.flatnonzero(model.shN.any(axis=(1, 2))).tolist()
+    with pytest.raises(InputError, match="level is 2, expected 0 to 1"):
+        files_read(path, 2)
     (path / "env" / "meta.json").unlink()
     with pytest.raises(InputError, match=r"there is no env/meta\.json"):
         csplat.read(path)
+    one, two = {"1": {"file": 0, "offset": 0, "count": 5}}, {"0": {"file": 1, "offset": 1, "count": 3}}
+    path = levels(tmp_path, tree={"children": [{"lods": one}, {"lods": two}]})
+    assert finest == files_read(path, 0) == files_read(path, 1)
 
 
 def all_of(folder):
@@ -217,74 +199,69 @@ def test_levels_in_a_zip_equal_those_in_a_folder(tmp_path, within):
     path = zipped(tmp_path / "a.zip", {within + name: data for name, data in all_of(folder).items()} | junk)
     for level in (0, 1):
         with open_scene(path, level=level) as scene, open_scene(folder, level=level) as expected:
-            assert (expected.count, expected.levels) == (scene.count, scene.levels)
-            assert np.array_equal(expected.model().means, scene.model().means)
+            assert expected.levels == scene.levels
+            same(expected.model(), scene.model())
 
 
 def test_zips_of_several_scenes_and_of_other_programs_are_refused(tmp_path):
     folder, other = levels(tmp_path), files_of(*splats())
-    first = (folder / "lod-meta.json").read_bytes()
+    files = all_of(folder)
+    nested = files | {"lod-meta.json": files["lod-meta.json"].replace(b"0_0/meta.json", b"0_0.sog")}
+    within = {name: data for name, data in nested.items() if name != "0_0/meta.json"}
     foreign = {"meta.json": b'{"app": "a scanner"}', "room.ply": b"ply"}
     not_sog = "meta.json is not the one of SOG, which has means, quats, scales, sh0; .*"
-    within = {"lod-meta.json": first.replace(b"0_0/meta.json", b"0_0.sog"), "0_0/meta.json": None}
-    scene = {f"a/{name}": data for name, data in other.items()}
-    for files, message in (
-        ({f"{one}/{name}": data for one in ("one", "two") for name, data in other.items()},
-            r"2 scenes, expected one \(one/meta.json, two/meta.json\): unpack it"),
-        ({f"b/{name}": data for name, data in other.items()} | all_of(folder), r"2 scenes, .*b/meta.json, lod-meta"),
-        (all_of(folder) | {"lod-meta.json": within["lod-meta.json"]}, r"0_0/meta.json, lod-meta.json"),
-        (all_of(folder) | within, r"0_0.sog is a zip within a zip: unpack a.zip"),
+    scene, again = ({f"{place}/{name}": data for name, data in other.items()} for place in ("a", "b"))
+    for contents, message in (
+        (scene | again, r"2 scenes, expected one \(a/meta.json, b/meta.json\): unpack it"),
+        (again | files, r"2 scenes, .*b/meta.json, lod-meta"),
+        (nested, r"0_0/meta.json, lod-meta.json"),
+        (within, r"0_0.sog is a zip within a zip: unpack a.zip"),
         ({"lod-meta.json": b'{"filenames": 3}', "x/meta.json": b"{}"}, "2 scenes"),
         (scene | {"scene.ply": b"ply"}, r"it contains 2 scenes, expected one \(a/meta.json, scene.ply\)"),
         (foreign, not_sog + r"a zip that contains room\.ply: unzip it"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(InputError, match=message):
-            csplat.read(zipped(tmp_path / "a.zip", {name: data for name, data in files.items() if data is not None}))
+            csplat.read(zipped(tmp_path / "a.zip", contents))
     report = []
     assert COUNT == len(csplat.read(zipped(tmp_path / "a.zip", {**scene, "a/b/scene.PLY": b"ply"}), report=report))
-    assert [("other-scenes", "note", "the zip also holds a/b/scene.PLY: not read")] == [
-        (one.id, one.kind, one.text) for one in report
-    ]
+    assert [("note", "the zip also holds a/b/scene.PLY: not read")] == [(one.kind, one.text) for one in report]
     with pytest.raises(InputError, match=not_sog + r"a folder, not a scene: name room\.ply"):
         csplat.read(foldered(tmp_path / "foreign", foreign))
     foldered(folder, other)
     with pytest.raises(InputError, match=r"lod-meta.json, meta.json\): name one of these files"):
         csplat.read(folder)
-    assert COUNT == len(csplat.read(folder / "meta.json"))
-    assert 13 == len(csplat.read(folder / "lod-meta.json"))
+    assert [COUNT, 13] == [len(csplat.read(folder / name)) for name in ("meta.json", "lod-meta.json")]
 
 
 def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
     folder = levels(tmp_path, filenames=[rf"{name}\meta.json" for name in ("0_0", "0_1", "1_0")])
-    for path in (folder, zipped(tmp_path / "a.zip", all_of(folder))):
-        report = []
-        assert 13 == len(csplat.read(path, report=report))
-        assert ["backslashes in filenames, read as slashes"] == [one.text for one in report]
     files = files_of(*splats())
-    expected = csplat.read(zipped(tmp_path / "a.sog", files))
     loud = {name.upper() if name == "meta.json" else name: data for name, data in files.items()}
-    for name, found, folder, message in (
-        ("b.zip", files, "scene\\", "backslashes in the names of the zip, read as slashes"),
-        ("c.sog", loud, "", "META.JSON is read as meta.json"),
-        ("d.zip", loud, "scene/", "META.JSON is read as meta.json"),
+    slashes, capitals = "backslashes in {}, read as slashes", "META.JSON is read as meta.json"
+    for path, message in (
+        (folder, slashes.format("filenames")),
+        (zipped(tmp_path / "a.zip", all_of(folder)), slashes.format("filenames")),
+        (zipped(tmp_path / "b.zip", files, "scene\\"), slashes.format("the names of the zip")),
+        (zipped(tmp_path / "c.sog", loud), capitals),
+        (zipped(tmp_path / "d.zip", loud, "scene/"), capitals),
     ):
         report = []
-        model = csplat.read(zipped(tmp_path / name, found, folder), report=report)
-        assert np.array_equal(expected.means, model.means)
-        assert [("zip-names", "note", message)] == [(one.id, one.kind, one.text) for one in report]
-    with pytest.raises(InputError, match="2 scenes"):
-        csplat.read(zipped(tmp_path / "e.sog", {**files, "META.JSON": files["meta.json"]}))
+        model = csplat.read(path, report=report)
+        assert [("note", message)] == [(one.kind, one.text) for one in report]
+        assert (13 if "filenames" in message else COUNT) == len(model)
     two = {**{name: data for name, data in files.items() if name != "sh0.webp"}, "SH0.webp": b"", "Sh0.webp": b""}
-    with pytest.raises(InputError, match=r"SH0\.webp and Sh0\.webp would both be sh0\.webp"):
-        csplat.read(zipped(tmp_path / "f.sog", two))
+    for contents, message in (
+        ({**files, "META.JSON": files["meta.json"]}, "2 scenes"),
+        (two, r"SH0\.webp and Sh0\.webp would both be sh0\.webp"),
+    ):
+        with pytest.raises(InputError, match=message):
+            csplat.read(zipped(tmp_path / "e.sog", contents))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("changes", "message"), [
-    ({"version": 2}, "version 2 of streamed"),
-    ({"tree": {"lods": 3}}, "not an object"),
-    ({"filenames": ["../a", "b", "c"]}, "outside"),
-    ({"filenames": []}, "integer from 0"),
+    ({"version": 2}, "version 2 of streamed"), ({"tree": {"lods": 3}}, "not an object"),
+    ({"filenames": ["../a", "b", "c"]}, "outside"), ({"filenames": []}, "integer from 0"),
     ({"tree": {"children": 3}}, "not a list"),
     ({"tree": {"lods": {"0": {"file": 0, "offset": 4, "count": 2}}}}, "up to 6"),
     ({"tree": {"lods": {"x": {"file": 0, "offset": 4, "count": 2}}}}, "level is 'x'"),
@@ -295,18 +272,18 @@ def test_inconsistent_levels_are_refused(tmp_path, changes, message):
         csplat.read(levels(tmp_path, **changes))
 
 
-def changed(path, value, version=2, **pictures):
+def changed(path, value, version=2):
     meta, more = splats(version)
     place = meta
     for key in path[:-1]:
         place = place[key]
-    if path and value is None:
+    place[path[-1]] = value
+    if value is None:
         del place[path[-1]]
-    elif path:
-        place[path[-1]] = value
-    return {**files_of(meta, more), **{f"{name}.webp": data for name, data in pictures.items()}}
+    return files_of(meta, more)
 
 
+GOOD = files_of(*splats())
 BAD = {
     "a later version": (changed(["version"], 3), "version 3"),
     "more splats than pixels": (changed(["count"], 17), "pixels"),
@@ -325,7 +302,7 @@ BAD = {
     "places beyond float32": (changed(["means", "maxs"], [0, 0, 300]), "float32"),
     "bounds the wrong way round": (changed(["means", "mins"], [9, 9, 9]), "means has mins 9, expected at most maxs"),
     "bounds of version 1 the wrong way round": (changed(["scales", "mins"], [9, 9, 9], 1), "scales has mins 9"),
-    "a pointer for a picture": (changed([], 0, quats=b"version https://git-lfs.github.com/spec/v1\noid"),
+    "a pointer for a picture": (GOOD | {"quats.webp": b"version https://git-lfs.github.com/spec/v1\noid"},
         "quats.webp is a pointer of"),
     "a list for an object": (changed(["means"], []), "means mins is missing"),
     "a short codebook": (changed(["scales", "codebook"], [1.0]), "codebook is shorter"),
@@ -335,16 +312,15 @@ BAD = {
     "SH of another degree": (changed(["shN", "bands"], 2), "192 x 1 pixels"),
     "a small palette": (changed(["shN", "count"], 63), "SH label 63 in a palette of 63"),
     "a large palette": (changed(["shN", "count"], 65), "192 x 1 pixels"),
-    "pictures of two sizes": (changed([], 0, quats=webp(pixels(1, (8, 4)))), "4 x 8 pixels"),
-    "far too many pixels": (changed([], 0, means_l=webp(np.zeros((900, 900, 4), np.uint8))), "900 x 900"),
-    "a text for a picture": (changed([], 0, means_l=b"no picture"), "means_l.webp is not an image"),
-    "a lossy picture": (changed([], 0, scales=webp(pixels(3), lossless=False)),
-        "scales.webp is a lossy WebP, expected"),
-    "half a picture": (changed([], 0, means_l=webp(pixels(0))[:50]), "means_l.webp is a WebP that is damaged"),
-    "brackets": (changed([], 0) | {"meta.json": b"[" * 100_000}, "nested too deep"),
-    "no JSON": (changed([], 0) | {"meta.json": b"{"}, "not JSON"),
-    "not an object": (changed([], 0) | {"meta.json": b"3"}, "is missing"),
-    "no UTF-8": (changed([], 0) | {"meta.json": b"\xff\xff\xff"}, "not JSON"),
+    "pictures of two sizes": (GOOD | {"quats.webp": webp(pixels(1, (8, 4)))}, "4 x 8 pixels"),
+    "far too many pixels": (GOOD | {"means_l.webp": webp(np.zeros((900, 900, 4), np.uint8))}, "900 x 900"),
+    "a text for a picture": (GOOD | {"means_l.webp": b"no picture"}, "means_l.webp is not an image"),
+    "a lossy picture": (GOOD | {"scales.webp": webp(pixels(3), lossless=False)}, "scales.webp is a lossy WebP, expe"),
+    "half a picture": (GOOD | {"means_l.webp": webp(pixels(0))[:50]}, "means_l.webp is a WebP that is damaged"),
+    "brackets": (GOOD | {"meta.json": b"[" * 100_000}, "nested too deep"),
+    "no JSON": (GOOD | {"meta.json": b"{"}, "not JSON"),
+    "not an object": (GOOD | {"meta.json": b"3"}, "is missing"),
+    "no UTF-8": (GOOD | {"meta.json": b"\xff\xff\xff"}, "not JSON"),
 }  # fmt: skip
 
 
@@ -355,15 +331,13 @@ def test_inconsistent_files_are_refused(tmp_path):
             csplat.read(zipped(tmp_path / "a.sog", files))
 
     assert [] == failures(BAD, check)
-    path = tmp_path / "a.sog"
-    data = path.read_bytes()
+    path, data = tmp_path / "b.sog", zip_of(GOOD.items())
     for size in (len(data) // 2, len(data) - 5):
         path.write_bytes(data[:size])
-        with pytest.raises(InputError, match=r"a\.sog: a damaged zip: its end is missing, .*: copy or download it aga"):
+        with pytest.raises(InputError, match=r"b\.sog: a damaged zip: its end is missing, .*: copy or download it aga"):
             csplat.read(path)
-    bomb = files_of(*splats()) | {"meta.json": b" " * 30_000_000}
     with pytest.raises(InputError, match="unpacked size of 30,000,000"):
-        csplat.read(zipped(path, bomb, how=zipfile.ZIP_DEFLATED))
+        csplat.read(zipped(path, GOOD | {"meta.json": b" " * 30_000_000}, how=zipfile.ZIP_DEFLATED))
 
 
 @pytest.mark.slow
@@ -389,43 +363,36 @@ def assert_within_a_step(model, back, means):
         assert np.sqrt(np.mean((getattr(model, name) - getattr(back, name)) ** 2)) < most
 
 
-def test_written_files_read_back_within_a_step(tmp_path, make_model):
-    model = make_model(600, 1, antialiased=True)
-    csplat.write(tmp_path / "a.sog", model)
-    back = csplat.read(tmp_path / "a.sog")
+@pytest.mark.slow
+def test_written_files_read_back_within_a_step_and_equal_a_folder(tmp_path, make_model):
+    model, path, folder = make_model(600, 1, antialiased=True), tmp_path / "a.sog", tmp_path / "c"
+    csplat.write(path, model)
+    csplat.write(folder / "meta.json", model)
+    back, first = csplat.read(path), path.read_bytes()
     assert back.antialiased
     rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
     assert 600 == len(set(rows))
     # Half of the largest step: 65,535 steps divide the logarithms.
     reach = np.abs(model.means.astype(float)).max()
     assert_within_a_step(model.select(rows), back, np.log1p(reach) / 65535 * (1 + reach))
+    with zipfile.ZipFile(path) as archive:
+        assert all_of(folder) == {name: archive.read(name) for name in archive.namelist()}
+    csplat.write(path, model)
+    assert first == path.read_bytes()
+    csplat.write(path, replace(model, antialiased=False, flat=True))
+    assert csplat.read(path).flat
 
 
 @pytest.mark.slow
-def test_zip_and_folder_have_the_same_bytes(tmp_path, make_model):
-    model = make_model(300, 2, flat=True)
-    for name in ("a.sog", "b.sog", "c/meta.json"):
-        csplat.write(tmp_path / name, model)
-    assert (tmp_path / "a.sog").read_bytes() == (tmp_path / "b.sog").read_bytes()
-    with zipfile.ZipFile(tmp_path / "a.sog") as archive:
-        assert {name: archive.read(name) for name in archive.namelist()} == {
-            one.name: one.read_bytes() for one in (tmp_path / "c").iterdir()
-        }
-    assert csplat.read(tmp_path / "c").flat
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("count", "degree", "fields"), [
-    (0, 3, {}), (1, 0, {}), (1, 3, {}), (17, 1, {}), (3, 0, {"means": np.full((3, 3), 2.5, np.float32)}),
-])  # fmt: skip
-def test_few_splats_are_written_and_read(tmp_path, make_model, count, degree, fields):
-    model = make_model(count, degree, **fields)
-    csplat.write(tmp_path / "a.sog", model)
-    back = csplat.read(tmp_path / "a.sog")
-    assert (count, degree if count else 0) == (len(back), back.sh_degree)
-    for name in ("means", "scales", "sh0", "shN") if count else ():
-        wanted, found = (np.sort(getattr(one, name).reshape(count, -1), 0) for one in (model, back))
-        np.testing.assert_allclose(wanted, found, atol=1e-3 if name == "shN" else 1e-4)
+def test_few_splats_are_written_and_read(tmp_path, make_model):
+    one_place = make_model(3, 0, means=np.full((3, 3), 2.5, np.float32))
+    for model in (make_model(0, 3), make_model(1, 0), make_model(1, 3), make_model(17, 1), one_place):
+        csplat.write(tmp_path / "a.sog", model)
+        back, count = csplat.read(tmp_path / "a.sog"), len(model)
+        assert (count, model.sh_degree if count else 0) == (len(back), back.sh_degree)
+        for name in ("means", "scales", "sh0", "shN") if count else ():
+            wanted, found = (np.sort(getattr(one, name).reshape(count, -1), 0) for one in (model, back))
+            np.testing.assert_allclose(wanted, found, atol=1e-3 if name == "shN" else 1e-4)
 
 
 SHAPES = {"quats": (4,), "scales": (3,), "sh0": (3,), "shN": (3, 3)}
@@ -487,10 +454,8 @@ def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
     for number in range(3):
         runs = [leaf["lods"][str(number)] for leaf in leaves]
         assert {number} == {run["file"] for run in runs}
-        assert np.cumsum([0, *(run["count"] for run in runs)]).tolist() == [
-            *(run["offset"] for run in runs),
-            counts[number],
-        ]
+        ends = np.cumsum([0, *(run["count"] for run in runs)]).tolist()
+        assert ends == [*(run["offset"] for run in runs), counts[number]]
         chunk = csplat.read(path.parent / meta["filenames"][number])
         for leaf, run in zip(leaves, runs, strict=True):
             splats = chunk.select(slice(run["offset"], run["offset"] + run["count"]))
@@ -519,10 +484,10 @@ def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
 
 @pytest.mark.slow
 def test_splats_at_one_point_are_one_leaf(tmp_path, make_model):
-    model = make_model(17_000, 0, means=np.full((17_000, 3), 2.5, np.float32))
-    csplat.write(tmp_path / "a" / "lod-meta.json", model)
-    assert "lods" in json.loads((tmp_path / "a" / "lod-meta.json").read_text())["tree"]
-    assert 17_000 == len(csplat.read(tmp_path / "a"))
+    path = tmp_path / "a" / "lod-meta.json"
+    csplat.write(path, make_model(17_000, 0, means=np.full((17_000, 3), 2.5, np.float32)))
+    assert "lods" in json.loads(path.read_text())["tree"]
+    assert 17_000 == len(csplat.read(path))
 
 
 @pytest.mark.slow
@@ -545,25 +510,16 @@ def test_all_levels_of_a_file_are_converted(tmp_path):
     assert {"a", "b"} == {one.name for one in tmp_path.iterdir()}
 
 
-def test_streamed_sog_replaces_only_streamed_sog(tmp_path, make_model):
+def test_streamed_sog_replaces_only_streamed_sog_and_only_if_it_succeeds(tmp_path, make_model):
     path = tmp_path / "a" / "lod-meta.json"
     with pytest.raises(InputError, match="no splats"):
         csplat.write(path, make_model(0, 0))
-    (tmp_path / "a").mkdir()
+    path.parent.mkdir()
     csplat.write(path, make_model(20, 1))  # an empty folder
     csplat.write(path, make_model(10, 0))
     assert 10 == len(csplat.read(path))
     with pytest.raises(InputError, match="is in the folder of"):
         convert_file(str(path.parent / "0_0"), str(path))
-    (tmp_path / "a" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"a contains notes\.txt, and a new folder replaces it: name another"):
-        csplat.write(path, make_model(10, 0))
-    assert 10 == len(csplat.read(path))
-
-
-def test_a_failed_write_of_streamed_sog_leaves_the_older_one(tmp_path, make_model):
-    path = tmp_path / "a" / "lod-meta.json"
-    csplat.write(path, make_model(10, 0))
     scene = source_from_model(make_model(20, 0))
     reads = []
 
@@ -577,6 +533,9 @@ def test_a_failed_write_of_streamed_sog_leaves_the_older_one(tmp_path, make_mode
         reads.clear()
         with pytest.raises(InputError, match="was removed"):
             write_levels(target, [replace(scene, blocks=blocks)])
+    (tmp_path / "a" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"a contains notes\.txt, and a new folder replaces it: name another"):
+        csplat.write(path, make_model(10, 0))
     assert ["a"] == [one.name for one in tmp_path.iterdir()]
     assert 10 == len(csplat.read(path))
 
