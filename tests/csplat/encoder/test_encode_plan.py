@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.inspect.file_description import describe_file
 
-ROOT = Path(__file__).resolve().parents[3]
 GEOMETRY = ("means", "quats", "scales", "opacities")
 COLOURS = ("sh0", "shN")
 
@@ -131,10 +128,3 @@ def test_absent_bands_are_decoded_as_zeros_and_cost_almost_nothing(make_model):
     full, few, none = (len(encode(sparse_model(big, share), options)) for share in (0.0, 0.95, 1.0))
     # One twentieth of the values, and for each of two bands a mask of at most half a bit per splat.
     assert few - none < 0.05 * (full - none) + 2 * 6_000 * 0.5 / 8
-
-
-def test_other_packages_import_no_modules_of_the_encoder():
-    places = [ROOT / "trainer", ROOT / "tools" / "csplat_tools", ROOT / "conformance" / "csplat_conformance"]
-    uses = re.compile(r"^\s*(?:from|import) csplat\.encoder\..*", re.MULTILINE)
-    files = [path for place in places for path in sorted(place.rglob("*.py"))]
-    assert {} == {str(path): lines for path in files if (lines := uses.findall(path.read_text("utf-8")))}

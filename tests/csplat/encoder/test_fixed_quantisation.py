@@ -7,7 +7,7 @@ import pytest
 from checked import measure_errors
 from quantisation_cases import ARRAYS, COUNT, assert_dequantised_as_decoded, important, moved
 
-from csplat import decode, encode
+from csplat import decode
 from csplat.decoder import decode_scene, read_declared_bounds, read_options
 from csplat.encoder import EncodeOptions, EncodePlan, Origin, encode_with_report, fix_quantisation
 from csplat.errors import InputError
@@ -93,16 +93,6 @@ def test_extra_columns_follow_their_splats(make_model):
     fixed = fix_quantisation(EncodePlan.of(model, EncodeOptions(keep_extra=True)))
     result = fixed.encode(fixed.start()).write()
     assert np.array_equal(result.source_index, decode_scene(result.data).model.extra["id"])
-
-
-@pytest.mark.slow
-def test_bytes_do_not_depend_on_threads(make_model):
-    files = []
-    for threads in (1, 2):
-        options = EncodeOptions(tile_splats=100, threads=threads)
-        fixed = fix_quantisation(EncodePlan.of(make_model(300, 3), options))
-        files.append(fixed.encode(moved(fixed)).write().data)
-    assert bool(files[0] == files[1] != encode(make_model(300, 3), options))
 
 
 def test_errors_are_declared_against_the_source(make_model):

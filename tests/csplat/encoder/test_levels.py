@@ -31,14 +31,18 @@ def quarter(splats):
 
 
 @pytest.mark.slow
-def test_level_0_of_a_file_is_the_scene_with_the_errors_of_a_plain_file(model):
-    plain, leaves = csplat.encode_with_report(model), kd_groups(model.means, 4)
+@pytest.mark.parametrize("options", [
+    {}, {"preset": "small"}, {"preset": "fast", "sh_degree": 0}, {"means_coding": "axis"},
+])  # fmt: skip
+def test_level_0_of_a_file_is_the_scene_with_the_errors_of_a_plain_file(model, options):
+    options, leaves = EncodeOptions(**options), kd_groups(model.means, 4)
+    plain, plan = csplat.encode_with_report(model, options), EncodePlan.of(model, options)
     halves = [quarter(model.select(np.concatenate(leaves[at : at + 2]))) for at in (0, 2)]
     nodes = [LevelNode(0, 4 + number // 2, rows=rows) for number, rows in enumerate(leaves)]
     nodes += [LevelNode(1, 6, splats=half, error=error) for half, error in zip(halves, (0.5, 0.25), strict=True)]
     nodes.append(LevelNode(2, None, splats=quarter(halves[0]), error=1.0))
-    data = encode_levels(EncodePlan.of(model), nodes).write().data
-    cut = encode_levels(EncodePlan.of(model), [LevelNode(0, None, rows=rows) for rows in leaves]).write()
+    data = encode_levels(plan, nodes).write().data
+    cut = encode_levels(plan, [LevelNode(0, None, rows=rows) for rows in leaves]).write()
     assert () == read_header(cut.data).coarse_tiles  # leaves alone are no levels
     assert () == tuple(validate(data).violations) == tuple(validate(cut.data).violations)
     whole, other = decode(data), decode(cut.data)
@@ -46,16 +50,6 @@ def test_level_0_of_a_file_is_the_scene_with_the_errors_of_a_plain_file(model):
     for measure, pair in plain.report.errors.items():
         assert cut.report.errors[measure] == pytest.approx(pair, rel=0.2), measure
     assert np.array_equal(np.sort(cut.source_index), np.arange(len(model)))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("options", [{"preset": "small"}, {"preset": "fast", "sh_degree": 0}, {"means_coding": "axis"}])
-def test_files_with_levels_are_valid_with_any_options(model, options):
-    nodes = [LevelNode(0, 2, rows=rows) for rows in kd_groups(model.means, 2)]
-    nodes.append(LevelNode(7, None, splats=quarter(model), error=2.0))
-    data = encode_levels(EncodePlan.of(model, EncodeOptions(**options)), nodes).write().data
-    assert () == tuple(validate(data).violations)
-    assert len(model) == len(decode(data))
 
 
 def test_refuses_leaves_that_are_not_the_scene(model):

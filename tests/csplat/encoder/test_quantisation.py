@@ -13,7 +13,7 @@ from codebooks_cases import few_shapes
 from quantisation_cases import COUNT, important, unequal
 
 import csplat
-from csplat.encoder import EncodeOptions, EncodePlan, encode_with_report, fix_quantisation, quantisation
+from csplat.encoder import EncodeOptions, EncodePlan, Importance, encode_with_report, fix_quantisation, quantisation
 from csplat.encoder.coding_parameters import choose_parameters
 from csplat.encoder.encode_plan import trial_rows
 from csplat.encoder.error_bounds import covariance_entries
@@ -230,18 +230,21 @@ def test_one_splat_does_not_change_the_steps_of_others(model, graded):
         assert 0.5 < heavy[name] / graded.report.options[name] < 2.0, name
 
 
-def test_invalid_blocks_are_refused(model):
+def test_invalid_blocks_and_matrices_are_refused(model, make_model):
     for field, value in (
         ("means", np.ones(3)), ("means", np.full(COUNT, -1.0)), ("opacities", np.full(COUNT, np.nan)),
         ("colours", np.ones(COUNT, np.int64)), ("shapes", np.ones((COUNT, 6))),
     ):  # fmt: skip
         with pytest.raises(InputError, match=f"Gauss-Newton blocks of {field}"):
             encode_with_report(model, importance=important(model, **{field: value}))
+    shapes, options = few_shapes(make_model, 200), EncodeOptions(shape_codebook_size=4)
+    for bad in (np.ones((200, 20)), np.ones((199, 21)), np.ones((200, 21), int), np.full((200, 21), np.nan)):
+        with pytest.raises(InputError, match="shape matrices"):
+            encode_with_report(shapes, options, importance=Importance(np.ones(200), None, None, bad))
 
 
 def test_the_number_of_threads_does_not_change_the_bytes_of_classes(model, graded):
-    other = encode_with_report(model, EncodeOptions(threads=3), importance=important(model))
-    assert bool(graded.data == other.data)
+    assert graded.data == encode_with_report(model, EncodeOptions(threads=3), importance=important(model)).data
     assert "classes" in graded.report.options
 
 
@@ -254,13 +257,3 @@ def test_the_javascript_decoder_agrees_about_classes_and_shape_codebooks(graded,
     with JsDecoder() as decoder:
         for data in (graded.data, csplat.encode(shapes, EncodeOptions(**options))):
             assert ("decoded", "") == compared(answer(data), decoder.ask(data), "JavaScript")
-
-
-@pytest.mark.slow
-def test_weights_that_give_one_class_are_noted(model, tmp_path):
-    from csplat_tools.importance_file import encode_by_importance
-
-    np.save(tmp_path / "weights.npy", np.ones(COUNT, np.float32))
-    for most in (None, 2):
-        result = encode_by_importance(model, EncodeOptions(max_classes=most), str(tmp_path / "weights.npy"))
-        assert (most is not None) == ("all splats are in one quantisation class" in str(result.report.notes))

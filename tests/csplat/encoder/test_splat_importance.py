@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import encoded
-from codebooks_cases import exact, few_shapes, scene
+from codebooks_cases import exact, scene
 from quantisation_cases import COUNT, important, unequal
 
 from csplat.encoder import EncodeOptions, Importance, encode_with_report
@@ -20,7 +20,6 @@ from csplat.encoder.splat_importance import (
     apply_weight_floor,
     rounding_errors,
 )
-from csplat.errors import InputError
 
 
 def test_errors_agree_with_the_matrices():
@@ -37,14 +36,6 @@ def test_entries_of_points_without_weight_do_not_move():
     silent = ErrorMetric(np.zeros(50, np.float32), np.zeros_like(metric.triangles))
     moved, _ = refine_by_metric(points, silent, entries, np.arange(50) % 5, 1)
     assert {tuple(row) for row in moved.reshape(len(moved), -1)} <= {tuple(row) for row in entries.reshape(5, -1)}
-
-
-def test_invalid_matrices_are_refused(make_model):
-    model = few_shapes(make_model, 200)
-    for bad in (np.ones((200, 20)), np.ones((199, 21)), np.ones((200, 21), int), np.full((200, 21), np.nan)):
-        importance = Importance(np.ones(200), None, None, bad)
-        with pytest.raises(InputError, match="shape matrices"):
-            encode_with_report(model, EncodeOptions(shape_codebook_size=4), importance=importance)
 
 
 @pytest.fixture

@@ -6,7 +6,6 @@ import base64
 import html
 import io
 import json
-import os
 import re
 import subprocess
 import sys
@@ -194,57 +193,43 @@ FORMAT = Format("lcc", open=format_by_name("splat").open)
 def html(model):
     return f"<p>{len(model)}</p>"
 """
+PROGRAM = """
+import sys, warnings, csplat, csplat.formats
 
-
-@pytest.fixture
-def installed(tmp_path):
-    """Return a function that runs lines where a distribution has these entry points; it returns the output."""
-
-    def run(*lines, name="other", **groups):
-        metadata = tmp_path / f"{name}-1.dist-info"
-        metadata.mkdir()
-        (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1\n", "utf-8")
-        points = [f"[csplat.{group}]\n{line}\n" for group, line in groups.items()]
-        (metadata / "entry_points.txt").write_text("".join(points), "utf-8")
-        (tmp_path / "other_plugin.py").write_text(PLUGIN, "utf-8")
-        paths = os.pathsep.join([str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])])
-        code = "\n".join(["import csplat, csplat.formats, sys, warnings, numpy as np", *lines])
-        done = subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": paths},
-            capture_output=True, text=True, check=True)  # fmt: skip
-        return done.stdout.strip()
-
-    return run
+model = csplat.read("a.ply")
+print("other_plugin" in sys.modules, model._repr_html_())
+with warnings.catch_warnings(record=True) as seen:
+    print(len(csplat.read("a.lcc")), {"lcc", "gltf"} <= {one.name for one in csplat.formats.formats()})
+print(seen[-1].message)
+"""
+ENTRY_POINTS = """
+[csplat.formats]
+lcc = other_plugin:FORMAT
+xyz = other_plugin:NOTHING
+[csplat.display]
+html = other_plugin:html
+"""
 
 
 @pytest.mark.slow
-def test_a_format_of_another_package_is_loaded_only_when_it_is_needed(installed, tmp_path, make_model):
-    (tmp_path / "a.lcc").write_bytes(bytes(32))
-    csplat.write(tmp_path / "a.ply", make_model(3, 0))
-    lines = [
-        f"csplat.read({str(tmp_path / 'a.ply')!r})",
-        f"print('other_plugin' in sys.modules, len(csplat.read({str(tmp_path / 'a.lcc')!r})))",
-        "print('lcc' in [one.name for one in csplat.formats.formats()])",
-    ]
-    assert "False 1\nTrue" == installed(*lines, formats="lcc = other_plugin:FORMAT")
-
-
-@pytest.mark.slow
-def test_a_plug_in_that_cannot_be_loaded_is_left_out_with_a_warning(installed):
-    lines = ("with warnings.catch_warnings(record=True) as seen:", "    first = csplat.formats.formats()[0].name")
-    message = "compressed-ply other_plugin:NOTHING, installed as 'lcc' of csplat.formats, cannot be loaded: module"
-    found = installed(*lines, "print(first, seen[-1].message)", formats="lcc = other_plugin:NOTHING")
-    assert found.startswith(message)
-
-
-@pytest.mark.slow
-def test_notebooks_use_the_display_that_is_installed(installed):
-    lines = (
-        "quats, three = np.array([[1, 0, 0, 0]] * 2, np.float32), np.zeros((2, 3), np.float32)",
-        "model = csplat.SplatModel(three, quats, three, np.ones(2, np.float32), three)",
-        "print(model._repr_html_(), [one.name for one in csplat.formats.formats()][-1])",
-    )
+def test_plug_ins_are_loaded_when_they_are_needed_or_left_out_with_a_warning(tmp_path, make_model):
     # A distribution of this name hides the metadata of the installed one, which has a display and formats, too.
-    assert "<p>2</p> gltf" == installed(*lines, name="csplat", display="html = other_plugin:html")
+    metadata = tmp_path / "csplat-1.dist-info"
+    metadata.mkdir()
+    for path, text in (
+        (metadata / "METADATA", "Metadata-Version: 2.1\nName: csplat\nVersion: 1\n"),
+        (metadata / "entry_points.txt", ENTRY_POINTS),
+        (tmp_path / "other_plugin.py", PLUGIN),
+        (tmp_path / "program.py", PROGRAM),
+    ):
+        path.write_text(text, "utf-8")
+    (tmp_path / "a.lcc").write_bytes(bytes(32))
+    csplat.write(tmp_path / "a.ply", make_model(2, 0))
+    words = [sys.executable, "program.py"]
+    lines = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert ["False <p>2</p>", "1 True"] == lines[:2]
+    message = "other_plugin:NOTHING, installed as 'xyz' of csplat.formats, cannot be loaded: module"
+    assert lines[2].startswith(message)
 
 
 def scene_in(shown):
@@ -295,19 +280,20 @@ BROKEN = b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', 'fortran_order': False, 'shape
 
 
 def test_an_archive_has_arrays_and_facts(tmp_path):
-    np.savez(tmp_path / "a.npz", one=np.arange(3), facts=np.frombuffer(b'{"n": 1}', np.uint8))
-    found = read_archive(tmp_path / "a.npz", KIND)
+    path = tmp_path / "a.npz"
+    np.savez(path, one=np.arange(3), facts=np.frombuffer(b'{"n": 1}', np.uint8))
+    found = read_archive(path, KIND)
     assert np.array_equal(np.arange(3), found["one"])
-    assert found.facts() == {"n": 1}
+    assert {"n": 1} == found.facts()
     found.check({"n": 1}, {"n": int})
     with pytest.raises(InputError, match="has no two"):
         found["two"]
     with pytest.raises(InputError, match="its n is not of type int"):
         found.check({"n": "1"}, {"n": int})
     for text in (b"[1]", b"{", b"[" * 100_000, b"\xff"):
-        np.savez(tmp_path / "a.npz", facts=np.frombuffer(text, np.uint8))
+        np.savez(path, facts=np.frombuffer(text, np.uint8))
         with pytest.raises(InputError, match="not a file of tests"):
-            read_archive(tmp_path / "a.npz", KIND).facts()
+            read_archive(path, KIND).facts()
     with pytest.raises(FileNotFoundError, match="absent"):
         read_archive(tmp_path / "absent.npz", KIND)
 

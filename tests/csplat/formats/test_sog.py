@@ -124,6 +124,11 @@ def test_tags_of_rotations_and_the_first_entry_of_a_codebook_may_be_missing(tmp_
         np.testing.assert_allclose(scene.model().scales, 1 / 16 - 12 - 254 / 16 / 255, rtol=1e-6)  # extrapolated
 
 
+def all_of(folder):
+    """Return all files of a folder by name."""
+    return {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
+
+
 def levels(tmp_path, **changes):
     """Write a streamed SOG: two files of the finest level, a coarser one, and an environment."""
     files = {}
@@ -141,24 +146,19 @@ def levels(tmp_path, **changes):
     return foldered(tmp_path / "a", {**files, "lod-meta.json": json.dumps(meta).encode()})
 
 
-def test_leaves_are_numbered_in_the_order_of_the_splats(tmp_path):
-    path = levels(tmp_path)
+@pytest.mark.slow
+def test_leaves_of_streamed_sog_are_numbered_and_become_nodes_of_a_file(tmp_path):
+    path, out = levels(tmp_path), tmp_path / "out.csplat"
     assert [0] * 5 + [1] * 3 + [2] * 5 == read_leaf_numbers(path).tolist()
     assert [0] * 3 + [1] * 2 + [2] * 5 == read_leaf_numbers(path / "lod-meta.json", 1).tolist()
     with pytest.raises(InputError, match="it is not streamed SOG"):
         read_leaf_numbers(foldered(tmp_path / "b", files_of(*splats())))
-
-
-@pytest.mark.slow
-def test_levels_of_streamed_sog_become_nodes_of_a_file(tmp_path):
-    path, out = levels(tmp_path), tmp_path / "out.csplat"
     encode_file(str(path), str(out), csplat.EncodeOptions(), levels=1)
     assert () == tuple(validate(out.read_bytes()).violations)
-    with csplat.open(out) as file, open_scene(path, level=1) as coarse:
-        assert [(0, 3, 5), (0, 4, 3), (0, None, 5), (1, None, 3), (1, None, 2)] == [
-            (node.level, node.parent, node.splat_count) for node in file.nodes
-        ]
-        assert coarse.count == len(file.read(tiles=file.cut(level=1)))
+    with csplat.open(out) as file:
+        nodes = [(node.level, node.parent, node.splat_count) for node in file.nodes]
+        assert [(0, 3, 5), (0, 4, 3), (0, None, 5), (1, None, 3), (1, None, 2)] == nodes
+        assert 10 == len(file.read(tiles=file.cut(level=1)))
         assert all(node.error > 0 for node in file.nodes if node.level)
 
 
@@ -168,9 +168,14 @@ def files_read(path, level):
         return scene.model().sh0[:, 0].tolist()
 
 
+@pytest.mark.slow
 def test_a_level_is_read_with_the_nearest_of_parts_without_it(tmp_path):
     path, finest = levels(tmp_path), [0] * 5 + [1] * 3 + [3] * 5
-    for place in (path, path / "lod-meta.json"):
+    files = all_of(path)
+    junk = {"__MACOSX/meta.json": b"", "__MACOSX/0_0/._meta.json": b""}
+    below = {f"a/b/{name}": data for name, data in files.items()}
+    zips = [zipped(tmp_path / f"{number}.zip", one | junk) for number, one in enumerate((files, below))]
+    for place in (path, path / "lod-meta.json", *zips):
         assert (finest, [2] * 5 + [3] * 5) == (files_read(place, 0), files_read(place, 1))
     with open_scene(path) as scene:
         model = scene.model()
@@ -184,23 +189,6 @@ def test_a_level_is_read_with_the_nearest_of_parts_without_it(tmp_path):
     one, two = {"1": {"file": 0, "offset": 0, "count": 5}}, {"0": {"file": 1, "offset": 1, "count": 3}}
     path = levels(tmp_path, tree={"children": [{"lods": one}, {"lods": two}]})
     assert finest == files_read(path, 0) == files_read(path, 1)
-
-
-def all_of(folder):
-    """Return all files of a folder by name."""
-    return {one.relative_to(folder).as_posix(): one.read_bytes() for one in folder.rglob("*") if one.is_file()}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("within", ["", "a/b/"])
-def test_levels_in_a_zip_equal_those_in_a_folder(tmp_path, within):
-    folder = levels(tmp_path)
-    junk = {"__MACOSX/meta.json": b"", "__MACOSX/0_0/._meta.json": b""}
-    path = zipped(tmp_path / "a.zip", {within + name: data for name, data in all_of(folder).items()} | junk)
-    for level in (0, 1):
-        with open_scene(path, level=level) as scene, open_scene(folder, level=level) as expected:
-            assert expected.levels == scene.levels
-            same(expected.model(), scene.model())
 
 
 def test_zips_of_several_scenes_and_of_other_programs_are_refused(tmp_path):
@@ -348,10 +336,9 @@ def test_damage_is_refused_or_read(tmp_path):
     damaged = [whole[:size] for size in range(0, len(whole), 97)] + [*flipped(whole, range(0, len(whole), 31))]
     messages = refusals(path, damaged, lambda path: csplat.read(path, "sog"))
     assert sum(map(bool, messages)) > len(damaged) / 2
-    assert all(not one or (one.startswith("a.sog") and "\n" not in one) for one in messages)
     damaged = flipped(picture, range(0, len(picture), 5), lambda at: 1 << at // 5 % 8)
-    messages = refusals(folder / "sh0.webp", damaged, lambda _: csplat.read(folder))
-    assert all(not one or one.startswith("b: sh0.webp") for one in messages)
+    messages += refusals(folder / "sh0.webp", damaged, lambda _: csplat.read(folder))
+    assert all(not one or one.startswith(("a.sog", "b: sh0.webp")) for one in messages)
 
 
 def assert_within_a_step(model, back, means):
@@ -385,17 +372,18 @@ def test_written_files_read_back_within_a_step_and_equal_a_folder(tmp_path, make
 
 @pytest.mark.slow
 def test_few_splats_are_written_and_read(tmp_path, make_model):
-    one_place = make_model(3, 0, means=np.full((3, 3), 2.5, np.float32))
-    for model in (make_model(0, 3), make_model(1, 0), make_model(1, 3), make_model(17, 1), one_place):
-        csplat.write(tmp_path / "a.sog", model)
-        back, count = csplat.read(tmp_path / "a.sog"), len(model)
-        assert (count, model.sh_degree if count else 0) == (len(back), back.sh_degree)
-        for name in ("means", "scales", "sh0", "shN") if count else ():
+    path, one_place = tmp_path / "a.sog", make_model(3, 0, means=np.full((3, 3), 2.5, np.float32))
+    for model in (make_model(1, 0), make_model(1, 3), make_model(17, 1), one_place):
+        csplat.write(path, model)
+        back, count = csplat.read(path), len(model)
+        assert (count, model.sh_degree) == (len(back), back.sh_degree)
+        for name in ("means", "scales", "sh0", "shN"):
             wanted, found = (np.sort(getattr(one, name).reshape(count, -1), 0) for one in (model, back))
             np.testing.assert_allclose(wanted, found, atol=1e-3 if name == "shN" else 1e-4)
+    csplat.write(path, make_model(0, 3))
+    assert (0, 0) == (len(csplat.read(path)), csplat.read(path).sh_degree)
 
 
-SHAPES = {"quats": (4,), "scales": (3,), "sh0": (3,), "shN": (3, 3)}
 SIDE = 64  # positions are integers below, so that a splat is known by its place
 
 
@@ -409,9 +397,9 @@ def streamed(tmp_path_factory):
     rng, count = np.random.default_rng(8), 18_000
     cells = rng.permutation(SIDE**3)[:count]
     means = np.stack([cells % SIDE, cells // SIDE % SIDE, cells // SIDE**2], axis=1).astype(np.float32)
-    normal = {name: rng.standard_normal((count, *shape), np.float32) for name, shape in SHAPES.items()}
-    normal |= {"quats": normalise_quats(normal["quats"]), "scales": normal["scales"] - 4}
-    finest = SplatModel(means=means, opacities=rng.random(count, np.float32), antialiased=True, **normal)
+    quats, scales, sh0, *shN = (rng.standard_normal((count, size), np.float32) for size in (4, 3, 3, 3, 3, 3))
+    opacities, shN = rng.random(count, np.float32), np.stack(shN, axis=1)
+    finest = SplatModel(means, normalise_quats(quats), scales - 4, opacities, sh0, shN, antialiased=True)
     levels = [finest, finest.select(slice(0, 4_000)), finest.select((means[:, :2] < SIDE / 4).all(axis=1))]
     path = tmp_path_factory.mktemp("streamed") / "scene" / "lod-meta.json"
     write_levels(path, [source_from_model(one) for one in levels])
@@ -468,14 +456,13 @@ def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
 
 @pytest.mark.long
 def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
-    count = 530_000
-    csplat.write(tmp_path / "a" / "lod-meta.json", make_model(count, 0))
-    meta = json.loads((tmp_path / "a" / "lod-meta.json").read_text())
+    path, count = tmp_path / "a" / "lod-meta.json", 530_000
+    csplat.write(path, make_model(count, 0))
+    meta, sizes = json.loads(path.read_text()), [0, 0]
     assert ["0_0/meta.json", "0_1/meta.json"] == meta["filenames"]
-    sizes = [0, 0]
-    for leaf in leaves_of(meta["tree"]):
-        assert sizes[leaf["lods"]["0"]["file"]] == leaf["lods"]["0"]["offset"]
-        sizes[leaf["lods"]["0"]["file"]] += leaf["lods"]["0"]["count"]
+    for run in (leaf["lods"]["0"] for leaf in leaves_of(meta["tree"])):
+        assert sizes[run["file"]] == run["offset"]
+        sizes[run["file"]] += run["count"]
     assert count == sum(sizes)
     assert abs(sizes[0] - sizes[1]) < 2 << 14
     with open_scene(tmp_path / "a") as scene:
@@ -492,20 +479,19 @@ def test_splats_at_one_point_are_one_leaf(tmp_path, make_model):
 
 @pytest.mark.slow
 def test_all_levels_of_a_file_are_converted(tmp_path):
-    source, out = RICH, tmp_path / "a" / "lod-meta.json"
-    made = convert_file(str(source), str(out), filters=Filters(scale=2.0))
+    out = tmp_path / "a" / "lod-meta.json"
+    made = convert_file(str(RICH), str(out), filters=Filters(scale=2.0))
     assert len(made.levels) > 1
     assert () == made.findings
     for number, count in enumerate(made.levels):
-        with csplat.open(source) as file, open_scene(out, level=number) as scene:
+        with csplat.open(RICH) as file, open_scene(out, level=number) as scene:
             cut, back = file.read(tiles=file.cut(level=number)), scene.model()
         assert count == len(cut) == len(back)
         np.testing.assert_allclose(np.sort(2 * cut.means, axis=0), np.sort(back.means, axis=0), rtol=1e-3, atol=1e-3)
-    coarser = convert_file(str(source), str(tmp_path / "b" / "lod-meta.json"), level=1)
-    assert made.levels[1:] == coarser.levels
+    assert made.levels[1:] == convert_file(str(RICH), str(tmp_path / "b" / "lod-meta.json"), level=1).levels
     with pytest.raises(InputError, match="floaters cannot be dropped from several levels"):
-        convert_file(str(source), str(tmp_path / "c" / "lod-meta.json"), filters=Filters(drop_floaters=True))
-    with pytest.raises(InputError, match="which has one level, found 2"), open_scene(source) as scene:
+        convert_file(str(RICH), str(tmp_path / "c" / "lod-meta.json"), filters=Filters(drop_floaters=True))
+    with pytest.raises(InputError, match="which has one level, found 2"), open_scene(RICH) as scene:
         write_levels(tmp_path / "d.ply", [scene, scene])
     assert {"a", "b"} == {one.name for one in tmp_path.iterdir()}
 
