@@ -47,8 +47,7 @@ def scene(make_model, degree, *, doubles=False):
 def slow_errors(source, decoded, index):
     """Return the differences of each pair of splats by measure, [n, k], by the definitions of the spec (5.5)."""
     count, most = len(index), max(source.shN.shape[1], decoded.shN.shape[1])
-    wanted, found = (covariances(*one) for one in ((source.quats[index], source.scales[index]),
-        (decoded.quats, decoded.scales)))  # fmt: skip
+    wanted, found = covariances(source.quats[index], source.scales[index]), covariances(decoded.quats, decoded.scales)
     norms = [np.linalg.norm(one.reshape(count, 9), axis=1) for one in (found - wanted, wanted)]
     places = decoded.means + np.array(decoded.origin) - (source.means[index] + np.array(source.origin))
     errors = {"means": np.linalg.norm(places, axis=1), "covariance": norms[0] / norms[1]}
@@ -107,11 +106,10 @@ def test_a_source_has_alphas_unit_quaternions_and_unchanged_means():
     source = source_of_rows(rows)
     np.testing.assert_array_equal(rows.means, source.means)
     assert source.means.dtype == np.float64
-    for j in range(8):
-        assert np.float32(1 / (1 + math.exp(-float(rows.logits[j])))) == source.opacities[j]
-        length = math.sqrt(math.fsum(float(c) ** 2 for c in rows.quats[j]))
-        unit = [np.float32(float(c) / length) for c in rows.quats[j]] if length else [1, 0, 0, 0]
-        np.testing.assert_allclose(source.quats[j], unit, rtol=1.2e-7)
+    alphas, quats = 1 / (1 + np.exp(-rows.logits.astype(np.float64))), rows.quats.astype(np.float64)
+    np.testing.assert_array_equal(alphas.astype(np.float32), source.opacities)
+    quats[3] = [1, 0, 0, 0]
+    np.testing.assert_allclose(source.quats, quats / np.linalg.norm(quats, axis=1, keepdims=True), rtol=1.2e-7)
 
 
 def test_a_source_about_another_origin_has_the_same_errors(make_model):

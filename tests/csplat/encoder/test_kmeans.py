@@ -220,17 +220,8 @@ def test_refining_reduces_errors_without_unused_entries():
 
 def seen_more(model):
     """Return random weights and matrices."""
-    rng = np.random.default_rng(1)
-    roots = rng.normal(size=(len(model), 6, 3))
-    matrices = roots @ roots.transpose(0, 2, 1)
-    matrices *= (6 / np.einsum("nii->n", matrices))[:, None, None]
-    weights = rng.lognormal(0, 2, len(model))
-    return Importance(weights, weights, None, triangles(matrices))
-
-
-def triangles(matrices):
-    rows, columns = np.triu_indices(matrices.shape[1])
-    return matrices[:, rows, columns]
+    weights = np.random.default_rng(1).lognormal(0, 2, len(model))
+    return Importance(weights, weights, None, scene(len(model), 6)[2].triangles)
 
 
 def books(data):
@@ -310,8 +301,7 @@ def digests(threads):
     model = csplat.SplatModel(**fields)
     sizes = {"codebook_size": 64, "shape_codebook_size": 150}
     options = EncodeOptions(sh_coding="codebook", tile_splats=800, threads=threads, **sizes)
-    roots = [rng.normal(size=(n, size, 3)) for size in (8, 6)]
-    matrices = [triangles(one @ one.transpose(0, 2, 1) / 3) for one in roots]
+    matrices = [scene(n, size)[2].triangles for size in (8, 6)]
     for importance in (Importance(rng.random(n), rng.random(n), *matrices), None):
         result = encode_with_report(model, options, importance=importance)
         assert all(result.report.options[name] for name in sizes)

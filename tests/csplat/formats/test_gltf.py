@@ -286,8 +286,7 @@ def test_short_buffers_and_rotations_of_length_0_are_reported(tmp_path):
     said, data = document(TWO | {f"{PREFIX}:ROTATION": np.zeros((2, 4), "<f4")})
     said["buffers"][0]["byteLength"] += 1000
     found, model = linted(tmp_path / "a.glb", said, data)
-    assert {"short-buffer", "zero-quats"} == set(found)
-    assert 2 == found["zero-quats"].count
+    assert {"short-buffer": 1, "zero-quats": 2} == {name: one.count for name, one in found.items()}
     assert [[1, 0, 0, 0]] * 2 == model.quats.tolist()
     assert TWO["POSITION"].tolist() == model.means.tolist()
     with pytest.raises(InputError, match="truncated"):
