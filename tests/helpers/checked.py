@@ -61,6 +61,14 @@ def flipped(data, places, mask=lambda at: 1 << at % 8):
         yield data[:at] + bytes([data[at] ^ mask(at)]) + data[at + 1 :]
 
 
+def assert_damage_is_refused_or_read(path, whole, sizes, places, read=csplat.read):
+    """Assert that a file is read, and that its prefixes, and flipped bytes if they matter, are refused in a line."""
+    assert [""] == refusals(path, [whole], read)
+    assert all(refusals(path, (whole[:size] for size in sizes), read))
+    for message in refusals(path, flipped(whole, places, lambda at: 255 >> at % 7), read):
+        assert not message or (path.name in message and "\n" not in message)
+
+
 def cloud(means, sizes=0.03, **fields):
     """Return a scene of grey splats of alpha 0.9 at these means; a size may be infinite."""
     count, sizes = len(means), np.asarray(sizes, np.float32).reshape(-1, 1)
