@@ -234,6 +234,7 @@ def test_options_are_scalars_of_python_or_numpy_within_their_range(make_model):
     assert encode(model, options) == encode(model, same)
 
 
+@pytest.mark.slow
 def test_invalid_importances_and_metadata_are_refused(make_model):
     ten = (-np.ones(10), np.full(10, np.nan), np.ones(10, complex), np.full(10, "1"), np.zeros(10, "M8[s]"))
     for bad in (np.ones(3), *ten):

@@ -58,6 +58,7 @@ def test_colours_and_an_origin_of_other_splats_are_refused(make_model):
         EncodePlan.of(model, origin=Origin(9, np.arange(5)))
 
 
+@pytest.mark.slow
 def test_a_part_with_other_colours_or_shapes_declares_the_errors_of_the_rest(make_model):
     source, rows = make_model(400, 3), np.arange(100, 300)
     plan = EncodePlan.of(source.select(rows), origin=Origin(400, rows))

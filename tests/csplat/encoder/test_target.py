@@ -22,6 +22,7 @@ def scene():
     return shell(8)
 
 
+@pytest.mark.slow
 def test_impossible_bounds_are_refused(scene):
     for measure, bound in (("opacities", 1e-9), ("opacities", 1e-310), ("covariance", 1e-310)):
         for more in ({}, {"size_bytes": 10**6}):

@@ -301,6 +301,7 @@ BAD_FILES = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_inconsistent_files_are_refused(tmp_path):
     cases = [(changed(place, value), message) for place, value, message in BAD]
     cases += [(changed("scales/mins", [9, 9, 9], version=1), "scales has mins 9")]
@@ -421,6 +422,7 @@ def test_levels_of_streamed_sog_read_back_within_a_step(streamed):
         assert_within_a_step(wanted, found, SIDE * np.log1p(SIDE) / 65535)
 
 
+@pytest.mark.slow
 def test_leaves_of_streamed_sog_divide_space_and_chunks(streamed):
     path, levels = streamed
     meta = json.loads(path.read_text())
