@@ -16,21 +16,17 @@ views may have a larger one, or a larger one of removal. `AnalyticScene.smallest
 find the best file by trying everything.
 """
 
-from __future__ import annotations
-
 import itertools
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 from checked import cloud
 
 from csplat import EncodeOptions, SplatModel
-from csplat.encoder import PRESETS, SearchReport, Target
+from csplat.encoder import PRESETS, Target
 from csplat_tools.optimise.candidates import CandidatePool
 from csplat_tools.optimise.pruning import Pruner
 from csplat_tools.optimise.search_report import make_report
@@ -55,17 +51,11 @@ def psnr_of(error):
 
 @dataclass(frozen=True)
 class Views:
-    """Views and their errors.
+    """Views and their errors."""
 
-    Attributes:
-        offset: dB by which errors are larger than in the validation views.
-        removal_offset: dB by which errors of removal are larger in addition.
-        photo_psnr: PSNR of the source against their images, dB; None to compare with the source.
-    """
-
-    offset: float = 0.0
-    removal_offset: float = 0.0
-    photo_psnr: float | None = None
+    offset: float = 0.0  # dB by which errors are larger than in the validation views
+    removal_offset: float = 0.0  # dB by which errors of removal are larger in addition
+    photo_psnr: float | None = None  # of the source against their images, dB; None: compare with the source
 
 
 DECIDING = Views()
@@ -73,80 +63,50 @@ DECIDING = Views()
 
 @dataclass(frozen=True)
 class Contents:
-    """A request for a file.
+    """A request for a file."""
 
-    Attributes:
-        options: options of the encoder; those still to be chosen are left open.
-        splats: number of splats.
-        refitted: whether the kept splats were fitted to renders of the source.
-        graded: whether splats are sorted by importance.
-        draft: whether a refit through its quantisers was left out.
-    """
-
-    options: EncodeOptions
+    options: EncodeOptions  # those still to be chosen are left open
     splats: int
-    refitted: bool = False
-    graded: bool = False
-    draft: bool = False
+    refitted: bool = False  # the kept splats were fitted to renders of the source
+    graded: bool = False  # splats are sorted by importance
+    draft: bool = False  # a refit through its quantisers was left out
 
 
 @dataclass(frozen=True)
 class AnalyticScene:
-    """A scene and the cost of its files.
-
-    Attributes:
-        splats, sh_degree: number of splats and SH degree of the scene.
-        unneeded: splats without effect in any view.
-        removal_psnr: PSNR after half of the others are pruned, dB, before a refit.
-        removal_power: exponent with which the error grows with the number of pruned splats.
-        mended: dB by which a refit reduces that error.
-        tuned: dB by which a refit through a file's quantisers reduces the error of these.
-        shown: PSNR of the scene with bands up to degree 0, 1 and 2, dB.
-        frame_bytes: bytes of a file without splats. splat_bytes, sh_bytes: bytes per splat at the usual quality.
-        rate: share by which bytes grow with each dB.
-        lost: dB between the quality of the attributes and that of renders.
-        grading: factor of the bytes if splats are sorted by importance.
-        index_bytes, entry_bytes: bytes of a codebook of SH, per splat and per entry.
-        book_psnr: PSNR that a codebook of one entry for 64 splats leaves, dB. book_octave: dB with twice the entries.
-        ceiling: dB that no precision exceeds.
-        plateau: range of quality that gains nothing, dB.
-        jump: dB that every other step of 0.6 dB of quality loses.
-        packing: factor of the bytes of a file with fast compression.
-        preset_saving: a preset, and the share by which its own file is smaller than others of its quality.
-        file_seconds: CPU seconds of making a file.
-    """
+    """A scene and the cost of its files."""
 
     splats: int = 8000
     sh_degree: int = 3
-    unneeded: int = 0
-    removal_psnr: float = 22.0
-    removal_power: float = 3.0
-    mended: float = 8.0
-    tuned: float = 2.0
-    shown: tuple[float, ...] = (26.0, 32.0, 38.0)
-    frame_bytes: int = 900
-    splat_bytes: float = 7.0
+    unneeded: int = 0  # splats without effect in any view
+    removal_psnr: float = 22.0  # dB after half of the others are pruned, before a refit
+    removal_power: float = 3.0  # with which the error grows with the number of pruned splats
+    mended: float = 8.0  # dB by which a refit reduces that error
+    tuned: float = 2.0  # dB by which a refit through a file's quantisers reduces the error of these
+    shown: tuple[float, ...] = (26.0, 32.0, 38.0)  # PSNR with bands up to degree 0, 1 and 2, dB
+    frame_bytes: int = 900  # of a file without splats
+    splat_bytes: float = 7.0  # per splat at the usual quality
     sh_bytes: float = 3.5
-    rate: float = 0.045
-    lost: float = 10.0
-    grading: float = 1.0
-    index_bytes: float = 1.6
-    entry_bytes: float = 8.0
-    book_psnr: float = 42.0
-    book_octave: float = 2.5
-    ceiling: float = 97.0
-    plateau: tuple[float, float] = (0.0, 0.0)
-    jump: float = 0.0
-    packing: float = 1.008
-    preset_saving: tuple[str, float] = ("", 0.0)
-    file_seconds: float = 0.0
+    rate: float = 0.045  # share by which bytes grow with each dB
+    lost: float = 10.0  # dB between the quality of the attributes and that of renders
+    grading: float = 1.0  # factor of the bytes if splats are sorted by importance
+    index_bytes: float = 1.6  # of a codebook of SH, per splat
+    entry_bytes: float = 8.0  # per entry
+    book_psnr: float = 42.0  # PSNR that a codebook of one entry for 64 splats leaves, dB
+    book_octave: float = 2.5  # dB with twice the entries
+    ceiling: float = 97.0  # dB that no precision exceeds
+    plateau: tuple[float, float] = (0.0, 0.0)  # range of quality that gains nothing, dB
+    jump: float = 0.0  # dB that every other step of 0.6 dB of quality loses
+    packing: float = 1.008  # factor of the bytes of a file with fast compression
+    preset_saving: tuple[str, float] = ("", 0.0)  # a preset, and the share that its own file saves
+    file_seconds: float = 0.0  # CPU seconds of making a file
 
-    def model(self) -> SplatModel:
+    def model(self):
         """Return a model with this number of splats; their values do not matter."""
         bands = (self.sh_degree + 1) ** 2 - 1
         return cloud(np.zeros((self.splats, 3)), shN=np.zeros((self.splats, bands, 3), np.float32))
 
-    def options_of(self, contents: Contents) -> dict[str, Any]:
+    def options_of(self, contents):
         """Return the encoder's choices, under the names of a file's options."""
         asked = contents.options
         degree = self.sh_degree if asked.sh_degree is None else min(asked.sh_degree, self.sh_degree)
@@ -160,14 +120,12 @@ class AnalyticScene:
             "opacity_levels": 255,
         } | ({"classes": {"splats": [contents.splats // 2] * 2}} if contents.graded else {})  # fmt: skip
 
-    def size_of(self, contents: Contents, quality: Any = None) -> Any:
+    def size_of(self, contents, quality=None):
         """Return the size of a file in bytes, or of one file for each of some qualities."""
         chosen = self.options_of(contents)
         finer = np.exp(self.rate * ((chosen["quality"] if quality is None else quality) - USUAL_QUALITY))
         kept = ((chosen["sh_degree"] + 1) ** 2 - 1) / 15.0
-        splat, book = self.splat_bytes * finer, 0.0
-        if contents.graded:
-            splat = splat * self.grading
+        splat, book = self.splat_bytes * finer * (self.grading if contents.graded else 1.0), 0.0
         if chosen["sh_coding"] == "scalar":
             splat = splat + self.sh_bytes * kept * finer
         elif chosen["sh_coding"] == "codebook":
@@ -178,7 +136,7 @@ class AnalyticScene:
             saved -= self.preset_saving[1] * (contents.options.preset == self.preset_saving[0])
         return np.rint((self.frame_bytes + contents.splats * splat * saved) * packed + book)
 
-    def error_of(self, contents: Contents, views: Views = DECIDING, quality: Any = None) -> Any:
+    def error_of(self, contents, views=DECIDING, quality=None):
         """Return the error of a file in some views, or of one file for each of some qualities."""
         chosen = self.options_of(contents)
         q = np.asarray(chosen["quality"] if quality is None else quality, np.float64)
@@ -192,37 +150,37 @@ class AnalyticScene:
         removed = self.removed(contents.splats, refitted=contents.refitted)
         return self._seen(error + self.missing(chosen["sh_degree"]), removed, views)
 
-    def source_error(self, splats: int, sh_degree: int, views: Views, *, refitted: bool = False) -> float:
+    def source_error(self, splats, sh_degree, views, *, refitted=False):
         """Return the error of some splats and bands before quantisation."""
         return float(self._seen(self.missing(sh_degree), self.removed(splats, refitted=refitted), views))
 
-    def removed(self, splats: Any, *, refitted: bool) -> Any:
+    def removed(self, splats, *, refitted):
         """Return the error of removal if this number of splats is kept."""
         needed = self.splats - self.unneeded
         gone = np.maximum(0, needed - splats) / (0.5 * needed)
         return error_of(self.removal_psnr + self.mended * refitted) * gone**self.removal_power
 
-    def missing(self, sh_degree: int) -> float:
+    def missing(self, sh_degree):
         """Return the error of the bands that are left out."""
         return float(error_of(self.shown[sh_degree])) if sh_degree < self.sh_degree else 0.0
 
-    def _seen(self, error: Any, removed: Any, views: Views) -> Any:
+    def _seen(self, error, removed, views):
         seen = (error + removed / error_of(views.removal_offset)) / error_of(views.offset)
         return seen if views.photo_psnr is None else seen + error_of(views.photo_psnr)
 
     # The reference, by trying everything.
 
-    def smallest(self, psnr: float, views: Views = DECIDING, *, no_prune: bool = False) -> float:
+    def smallest(self, psnr, views=DECIDING, *, no_prune=False):
         """Return the size of the smallest file of a PSNR; infinite if there is none."""
         sizes = [np.where(psnr_of(e) >= psnr, s, np.inf).min() for s, e in self._files(views, no_prune=no_prune)]
         return float(min(sizes))
 
-    def best(self, size_bytes: int, views: Views = DECIDING, *, no_prune: bool = False) -> float:
+    def best(self, size_bytes, views=DECIDING, *, no_prune=False):
         """Return the PSNR of the best file of a size; negative infinity if there is none."""
         found = [np.where(s <= size_bytes, psnr_of(e), -np.inf).max() for s, e in self._files(views, no_prune=no_prune)]
         return float(max(found))
 
-    def _files(self, views: Views, *, no_prune: bool) -> Iterator[tuple[Any, Any]]:
+    def _files(self, views, *, no_prune):
         """Yield sizes and errors of all qualities, for every number of splats, coding and degree."""
         shares = [1.0] if no_prune else np.arange(0.1, 1.001, 0.1)
         for share, coding in itertools.product(shares, ("scalar", "codebook", "none")):
@@ -237,58 +195,22 @@ class AnalyticScene:
 
 @dataclass(frozen=True, eq=False)
 class AnalyticFile:
-    """A file of the computed size without content.
-
-    Attributes:
-        scene, contents: the scene and the request.
-    """
+    """A file of the computed size without content."""
 
     scene: AnalyticScene
     contents: Contents
 
-    def __len__(self) -> int:
+    def __len__(self):
         return int(self.scene.size_of(self.contents))
 
-    def psnr(self, views: Views = DECIDING) -> float:
-        """Return its PSNR in some views, dB."""
+    def psnr(self, views=DECIDING):
         return float(psnr_of(self.scene.error_of(self.contents, views)))
-
-    @property
-    def errors(self) -> dict[str, tuple[float, float]]:
-        """Return the largest and the mean error of its means: a power of the quality."""
-        largest = 10.0 ** (-self.scene.options_of(self.contents)["quality"] / 20.0)
-        return {"means": (largest, 0.5 * largest)}
-
-
-@dataclass(frozen=True)
-class Found:
-    """The result of a search.
-
-    Attributes:
-        file: the chosen file.
-        tried: every file that was made, in order.
-        scored: the files that were scored in test views.
-        report: the report for users.
-    """
-
-    file: AnalyticFile
-    tried: list[AnalyticFile]
-    scored: list[AnalyticFile]
-    report: SearchReport
 
 
 def search(
-    scene: AnalyticScene,
-    *,
-    options: EncodeOptions | None = None,
-    no_prune: bool = False,
-    judging: Views | None = None,
-    photo_psnr: float | None = None,
-    grades: bool = False,
-    effort: int = 3,
-    tried: list[AnalyticFile] | None = None,
-    **target: object,
-) -> Found:
+    scene, *, options=None, no_prune=False, judging=DECIDING, photo_psnr=None, grades=False, effort=3, tried=None,
+    **target,
+):  # fmt: skip
     """Search for a file of an analytic scene.
 
     Args:
@@ -301,11 +223,13 @@ def search(
         effort: effort of the refit.
         tried: receives the candidates, even if the search fails.
         target: arguments of `Target`.
+
+    Returns:
+        The chosen `file`, every file that was `tried`, in order, those `scored` in test views, the `report` for users.
     """
-    encoding, model, asked = options or EncodeOptions(), scene.model(), Target(**target)
-    judge, validation_scorer = _Judge(scene, judging or Views()), _Judge(scene, Views())
+    model, asked, judge = scene.model(), Target(**target), _Judge(scene, judging)
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
-    pool = CandidatePool(encoding, validation_scorer, decode=lambda data: data)
+    pool = CandidatePool(options or EncodeOptions(), _Judge(scene, DECIDING), decode=lambda data: data)
     removal = None if no_prune else analytic_removal(scene, grades=grades)
     whole = _Splats(scene, model, refits=False, classifiable=grades, file_seconds=scene.file_seconds)
     goal, work = Goal.of(asked, model, judge, photographs), SimplifyOptions(effort=effort).work
@@ -318,10 +242,11 @@ def search(
         asked, best, pool, judge, splats_before=scene.splats, views_of="virtual", remarks=(),
         encodes=len(pool.made), seconds=0.0,
     )  # fmt: skip
-    return Found(best.result.data, [one.result.data for one in pool.made], judge.scored, report)
+    files = [one.result.data for one in pool.made]
+    return SimpleNamespace(file=best.result.data, tried=files, scored=judge.scored, report=report)
 
 
-def analytic_removal(scene: AnalyticScene, *, grades: bool = False) -> Pruner:
+def analytic_removal(scene, *, grades=False):
     """Return the pruner of an analytic scene."""
     return _Removal(scene.model(), None, (48, 36), use_classes=grades, scene=scene)
 
@@ -364,17 +289,15 @@ class _Splats:
     def encode(self, options, *, use_classes, draft):
         use_classes = use_classes and self.classifiable and options.max_classes != 1 and self.scene.grading != 1.0
         contents = Contents(options, len(self.model), self.refits, graded=use_classes, draft=draft and self.refits)
-        return SimpleNamespace(write=lambda: _encoded(AnalyticFile(self.scene, contents)))
+        chosen = self.scene.options_of(contents)
+        largest = 10.0 ** (-chosen["quality"] / 20.0)  # error of the means; twice the mean one
+        report = SimpleNamespace(
+            options=chosen, errors={"means": (largest, 0.5 * largest)}, splat_count=contents.splats
+        )
+        return SimpleNamespace(write=lambda: SimpleNamespace(data=AnalyticFile(self.scene, contents), report=report))
 
     def metadata(self, validation_psnr):  # noqa: ARG002  # not recorded in the file
         return None
-
-
-def _encoded(file):
-    """Wrap a file like the encoder's result."""
-    options = file.scene.options_of(file.contents)
-    report = SimpleNamespace(options=options, errors=file.errors, splat_count=file.contents.splats)
-    return SimpleNamespace(data=file, report=report)
 
 
 @dataclass
@@ -406,6 +329,5 @@ class _Removal(Pruner):
     def refit(self, kept_count):
         model = self.source.select(self.order.kept(kept_count))
         model = replace(model, sh0=np.ones_like(model.sh0))
-        return _Splats(
-            self.scene, model, refits=True, classifiable=self.use_classes, file_seconds=self.scene.file_seconds
-        )
+        how = {"classifiable": self.use_classes, "file_seconds": self.scene.file_seconds}
+        return _Splats(self.scene, model, refits=True, **how)

@@ -3,9 +3,7 @@
 import numpy as np
 from checked import cloud
 
-from csplat_render.camera import (
-    intrinsics,
-)
+from csplat_render.camera import intrinsics
 
 K = intrinsics(640, 480, 60.0)
 UP = np.array([0.0, 0.0, 1.0])

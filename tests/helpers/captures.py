@@ -1,23 +1,19 @@
-"""A small scene and images of it, for training, tuning and searches; a trained and a tuned scene.
+"""A small scene and images of it, for training, tuning and searches; a trained and a tuned scene, by the command line.
 
-`make_trained` and `FileRuns` train on images drawn by NumPy, independent of csplat, by the command line alone.
 Requires the extra [render].
 """
 
-from __future__ import annotations
-
 import json
 import math
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from checked import cloud
+from checked import cloud, quaternion_of
 from command_line import call, change_options
 from PIL import Image
-from posed_sets import to_opengl
-from scipy.spatial.transform import Rotation
+from posed_sets import to_opengl, write_document
 
 from csplat import EncodeOptions, Target, write_ply
 from csplat.model import SplatModel, normalise_quats
@@ -46,19 +42,24 @@ def views_of(seen_from, photographs=()):
     return with_validation_views(ViewSet("cameras", BLACK, seen_from, (), (), photographs))
 
 
-def training_images(make_model, *, alpha: bool = True) -> DataSet:
+def with_alpha(seen):
+    """Return the straight RGBA pixels of a render on black, [H, W, 4] uint8."""
+    straight = np.clip(seen.rgb / np.maximum(seen.alpha, 1e-6)[..., None], 0.0, 1.0)
+    return as_bytes(np.concatenate([straight, seen.alpha[..., None]], axis=2))
+
+
+def as_bytes(pixels):
+    return np.rint(255.0 * np.clip(pixels, 0.0, 1.0)).astype(np.uint8)
+
+
+def training_images(make_model, *, alpha=True):
     """Return twelve images of thirty splats, nine of them for training."""
     scene = make_model(30, 1, seed=3, scales=np.full((30, 3), -1.2, np.float32))
-    rasteriser = Rasteriser(gradients=False)
-    shots = []
+    rasteriser, shots, K = Rasteriser(gradients=False), [], intrinsics(32, 32, 50.0)
     for elevation in (10.0, 45.0):
-        seen_from = orbit((0, 0, 0), 6.0, (0, 0, 1), 6, intrinsics(32, 32, 50.0), 32, 32, elevation=elevation)
-        for camera in seen_from:
+        for camera in orbit((0, 0, 0), 6.0, (0, 0, 1), 6, K, 32, 32, elevation=elevation):
             seen = rasteriser.forward(scene, camera)
-            cover = np.maximum(seen.alpha, 1e-6)[..., None]
-            colour = np.clip(seen.rgb / cover, 0, 1)
-            pixels = np.concatenate([colour, seen.alpha[..., None]], axis=2) if alpha else np.clip(seen.rgb, 0, 1)
-            shots.append(PosedImage(camera, np.rint(pixels * 255).astype(np.uint8)))
+            shots.append(PosedImage(camera, with_alpha(seen) if alpha else as_bytes(seen.rgb)))
     return DataSet("made", shots[:9], shots[9:])
 
 
@@ -67,14 +68,12 @@ def shell(coefficients):
     rng = np.random.default_rng(0)
     means = rng.standard_normal((300, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
-    return SplatModel(
-        means=means.astype(np.float32),
-        quats=normalise_quats(rng.standard_normal((300, 4))),
-        scales=rng.uniform(-2.5, -1.3, (300, 3)).astype(np.float32),
-        opacities=rng.uniform(0.1, 0.95, 300).astype(np.float32),
-        sh0=(np.sin(3.0 * means) + 0.5).astype(np.float32),
-        shN=(0.1 * rng.standard_normal((300, coefficients, 3))).astype(np.float32),
-    )
+    arrays = {
+        "means": means, "quats": normalise_quats(rng.standard_normal((300, 4))),
+        "scales": rng.uniform(-2.5, -1.3, (300, 3)), "opacities": rng.uniform(0.1, 0.95, 300),
+        "sh0": np.sin(3.0 * means) + 0.5, "shN": 0.1 * rng.standard_normal((300, coefficients, 3)),
+    }  # fmt: skip
+    return SplatModel(**{name: array.astype(np.float32) for name, array in arrays.items()})
 
 
 def photograph(scene, folder):
@@ -82,12 +81,10 @@ def photograph(scene, folder):
     (folder / "images").mkdir()
     frames = []
     for number, camera in enumerate(cameras(16)):
-        pixels = np.clip(render(scene, camera).rgb, 0.0, 1.0)
-        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / "images" / f"view{number:02}.png")
-        frames.append({"file_path": f"images/view{number:02}.png", "transform_matrix": to_opengl(camera)})
-    K = intrinsics(W, H, 60.0)
-    document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document))
+        name = f"images/view{number:02}.png"
+        Image.fromarray(as_bytes(render(scene, camera).rgb)).save(folder / name)
+        frames.append({"file_path": name, "transform_matrix": to_opengl(camera)})
+    write_document(folder, intrinsics(W, H, 60.0), W, H, frames)
     hidden = scene.select(np.concatenate([[0], np.arange(len(scene))]))
     hidden = replace(hidden, means=np.concatenate([np.full((1, 3), 400.0, np.float32), scene.means]))
     write_ply(folder / "scene.ply", hidden)
@@ -101,8 +98,7 @@ def as_colmap(folder):
     model.mkdir(parents=True)
     K, lines = cameras(1)[0].K, []
     for number, camera in enumerate(cameras(16)):
-        x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3]).as_quat()
-        values = " ".join(str(value) for value in (w, x, y, z, *camera.viewmat[:3, 3]))
+        values = " ".join(map(str, (*quaternion_of(camera.viewmat[:3, :3]), *camera.viewmat[:3, 3])))
         lines.append(f"{number + 1} {values} 1 view{number:02}.png\n\n")
     (model / "images.txt").write_text("".join(lines))
     (model / "cameras.txt").write_text(f"1 PINHOLE {W} {H} {K[0, 0]} {K[1, 1]} {W / 2} {H / 2}\n")
@@ -115,10 +111,7 @@ def photograph_object(scene, folder):
         (folder / part).mkdir()
         frames = []
         for number, camera in enumerate(seen_from):
-            seen = render(scene, camera)
-            straight = np.clip(seen.rgb / np.maximum(seen.alpha, 1e-6)[..., None], 0.0, 1.0)
-            pixels = np.concatenate([straight, seen.alpha[..., None]], axis=2)
-            Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / part / f"r_{number}.png")
+            Image.fromarray(with_alpha(render(scene, camera))).save(folder / part / f"r_{number}.png")
             frames.append({"file_path": f"./{part}/r_{number}", "transform_matrix": to_opengl(camera)})
         angle = 2.0 * math.atan(W / 2 / cameras(1)[0].K[0, 0])
         (folder / f"transforms_{part}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
@@ -180,52 +173,26 @@ _SAMPLES = 3  # rays per pixel and axis
 TRAIN = ("--max-splats", 300, "--sh-degree", 1, "--iterations", 300, "--seed", 1)
 
 
-@dataclass(frozen=True)
-class TrainedScene:
-    """A trained scene and its sources."""
-
-    data: Path
-    ply: Path
-    report: Path
-    checkpoint: Path
-    messages: str
-
-
-@dataclass(frozen=True)
-class TunedFile:
-    """A tuned file and its sources."""
-
-    source: TrainedScene
-    path: Path
-    report: Path
-    messages: str
-
-
-def write_photographs(folder: Path) -> None:
-    """Write a transforms.json set of a ball with coloured stripes on a transparent background."""
+def write_photographs(folder):
+    """Write a transforms.json set of a ball with coloured stripes on a transparent background, drawn by NumPy."""
     folder.mkdir(parents=True, exist_ok=True)
-    frames = []
+    K, frames = np.array([[FOCAL, 0.0, W / 2], [0.0, FOCAL, H / 2], [0.0, 0.0, 1.0]]), []
     for number in range(VIEWS):
         turn, height = 2.4 * number, 0.5 * np.sin(1.7 * number)
-        eye = np.array([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)]) * DISTANCE
-        back = eye / DISTANCE
-        right = np.cross([0.0, 0.0, 1.0], back)
-        right /= np.linalg.norm(right)
-        pose = np.eye(4)
-        pose[:3] = np.stack([right, np.cross(back, right), back, eye], axis=1)  # OpenGL: looks along -z
-        Image.fromarray(_photograph(pose)).save(folder / f"{number:02}.png")
-        frames.append({"file_path": f"{number:02}.png", "transform_matrix": pose.tolist()})
-    document = {"fl_x": FOCAL, "fl_y": FOCAL, "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document))
+        eye = DISTANCE * np.array([np.cos(turn) * np.cos(height), np.sin(turn) * np.cos(height), np.sin(height)])
+        camera = look_at(eye, (0, 0, 0), (0, 0, 1), K, W, H)
+        Image.fromarray(_photograph(eye, camera.viewmat[:3, :3])).save(folder / f"{number:02}.png")
+        frames.append({"file_path": f"{number:02}.png", "transform_matrix": to_opengl(camera)})
+    write_document(folder, K, W, H, frames)
 
 
-def _photograph(pose: np.ndarray) -> np.ndarray:
+def _photograph(eye, rotation):
     """Return an image of the ball, [H, W, 4] uint8, straight RGBA."""
-    ticks = [(np.arange(_SAMPLES * size) + 0.5) / _SAMPLES for size in (W, H)]
-    x, y = np.meshgrid((ticks[0] - W / 2) / FOCAL, (H / 2 - ticks[1]) / FOCAL)
-    rays = np.stack([x, y, -np.ones_like(x)], axis=2) @ pose[:3, :3].T
+    ticks = [((np.arange(_SAMPLES * size) + 0.5) / _SAMPLES - size / 2) / FOCAL for size in (W, H)]
+    x, y = np.meshgrid(*ticks)
+    rays = np.stack([x, y, np.ones_like(x)], axis=2) @ rotation
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
-    along, eye = rays @ pose[:3, 3], pose[:3, 3]
+    along = rays @ eye
     root = along**2 - (eye @ eye - 1.0)
     points = eye + (-along - np.sqrt(np.maximum(root, 0.0)))[..., None] * rays
     colours = 0.5 + 0.4 * np.sin(3.0 * points + np.array([0.0, 1.0, 2.0]))
@@ -235,18 +202,18 @@ def _photograph(pose: np.ndarray) -> np.ndarray:
     return np.rint(255.0 * means).astype(np.uint8)
 
 
-def make_trained(folder: Path) -> TrainedScene:
-    """Write the images and train the scene."""
+def make_trained(folder):
+    """Write the images and train the scene; return the paths and the messages."""
     data, ply, report, checkpoint = (folder / name for name in ("photographs", "a.ply", "train.json", "train.npz"))
     write_photographs(data)
     with pytest.MonkeyPatch.context() as patch:
         change_options(patch, "csplat_tools.cli.train.TrainOptions", refine_start=50, refine_every=25, lr_means=1e-3)
         words = ("train", data, ply, *TRAIN, "--report", report, "--checkpoint", checkpoint)
         messages = call(*words).stderr
-    return TrainedScene(data, ply, report, checkpoint, messages)
+    return SimpleNamespace(data=data, ply=ply, report=report, checkpoint=checkpoint, messages=messages)
 
 
-def make_tuned(folder: Path, source: TrainedScene) -> TunedFile:
+def make_tuned(folder, source):
     """Tune a file of the trained scene."""
     path, report = folder / "a.csplat", folder / "finetune.json"
     with pytest.MonkeyPatch.context() as patch:
@@ -254,7 +221,7 @@ def make_tuned(folder: Path, source: TrainedScene) -> TunedFile:
         change_options(patch, "csplat_trainer.tuning.tuning_options.FinetuneOptions", seed=1)
         words = ("finetune", source.ply, path, "--data", source.data, "--iterations", 100, "--report", report)
         messages = call(*words).stderr
-    return TunedFile(source, path, report, messages)
+    return SimpleNamespace(source=source, path=path, report=report, messages=messages)
 
 
 class FileRuns:
@@ -266,14 +233,14 @@ class FileRuns:
     WORDS = ("--max-splats", 40, "--sh-degree", 0, "--iterations", 30)
     TUNED = 30  # steps; the default is 1,000
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.folder, self.data = folder, folder / "photographs"
         self.checkpoint, self.page = folder / "run.npz", folder / "page.html"
         write_photographs(self.data)
         outputs = ("--checkpoint", self.checkpoint, "--page", self.page)
         self.report, self.messages = self.made("a.csplat", "--keep", 1, *outputs)
 
-    def made(self, name: str, *more: object, **options: object) -> tuple[dict, str]:
+    def made(self, name, *more, **options):
         """Make a file or a PLY, with options of the training; return the report and the messages."""
         report = self.folder / f"{name}.json"
         with pytest.MonkeyPatch.context() as patch:
@@ -288,15 +255,13 @@ class FileRuns:
 
 def shell_with_hidden_splats():
     """Return a shell of opaque splats with hidden ones inside, and ten that are too transparent to be drawn."""
-    rng = np.random.default_rng(0)
-    n, count = 300, 450
-    at = rng.standard_normal((n, 3))
-    at /= np.linalg.norm(at, axis=1, keepdims=True)
-    means = np.concatenate([at, 0.3 * rng.standard_normal((n // 2, 3))])
-    quats = normalise_quats(rng.standard_normal((count, 4)))
-    opacities = rng.uniform(0.6, 1.0, count)
-    opacities[:10] = 0.003
-    arrays = {"opacities": opacities, "scales": rng.uniform(-2.3, -1.7, (count, 3))}
-    arrays["sh0"] = np.sin(3.0 * means) + rng.uniform(0.0, 1.0, (count, 3))
-    arrays["shN"] = 0.05 * rng.standard_normal((count, 8, 3))
-    return cloud(means, quats=quats, **{name: values.astype(np.float32) for name, values in arrays.items()})
+    rng, count = np.random.default_rng(0), 450
+    at = rng.standard_normal((300, 3))
+    means = np.concatenate([at / np.linalg.norm(at, axis=1, keepdims=True), 0.3 * rng.standard_normal((150, 3))])
+    arrays = {
+        "quats": normalise_quats(rng.standard_normal((count, 4))), "opacities": rng.uniform(0.6, 1.0, count),
+        "scales": rng.uniform(-2.3, -1.7, (count, 3)), "sh0": np.sin(3.0 * means) + rng.uniform(0.0, 1.0, (count, 3)),
+        "shN": 0.05 * rng.standard_normal((count, 8, 3)),
+    }  # fmt: skip
+    arrays["opacities"][:10] = 0.003
+    return cloud(means, **{name: values.astype(np.float32) for name, values in arrays.items()})

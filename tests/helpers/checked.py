@@ -1,13 +1,10 @@
 """Helpers on models for tests: encode with everything checked, read along the axes of a format, covariances."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 from numpy.polynomial import Legendre
-from numpy.typing import NDArray
 
 import csplat
 from csplat.disk_files import local_file
@@ -46,12 +43,11 @@ def refusals(path, cases, read=csplat.read):
     messages = []
     for data in cases:
         path.write_bytes(data)
+        messages.append("")
         try:
             read(path)
         except InputError as error:
-            messages.append(str(error))
-        else:
-            messages.append("")
+            messages[-1] = str(error)
     return messages
 
 
@@ -83,49 +79,39 @@ def cloud(means, sizes=0.03, **fields):
 
 
 def covariances(quats, scales):
-    """Compute covariances in float64 from their definition.
+    """Return covariances [n, 3, 3] in float64 by definition, from quats of any length and logarithms of scales."""
+    rotation = rotations(quats / np.linalg.norm(quats.astype(np.float64), axis=1)[:, None])
+    return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * scales.astype(np.float64)), rotation)
 
-    Args:
-        quats: [n, 4], of any length.
-        scales: [n, 3], logarithms.
 
-    Returns:
-        [n, 3, 3].
-    """
-    w, x, y, z = (quats / np.linalg.norm(quats.astype(np.float64), axis=1)[:, None]).T
+def rotations(quats):
+    """Return the matrices [n, 3, 3] of unit quaternions."""
+    w, x, y, z = np.asarray(quats, np.float64).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    rotation = np.moveaxis(np.array(rows), 2, 0)
-    return np.einsum("nij,nj,nkj->nik", rotation, np.exp(2 * scales.astype(np.float64)), rotation)
+    return np.moveaxis(np.array(rows), 2, 0)
 
 
 def quaternion_of(rotation):
     """Return w x y z of a rotation (Bar-Itzhack: the eigenvector of the largest eigenvalue)."""
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    lower = [
-        [xx + yy + zz, 0, 0, 0],
-        [zy - yz, xx - yy - zz, 0, 0],
-        [xz - zx, yx + xy, yy - xx - zz, 0],
-        [yx - xy, zx + xz, zy + yz, zz - xx - yy],
-    ]
-    return np.linalg.eigh(np.array(lower))[1][:, -1]
+    lower = np.diag([xx + yy + zz, xx - yy - zz, yy - xx - zz, zz - xx - yy])
+    lower[np.tril_indices(4, -1)] = zy - yz, xz - zx, yx + xy, yx - xy, zx + xz, zy + yz
+    return np.linalg.eigh(lower)[1][:, -1]
 
 
 def disturbed(model, rng, sigma=1e-3):
     """Return the model with normal noise on every value."""
-
-    def near(values):
-        return (values + rng.normal(0, sigma, values.shape)).astype(np.float32)
-
-    arrays = {name: near(getattr(model, name)) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+    arrays = {name: getattr(model, name) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
+    arrays = {name: (a + rng.normal(0, sigma, a.shape)).astype(np.float32) for name, a in arrays.items()}
     arrays |= {"quats": normalise_quats(arrays["quats"]), "opacities": np.clip(arrays["opacities"], 0, 1)}
     return replace(model, **arrays)
 
 
-def sh_by_definition(degree: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+def sh_by_definition(degree, directions):
     """Return the real SH basis [D, (degree + 1)**2] in unit directions [D, 3], by associated Legendre functions."""
     x, y, z = directions.T
     columns = []

@@ -1,7 +1,5 @@
 """Chromium for tests: a browser per session, a static server that counts requests, and page objects of the viewer."""
 
-from __future__ import annotations
-
 import base64
 import itertools
 import os
@@ -9,12 +7,10 @@ import re
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, ClassVar, Self
 
 import numpy as np
 import pytest
@@ -36,35 +32,22 @@ _BASE64 = """(async (read) => {
 })"""
 
 
-def read_pixels(page: Any, pixels: str, width: int, height: int) -> np.ndarray:
-    """Return a picture, [H, W, 4] uint8, the top row first.
-
-    Args:
-        page: playwright's page.
-        pixels: an expression for its bytes, or for a promise of them.
-        width: pixels.
-        height: pixels.
-    """
+def read_pixels(page, pixels, width, height):
+    """Return a picture, [H, W, 4] uint8, the top row first, of an expression for its bytes or a promise of them."""
     text = page.evaluate(f"{_BASE64}({pixels})")
     return np.frombuffer(base64.b64decode(text), np.uint8).reshape(height, width, 4)
 
 
 class _ServedPage:
-    """A page in a tab.
+    """A page in a tab: `page` is playwright's, `site` the server of scenes."""
 
-    Attributes:
-        tab: the tab; `tab.problems` are its complaints.
-        page: playwright's page.
-        site: the server of scenes.
-    """
-
-    def __init__(self, tab: Tab, site: Site) -> None:
+    def __init__(self, tab, site):
         self.tab, self.page, self.site = tab, tab.page, site
         self._numbers = itertools.count()
 
     @classmethod
     @contextmanager
-    def opened(cls, context: Any) -> Iterator[Self]:
+    def opened(cls, context):
         """Load the page in a tab of its own, with a server."""
         site = Site()
         try:
@@ -75,12 +58,8 @@ class _ServedPage:
         finally:
             site.close()
 
-    def load(self) -> None:
-        """Load the page anew."""
-        raise NotImplementedError
-
     @contextmanager
-    def watched(self, request: pytest.FixtureRequest) -> Iterator[Self]:
+    def watched(self, request):
         """Let a test use the page; load it anew if the test fails, which it also does by complaints of the page."""
         failures = request.session.testsfailed
         yield self
@@ -91,36 +70,33 @@ class _ServedPage:
 
 
 class ViewerPage(_ServedPage):
-    """The viewer's page."""
+    SIZE = (240, 180)  # size of the window: the tools take up most of a smaller one
 
-    SIZE: ClassVar = (240, 180)  # size of the window: the tools take up most of a smaller one
-
-    def load(self, query: str = "") -> None:
-        """Load the served page with parameters, and wait until it shows its scene or an error."""
+    def load(self, query=""):
         self.visit(self.site.url(VIEWER + query))
 
-    def visit(self, url: str) -> None:
-        """Do the same with a page at another address."""
+    def visit(self, url):
+        """Load a page, and wait until it shows its scene or an error."""
         self._resize()
         self.page.goto(url)
         self.page.evaluate(_HEED_WHEEL)
         self.until("'csplatViewer' in window")  # a page of one file starts when all of it has been read
         self.page.evaluate("csplatViewer.ready")
 
-    def show(self, data: bytes, name: str = "scene.csplat") -> str:
+    def show(self, data, name="scene.csplat"):
         """Show a scene in the place of the present one; return its path on the server."""
         path = self.begin(data, name)
         self.page.evaluate("shown")
         return path
 
-    def begin(self, data: bytes | None, name: str = "scene.csplat") -> str:
+    def begin(self, data, name="scene.csplat"):
         """Start to show a scene, or an absent one; `shown` on the page resolves at the end."""
         path = f"/{next(self._numbers)}/{name}"
         url = self.site.url(path) if data is None else self.site.add(path, data)
         self.page.evaluate("([url, name]) => void (window.shown = csplatViewer.show(url, name))", [url, name])
         return path
 
-    def rest(self) -> None:
+    def rest(self):
         """Reset the page to its state after loading, except for the scene."""
         self.page.bring_to_front()
         self._resize()
@@ -132,21 +108,20 @@ class ViewerPage(_ServedPage):
         self.site.requests.clear()
         self.site.ranges, self.site.bytes_per_second = True, 0
 
-    def _resize(self) -> None:
+    def _resize(self):
         size = {"width": self.SIZE[0], "height": self.SIZE[1]}
         if self.page.viewport_size != size:
             self.page.set_viewport_size(size)
 
-    def until(self, expression: str) -> None:
-        """Wait until an expression is true."""
+    def until(self, expression):
         self.tab.until(expression)
 
-    def settle(self) -> None:
+    def settle(self):
         """Wait until camera and picture are at rest."""
         self.until("!csplatViewer.controls.frame && !csplatViewer.stage.moving")
         self.page.evaluate("csplatViewer.engine.settled()")
 
-    def moved(self, act: Callable[[], object]) -> tuple[dict[str, Any], dict[str, Any]]:
+    def moved(self, act):
         """Return the camera's pose before and after an action that moves it; browsers may report events late."""
         before = self.pose
         self.page.evaluate("window.before = JSON.stringify(csplatViewer.rig.pose)")
@@ -156,33 +131,30 @@ class ViewerPage(_ServedPage):
         return before, self.pose
 
     @property
-    def pose(self) -> dict[str, Any]:
-        """The camera's pose."""
+    def pose(self):
         return self.page.evaluate(_COPY.format("pose"))
 
     @property
-    def home(self) -> dict[str, Any]:
+    def home(self):
         """The camera's pose in the first picture."""
         return self.page.evaluate(_COPY.format("home"))
 
     @property
-    def viewmat(self) -> list[float]:
+    def viewmat(self):
         """The camera's matrix, row by row."""
         return self.page.evaluate("csplatViewer.rig.camera(80, 60).viewmat")
 
-    def text(self, selector: str) -> str:
-        """Return the text of an element."""
+    def text(self, selector):
         return self.page.inner_text(selector)
 
-    def hides(self, *selectors: str) -> bool:
-        """Return whether all of these elements are hidden."""
+    def hides(self, *selectors):
         return all(self.page.locator(selector).is_hidden() for selector in selectors)
 
-    def error(self) -> str | None:
+    def error(self):
         """Return the code of the error that is shown, or None."""
         return None if self.hides("#error") else self.page.get_attribute("#error", "data-code")
 
-    def picture(self) -> np.ndarray:
+    def picture(self):
         """Return the settled picture, [H, W, 4] uint8, the top row first."""
         self.settle()  # while the camera glides to its place a slow machine draws fewer pixels
         width, height = self.page.evaluate("[csplatViewer.stage.width, csplatViewer.stage.height]")
@@ -214,31 +186,25 @@ window.isLoaded = true;
 
 
 class EnginePage(_ServedPage):
-    """A page with the engine alone."""
-
-    def load(self) -> None:
-        """Load the page, and make the engine."""
+    def load(self):
         self.page.goto(self.site.add("/engine.html", _ENGINE.encode()))
         self.page.wait_for_function("window.isLoaded")
         self.start()
 
-    def start(self, options: str = "{}") -> None:
-        """Make the engine."""
+    def start(self, options="{}"):
         self.page.evaluate(f"make({options})")
 
-    def start_again(self, options: str = "{}") -> None:
+    def start_again(self, options="{}"):
         """Make the engine with other options, on a canvas of its own, since a canvas keeps its kind of context."""
         self.page.evaluate(
             "engine.close(), document.getElementById('canvas').outerHTML = '<canvas id=canvas></canvas>'"
         )
         self.start(options)
 
-    def open(self, data: bytes, path: str = "/scene.csplat") -> dict[str, Any] | None:
-        """Show a file; return the error, or None."""
+    def open(self, data, path="/scene.csplat"):
         return self.page.evaluate("open_", self.site.add(path, data))
 
-    def look(self, camera: Any, background: tuple[float, ...] = (0, 0, 0), degree: int = 4) -> None:
-        """Set camera, size, background and degree."""
+    def look(self, camera, background=(0, 0, 0), degree=4):
         K = camera.K
         pinhole = {
             "viewmat": camera.viewmat.ravel().tolist(), "fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2],
@@ -246,20 +212,19 @@ class EnginePage(_ServedPage):
         }  # fmt: skip
         self.page.evaluate("(given) => look(...given)", [pinhole, camera.W, camera.H, list(background), degree])
 
-    def picture(self, camera: Any, background: tuple[float, ...] = (0, 0, 0), degree: int = 4) -> np.ndarray:
+    def picture(self, camera, background=(0, 0, 0), degree=4):
         """Return the settled picture, [H, W, 3] float, 0 to 1."""
         self.look(camera, background, degree)
         return self._read("engine.readPixels()", camera)
 
-    def picture_of_now(self, camera: Any) -> np.ndarray:
+    def picture_of_now(self, camera):
         """Return the picture of the part that has arrived."""
         return self._read("(engine.drawNow(), engine.renderer.readPixels())", camera)
 
-    def _read(self, pixels: str, camera: Any) -> np.ndarray:
+    def _read(self, pixels, camera):
         return read_pixels(self.page, pixels, camera.W, camera.H)[..., :3] / 255.0
 
-    def stats(self) -> dict[str, Any]:
-        """Return the engine's counts."""
+    def stats(self):
         return self.page.evaluate("engine.stats")
 
 
@@ -283,18 +248,12 @@ TYPES = {
 
 @dataclass
 class Tab:
-    """A page and its problems.
+    """A page and its problems: console errors and uncaught exceptions. A test that provokes them clears the list."""
 
-    Attributes:
-        page: playwright's page.
-        problems: console errors and uncaught exceptions; a test fails at its end when some are left, so a test
-            that provokes them looks at them and clears the list.
-    """
-
-    page: Any
+    page: object
     problems: list[str] = field(default_factory=list)
 
-    def until(self, expression: str, seconds: float = 60.0) -> None:
+    def until(self, expression, seconds=60.0):
         """Wait until an expression is true; playwright's own way evaluates strings, which the page's policy forbids."""
         end = time.monotonic() + seconds
         while not self.page.evaluate(expression):
@@ -326,52 +285,44 @@ class Site:
             headers and body of an answer of its own; None for the usual one.
     """
 
-    def __init__(self) -> None:
-        self.requests: list[Request] = []
-        self.ranges = True
-        self.bytes_per_second = 0
-        self.breaks = False
-        self.policy = ""
-        self.scripts: dict[str, Callable[[Mapping[str, str], int], tuple[int, dict[str, str], bytes] | None]] = {}
-        self._files: dict[str, bytes | Path] = {}
+    def __init__(self):
+        self.requests, self.ranges, self.bytes_per_second, self.breaks, self.policy = [], True, 0, False, ""
+        self.scripts, self._files = {}, {}
         self._web = web_files()  # from the package that is being tested, a checkout or a wheel
         site = self
 
         class Handler(BaseHTTPRequestHandler):
             protocol_version = "HTTP/1.1"
 
-            def do_GET(self) -> None:
+            def do_GET(self):
                 site._answer(self)
 
             do_HEAD = do_GET
 
-            def log_message(self, *_args: object) -> None:
-                """Log nothing."""
+            def log_message(self, *_args):
+                pass
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
         self._thread = threading.Thread(target=self._server.serve_forever, kwargs={"poll_interval": 0.05})
         self._thread.start()
 
-    def add(self, path: str, what: bytes | Path) -> str:
-        """Serve bytes or a file under a path; returns its URL."""
+    def add(self, path, what):
         self._files[path] = what
         return self.url(path)
 
-    def url(self, path: str) -> str:
+    def url(self, path):
         """Return the address of a path: `/tools/viewer/...`, `/codec/js/...`, or one that was added."""
         return f"http://127.0.0.1:{self._server.server_address[1]}{path}"
 
-    def statuses(self, path: str) -> list[int]:
-        """Return the statuses of all answers to a path."""
+    def statuses(self, path):
         return [one.status for one in self.requests if one.path == path]
 
-    def close(self) -> None:
-        """End the server."""
+    def close(self):
         self._server.shutdown()
         self._server.server_close()
         self._thread.join()
 
-    def _answer(self, handler: BaseHTTPRequestHandler) -> None:
+    def _answer(self, handler):
         path = handler.path.partition("?")[0]
         body = self._body(path)
         asked = handler.headers.get("Range") or ""
@@ -403,7 +354,7 @@ class Site:
         if handler.command == "GET":
             self._send(handler, body, slow=path in self._files)
 
-    def _send(self, handler: BaseHTTPRequestHandler, body: bytes, *, slow: bool) -> None:
+    def _send(self, handler, body, *, slow):
         step = max(1, self.bytes_per_second // 20) if slow and self.bytes_per_second else len(body) or 1
         try:
             for start in range(0, len(body), step):
@@ -413,7 +364,7 @@ class Site:
         except (BrokenPipeError, ConnectionResetError):
             handler.close_connection = True  # the page has gone elsewhere
 
-    def _body(self, path: str) -> bytes | None:
+    def _body(self, path):
         what = self._files.get(path)
         if isinstance(what, bytes):
             return what
@@ -424,7 +375,7 @@ class Site:
         return what.read_bytes() if what is not None and what.is_file() else None
 
 
-def absent(reason: str) -> None:
+def absent(reason):
     """Skip the test, or fail if skipping is forbidden."""
     if os.environ.get("CI") == "true":
         pytest.fail(f"CI=true, and {reason}")
@@ -432,7 +383,7 @@ def absent(reason: str) -> None:
 
 
 @pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
+def browser():
     """Playwright's browser, headless Chromium with WebGL2 on the CPU."""
     program = shutil.which("chromium") or shutil.which("chromium-browser")
     if program is None:
@@ -448,7 +399,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="session")
-def context(browser: Any) -> Iterator[Any]:
+def context(browser):
     """The profile that all tabs share: one of its own would cost a tab twice as much."""
     made = browser.new_context(viewport={"width": 800, "height": 600}, device_scale_factor=1)
     yield made
@@ -456,7 +407,7 @@ def context(browser: Any) -> Iterator[Any]:
 
 
 @contextmanager
-def open_tab(context: Any) -> Iterator[Tab]:
+def open_tab(context):
     """Open a page; complaints that are left in `problems` at the end are a failure."""
     made = Tab(context.new_page())
     try:
@@ -470,14 +421,14 @@ def open_tab(context: Any) -> Iterator[Tab]:
 
 
 @pytest.fixture
-def tab(context: Any) -> Iterator[Tab]:
+def tab(context):
     """A fresh page of 800 by 600 pixels."""
     with open_tab(context) as made:
         yield made
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
+def site():
     """A server for one test."""
     made = Site()
     yield made
@@ -485,14 +436,14 @@ def site() -> Iterator[Site]:
 
 
 @pytest.fixture(scope="session")
-def viewer_page(context: Any) -> Iterator[ViewerPage]:
+def viewer_page(context):
     """The viewer's page, loaded once; tests take `viewer`."""
     with ViewerPage.opened(context) as page:
         yield page
 
 
 @pytest.fixture
-def viewer(request: pytest.FixtureRequest, viewer_page: ViewerPage) -> Iterator[ViewerPage]:
+def viewer(request, viewer_page):
     """The viewer's page, loaded already; what the last test left open is closed. A failed test leaves a fresh page."""
     viewer_page.rest()
     with viewer_page.watched(request) as page:
@@ -500,14 +451,14 @@ def viewer(request: pytest.FixtureRequest, viewer_page: ViewerPage) -> Iterator[
 
 
 @pytest.fixture(scope="session")
-def engine_page(context: Any) -> Iterator[EnginePage]:
+def engine_page(context):
     """A page with the engine alone, loaded once; tests take `engine`."""
     with EnginePage.opened(context) as page:
         yield page
 
 
 @pytest.fixture
-def engine(request: pytest.FixtureRequest, engine_page: EnginePage) -> Iterator[EnginePage]:
+def engine(request, engine_page):
     """The engine, made already; a failed test leaves a fresh page."""
     engine_page.page.evaluate("void (errors.length = 0)")
     with engine_page.watched(request) as page:

@@ -1,15 +1,10 @@
 """The command line in the process of the tests, batches without processes, and SIGINT in child processes."""
 
-from __future__ import annotations
-
 import signal
 from concurrent.futures import Executor, Future
 from dataclasses import replace
-from functools import partial
 from importlib import import_module
-from typing import Any
 
-import pytest
 from typer.testing import CliRunner
 
 from csplat_tools.cli.app import app
@@ -31,35 +26,29 @@ def call(*words, status=0):
 class _ChangedOptions:
     """A dataclass of options whose instances have other values of some fields."""
 
-    def __init__(self, kind: type, values: dict[str, Any]) -> None:
+    def __init__(self, kind, values):
         self._kind, self._values = kind, values
 
-    def __call__(self, *args: Any, **given: Any) -> Any:
+    def __call__(self, *args, **given):
         return replace(self._kind(*args, **given), **self._values)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return getattr(self._kind, name)
 
 
-def change_options(patch: pytest.MonkeyPatch, place: str, **values: object) -> None:
-    """Let commands use other options of the library, which the command line does not have.
-
-    Args:
-        patch: undoes it.
-        place: name of a class of options where a command finds it, such as `csplat_tools.cli.train.TrainOptions`.
-        values: values by field.
-    """
+def change_options(patch, place, **values):
+    """Let commands use other values of fields of options, at a place like `csplat_tools.cli.train.TrainOptions`."""
     module, _, name = place.rpartition(".")
     patch.setattr(place, _ChangedOptions(getattr(import_module(module), name), values))
 
 
-def change_views(patch: pytest.MonkeyPatch, count: int, size: tuple[int, int]) -> None:
+def change_views(patch, count, size):
     """Let commands place few, small virtual views if they place any."""
 
-    def find(source, *, count: int | None, size: tuple[int, int] | None, few, small, **how):  # noqa: ARG001
-        return find_view_set(source, count=count if count == 0 else few, size=small, **how)
+    def find(source, **how):
+        return find_view_set(source, **{**how, "count": 0 if how["count"] == 0 else count, "size": size})
 
-    patch.setattr("csplat_tools.cli.shared_options.find_view_set", partial(find, few=count, small=size))
+    patch.setattr("csplat_tools.cli.shared_options.find_view_set", find)
 
 
 class InThisProcess(Executor):

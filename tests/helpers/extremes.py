@@ -1,49 +1,39 @@
-"""Extreme scenes as PLY columns and through all stages, for the tests marked `extremes`.
+"""Extreme scenes as PLY columns and through all stages.
 
 All are variants of one object, a shell of 300 overlapping splats about two units across. `CONDITIONS` names them;
 `tools/docs/results/extremes.md` describes the results, whose figures are `EXPECTED`.
 `python tests/helpers/extremes.py` writes the figures. Requires the extra [render].
 """
 
-from __future__ import annotations
-
 import json
 import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 from captures import cameras, views_of
 
 from csplat import EncodeOptions, decode, read_ply
 from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder import (
-    EncodePlan,
-    EncodeResult,
-    FixedQuantisation,
-    Target,
-    encode_with_report,
-    fix_quantisation,
-)
+from csplat.encoder import EncodePlan, Target, encode_with_report, fix_quantisation
 from csplat.errors import InputError
-from csplat.lint import Finding
-from csplat.model import SplatModel, normalise_quats
+from csplat.model import normalise_quats
 from csplat.ply import lint_ply
-from csplat_conformance.declared_bounds import BoundsVerification, Source, verify_bounds
-from csplat_render import Camera, render
-from csplat_render.conventions import RenderResult
+from csplat_conformance.declared_bounds import Source, verify_bounds
+from csplat_render import render
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
+from csplat_tools.optimise.simplify import SimplifyOptions, simplify
 from csplat_trainer.data import DataSet
 from csplat_trainer.posed_images import PosedImage
 from csplat_trainer.training_loop import train
-from csplat_trainer.training_options import TrainOptions, TrainResult
-from csplat_trainer.tuning import FinetuneOptions, TuningResult, TuningViews, renders_of, split_views, tune
+from csplat_trainer.training_options import TrainOptions
+from csplat_trainer.tuning import FinetuneOptions, renders_of, split_views, tune
 
 RESULTS = Path(__file__).resolve().parents[2] / "tools" / "lab" / "results" / "extremes.json"
 #: Bytes per splat, PSNR and the like of each condition, as `python tests/helpers/extremes.py` measured them.
@@ -54,62 +44,40 @@ TINY = 1e-42  # denormal
 PRESETS = ("fast", "balanced", "small")
 COPIES = 2_000  # replaces a million identical splats in training, which visits every splat in each step
 
-Columns = dict[str, np.ndarray]
-
 
 @dataclass(frozen=True)
 class Condition:
-    """An extreme scene.
+    """An extreme scene: a function for a PLY's columns; comments; how many rows are dropped, which defects repaired."""
 
-    Attributes:
-        make: returns the columns `means`, `quats`, `scales`, `logits`, `sh0`, `shN` of the PLY.
-        comments: comments in the PLY's header.
-        dropped: number of rows that a reader drops.
-        repairs: ids of the defects that `strict` refuses.
-    """
-
-    make: Callable[[], Columns]
-    comments: tuple[str, ...] = ()
+    make: Callable
+    comments: tuple = ()
     dropped: int = 0
-    repairs: tuple[str, ...] = ()
+    repairs: tuple = ()
 
 
-def ordinary(count: int = COUNT, coefficients: int = 8) -> Columns:
+def ordinary(count=COUNT, coefficients=8):
     """Return the object that all scenes are variants of."""
     rng = np.random.default_rng(0)
     means = rng.standard_normal((count, 3))
     means /= np.linalg.norm(means, axis=1, keepdims=True)
-    return {
-        "means": means.astype(np.float32),
-        "quats": normalise_quats(rng.standard_normal((count, 4))),
-        "scales": rng.uniform(-2.5, -1.3, (count, 3)).astype(np.float32),
-        "logits": rng.uniform(-2.0, 3.0, count).astype(np.float32),
-        "sh0": (np.sin(3.0 * means) + 0.5).astype(np.float32),
-        "shN": (0.1 * rng.standard_normal((count, coefficients, 3))).astype(np.float32),
-    }
+    columns = {
+        "means": means, "quats": normalise_quats(rng.standard_normal((count, 4))),
+        "scales": rng.uniform(-2.5, -1.3, (count, 3)), "logits": rng.uniform(-2.0, 3.0, count),
+        "sh0": np.sin(3.0 * means) + 0.5, "shN": 0.1 * rng.standard_normal((count, coefficients, 3)),
+    }  # fmt: skip
+    return {name: column.astype(np.float32) for name, column in columns.items()}
 
 
-def far_away() -> Columns:
+def far_away(dtype=np.float32):
     columns = ordinary()
-    columns["means"] += np.float32(FAR)
-    return columns
+    return columns | {"means": columns["means"].astype(dtype) + dtype(FAR)}
 
 
-def far_away_in_doubles() -> Columns:
-    columns = ordinary()
-    columns["means"] = columns["means"].astype(np.float64) + FAR
-    return columns
+def identical(count=1_000_000, coefficients=0):
+    return {name: np.repeat(column[:1], count, axis=0) for name, column in ordinary(COUNT, coefficients).items()}
 
 
-def one_splat() -> Columns:
-    return {name: column[:1] for name, column in ordinary().items()}
-
-
-def identical(count: int = 1_000_000) -> Columns:
-    return {name: np.repeat(column[:1], count, axis=0) for name, column in ordinary(coefficients=0).items()}
-
-
-def needles() -> Columns:
+def needles():
     """Return needles, discs and blades, a third each, with axes 1 : e^20."""
     columns = ordinary()
     columns["scales"][0::3] = [-1.0, -21.0, -21.0]
@@ -118,7 +86,7 @@ def needles() -> Columns:
     return columns
 
 
-def giant_background() -> Columns:
+def giant_background():
     """Return the object at a hundredth of its size, amid twenty splats a million times larger."""
     columns = ordinary()
     columns["means"] *= np.float32(0.01)
@@ -130,14 +98,14 @@ def giant_background() -> Columns:
     return columns
 
 
-def transparent() -> Columns:
+def transparent():
     """Return splats with alpha 0 or 1/8100, which is too faint to be drawn."""
     columns = ordinary()
     columns["logits"][:] = np.where(np.arange(COUNT) % 2, -np.inf, -9.0)
     return columns
 
 
-def saturated() -> Columns:
+def saturated():
     """Return a scene in which every third splat has coefficients of ±1e4: white from one side, black from another."""
     columns = ordinary()
     for name, middle in (("sh0", 0.5), ("shN", 0.0)):
@@ -145,7 +113,7 @@ def saturated() -> Columns:
     return columns
 
 
-def half_nan() -> Columns:
+def half_nan():
     """Return a scene with NaN or infinity in every other row, in alternating columns."""
     columns = ordinary()
     names = list(columns)
@@ -156,7 +124,7 @@ def half_nan() -> Columns:
     return columns
 
 
-def denormals() -> Columns:
+def denormals():
     """Return denormal numbers in every column, rotations of denormal length, and one of length 0."""
     columns = ordinary()
     columns["means"][0::3] *= np.float32(1e-40)
@@ -169,7 +137,7 @@ def denormals() -> Columns:
     return columns
 
 
-def float32_limits() -> Columns:
+def float32_limits():
     """Return centres, logits and rotations at the limits of float32, and log scales of ±60 and ±88."""
     columns = ordinary()
     columns["means"][:4] = 3e38 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, -1], [-1, 1, 1]])
@@ -181,7 +149,7 @@ def float32_limits() -> Columns:
     return columns
 
 
-def exploded() -> Columns:
+def exploded():
     """Return eight splats with colours and log scales of ±3e38, as diverged training leaves them."""
     columns = ordinary()
     for row, value in enumerate((3e38, -3e38)):
@@ -195,8 +163,8 @@ def exploded() -> Columns:
 CONDITIONS = {
     "10 km away": Condition(far_away),
     "10 km away, origin": Condition(ordinary, (f"csplat origin {FAR} {FAR} {FAR}",)),
-    "10 km away, doubles": Condition(far_away_in_doubles),
-    "one splat": Condition(one_splat),
+    "10 km away, doubles": Condition(partial(far_away, np.float64)),
+    "one splat": Condition(partial(identical, 1, 8)),
     "a million identical": Condition(identical),
     "needles": Condition(needles),
     "giant background": Condition(giant_background),
@@ -212,7 +180,7 @@ NAMES = tuple(CONDITIONS)
 DRAWN = tuple(name for name in NAMES if name != "a million identical")
 
 
-def write_columns(path: Path, columns: Columns, comments: tuple[str, ...] = ()) -> Path:
+def write_columns(path, columns, comments=()):
     """Write columns unchanged, including NaN, in INRIA's layout."""
     count, rest = len(columns["means"]), columns["shN"].shape[1] * 3
     names = ["f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{k}" for k in range(rest))]
@@ -230,28 +198,24 @@ def write_columns(path: Path, columns: Columns, comments: tuple[str, ...] = ()) 
     return path
 
 
-def write_scene(folder: Path, name: str) -> Path:
-    """Write the PLY of a condition."""
+def write_scene(folder, name):
     condition = CONDITIONS[name]
     return write_columns(folder / "scene.ply", condition.make(), condition.comments)
 
 
 @cache
-def scene(name: str) -> tuple[SplatModel, tuple[Finding, ...]]:
-    """Return the scene of a condition, and the reader's findings."""
-    findings: list[Finding] = []
+def scene(name):
     with tempfile.TemporaryDirectory() as folder:
-        return read_ply(write_scene(Path(folder), name), report=findings), tuple(findings)
+        return read_ply(write_scene(Path(folder), name))
 
 
 @cache
-def encoded(name: str, preset: str, quality: float | None = None) -> EncodeResult:
-    """Encode a condition."""
-    return encode_with_report(scene(name)[0], EncodeOptions(preset=preset, attribute_psnr=quality))
+def encoded(name, preset, quality=None):
+    return encode_with_report(scene(name), EncodeOptions(preset=preset, attribute_psnr=quality))
 
 
 @cache
-def scorer(name: str, size: tuple[int, int] = (640, 480)) -> Scorer:
+def scorer(name, size=(640, 480)):
     """Return a scorer of renders against those of a condition, from eight virtual cameras."""
     model = small_scene(name)
     return Scorer.of_source(model, virtual_cameras(model, 8, *size), (0.0, 0.0, 0.0))
@@ -269,53 +233,9 @@ COARSE = EncodeOptions(preset="small", attribute_psnr=36.0)
 BLACK = np.zeros(3, np.float32)
 
 
-@dataclass(frozen=True)
-class Learnt:
-    """A condition after a few steps of learning.
-
-    Attributes:
-        half: the scene with half its splats.
-        trained: splats trained on renders of the scene.
-        losses: training loss of each step.
-        tuned: the decoded scene of the tuned file, or the reason why it cannot be tuned.
-    """
-
-    half: SplatModel
-    trained: SplatModel
-    losses: tuple[float, ...]
-    tuned: SplatModel | str
-
-
-@dataclass(frozen=True)
-class Chain:
-    """A condition after each stage.
-
-    Attributes:
-        source: the scene as read.
-        findings: findings of the reader.
-        linted: ids of the repairs that `lint_ply` reports.
-        refusal: message of strict reading; "" if it succeeds.
-        result: the encoded file, preset `balanced`.
-        decoded: the decoded scene.
-        verification: verification of the declared error bounds.
-        renders: renders of source and decoded scene, in the modes `fast` and `exact`.
-        learnt: the scene after learning, for conditions in `TRAINED`.
-    """
-
-    source: SplatModel
-    findings: tuple[Finding, ...]
-    linted: tuple[str, ...]
-    refusal: str
-    result: EncodeResult
-    decoded: SplatModel
-    verification: BoundsVerification
-    renders: tuple[RenderResult, ...]
-    learnt: Learnt | None
-
-
-def chain_of(name: str) -> Chain:
+def chain_of(name):
     """Take a condition through all stages, with `COPIES` instead of a million splats."""
-    findings: list[Finding] = []
+    findings = []
     with tempfile.TemporaryDirectory() as folder:
         columns = CONDITIONS[name].make() if name in DRAWN else identical(COPIES)
         path = write_columns(Path(folder) / "scene.ply", columns, CONDITIONS[name].comments)
@@ -328,69 +248,65 @@ def chain_of(name: str) -> Chain:
     result = encode_with_report(source)
     decoded = decode(result.data)
     (camera,) = virtual_cameras(source, 1, 24, 18)
-    renders = [render(model, camera, mode=mode) for model in (source, decoded) for mode in ("fast", "exact")]
-    learnt = _learn(source) if name in TRAINED else None
-    verification = verify(source, result, decoded)
-    return Chain(source, tuple(findings), linted, refusal, result, decoded, verification, tuple(renders), learnt)
+    return SimpleNamespace(
+        source=source, findings=findings, linted=linted, refusal=refusal, result=result, decoded=decoded,
+        renders=[render(model, camera, mode=mode) for model in (source, decoded) for mode in ("fast", "exact")],
+        learnt=_learn(source) if name in TRAINED else None,
+    )  # fmt: skip
 
 
-def verify(source: SplatModel, result: EncodeResult, decoded: SplatModel) -> BoundsVerification:
+def assert_bounds_hold(source, result, decoded):
     """Verify the declared error bounds of a file against its source."""
-    bounds = read_declared_bounds(result.data)
-    return verify_bounds(Source.of(source), decoded, read_header(result.data), bounds, result.source_index)
+    header, bounds = read_header(result.data), read_declared_bounds(result.data)
+    found = verify_bounds(Source.of(source), decoded, header, bounds, result.source_index)
+    assert ((), True) == (found.failures, found.rms_verified)
+    assert list(range(len(source))) == sorted(result.source_index.tolist())
+    assert source.origin == decoded.origin
 
 
-def _learn(source: SplatModel) -> Learnt:
+def _learn(source):
+    """Return the scene with half its splats, splats trained on its renders, and its tuned file or why there is none."""
     views = cameras(9)
     half = simplify(source, Target(keep=0.5), views=views_of(views), options=SimplifyOptions(effort=1)).model
     options = replace(QUICK, iterations=40, refine_start=10, refine_every=10)
     trained = train(images_of(source, views, source.means[:COUNT]), options)
     try:
         fixed, result, _ = tune_on_renders(source, views, 2, replace(SHORT, iterations=20))
-        tuned: SplatModel | str = decode(fixed.encode(result.best_values).write().data)
+        tuned = decode(fixed.encode(result.best_values).write().data)
     except InputError as error:
         tuned = str(error)
-    return Learnt(half, trained.model, tuple(trained.log["losses"]), tuned)
+    return SimpleNamespace(half=half, trained=trained.model, losses=trained.log["losses"], tuned=tuned)
 
 
-def tune_on_renders(
-    source: SplatModel, views: list[Camera], validation_count: int, options: FinetuneOptions
-) -> tuple[FixedQuantisation, TuningResult, TuningViews]:
+def tune_on_renders(source, views, validation_count, options):
     """Tune a coarse file of a scene to renders of it."""
     split = split_views(renders_of(source, views, BLACK, None), BLACK, validation_count=validation_count)
     fixed = fix_quantisation(EncodePlan.of(source, COARSE))
     return fixed, tune(fixed, split, options), split
 
 
-def assert_finite(model: SplatModel) -> None:
-    """Fail if an array of a scene contains NaN or infinity."""
+def assert_finite(model):
     for name in ARRAYS:
         assert np.isfinite(getattr(model, name)).all(), name
 
 
-def small_scene(name: str) -> SplatModel:
+def small_scene(name):
     """Return a condition, with `COPIES` instead of a million splats."""
-    return scene(name)[0].select(slice(COPIES))
-
-
-def small_scorer(name: str) -> Scorer:
-    """Return a scorer of 160×120 renders against those of a condition."""
-    return scorer(name, SMALL)
+    return scene(name).select(slice(COPIES))
 
 
 @cache
-def half(name: str) -> Simplified:
-    """Simplify a condition to half its splats."""
+def half(name):
     return simplify(small_scene(name), Target(keep=0.5), options=FEW)
 
 
-def images(name: str, points: np.ndarray | None = None) -> DataSet:
+def images(name, points=None):
     """Return a data set of renders of a condition, and points."""
     model = small_scene(name)
     return images_of(model, virtual_cameras(model, 12, 48, 40), points)
 
 
-def images_of(model: SplatModel, views: list[Camera], points: np.ndarray | None = None) -> DataSet:
+def images_of(model, views, points=None):
     """Return a data set of renders on black, three of four for training, and points."""
     rasteriser, shots = Rasteriser(gradients=False), []
     for camera in views:
@@ -401,18 +317,14 @@ def images_of(model: SplatModel, views: list[Camera], points: np.ndarray | None 
 
 
 @cache
-def trained(name: str) -> TrainResult:
+def trained(name):
     """Train splats on renders of a condition, starting from its centres."""
     return train(images(name, small_scene(name).means[:COUNT]), QUICK)
 
 
 @cache
-def tuned(name: str) -> tuple[SplatModel, SplatModel, TuningResult, Scorer]:
-    """Tune a file of a condition to 48 of 52 renders.
-
-    Returns:
-        The decoded scene before and after, the result, and a scorer of the four validation renders.
-    """
+def tuned(name):
+    """Tune to 48 of 52 renders; return the scene before and after, the result, and a scorer of the four others."""
     source = small_scene(name)
     fixed, result, views = tune_on_renders(source, virtual_cameras(source, 52, 48, 36), 4, SHORT)
     before, after = (decode(fixed.encode(values).write().data) for values in (fixed.start(), result.best_values))
@@ -420,15 +332,15 @@ def tuned(name: str) -> tuple[SplatModel, SplatModel, TuningResult, Scorer]:
     return before, after, result, Scorer([view.camera for view in views.validation], references)
 
 
-def measure(name: str) -> dict[str, object]:
+def measure(name):
     """Return the row of a condition in `results/extremes.json`."""
-    row: dict[str, object] = {"scene": name}
+    row = {"scene": name}
     for preset in PRESETS:
-        data, count = encoded(name, preset).data, len(scene(name)[0])
+        data, count = encoded(name, preset).data, len(scene(name))
         figures = {"bytes_per_splat": round(len(data) / count, 1 if len(data) > count else 4)}
         row[preset] = figures | ({"psnr": round(scorer(name).psnr(decode(data)), 1)} if name in DRAWN else {})
     losses = trained(name).log["losses"]
-    row["half_psnr"] = round(small_scorer(name).psnr(half(name).model), 1)
+    row["half_psnr"] = round(scorer(name, SMALL).psnr(half(name).model), 1)
     row["loss_before"], row["loss_after"] = (round(float(np.mean(part)), 2) for part in (losses[:10], losses[-10:]))
     if name != "exploded":
         before, after, _, views = tuned(name)

@@ -1,21 +1,14 @@
 """References for the rasteriser: random and adversarial splats, the exact twin, finite differences."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from csplat_render import Camera
-from csplat_render.conventions import Gradients, HasSplats, RenderResult, UncheckedSplats
+from csplat_render.conventions import UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.reference_rasteriser import Decisions, render_exact
-
-Array = NDArray[Any]
-Arrays = dict[str, Array]
 
 #: Groups of parameters, in the order of `UncheckedSplats`.
 GROUPS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -32,125 +25,86 @@ _STEP = 1e-5  # step of finite differences, whose error is about its square
 _FLIPPED = 1e-4  # a larger difference of colours means that a comparison has another result
 
 
-@dataclass(frozen=True)
-class Difference:
-    """The difference of two renders of the same splats.
-
-    Attributes:
-        most: largest absolute difference of a colour component.
-        share: share of pixels with a colour difference above 1/255.
-        mean: mean absolute difference of colours.
-    """
-
-    most: float
-    share: float
-    mean: float
-
-
 @dataclass(frozen=True, eq=False)
 class Case:
-    """Splats that break rasterisers.
+    """Splats that break rasterisers, arrays of float32; gradients that exceed float32 only have to be finite."""
 
-    Attributes:
-        arrays: arrays of the splats, float32.
-        view: the camera.
-        antialiased: render with antialiasing.
-        beyond: gradients exceed float32; they only have to be finite.
-    """
-
-    arrays: Arrays
+    arrays: dict
     view: Camera
     antialiased: bool = False
     beyond: bool = False
 
 
-def difference(picture: Array, exact: Array) -> Difference:
-    """Compare two renders, [H, W, 3]."""
+def difference(picture, exact):
+    """Compare renders: largest and mean difference of a component, and the share of pixels with more than 1/255."""
     error = np.abs(np.asarray(picture, np.float64) - exact)
-    return Difference(float(error.max()), float(np.mean(error.max(2) > 1 / 255)), float(error.mean()))
+    return SimpleNamespace(most=error.max(), share=np.mean(error.max(2) > 1 / 255), mean=error.mean())
 
 
-def facing(focal: float = 40.0, near: float = 0.2, distance: float = 3.0, width: int = 50, height: int = 37) -> Camera:
+def facing(focal=40.0, near=0.2, distance=3.0, width=50, height=37):
     """Return a camera on the z axis that looks at the origin."""
     viewmat = np.eye(4)
     viewmat[2, 3] = distance
     return Camera([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], viewmat, width, height, near=near)
 
 
-def random_splats(count: int, degree: int, seed: int) -> Arrays:
+def random_splats(count, degree, seed):
     """Return splats of all shapes in front of `VIEW`, float64."""
     rng = np.random.default_rng(seed)
     return {
-        "means": rng.uniform((-1.1, -0.9, -0.6), (1.1, 0.9, 0.9), (count, 3)),
-        "quats": rng.standard_normal((count, 4)),
-        "scales": rng.uniform(-3.0, -0.8, (count, 3)),
-        "opacities": rng.uniform(0.2, 1.0, count),
-        "sh0": rng.standard_normal((count, 3)),
-        "shN": 0.4 * rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)),
-    }
+        "means": rng.uniform((-1.1, -0.9, -0.6), (1.1, 0.9, 0.9), (count, 3)), "quats": rng.standard_normal((count, 4)),
+        "scales": rng.uniform(-3.0, -0.8, (count, 3)), "opacities": rng.uniform(0.2, 1.0, count),
+        "sh0": rng.standard_normal((count, 3)), "shN": 0.4 * rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)),
+    }  # fmt: skip
 
 
-def random_gradients(view: Camera, seed: int) -> tuple[Array, Array, Array]:
+def random_gradients(view, seed):
     """Return random gradients with respect to colours, alpha and depth."""
     rng = np.random.default_rng(seed)
     size = (view.H, view.W)
     return rng.standard_normal((*size, 3)), rng.standard_normal(size), rng.standard_normal(size)
 
 
-def relative_error(value: Array, wanted: Array) -> float:
+def relative_error(value, wanted):
     """Return the L2 norm of the difference relative to the expected value, or to 1e-30 if that is larger."""
     off = np.linalg.norm(np.asarray(value, np.float64) - wanted)
     return float(off / max(1e-30, float(np.linalg.norm(wanted))))
 
 
-def gradients_of(
-    splats: HasSplats, view: Camera, weights: tuple[Array, Array, Array], dtype: Any = np.float64, **options: Any
-) -> tuple[RenderResult, Gradients]:
+def gradients_of(splats, view, weights, dtype=np.float64, **options):
     """Return a render, and the gradients of the weighted sum of its values."""
     rasteriser = Rasteriser(dtype=dtype)
     picture = rasteriser.forward(splats, view, **options)
     return picture, rasteriser.backward(*(weight.astype(dtype) for weight in weights))
 
 
-def finite_differences(
-    arrays: Arrays, view: Camera, weights: tuple[Array, Array, Array], **options: Any
-) -> tuple[RenderResult, Arrays]:
+def finite_differences(arrays, view, weights, **options):
     """Return the twin's render, and the slopes of the weighted sum of its values with all comparisons fixed."""
     decisions = Decisions()
     picture = render_exact(UncheckedSplats(**arrays), view, decisions=decisions, **options)
 
-    def loss(changed: Mapping[str, Array]) -> float:
+    def loss(group, index, step):
+        changed = arrays[group].copy()
+        changed[index] += step
         decisions.replay()
-        result = render_exact(UncheckedSplats(**changed), view, decisions=decisions, **options)
-        return float(sum(np.sum(a * b) for a, b in zip((result.rgb, result.alpha, result.depth), weights, strict=True)))
+        result = render_exact(UncheckedSplats(**{**arrays, group: changed}), view, decisions=decisions, **options)
+        return sum(np.sum(a * b) for a, b in zip((result.rgb, result.alpha, result.depth), weights, strict=True))
 
-    slopes = {}
-    for group in GROUPS:
-        slopes[group] = np.zeros_like(arrays[group])
-        for index in np.ndindex(arrays[group].shape):
-            values = []
-            for step in (_STEP, -_STEP):
-                moved = arrays[group].copy()
-                moved[index] += step
-                values.append(loss({**arrays, group: moved}))
-            slopes[group][index] = (values[0] - values[1]) / (2.0 * _STEP)
+    slopes = {group: np.zeros_like(arrays[group]) for group in GROUPS}
+    for group, slope in slopes.items():
+        for index in np.ndindex(slope.shape):
+            slope[index] = (loss(group, index, _STEP) - loss(group, index, -_STEP)) / (2.0 * _STEP)
     return picture, slopes
 
 
-def float32_errors(
-    splats: HasSplats, view: Camera, weights: tuple[Array, Array, Array], **options: Any
-) -> tuple[int, dict[str, float]]:
-    """Compare float32 gradients with float64 ones.
+def float32_errors(splats, view, weights, **options):
+    """Compare float32 gradients with float64 ones; return a number of pixels, and relative errors by parameter.
 
     If a comparison, such as alpha against 1/255, has another result in float32, a pixel gives one splat another
     gradient. For each such pixel the splat with the largest difference is left out.
-
-    Returns:
-        The number of these pixels, and the relative error of each group of parameters.
     """
-    pictures, found = zip(
-        *(gradients_of(splats, view, weights, dtype, **options) for dtype in (np.float32, np.float64)), strict=True
-    )
+    both = (gradients_of(splats, view, weights, dtype, **options) for dtype in (np.float32, np.float64))
+    pictures, found = zip(*both, strict=True)
     flipped = int(np.count_nonzero(np.abs(pictures[0].rgb - pictures[1].rgb).max(2) > _FLIPPED))
     errors = {}
     for group in GROUPS:
@@ -160,22 +114,19 @@ def float32_errors(
     return flipped, errors
 
 
-def extreme_splats(count: int = 64, degree: int = 1, seed: int = 0, **fields: Any) -> Arrays:
+def extreme_splats(count=64, degree=1, seed=0, **fields):
     """Return random splats around the origin, float32; `fields` are values common to all."""
     rng = np.random.default_rng(seed)
-    arrays: Arrays = {
-        "means": rng.uniform(-1.0, 1.0, (count, 3)),
-        "quats": rng.standard_normal((count, 4)),
-        "scales": rng.uniform(-4.0, -1.0, (count, 3)),
-        "opacities": rng.random(count),
-        "sh0": rng.standard_normal((count, 3)),
-        "shN": rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)),
-    }
+    arrays = {
+        "means": rng.uniform(-1.0, 1.0, (count, 3)), "quats": rng.standard_normal((count, 4)),
+        "scales": rng.uniform(-4.0, -1.0, (count, 3)), "opacities": rng.random(count),
+        "sh0": rng.standard_normal((count, 3)), "shN": rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)),
+    }  # fmt: skip
     arrays.update({name: np.broadcast_to(value, arrays[name].shape) for name, value in fields.items()})
     return {name: np.array(value, np.float32) for name, value in arrays.items()}
 
 
-def adversarial() -> Iterator[tuple[str, Case]]:
+def adversarial():
     """Yield named cases: long and thin, far and near, tiny and huge."""
     shapes = {
         "needle": (0.0, -13.8, -13.8), "disc": (0.0, 0.0, -13.8), "large needle": (4.0, -9.8, -9.8),
@@ -193,11 +144,9 @@ def adversarial() -> Iterator[tuple[str, Case]]:
     for alpha in (0.0, 1.0):
         yield f"alpha {alpha:g}", Case(extreme_splats(opacities=alpha), facing())
     for scale in (-60.0, 60.0):
-        arrays = extreme_splats()
-        arrays["scales"][:] = scale
-        yield f"log-scales {scale:g}", Case(arrays, facing())
+        yield f"log-scales {scale:g}", Case(extreme_splats(scales=scale), facing())
     mixed = extreme_splats()
-    mixed["scales"][:, 0], mixed["scales"][:, 1] = 60.0, -60.0
+    mixed["scales"][:, :2] = 60.0, -60.0
     yield "log-scales 60 and -60", Case(mixed, facing(), antialiased=True, beyond=True)
     for focal in (1e-6, 1e-2, 1e4, 1e9):
         yield f"focal length {focal:g}", Case(extreme_splats(), facing(focal=focal))

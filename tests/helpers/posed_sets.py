@@ -1,6 +1,7 @@
 """Tiny data sets of each kind on disk: a few cameras that look at three dots."""
 
 import json
+import re
 import struct
 
 import numpy as np
@@ -33,22 +34,22 @@ def write_picture(path, camera, mode="RGB", scale=1):
     width, height = camera.W // scale, camera.H // scale
     pixels = np.zeros((height, width, len(mode)), np.uint8)
     for point, colour in zip(POINTS, COLOURS, strict=True):
-        c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
-        u, v = (camera.K @ (c / c[2]))[:2] / scale
-        pixels[int(v), int(u), :3] = colour
-        if mode == "RGBA":
-            pixels[int(v), int(u), 3] = 255
+        pixels[pixel_of(camera, point, scale)] = [*colour, 255][: len(mode)]
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(pixels, mode).save(path)
 
 
+def pixel_of(camera, point, scale=1):
+    """Return row and column of the projection of a point."""
+    c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
+    u, v = (camera.K @ (c / c[2]))[:2] / scale
+    return int(v), int(u)
+
+
 def assert_dots_are_where_points_fall(pictures, points=POINTS):
     for picture in pictures:
-        camera = picture.camera
         for point, colour in zip(points, COLOURS, strict=True):
-            c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
-            u, v = (camera.K @ (c / c[2]))[:2]
-            assert (picture.pixels[int(v), int(u), :3] == colour).all()
+            assert (picture.pixels[pixel_of(picture.camera, point)][:3] == colour).all()
 
 
 def assert_refused(message, folder, **options):
@@ -93,10 +94,14 @@ def write_transforms(folder, missing=(), up=(0, 0, 1), at=(0, 0, 0)):
         pose = np.array(to_opengl(camera))
         pose[:3, 3] += at
         frames.append({"file_path": f"images/{i:04}.png", "transform_matrix": pose.tolist()})
-    K = intrinsics(W, H, 50.0)
-    intrinsic = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H}
-    (folder / "transforms.json").write_text(json.dumps({**intrinsic, "frames": frames}))
+    write_document(folder, intrinsics(W, H, 50.0), W, H, frames)
     return folder
+
+
+def write_document(folder, K, width, height, frames):
+    """Write a transforms.json."""
+    document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": width, "h": height}
+    (folder / "transforms.json").write_text(json.dumps({**document, "frames": frames}))
 
 
 MODELS = {"PINHOLE": 1, "FULL_OPENCV": 6}
@@ -113,15 +118,12 @@ def write_colmap(folder, shots, model="PINHOLE", parameters=None, text=False, wi
     if text:
         words = " ".join(str(float(p)) for p in parameters)
         (folder / "cameras.txt").write_text(f"# comment\n7 {model} {width} {height} {words}\n")
-        lines = [
-            f"{i + 1} {' '.join(str(float(v)) for v in pose)} 7 {name}\n{'1.5 2.5 -1' if i % 2 else ''}\n"
-            for i, (pose, name) in enumerate(zip(poses, names, strict=True))
-        ]
-        (folder / "images.txt").write_text("# comment\n# another\n" + "".join(lines))
-        rows = [
-            f"{i} {p[0]} {p[1]} {p[2]} {c[0]} {c[1]} {c[2]} 0.5 1 0 2 0\n"
-            for i, (p, c) in enumerate(zip(points, COLOURS, strict=True))
-        ]
+        lines = ["# comment\n# another\n"]
+        for i, (pose, name) in enumerate(zip(poses, names, strict=True)):
+            lines.append(f"{i + 1} {' '.join(map(str, pose))} 7 {name}\n{'1.5 2.5 -1' if i % 2 else ''}\n")
+        (folder / "images.txt").write_text("".join(lines))
+        colours = zip(points, COLOURS, strict=True)
+        rows = [f"{i} {' '.join(map(str, (*p, *c)))} 0.5 1 0 2 0\n" for i, (p, c) in enumerate(colours)]
         (folder / "points3D.txt").write_text("# comment\n" + "".join(rows))
         return
     data = struct.pack("<QiiQQ", 1, 7, MODELS[model], width, height) + struct.pack(f"<{len(parameters)}d", *parameters)
@@ -151,12 +153,7 @@ def rename_in_images_txt(folder, name):
     for file in (folder / "sparse" / "0").glob("*.bin"):
         file.unlink()
     file = folder / "sparse" / "0" / "images.txt"
-    text = file.read_text()
-    for i in range(9):
-        text = text.replace(f"im {i:03}.png", f"<{i}>")
-    for i in range(9):
-        text = text.replace(f"<{i}>", name(i))
-    file.write_text(text)
+    file.write_text(re.sub(r"im (\d{3})\.png", lambda old: name(int(old[1])), file.read_text()))
 
 
 def frames_of(folder):

@@ -7,9 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from csplat import decode
-from csplat.encoder import (
-    Importance,
-)
+from csplat.encoder import Importance
 from csplat.encoder.splat_importance import GaussNewtonBlocks
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")

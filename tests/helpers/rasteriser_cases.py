@@ -2,9 +2,7 @@
 
 import numpy as np
 import pytest
-from oracle import (
-    facing,
-)
+from oracle import facing
 
 from csplat.model import SplatModel
 from csplat.spherical_harmonics import SH_C0

@@ -1,13 +1,12 @@
 """Fixtures and hooks shared by several test files."""
 
+import importlib
 import math
 import os
 import pickle
 import re
-from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TypeVar
 
 import filelock
 import hypothesis
@@ -36,18 +35,11 @@ def of_peers(name: str) -> Path:
     return PEERS / name
 
 
-T = TypeVar("T")
-
 #: Files with the longest tests: pytest-xdist starts them first, so that no worker is left with one at the end.
 LONGEST = (
-    "test_encoder_suite",
-    "test_level_builder",
-    "test_tradeoffs",
-    "test_batch",
-    "test_target_encoding",
+    "test_encoder_suite", "test_level_builder", "test_tradeoffs", "test_batch", "test_target_encoding",
     "test_viewer_pictures",
-)
-
+)  # fmt: skip
 
 #: The marker of a file whose tests all have it.
 OF_A_FILE = re.compile(r"^pytestmark = .*?\bpytest\.mark\.(\w+)", re.MULTILINE)
@@ -76,15 +68,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     """Report tests without shared scenes."""
-    skipped = [
-        one for one in terminalreporter.stats.get("skipped", []) if "shared_data" in getattr(one, "keywords", ())
-    ]
-    if skipped:
-        terminalreporter.section(f"{len(skipped)} tests skipped for lack of shared scenes", sep="=")
-        terminalreporter.line(
-            f"They are absent ({SHARED}); CSPLAT_DATA names their folder. What they say of scenes that"
-        )
-        terminalreporter.line("were trained by others, other tests say of the sample and of scenes that are made.")
+    skipped = terminalreporter.stats.get("skipped", [])
+    count = sum("shared_data" in getattr(one, "keywords", ()) for one in skipped)
+    if count:
+        terminalreporter.section(f"{count} tests skipped for lack of shared scenes", sep="=")
+        terminalreporter.line(f"They are absent ({SHARED}); CSPLAT_DATA names their folder.")
 
 
 @pytest.fixture(scope="session")
@@ -96,12 +84,12 @@ def data_dir() -> Path:
 
 
 @pytest.fixture(scope="session")
-def once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[], T]], T]:
+def once(tmp_path_factory):
     """Compute an expensive value once for all workers: `once("trained scene", make)`; the value must pickle."""
     folder = tmp_path_factory.getbasetemp()
     folder = folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
-    def get(name: str, make: Callable[[], T]) -> T:
+    def get(name, make):
         file = folder / f"{name.replace(' ', '-')}.pickle"
         with filelock.FileLock(f"{file}.lock"):
             if not file.exists():
@@ -123,9 +111,8 @@ def spec() -> SimpleNamespace:
     text = (ROOT / "spec" / "format.md").read_text(encoding="utf-8")
     names = {
         "float64": np.float64, "float32": np.float32, "sqrt": np.sqrt, "ldexp": math.ldexp, "isfinite": np.isfinite,
-        "floor": math.floor, "NO_PARENT": _spec.NO_PARENT,
+        "floor": math.floor, "NO_PARENT": _spec.NO_PARENT, "bits": lambda x: int(np.float32(x).view(np.uint32)),
     }  # fmt: skip
-    names |= {"bits": lambda x: int(np.float32(x).view(np.uint32))}
     blocks = re.findall(r"```python spec-test\n(.*?)```", text, re.DOTALL)
     assert blocks
     for block in blocks:
@@ -161,20 +148,17 @@ def little_level_work(monkeypatch):
 def make_model():
     """Return a function for small random models: `make_model(count, degree, **fields)`."""
 
-    def make(count: int = 10, degree: int = 3, seed: int = 0, **fields: object) -> SplatModel:
+    def make(count=10, degree=3, seed=0, **fields):
         rng = np.random.default_rng(seed)
 
-        def normal(*shape: int) -> np.ndarray:
+        def normal(*shape):
             return rng.standard_normal((count, *shape)).astype(np.float32)
 
         arrays = {
-            "means": normal(3),
-            "quats": normalise_quats(normal(4)),
-            "scales": normal(3) - 4,
-            "opacities": rng.random(count).astype(np.float32),
-            "sh0": normal(3),
+            "means": normal(3), "quats": normalise_quats(normal(4)), "scales": normal(3) - 4,
+            "opacities": rng.random(count).astype(np.float32), "sh0": normal(3),
             "shN": normal((degree + 1) ** 2 - 1, 3),
-        }
+        }  # fmt: skip
         return SplatModel(**{**arrays, **fields})
 
     return make
@@ -209,58 +193,46 @@ def colmap_text_set(tmp_path):
 
 
 @pytest.fixture(scope="session")
-def trained_scene(once, tmp_path_factory):
-    """A scene trained for 300 steps on small photographs, see captures.py; all workers share its files."""
-    pytest.importorskip("numba", reason="training requires the extra [render]")
-    pytest.importorskip("scipy", reason="data sets require the extra [render]")
-    from captures import make_trained
-
-    return once("trained scene", lambda: make_trained(tmp_path_factory.mktemp("trained")))
+def captures():
+    """The module captures.py, which trains and searches."""
+    for name in ("numba", "scipy"):
+        pytest.importorskip(name, reason="training and targets require the extra [render]")
+    return importlib.import_module("captures")
 
 
 @pytest.fixture(scope="session")
-def tuned_file(once, trained_scene, tmp_path_factory):
+def trained_scene(once, captures, tmp_path_factory):
+    """A scene trained for 300 steps on small photographs; all workers share its files."""
+    return once("trained scene", lambda: captures.make_trained(tmp_path_factory.mktemp("trained")))
+
+
+@pytest.fixture(scope="session")
+def tuned_file(once, captures, trained_scene, tmp_path_factory):
     """A file of the trained scene, tuned for 100 steps; all workers share its files."""
-    from captures import make_tuned
-
-    return once("tuned file", lambda: make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene))
+    return once("tuned file", lambda: captures.make_tuned(tmp_path_factory.mktemp("tuned"), trained_scene))
 
 
 @pytest.fixture(scope="session")
-def search_at_psnr(once):
+def search_at_psnr(once, captures):
     """The smallest file of `captures.crowded()` at 30 dB, by a real search."""
-    return _searched(once, "psnr", psnr=30.0)
+    return once("search at a psnr", lambda: captures.found_within(captures.crowded(), psnr=30.0))
 
 
 @pytest.fixture(scope="session")
-def search_at_size(once):
+def search_at_size(once, captures):
     """The best file of `captures.crowded()` within 1,500 bytes, by a real search."""
-    return _searched(once, "size", size_bytes=1500)
+    return once("search at a size", lambda: captures.found_within(captures.crowded(), size_bytes=1500))
 
 
 @pytest.fixture(scope="session")
-def search_at_loss(once):
+def search_at_loss(once, captures):
     """The smallest file of `captures.crowded()` that loses 0.5 dB against photographs of it."""
-    return _searched(once, "loss", max_psnr_drop=0.5)
-
-
-def _searched(once, name: str, **goal: float):
-    pytest.importorskip("numba", reason="targets require the extra [render]")
-    import captures
-
-    def find():
-        scene = captures.crowded()
-        views = captures.photographed(scene) if name == "loss" else None
-        return captures.found_within(scene, views, **goal)
-
-    return once(f"search at a {name}", find)
+    scene = captures.crowded()
+    find = captures.found_within
+    return once("search at a loss", lambda: find(scene, captures.photographed(scene), max_psnr_drop=0.5))
 
 
 @pytest.fixture(scope="session")
-def file_runs(once, tmp_path_factory):
-    """Runs of `csplat train` to files, see captures.py."""
-    pytest.importorskip("numba", reason="training requires the extra [render]")
-    pytest.importorskip("scipy", reason="data sets require the extra [render]")
-    from captures import FileRuns
-
-    return once("file runs", lambda: FileRuns(tmp_path_factory.mktemp("runs")))
+def file_runs(once, captures, tmp_path_factory):
+    """Runs of `csplat train` to files."""
+    return once("file runs", lambda: captures.FileRuns(tmp_path_factory.mktemp("runs")))

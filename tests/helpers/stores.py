@@ -5,7 +5,7 @@ Memory and web server can be made to misbehave.
 
 import gzip
 import threading
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
@@ -31,24 +31,16 @@ def box_of(data, place):
 
 
 class FileSystem:
-    """Files in memory with the interface of fsspec's file systems.
-
-    Attributes:
-        files: by name.
-        protocol: one name, or several.
-        cut_after: number of requests after which only half of a range is returned; `None`: never.
-        answer: raised in place of any answer.
-        asked, sent: numbers of requests and of bytes sent.
-    """
+    """Files in memory with the interface of fsspec's file systems."""
 
     async_impl = True
 
     def __init__(self, files):
-        self.files = dict(files)
-        self.protocol = "store"
-        self.cut_after = None
-        self.answer = None
-        self.asked = self.sent = 0
+        self.files = dict(files)  # by name
+        self.protocol = "store"  # one name, or several
+        self.cut_after = None  # number of requests after which only half of a range is returned
+        self.answer = None  # raised in place of any answer
+        self.asked = self.sent = 0  # numbers of requests and of bytes sent
 
     def info(self, name):
         data = self._data(name)
@@ -78,31 +70,19 @@ class FileSystem:
 
 
 class Web:
-    """A server's files and behaviour.
-
-    Attributes:
-        files: by path, as `/scene.csplat`.
-        ranges: whether it supports HTTP Range.
-        faults: answers to the next GETs, by default right ones: a status; None; or the name of a fault in `_Handler`.
-        tag: its ETag; by default that of the content.
-        coding: Content-Encoding of all answers, as of a file that is stored compressed.
-        released: ends stalled answers.
-        cut_after: number of requests after which bodies are cut short; `None`: never.
-        asked: method, path and Range of each request so far.
-        before: called before each answer.
-    """
+    """A server's files and behaviour."""
 
     def __init__(self, files):
-        self.files = dict(files)
-        self.ranges = True
-        self.faults = []
-        self.tag = None
-        self.coding = ""
-        self.released = threading.Event()
-        self.cut_after = None
-        self.asked = []
-        self.before = lambda: None
-        self.sent = 0
+        self.files = dict(files)  # by path, as `/scene.csplat`
+        self.ranges = True  # whether it supports HTTP Range
+        self.faults = []  # answers to the next GETs: a status; None; or the name of a fault in `_Handler`
+        self.tag = None  # its ETag; by default that of the content
+        self.coding = ""  # Content-Encoding of all answers, as of a file that is stored compressed
+        self.released = threading.Event()  # ends stalled answers
+        self.cut_after = None  # number of requests after which bodies are cut short
+        self.asked = []  # method, path and Range of each request so far
+        self.before = lambda: None  # called before each answer
+        self.sent = 0  # bytes
 
     @property
     def gets(self):
@@ -126,16 +106,13 @@ class _Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     web: Web
 
-    def do_HEAD(self):
-        self._answer(send=False)
-
-    def do_GET(self):
-        self._answer(send=True)
-
     def log_message(self, format, *args):
         pass
 
-    def _answer(self, *, send):
+    def do_HEAD(self):
+        self.do_GET(send=False)
+
+    def do_GET(self, *, send=True):
         web = self.web
         web.asked.append((self.command, self.path, self.headers.get("Range")))
         web.before()
@@ -181,11 +158,9 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
         if fault == "broken chunk":
             body = b"%x\r\n%s" % (len(body), body)
-        try:
+        with suppress(ConnectionError):  # the client closed the connection
             self.wfile.write(body)
             web.sent += len(body)
-        except ConnectionError:
-            pass  # the client closed the connection
         if fault == "stall":
             web.released.wait(5)
 

@@ -15,7 +15,6 @@ VECTOR_LIST = load()
 INVALID = [vector for vector in VECTOR_LIST if vector.error]
 SMALL = build(scene())
 
-
 #: Vectors whose arrays, at SH degree 3, fill the decoders' default budget.
 SPLATS_MAX = _spec.BUDGET_BYTES // (4 * (11 + 48))
 SIZE = 2000

@@ -26,8 +26,7 @@ def test_encoding_by_a_preset_does_not_import_the_renderer(ply, tmp_path):
 import sys
 from csplat_tools.cli.app import app
 app(["encode", {str(ply)!r}, {str(tmp_path / "out.csplat")!r}], standalone_mode=False)
-assert not {{"numba", "scipy", "rich"}} & set(sys.modules)
-assert not {{"csplat_tools.cli.info", "csplat_tools.cli.train"}} & set(sys.modules)
+assert not {{"numba", "scipy", "rich", "csplat_tools.cli.info", "csplat_tools.cli.train"}} & set(sys.modules)
 """
     subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
     assert (tmp_path / "out.csplat").exists()
@@ -37,7 +36,7 @@ def test_decodes_fewer_bands(tmp_path, csplat_file):
     call("decode", csplat_file, tmp_path / "d1.ply", "--sh-degree", 1)
     call("decode", csplat_file, tmp_path / "d2.ply", "--sh-degree", 3)
     one, two = read_ply(tmp_path / "d1.ply"), read_ply(tmp_path / "d2.ply")
-    assert (one.sh_degree, two.sh_degree) == (1, 2)
+    assert (1, 2) == (one.sh_degree, two.sh_degree)
     np.testing.assert_array_equal(one.shN, two.shN[:, :3])
 
 
@@ -50,21 +49,20 @@ def test_the_second_of_two_writers_of_a_name_is_refused(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "fsync", meet)
     check_output(target, force=False)
-    lost = []
+    lost = {}
 
     def write(data):
         try:
             write_bytes(target, data)
         except InputError as error:
-            lost.append((data, str(error)))
+            lost[data] = str(error)
 
     writers = [threading.Thread(target=write, args=(data,)) for data in (b"one", b"two")]
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join()
-    assert 1 == len(lost)
-    data, message = lost[0]
+    ((data, message),) = lost.items()
     assert "and it was not replaced; --force replaces it" in message
     assert {b"one": b"two", b"two": b"one"}[data] == (tmp_path / "new").read_bytes()
     assert ["new"] == [path.name for path in tmp_path.iterdir()]
@@ -72,11 +70,10 @@ def test_the_second_of_two_writers_of_a_name_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("links", [True, False])
 def test_a_name_that_was_taken_meanwhile_is_replaced_only_by_force(tmp_path, monkeypatch, links):
+    def refuse(*_):
+        raise PermissionError(1, "Operation not permitted")
+
     if not links:  # a file system without hard links, such as FAT
-
-        def refuse(*_):
-            raise PermissionError(1, "Operation not permitted")
-
         monkeypatch.setattr(os, "link", refuse)
     target = tmp_path / "new"
     check_output(str(target), force=False)
@@ -89,68 +86,53 @@ def test_a_name_that_was_taken_meanwhile_is_replaced_only_by_force(tmp_path, mon
     assert b"ours" == target.read_bytes()
     target.unlink()
     check_output(str(target), force=False)
-    write_bytes(str(target), b"first")
-    write_bytes(str(target), b"second")  # the name is ours now
-    assert b"second" == target.read_bytes()
+    for data in (b"first", b"second"):  # the name is ours now
+        write_bytes(str(target), data)
+        assert data == target.read_bytes()
     assert ["new"] == [path.name for path in tmp_path.iterdir()]
 
 
 def test_files_of_the_other_kind_are_refused_with_the_command_for_them(tmp_path, ply, csplat_file):
-    renamed = tmp_path / "renamed.ply"
+    renamed, out = tmp_path / "renamed.ply", tmp_path / "out"
     renamed.write_bytes(csplat_file.read_bytes())
-    for path in (csplat_file, renamed):
-        assert "csplat decode" in refused("encode", path, tmp_path / "out")
-        assert "csplat decode" in refused("lint", path)
-    for words in (("decode", ply, tmp_path / "out"), ("verify", ply)):
+    for words in (("encode", csplat_file, out), ("encode", renamed, out), ("lint", csplat_file), ("lint", renamed)):
+        assert "csplat decode" in refused(*words)
+    for words in (("decode", ply, out), ("verify", ply)):
         assert "csplat encode" in refused(*words)
 
 
-def test_lint_names_defects_with_their_counts_and_repairs_them(tmp_path, make_model):
+def test_lint_names_defects_with_their_counts_and_repairs_what_it_need_not_guess(tmp_path, make_model, ply):
     path, good = damaged_ply(tmp_path / "bad.ply", make_model), tmp_path / "good.ply"
     result = invoke("lint", path, "--json")
     report = json.loads(result.stdout)
     assert (1, False) == (result.exit_code, report["clean"])
-    assert {one["id"]: one["count"] for one in report["findings"]} == {"trailing-bytes": 8, "nonfinite-rows": 1}
+    assert {"trailing-bytes": 8, "nonfinite-rows": 1} == {one["id"]: one["count"] for one in report["findings"]}
     assert "nonfinite-rows" in invoke("lint", path).stdout
     call("lint", path, "--fix", good)
     assert len(read_ply(good, strict=True)) == 49
     assert call("lint", good) == "nothing found\n"
     assert json.loads(call("lint", good, "--json"))["clean"]
-
-
-def test_lint_does_not_guess(tmp_path, ply):
-    data = ply.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n")
-    ply.write_bytes(data)
-    result = invoke("lint", ply, "--fix", tmp_path / "good.ply")
-    assert result.exit_code == 1
-    assert "missing-columns" in result.stdout
-    assert not (tmp_path / "good.ply").exists()
+    ply.write_bytes(ply.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n"))
+    result = invoke("lint", ply, "--fix", tmp_path / "guessed.ply")
+    assert (1, True) == (result.exit_code, "missing-columns" in result.stdout)
+    assert not (tmp_path / "guessed.ply").exists()
 
 
 def test_runs_the_conformance_suite():
     report = json.loads(invoke("conformance", "decoder", "--filter", "valid/q*", "--json").stdout)
-    assert report["passed"] is True
-    assert ["L1", "L2", "L3"] == list(report["levels"])
+    assert (True, ["L1", "L2", "L3"]) == (report["passed"], list(report["levels"]))
     assert invoke("conformance", "decoder", "--filter", "nothing").exit_code == 1
 
 
-@pytest.mark.slow
-def test_a_misspelt_command_gets_a_suggestion():
+def test_completes_commands_and_options_and_corrects_misspelt_ones(monkeypatch, capfd):
     result = invoke("enocde")
-    assert 2 == result.exit_code
-    assert "'encode'" in result.stderr
-
-
-def test_completes_commands_and_options(monkeypatch, capfd):
-    def complete(*words):
+    assert (2, True) == (result.exit_code, "'encode'" in result.stderr)
+    for words, expected in (("csplat enc", "encode"), ("csplat encode --pre", "--preset")):
         monkeypatch.setenv("_CSPLAT_COMPLETE", "complete_bash")
-        monkeypatch.setenv("COMP_WORDS", " ".join(words))
-        monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+        monkeypatch.setenv("COMP_WORDS", words)
+        monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
         assert 0 == status_of()
-        return capfd.readouterr().out.split()
-
-    assert ["encode"] == complete("csplat", "enc")
-    assert ["--preset"] == complete("csplat", "encode", "--pre")
+        assert [expected] == capfd.readouterr().out.split()
 
 
 @pytest.mark.slow
@@ -180,45 +162,41 @@ def test_a_closed_or_full_standard_stream_is_an_error_of_one_line(tmp_path):
 
 @pytest.mark.slow
 def test_an_interrupt_is_status_130_and_leaves_nothing(tmp_path):
-    target = tmp_path / "out.csplat"
-    with subprocess.Popen(
-        [*PROGRAM, "encode", "-", str(target)],
-        stdin=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
-    ) as running:
-        assert running.stdin is not None
+    with child([*PROGRAM, "encode", "-", str(tmp_path / "out.csplat")]) as running:
         running.stdin.write(bytes(1 << 20))  # more than a pipe holds: it has begun to read
         running.send_signal(signal.SIGINT)
-        assert running.wait(20) == 130
-        assert running.stderr is not None
-        assert running.stderr.read() == b"interrupted\n"
-    assert list(tmp_path.iterdir()) == []
+        assert 130 == running.wait(20)
+        assert b"interrupted\n" == running.stderr.read()
+    assert [] == list(tmp_path.iterdir())
+
+
+def child(command, **options):
+    streams = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+    return subprocess.Popen(command, preexec_fn=heed_interrupts, **streams, **options)  # noqa: PLW1509  # one signal
+
+
+#: A module in whose import the interrupt becomes another error.
+INTERRUPTED = """
+import sys, time
+print('loading', flush=True)
+try:
+    time.sleep(20)
+except KeyboardInterrupt as error:
+    raise ImportError('half of it') from error
+"""
 
 
 @pytest.mark.slow
-def test_an_interrupt_while_the_program_loads_is_no_traceback(tmp_path):
-    def interrupted(module, script):
-        """Run a script that imports a module in whose import the interrupt becomes another error."""
-        folder = tmp_path / module
-        folder.mkdir()
-        (folder / f"{module}.py").write_text(
-            "import sys, time\n"
-            "print('loading', flush=True)\n"
-            "try:\n    time.sleep(20)\n"
-            "except KeyboardInterrupt as error:\n    raise ImportError('half of it') from error\n"
-        )
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *filter(None, sys.path)])}
-        with subprocess.Popen(
-            [sys.executable, "-c", script, "info"], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            preexec_fn=heed_interrupts,  # noqa: PLW1509  # it sets one signal
-        ) as running:  # fmt: skip
-            assert running.stdout is not None
-            assert running.stdout.readline() == b"loading\n"
-            running.send_signal(signal.SIGINT)
-            _, errors = running.communicate(timeout=20)
-            return running.returncode, errors
-
-    run = "from csplat_program import main; main()"
-    assert (-signal.SIGINT, b"") == interrupted("contextlib", f"import sys; sys.modules.pop('contextlib', None); {run}")
-    assert (130, b"interrupted\n") == interrupted("typer", run)
+@pytest.mark.parametrize(("module", "before", "expected"), [
+    ("contextlib", "import sys; sys.modules.pop('contextlib', None); ", (-signal.SIGINT, b"")),
+    ("typer", "", (130, b"interrupted\n")),
+])  # fmt: skip
+def test_an_interrupt_while_the_program_loads_is_no_traceback(tmp_path, module, before, expected):
+    (tmp_path / f"{module}.py").write_text(INTERRUPTED)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    script = f"{before}from csplat_program import main; main()"
+    with child([sys.executable, "-c", script, "info"], env=environment) as running:
+        assert b"loading\n" == running.stdout.readline()
+        running.send_signal(signal.SIGINT)
+        _, errors = running.communicate(timeout=20)
+    assert expected == (running.returncode, errors)

@@ -15,15 +15,11 @@ from csplat_tools.cli.app import app
 from encoder_faults.run import FAULTS
 
 INPUTS = {one.name: one for one in all_inputs()}
+FILES = ("sound.csplat", "sound.npy")
 
 
 def invoke(*words):
     return CliRunner().invoke(app, ["conformance", "encoder", *map(str, words)])
-
-
-def program(code):
-    """Return a command line that runs Python code on {ply} and {out}; the standard library alone starts quickly."""
-    return f"{shlex.quote(sys.executable)} -I -S -c {shlex.quote(code)} {{ply}} {{out}}"
 
 
 def copying(folder, name, change=lambda data: data):
@@ -32,11 +28,10 @@ def copying(folder, name, change=lambda data: data):
     result = encode_with_report(csplat.read_ply(folder / "sound.ply"))
     (folder / "sound.csplat").write_bytes(change(result.data))
     np.save(folder / "sound.npy", result.source_index)
-    code = (
-        f"import shutil, sys; shutil.copy({str(folder / 'sound.csplat')!r}, sys.argv[2]);"
-        f"shutil.copy({str(folder / 'sound.npy')!r}, sys.argv[3])"
-    )
-    return f"{program(code)} {{index}}"
+    code = "import shutil, sys\n"
+    code += "".join(f"shutil.copy({str(folder / one)!r}, sys.argv[{n}])\n" for n, one in enumerate(FILES, 2))
+    # The standard library alone starts quickly.
+    return f"{shlex.quote(sys.executable)} -I -S -c {shlex.quote(code)} {{ply}} {{out}} {{index}}"
 
 
 @pytest.mark.slow

@@ -1,5 +1,6 @@
 """README and documentation: links resolve, figures are the measured ones, examples run."""
 
+import importlib
 import itertools
 import json
 import re
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import InThisProcess
+from typer.main import get_command
 from typer.testing import CliRunner
 
 import csplat
@@ -25,13 +27,10 @@ MEASURED = json.loads((DOCS / "measured.json").read_text("utf-8"))
 PRESETS = {row["name"]: row for row in MEASURED["rows"] if row["series"] == "preset"}
 
 
-@pytest.fixture(scope="module")
-def site():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(DOCS)
-        import make_site
-
-        yield make_site
+@pytest.fixture
+def site(monkeypatch):
+    monkeypatch.syspath_prepend(DOCS)
+    return importlib.import_module("make_site")
 
 
 def blocks(text, language):
@@ -111,17 +110,10 @@ def test_the_readme_of_the_package_has_no_relative_links():
     assert len(text) > 0.7 * len(README)
 
 
-@pytest.fixture(scope="module")
-def commands():
-    """The commands of csplat, by name."""
-    from typer.main import get_command
-
-    group = get_command(app)
-    return {name: group.get_command(None, name) for name in group.list_commands(None)}
-
-
-def test_commands_in_readme_and_guides_are_valid(commands):
+def test_commands_in_readme_and_guides_and_options_on_result_pages_are_valid():
     """Commands are parsed, not run, which reveals removed options."""
+    group = get_command(app)
+    commands = {name: group.get_command(None, name) for name in group.list_commands(None)}
     texts = [README, *(path.read_text("utf-8") for path in sorted((DOCS / "guide").glob("*.md")))]
     lines = [line for text in texts for block in blocks(text, "sh") for line in block.splitlines()]
     lines = [line.split("||")[0].strip() for line in lines if line.strip().startswith("csplat ")]
@@ -129,9 +121,6 @@ def test_commands_in_readme_and_guides_are_valid(commands):
     for line in lines:
         name, *words = shlex.split(line, comments=True)[1:]
         commands[name].make_context(name, words, resilient_parsing=False)
-
-
-def test_options_on_result_pages_exist(commands):
     options = {option for command in commands.values() for parameter in command.params for option in parameter.opts}
     for path in (DOCS / "results").glob("*.md"):
         prose = re.sub(r"<!-- table.*?<!-- end -->", "", path.read_text("utf-8"), flags=re.DOTALL)
@@ -143,11 +132,10 @@ def test_options_on_result_pages_exist(commands):
 def test_python_examples_run(sample_path, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(batch, "ProcessPoolExecutor", InThisProcess)
-    (tmp_path / "scenes").mkdir()
-    (tmp_path / "encoded").mkdir()
-    model = csplat.read_ply(sample_path)
+    for folder in ("scenes", "encoded"):
+        (tmp_path / folder).mkdir()
     for name in ("scene.ply", "scenes/one.ply"):
-        csplat.write_ply(tmp_path / name, model.select(range(200)))
+        csplat.write_ply(tmp_path / name, csplat.read_ply(sample_path).select(range(200)))
     (tmp_path / "scenes" / "two.ply").write_bytes(b"not a PLY")
     names = {}
     exec(blocks(README, "python")[0], names)  # noqa: S102  # the README's own lines
@@ -167,20 +155,18 @@ def test_the_tutorial_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(ROOT / "tools" / "lab" / "sample")
     text = (DOCS / "guide" / "tutorial.md").read_text("utf-8")
-    lines = list(itertools.chain.from_iterable(block.splitlines() for block in blocks(text, "sh")))
-    first, *others = [shlex.split(line) for line in lines]
+    lines = [shlex.split(line) for block in blocks(text, "sh") for line in block.splitlines()]
+    numbers = {"--views": "3", "--size": "16", "--iterations": "6", "--max-splats": "50"}
+    first, *others = [[numbers.get(before, word) for before, word in itertools.pairwise(["", *line])] for line in lines]
     assert ["python", "tools/lab/sample/make_sample.py"] == first[:2]
-    import make_sample
-
+    make_sample = importlib.import_module("make_sample")
     monkeypatch.setattr(make_sample, "photograph", square)
-    make_sample.main(smaller(first[2:], {"--views": "3", "--size": "16"}))
-    for line in others:
-        words = smaller(line, {"--iterations": "6", "--max-splats": "50"})
+    make_sample.main(first[2:])
+    for words in others:
         result = CliRunner().invoke(app, [*words[1:], "--quiet"])
         assert 0 == result.exit_code, (words, result.output, result.exception)
-    assert {"photographs", "garden.ply", "garden.csplat", "garden.html", "about.html", "back.ply"} == {
-        path.name for path in tmp_path.iterdir()
-    }
+    made = {"photographs", "garden.ply", "garden.csplat", "garden.html", "about.html", "back.ply"}
+    assert made == {path.name for path in tmp_path.iterdir()}
 
 
 def square(_garden, camera):
@@ -188,7 +174,3 @@ def square(_garden, camera):
     pixels = np.zeros((camera.H, camera.W, 4), np.uint8)
     pixels[camera.H // 3 : -camera.H // 3, camera.W // 3 : -camera.W // 3] = (200, 120, 40, 255)
     return pixels, np.random.default_rng(0).uniform(-0.5, 0.5, (camera.H, camera.W, 3))
-
-
-def smaller(words, numbers):
-    return [numbers.get(before, word) for before, word in zip(["", *words], words, strict=False)]

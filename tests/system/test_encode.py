@@ -11,28 +11,19 @@ import subprocess
 import sys
 import tempfile
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import typer
 from cli_cases import PROGRAM, call, damaged_ply, invoke, refused, status_of
-from large_cases import COUNT, FAST, EveryFourth, encode_large
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from csplat import decode, read_ply, write_ply
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
-from csplat.scene_source import source_from_model
 from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.usefixtures("no_estimated_up")
-
-
-def program(*words, **options):
-    return subprocess.run([*PROGRAM, *map(str, words)], capture_output=True, check=False, **options)
 
 
 @contextmanager
@@ -53,19 +44,9 @@ def test_reports_as_json(tmp_path, ply):
     assert (200, size, size / 200) == (report["splats"], report["size_bytes"], report["bytes_per_splat"])
     assert report["ratio"] == ply.stat().st_size / size
     assert {"means", "covariance", "opacities", "sh0", "sh1", "sh2"} == set(report["stated_errors"])
-    assert report["options"]["asked"] == {"preset": "fast"}
+    assert {"preset": "fast"} == report["options"]["asked"]
     quiet = invoke("encode", ply, out, "--quiet", "--force")
-    assert (quiet.stdout, quiet.stderr) == ("", "")
-
-
-def commands():
-    """Yield the names and commands of the program."""
-    group = get_command(app)
-    context = typer.Context(group, info_name="csplat")
-    for name in group.list_commands(context):
-        one = group.get_command(context, name)
-        for inner, each in getattr(one, "commands", {"": one}).items():
-            yield f"{name} {inner}".split(), each
+    assert ("", "") == (quiet.stdout, quiet.stderr)
 
 
 COMMON = {"--force", "--report", "--json", "--quiet", "--help-all"}
@@ -74,41 +55,32 @@ COMMON = {"--force", "--report", "--json", "--quiet", "--help-all"}
 @pytest.mark.slow
 def test_every_command_has_the_five_common_options_and_help_for_all(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    count = 0
-    for name, command in commands():
-        options = [one for one in command.params if one.param_type_name == "option"]
-        spelt = [{*one.opts, *one.secondary_opts} for one in options]
-        assert COMMON <= set().union(*spelt), name
-        assert [] == [one.opts for one in options if not one.help], name
-        count += sum(not one & COMMON for one in spelt)
-        hidden = [one.opts[0] for one in options if one.hidden]
-        if name == ["encode"]:
-            shown, everything = call(*name, "--help"), call(*name, "--help-all")
-            assert [] == [one for one in hidden if one not in everything]
-            assert "--threads" in hidden
-            assert "--threads" not in shown
+    group, count = get_command(app), 0
+    for name in group.list_commands(None):
+        one = group.get_command(None, name)
+        for command in getattr(one, "commands", {"": one}).values():
+            options = [one for one in command.params if one.param_type_name == "option"]
+            spelt = [{*one.opts, *one.secondary_opts} for one in options]
+            assert COMMON <= set().union(*spelt), name
+            assert [] == [one.opts for one in options if not one.help], name
+            count += sum(not one & COMMON for one in spelt)
+    hidden = [one.opts[0] for one in group.get_command(None, "encode").params if getattr(one, "hidden", False)]
+    everything = call("encode", "--help-all")
+    assert [] == [one for one in hidden if one not in everything]
+    assert (True, False) == ("--threads" in hidden, "--threads" in call("encode", "--help"))
     assert count <= 150
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("--preset", "slow"),
-        ("--sh-degree", "5"),
-        ("--up", "0,0,0"),
-        ("--max-psnr-drop", "much"),
-        ("--memory", "1GB", "--keep", "0.5"),
-        ("--no-prune",),
-        ("--no-such-option",),
-        ("--json", "-"),
-    ],
-)
-def test_wrong_options_are_usage_errors(tmp_path, ply, words):
-    target = [] if "-" in words else [tmp_path / "out.csplat"]
-    line = refused("encode", ply, *target, *words, status=2)
-    assert line.startswith("error: csplat encode: ")
-    assert line.endswith("; `csplat encode --help` lists the options (E_USAGE)\n")
+def test_wrong_options_are_usage_errors(tmp_path, ply):
+    for words in (
+        "--preset slow", "--sh-degree 5", "--up 0,0,0", "--max-psnr-drop much", "--memory 1GB --keep 0.5", "--no-prune",
+        "--no-such-option", "--json -",
+    ):  # fmt: skip
+        target = [] if words == "--json -" else [tmp_path / "out.csplat"]
+        line = refused("encode", ply, *target, *words.split(), status=2)
+        assert line.startswith("error: csplat encode: ")
+        assert line.endswith("; `csplat encode --help` lists the options (E_USAGE)\n")
     assert not (tmp_path / "out.csplat").exists()
 
 
@@ -124,10 +96,9 @@ def test_repairs_are_reported_even_if_quiet(tmp_path, make_model):
     source = tmp_path / "extra.ply"
     write_ply(source, make_model(20, 0, extra={"object_id": np.arange(20, dtype=np.int32)}))
     quiet = invoke("encode", source, tmp_path / "q.csplat", "--quiet")
-    assert "extra-columns" in quiet.stderr
-    assert 1 == len(quiet.stderr.splitlines())
+    assert (1, True) == (quiet.stderr.count("\n"), "extra-columns" in quiet.stderr)
     call("encode", source, tmp_path / "c.csplat", "--keep-extra")
-    assert sorted(decode(tmp_path / "c.csplat").extra["object_id"]) == list(range(20))
+    assert list(range(20)) == sorted(decode(tmp_path / "c.csplat").extra["object_id"])
 
 
 @pytest.mark.slow
@@ -138,7 +109,7 @@ def test_encode_reports_lengths_of_rotations_that_no_training_produces(tmp_path,
         data[-16:] = np.array([length, 0, 0, 0], "<f4").tobytes()  # the last rotation
         ply.write_bytes(data)
         encoded = invoke("encode", ply, tmp_path / "out.csplat", "--preset", "fast", "--force")
-        assert (length, reported) == (length, line in encoded.stderr)
+        assert reported == (line in encoded.stderr), length
         assert line in call("lint", ply)
 
 
@@ -176,60 +147,48 @@ def test_decodes_absolute_positions(tmp_path, make_model):
     assert b"property double x" in (tmp_path / "abs.ply").read_bytes()
 
 
-@pytest.mark.parametrize("command", ["encode", "decode"])
-def test_replaces_nothing_without_force(tmp_path, ply, csplat_file, command):
-    source = ply if command == "encode" else csplat_file
+def test_replaces_nothing_without_force(tmp_path, ply, csplat_file):
     target = tmp_path / "there"
-    target.write_text("precious")
-    assert "--force" in refused(command, source, target)
-    assert target.read_text() == "precious"
-    call(command, source, target, "--force")
-    assert target.read_bytes() != b"precious"
-
-
-def test_files_have_the_usual_permissions(csplat_file):
-    mask = os.umask(0o022)
-    os.umask(mask)
-    assert csplat_file.stat().st_mode & 0o777 == 0o666 & ~mask
+    for words in (("encode", ply, target), ("decode", csplat_file, target)):
+        target.write_text("precious")
+        assert "--force" in refused(*words)
+        assert "precious" == target.read_text()
+        call(*words, "--force")
+        assert b"precious" != target.read_bytes()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "part"),
-    [
-        (("encode", "absent.ply", "out.csplat"), "absent.ply: No such file"),
-        (("decode", "absent.csplat", "out.ply"), "absent.csplat: No such file"),
-        (("info", "absent.csplat"), "No such file"),
-        (("verify", "absent.csplat"), "No such file"),
-        (("lint", "absent.ply"), "No such file"),
-        (("info", "."), "is a folder, not a scene"),
-        (("encode", "scene.ply", "."), "is a folder"),
-        (("encode", "scene.ply", "no/such/folder/out.csplat"), "No such file"),
-    ],
-)
-def test_absent_files_are_refused_in_one_line(tmp_path, ply, monkeypatch, words, part):
-    assert ply.name == "scene.ply"
+@pytest.mark.usefixtures("ply")
+def test_absent_files_and_folders_are_refused_in_one_line(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert part in refused(*words)
+    for words, part in {
+        "encode absent.ply out.csplat": "absent.ply: No such file",
+        "decode absent.csplat out.ply": "absent.csplat: No such file",
+        "info absent.csplat": "No such file",
+        "verify absent.csplat": "No such file",
+        "lint absent.ply": "No such file",
+        "info .": "is a folder, not a scene",
+        "encode scene.ply .": "is a folder",
+        "encode scene.ply no/such/folder/out.csplat": "No such file",
+    }.items():
+        assert part in refused(*words.split()), words
 
 
 def test_a_full_disk_leaves_the_old_file_and_the_error_names_it(tmp_path, ply, monkeypatch):
-    folder = tmp_path / "out"
-    folder.mkdir()
-    old = folder / "old.csplat"
+    def fail(_):
+        raise OSError(28, "No space left on device")
+
+    old = tmp_path / "out" / "old.csplat"
+    old.parent.mkdir()
     old.write_text("precious")
     with limited_files(1000):
         line = refused("encode", ply, old, "--force")
     assert line.startswith(f"error: {old}: File too large; no partial file was left")
     assert line.endswith("(EFBIG)\n")
-
-    def fail(_):
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(os, "fsync", fail)
     assert "No space left" in refused("encode", ply, old, "--force", "--quiet")
-    assert [old] == list(folder.iterdir())
-    assert old.read_text() == "precious"
+    assert [old] == list(old.parent.iterdir())
+    assert "precious" == old.read_text()
 
 
 @pytest.mark.slow
@@ -254,42 +213,39 @@ def test_unreadable_formats_are_refused_with_a_converter(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "meant"),
-    [
-        (("encode", "scene.ply", "out.ply"), "csplat encode scene.ply out.csplat"),
-        (("encode", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
-        (("encode", "scene.ply", "page.html"), "csplat export-html scene.ply page.html"),
-        (("encode", "scene.ply", "out.spz"), "csplat convert scene.ply out.spz"),
-        (("decode", "scene.csplat", "out.csplat"), "csplat decode scene.csplat out.ply"),
-        (("decode", "scene.ply", "out.csplat"), "csplat encode scene.ply out.csplat"),
-        (("export-html", "scene.csplat", "out.ply"), "csplat decode scene.csplat out.ply"),
-        (("render", "scene.ply", "out.ply", "--orbit", "2"), "csplat render scene.ply out.webp"),
-        (("lint", "scene.ply", "--fix", "out.csplat"), "csplat encode scene.ply out.csplat"),
-        (("info", "scene.csplat", "--page", "out.png"), "--page out.html"),
-        (("tradeoff", "scene.ply", "-o", "out.png"), "-o out.html"),
-        (("encode", "scene.ply", "out.csplat", "--report", "out.csv"), "--report out.json"),
-    ],
-)
-def test_a_name_of_another_kind_is_refused_with_a_suggestion(tmp_path, ply, csplat_file, monkeypatch, words, meant):
-    assert {ply.name, csplat_file.name} == {"scene.ply", "scene.csplat"}
+@pytest.mark.usefixtures("csplat_file")
+def test_a_name_of_another_kind_is_refused_with_a_suggestion(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert f"did you mean `{meant}`? (E_INPUT)" in refused(*words)
+    for words, meant in {
+        "encode scene.ply out.ply": "csplat encode scene.ply out.csplat",
+        "encode scene.csplat out.ply": "csplat decode scene.csplat out.ply",
+        "encode scene.ply page.html": "csplat export-html scene.ply page.html",
+        "encode scene.ply out.spz": "csplat convert scene.ply out.spz",
+        "decode scene.csplat out.csplat": "csplat decode scene.csplat out.ply",
+        "decode scene.ply out.csplat": "csplat encode scene.ply out.csplat",
+        "export-html scene.csplat out.ply": "csplat decode scene.csplat out.ply",
+        "render scene.ply out.ply --orbit 2": "csplat render scene.ply out.webp",
+        "lint scene.ply --fix out.csplat": "csplat encode scene.ply out.csplat",
+        "info scene.csplat --page out.png": "--page out.html",
+        "tradeoff scene.ply -o out.png": "-o out.html",
+        "encode scene.ply out.csplat --report out.csv": "--report out.json",
+    }.items():
+        assert f"did you mean `{meant}`? (E_INPUT)" in refused(*words.split()), words
     assert {"scene.ply", "scene.csplat", "index.npy"} == {path.name for path in tmp_path.iterdir()}
 
 
 def test_errors_name_the_file_that_was_read(tmp_path, make_model, csplat_file):
-    path = damaged_ply(tmp_path / "bad.ply", make_model)
+    path, cut, none = damaged_ply(tmp_path / "bad.ply", make_model), tmp_path / "cut.csplat", tmp_path / "none.csplat"
     path.write_bytes(path.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n"))
-    line = refused("encode", path, tmp_path / "out.csplat")
-    assert line.startswith(f"error: {path}: missing-columns: no column opacity")
-    (tmp_path / "cut.csplat").write_bytes(csplat_file.read_bytes()[:200])
-    line = refused("compare", csplat_file, tmp_path / "cut.csplat")
-    assert line.startswith(f"error: {tmp_path / 'cut.csplat'}: the file ends too early: E_TRUNCATED")
-    (tmp_path / "none.csplat").write_bytes(b"nothing of ours" * 20)
-    line = refused("decode", tmp_path / "none.csplat", tmp_path / "out.ply")
-    assert line.startswith(f"error: {tmp_path / 'none.csplat'}: not a .csplat file: E_MAGIC at byte 0")
-    assert "`csplat encode` makes one of a PLY" in line
+    cut.write_bytes(csplat_file.read_bytes()[:200])
+    none.write_bytes(b"nothing of ours" * 20)
+    for words, message in (
+        (("encode", path, tmp_path / "out.csplat"), f"{path}: missing-columns: no column opacity"),
+        (("compare", csplat_file, cut), f"{cut}: the file ends too early: E_TRUNCATED"),
+        (("decode", none, tmp_path / "out.ply"), f"{none}: not a .csplat file: E_MAGIC at byte 0"),
+    ):
+        assert refused(*words).startswith(f"error: {message}")
+    assert "`csplat encode` makes one of a PLY" in refused("info", none)
 
 
 def test_errors_of_omitted_bands_are_verified_against_zero(tmp_path, ply):
@@ -301,8 +257,9 @@ def test_errors_of_omitted_bands_are_verified_against_zero(tmp_path, ply):
 
 @pytest.mark.slow
 def test_works_in_pipes_and_gives_the_same_bytes_in_every_process(ply, csplat_file):
-    encoded = program("encode", "-", "-", "--quiet", "--threads", 1, input=ply.read_bytes())
-    assert (0, b"", csplat_file.read_bytes()) == (encoded.returncode, encoded.stderr, encoded.stdout)
+    words = [*PROGRAM, "encode", "-", "-", "--quiet", "--threads", "1"]
+    encoded = subprocess.run(words, capture_output=True, check=True, input=ply.read_bytes())
+    assert (b"", csplat_file.read_bytes()) == (encoded.stderr, encoded.stdout)
 
 
 def test_writes_no_binary_to_a_terminal(ply, csplat_file, monkeypatch, capsys):
@@ -318,7 +275,10 @@ def test_writes_no_binary_to_a_terminal(ply, csplat_file, monkeypatch, capsys):
 
 
 @pytest.mark.slow
-def test_a_replaced_output_keeps_its_permissions(tmp_path, ply, csplat_file):
+def test_a_new_output_has_the_usual_permissions_and_a_replaced_one_keeps_its_own(tmp_path, ply, csplat_file):
+    mask = os.umask(0o022)
+    os.umask(mask)
+    assert 0o666 & ~mask == stat.S_IMODE(csplat_file.stat().st_mode)
     page, folder = tmp_path / "page.html", tmp_path / "streamed" / "lod-meta.json"
     report, modes = tmp_path / "report.json", (0o640, 0o755, 0o400, 0o2660)
     outputs = {
@@ -398,8 +358,7 @@ def test_names_may_be_as_long_as_the_file_system_allows(tmp_path, ply, csplat_fi
             name = letter * (count - len(os.fsencode(ending)) // len(os.fsencode(letter))) + ending
             call(*words, name, "--quiet")
             call(*words, name, "--quiet", "--force")
-            longer = letter * 30 + name
-            assert f"{longer}: File name too long; choose a shorter name" in refused(*words, longer)
+            assert f"{letter * 30 + name}: File name too long; choose a" in refused(*words, letter * 30 + name)
     call("encode", ply, f"{'n' * 248}.csplat", "--force", "--memory", "1GB", "--quiet")  # has a folder .work
     assert [] == [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
 
@@ -482,77 +441,49 @@ def test_control_characters_of_names_do_not_reach_the_terminal(tmp_path, ply):
     assert "a\\x1b[31m\\x07\\x9b" in shown
 
 
-@pytest.mark.parametrize("digits", ["9" * 5000, "9" * 400 + "M", "١", "²"])
-def test_numbers_of_any_length_are_refused(ply, tmp_path, digits):
+def test_numbers_of_any_length_are_refused(ply, tmp_path):
     for words in (("encode", ply, tmp_path / "b.csplat", "--levels"), ("convert", ply, tmp_path / "b.ply", "--level")):
-        refused(*words, digits, status=2)
+        for digits in ("9" * 5000, "9" * 400 + "M", "١", "²"):
+            refused(*words, digits, status=2)
 
 
-@pytest.fixture(scope="module")
-def model(sample_path):
-    sample, rng = read_ply(sample_path), np.random.default_rng(5)
-    many = sample.select(rng.integers(0, len(sample), COUNT))
-    means = many.means + rng.normal(0, 0.05, many.means.shape).astype(np.float32)
-    extra = {"confidence": np.arange(COUNT, dtype=np.uint16)}
-    return replace(many, means=means, extra=extra, metadata={"licence": "CC0"})
-
-
-@pytest.fixture(scope="module")
-def with_levels(model, tmp_path_factory):
-    """The file of the scene with levels of detail."""
-    path = tmp_path_factory.mktemp("levels") / "out.csplat"
-    encode_large(source_from_model(model), path, FAST, levels=EveryFourth())
-    return path.read_bytes()
-
-
-@pytest.fixture
-def ply_of_large(model, tmp_path):
-    write_ply(tmp_path / "scene.ply", replace(model, extra={}, metadata={}))
-    return tmp_path / "scene.ply"
-
-
-def test_the_command_passes_out_of_core_options(ply_of_large, tmp_path, monkeypatch):
-    target, limits = tmp_path / "out.csplat", []
+def test_the_command_passes_out_of_core_options(ply, tmp_path, monkeypatch):
+    limits, words = [], ("encode", ply, tmp_path / "out.csplat", "--memory", "300MB")
 
     def encode_here(scene, target, options, asked, **others):
         limits.append(asked)
         return encode_scene(scene, target, options, asked, **others)
 
     monkeypatch.setattr("csplat_tools.encode_file.encode_scene", encode_here)
-    run = CliRunner().invoke
-    dry = run(app, ["encode", str(ply_of_large), str(target), "--memory", "300MB", "--dry-run", "--json"])
-    assert 0 == dry.exit_code
-    cost = json.loads(dry.stdout)
-    assert (COUNT, 3, True) == (cost["splats"], cost["sh_degree"], cost["in_memory"])
-    assert not target.exists()
-    words = ["--memory", "300MB", "--resume", "--preset", "fast", "--quiet"]
-    done = run(app, ["encode", str(ply_of_large), str(target), *words])
-    assert 0 == done.exit_code, done.output
+    cost = json.loads(call(*words, "--dry-run", "--json"))
+    assert (200, 2, True) == (cost["splats"], cost["sh_degree"], cost["in_memory"])
+    assert not words[2].exists()
+    call(*words, "--resume", "--preset", "fast", "--quiet")
     assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == limits
-    refused = run(app, ["encode", str(ply_of_large), str(target), "--resume", "--target-psnr", "40", "--force"])
-    assert 2 == refused.exit_code
+    refused(*words[:3], "--resume", "--target-psnr", "40", "--force", status=2)
 
 
 @pytest.mark.slow
-def test_a_large_scene_needs_little_memory_unless_levels_are_requested(model, tmp_path):
+def test_a_large_scene_needs_little_memory_unless_levels_are_requested(make_model, tmp_path):
     """The splats of this file are a hole in it; an estimate does not read them."""
-    ply_of_large = tmp_path / "large.ply"
-    write_ply(ply_of_large, replace(model.select(slice(1)), extra={}, metadata={}))
-    header, _, splat = ply_of_large.read_bytes().partition(b"end_header\n")
+    large = tmp_path / "large.ply"
+    write_ply(large, make_model(1))
+    header, _, splat = large.read_bytes().partition(b"end_header\n")
     header = header.replace(b"element vertex 1\n", b"element vertex 3000000\n") + b"end_header\n"
-    ply_of_large.write_bytes(header)
-    os.truncate(ply_of_large, len(header) + 3_000_000 * len(splat))
-    words = ["encode", str(ply_of_large), "--dry-run", "--json", "--memory"]
-    small, large = (CliRunner().invoke(app, [*words, size]) for size in ("500MB", "8GB"))
-    assert (0, 0) == (small.exit_code, large.exit_code), small.output
-    assert 400_000_000 < json.loads(small.stdout)["memory_bytes"] <= 500_000_000
-    assert "" == small.stderr  # the levels do not fit
-    with_levels = CliRunner().invoke(app, [*words, "8GB", "--levels", "auto"])
-    cost, more = json.loads(large.stdout), json.loads(with_levels.stdout)
+    large.write_bytes(header)
+    os.truncate(large, len(header) + 3_000_000 * len(splat))
+
+    def estimate(*more):
+        done = invoke("encode", large, "--dry-run", "--json", "--memory", *more)
+        assert 0 == done.exit_code, done.output
+        return json.loads(done.stdout), done.stderr
+
+    small, said = estimate("500MB")
+    assert 400_000_000 < small["memory_bytes"] <= 500_000_000
+    assert "levels" not in said  # they do not fit
+    (cost, said), (more, nothing) = estimate("8GB"), estimate("8GB", "--levels", "auto")
     assert 1.35 == pytest.approx(more["file_bytes"] / cost["file_bytes"], abs=0.001)
     assert more["seconds"] > cost["seconds"]
-    assert large.stderr.startswith(
-        "viewers show a scene of 3,000,000 splats sooner with levels of detail: --levels auto"
-    )
-    assert large.stderr.endswith(" more, 35 % more bytes)\n")
-    assert "" == with_levels.stderr == CliRunner().invoke(app, [*words, "8GB", "--quiet"]).stderr
+    assert "sooner with levels of detail: --levels auto" in said
+    assert said.endswith(" more, 35 % more bytes)\n")
+    assert "levels of detail" not in nothing + estimate("8GB", "--quiet")[1]

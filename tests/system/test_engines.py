@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,11 +24,9 @@ from csplat_render.metrics import psnr
 
 pytest.importorskip("numba", reason="requires the extra [render]")
 
-
 pytestmark = [pytest.mark.slow, pytest.mark.engines]
 EXAMPLES = Path(__file__).resolve().parents[2] / "tools" / "examples"
 FAST = EncodeOptions(preset="fast")
-
 
 #: The PLY as read by the engine's own loader: Spark's cuts SH that exceeds a power of two.
 LIKE_THE_PLY = {"three": 60.0, "playcanvas": 45.0, "babylon": 60.0, "spark": 38.0}
@@ -36,11 +35,8 @@ LIKE_THE_PLY = {"three": 60.0, "playcanvas": 45.0, "babylon": 60.0, "spark": 38.
 @pytest.fixture(scope="module")
 def packages():
     """The engines of the examples."""
-    npm = shutil.which("npm")
-    if npm is None:
-        absent("the engines come from npm, which is not installed")
-    lock = EXAMPLES / "package-lock.json"
-    installed = EXAMPLES / "node_modules" / ".package-lock.json"
+    npm = shutil.which("npm") or absent("the engines come from npm, which is not installed")
+    lock, installed = EXAMPLES / "package-lock.json", EXAMPLES / "node_modules" / ".package-lock.json"
     if not installed.exists() or installed.stat().st_mtime < lock.stat().st_mtime:
         words = [npm, "ci", "--silent", "--ignore-scripts", "--no-audit", "--no-fund"]
         subprocess.run(words, cwd=EXAMPLES, check=True, capture_output=True)
@@ -67,14 +63,20 @@ def files(packages, sample_path):
         yield folder, address, model, camera
 
 
-@pytest.fixture(scope="module", params=ENGINES)
-def trial(request, browser, files):
-    """An engine on a page."""
+@contextmanager
+def started(browser, files, engine):
     _, address, model, camera = files
     page = browser.new_page(device_scale_factor=1)
     page.set_default_timeout(60_000)
-    yield Trial(page, address, request.param, pinhole(camera, model)).start()
+    yield Trial(page, address, engine, pinhole(camera, model)).start()
     page.close()
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def trial(request, browser, files):
+    """An engine on a page."""
+    with started(browser, files, request.param) as one:
+        yield one
 
 
 @pytest.fixture(scope="module")
@@ -83,16 +85,11 @@ def picture(trial):
     return shown(trial, "scene.csplat")
 
 
-def settled(trial):
-    """Return the engine's final picture; it redraws continuously, which makes up most of these tests' time."""
-    return settled_image(trial.page, 0.2)
-
-
 def shown(trial, name, **options):
     """Show a file and remove it again; return the picture and the engine's messages."""
     said = trial.show(name, **options)
     assert "failed" not in said, said
-    image = settled(trial)
+    image = settled_image(trial.page, 0.2)  # it redraws continuously, which takes most of these tests' time
     trial.remove()
     return image, said
 
@@ -169,16 +166,13 @@ def test_a_budget_selects_the_version_of_a_file_with_levels(trial, files):
 
 @pytest.mark.parametrize("engine", ["playcanvas", "babylon"])
 def test_engines_draw_streamed_sog_of_csplat(browser, files, engine):
-    folder, address, model, camera = files
+    folder, _, model, camera = files
     coarser = model.select(slice(0, None, 4))
     write_levels(folder / engine / "lod-meta.json", [source_from_model(one) for one in (model, coarser)])
-    page = browser.new_page(device_scale_factor=1)
-    streamed = Trial(page, address, engine, pinhole(camera, model)).start()
-    said = streamed.show(f"{engine}/lod-meta.json")
-    assert "failed" not in said, said
+    with started(browser, files, engine) as streamed:
+        image, _ = shown(streamed, f"{engine}/lod-meta.json")
     ours, quarter = (ENGINES[engine].render(one, camera, 3) for one in (model, coarser))
-    assert psnr(settled(streamed), ours) > max(30.0, psnr(quarter, ours) + 6.0)
-    page.close()
+    assert psnr(image, ours) > max(30.0, psnr(quarter, ours) + 6.0)
 
 
 @pytest.mark.usefixtures("packages")

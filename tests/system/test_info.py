@@ -16,10 +16,10 @@ pytestmark = pytest.mark.usefixtures("no_estimated_up")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["info", "verify", "lint", "decode"])
 def test_the_report_is_what_json_prints(tmp_path, csplat_file, ply, name):
-    words = {"lint": (ply,), "decode": (csplat_file, tmp_path / "back.ply")}.get(name, (csplat_file,))
-    printed = call(name, *words, "--json", "--report", tmp_path / "report.json")
-    assert json.loads(printed) == json.loads((tmp_path / "report.json").read_text())
-    assert "exists: --force replaces it" in refused(name, *words, "--report", tmp_path / "report.json")
+    words = (ply,) if name == "lint" else (csplat_file, tmp_path / "back.ply") if name == "decode" else (csplat_file,)
+    report = ("--report", tmp_path / "report.json")
+    assert json.loads(call(name, *words, "--json", *report)) == json.loads(report[1].read_text())
+    assert "exists: --force replaces it" in refused(name, *words, *report)
 
 
 def test_an_empty_scene_round_trips(tmp_path, make_model):
@@ -31,31 +31,39 @@ def test_an_empty_scene_round_trips(tmp_path, make_model):
     assert len(read_ply(tmp_path / "back.ply")) == 0
 
 
-def test_a_full_standard_output_is_one_line(csplat_file, monkeypatch, capsys):
+def test_a_full_standard_output_is_one_line_and_a_closed_pipe_no_traceback(csplat_file, monkeypatch, capsys):
+    def written_to(output, *words):
+        monkeypatch.setattr(sys, "stdout", output)
+        status = status_of(*words)
+        monkeypatch.undo()
+        return status, capsys.readouterr().err
+
     line = "error: standard output: No space left on device; the output is incomplete (ENOSPC)\n"
     for words in (("info", csplat_file), ("--version",)):
         full = Path("/dev/full").open("w", encoding="utf-8")  # noqa: SIM115  # what closes it fails as well
-        monkeypatch.setattr(sys, "stdout", full)
-        status = status_of(*words)
-        monkeypatch.undo()
+        assert (1, line) == written_to(full, *words)
         with suppress(OSError):
             full.close()
-        assert (1, line) == (status, capsys.readouterr().err)
     assert refused("decode", csplat_file, "/dev/full").startswith("error: /dev/full: No space left")
+    near, far = os.pipe()
+    os.close(near)
+    with os.fdopen(far, "w") as pipe:
+        assert (1, "") == written_to(pipe, "info", csplat_file, "--json")
+        pipe.write("what the interpreter flushes when it ends")
 
 
 def test_a_url_instead_of_a_file_is_reported(tmp_path):
-    for words in (["info"], ["lint"], ["encode"]):
-        line = refused(words[0], "https://example.com/a/b.ply", *[tmp_path / "c.csplat"][: words == ["encode"]])
-        assert line.startswith("error: https://example.com/a/b.ply is a URL, expected a file: download it first")
+    url = "https://example.com/a/b.ply"
+    for words in (("info", url), ("lint", url), ("encode", url, tmp_path / "c.csplat")):
+        assert refused(*words).startswith(f"error: {url} is a URL, expected a file: download it first")
 
 
 def test_info_accounts_for_every_byte_and_prints_text(tmp_path, csplat_file):
     described = json.loads(call("info", csplat_file, "--json"))
     attributes = sum(one["size_bytes"] for one in described["attributes"].values())
     assert attributes + sum(described["overhead"].values()) == csplat_file.stat().st_size == described["size_bytes"]
-    assert list(described["attributes"]) == ["opacities", "scales", "quats", "means", "sh0", "sh1", "sh2"]
-    assert list(described["layers"]) == ["geometry", "sh1", "sh2"]
+    assert ["opacities", "scales", "quats", "means", "sh0", "sh1", "sh2"] == list(described["attributes"])
+    assert ["geometry", "sh1", "sh2"] == list(described["layers"])
     assert described["stated_errors"]["source_splats"] == 200
     assert described["options"]["asked"]["preset"] == "balanced"
     assert "splats       200, SH degree 2" in call("info", csplat_file)
@@ -63,17 +71,6 @@ def test_info_accounts_for_every_byte_and_prints_text(tmp_path, csplat_file):
     for wrong, code in ((data[:1], "wrong is"), (data[:-1], "E_TRUNCATED"), (data + b"x", "E_TRAILING")):
         (tmp_path / "wrong").write_bytes(wrong)
         assert code in refused("info", tmp_path / "wrong")
-
-
-def test_a_closed_pipe_is_no_traceback(csplat_file, monkeypatch, capsys):
-    near, far = os.pipe()
-    os.close(near)
-    with os.fdopen(far, "w") as pipe:
-        monkeypatch.setattr(sys, "stdout", pipe)
-        status = status_of("info", csplat_file, "--json")
-        monkeypatch.undo()
-        assert (1, "") == (status, capsys.readouterr().err)
-        pipe.write("what the interpreter flushes when it ends")
 
 
 def test_a_file_with_too_much_metadata_is_not_called_a_large_scene():

@@ -25,19 +25,15 @@ pytestmark = [pytest.mark.slow, pytest.mark.peers]
 
 def made(degree, reach, antialiased):
     """Return splats of all sizes, with opacities at both ends and coefficients beyond 1."""
-    rng = np.random.default_rng(degree)
-    count = 300
-    opacities = rng.random(count)
-    opacities[:40] = np.repeat([0.001, 0.01, 0.99, 0.999], 10)
-    return SplatModel(
-        means=(rng.uniform(-1, 1, (count, 3)) * reach).astype("f4"),
-        quats=normalise_quats(rng.standard_normal((count, 4)).astype("f4")),
-        scales=rng.uniform(-12, 6, (count, 3)).astype("f4"),
-        opacities=opacities.astype("f4"),
-        sh0=rng.uniform(-1.7, 1.7, (count, 3)).astype("f4"),
-        shN=(rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)) / 3).astype("f4"),
-        antialiased=antialiased,
-    )
+    rng, count = np.random.default_rng(degree), 300
+    arrays = {
+        "opacities": rng.random(count), "means": rng.uniform(-1, 1, (count, 3)) * reach,
+        "quats": normalise_quats(rng.standard_normal((count, 4))), "scales": rng.uniform(-12, 6, (count, 3)),
+        "sh0": rng.uniform(-1.7, 1.7, (count, 3)), "shN": rng.standard_normal((count, (degree + 1) ** 2 - 1, 3)) / 3,
+    }  # fmt: skip
+    arrays["opacities"][:40] = np.repeat([0.001, 0.01, 0.99, 0.999], 10)
+    arrays = {name: values.astype("f4") for name, values in arrays.items()}
+    return SplatModel(**arrays, antialiased=antialiased)
 
 
 #: Programs that fix the fraction of SPZ's positions at 12 bits reach 2,048 at most.
@@ -97,16 +93,11 @@ class Spz:
     def read(self, path):
         self.run(path, path.with_suffix(".out"))
         cloud = json.loads(path.with_suffix(".out").read_text())
-        count, degree = cloud["numPoints"], cloud["shDegree"]
-        return SplatModel(
-            means=np.array(cloud["positions"], "f4").reshape(count, 3),
-            quats=np.array(cloud["rotations"], "f4").reshape(count, 4)[:, [3, 0, 1, 2]],
-            scales=np.array(cloud["scales"], "f4").reshape(count, 3),
-            opacities=np.array(cloud["alphas"], "f4"),
-            sh0=np.array(cloud["colors"], "f4").reshape(count, 3),
-            shN=np.array(cloud["sh"], "f4").reshape(count, (degree + 1) ** 2 - 1, 3),
-            antialiased=cloud["antialiased"],
-        )
+        names = {"means": "positions", "quats": "rotations", "scales": "scales", "sh0": "colors", "shN": "sh"}
+        arrays = {name: np.array(cloud[one], "f4").reshape(cloud["numPoints"], -1) for name, one in names.items()}
+        arrays |= {"quats": arrays["quats"][:, [3, 0, 1, 2]], "opacities": np.array(cloud["alphas"], "f4")}
+        arrays["shN"] = arrays["shN"].reshape(cloud["numPoints"], (cloud["shDegree"] + 1) ** 2 - 1, 3)
+        return SplatModel(**arrays, antialiased=cloud["antialiased"])
 
 
 class Converter:
@@ -148,7 +139,6 @@ class Gsply(Converter):
 
 PROGRAMS = {"spz": Spz(), "splat-transform": SplatTransform(), "gsply": Gsply()}
 
-
 # --- Formats and tolerances
 ENDINGS = {"compressed-ply": ".compressed.ply", "spz4": ".v4.spz", "gltf": ".glb"}
 WRITE = {
@@ -156,29 +146,16 @@ WRITE = {
     "splat-transform": ["ply", "compressed-ply", "sog", "spz", "spz4", "gltf"],
     "gsply": ["ply", "compressed-ply", "spz", "spz4"],
 }
-
-
 READ = {
     "spz": ["spz", "spz4"],
     "splat-transform": ["ply", "compressed-ply", "sog", "spz", "spz4", "splat"],
     "gsply": ["ply", "compressed-ply", "sog", "spz", "spz4"],
 }
-
-
-#: Programs that read SPZ in a PLY's axes: they are off by half a turn about x.
-UNTURNED = {"splat-transform", "gsply"}
-
-
-#: Programs that hold SH of degree 4, and the format.
-GLOSSY = {"spz": ["spz4"]}
-
-
+UNTURNED = {"splat-transform", "gsply"}  # they read SPZ in a PLY's axes, off by half a turn about x
+GLOSSY = {"spz": ["spz4"]}  # programs that hold SH of degree 4, and the format
 #: Programs that write splats in another order.
 REORDERED = {(writer, format) for writer in ("csplat", "splat-transform") for format in ("compressed-ply", "sog")}
-
-
-#: Formats that cannot record antialiasing, and programs that do not read it.
-NOT_ANTIALIASED = {"gltf", "splat", "gsply"}
+NOT_ANTIALIASED = {"gltf", "splat", "gsply"}  # formats that cannot record it, and programs that do not read it
 
 
 def bounds(format, writer, reach):

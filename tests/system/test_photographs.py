@@ -1,14 +1,15 @@
 """`csplat compare --data` and `csplat render --data`; both check their inputs before they compile."""
 
 import json
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from captures import as_bytes, with_alpha
 from checked import cloud
 from command_line import call, invoke
 from PIL import Image
+from posed_sets import to_opengl, write_document
 
 from csplat import EncodeOptions, encode, read_ply, write_ply
 from csplat.errors import InputError
@@ -20,7 +21,6 @@ from csplat_tools.views import DataOptions, find_view_set
 from csplat_trainer.posed_images import PosedImage, image_scorer
 
 pytest.importorskip("numba", reason="requires the extra [render]")
-
 
 W, H = 64, 48
 
@@ -43,18 +43,12 @@ def write_set(folder, scene, *, alpha, shift=(0.0, 0.0, 0.0)):
     (folder / "images").mkdir(parents=True)
     frames = []
     for number, camera in enumerate(cameras(9)):
-        seen = render(scene, camera, background=(0.0, 0.0, 0.0))
-        pixels = np.clip(seen.rgb, 0.0, 1.0)
-        if alpha:
-            straight = np.clip(pixels / np.maximum(seen.alpha, 1e-6)[..., None], 0.0, 1.0)
-            pixels = np.concatenate([straight, seen.alpha[..., None]], axis=2)
-        Image.fromarray(np.rint(pixels * 255).astype(np.uint8)).save(folder / "images" / f"view{number}.png")
-        pose = np.linalg.inv(camera.viewmat) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        seen, pose = render(scene, camera, background=(0.0, 0.0, 0.0)), np.array(to_opengl(camera))
+        name = f"images/view{number}.png"
+        Image.fromarray(with_alpha(seen) if alpha else as_bytes(seen.rgb)).save(folder / name)
         pose[:3, 3] += shift
-        frames.append({"file_path": f"images/view{number}.png", "transform_matrix": pose.tolist()})
-    K = intrinsics(W, H, 60.0)
-    document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(document))
+        frames.append({"file_path": name, "transform_matrix": pose.tolist()})
+    write_document(folder, intrinsics(W, H, 60.0), W, H, frames)
     return folder
 
 
@@ -80,15 +74,14 @@ def compared(*words):
 @pytest.mark.slow
 def test_both_scenes_are_scored_on_the_test_images(files, data):
     result = compared(*files, "--data", data)
-    assert ["view0.png", "view8.png"] == [view["image"].removeprefix("images/") for view in result["views"]]
+    assert ["images/view0.png", "images/view8.png"] == [view["image"] for view in result["views"]]
     assert ["capture", [0.0, 0.0, 0.0]] == [result["cameras"], result["background"]]
     scores = result["photographs"]
-    assert "test" == scores["split"]
-    assert 2 == scores["a"]["views"] == scores["b"]["views"]
-    assert scores["a"]["psnr"] > 50.0  # rounding to bytes is the only error
-    assert scores["b"]["psnr"] == pytest.approx(result["psnr"], abs=0.2)
-    assert scores["b"]["ssim"] < scores["a"]["ssim"]
-    assert scores["a"]["lpips"] is None
+    a, b = scores["a"], scores["b"]
+    assert ("test", 2, 2, None) == (scores["split"], a["views"], b["views"], a["lpips"])
+    assert a["psnr"] > 50.0  # rounding to bytes is the only error
+    assert b["psnr"] == pytest.approx(result["psnr"], abs=0.2)
+    assert b["ssim"] < a["ssim"]
     training = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
     assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in training["views"]]
     assert 6 == training["photographs"]["a"]["views"]
@@ -96,13 +89,11 @@ def test_both_scenes_are_scored_on_the_test_images(files, data):
 
 def test_a_background_is_composited_behind_images_and_scene(scene, files, tmp_path):
     data = write_set(tmp_path / "object", scene, alpha=True)
-    result = compared(*files, "--data", data)
-    assert [0.0, 0.0, 0.0] == result["background"]
-    assert result["photographs"]["a"]["psnr"] > 45.0
-    assert result["photographs"]["a"]["psnr_covered"] is not None
-    white = compared(*files, "--data", data, "--background", "white")
-    assert [1.0, 1.0, 1.0] == white["background"]
-    assert white["photographs"]["a"]["psnr"] > 45.0
+    for words, background in (((), [0.0, 0.0, 0.0]), (("--background", "white"), [1.0, 1.0, 1.0])):
+        result = compared(*files, "--data", data, *words)
+        assert background == result["background"]
+        assert result["photographs"]["a"]["psnr"] > 45.0
+        assert result["photographs"]["a"]["psnr_covered"] is not None
 
 
 def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
@@ -116,13 +107,6 @@ def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
     with Image.open(tmp_path / "out" / "view0.png") as one, Image.open(data / "images" / "view0.png") as two:
         assert (W, H) == one.size
         assert np.abs(np.asarray(one).astype(int) - np.asarray(two)).max() <= 1
-
-
-def test_the_table_has_a_column_for_each_scene(files, data, tmp_path):
-    text = call("compare", *files, "--data", data, "--pictures", tmp_path / "out").stdout
-    assert "B - A" in text
-    with Image.open(tmp_path / "out" / "view8.png") as sheet:
-        assert (4 * W, H) == sheet.size
 
 
 def test_lpips_is_computed_with_weights(files, data, data_dir):
@@ -157,8 +141,7 @@ def test_an_image_with_alpha_is_composited_over_the_background():
 def test_masked_pixels_are_not_scored(scene):
     taken = cameras(2)
     seen = [np.clip(render(scene, camera).rgb, 0.0, 1.0) for camera in taken]
-    images = [np.rint(255.0 * np.clip(one + 0.1, 0.0, 1.0)).astype(np.uint8) for one in seen]
-    mask = np.zeros((H, W), bool)
+    images, mask = [as_bytes(one + 0.1) for one in seen], np.zeros((H, W), bool)
     mask[:, : W // 4] = True
     images[0][~mask] = 255
     scorer = image_scorer([PosedImage(taken[0], images[0], mask), PosedImage(taken[1], images[1])], (0.0, 0.0, 0.0))
@@ -172,33 +155,30 @@ def test_masked_pixels_are_not_scored(scene):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (("compare", "absent.ply", "B"), "absent.ply"),
-        (("compare", "A", "absent.csplat"), "absent.csplat"),
-        (("compare", "A", "B", "--cameras", "absent.json"), "absent.json"),
-        (("compare", "A", "B", "--data", "absent"), "absent"),
-        (("compare", "A", "B", "--lpips", "absent.npz"), "absent.npz"),
-        (("compare", "A", "B", "--source-index", "absent.npy"), "absent.npy"),
-        (("compare", "A", "B", "--cameras", "cameras.json", "--pictures", "A"), "not a folder"),
-        (("render", "A", "--cameras", "absent.json", "o"), "absent.json"),
-        (("render", "A", "--orbit", "2", "A"), "not a folder"),
-        (("render", "A", "--orbit", "2", "nowhere/film.gif"), "nowhere"),
-        (("train", "capture", "o.ply", "--resume", "absent.npz"), "absent.npz"),
-    ],
-)
-def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypatch, words, message):
+def test_an_invalid_input_is_reported_before_compiling(files, tmp_path, monkeypatch):
     for place in ("tools.cli.compare.prepare_renderer", "tools.cli.render.prepare_renderer", "render.warmup.warm_up"):
         monkeypatch.setattr(f"csplat_{place}", lambda *_, **__: pytest.fail("compiled before the inputs were checked"))
     monkeypatch.chdir(tmp_path)
-    shutil.copy(files[0], "A")
-    shutil.copy(files[1], "B")
+    for name, path in zip("AB", files, strict=True):
+        (tmp_path / name).symlink_to(path)
     (tmp_path / "capture").mkdir()
     save_cameras("cameras.json", cameras(1))
-    done = invoke(*words)
-    assert done.exit_code in (1, 2), (done.stdout, done.exception)
-    assert message in done.stderr
+    for words, message in {
+        "compare absent.ply B": "absent.ply",
+        "compare A absent.csplat": "absent.csplat",
+        "compare A B --cameras absent.json": "absent.json",
+        "compare A B --data absent": "absent",
+        "compare A B --lpips absent.npz": "absent.npz",
+        "compare A B --source-index absent.npy": "absent.npy",
+        "compare A B --cameras cameras.json --pictures A": "not a folder",
+        "render A --cameras absent.json o": "absent.json",
+        "render A --orbit 2 A": "not a folder",
+        "render A --orbit 2 nowhere/film.gif": "nowhere",
+        "train capture o.ply --resume absent.npz": "absent.npz",
+    }.items():
+        done = invoke(*words.split())
+        assert done.exit_code in (1, 2), (words, done.stdout, done.exception)
+        assert message in done.stderr, words
 
 
 def test_the_renderer_is_prepared_once_after_reading(files, tmp_path):

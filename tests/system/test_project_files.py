@@ -1,8 +1,8 @@
 """Files that other programs read: attributes, metadata of packages."""
 
-import importlib.util
 import json
 import re
+import runpy
 import subprocess
 import tomllib
 from pathlib import Path
@@ -17,20 +17,14 @@ in_a_checkout = pytest.mark.skipif(not (ROOT / ".git").exists(), reason="not a c
 
 def listed(*words):
     words = ["git", "ls-files", *words]
-    return subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines()
+    return subprocess.check_output(words, cwd=ROOT, text=True).splitlines()
 
 
 @pytest.mark.slow
 @in_a_checkout
 def test_attributes_of_git_know_binary_files():
-    wrong = []
-    for line in listed("--eol"):
-        facts, path = line.split("\t")
-        content, _, attributes = facts.split(None, 2)
-        is_text = "-text" not in attributes
-        if (is_text and content not in ("i/lf", "i/none")) or (is_text and path.endswith((".csplat", ".ply"))):
-            wrong.append(line)
-    assert [] == wrong
+    texts = [line for line in listed("--eol") if "-text" not in line.split("\t")[0]]
+    assert [] == [one for one in texts if not one.startswith(("i/lf", "i/none")) or one.endswith((".csplat", ".ply"))]
 
 
 @pytest.mark.slow
@@ -43,38 +37,23 @@ def test_every_file_that_a_page_about_the_code_names_exists(page, least):
     assert [] == sorted(name for name in named - found if "NAME" not in name)
 
 
-def prepare(root, *words):
-    place = ROOT / "tools" / "release" / "prepare.py"
-    spec = importlib.util.spec_from_file_location("prepare", place)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.main(list(words), root)
+def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path):
+    def prepared(tag, url):
+        return runpy.run_path(ROOT / "tools" / "release" / "prepare.py")["main"](["--tag", tag, "--url", url], tmp_path)
 
-
-@pytest.fixture
-def copied(tmp_path):
-    """The files that a release changes."""
     for name in ("pyproject.toml", "codec/js/package.json", "codec/csplat/__init__.py"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes((ROOT / name).read_bytes())
-    return tmp_path
-
-
-def test_a_release_names_its_own_repository(copied):
-    before = tomllib.loads((copied / "pyproject.toml").read_text("utf-8"))
-    tag = f"v{csplat.__version__}"
+    project = tmp_path / "pyproject.toml"
+    text, before = project.read_bytes(), tomllib.loads(project.read_text("utf-8"))
+    assert 1 == prepared("v9.9.9", "https://github.com/owner/csplat")
+    with pytest.raises(SystemExit):
+        prepared("v0.1.0", "git@github.com:owner/csplat")
+    assert text == project.read_bytes()
     for url in ("https://github.com/first/csplat", "https://github.com/second/csplat"):  # twice: links are replaced
-        assert prepare(copied, "--tag", tag, "--url", url) == 0
-        after = tomllib.loads((copied / "pyproject.toml").read_text("utf-8"))
+        assert 0 == prepared(f"v{csplat.__version__}", url)
+        after = tomllib.loads(project.read_text("utf-8"))
         assert url == after["project"].pop("urls")["Homepage"]
         assert before == after
-        package = json.loads((copied / "codec" / "js" / "package.json").read_text("utf-8"))
+        package = json.loads((tmp_path / "codec" / "js" / "package.json").read_text("utf-8"))
         assert {"type": "git", "url": f"git+{url}.git", "directory": "codec/js"} == package["repository"]
-
-
-def test_a_release_refuses_a_tag_of_another_version_and_other_addresses(copied):
-    text = (copied / "pyproject.toml").read_bytes()
-    assert prepare(copied, "--tag", "v9.9.9", "--url", "https://github.com/owner/csplat") == 1
-    with pytest.raises(SystemExit):
-        prepare(copied, "--tag", "v0.1.0", "--url", "git@github.com:owner/csplat")
-    assert text == (copied / "pyproject.toml").read_bytes()

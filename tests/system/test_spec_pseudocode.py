@@ -6,6 +6,7 @@ import zlib
 
 import numpy as np
 import pytest
+from checked import covariances, rotations
 
 from csplat import _spec
 from csplat.decoder.blocks import ColumnBlock, morton_axes
@@ -16,27 +17,21 @@ from csplat_authoring.coders import Deflate
 from csplat_conformance.tolerance import describe_deviation, is_valid_bound
 
 
-def elements(width: int) -> list[int]:
-    top = 2 ** (8 * width)
-    rng = np.random.default_rng(width)
-    edges = [0, 1, 2, top - 1, top - 2, top // 2, top // 2 - 1, top // 2 + 1, 0, top - 1]
-    return edges + [int.from_bytes(rng.bytes(width), "little") for _ in range(50)]
-
-
 def test_transforms_are_undone_from_the_last_to_the_first(spec):
     for width in range(1, 9):
-        values = elements(width)
+        top, rng = 2 ** (8 * width), np.random.default_rng(width)
+        values = [0, 1, 2, top - 1, top - 2, top // 2, top // 2 - 1, top // 2 + 1, 0, top - 1]
+        values += [int.from_bytes(rng.bytes(width), "little") for _ in range(50)]
         data, count = b"".join(value.to_bytes(width, "little") for value in values), len(values)
-
-        def undone(transforms, data=data, count=count, width=width):
-            return undo_transforms(data, transforms, count, width).tolist()
-
         joined = spec.undo_byte_planes(data, count, width)
-        assert values == undone(b"\0\0\0\0")
-        assert spec.undo_delta(values, width) == undone(b"\1\0\0\0")
-        assert spec.undo_zigzag(values, width) == undone(b"\2\0\0\0")
-        assert joined == undone(b"\3\0\0\0")
-        assert spec.undo_delta(spec.undo_zigzag(joined, width), width) == undone(b"\1\2\3\0")
+        for transforms, expected in {
+            b"\0\0\0\0": values,
+            b"\1\0\0\0": spec.undo_delta(values, width),
+            b"\2\0\0\0": spec.undo_zigzag(values, width),
+            b"\3\0\0\0": joined,
+            b"\1\2\3\0": spec.undo_delta(spec.undo_zigzag(joined, width), width),
+        }.items():
+            assert expected == undo_transforms(data, transforms, count, width).tolist()
 
 
 def test_run_length(spec):
@@ -53,12 +48,11 @@ def test_morton(spec):
     assert [spec.morton_axes(code) for code in codes] == found.T.tolist()
 
 
-def record(attribute: int, mapping: int, **fields: float) -> _spec.AttributeRecord:
-    values = {"chroma_shift": 0, "levels": 0, "step": 1.0} | fields
-    return _spec.AttributeRecord(attribute, mapping, values["chroma_shift"], 0, values["levels"], values["step"])
+def record(attribute, mapping, chroma_shift=0, levels=0, step=1.0):
+    return _spec.AttributeRecord(attribute, mapping, chroma_shift, 0, levels, step)
 
 
-def columns(rows: list[list[int]], exponent: int = 0) -> ColumnBlock:
+def columns(rows, exponent=0):
     """Return [n][C] integers as a block; wide ones are an offset plus elements."""
     return ColumnBlock(np.array(rows, np.int64).T, (0,) * len(rows[0]), exponent, 0)
 
@@ -66,12 +60,8 @@ def columns(rows: list[list[int]], exponent: int = 0) -> ColumnBlock:
 def test_colour_lifting(spec):
     for shift, bound in itertools.product((0, 1, 5, 15, 16), (0, 1, 127, 2**13, 2**15, 2**31, 2**50)):
         rng, chroma = np.random.default_rng(shift), bound >> shift
-        rows = [
-            [bound, -chroma, chroma],
-            [-bound, chroma, chroma],
-            [bound, chroma, -chroma],
-            [-bound, -chroma, -chroma],
-        ]
+        signs = np.array([[1, -1, 1], [-1, 1, 1], [1, 1, -1], [-1, -1, -1]])
+        rows = (signs * [bound, chroma, chroma]).tolist()
         luma, others = rng.integers(-bound, bound + 1, (20, 1)), rng.integers(-chroma, chroma + 1, (20, 2))
         rows += np.hstack([luma, others]).tolist()
         colour = record(_spec.ATTRIBUTE_SH0, _spec.MAPPING_YCOCG, chroma_shift=shift)
@@ -85,17 +75,15 @@ def test_colour_lifting(spec):
     [(1.0, 0), (0.1, 0), (0.1, -3), (1e-30, 0), (2.0**-1022, 0), (1e300, -2000), (2.0**-1022, 1100), (1e-12, 5)],
 )
 def test_lattice_values_of_means(spec, step, exponent):
-    rng = np.random.default_rng(1)
     wide = 2**24 + 1, 2**31, -(2**49) + 1
-    integers = [0, 1, -1, 2, 3, -3, 255, *wide, *(int(v) for v in rng.integers(-999, 999, 90))]
+    integers = [0, 1, -1, 2, 3, -3, 255, *wide, *np.random.default_rng(1).integers(-999, 999, 90).tolist()]
     with np.errstate(over="ignore"):
-        expected = [spec.lattice_value(n, step, exponent) for n in integers]
-    keep = [i for i, value in enumerate(expected) if np.isfinite(value)]
-    rows = [[integers[i]] * 3 for i in keep]
-    out = np.empty((len(rows), 3), np.float32)
-    largest = write_lattice(columns(rows, exponent), record(_spec.ATTRIBUTE_MEANS, 0, step=step), out)
-    assert max(integers[i] for i in keep) == largest
-    assert np.array([expected[i] for i in keep], np.float32).tobytes() == out[:, 1].tobytes()
+        expected = {n: spec.lattice_value(n, step, exponent) for n in integers}
+    kept = [n for n in integers if np.isfinite(expected[n])]
+    out = np.empty((len(kept), 3), np.float32)
+    means = record(_spec.ATTRIBUTE_MEANS, 0, step=step)
+    assert max(kept) == write_lattice(columns([[n] * 3 for n in kept], exponent), means, out)
+    assert np.array([expected[n] for n in kept], np.float32).tobytes() == out[:, 1].tobytes()
 
 
 @pytest.mark.parametrize(
@@ -103,8 +91,7 @@ def test_lattice_values_of_means(spec, step, exponent):
 )
 def test_values_of_scales_and_colours_are_products_in_binary32(spec, step, exponent):
     step = float(np.float32(step))
-    rng = np.random.default_rng(1)
-    integers = [0, 1, -1, 3, 2**22, -(2**22), *(int(v) for v in rng.integers(-(2**22), 2**22, 999))]
+    integers = [0, 1, -1, 3, 2**22, -(2**22), *np.random.default_rng(1).integers(-(2**22), 2**22, 999).tolist()]
     expected = np.array([spec.lattice_value(n, step, exponent) for n in integers], np.float32)
     single = np.array(integers, np.float32) * np.float32(math.ldexp(step, exponent))
     out = np.empty((len(integers), 3), np.float32)
@@ -116,20 +103,17 @@ def test_bands_are_laid_out_by_channel_then_coefficient(spec):
     rows = np.random.default_rng(2).integers(-2000, 2000, (30, 15)).tolist()
     out = np.empty((30, 5, 3), np.float32)
     write_colour(columns(rows), record(_spec.ATTRIBUTE_SH2, 0, step=0.015625), out)
-    for i, row in enumerate(rows):
-        for m in range(5):
-            for channel in range(3):
-                assert spec.lattice_value(row[channel * 5 + m], 0.015625, 0) == out[i, m, channel]
+    expected = np.array([[spec.lattice_value(n, 0.015625, 0) for n in row] for row in rows])
+    np.testing.assert_array_equal(expected.reshape(30, 3, 5).transpose(0, 2, 1), out)
 
 
 def test_opacities(spec):
     for levels in (1, 2, 3, 63, 255, 256, 65535):
-        linear = opacity_table(record(1, _spec.MAPPING_LINEAR, levels=levels, step=0.0))
-        square = opacity_table(record(1, _spec.MAPPING_SQUARE, levels=levels, step=0.0))
-        for q in {0, 1, levels // 2, levels - 1, levels, *range(0, levels, 997)}:
-            assert spec.opacity_linear(q, levels) == linear[q]
-            assert spec.opacity_square(q, levels) == square[q]
-        assert (0.0, 1.0) == (linear[0], linear[-1]) == (square[0], square[-1])
+        for mapping, by_definition in (("LINEAR", spec.opacity_linear), ("SQUARE", spec.opacity_square)):
+            table = opacity_table(record(1, getattr(_spec, f"MAPPING_{mapping}"), levels=levels, step=0.0))
+            for q in {0, 1, levels // 2, levels - 1, levels, *range(0, levels, 997)}:
+                assert by_definition(q, levels) == table[q]
+            assert (0.0, 1.0) == (table[0], table[-1])
 
 
 def test_quats(spec):
@@ -196,7 +180,8 @@ def test_rotations_there_and_back(spec):
         turned = spec.with_w_largest(*quat.tolist())
         assert turned[0] == max(map(abs, turned))
         # One half turn about an axis of the splat, or none: the axes are the same up to their signs.
-        np.testing.assert_allclose(np.abs(rotation_of(quat).T @ rotation_of(turned)), np.eye(3), atol=1e-12)
+        before, after = rotations([quat, turned])
+        np.testing.assert_allclose(np.abs(before.T @ after), np.eye(3), atol=1e-12)
         for levels in (3, 4, 5, 127, 32767):
             q = spec.quat_integers(turned, levels)
             assert max(map(abs, q)) <= levels
@@ -211,31 +196,11 @@ def test_axes_are_exchanged_with_their_scales(spec):
     for quat, scales in zip(quats, rng.normal(0, 1, (50, 3)), strict=True):
         turned, ordered = spec.with_scales_sorted(quat.tolist(), scales.tolist())
         assert sorted(scales.tolist(), reverse=True) == ordered
-        before, after = (
-            rotation_of(q) @ np.diag(np.exp(2 * np.array(s))) @ rotation_of(q).T
-            for q, s in ((quat, scales), (turned, ordered))
-        )
+        before, after = covariances(np.array([quat, turned]), np.array([scales, ordered]))
         np.testing.assert_allclose(after, before, atol=1e-12)
 
 
-def rotation_of(quat):
-    w, x, y, z = quat
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def lengths_of_codes(count):
-    """Yield all code lengths of 0 to 4 bits for this number of symbols."""
-    for number in range(5**count):
-        yield [number // 5**i % 5 for i in range(count)]
-
-
-def reads(stream) -> bool:
+def reads(stream):
     try:
         return zlib.decompressobj(-15).decompress(stream.literals(256).end()) == b"\7"
     except zlib.error:
@@ -244,7 +209,7 @@ def reads(stream) -> bool:
 
 @pytest.mark.slow
 def test_codes_are_allowed_where_zlib_reads_them(spec):
-    for lengths in lengths_of_codes(4):
+    for lengths in map(list, itertools.product(range(5), repeat=4)):
         numbered, literals = dict(enumerate(lengths)), dict(zip((7, 8, 255, 256), lengths, strict=True))
         stream = Deflate().dynamic({7: 1, 256: 1}, numbered, counts=(257, 4)).literals(7)
         assert spec.is_allowed(lengths, "distance") == reads(stream), lengths
