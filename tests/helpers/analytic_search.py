@@ -40,19 +40,15 @@ BOOKS = tuple(2**power for power in range(5, 13))
 
 
 def error_of(psnr):
-    """Return the mean squared error of a PSNR in dB."""
     return 10.0 ** (-np.asarray(psnr, np.float64) / 10.0)
 
 
 def psnr_of(error):
-    """Return the PSNR in dB of a mean squared error."""
     return np.minimum(-10.0 * np.log10(np.maximum(error, 1e-30)), PSNR_CAP)
 
 
 @dataclass(frozen=True)
 class Views:
-    """Views and their errors."""
-
     offset: float = 0.0  # dB by which errors are larger than in the validation views
     removal_offset: float = 0.0  # dB by which errors of removal are larger in addition
     photo_psnr: float | None = None  # of the source against their images, dB; None: compare with the source
@@ -63,8 +59,6 @@ DECIDING = Views()
 
 @dataclass(frozen=True)
 class Contents:
-    """A request for a file."""
-
     options: EncodeOptions  # those still to be chosen are left open
     splats: int
     refitted: bool = False  # the kept splats were fitted to renders of the source
@@ -74,8 +68,6 @@ class Contents:
 
 @dataclass(frozen=True)
 class AnalyticScene:
-    """A scene and the cost of its files."""
-
     splats: int = 8000
     sh_degree: int = 3
     unneeded: int = 0  # splats without effect in any view
@@ -137,7 +129,6 @@ class AnalyticScene:
         return np.rint((self.frame_bytes + contents.splats * splat * saved) * packed + book)
 
     def error_of(self, contents, views=DECIDING, quality=None):
-        """Return the error of a file in some views, or of one file for each of some qualities."""
         chosen = self.options_of(contents)
         q = np.asarray(chosen["quality"] if quality is None else quality, np.float64)
         q = q - np.clip(q - self.plateau[0], 0.0, self.plateau[1] - self.plateau[0])
@@ -151,7 +142,6 @@ class AnalyticScene:
         return self._seen(error + self.missing(chosen["sh_degree"]), removed, views)
 
     def source_error(self, splats, sh_degree, views, *, refitted=False):
-        """Return the error of some splats and bands before quantisation."""
         return float(self._seen(self.missing(sh_degree), self.removed(splats, refitted=refitted), views))
 
     def removed(self, splats, *, refitted):
@@ -161,7 +151,6 @@ class AnalyticScene:
         return error_of(self.removal_psnr + self.mended * refitted) * gone**self.removal_power
 
     def missing(self, sh_degree):
-        """Return the error of the bands that are left out."""
         return float(error_of(self.shown[sh_degree])) if sh_degree < self.sh_degree else 0.0
 
     def _seen(self, error, removed, views):
@@ -211,21 +200,10 @@ def search(
     scene, *, options=None, no_prune=False, judging=DECIDING, photo_psnr=None, grades=False, effort=3, tried=None,
     **target,
 ):  # fmt: skip
-    """Search for a file of an analytic scene.
+    """Search for a file that meets `Target(**target)`; return it, all that were tried or scored, and the report.
 
-    Args:
-        scene: the scene.
-        options: options fixed by the caller.
-        no_prune: keep all splats.
-        judging: the test views; by default they have the errors of the validation views.
-        photo_psnr: PSNR of the source against images, dB, for a PSNR drop.
-        grades: allow quantisation classes.
-        effort: effort of the refit.
-        tried: receives the candidates, even if the search fails.
-        target: arguments of `Target`.
-
-    Returns:
-        The chosen `file`, every file that was `tried`, in order, those `scored` in test views, the `report` for users.
+    Test views may have other errors (`judging`), images a PSNR of the source (`photo_psnr`, for a PSNR drop); `grades`
+    allows quantisation classes, `effort` is that of a refit; `tried` receives the candidates even if the search fails.
     """
     model, asked, judge = scene.model(), Target(**target), _Judge(scene, judging)
     photographs = None if photo_psnr is None else _Judge(scene, Views(photo_psnr=photo_psnr))
@@ -247,7 +225,6 @@ def search(
 
 
 def analytic_removal(scene, *, grades=False):
-    """Return the pruner of an analytic scene."""
     return _Removal(scene.model(), None, (48, 36), use_classes=grades, scene=scene)
 
 
@@ -302,8 +279,6 @@ class _Splats:
 
 @dataclass
 class _Order:
-    """A complete pruning order."""
-
     scene: AnalyticScene
 
     def extend(self, **_):
@@ -318,8 +293,6 @@ class _Order:
 
 @dataclass(eq=False)
 class _Removal(Pruner):
-    """The pruning order and refit by the law, in place of measured ones."""
-
     scene: AnalyticScene = None
 
     @cached_property

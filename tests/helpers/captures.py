@@ -92,7 +92,6 @@ def photograph(scene, folder):
 
 
 def as_colmap(folder):
-    """Replace the poses of such a folder by COLMAP's files."""
     (folder / "transforms.json").unlink()
     model = folder / "sparse" / "0"
     model.mkdir(parents=True)
@@ -133,7 +132,6 @@ def crowded():
 
 
 def around(source, count=24):
-    """Return small virtual views of a scene."""
     views = find_view_set(source, count=count, size=SMALL)
     test, validation = ([resized(camera, 48, 36) for camera in part] for part in (views.test, views.validation))
     return replace(views, test=test, validation=validation)
@@ -187,7 +185,6 @@ def write_photographs(folder):
 
 
 def _photograph(eye, rotation):
-    """Return an image of the ball, [H, W, 4] uint8, straight RGBA."""
     ticks = [((np.arange(_SAMPLES * size) + 0.5) / _SAMPLES - size / 2) / FOCAL for size in (W, H)]
     x, y = np.meshgrid(*ticks)
     rays = np.stack([x, y, np.ones_like(x)], axis=2) @ rotation
@@ -214,7 +211,6 @@ def make_trained(folder):
 
 
 def make_tuned(folder, source):
-    """Tune a file of the trained scene."""
     path, report = folder / "a.csplat", folder / "finetune.json"
     with pytest.MonkeyPatch.context() as patch:
         change_options(patch, "csplat_tools.cli.finetune.EncodeOptions", attribute_psnr=28.0, seed=1, threads=1)

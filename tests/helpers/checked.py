@@ -17,7 +17,6 @@ from csplat_conformance.validator import validate
 
 
 def encoded(model, importance=None, **options):
-    """Encode; assert that the file is valid and that its declared errors hold."""
     result = encode_with_report(model, EncodeOptions(**options), importance=importance)
     assert () == tuple(validate(result.data).violations)
     decoded = csplat.decode(result.data)

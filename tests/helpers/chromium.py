@@ -48,7 +48,6 @@ class _ServedPage:
     @classmethod
     @contextmanager
     def opened(cls, context):
-        """Load the page in a tab of its own, with a server."""
         site = Site()
         try:
             with open_tab(context) as tab:
@@ -70,7 +69,7 @@ class _ServedPage:
 
 
 class ViewerPage(_ServedPage):
-    SIZE = (240, 180)  # size of the window: the tools take up most of a smaller one
+    SIZE = {"width": 240, "height": 180}  # noqa: RUF012  # the tools take up most of a smaller window
 
     def load(self, query=""):
         self.visit(self.site.url(VIEWER + query))
@@ -109,15 +108,13 @@ class ViewerPage(_ServedPage):
         self.site.ranges, self.site.bytes_per_second = True, 0
 
     def _resize(self):
-        size = {"width": self.SIZE[0], "height": self.SIZE[1]}
-        if self.page.viewport_size != size:
-            self.page.set_viewport_size(size)
+        if self.page.viewport_size != self.SIZE:
+            self.page.set_viewport_size(self.SIZE)
 
     def until(self, expression):
         self.tab.until(expression)
 
     def settle(self):
-        """Wait until camera and picture are at rest."""
         self.until("!csplatViewer.controls.frame && !csplatViewer.stage.moving")
         self.page.evaluate("csplatViewer.engine.settled()")
 
@@ -136,12 +133,10 @@ class ViewerPage(_ServedPage):
 
     @property
     def home(self):
-        """The camera's pose in the first picture."""
         return self.page.evaluate(_COPY.format("home"))
 
     @property
     def viewmat(self):
-        """The camera's matrix, row by row."""
         return self.page.evaluate("csplatViewer.rig.camera(80, 60).viewmat")
 
     def text(self, selector):
@@ -151,7 +146,6 @@ class ViewerPage(_ServedPage):
         return all(self.page.locator(selector).is_hidden() for selector in selectors)
 
     def error(self):
-        """Return the code of the error that is shown, or None."""
         return None if self.hides("#error") else self.page.get_attribute("#error", "data-code")
 
     def picture(self):
@@ -196,9 +190,7 @@ class EnginePage(_ServedPage):
 
     def start_again(self, options="{}"):
         """Make the engine with other options, on a canvas of its own, since a canvas keeps its kind of context."""
-        self.page.evaluate(
-            "engine.close(), document.getElementById('canvas').outerHTML = '<canvas id=canvas></canvas>'"
-        )
+        self.page.evaluate("engine.close(), document.querySelector('canvas').outerHTML = '<canvas id=canvas></canvas>'")
         self.start(options)
 
     def open(self, data, path="/scene.csplat"):
@@ -218,7 +210,6 @@ class EnginePage(_ServedPage):
         return self._read("engine.readPixels()", camera)
 
     def picture_of_now(self, camera):
-        """Return the picture of the part that has arrived."""
         return self._read("(engine.drawNow(), engine.renderer.readPixels())", camera)
 
     def _read(self, pixels, camera):
@@ -261,32 +252,16 @@ class Tab:
             time.sleep(0.02)
 
 
-@dataclass(frozen=True)
-class Request:
-    """A request to the server: path without query, the Range header or "", and the status of the answer."""
-
-    method: str
-    path: str
-    range: str
-    status: int
-    size: int
-
-
 class Site:
-    """A static server on 127.0.0.1 with the viewer, the decoder, and the files that a test adds.
-
-    Attributes:
-        requests: all that came, in order.
-        ranges: False for a server that ignores Range and answers 200 with everything.
-        bytes_per_second: speed of each answer to a path that a test added; 0 for no limit.
-        breaks: True for connections that break in the middle of a later part of such a path.
-        policy: the Content-Security-Policy of all answers, if any.
-        scripts: for a path, a function of the request's headers and its number, from 1 on, that returns status,
-            headers and body of an answer of its own; None for the usual one.
-    """
+    """A static server on 127.0.0.1 with the viewer, the decoder, and the files that a test adds."""
 
     def __init__(self):
-        self.requests, self.ranges, self.bytes_per_second, self.breaks, self.policy = [], True, 0, False, ""
+        self.requests = []  # path and status of all that came, in order
+        self.ranges = True  # False: ignore Range, and answer 200 with everything
+        self.bytes_per_second = 0  # speed of each answer to a path that a test added; 0 for no limit
+        self.breaks = False  # True: connections break in the middle of a later part of such a path
+        self.policy = ""  # Content-Security-Policy of all answers
+        # By path: functions of a request's headers and number, from 1 on, that return an answer of their own or None.
         self.scripts, self._files = {}, {}
         self._web = web_files()  # from the package that is being tested, a checkout or a wheel
         site = self
@@ -315,7 +290,7 @@ class Site:
         return f"http://127.0.0.1:{self._server.server_address[1]}{path}"
 
     def statuses(self, path):
-        return [one.status for one in self.requests if one.path == path]
+        return [status for asked, status in self.requests if asked == path]
 
     def close(self):
         self._server.shutdown()
@@ -340,11 +315,10 @@ class Site:
                 status = 416 if first >= total else 206
                 body = b"" if status == 416 else body[first : last + 1]
                 headers["Content-Range"] = f"bytes */{total}" if status == 416 else f"bytes {first}-{last}/{total}"
-        script = self.scripts.get(path)
-        own = script(handler.headers, 1 + len(self.statuses(path))) if script else None
+        own = path in self.scripts and self.scripts[path](handler.headers, 1 + len(self.statuses(path)))
         if own:
             status, headers, body = own
-        self.requests.append(Request(handler.command, path, asked, status, len(body)))
+        self.requests.append((path, status))
         handler.send_response(status)
         for name, value in {**headers, "Content-Length": str(len(body)), "Cache-Control": "no-store"}.items():
             handler.send_header(name, value)
@@ -376,7 +350,6 @@ class Site:
 
 
 def absent(reason):
-    """Skip the test, or fail if skipping is forbidden."""
     if os.environ.get("CI") == "true":
         pytest.fail(f"CI=true, and {reason}")
     pytest.skip(reason)
@@ -422,14 +395,12 @@ def open_tab(context):
 
 @pytest.fixture
 def tab(context):
-    """A fresh page of 800 by 600 pixels."""
     with open_tab(context) as made:
         yield made
 
 
 @pytest.fixture
 def site():
-    """A server for one test."""
     made = Site()
     yield made
     made.close()

@@ -1,26 +1,52 @@
 """The command line in the process of the tests, batches without processes, and SIGINT in child processes."""
 
 import signal
+import sys
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from importlib import import_module
 
+import pytest
 from typer.testing import CliRunner
 
+from csplat_tools.__main__ import main
 from csplat_tools.cli.app import app
 from csplat_tools.views import find_view_set
 
-
-def invoke(*words):
-    """Run `csplat WORDS` and return the result, with its output and exit code."""
-    return CliRunner().invoke(app, [str(word) for word in words])
+PROGRAM = [sys.executable, "-m", "csplat_tools"]
 
 
-def call(*words, status=0):
-    """Run `csplat WORDS`, assert its exit status, and return the result."""
-    result = invoke(*words)
+def invoke(*words, **options):
+    return CliRunner().invoke(app, [str(word) for word in words], **options)
+
+
+def call(*words, status=0, **options):
+    result = invoke(*words, **options)
     assert status == result.exit_code, (result.output, result.exception)
     return result
+
+
+def printed(*words, **options):
+    """Run a command that succeeds; return what it printed as data."""
+    return call(*words, **options).stdout
+
+
+def refused(*words, status=1):
+    """Run a command that is refused with one line; return the line."""
+    result = call(*words, status=status)
+    assert result.exception is None or isinstance(result.exception, SystemExit)
+    assert (1, True) == (result.stderr.count("\n"), result.stderr.startswith("error: ")), result.stderr
+    return result.stderr
+
+
+def status_of(*words):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["csplat", *map(str, words)])
+        try:
+            main()
+        except SystemExit as ended:
+            return ended.code or 0
+    return 0
 
 
 class _ChangedOptions:
@@ -58,7 +84,6 @@ class InThisProcess(Executor):
         pass
 
     def submit(self, function, *args):
-        """Call a function at once, and return its result as a future."""
         future, before = Future(), signal.getsignal(signal.SIGINT)
         try:
             future.set_result(function(*args))

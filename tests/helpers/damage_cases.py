@@ -14,7 +14,6 @@ RICH = BUILT.data
 
 
 def flipped(data, bit):
-    """Return a copy of the data with another value of a bit."""
     damaged = bytearray(data)
     damaged[bit // 8] ^= 1 << bit % 8
     return bytes(damaged)

@@ -9,7 +9,6 @@ import csplat
 
 
 def extract(data, box):
-    """Return the part and its bytes."""
     stream = io.BytesIO()
     part = csplat.extract(data, box, stream)
     assert part.size == len(stream.getvalue())
@@ -29,7 +28,6 @@ STEPS = {
 
 
 def merge(*files, **named):
-    """Merge files into a stream; return the result and the bytes."""
     stream = io.BytesIO()
     done = csplat.merge(files, stream, **named)
     assert done.size == len(stream.getvalue())

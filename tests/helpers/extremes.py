@@ -15,13 +15,12 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-from captures import cameras, views_of
+from captures import cameras, shell, views_of
 
 from csplat import EncodeOptions, decode, read_ply
 from csplat.decoder import read_declared_bounds, read_header
 from csplat.encoder import EncodePlan, Target, encode_with_report, fix_quantisation
 from csplat.errors import InputError
-from csplat.model import normalise_quats
 from csplat.ply import lint_ply
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render import render
@@ -47,86 +46,73 @@ COPIES = 2_000  # replaces a million identical splats in training, which visits 
 
 @dataclass(frozen=True)
 class Condition:
-    """An extreme scene: a function for a PLY's columns; comments; how many rows are dropped, which defects repaired."""
+    """A change of the object's columns in a PLY; its comments; how many rows are dropped, which defects repaired."""
 
-    make: Callable
+    change: Callable
     comments: tuple = ()
     dropped: int = 0
     repairs: tuple = ()
 
-
-def ordinary(count=COUNT, coefficients=8):
-    """Return the object that all scenes are variants of."""
-    rng = np.random.default_rng(0)
-    means = rng.standard_normal((count, 3))
-    means /= np.linalg.norm(means, axis=1, keepdims=True)
-    columns = {
-        "means": means, "quats": normalise_quats(rng.standard_normal((count, 4))),
-        "scales": rng.uniform(-2.5, -1.3, (count, 3)), "logits": rng.uniform(-2.0, 3.0, count),
-        "sh0": np.sin(3.0 * means) + 0.5, "shN": 0.1 * rng.standard_normal((count, coefficients, 3)),
-    }  # fmt: skip
-    return {name: column.astype(np.float32) for name, column in columns.items()}
+    def make(self):
+        columns = ordinary()
+        return self.change(columns) or columns
 
 
-def far_away(dtype=np.float32):
-    columns = ordinary()
-    return columns | {"means": columns["means"].astype(dtype) + dtype(FAR)}
+def ordinary(coefficients=8):
+    model = shell(coefficients)
+    first = {name: getattr(model, name).copy() for name in ("means", "quats", "scales")}
+    logits = np.float32(5.0) * (model.opacities - np.float32(0.1)) / np.float32(0.85) - np.float32(2.0)  # -2 to 3
+    return {**first, "logits": logits, "sh0": model.sh0.copy(), "shN": model.shN.copy()}
 
 
-def identical(count=1_000_000, coefficients=0):
-    return {name: np.repeat(column[:1], count, axis=0) for name, column in ordinary(COUNT, coefficients).items()}
+def far_away(columns, dtype=np.float32):
+    columns["means"] = columns["means"].astype(dtype) + dtype(FAR)
 
 
-def needles():
-    """Return needles, discs and blades, a third each, with axes 1 : e^20."""
-    columns = ordinary()
+def identical(columns, count=1_000_000):
+    columns["shN"] = ordinary(coefficients=0)["shN"]
+    return {name: np.repeat(column[:1], count, axis=0) for name, column in columns.items()}
+
+
+def needles(columns):
+    """Make needles, discs and blades, a third each, with axes 1 : e^20."""
     columns["scales"][0::3] = [-1.0, -21.0, -21.0]
     columns["scales"][1::3] = [-21.0, -1.0, -1.0]
     columns["scales"][2::3] = [-21.0, -11.0, -1.0]
-    return columns
 
 
-def giant_background():
-    """Return the object at a hundredth of its size, amid twenty splats a million times larger."""
-    columns = ordinary()
+def giant_background(columns):
+    """Scale the object to a hundredth, amid twenty splats a million times larger."""
     columns["means"] *= np.float32(0.01)
     columns["scales"] += np.float32(math.log(0.01))
     behind = slice(None, None, 15)
     columns["means"][behind] *= np.float32(3e6)
     columns["scales"][behind] = math.log(1e4)
     columns["logits"][behind] = 4.0
-    return columns
 
 
-def transparent():
-    """Return splats with alpha 0 or 1/8100, which is too faint to be drawn."""
-    columns = ordinary()
+def transparent(columns):
+    """Make splats with alpha 0 or 1/8100, which is too faint to be drawn."""
     columns["logits"][:] = np.where(np.arange(COUNT) % 2, -np.inf, -9.0)
-    return columns
 
 
-def saturated():
-    """Return a scene in which every third splat has coefficients of ±1e4: white from one side, black from another."""
-    columns = ordinary()
+def saturated(columns):
+    """Make a scene in which every third splat has coefficients of ±1e4: white from one side, black from another."""
     for name, middle in (("sh0", 0.5), ("shN", 0.0)):
         columns[name][::3] = np.where(columns[name][::3] > middle, np.float32(1e4), np.float32(-1e4))
-    return columns
 
 
-def half_nan():
-    """Return a scene with NaN or infinity in every other row, in alternating columns."""
-    columns = ordinary()
+def half_nan(columns):
+    """Make a scene with NaN or infinity in every other row, in alternating columns."""
     names = list(columns)
     for number, row in enumerate(range(0, COUNT, 2)):
         name = names[number % len(names)]
         column = columns[name].reshape(COUNT, -1)
         column[row, number % column.shape[1]] = np.nan if name == "logits" or number % 4 else np.inf
-    return columns
 
 
-def denormals():
-    """Return denormal numbers in every column, rotations of denormal length, and one of length 0."""
-    columns = ordinary()
+def denormals(columns):
+    """Make denormal numbers in every column, rotations of denormal length, and one of length 0."""
     columns["means"][0::3] *= np.float32(1e-40)
     columns["quats"][1::3] *= np.float32(TINY)
     columns["quats"][1] = 0.0
@@ -134,37 +120,32 @@ def denormals():
     columns["logits"][::5] = -TINY
     columns["sh0"][::2] = TINY
     columns["shN"][::2] = -TINY
-    return columns
 
 
-def float32_limits():
-    """Return centres, logits and rotations at the limits of float32, and log scales of ±60 and ±88."""
-    columns = ordinary()
+def float32_limits(columns):
+    """Make centres, logits and rotations at the limits of float32, and log scales of ±60 and ±88."""
     columns["means"][:4] = 3e38 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, -1], [-1, 1, 1]])
     for row, value in enumerate((60.0, -60.0, 88.0, -88.0)):
         columns["scales"][10 + row] = value
         columns["scales"][20 + row, row % 3] = value
     columns["logits"][30:32] = [3e38, -3e38]
     columns["quats"][32:34] *= np.float32(1e38)
-    return columns
 
 
-def exploded():
-    """Return eight splats with colours and log scales of ±3e38, as diverged training leaves them."""
-    columns = ordinary()
+def exploded(columns):
+    """Make eight splats with colours and log scales of ±3e38, as diverged training leaves them."""
     for row, value in enumerate((3e38, -3e38)):
         columns["sh0"][40 + row] = value
         columns["shN"][42 + row, row] = value
         columns["scales"][44 + row] = value
         columns["scales"][46 + row, row] = value
-    return columns
 
 
 CONDITIONS = {
     "10 km away": Condition(far_away),
-    "10 km away, origin": Condition(ordinary, (f"csplat origin {FAR} {FAR} {FAR}",)),
-    "10 km away, doubles": Condition(partial(far_away, np.float64)),
-    "one splat": Condition(partial(identical, 1, 8)),
+    "10 km away, origin": Condition(lambda _: None, (f"csplat origin {FAR} {FAR} {FAR}",)),
+    "10 km away, doubles": Condition(partial(far_away, dtype=np.float64)),
+    "one splat": Condition(lambda columns: {name: column[:1] for name, column in columns.items()}),
     "a million identical": Condition(identical),
     "needles": Condition(needles),
     "giant background": Condition(giant_background),
@@ -216,7 +197,6 @@ def encoded(name, preset, quality=None):
 
 @cache
 def scorer(name, size=(640, 480)):
-    """Return a scorer of renders against those of a condition, from eight virtual cameras."""
     model = small_scene(name)
     return Scorer.of_source(model, virtual_cameras(model, 8, *size), (0.0, 0.0, 0.0))
 
@@ -237,7 +217,7 @@ def chain_of(name):
     """Take a condition through all stages, with `COPIES` instead of a million splats."""
     findings = []
     with tempfile.TemporaryDirectory() as folder:
-        columns = CONDITIONS[name].make() if name in DRAWN else identical(COPIES)
+        columns = CONDITIONS[name].make() if name in DRAWN else identical(ordinary(), COPIES)
         path = write_columns(Path(folder) / "scene.ply", columns, CONDITIONS[name].comments)
         source, refusal = read_ply(path, report=findings), ""
         linted = tuple(one.id for one in lint_ply(path) if one.kind == "repair")
@@ -256,7 +236,6 @@ def chain_of(name):
 
 
 def assert_bounds_hold(source, result, decoded):
-    """Verify the declared error bounds of a file against its source."""
     header, bounds = read_header(result.data), read_declared_bounds(result.data)
     found = verify_bounds(Source.of(source), decoded, header, bounds, result.source_index)
     assert ((), True) == (found.failures, found.rms_verified)
@@ -279,7 +258,6 @@ def _learn(source):
 
 
 def tune_on_renders(source, views, validation_count, options):
-    """Tune a coarse file of a scene to renders of it."""
     split = split_views(renders_of(source, views, BLACK, None), BLACK, validation_count=validation_count)
     fixed = fix_quantisation(EncodePlan.of(source, COARSE))
     return fixed, tune(fixed, split, options), split
@@ -301,7 +279,6 @@ def half(name):
 
 
 def images(name, points=None):
-    """Return a data set of renders of a condition, and points."""
     model = small_scene(name)
     return images_of(model, virtual_cameras(model, 12, 48, 40), points)
 
@@ -318,7 +295,6 @@ def images_of(model, views, points=None):
 
 @cache
 def trained(name):
-    """Train splats on renders of a condition, starting from its centres."""
     return train(images(name, small_scene(name).means[:COUNT]), QUICK)
 
 
@@ -333,7 +309,6 @@ def tuned(name):
 
 
 def measure(name):
-    """Return the row of a condition in `results/extremes.json`."""
     row = {"scene": name}
     for preset in PRESETS:
         data, count = encoded(name, preset).data, len(scene(name))

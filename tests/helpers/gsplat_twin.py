@@ -1,9 +1,5 @@
 """A stand-in for the function `rasterization` of gsplat, on the CPU."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import torch
 from torch_twin import render_torch
@@ -22,7 +18,7 @@ def rasterization(
     behind, antialiased = tuple(backgrounds[0].tolist()), rest["rasterize_mode"] == "antialiased"
     if covars is not None:
         upper = covars.triu()
-        splats: dict[str, Any] = {
+        splats = {
             "means": means.double(),
             "quats": torch.zeros((len(means), 4)).double(),
             "scales": (upper + upper.mT - upper * torch.eye(3)).double(),

@@ -49,7 +49,6 @@ def facing(focal=40.0, near=0.2, distance=3.0, width=50, height=37):
 
 
 def random_splats(count, degree, seed):
-    """Return splats of all shapes in front of `VIEW`, float64."""
     rng = np.random.default_rng(seed)
     return {
         "means": rng.uniform((-1.1, -0.9, -0.6), (1.1, 0.9, 0.9), (count, 3)), "quats": rng.standard_normal((count, 4)),
@@ -59,9 +58,7 @@ def random_splats(count, degree, seed):
 
 
 def random_gradients(view, seed):
-    """Return random gradients with respect to colours, alpha and depth."""
-    rng = np.random.default_rng(seed)
-    size = (view.H, view.W)
+    rng, size = np.random.default_rng(seed), (view.H, view.W)
     return rng.standard_normal((*size, 3)), rng.standard_normal(size), rng.standard_normal(size)
 
 
@@ -72,7 +69,6 @@ def relative_error(value, wanted):
 
 
 def gradients_of(splats, view, weights, dtype=np.float64, **options):
-    """Return a render, and the gradients of the weighted sum of its values."""
     rasteriser = Rasteriser(dtype=dtype)
     picture = rasteriser.forward(splats, view, **options)
     return picture, rasteriser.backward(*(weight.astype(dtype) for weight in weights))

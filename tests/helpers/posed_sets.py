@@ -20,7 +20,6 @@ COLOURS = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255]])
 
 
 def cameras(count, width=W, height=H, up=(0, 0, 1)):
-    """Return cameras around the origin."""
     K = intrinsics(width, height, 50.0)
     angles = np.linspace(0.3, 5.0, count)
     above = np.array(up, np.float64)
@@ -40,7 +39,6 @@ def write_picture(path, camera, mode="RGB", scale=1):
 
 
 def pixel_of(camera, point, scale=1):
-    """Return row and column of the projection of a point."""
     c = camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3]
     u, v = (camera.K @ (c / c[2]))[:2] / scale
     return int(v), int(u)
@@ -99,7 +97,6 @@ def write_transforms(folder, missing=(), up=(0, 0, 1), at=(0, 0, 0)):
 
 
 def write_document(folder, K, width, height, frames):
-    """Write a transforms.json."""
     document = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2], "w": width, "h": height}
     (folder / "transforms.json").write_text(json.dumps({**document, "frames": frames}))
 
@@ -166,6 +163,5 @@ def change_transforms(folder, **changes):
 
 
 def change_frames(folder, numbers, **changes):
-    """Change fields of some frames of transforms.json."""
     frames = [{**frame, **changes} if i in numbers else frame for i, frame in enumerate(frames_of(folder))]
     change_transforms(folder, frames=frames)

@@ -29,7 +29,6 @@ PEERS = Path(os.environ.get("CSPLAT_PEERS", ROOT / "out" / "peers")).absolute()
 
 
 def of_peers(name: str) -> Path:
-    """An external file or folder; a test is skipped if it is absent."""
     if not (PEERS / name).exists():
         pytest.skip(f"{name} is absent ({PEERS}); CSPLAT_PEERS names the folder of others, see CONTRIBUTING.md")
     return PEERS / name
@@ -101,7 +100,6 @@ def once(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def sample_path() -> Path:
-    """The sample PLY that ships with the project."""
     return ROOT / "tools" / "csplat_tools" / "data" / "sample.ply"
 
 
@@ -133,7 +131,6 @@ def small_views():
 
 @pytest.fixture
 def little_level_work(monkeypatch):
-    """Fit levels with few steps and views."""
     from csplat_tools.level_fitting import LevelFitter, Work
 
     work = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
@@ -202,7 +199,6 @@ def captures():
 
 @pytest.fixture(scope="session")
 def trained_scene(once, captures, tmp_path_factory):
-    """A scene trained for 300 steps on small photographs; all workers share its files."""
     return once("trained scene", lambda: captures.make_trained(tmp_path_factory.mktemp("trained")))
 
 
@@ -234,5 +230,4 @@ def search_at_loss(once, captures):
 
 @pytest.fixture(scope="session")
 def file_runs(once, captures, tmp_path_factory):
-    """Runs of `csplat train` to files."""
     return once("file runs", lambda: captures.FileRuns(tmp_path_factory.mktemp("runs")))

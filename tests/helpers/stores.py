@@ -17,13 +17,11 @@ KEYS = {"key": "nobody", "secret": "nothing"}
 
 
 def assert_same(a, b):
-    """Compare the arrays of two scenes, bit for bit."""
     for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
 
 
 def box_of(data, place):
-    """Return the box around a tile of a file."""
     header = read_header(data)
     tile, step = header.tiles[place], header.attributes[3].step
     corners = np.array([tile.corner, np.add(tile.corner, tile.extent)])
@@ -31,8 +29,6 @@ def box_of(data, place):
 
 
 class FileSystem:
-    """Files in memory with the interface of fsspec's file systems."""
-
     async_impl = True
 
     def __init__(self, files):
@@ -70,8 +66,6 @@ class FileSystem:
 
 
 class Web:
-    """A server's files and behaviour."""
-
     def __init__(self, files):
         self.files = dict(files)  # by path, as `/scene.csplat`
         self.ranges = True  # whether it supports HTTP Range

@@ -3,51 +3,23 @@
 It evaluates every splat at every pixel in float64, for a dozen splats and some hundred pixels.
 """
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from csplat.spherical_harmonics import sh_basis
-from csplat_render import Camera
 from csplat_render.conventions import ALPHA_CAP, ALPHA_MIN, COMPENSATION_MIN, DILATION, FOV_MARGIN, TRANSMITTANCE_MIN
 
-Array = NDArray[Any]
-Tensor = torch.Tensor
 
-
-def autograd_gradients(
-    arrays: dict[str, Array],
-    view: Camera,
-    weights: tuple[Array, Array, Array],
-    *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    antialiased: bool = False,
-) -> tuple[Array, dict[str, Array]]:
-    """Return a render, and autograd's gradients of the weighted sum of its colours, alpha and depth.
-
-    Args:
-        arrays: the six arrays of the splats, float64.
-        view: the camera.
-        weights: [H, W, 3], [H, W], [H, W].
-        background: colour of the background.
-        antialiased: compensate opacities for the dilation.
-    """
+def autograd_gradients(arrays, view, weights, *, background=(0.0, 0.0, 0.0), antialiased=False):
+    """Return a render, and autograd's gradients of the sum of its colours, alpha and depth, each times its weights."""
     splats = {name: torch.tensor(array, requires_grad=True) for name, array in arrays.items()}
     pictures = render_torch(splats, view, background, antialiased)
-    loss = sum((picture * torch.tensor(weight)).sum() for picture, weight in zip(pictures, weights, strict=True))
-    assert isinstance(loss, Tensor)
-    loss.backward()
+    sum((picture * torch.tensor(weight)).sum() for picture, weight in zip(pictures, weights, strict=True)).backward()
     gradients = {name: np.zeros(one.shape) if one.grad is None else one.grad.numpy() for name, one in splats.items()}
     return pictures[0].detach().numpy(), gradients
 
 
-def render_torch(
-    splats: dict[str, Tensor], view: Camera, background: tuple[float, float, float], antialiased: bool
-) -> tuple[Tensor, Tensor, Tensor]:
+def render_torch(splats, view, background, antialiased):
     """Return colours, alpha and depth; `scales` may be covariances [N, 3, 3] instead."""
     centre, covariance, opacity, colour, depth = _project(splats, view, antialiased)
     ys, xs = torch.meshgrid(torch.arange(view.H) + 0.5, torch.arange(view.W) + 0.5, indexing="ij")
@@ -64,7 +36,7 @@ def render_torch(
     return rgb, 1.0 - left, torch.einsum("nhw,n->hw", weight, depth)
 
 
-def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tuple[Tensor, ...]:
+def _project(splats, view, antialiased):
     """Return centre, covariance, opacity, colour and depth of splats beyond the near plane, nearest first."""
     R, t = torch.tensor(view.viewmat[:3, :3]), torch.tensor(view.viewmat[:3, 3])
     z = (splats["means"] @ R.T + t)[:, 2]
@@ -75,9 +47,8 @@ def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tupl
     fx, fy, cx, cy = (float(value) for value in (view.K[0, 0], view.K[1, 1], view.K[0, 2], view.K[1, 2]))
     tx, ty = _clamped(x / z, fx, cx, view.W), _clamped(y / z, fy, cy, view.H)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)], 1
-    )
+    rows = torch.stack([fx / z, zero, -fx * tx / z], -1), torch.stack([zero, fy / z, -fy * ty / z], -1)
+    jacobian = torch.stack(rows, 1)
     if scales.dim() == 2:
         spans = _rotation(quats) @ torch.diag_embed(torch.exp(scales))
         scales = spans @ spans.mT
@@ -90,7 +61,7 @@ def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tupl
     direction = means - torch.tensor(view.position)
     direction = direction / direction.norm(dim=1, keepdim=True)
     coefficients = torch.cat([sh0[:, None], shN], 1)
-    basis: list[Any] = [torch.zeros(())] * coefficients.shape[1]
+    basis = [torch.zeros(())] * coefficients.shape[1]
     degree = int(np.sqrt(len(basis))) - 1
     sh_basis(degree, direction[:, 0], direction[:, 1], direction[:, 2], basis)
     values = torch.stack([one * torch.ones_like(z) for one in basis], 1)
@@ -98,19 +69,16 @@ def _project(splats: dict[str, Tensor], view: Camera, antialiased: bool) -> tupl
     return torch.stack([fx * x / z + cx, fy * y / z + cy], 1), covariance, opacity, colour, z
 
 
-def _clamped(tangent: Tensor, focal: float, centre: float, size: int) -> Tensor:
+def _clamped(tangent, focal, centre, size):
     margin = FOV_MARGIN * 0.5 * size / focal
     return torch.clamp(tangent, -centre / focal - margin, (size - centre) / focal + margin)
 
 
-def _rotation(quats: Tensor) -> Tensor:
+def _rotation(quats):
     """Return matrices whose columns are the splats' axes: the images of x, y, z under q v q⁻¹."""
-    w, v = quats[:, :1], quats[:, 1:]
-    length = quats.norm(dim=1, keepdim=True)
-    w, v = w / length, v / length
+    w, v = torch.split(quats / quats.norm(dim=1, keepdim=True), [1, 3], dim=1)
     images = []
     for axis in torch.eye(3).double():
-        u = axis.expand_as(v)
-        twice = 2.0 * torch.linalg.cross(v, u)
-        images.append(u + w * twice + torch.linalg.cross(v, twice))
+        twice = 2.0 * torch.linalg.cross(v, axis.expand_as(v))
+        images.append(axis + w * twice + torch.linalg.cross(v, twice))
     return torch.stack(images, -1)

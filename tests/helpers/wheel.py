@@ -1,12 +1,9 @@
 """Unpack a wheel for tests: `python tests/helpers/wheel.py out/dist/csplat-0.1.0-py3-none-any.whl out/wheel`.
 
 The folder then comes first on PYTHONPATH, so that tests see what users install, in the one environment that there is.
-A file's modification time follows from its content, so that bytecode stays valid as long as the source is the same.
-numba does not notice changes in callees of a kernel that are in other files, so each state of all kernels has a cache
-folder of its own; its name is printed.
+Modification times follow from contents, so that bytecode stays valid. numba does not notice changes in callees of a
+kernel in other files, so each state of all kernels has a cache folder of its own; its name is printed.
 """
-
-from __future__ import annotations
 
 import hashlib
 import os
@@ -20,11 +17,6 @@ _EPOCH = 1_000_000_000  # seconds, 2001: modification times lie in the 136 years
 
 
 def unpack(wheel: Path, folder: Path) -> None:
-    """Make a folder hold the files of a wheel, and no others but bytecode.
-
-    Raises:
-        AssertionError: a package is absent.
-    """
     with zipfile.ZipFile(wheel) as archive:
         entries = {info.filename: info for info in archive.infolist() if not info.is_dir()}
         for path in [one for one in folder.rglob("*") if one.is_file() and one.suffix != ".pyc"]:

@@ -1,7 +1,8 @@
 """A small scene, its file and its source index, for tests of commands."""
 
+import numpy as np
 import pytest
-from cli_cases import call
+from command_line import printed
 
 from csplat import write_ply
 
@@ -11,6 +12,18 @@ def ply(tmp_path, make_model):
     """A PLY of 200 splats of degree 2."""
     path = tmp_path / "scene.ply"
     write_ply(path, make_model(200, 2))
+    return path
+
+
+@pytest.fixture
+def damaged_ply(tmp_path, make_model):
+    """A PLY of 50 splats; a value is NaN, and bytes follow the last row."""
+    path = tmp_path / "bad.ply"
+    write_ply(path, make_model(50, 1))
+    data = bytearray(path.read_bytes())
+    start = data.index(b"end_header\n") + 11
+    data[start : start + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(data + b"trailing")
     return path
 
 
@@ -25,7 +38,7 @@ def csplat_file(tmp_path, ply, encoded_once):
     """The file of `ply`, with its source index next to it."""
     names = ("scene.csplat", "index.npy")
     if not encoded_once:
-        call("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
+        printed("encode", ply, tmp_path / names[0], "--source-index", tmp_path / names[1], "--quiet")
         encoded_once.update({name: (tmp_path / name).read_bytes() for name in names})
     for name, data in encoded_once.items():
         (tmp_path / name).write_bytes(data)

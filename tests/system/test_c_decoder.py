@@ -37,7 +37,6 @@ def run(command, **options):
 
 
 def compiled(folder, name, *arguments):
-    """Compile a program; return its path."""
     libraries = () if "-c" in arguments else ("-lz", "-lm")
     made = run([COMPILER, *STRICT, f"-I{C}", *map(str, arguments), "-o", str(folder / name), *libraries])
     assert (0, "") == (made.returncode, made.stderr)

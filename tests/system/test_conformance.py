@@ -1,4 +1,5 @@
 import json
+import re
 import shlex
 import sys
 import xml.etree.ElementTree as ET
@@ -9,10 +10,8 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat.encoder import encode_with_report
-from csplat.errors import InputError
 from csplat_conformance.encoders import all_inputs
 from csplat_tools.cli.app import app
-from encoder_faults.run import FAULTS
 
 INPUTS = {one.name: one for one in all_inputs()}
 FILES = ("sound.csplat", "sound.npy")
@@ -22,11 +21,11 @@ def invoke(*words):
     return CliRunner().invoke(app, ["conformance", "encoder", *map(str, words)])
 
 
-def copying(folder, name, change=lambda data: data):
+def copying(folder, name):
     """Return the command line of an encoder that copies our file of an input, and its source index."""
     (folder / "sound.ply").write_bytes(INPUTS[name].make())
     result = encode_with_report(csplat.read_ply(folder / "sound.ply"))
-    (folder / "sound.csplat").write_bytes(change(result.data))
+    (folder / "sound.csplat").write_bytes(result.data)
     np.save(folder / "sound.npy", result.source_index)
     code = "import shutil, sys\n"
     code += "".join(f"shutil.copy({str(folder / one)!r}, sys.argv[{n}])\n" for n, one in enumerate(FILES, 2))
@@ -55,14 +54,6 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
 
 
 @pytest.mark.slow
-def test_failures_are_shown_with_their_clause(tmp_path):
-    command = copying(tmp_path, "ordinary/degree_1", FAULTS["max_scale_linear"].data)
-    result = invoke("--cmd", command, "--filter", "ordinary/degree_1", "--level", "1", "--junit", "-")
-    assert 1 == result.exit_code
-    (case,) = ET.fromstring(result.stdout).iter("testcase")  # noqa: S314 - our own text
-    assert "TIL-11 E_BOX" in case[0].attrib["message"]
-
-
 @pytest.mark.parametrize(("words", "message"), [
     (("--filter", "nothing"), "no input matches 'nothing'"),
     (("--filter", "*/degree_0", "--filter", "nothing"), "no input matches 'nothing'"),
@@ -74,18 +65,5 @@ def test_failures_are_shown_with_their_clause(tmp_path):
 ])  # fmt: skip
 def test_wrong_arguments_are_reported_in_one_line(words, message):
     result = invoke(*words)
-    assert (2 if "--level" in words else 1) == result.exit_code
-    assert message in result.stderr
-    assert 1 == len(result.stderr.strip().splitlines())
-
-
-@pytest.mark.slow
-def test_without_a_renderer_pictures_are_skipped_with_a_note(tmp_path, monkeypatch):
-    def absent():
-        raise InputError("this needs numba: pip install 'csplat[render]'")
-
-    monkeypatch.setattr("csplat_tools.cli.conformance.require_renderer", absent)
-    result = invoke("--cmd", copying(tmp_path, "ordinary/degree_1"), "--filter", "*/degree_1")
-    assert 0 == result.exit_code
-    assert "L4 SKIPPED: this needs numba" in result.stdout
-    assert "L4  skipped  ordinary/degree_1  this needs numba" in result.stdout
+    (error,) = [line for line in result.stderr.splitlines() if not re.search("so far$", line)]  # besides progress
+    assert (2 if "--level" in words else 1, True) == (result.exit_code, message in error)

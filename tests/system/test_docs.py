@@ -16,7 +16,6 @@ from typer.testing import CliRunner
 
 import csplat
 from csplat_bench.pages import with_tables, write_pages
-from csplat_bench.tables import markdown_table, select_rows
 from csplat_tools import batch
 from csplat_tools.cli.app import app
 
@@ -48,25 +47,6 @@ def test_links_of_pages_lead_to_files_and_headings(site):
                 assert anchor in {re.sub(r"[^\w\- ]", "", one.lower()).replace(" ", "-") for one in headings}
     with pytest.raises(FileNotFoundError, match=r"README\.md: nowhere\.md"):
         site.rewritten("see [this](nowhere.md)", "README.md")
-
-
-def test_tables_show_templates_missing_values_and_labels():
-    rows = [{"name": "a", "bytes": 1_500_000, "count": 3, "psnr": {"file": 38.25, "source": 40.0}}, {"name": "b"}]
-    columns = [["", "{name}"], ["MB", "{bytes / 1e6:.2f}"], ["dB", "{psnr.file - psnr.source:+.1f}"]]
-    expected = "|  | MB | dB |\n| --- | --- | --- |\n| first | 1.50 | -1.8 |\n| b | – | – |"
-    assert expected == markdown_table(rows, columns, {"a": "first"})
-    assert "| 0.50 |" in markdown_table(rows, [{"key": "bytes", "title": "MB", "scale": 1 / 3e6, "format": ".2f"}])
-
-
-def test_rows_of_results_are_filtered_ordered_and_grouped(tmp_path):
-    rows = [{"scene": s, "encoder": e, "size": n} for n, (s, e) in enumerate(itertools.product("ab", "xyz"))]
-    (tmp_path / "r.json").write_text(json.dumps({"rows": rows}))
-    spec = {"source": "r.json", "where": {"scene": ["b", "a"], "encoder": ["x", "y"]}}
-    assert [3, 4, 0, 1] == [row["size"] for row in select_rows(spec, tmp_path)]
-    grouped = select_rows({**spec, "group": "scene", "by": "encoder"}, tmp_path)
-    assert [{"scene": "b", "x.size": 3, "y.size": 4}, {"scene": "a", "x.size": 0, "y.size": 1}] == grouped
-    with pytest.raises(ValueError, match="no row is left"):
-        select_rows({"source": "r.json", "where": {"scene": "c"}}, tmp_path)
 
 
 def test_markdown_of_github_is_converted_for_the_site(site):
@@ -170,7 +150,6 @@ def test_the_tutorial_runs(tmp_path, monkeypatch):
 
 
 def square(_garden, camera):
-    """Return an image of a square and 3D points on it, without compiling the renderer."""
     pixels = np.zeros((camera.H, camera.W, 4), np.uint8)
     pixels[camera.H // 3 : -camera.H // 3, camera.W // 3 : -camera.W // 3] = (200, 120, 40, 255)
     return pixels, np.random.default_rng(0).uniform(-0.5, 0.5, (camera.H, camera.W, 3))

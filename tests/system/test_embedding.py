@@ -24,7 +24,10 @@ FAST = EncodeOptions(preset="fast")
 
 # The parts of three.js that `points.mjs` uses; its drawing is not checked.
 THREE = """
-const typed = (value, kind) => { if (!(value instanceof kind)) throw new TypeError(`${value} is no ${kind.name}`); };
+const typed = (value, kind) => {
+  if (value instanceof kind) return value;
+  throw new TypeError(`${value} is no ${kind.name}`);
+};
 export const SRGBColorSpace = 'srgb';
 const linear = (value) => (value <= 0.04045 ? value / 12.92 : ((value + 0.055) / 1.055) ** 2.4);
 export class Color {
@@ -35,18 +38,16 @@ export class Color {
   toArray(array, at) { array.set([this.r, this.g, this.b], at); }
 }
 export class BufferAttribute {
-  constructor(array, itemSize) { typed(array, Float32Array); Object.assign(this, { array, itemSize }); }
+  constructor(array, itemSize) { Object.assign(this, { array: typed(array, Float32Array), itemSize }); }
 }
 export class BufferGeometry {
   attributes = {};
-  setAttribute(name, attribute) { typed(attribute, BufferAttribute); this.attributes[name] = attribute; }
+  setAttribute(name, attribute) { this.attributes[name] = typed(attribute, BufferAttribute); }
 }
 export class PointsMaterial { constructor(options) { Object.assign(this, options); } }
 export class Points {
   constructor(geometry, material) {
-    typed(geometry, BufferGeometry);
-    typed(material, PointsMaterial);
-    Object.assign(this, { geometry, material });
+    Object.assign(this, { geometry: typed(geometry, BufferGeometry), material: typed(material, PointsMaterial) });
   }
 }
 """
@@ -62,8 +63,7 @@ import { stream } from './stream.mjs';
 const [url, directions] = JSON.parse(process.argv[2]);
 const scene = await decode(await (await fetch(url)).arrayBuffer(), { workers: 2 });
 const points = await loadPoints(url);
-const tiles = [];
-const bands = [];
+const [tiles, bands] = [[], []];
 await stream(url, {
   addTile: (first, part) => tiles.push([first, part.count, Array.from(part.means)]),
   addBand: (first, layer, sh) => bands.push([first, layer, sh.length]),
@@ -95,7 +95,6 @@ def model(request):
 
 
 def copy_decoder(folder):
-    """Copy the files that the package of the decoder ships."""
     source, target = ROOT / "codec" / "js", folder / "node_modules" / "csplat-decoder"
     target.mkdir(parents=True)
     for pattern in ["package.json", *json.loads((source / "package.json").read_text("utf-8"))["files"]]:
@@ -179,7 +178,6 @@ def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
     assert f"{len(model)} [(0, 0.0)]\n" == cut
 
 
-@pytest.mark.browser
 def test_the_engine_without_a_page(tab, site, model):
     (sample,) = (text for text in samples("js") if text.startswith("// show.mjs"))
     site.add("/show.mjs", sample.encode())
@@ -248,7 +246,6 @@ def shown(page, element="csplat-view"):
     return read_pixels(page, pixels, 160, 120)[..., :3].max(axis=2) > 20
 
 
-@pytest.mark.browser
 def test_scenes_are_shown_replaced_and_removed(tab, blog):
     page = blog('<csplat-view alt="A garden"></csplat-view>')
     page.evaluate("globalThis.view = document.querySelector('csplat-view')")
@@ -277,7 +274,6 @@ def test_scenes_are_shown_replaced_and_removed(tab, blog):
     assert [] == page.workers
 
 
-@pytest.mark.browser
 def test_the_wheel_scrolls_the_page_until_a_scene_is_clicked_and_scenes_load_when_they_are_near(tab, site, blog):
     near, far = '<csplat-view id=a src="/scene.csplat">', '<csplat-view id=b src="/other.csplat">'
     page = blog(f"{near}</csplat-view>{90 * '<br>x'}{far}</csplat-view>", MODULE, policy="")
@@ -308,16 +304,18 @@ def test_the_wheel_scrolls_the_page_until_a_scene_is_clicked_and_scenes_load_whe
     assert (2, True) == (len(page.workers), shown(page, "#b").any())
 
 
-@pytest.mark.browser
 def test_errors_are_shown_as_text(tab, site, blog):
     site.add("/cut.csplat", site._files["/scene.csplat"][:-20])
-    cases = [
+    types = f"{POLICY}; require-trusted-types-for 'script'; trusted-types"
+    blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{types} csplat")
+    assert_loads(tab, 60)
+    for src, code, words, policy in (
         ("/cut.csplat", "E_TRUNCATED", "is incomplete", POLICY),
         ("/none.csplat", "E_INPUT", "could not be read.*404", POLICY),
         ("/scene.csplat", "E_WORKER", "could not start.*worker-src", POLICY.replace("blob:", "'none'")),
+        ("/scene.csplat", "E_WORKER", "could not start.*trusted-types", f"{types} 'none'"),
         ("/scene.csplat", "E_WEBGL2", "no WebGL 2", POLICY),
-    ]
-    for src, code, words, policy in cases:
+    ):
         if code == "E_WEBGL2":
             tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
         page = blog("<csplat-view></csplat-view>", policy=policy)
@@ -328,7 +326,6 @@ def test_errors_are_shown_as_text(tab, site, blog):
     tab.problems.clear()  # browsers report a status, and what a policy forbids
 
 
-@pytest.mark.browser
 def test_properties_count_that_were_set_before_the_script_had_run(tab, blog):
     before = """
     <csplat-view src="/none.csplat"></csplat-view><script>
@@ -349,7 +346,6 @@ def test_properties_count_that_were_set_before_the_script_had_run(tab, blog):
     assert page.evaluate("!view.hasAttribute('background') && view.background === '' && !view.hasAttribute('alt')")
 
 
-@pytest.mark.browser
 def test_setting_an_address_again_retries_after_an_error_and_a_script_may_run_twice(tab, site, blog):
     page = blog('<csplat-view src="/late.csplat"></csplat-view>' + ONE_FILE)
     page.evaluate("globalThis.view = document.querySelector('csplat-view')")
@@ -365,7 +361,6 @@ def test_setting_an_address_again_retries_after_an_error_and_a_script_may_run_tw
     tab.problems.clear()  # the browser reports each 404
 
 
-@pytest.mark.browser
 def test_a_page_decides_on_the_requests_of_an_element(tab, site, blog):
     keys = []
 
@@ -392,7 +387,6 @@ def test_a_page_decides_on_the_requests_of_an_element(tab, site, blog):
     tab.problems.clear()  # the browser reports the status
 
 
-@pytest.mark.browser
 def test_a_file_that_is_replaced_while_it_is_read_is_opened_anew(tab, site, blog, make_model):
     old, new = (encode(make_model(count, 3), replace(FAST, tile_splats=2000)) for count in (6000, 6500))
     assert len(old) > 2**17
@@ -410,7 +404,6 @@ def test_a_file_that_is_replaced_while_it_is_read_is_opened_anew(tab, site, blog
     assert page.evaluate("document.querySelector('csplat-view').shadowRoot.querySelector('#error').hidden")
 
 
-@pytest.mark.browser
 def test_a_blob_may_be_revoked_at_once(tab, blog):
     page = blog('<br style="line-height:300vh"><csplat-view id="view"></csplat-view>', policy="")
     page.evaluate(
@@ -423,18 +416,6 @@ def test_a_blob_may_be_revoked_at_once(tab, blog):
     assert_loads(tab, 60, "view")
 
 
-@pytest.mark.browser
-def test_a_policy_of_trusted_types_allows_the_worker_by_its_name(tab, blog):
-    types = "; require-trusted-types-for 'script'; trusted-types"
-    blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{POLICY}{types} csplat")
-    assert_loads(tab, 60)
-    blog('<csplat-view src="/scene.csplat"></csplat-view>', policy=f"{POLICY}{types} 'none'")
-    report = told(tab)[1]
-    assert ("E_WORKER", True) == (report["code"], "trusted-types" in report["message"])
-    tab.problems.clear()  # the browser reports what a policy forbids
-
-
-@pytest.mark.browser
 def test_a_page_from_disk_says_what_to_do(tab, tmp_path):
     (tmp_path / "csplat-view.js").write_bytes(export_element())
     (tmp_path / "page.html").write_text(
@@ -450,14 +431,13 @@ def test_a_page_from_disk_says_what_to_do(tab, tmp_path):
 
 @pytest.mark.slow
 def test_the_script_is_written_once(tmp_path):
-    out = tmp_path / "csplat-view.js"
+    out, script = tmp_path / "csplat-view.js", export_element()
     call("export-element", out)
-    assert out.read_bytes() == export_element()
-    assert export_element().isascii()
+    assert script.isascii()
+    assert script == out.read_bytes()
     said = re.search(r"self-contained script \((\d+) kB, (\d+) kB gzipped\)", TEXT)
-    assert [pytest.approx(int(kilobytes), rel=0.05) for kilobytes in said.groups()] == [
-        len(data) / 1000 for data in (export_element(), gzip.compress(export_element()))
-    ]
+    sizes = [len(data) / 1000 for data in (script, gzip.compress(script))]
+    assert sizes == [pytest.approx(int(kilobytes), rel=0.05) for kilobytes in said.groups()]
     assert "--force replaces it" in call("export-element", out, status=1).stderr
     wrong = invoke("export-element", "scene.csplat")
     assert "did you mean `csplat export-element scene.js`" in wrong.stderr

@@ -16,7 +16,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from cli_cases import PROGRAM, call, damaged_ply, invoke, refused, status_of
+from command_line import PROGRAM, invoke, printed, refused, status_of
 from typer.main import get_command
 
 from csplat import decode, read_ply, write_ply
@@ -39,7 +39,7 @@ def limited_files(size):
 
 def test_reports_as_json(tmp_path, ply):
     out = tmp_path / "out.csplat"
-    report = json.loads(call("encode", ply, out, "--json", "--preset", "fast"))
+    report = json.loads(printed("encode", ply, out, "--json", "--preset", "fast"))
     size = out.stat().st_size
     assert (200, size, size / 200) == (report["splats"], report["size_bytes"], report["bytes_per_splat"])
     assert report["ratio"] == ply.stat().st_size / size
@@ -65,9 +65,9 @@ def test_every_command_has_the_five_common_options_and_help_for_all(monkeypatch)
             assert [] == [one.opts for one in options if not one.help], name
             count += sum(not one & COMMON for one in spelt)
     hidden = [one.opts[0] for one in group.get_command(None, "encode").params if getattr(one, "hidden", False)]
-    everything = call("encode", "--help-all")
+    everything = printed("encode", "--help-all")
     assert [] == [one for one in hidden if one not in everything]
-    assert (True, False) == ("--threads" in hidden, "--threads" in call("encode", "--help"))
+    assert (True, False) == ("--threads" in hidden, "--threads" in printed("encode", "--help"))
     assert count <= 150
 
 
@@ -86,7 +86,7 @@ def test_wrong_options_are_usage_errors(tmp_path, ply):
 
 def test_encode_takes_metadata_that_a_ply_lacks(tmp_path, ply):
     metadata = ("--up", "z", "--unit-metres", "0.5", "--antialiased", "--licence", "CC0")
-    call("encode", ply, tmp_path / "out.csplat", *metadata)
+    printed("encode", ply, tmp_path / "out.csplat", *metadata)
     model = decode(tmp_path / "out.csplat")
     assert ([0, 0, 1], "CC0") == (model.metadata["up"], model.metadata["licence"])
     assert (0.5, True) == (model.unit_metres, model.antialiased)
@@ -97,7 +97,7 @@ def test_repairs_are_reported_even_if_quiet(tmp_path, make_model):
     write_ply(source, make_model(20, 0, extra={"object_id": np.arange(20, dtype=np.int32)}))
     quiet = invoke("encode", source, tmp_path / "q.csplat", "--quiet")
     assert (1, True) == (quiet.stderr.count("\n"), "extra-columns" in quiet.stderr)
-    call("encode", source, tmp_path / "c.csplat", "--keep-extra")
+    printed("encode", source, tmp_path / "c.csplat", "--keep-extra")
     assert list(range(20)) == sorted(decode(tmp_path / "c.csplat").extra["object_id"])
 
 
@@ -110,7 +110,7 @@ def test_encode_reports_lengths_of_rotations_that_no_training_produces(tmp_path,
         ply.write_bytes(data)
         encoded = invoke("encode", ply, tmp_path / "out.csplat", "--preset", "fast", "--force")
         assert reported == (line in encoded.stderr), length
-        assert line in call("lint", ply)
+        assert line in printed("lint", ply)
 
 
 def test_a_command_replaces_none_of_its_own_files(tmp_path, ply, csplat_file):
@@ -128,7 +128,7 @@ def test_a_command_replaces_none_of_its_own_files(tmp_path, ply, csplat_file):
 def test_importance_is_taken_from_a_file(tmp_path, ply):
     weights = tmp_path / "weights.npy"
     np.save(weights, np.linspace(0, 1, 200))
-    call("encode", ply, tmp_path / "out.csplat", "--importance", weights)
+    printed("encode", ply, tmp_path / "out.csplat", "--importance", weights)
     for wrong, message in (
         (np.ones(3), "importance"), (np.array([{}], dtype=object), ""), (None, "weights.npy is not a NumPy array file"),
     ):  # fmt: skip
@@ -139,8 +139,8 @@ def test_importance_is_taken_from_a_file(tmp_path, ply):
 def test_decodes_absolute_positions(tmp_path, make_model):
     model = make_model(20, 0, origin=(1e7, -2e6, 3.0))
     write_ply(tmp_path / "geo.ply", model)
-    call("encode", tmp_path / "geo.ply", tmp_path / "geo.csplat")
-    call("decode", tmp_path / "geo.csplat", tmp_path / "abs.ply", "--absolute")
+    printed("encode", tmp_path / "geo.ply", tmp_path / "geo.csplat")
+    printed("decode", tmp_path / "geo.csplat", tmp_path / "abs.ply", "--absolute")
     absolute, relative = read_ply(tmp_path / "abs.ply"), decode(tmp_path / "geo.csplat")
     assert absolute.origin == relative.origin == model.origin
     np.testing.assert_array_equal(absolute.means, relative.means)
@@ -153,7 +153,7 @@ def test_replaces_nothing_without_force(tmp_path, ply, csplat_file):
         target.write_text("precious")
         assert "--force" in refused(*words)
         assert "precious" == target.read_text()
-        call(*words, "--force")
+        printed(*words, "--force")
         assert b"precious" != target.read_bytes()
 
 
@@ -193,22 +193,19 @@ def test_a_full_disk_leaves_the_old_file_and_the_error_names_it(tmp_path, ply, m
 
 @pytest.mark.slow
 def test_the_default_output_is_next_to_its_source(tmp_path, ply):
-    call("encode", ply)
-    call("export-html", tmp_path / "scene.csplat")
+    printed("encode", ply)
+    printed("export-html", tmp_path / "scene.csplat")
     assert {"scene.ply", "scene.csplat", "scene.html"} <= {one.name for one in tmp_path.iterdir()}
     assert "scene.ply exists" in refused("decode", tmp_path / "scene.csplat")
     assert "expected an output" in refused("encode", "-", status=2)
 
 
 def test_unreadable_formats_are_refused_with_a_converter(tmp_path):
-    path = tmp_path / "a.lcc"
-    path.write_bytes(bytes(60))
-    for words in [("encode", path, tmp_path / "out.csplat"), ("lint", path), ("info", path)]:
-        line = refused(*words)
-        assert line.startswith("error: a.lcc is LCC, which csplat does not read: convert it to PLY first, with splat-t")
-        assert line.endswith("(E_INPUT)\n")
+    (tmp_path / "a.lcc").write_bytes(bytes(60))
+    message = "error: a.lcc is LCC, which csplat does not read: convert it to PLY first, with splat-t"
+    assert refused("encode", tmp_path / "a.lcc", tmp_path / "out.csplat").startswith(message)
     (tmp_path / "a.spz").write_bytes(gzip.compress(b"NGSP" + bytes(60)))
-    for words in [("decode", tmp_path / "a.spz", tmp_path / "out.ply"), ("verify", tmp_path / "a.spz")]:
+    for words in (("decode", tmp_path / "a.spz", tmp_path / "out.ply"), ("verify", tmp_path / "a.spz")):
         assert "convert it with `csplat encode`" in refused(*words)
 
 
@@ -234,8 +231,8 @@ def test_a_name_of_another_kind_is_refused_with_a_suggestion(tmp_path, monkeypat
     assert {"scene.ply", "scene.csplat", "index.npy"} == {path.name for path in tmp_path.iterdir()}
 
 
-def test_errors_name_the_file_that_was_read(tmp_path, make_model, csplat_file):
-    path, cut, none = damaged_ply(tmp_path / "bad.ply", make_model), tmp_path / "cut.csplat", tmp_path / "none.csplat"
+def test_errors_name_the_file_that_was_read(tmp_path, damaged_ply, csplat_file):
+    path, cut, none = damaged_ply, tmp_path / "cut.csplat", tmp_path / "none.csplat"
     path.write_bytes(path.read_bytes().replace(b"property float opacity\n", b"property float opaqueness\n"))
     cut.write_bytes(csplat_file.read_bytes()[:200])
     none.write_bytes(b"nothing of ours" * 20)
@@ -250,9 +247,9 @@ def test_errors_name_the_file_that_was_read(tmp_path, make_model, csplat_file):
 
 def test_errors_of_omitted_bands_are_verified_against_zero(tmp_path, ply):
     target, index = tmp_path / "d0.csplat", tmp_path / "d0.npy"
-    call("encode", ply, target, "--sh-degree", 0, "--source-index", index)
-    call("verify", target, "--source", ply, "--source-index", index)
-    call("verify", target, "--source", ply)
+    printed("encode", ply, target, "--sh-degree", 0, "--source-index", index)
+    printed("verify", target, "--source", ply, "--source-index", index)
+    printed("verify", target, "--source", ply)
 
 
 @pytest.mark.slow
@@ -291,18 +288,18 @@ def test_a_new_output_has_the_usual_permissions_and_a_replaced_one_keeps_its_own
         for mode in (0o600, *(modes if output == report else ())):
             output.touch()
             output.chmod(mode)
-            call(*words, "--force", "--quiet")
+            printed(*words, "--force", "--quiet")
             assert mode == stat.S_IMODE(output.stat().st_mode), output
             assert output.stat().st_size
             output.chmod(0o600)
     folder.parent.mkdir()
     folder.parent.chmod(0o700)
     for force in ((), ("--force",)):
-        call("convert", ply, folder, "--quiet", *force)
+        printed("convert", ply, folder, "--quiet", *force)
         assert 0o700 == stat.S_IMODE(folder.parent.stat().st_mode)
     if os.getuid() == 0:
         os.chown(page, 65534, 65534)
-        call(*outputs[page], "--force", "--quiet")
+        printed(*outputs[page], "--force", "--quiet")
         assert (65534, 65534) == (page.stat().st_uid, page.stat().st_gid)
 
 
@@ -312,41 +309,49 @@ def test_an_output_that_is_a_link(tmp_path, ply, csplat_file):
     link, hard = tmp_path / "link.csplat", tmp_path / "hard.csplat"
     link.symlink_to(csplat_file.name)
     hard.hardlink_to(csplat_file)
-    call("encode", ply, link, "--force", "--quiet", "--preset", "fast")
+    printed("encode", ply, link, "--force", "--quiet", "--preset", "fast")
     assert link.is_symlink()
     assert data == hard.read_bytes() != csplat_file.read_bytes()
     new, nowhere = tmp_path / "new.csplat", tmp_path / "nowhere.csplat"
     link.unlink()
     link.symlink_to(new)
-    call("encode", ply, link, "--quiet")
+    printed("encode", ply, link, "--quiet")
     assert data == new.read_bytes()
     nowhere.symlink_to(tmp_path / "absent" / "x.csplat")
     assert f"{nowhere}: No such file" in refused("encode", ply, nowhere)
 
 
 @pytest.mark.slow
-def test_a_loop_of_links_is_an_error_of_one_line(tmp_path, ply, csplat_file):
-    loop, other = tmp_path / "loop", tmp_path / "other"
-    loop.symlink_to(other)
-    other.symlink_to(loop)
-    new = tmp_path / "new"
+@pytest.mark.parametrize("kind", ["ELOOP", "EIO"])
+def test_an_input_or_output_that_fails_is_named_in_one_line(tmp_path, ply, csplat_file, kind):
+    """A loop of links, and a file whose reading fails."""
+    bad, new = Path("/proc/self/mem") if kind == "EIO" else tmp_path / "loop", tmp_path / "new"
     lines = [
-        ("encode", ply, loop), ("encode", ply, loop, "--force"), ("encode", loop, new), ("encode", ply, loop / "new"),
-        ("encode", ply, new, "--report", f"{loop}.json"), ("encode", ply, new, "--source-index", f"{loop}.npy"),
-        ("decode", csplat_file, loop), ("info", loop), ("info", csplat_file, "--page", f"{loop}.html"),
-        ("convert", ply, loop / "lod-meta.json"), ("convert", ply, f"{loop}.sog"), ("convert", loop, new),
-        ("merge", csplat_file, csplat_file, "-o", loop), ("merge", csplat_file, loop, "-o", new), ("lint", loop),
-        ("extract", csplat_file, loop, "--box", "0,0,0,1,1,1"), ("verify", csplat_file, "--source", loop),
-        ("compare", ply, loop), ("render", ply, loop, "--orbit", 1), ("view", loop), ("export-html", loop, new),
-        ("export-html", csplat_file, loop), ("export-element", loop),
+        ("encode", bad, new), ("decode", bad, new), ("convert", bad, f"{new}.ply"), ("info", bad), ("lint", bad),
+        ("verify", bad), ("verify", csplat_file, "--source", bad), ("compare", ply, bad), ("compare", bad, ply),
+        ("merge", csplat_file, bad, "-o", new), ("extract", bad, new, "--box", "0,0,0,1,1,1"), ("view", bad),
+        ("export-html", bad, new), ("render", bad, new, "--orbit", 1), ("simplify", bad, f"{new}.ply", "--keep", 0.5),
+        ("encode", ply, new, "--importance", bad), ("verify", csplat_file, "--source", ply, "--source-index", bad),
+        ("encode", bad, "-"),
     ]  # fmt: skip
-    for ending in (".json", ".npy", ".html", ".sog"):
-        tmp_path.joinpath(f"loop{ending}").symlink_to(f"loop{ending}")
+    if kind == "ELOOP":
+        for ending in ("", ".json", ".npy", ".html", ".sog"):
+            tmp_path.joinpath(f"loop{ending}").symlink_to(f"loop{ending}")
+        lines += [
+            ("encode", ply, bad), ("encode", ply, bad, "--force"), ("encode", ply, bad / "new"),
+            ("encode", ply, new, "--report", f"{bad}.json"), ("encode", ply, new, "--source-index", f"{bad}.npy"),
+            ("decode", csplat_file, bad), ("info", csplat_file, "--page", f"{bad}.html"),
+            ("convert", ply, f"{bad}.sog"), ("convert", ply, bad / "lod-meta.json"),
+            ("merge", csplat_file, csplat_file, "-o", bad), ("extract", csplat_file, bad, "--box", "0,0,0,1,1,1"),
+            ("render", ply, bad, "--orbit", 1),
+            ("export-html", csplat_file, bad), ("export-element", bad),
+        ]  # fmt: skip
+    elif not bad.exists():
+        pytest.skip("reading this file of Linux fails with EIO")
     before = sorted(tmp_path.rglob("*"))
     for words in lines:
         line = refused(*words)
-        assert "loop" in line, words
-        assert "(ELOOP)" in line, words
+        assert (True, True) == (str(bad) in line, f"({kind})" in line), (words, line)
         assert before == sorted(tmp_path.rglob("*")), words
 
 
@@ -356,36 +361,14 @@ def test_names_may_be_as_long_as_the_file_system_allows(tmp_path, ply, csplat_fi
     for letter, count in (("n", 255), ("n", 230), ("ö", 126), ("\U0001f600", 62)):
         for ending, words in ((".csplat", ["encode", ply]), (".html", ["info", csplat_file, "--page"])):
             name = letter * (count - len(os.fsencode(ending)) // len(os.fsencode(letter))) + ending
-            call(*words, name, "--quiet")
-            call(*words, name, "--quiet", "--force")
+            printed(*words, name, "--quiet")
+            printed(*words, name, "--quiet", "--force")
             assert f"{letter * 30 + name}: File name too long; choose a" in refused(*words, letter * 30 + name)
-    call("encode", ply, f"{'n' * 248}.csplat", "--force", "--memory", "1GB", "--quiet")  # has a folder .work
+    printed("encode", ply, f"{'n' * 248}.csplat", "--force", "--memory", "1GB", "--quiet")  # has a folder .work
     assert [] == [path.name for path in tmp_path.iterdir() if path.name.startswith(".")]
 
 
-@pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="reading this file of Linux fails with EIO")
-def test_a_read_error_names_the_input(tmp_path, ply, csplat_file):
-    bad, new = Path("/proc/self/mem"), tmp_path / "new"
-    lines = [
-        ("encode", bad, new), ("decode", bad, new), ("convert", bad, f"{new}.ply"), ("info", bad), ("lint", bad),
-        ("verify", bad), ("verify", csplat_file, "--source", bad), ("compare", ply, bad), ("compare", bad, ply),
-        ("merge", csplat_file, bad, "-o", new), ("extract", bad, new, "--box", "0,0,0,1,1,1"), ("view", bad),
-        ("export-html", bad, new), ("render", bad, new, "--orbit", 1), ("simplify", bad, f"{new}.ply", "--keep", 0.5),
-        ("encode", ply, new, "--importance", bad), ("verify", csplat_file, "--source", ply, "--source-index", bad),
-        ("encode", bad, "-"),
-    ]  # fmt: skip
-    before = sorted(tmp_path.iterdir())
-    for words in lines:
-        line = refused(*words)
-        assert f"{bad}: Input/output error" in line, words
-        assert "standard output" not in line
-    assert before == sorted(tmp_path.iterdir())
-
-
 class FailingInput(io.BytesIO):
-    """A file that fails in the middle."""
-
     def read(self, size=-1, /):
         if size < 0 or self.tell():
             raise OSError(errno.EIO, os.strerror(errno.EIO))
@@ -400,10 +383,10 @@ def test_commands_read_standard_input_and_name_it(ply, csplat_file, monkeypatch,
     encoded = invoke("encode", "-", "-", input=ply.read_bytes())
     assert (0, data) == (encoded.exit_code, encoded.stdout_bytes)
     for name in ("info", "verify"):
-        assert call(name, csplat_file).partition("\n")[2] == call(name, "-", input=data).partition("\n")[2]
+        assert printed(name, csplat_file).partition("\n")[2] == printed(name, "-", input=data).partition("\n")[2]
     back = invoke("decode", "-", "-", "--quiet", input=data)
     assert (0, b"") == (back.exit_code, back.stderr_bytes)
-    assert json.loads(call("lint", "-", "--json", input=back.stdout_bytes))["clean"]
+    assert json.loads(printed("lint", "-", "--json", input=back.stdout_bytes))["clean"]
     assert "standard input" in invoke("encode", "-", "-", input=b"nonsense").stderr
     for words, path in ((("encode", "-", "-"), ply), (("lint", "-"), ply), (("info", "-"), csplat_file)):
         with monkeypatch.context() as patch:
@@ -455,10 +438,10 @@ def test_the_command_passes_out_of_core_options(ply, tmp_path, monkeypatch):
         return encode_scene(scene, target, options, asked, **others)
 
     monkeypatch.setattr("csplat_tools.encode_file.encode_scene", encode_here)
-    cost = json.loads(call(*words, "--dry-run", "--json"))
+    cost = json.loads(printed(*words, "--dry-run", "--json"))
     assert (200, 2, True) == (cost["splats"], cost["sh_degree"], cost["in_memory"])
     assert not words[2].exists()
-    call(*words, "--resume", "--preset", "fast", "--quiet")
+    printed(*words, "--resume", "--preset", "fast", "--quiet")
     assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == limits
     refused(*words[:3], "--resume", "--target-psnr", "40", "--force", status=2)
 

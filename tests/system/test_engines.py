@@ -34,7 +34,6 @@ LIKE_THE_PLY = {"three": 60.0, "playcanvas": 45.0, "babylon": 60.0, "spark": 38.
 
 @pytest.fixture(scope="module")
 def packages():
-    """The engines of the examples."""
     npm = shutil.which("npm") or absent("the engines come from npm, which is not installed")
     lock, installed = EXAMPLES / "package-lock.json", EXAMPLES / "node_modules" / ".package-lock.json"
     if not installed.exists() or installed.stat().st_mtime < lock.stat().st_mtime:
@@ -74,7 +73,6 @@ def started(browser, files, engine):
 
 @pytest.fixture(scope="module", params=ENGINES)
 def trial(request, browser, files):
-    """An engine on a page."""
     with started(browser, files, request.param) as one:
         yield one
 

@@ -50,8 +50,6 @@ def run(*command):
 
 
 class Spz:
-    """SPZ's own library in WebAssembly."""
-
     path = "node_modules/@adobe/spz/dist/spz.js"
     package = "@adobe/spz@0.2.3"
     code = """
@@ -101,8 +99,6 @@ class Spz:
 
 
 class Converter:
-    """A program that converts files from or to PLY."""
-
     def write(self, model, path, format):
         csplat.write(path.with_name("source.ply"), model)
         self.run(path.with_name("source.ply"), path, format)
@@ -193,7 +189,6 @@ def differences(source, found, format, allowed):
 
 
 def degrees(a, b):
-    """Return the angles between rotations, up to half turns about the axes of a splat."""
     w, x, y, z = b.T
     turns = np.stack([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
     cosine = np.abs(np.einsum("ij,tji->ti", a, turns)).max(0) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)

@@ -63,7 +63,6 @@ def files(scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def data(scene, tmp_path_factory):
-    """The set of the scene without alpha."""
     return write_set(tmp_path_factory.mktemp("set") / "capture", scene, alpha=False)
 
 

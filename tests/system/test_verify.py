@@ -2,7 +2,7 @@ import json
 
 import numpy as np
 import pytest
-from cli_cases import call, invoke, refused
+from command_line import invoke, printed, refused
 
 from csplat import _spec, read_ply, write_ply
 
@@ -11,15 +11,15 @@ pytestmark = pytest.mark.usefixtures("no_estimated_up")
 
 def test_decode_and_verify_refuse_more_splats_than_allowed(tmp_path, csplat_file):
     assert "LIM-1" in invoke("verify", csplat_file, "--max-splats", 199).stdout
-    call("verify", csplat_file, "--max-splats", 200)
+    printed("verify", csplat_file, "--max-splats", 200)
     assert "E_LIMIT" in refused("decode", csplat_file, tmp_path / "out.ply", "--max-splats", 199)
-    call("decode", csplat_file, tmp_path / "out.ply", "--max-splats", 200)
+    printed("decode", csplat_file, tmp_path / "out.ply", "--max-splats", 200)
 
 
 def test_verify_finds_damage(csplat_file):
-    assert "intact" in call("verify", csplat_file)
-    assert json.loads(call("verify", csplat_file, "--json"))["holds"]
-    assert "" == call("verify", csplat_file, "--quiet")
+    assert "intact" in printed("verify", csplat_file)
+    assert json.loads(printed("verify", csplat_file, "--json"))["holds"]
+    assert "" == printed("verify", csplat_file, "--quiet")
     data = bytearray(csplat_file.read_bytes())
     data[len(data) // 2] ^= 0x40
     csplat_file.write_bytes(data)
@@ -50,10 +50,10 @@ def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
 @pytest.mark.slow
 def test_verify_proves_the_declared_errors_of_their_source(tmp_path, ply, csplat_file):
     index, words = ("--source-index", tmp_path / "index.npy"), ("verify", csplat_file, "--source", ply)
-    assert "the declared errors hold" in call(*words, *index)
-    proof = json.loads(call(*words, *index, "--json"))["proof"]
+    assert "the declared errors hold" in printed(*words, *index)
+    proof = json.loads(printed(*words, *index, "--json"))["proof"]
     assert all((proof["rms_and_counts_proved"], *(one["holds"] for one in proof["measures"].values())))
-    assert "rms and counts are not proved" in call(*words)
+    assert "rms and counts are not proved" in printed(*words)
     model = read_ply(ply)
     fewer = model.select(slice(0, 199))
     model.means[7] += 1.0

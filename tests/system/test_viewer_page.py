@@ -29,7 +29,6 @@ def model(sample_path):
 
 @pytest.fixture(scope="module")
 def sample(model):
-    """The file of that scene."""
     return encode(model, FAST)
 
 
@@ -114,7 +113,6 @@ def test_a_damaged_part_is_reported_next_to_the_scene(viewer, model):
     assert f"{len(model):,} splats" in viewer.text("#summary")
 
 
-@pytest.mark.browser
 def test_a_browser_without_webgl_shows_an_error(tab, site, sample):
     tab.page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     viewer = ViewerPage(tab, site)
@@ -136,7 +134,6 @@ DROP = """async ([text, name]) => {
 }"""
 
 
-@pytest.mark.browser
 def test_a_page_without_a_scene_shows_an_error_and_accepts_files(tab, site, model, sample):
     viewer = ViewerPage(tab, site)
     viewer.load("?size=big&axes=RRR&camera=[{}]")
@@ -202,7 +199,6 @@ def test_mouse_and_keys_move_the_camera(viewer, light):
     assert viewer.home == viewer.pose  # at once: the user prefers no motion
 
 
-@pytest.mark.browser
 def test_fingers_move_the_camera(viewer, light):
     viewer.show(light)
     viewer.settle()
@@ -232,7 +228,6 @@ def test_the_automatic_camera_sees_the_object_whatever_outliers_do(viewer, model
 
 
 def look_at(eye):
-    """Return a camera that looks at the origin, as in a file."""
     K = [[90.0, 0.0, 40.0], [0.0, 90.0, 30.0], [0.0, 0.0, 1.0]]
     viewmat = camera.look_at(eye, (0, 0, 0), (0, -1, 0), K, 80, 60).viewmat.tolist()
     return {"K": K, "W": 80, "H": 60, "near": 0.1, "viewmat": viewmat}
@@ -261,7 +256,6 @@ def test_the_file_gives_the_first_view(viewer, make_model):
     assert "CC0" in viewer.page.locator("#statistics dd").all_inner_texts()
 
 
-@pytest.mark.browser
 def test_the_address_has_precedence_over_the_file(tab, site, make_model):
     views = [look_at([0.0, 0.0, -4.0]), look_at([3.0, 0.0, -4.0])]
     site.add("/cameras.json", json.dumps(views).encode())
@@ -353,7 +347,6 @@ def test_all_controls_have_a_name_and_can_be_reached_by_keys(viewer, make_model)
     assert {"canvas", "reset", "details", "open", "help"} <= reached
 
 
-@pytest.mark.browser
 def test_the_page_measures_itself(viewer, make_model):
     viewer.show(encode(make_model(100, 0)), "balls.csplat")
     page = viewer.page

