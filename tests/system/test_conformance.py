@@ -67,3 +67,11 @@ def test_wrong_arguments_are_reported_in_one_line(words, message):
     result = invoke(*words)
     (error,) = [line for line in result.stderr.splitlines() if not re.search("so far$", line)]  # besides progress
     assert (2 if "--level" in words else 1, True) == (result.exit_code, message in error)
+
+
+@pytest.mark.slow
+def test_without_a_renderer_pictures_are_skipped_with_a_note(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "numba", None)
+    result = invoke("--cmd", copying(tmp_path, "ordinary/degree_1"), "--filter", "*/degree_1")
+    assert 0 == result.exit_code
+    assert "L4 SKIPPED: this needs numba" in result.stdout
