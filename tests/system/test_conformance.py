@@ -51,6 +51,7 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
     assert {f"ordinary-one_splat/{name}" for name in ("in.ply", "out.csplat", "out.npy")} == kept
     assert 1 == invoke(*one, 1).exit_code  # what was kept is not overwritten, nor is a report
     assert 1 == invoke(*one[:4], "--level", 1, "--report", tmp_path / "r.json").exit_code
+    assert "testcase" in invoke(*one[:4], "--level", 1, "--junit", "-").stdout
 
 
 @pytest.mark.slow

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from command_line import call
@@ -28,10 +30,10 @@ def test_the_command_merges_and_reports(sample, make_model, tmp_path):
     """Two files have the same steps and separate codebooks of SH and of shapes."""
     options = EncodeOptions(
         preset="fast", sh_coding="codebook", codebook_size=64, escape_fraction=0.05, shape_codebook_size=64,
-        shape_escape_fraction=0.05, tile_splats=170, **STEPS,
+        shape_escape_fraction=0.05, tile_splats=170, keep_extra=True, **STEPS,
     )  # fmt: skip
-    parts = np.array_split(np.argsort(sample.means[:, 0]), 2)
-    halves = [encode(sample.select(part), options) for part in parts]
+    model = replace(sample, extra={"id": np.arange(len(sample), dtype=np.uint32)})
+    halves = [encode(model.select(part), options) for part in np.array_split(np.argsort(sample.means[:, 0]), 2)]
     a, b, c, out = (tmp_path / f"{name}.csplat" for name in ("a", "b", "c", "out"))
     for path, data in zip((a, b, c), [*halves, encode(make_model(40, 3))], strict=True):
         path.write_bytes(data)
@@ -41,4 +43,5 @@ def test_the_command_merges_and_reports(sample, make_model, tmp_path):
     assert "is the input" in call("merge", a, b, "-o", a, "--force", status=1).stderr
     again = call("merge", a, c, "-o", out, "--force", "--preset", "fast", "--json")
     assert "decoded and coded again (fast): " in again.stderr
+    assert "left out: id" in again.stderr
     assert '"copied": false' in again.stdout

@@ -133,17 +133,17 @@ assert not {{"scipy", "torch"}} & set(sys.modules)
 path = {str(files[1])!r}
 model = csplat.read_ply(path)
 csplat.encode(model, target=csplat.Target(max_error={{"means": 0.01}}))
-for function, *given in (
-    (lambda: csplat.encode(model, target=csplat.Target(psnr=40.0)),),
-    (csplat_tools.simplify, path, csplat.Target(keep=0.5)),
-    (csplat_tools.compare, path, path),
-    (csplat_tools.tradeoff, path),
-    (csplat_trainer.train, path),
-    (csplat_trainer.finetune, model, None),
-    (csplat_render.render, model, virtual_cameras(model, 1, 8, 8)[0]),
+for call in (
+    lambda: csplat.encode(model, target=csplat.Target(psnr=40.0)),
+    lambda: csplat_tools.simplify(path, csplat.Target(keep=0.5)),
+    lambda: csplat_tools.compare(path, path),
+    lambda: csplat_tools.tradeoff(path),
+    lambda: csplat_trainer.train(path),
+    lambda: csplat_trainer.finetune(model, None),
+    lambda: csplat_render.render(model, virtual_cameras(model, 1, 8, 8)[0]),
 ):
     try:
-        raise SystemExit(f"no error but {{function(*given)}}")
+        raise SystemExit(f"no error but {{call()}}")
     except csplat.InputError as error:
         assert "this needs numba: pip install 'csplat[render]'" == str(error), error
 """

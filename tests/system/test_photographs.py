@@ -81,6 +81,7 @@ def test_both_scenes_are_scored_on_the_test_images(files, data):
     assert a["psnr"] > 50.0  # rounding to bytes is the only error
     assert b["psnr"] == pytest.approx(result["psnr"], abs=0.2)
     assert b["ssim"] < a["ssim"]
+    assert "B - A" in call("compare", *files, "--data", data).stdout  # the table
     training = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
     assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in training["views"]]
     assert 6 == training["photographs"]["a"]["views"]
