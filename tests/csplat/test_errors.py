@@ -10,40 +10,35 @@ import numpy as np
 import pytest
 
 import csplat
-from csplat import errors
-from csplat.errors import InputError
+from csplat.errors import CsplatError, FormatError, InputError, LimitError, UnsupportedError
 
 
-@pytest.mark.parametrize("function", ["read_ply", "decode", "read_header", "lint_ply"])
+@pytest.mark.parametrize("function", [csplat.read_ply, csplat.decode, csplat.read_header, csplat.lint_ply])
 def test_other_objects_than_files_are_typed_errors(function, tmp_path):
     for wrong in (5, None, 1.5, ["scene.ply"], io.StringIO("ply\n")):
         with pytest.raises(InputError, match="expected"):
-            getattr(csplat, function)(wrong)
+            function(wrong)
     with pytest.raises(FileNotFoundError, match="absent"):
-        getattr(csplat, function)(tmp_path / "absent")
+        function(tmp_path / "absent")
 
 
 @pytest.mark.parametrize(("error", "message", "fields"), [
-    (errors.FormatError("E_CRC", 12, "CRC-1", "found 0x1a2b3c4d, computed 0x5e6f7081"),
-        "E_CRC at byte 12 (CRC-1): found 0x1a2b3c4d, computed 0x5e6f7081",
+    (FormatError("E_CRC", 12, "CRC-1", "found 0x1a"), "E_CRC at byte 12 (CRC-1): found 0x1a",
         {"code": "E_CRC", "offset": 12, "clause": "CRC-1"}),
-    (errors.FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5"),
-        "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5", {"code": "E_COUNT"}),
-    (errors.FormatError("E_HASH", None, "SHA-1"), "E_HASH (SHA-1)", {}),
-    (errors.UnsupportedError("version 0.7"), "E_UNSUPPORTED: version 0.7 is not supported",
-        {"code": "E_UNSUPPORTED", "feature": "version 0.7"}),
-    (errors.UnsupportedError("x", code="E_VERSION", offset=8, clause="VER-1"),
+    (FormatError("E_COUNT", 40, "IDX-3", found=7, wanted="at most 5"),
+        "E_COUNT at byte 40 (IDX-3): found 7, expected at most 5", {}),
+    (FormatError("E_HASH", None, "SHA-1"), "E_HASH (SHA-1)", {}),
+    (UnsupportedError("0.7"), "E_UNSUPPORTED: 0.7 is not supported", {"code": "E_UNSUPPORTED", "feature": "0.7"}),
+    (UnsupportedError("x", code="E_VERSION", offset=8, clause="VER-1"),
         "E_VERSION at byte 8 (VER-1): x is not supported", {"code": "E_VERSION", "offset": 8, "clause": "VER-1"}),
-    (errors.LimitError("max_splats", 10, 5), "E_LIMIT: max_splats: needs 10, allowed 5",
-        {"limit": "max_splats", "wanted": 10, "allowed": 5}),
-    (errors.LimitError("x", 2, code="E_BUDGET", offset=3), "E_BUDGET at byte 3: x: needs 2", {"code": "E_BUDGET"}),
-    (errors.InputError("x"), "x", {"code": "E_INPUT"}),
+    (LimitError("most", 10, 5), "E_LIMIT: most: needs 10, allowed 5", {"limit": "most", "wanted": 10, "allowed": 5}),
+    (LimitError("x", 2, code="E_BUDGET", offset=3), "E_BUDGET at byte 3: x: needs 2", {"code": "E_BUDGET"}),
+    (InputError("x"), "x", {"code": "E_INPUT"}),
 ])  # fmt: skip
 def test_an_error_names_code_place_and_values_also_in_another_process(error, message, fields):
     for one in (error, pickle.loads(pickle.dumps(error))):  # noqa: S301 -- our own bytes
-        assert isinstance(one, errors.CsplatError)
-        assert message == str(one)
-        assert fields == {name: getattr(one, name) for name in fields}
+        assert isinstance(one, CsplatError)
+        assert (message, fields) == (str(one), {name: getattr(one, name) for name in fields})
 
 
 @pytest.mark.parametrize(("field", "value", "message"), [
@@ -55,7 +50,6 @@ def test_an_error_names_code_place_and_values_also_in_another_process(error, mes
     ("sh0", np.zeros((10, 3)), "sh0 is float64, expected float32"),
     ("sh0", np.zeros((10, 3), ">f4"), "sh0 is >f4, expected float32"),
     ("shN", np.zeros((10, 4, 3), np.float32), "4 coefficients per channel, expected 0, 3, 8"),
-    ("shN", np.zeros((10, 35, 3), np.float32), "35 coefficients"),
     ("shN", np.zeros((10, 45), np.float32), "shN has shape"),
     ("opacities", np.full(10, 1.5, np.float32), "alpha in .0, 1."),
     ("opacities", np.full(10, -0.1, np.float32), "not logits"),
@@ -65,7 +59,6 @@ def test_an_error_names_code_place_and_values_also_in_another_process(error, mes
     ("origin", (1.0, 2.0, float("nan")), "expected finite numbers"),
     ("coordinate_system", "XYZ", "the axes are 'XYZ'"),
     ("coordinate_system", "RLU", "the axes are 'RLU'"),
-    ("coordinate_system", "RDFF", "the axes are 'RDFF'"),
     ("unit_metres", 0.0, "unit_metres is 0.0"),
     ("unit_metres", float("inf"), "unit_metres is inf"),
     ("extra", {"id": np.zeros(9)}, "extra column 'id' is not an array of 10"),
@@ -90,8 +83,7 @@ def test_doubles_have_to_match_their_means(make_model):
     doubles = np.random.default_rng(1).normal(0, 1, (10, 3)) + np.array(origin)
     means = (doubles - np.array(origin)).astype(np.float32)
     model = make_model(10, 0, means=means, origin=origin, means_double=doubles)
-    some = model.select(np.array([3, 1]))
-    np.testing.assert_array_equal(model.means_double[[3, 1]], some.means_double)
+    np.testing.assert_array_equal(model.means_double[[3, 1]], model.select(np.array([3, 1])).means_double)
     assert replace(model, means=model.means + 1, means_double=None).means_double is None
     for wrong in ({"means": model.means + 1}, {"origin": (0.0, 0.0, 0.0)}, {"means_double": model.means}):
         with pytest.raises(InputError, match="means_double"):

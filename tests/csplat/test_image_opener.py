@@ -2,19 +2,18 @@
 
 import io
 import os
+import re
 import struct
 import zlib
 
 import numpy as np
 import pytest
-from PIL import Image
 from tables import failures
 
 from csplat.errors import InputError
 from csplat.image_opener import open_image
 
-pytest.importorskip("PIL", reason="requires the extra [render]")
-
+Image = pytest.importorskip("PIL.Image", reason="requires the extra [render]")
 
 RGB = (np.random.default_rng(0).random((16, 24, 3)) * 255).astype(np.uint8)
 
@@ -40,7 +39,7 @@ def spoilt(data, begin, end):
 
 
 def tiff(*entries, next_at=0):
-    rows = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in sorted(entries))
+    rows = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in entries)
     return b"II*\0" + struct.pack("<IH", 8, len(entries)) + rows + struct.pack("<I", next_at)
 
 
@@ -48,7 +47,6 @@ JPEG = saved("JPEG")
 DEFLATED, LZW = (saved("TIFF", compression=kind) for kind in ("tiff_adobe_deflate", "tiff_lzw"))
 LARGE_TEXT = zlib.compress(b"a" * (1 << 25))
 EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 32 32\n%%EndComments\nshowpage\n%%EOF\n"
-
 
 #: Bytes of a file, and a part of the message; the name of the file never matters.
 REFUSED = {
@@ -88,11 +86,8 @@ REFUSED = {
     "a damaged TIFF": (spoilt(DEFLATED, 200, 260), "is a TIFF that is damaged"),
     "another damaged TIFF": (spoilt(LZW, 200, 260), "is a TIFF that is damaged"),
     "a TIFF of large tags": (
-        tiff(*((256 + i, 0x7FFFFFFF) for i in range(20))).replace(struct.pack("<I", 1), struct.pack("<I", 2**32 - 1)),
-        "TIFF that is damaged",
-    ),
+        tiff(*((256 + i, 0x7FFFFFFF) for i in range(20))).replace(b"\1\0\0\0", b"\xff" * 4), "TIFF that is damaged"),
 }  # fmt: skip
-
 
 #: Files that are read although Pillow warns of them.
 READ = {
@@ -111,45 +106,39 @@ def test_other_formats_and_bombs_are_refused_in_one_line(tmp_path, capfd):
             with pytest.raises(InputError) as raised, open_image(source) as image:
                 np.asarray(image.convert("RGB"))
             assert message in str(raised.value)
-            assert "\n" not in str(raised.value)
-            assert "object at 0x" not in str(raised.value)
+            assert not re.search("\n|object at 0x", str(raised.value))
 
     assert [] == failures(REFUSED, check)
     assert ("", "") == capfd.readouterr()
 
 
 def test_doubtful_images_are_read_silently(capfd):
-    def check(data):
+    for data in READ.values():
         with open_image(data) as image:
             image.convert("RGBA").load()
             _ = image.getexif()
-
-    assert [] == failures(READ, check)
     assert ("", "") == capfd.readouterr()
 
 
 def test_the_first_bytes_determine_the_format(tmp_path):
+    path = tmp_path / "a.eps"
     for kind in ("PNG", "JPEG", "TIFF", "WEBP", "BMP"):
-        path = tmp_path / "a.eps"
         path.write_bytes(saved(kind))
         with open_image(path) as image:
-            assert (24, 16) == image.size
-            assert kind == image.format
+            assert (24, 16, kind) == (*image.size, image.format)
     with pytest.raises(InputError, match=r"a\.eps is a BMP, expected WebP"), open_image(path, formats=("WebP",)):
         pass
 
 
 def test_no_program_is_started(tmp_path, monkeypatch):
-    ran = tmp_path / "ran"
-    for name in ("gs", "gswin64c", "gswin32c"):
-        (tmp_path / name).write_text(f"#!/bin/sh\necho ran >> {ran}\n")
-        (tmp_path / name).chmod(0o755)
+    (tmp_path / "gs").write_text(f"#!/bin/sh\necho ran >> {tmp_path / 'ran'}\n")
+    (tmp_path / "gs").chmod(0o755)
     monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
     for name in ("3.png", "3.eps"):
         (tmp_path / name).write_bytes(EPS)
         with pytest.raises(InputError, match="PostScript"), open_image(tmp_path / name) as image:
             image.load()
-    assert not ran.exists()
+    assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes on Windows")
@@ -157,15 +146,12 @@ def test_pipes_devices_and_folders_are_refused_without_waiting(tmp_path):
     os.mkfifo(tmp_path / "3.png")
     (tmp_path / "4.png").mkdir()
     (tmp_path / "5.png").symlink_to("/dev/zero")
-    for name in ("3.png", "4.png", "5.png"):
-        with pytest.raises(InputError, match=f"{name}: not a regular file"), open_image(tmp_path / name):
+    for number, message in ((3, "not a regular file"), (4, "not a reg"), (5, "not a reg"), (6, "No such file")):
+        with pytest.raises(InputError, match=rf"{number}\.png: {message}"), open_image(tmp_path / f"{number}.png"):
             pass
-    with pytest.raises(InputError, match=r"6\.png: No such file"), open_image(tmp_path / "6.png"):
-        pass
 
 
 def test_large_images_of_large_files_are_within_the_budget():
-    with open_image(png(9_000, 9_000) + bytes(1_300_000)) as image:
-        assert (9_000, 9_000) == image.size
-    with open_image(png(13_300, 13_300), budget=False) as image:
-        assert (13_300, 13_300) == image.size
+    large, bomb = png(9_000, 9_000) + bytes(1_300_000), png(13_300, 13_300)
+    with open_image(large) as image, open_image(bomb, budget=False) as larger:
+        assert (9_000, 13_300) == (image.height, larger.height)

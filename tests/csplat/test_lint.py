@@ -5,6 +5,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from ply_cases import columns_of
 from tables import failures
 
 import csplat
@@ -14,15 +15,7 @@ from csplat.ply import lint_ply, read_ply
 from csplat.ply.columns import alpha_of_logits
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
-NAMES = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
-
-
-NAMES += [f"f_rest_{i}" for i in range(9)]
-
-
-NAMES += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-
-
+NAMES, COLOURS = columns_of(1), ("red", "green", "blue")
 SCALES, ROTATIONS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 
 
@@ -33,9 +26,9 @@ def without(*names):
 PLAIN = without(*(name for name in NAMES if name.startswith("f_rest")))
 
 
-def good_rows(count=5, names=NAMES, **columns):
-    """Return rows without defects, with some columns replaced."""
-    rows = np.zeros(count, [(name, "<f4") for name in names])
+def good_rows(count=5, names=NAMES, kind="<f4", kinds=(), **columns):
+    """Return rows without defects, with some columns replaced, of which `kinds` are of another kind."""
+    rows = np.zeros(count, [(name, kind if name in kinds else "<f4") for name in names])
     for index, name in enumerate(name for name in names if not name.startswith(("n", "rot"))):
         rows[name] = np.arange(count) + index / 8
     if "rot_0" in names:
@@ -67,6 +60,12 @@ def ply(rows, trailing=b"", **words):
 
 def text_ply(text, rows=ROWS, **words):
     return header(rows, kind="ascii", **words) + text.encode()
+
+
+def assert_splats_of_rows(model):
+    assert np.array_equal(model.means[:, 0], ROWS["x"])
+    assert np.array_equal(model.scales[:, 2], ROWS["scale_2"])
+    assert np.array_equal(model.quats[:, 0], ROWS["rot_0"])
 
 
 @pytest.fixture
@@ -105,46 +104,79 @@ def assert_refused(path, cases):
     assert [] == failures(cases, check)
 
 
-def retyped(kind, names, **columns):
-    rows = good_rows().astype([(name, kind if name in names else "<f4") for name in NAMES])
-    for name, values in columns.items():
-        rows[name] = values
-    return rows
+def coloured(kind, values, names=COLOURS):
+    """Return three rows with colours of this kind in place of f_dc."""
+    names = [*(name for name in NAMES if not name.startswith("f_")), *names]
+    return good_rows(3, names, kind, names[-3:], **dict(zip(names[-3:], values, strict=True)))
+
+
+def packed(name):
+    """Return a PLY in which three bytes of colour are declared as one."""
+    names = [(name, "u1") if one == "f_dc_0" else (one, "<f4") for one in PLAIN if one not in ("f_dc_1", "f_dc_2")]
+    rows = np.zeros(4, [(*one, 3) if one[0] == name else one for one in names])
+    rows["rot_0"], rows[name] = 1, np.arange(12).reshape(4, 3) * 20
+    return header(np.zeros(0, names), count=4) + rows.tobytes()
+
+
+def sh_of(*colours):
+    return (np.array(colours) - 0.5) / 0.28209479177387814
 
 
 GOOD_SH = np.stack([good_rows()[f"f_dc_{channel}"] for channel in range(3)], 1)
 BAD_VALUES = [("x", np.nan), ("x", -np.inf), ("f_dc_1", np.inf), ("f_rest_8", np.nan), ("f_rest_8", -np.inf),
     ("scale_2", np.nan), ("scale_2", np.inf), ("rot_3", np.nan), ("rot_3", np.inf)]  # fmt: skip
-
-
-VALUES = {  # rows, findings, and an array of the model that is read
+ONE_SCALE = without(*SCALES)
+VALUES = {  # rows or bytes, findings, and an array of the model that is read
     "good": (good_rows(), {}, "sh0", GOOD_SH),
     "normals": (good_rows(ny=[np.nan, 1, 1, 0, 0]), {"nonzero-normals": 3}, "sh0", GOOD_SH),
     "large means": (good_rows(x=3e38, y=0, z=0), {}, "means", [[3e38, 0, 0]] * 5),
     "opacities": (good_rows(opacity=[np.nan, np.inf, -np.inf, 0, 0]), {"nonfinite-rows": 1, "infinite-logits": 2},
         "opacities", [1, 0, 0.5, 0.5]),
-    "large doubles": (retyped("<f8", ["x", "f_dc_0"], x=[0, 1e300, 2, 3, 4], f_dc_0=[0, 1, -1e300, 3, 4]),
+    "large doubles": (
+        good_rows(kind="<f8", kinds=["x", "f_dc_0"], x=[0, 1e300, 2, 3, 4], f_dc_0=[0, 1, -1e300, 3, 4]),
         {"nonfinite-rows": 2, "double-means": 3}, "opacities", alpha_of_logits(good_rows()["opacity"][[0, 3, 4]])),
-    "integers": (retyped("<i4", "xyz"), {"double-means": 5}, "means", [[x] * 3 for x in range(5)]),
+    "integers": (good_rows(kind="<i4", kinds="xyz", y=range(5), z=range(5)), {"double-means": 5},
+        "means", [[x] * 3 for x in range(5)]),
     "zero rotations": (good_rows(rot_0=[0, 0, 1, 1, 1]), {"zero-quats": 2}, "quats", [[1, 0, 0, 0]] * 5),
     **{f"rotations of {length}": (good_rows(rot_0=0, rot_2=-length), {"unnormalised-quats": 5},
         "quats", [[0, 0, -1, 0]] * 5) for length in (1e-40, 0.006, 2.0, 1e30)},
     **{f"{name} of {value}": (good_rows(**{name: [0, value, 0, value, 0]}), {"nonfinite-rows": 2},
         "opacities", alpha_of_logits(good_rows()["opacity"][::2])) for name, value in BAD_VALUES},
+    **{f"{word} in text": (text_ply(LINES.replace("3.0", word, 1)), {"unusual-rows": 1, "nonfinite-rows": 1},
+        "quats", [[1, 0, 0, 0]] * 3) for word in ("-nan(ind)", "nan(snan)", "-1.#IND", "1.#QNAN0", "1.#INF00")},
+    "discs": (good_rows(names=without("scale_2"), scale_0=range(5), scale_1=2), {"flat-scales": 1},
+        "scales", [[x, 2, np.log(0.01)] for x in range(5)]),
+    **{f"one scale, {name}": (good_rows(names=[*ONE_SCALE, name], **{name: range(5)}), {"one-scale": 1},
+        "scales", [[x] * 3 for x in range(5)]) for name in ("scale_0", "scale", "scalar_scale")},
+    "one scale without rotations": (good_rows(names=[*without(*SCALES, *ROTATIONS), "scale"]), {"one-scale": 1},
+        "quats", [[1, 0, 0, 0]] * 5),
+    "a filter of one scale": (good_rows(3, [*ONE_SCALE, "scale", "filter_3D"], scale=0, filter_3D=1),
+        {"one-scale": 1, "filter-3d": 3}, "scales", np.full((3, 3), np.log(2**0.5))),
+    "bytes": (coloured("|u1", (0, 255, 51)), {"rgb-colours": 3}, "sh0", [sh_of(0, 1, 0.2)] * 3),
+    "16 bits": (coloured("<u2", (0, 65535, 13107), ("diffuse_red", "diffuse_green", "diffuse_blue")),
+        {"rgb-colours": 3}, "sh0", [sh_of(0, 1, 0.2)] * 3),
+    "16 bits of 255": (coloured("<u2", (0, 51, 255)), {"rgb-colours": 3}, "sh0", [sh_of(0, 0.2, 1)] * 3),
+    "floats of colours": (coloured("<f4", (0, 1, 0)), {"rgb-colours": 3}, "sh0", [sh_of(0, 1, 0)] * 3),
+    "doubles": (coloured("<f8", (0, 1, 0), ("r", "g", "b")), {"rgb-colours": 3}, "sh0", [sh_of(0, 1, 0)] * 3),
+    **{f"packed {name}": (packed(name), {"packed-colours": 1, "rgb-colours": 3},
+        "sh0", sh_of(*np.arange(12).reshape(4, 3) / 12.75)) for name in ("colors", "rgb")},
 }  # fmt: skip
 
 
 @pytest.mark.slow
 def test_unusual_values_are_counted_and_repaired_unless_reading_is_strict(path):
     def check(case):
-        rows, findings, name, values = case
-        put(path, rows)
-        assert findings == counts(path)
-        assert np.array_equal(np.asarray(values, np.float32), getattr(read_ply(path), name))
+        data, findings, name, values = case
+        path.write_bytes(data if isinstance(data, bytes) else ply(data))
+        others = {"shuffled-columns", "alias-columns"}
+        assert findings == {one: count for one, count in counts(path).items() if one not in others}
+        for model in both(path):
+            np.testing.assert_allclose(getattr(model, name), np.asarray(values, np.float32), rtol=1e-6, atol=1e-7)
+            assert ("flat-scales" in findings) == model.flat
         repaired = [one for one in ("nonfinite-rows", "zero-quats") if one in findings]
         assert repaired == [one.id for one in lint_ply(path) if one.kind == "repair"]
         if not repaired:
-            assert 5 == len(read_ply(path, strict=True))
+            assert len(model) == len(read_ply(path, strict=True))
         for one in repaired:
             with pytest.raises(InputError, match=f"{one}: {findings[one]} (splats?|rotations) "):
                 read_ply(path, strict=True)
@@ -156,10 +188,8 @@ def test_trailing_bytes_are_ignored_and_counted(path):
     put(path, good_rows(x=[np.nan, 1, 2, 3, 4]), bytes(14))
     assert ("repair", True) == (found(path)["trailing-bytes"].kind, found(path)["trailing-bytes"].repairable)
     assert 4 == len(read_ply(path))
-    report = []
     with pytest.raises(InputError, match="trailing-bytes: 14 bytes"):
-        read_ply(path, strict=True, report=report)
-    assert {"trailing-bytes", "nonfinite-rows"} >= {one.id for one in report} >= {"trailing-bytes"}
+        read_ply(path, strict=True)
 
 
 def test_rows_damaged_by_a_text_mode_transfer_are_refused(path):
@@ -191,9 +221,8 @@ def test_lines_after_and_before_the_declared_count_are_counted(path, text, count
 
 
 def test_non_finite_rows_are_dropped_in_every_block(path):
-    rows = good_rows(20_000)
     bad = np.random.default_rng(0).random(20_000) < 0.3
-    rows["f_rest_0"][bad] = np.nan
+    rows = good_rows(20_000, f_rest_0=np.where(bad, np.nan, 0))
     put(path, rows)
     assert bad.sum() == counts(path)["nonfinite-rows"]
     model = read_ply(path)
@@ -203,10 +232,9 @@ def test_non_finite_rows_are_dropped_in_every_block(path):
 
 @pytest.mark.parametrize("names", [("scale_2",), SCALES])
 def test_log_scales_of_minus_infinity_are_sizes_of_0(path, names):
-    rows = good_rows()
+    rows = good_rows(opacity=[0, 0, 0, np.nan, 0])
     for name in names:
         rows[name][1:4] = -np.inf
-    rows["opacity"][3] = np.nan
     rows["scale_1"][4] = np.inf
     put(path, rows)
     assert {"zero-scales": 2, "nonfinite-rows": 2} == counts(path)
@@ -229,46 +257,6 @@ def test_sizes_of_0_are_read_from_arrays(make_model):
         csplat.from_gsplat(sizes, form="activated")
 
 
-def test_two_scales_are_read_as_discs(path):
-    rows = good_rows(names=without("scale_2"))
-    put(path, rows)
-    assert "note" == found(path)["flat-scales"].kind
-    model = read_ply(path, strict=True)
-    assert model.flat
-    smallest = min(rows["scale_0"].min(), rows["scale_1"].min())
-    np.testing.assert_allclose(model.scales[:, 2], smallest + np.log(0.01), rtol=1e-6)
-
-
-@pytest.mark.parametrize("name", ["scale_0", "scale", "scalar_scale"])
-@pytest.mark.parametrize("rotations", [ROTATIONS, ()])
-def test_one_scale_is_the_size_of_all_axes(path, name, rotations):
-    names = without("scale_1", "scale_2", *(ROTATIONS if not rotations else ()))
-    rows = good_rows(names=names, **({"rot_1": 1} if rotations else {}))
-    rows.dtype.names = [name if one == "scale_0" else one for one in names]
-    put(path, rows)
-    assert "note" == found(path)["one-scale"].kind
-    for model in both(path, strict=True):
-        assert (np.repeat(rows[name][:, None], 3, axis=1) == model.scales).all()
-        assert not model.flat
-        assert (model.quats[:, 0] == (np.float32(0.5**0.5) if rotations else 1)).all()
-
-
-@pytest.mark.parametrize("name", ["colors", "rgb"])
-def test_three_bytes_of_colour_declared_as_one_are_read(path, name):
-    names = [("nx", "<f4"), (name, "u1"), *((one, "<f4") for one in PLAIN if not one.startswith(("n", "f_dc")))]
-    rows = np.zeros(4, [(one, kind, 3) if one == name else (one, kind) for one, kind in names])
-    rows["rot_0"], rows[name], rows["x"] = 1, np.arange(12).reshape(4, 3) * 20, np.arange(4)
-    data = header(np.zeros(0, names), count=4) + rows.tobytes()
-    path.write_bytes(data)
-    assert {"packed-colours", "rgb-colours"} <= set(found(path))
-    assert "trailing-bytes" not in found(path)
-    for model in both(path):
-        np.testing.assert_allclose(model.sh0 * 0.28209479 + 0.5, rows[name] / 255, atol=1e-6)
-        assert [0, 1, 2, 3] == model.means[:, 0].tolist()
-    assert_refused(path, {"a byte more": (data + b"x", "f_dc_0")})
-
-
-@pytest.mark.slow
 def test_degree_5_is_read_with_fewer_bands(path):
     rows = good_rows(names=[*PLAIN, *(f"f_rest_{i}" for i in range(105))])
     put(path, rows)
@@ -284,14 +272,10 @@ def test_degree_5_is_read_with_fewer_bands(path):
         for channel in range(3):
             expected = [rows[f"f_rest_{35 * channel + band}"] for band in range(kept)]
             assert np.array_equal(model.shN[:, :, channel], np.reshape(expected, (kept, 5)).T)
-        with open_scene(path, sh_degree=degree) as scene:
-            assert np.array_equal(model.shN, scene.model().shN)
+        assert np.array_equal(model.shN, csplat.read(path, sh_degree=degree).shN)
     assert "sh-bands" in [one.id for one in lint_ply(path, sh_degree=3)]
     put(path, good_rows())  # of degree 1
-    report = []
-    assert 0 == read_ply(path, sh_degree=0, strict=True, report=report).sh_degree
-    assert [] == report
-    assert 1 == csplat.read(path, sh_degree=2).sh_degree
+    assert (0, 1) == (read_ply(path, sh_degree=0, strict=True).sh_degree, csplat.read(path, sh_degree=2).sh_degree)
 
 
 @pytest.mark.parametrize("name_of", [
@@ -314,9 +298,6 @@ def test_column_names_of_other_programs_are_read(path, name_of):
     assert [("alias-columns", count, "note")] == [(one.id, one.count, one.kind) for one in report]
 
 
-COLOURS = ("red", "green", "blue")
-
-
 def test_the_usual_columns_take_precedence(path):
     rows = good_rows(names=[*NAMES, "scalar_opacity", *COLOURS], scalar_opacity=9.0)
     put(path, rows)
@@ -324,32 +305,6 @@ def test_the_usual_columns_take_precedence(path):
     assert "red, green, blue are not splat attributes" in found(path)["extra-columns"].text
     assert np.array_equal(alpha_of_logits(rows["opacity"]), read_ply(path).opacities)
     assert np.array_equal(rows["f_dc_1"], read_ply(path).sh0[:, 1])
-
-
-def coloured(kind, values, names=COLOURS, count=3):
-    plain = [name for name in NAMES if not name.startswith("f_")]
-    kinds = [(name, "<f4") for name in plain[:6]] + [(name, kind) for name in names]
-    rows = np.zeros(count, [*kinds, *((name, "<f4") for name in plain[6:])])
-    for name, value in {"x": 1, "rot_0": 1, **dict(zip(names, values, strict=True))}.items():
-        rows[name] = value
-    return rows
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("kind", "unit", "values", "names", "text"), [
-    ("|u1", 255, (0, 255, 51), COLOURS, ""),
-    ("<u2", 65535, (0, 65535, 13107), ("diffuse_red", "diffuse_green", "diffuse_blue"), ""),
-    ("<f4", 1, (0, 1, 0), COLOURS, ""),
-    ("<f8", 1, (0, 1, 0), ("r", "g", "b"), ""),
-    ("<u2", 255, (0, 17, 255), COLOURS, "in steps of 1/255: they have 16 bits, but are at most 255"),
-])  # fmt: skip
-def test_red_green_and_blue_replace_f_dc(path, kind, unit, values, names, text):
-    put(path, coloured(kind, values, names))
-    assert ["rgb-colours"] == list(found(path))
-    assert text in found(path)["rgb-colours"].text
-    expected = (np.array(values) / unit - 0.5) / 0.28209479177387814
-    for model in both(path, strict=True):
-        np.testing.assert_allclose(model.sh0, [expected] * 3, rtol=1e-6)
 
 
 def test_the_filter_of_mip_splatting_is_fused(path):
@@ -374,27 +329,22 @@ def test_the_filter_of_mip_splatting_is_fused(path):
     assert np.array_equal(model.opacities, both(path)[1].opacities)
 
 
-def test_the_filter_is_fused_into_one_scale_and_not_into_discs(path):
-    one = good_rows(3, [*without("scale_1", "scale_2"), "filter_3D"], scale_0=0, filter_3D=1)
-    put(path, one)
-    np.testing.assert_allclose(read_ply(path).scales, np.full((3, 3), np.log(2**0.5)), rtol=1e-6)
-    two = good_rows(names=[*without("scale_2"), "filter_3D"])
-    put(path, two)
+def test_the_filter_is_not_fused_into_discs(path):
+    rows = good_rows(names=[*without("scale_2"), "filter_3D"])
+    put(path, rows)
     assert "which is not defined for discs: it is not fused" in found(path)["filter-3d"].text
-    assert np.array_equal(two["scale_1"], read_ply(path).scales[:, 1])
+    assert np.array_equal(rows["scale_1"], read_ply(path).scales[:, 1])
 
 
 def test_extreme_filters_stay_finite(path):
     scales = {name: [-80, 80, -80, 0] for name in SCALES}
     rows = good_rows(4, [*NAMES, "filter_3D"], **scales, filter_3D=[1e38, 1e-45, -1e-30, -1])
     put(path, rows)
-    model = read_ply(path)
+    model, alphas = read_ply(path), alpha_of_logits(rows["opacity"])
     np.testing.assert_allclose(model.scales[:, 0], [np.log(1e38), 80, np.log(1e-30), np.log(2) / 2], rtol=1e-6)
-    assert (0, alpha_of_logits(rows["opacity"])[1]) == (model.opacities[0], model.opacities[1])
-    np.testing.assert_allclose(model.opacities[3], alpha_of_logits(rows["opacity"])[3] / 2**1.5, rtol=1e-6)
+    np.testing.assert_allclose(model.opacities[[0, 1, 3]], [0, alphas[1], alphas[3] / 2**1.5], rtol=1e-6)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("changes", "noted"), [
     ({"opacity": (0, 1)}, {"opacities-are-alphas"}),
     ({"opacity": (-0.1, 1)}, set()),
@@ -416,9 +366,8 @@ def test_values_after_their_activation_are_noted(path, changes, noted):
 
 def test_other_elements_and_dynamic_splats_are_named_and_dropped(path):
     rows = good_rows()
-    face = b"\x03" + np.arange(3, dtype="<i4").tobytes()
     for data, after, text in (
-        (face * 2, ["element face 2", "property list uchar int vertex_indices"], "face"),
+        (b"\0\1abcd", ["element face 2", "property list uchar int vertex_indices"], "face"),
         (bytes(4), ["element delta_vertex_0 1", "property float x"], "of which the first frame is kept"),
     ):
         put(path, rows, data, after=after)
@@ -428,11 +377,9 @@ def test_other_elements_and_dynamic_splats_are_named_and_dropped(path):
             read_ply(path, strict=True)
     for names in (["motion_0", "trbf_center"], ["t", "scale_t"]):
         put(path, good_rows(names=[*NAMES, *names]))
-        message = "are not splat attributes: dropped; the file contains dynamic (4D) splats: their time"
-        assert f"{', '.join(names)} {message}" in found(path)["extra-columns"].text
+        assert "dropped; the file contains dynamic (4D) splats: their time" in found(path)["extra-columns"].text
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("text", "message"), [
     (LINES.replace(".", ","), "decimal commas"),
     (LINES.replace(".", ",").replace(" ", ";"), "decimal commas"),
@@ -446,28 +393,16 @@ def test_other_elements_and_dynamic_splats_are_named_and_dropped(path):
 def test_unambiguous_rows_of_text_are_read(path, text, message):
     path.write_bytes(text_ply(text))
     assert message in found(path)["unusual-rows"].text
-    model = read_ply(path)
-    assert np.array_equal(model.means[:, 0], ROWS["x"])
-    assert np.array_equal(model.quats[:, 3], ROWS["rot_3"])
-    assert np.array_equal(model.scales[:, 2], ROWS["scale_2"])
+    assert_splats_of_rows(read_ply(path))
 
 
-@pytest.mark.parametrize("word", ["-nan(ind)", "nan(snan)", "-1.#IND", "1.#QNAN0", "1.#INF00"])
-def test_nan_and_infinity_are_read_in_other_spellings(path, word):
-    path.write_bytes(text_ply(LINES.replace("3.0", word, 1)))
-    assert {"unusual-rows": 1, "nonfinite-rows": 1} == counts(path)
-    assert 3 == len(read_ply(path))
-
-
-SEPARATED = good_rows(2, names=without("nx", "ny", "nz"))
 BIG_LABELS = f"1 2{' 0' * len(NAMES)}\n{10**30} 2{' 0' * len(NAMES)}\n"
 BAD_TEXT = {
     "a decimal comma": (LINES.replace("\n3.0 ", "\n3,0 "), ROWS, "row 3 of vertex: x is '3,0', expected a number"),
     "two points": (LINES.replace("\n3.0 ", "\n3.0.0 "), ROWS, r"row 3 of vertex: x is '3\.0\.0', expected a number"),
     "a value less": (LINES.replace("\n3.0 ", "\n"), ROWS, "row 3 of vertex has 25 values, expected 26"),
     "a value more": (LINES.replace("\n2.0 ", " 9.0\n"), ROWS, "row 1 of vertex has 27 values, expected 26"),
-    "thousands separators": ("\n".join([" ".join(["1,000"] * len(SEPARATED.dtype.names))] * 2), SEPARATED,
-        "x is '1,000', expected a number"),
+    "thousands separators": (f"{'1,000 ' * len(PLAIN)}\n" * 2, good_rows(2, PLAIN), "x is '1,000', expected a number"),
     "an integer beyond its type": (
         "\n" + BIG_LABELS, np.zeros(2, [("label", "u1"), ("other", "u1"), *ROWS.dtype.descr]), r"a\.ply"),
 }  # fmt: skip
@@ -479,7 +414,6 @@ def test_ambiguous_rows_of_text_are_refused(path):
     assert_refused(path, {**cases, "UTF-16": (utf16, "is a PLY in UTF-16, expected ASCII: save it as UTF-8")})
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian"])
 @pytest.mark.parametrize(("written", "message"), [
     (lambda head: b"\xef\xbb\xbf" + head, "a byte order mark"),
@@ -495,17 +429,14 @@ def test_headers_in_other_spellings_are_read(path, kind, written, message):
     path.write_bytes(written(header(ROWS, kind=kind, before=["comment Made by É"])) + body)
     assert message in found(path)["unusual-header"].text
     model = csplat.read(path)
-    assert np.array_equal(model.means[:, 0], ROWS["x"])
+    assert_splats_of_rows(model)
     assert "by ??" in model.metadata["comments"][0].lower()
-    assert np.array_equal(model.scales[:, 2], ROWS["scale_2"])
 
 
 def halves_of(rows, names, order="<"):
     """Return rows with half floats in some columns, declared as integers."""
-    out = np.zeros(len(rows), [(name, f"{order}u2" if name in names else "<f4") for name in rows.dtype.names])
-    for name in rows.dtype.names:
-        out[name] = rows[name].astype(f"{order}f2").view(f"{order}u2") if name in names else rows[name]
-    return out
+    halves = rows.astype([(name, f"{order}f2" if name in names else "<f4") for name in NAMES])
+    return halves.view([(name, f"{order}u2" if name in names else "<f4") for name in NAMES])
 
 
 @pytest.mark.parametrize(("order", "kind"), [("<", "binary_little_endian"), (">", "binary_big_endian")])
@@ -518,9 +449,7 @@ def test_half_floats_in_columns_of_integers_are_read(path, order, kind):
     assert np.array_equal(model.means[:, 0], rows["x"])
     rows["f_dc_1"][7], rows["opacity"][9] = np.nan, np.inf
     put(path, halves_of(rows, NAMES, order), kind=kind)
-    assert {"nonfinite-rows": 1, "infinite-logits": 1} == {
-        name: count for name, count in counts(path).items() if name.endswith(("rows", "logits"))
-    }
+    assert (1, 1) == (counts(path)["nonfinite-rows"], counts(path)["infinite-logits"])
     assert 59 == len(read_ply(path))
 
 
@@ -538,26 +467,22 @@ def test_positions_alone_may_be_half_floats(path):
     assert_refused(path, cases)
 
 
-def integers(names, kind, values, count=5):
-    """Return rows of zeros with integers in some columns."""
-    rows = np.zeros(count, [(name, kind if name in names else "<f4") for name in NAMES])
-    for name in names:
-        rows[name] = values
-    return rows
+RANDOM = np.random.default_rng(0).integers(0, 30_000, 60)
+BAD_KINDS = {
+    "u1 in opacity": (["opacity"], 200, "opacity is of type uint8, expected float: export"),
+    "u1 in colours": (["f_dc_0", "f_dc_1", "f_dc_2"], 200, "uint8, expected float: rename colours of 0 to 255 to red"),
+    "i4 in two": (["scale_0", "rot_2"], 200, "scale_0, rot_2 are of type int32, expected float"),
+    "u2 that are NaN as halves": (PLAIN[6:], 65535, "are of type uint16, expected"),
+    "u2 in all": (NAMES, RANDOM, "of type uint16, expected float: export the values before quantisation"),
+}
 
 
 def test_integers_in_place_of_floats_are_refused(path):
-    random = np.random.default_rng(0).integers(0, 30_000, 60)
-    cases = {
-        "opacity": (ply(integers(["opacity"], "u1", 200)), "opacity is of type uint8, expected float: export"),
-        "colours": (ply(integers(["f_dc_0", "f_dc_1", "f_dc_2"], "u1", 200)),
-            "are of type uint8, expected float: rename colours of 0 to 255 to red"),
-        "two kinds": (ply(integers(["scale_0", "rot_2"], "i4", 200)), "scale_0, rot_2 are of type int32, expected flo"),
-        "NaN as halves": (ply(integers(without(*"xyz", "nx", "ny", "nz"), "u2", 65535)), "are of type uint16, expect"),
-        "quantised": (ply(integers(NAMES, "u2", random, 60)),
-            "of type uint16, expected float: export the values before quantisation"),
-    }  # fmt: skip
-    assert_refused(path, {name: (data, f"integer-columns: .*{message}") for name, (data, message) in cases.items()})
+    cases = {}
+    for name, (kinds, values, message) in BAD_KINDS.items():
+        rows = good_rows(60, kind=name[:2], kinds=kinds, **dict.fromkeys(kinds, values))
+        cases[name] = ply(rows), f"integer-columns: .*{message}"
+    assert_refused(path, cases)
 
 
 def test_the_camera_of_ml_sharp_is_a_note(path):
@@ -577,9 +502,7 @@ def test_extra_columns_are_named_and_dropped(path):
     assert 2 == counts(path)["extra-columns"]
     with pytest.raises(InputError, match="columns object_id, conf are not splat attributes"):
         read_ply(path, strict=True)
-    report = []
-    assert ["object_id", "conf"] == list(read_ply(path, strict=True, keep_extra=True, report=report).extra)
-    assert [] == report
+    assert ["object_id", "conf"] == list(read_ply(path, strict=True, keep_extra=True).extra)
 
 
 FACES = ["element face 0", "property list uchar int vertex_indices"]
@@ -614,10 +537,9 @@ BAD_COLUMNS = {
 
 def test_columns_that_are_not_those_of_splats_are_refused(path):
     assert_refused(path, BAD_COLUMNS)
-    for name in ("no scale_0", "8 of SH", "signed colours"):
+    for name, count in (("no scale_0", 1), ("8 of SH", 8)):
         path.write_bytes(BAD_COLUMNS[name][0])
-        ((finding, count),) = ((one, one.count) for one in lint_ply(path) if one.kind == "error")
-        assert ({"8 of SH": 8, "no scale_0": 1}.get(name, count), False) == (count, finding.repairable)
+        assert [(count, False)] == [(one.count, one.repairable) for one in lint_ply(path) if one.kind == "error"]
 
 
 def test_a_file_without_columns_of_splats_is_refused_from_its_header(path):
@@ -633,13 +555,11 @@ BAD_HEADERS = {
     for old, new, message in [
         (b"vertex 5", b"vertex -5", "malformed: .*-5 rows are declared"),
         (b"vertex 5", b"vertex " + b"5" * 5000, r"555\.\.\. \(5,000 digits\) rows are declared, the file has"),
-        (b"vertex 5", b"vertex -" + b"5" * 5000, r"-555.* rows are declared"),
         (b"vertex 5", b"vertex 1_0", "the count '1_0' of an element is not a whole number"),
         (b"vertex 5", b"vertex 5.0", "the count '5.0' of an element is not a whole number"),
         (b"end_header", b"element a 0\n" * 5000 + b"end_header", "more than 4,096 elements and properties"),
         (b"end_header", b"property int a\n" * 5000 + b"end_header", "more than 4,096 elements and properties"),
         (b"end_header", b"comment a\n" * 10**6 + b"end_header", "no line end_header in its first 1,048,576 bytes"),
-        (b"end_header", b"element a 5" + b"5" * 1000 + b"\nend_header", r"555\.\.\. \(1,001 digits\) rows are decl"),
     ]
 }  # fmt: skip
 
@@ -651,17 +571,17 @@ def test_headers_that_declare_too_much_are_refused(path):
         assert found(path)["truncated"].repairable is False
 
 
-_LISTS = 12_000
-_HEADER_PEAK = 1_100_000  # bytes; up to 1 MiB of the file is searched for the end of the header
-_UNUSED = {  # other elements, their rows in binary, and their lines in ASCII
-    "empty lists": ([f"element tags {_LISTS}", "property list uchar int a"], bytes(_LISTS), "0\n" * _LISTS),
+LIST, PAIR = "property list uchar int a", ["element tags 2", "property int a", "property int b"]
+HEADER_PEAK = 1_100_000  # bytes; up to 1 MiB of the file is searched for the end of the header
+UNUSED = {  # other elements, their rows in binary, and their lines in ASCII
+    "empty lists": (["element tags 12000", LIST], bytes(12_000), "0\n" * 12_000),
     "lists of two kinds": (
         ["element tags 2", "property list ushort short a", "property int b", "property list char double c"],
         bytes.fromhex("0200 0000 0000 00000000 01 0000000000000000 0000 00000000 00"), "2 0 0 7 1 0.5\n0 7 0\n",
     ),
-    "fixed rows": (["element tags 3", "property int a", "property uchar b"], bytes(15), "1 2\n" * 3),
-    "rows that share a line": (["element tags 3", "property int a", "property uchar b"], bytes(15), "1 2 1 2 1 2\n"),
-    "a blank line": (["element tags 2", "property list uchar int a"], bytes(2), "0\n\n0\n"),
+    "fixed rows": (PAIR, bytes(16), "1 2\n" * 2),
+    "rows that share a line": (PAIR, bytes(16), "1 2 1 2\n"),
+    "a blank line": (["element tags 2", LIST], bytes(2), "0\n\n0\n"),
 }  # fmt: skip
 
 
@@ -687,7 +607,7 @@ def peak_of(read, path):
 @pytest.mark.parametrize("comes_first", [True, False])
 @pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
 def test_other_elements_are_skipped_without_an_object_per_row(path, kind, comes_first):
-    for name, (lines, binary, text) in _UNUSED.items():
+    for name, (lines, binary, text) in UNUSED.items():
         rows = text.encode() if kind == "ascii" else binary
         data = with_element(kind, lines, rows, comes_first=comes_first)
         if kind.endswith("big_endian"):
@@ -695,12 +615,10 @@ def test_other_elements_are_skipped_without_an_object_per_row(path, kind, comes_
             data = data.replace(ROWS.tobytes(), ROWS.byteswap().tobytes()).replace(rows, swapped)
         path.write_bytes(data)
         model, peak = peak_of(read_ply, path) if name == "empty lists" and comes_first else (read_ply(path), 0)
-        assert np.array_equal(model.means[:, 0], ROWS["x"]), name
-        assert np.array_equal(model.scales[:, 2], ROWS["scale_2"]), name
-        assert peak < 8 * len(data) + _HEADER_PEAK, name  # a kept object per row takes 60 to 140 bytes
+        assert_splats_of_rows(model)
+        assert peak < 8 * len(data) + HEADER_PEAK  # a kept object per row takes 60 to 140 bytes
 
 
-LIST, PAIR = "property list uchar int a", ["element tags 2", "property int a", "property int b"]
 BAD_ELEMENTS = {
     f"{lines[-1]}, rows {rows}": (
         with_element("ascii" if lines == PAIR else "binary_little_endian", lines, rows, comes_first=False), message)
@@ -727,17 +645,15 @@ def test_other_elements_that_the_file_does_not_have_are_refused(path):
 def test_lists_of_splats_are_dropped_without_an_object_per_list(path):
     body = b"".join(row.tobytes() + bytes([index]) + bytes(4 * index) for index, row in enumerate(ROWS))
     text = "\n".join(f"{line} {'2 1 1' if row % 2 else '0'}" for row, line in enumerate(lines_of(ROWS)))
-    for data in (
-        header(ROWS, after=[LIST]) + body, text_ply(text, after=[LIST]),
-        text_ply(text.replace("\n", "\n\n"), after=[LIST]),
-    ):  # fmt: skip
+    texts = [text_ply(one, after=[LIST]) for one in (text, text.replace("\n", "\n\n"))]
+    for data in (header(ROWS, after=[LIST]) + body, *texts):
         path.write_bytes(data)
         assert 1 == counts(path)["list-columns"]
-        assert np.array_equal(read_ply(path).scales[:, 2], ROWS["scale_2"])
+        assert_splats_of_rows(read_ply(path))
     short = text_ply(text.replace("2 1 1", "2 1"), after=[LIST])
     assert_refused(path, {"short": (short, "row 1 of vertex has 28 values, which its properties do not match")})
     rows, names = good_rows(130), [f"property list uchar int a{index}" for index in range(100)]
     path.write_bytes(header(rows, after=names) + b"".join(row.tobytes() + bytes(100) for row in rows))
     model, peak = peak_of(read_ply, path)
     assert np.array_equal(model.means[:, 0], rows["x"])
-    assert peak < 8 * path.stat().st_size + _HEADER_PEAK
+    assert peak < 8 * path.stat().st_size + HEADER_PEAK
