@@ -15,11 +15,7 @@ from csplat.encoder import EncodePlan, LevelNode, encode_levels
 from csplat.remote_store import RemoteStore
 
 pytestmark = pytest.mark.remote
-
-
-pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
-
-
+fsspec = pytest.importorskip("fsspec", reason="URLs require the extra [remote]")
 aiohttp = pytest.importorskip("aiohttp", reason="URLs require the extra [remote]")
 
 
@@ -31,6 +27,10 @@ def data(sample_path):
 @pytest.fixture(scope="module")
 def box(data):
     return box_of(data, 2)  # others touch it
+
+
+def assert_part(file, data, box):
+    assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
 
 
 @pytest.fixture
@@ -46,8 +46,7 @@ def web(data, monkeypatch):
 def test_parts_are_read_from_a_web_server(web, data, box):
     with csplat.open(web.url) as file:
         assert [("HEAD", None), ("GET", "bytes=0-65535")] == [(one[0], one[2]) for one in web.asked]
-        chosen = [tile.tile.index for tile in file.tiles(box)]
-        assert_same(decode(data, tiles=chosen), file.read(box))
+        assert_part(file, data, box)
         assert (len(web.asked), web.sent) == (file.requests, file.bytes_read)
         assert_same(decode(data), file.read())
 
@@ -69,23 +68,14 @@ def test_a_coarser_version_is_read_without_the_rest(web, sample_path):
         assert file.bytes_read - before > len(data) / 2
 
 
-#: Answers to the GETs of a read, and the error; none if the data are right in the end.
-FAULTS = [
-    (["short"], ""),
-    (["short", "short", "short"], ""),
-    ([None, "short"], ""),
-    (["until it closes"], ""),
-    ([503], ""),
-    ([429, 503, 502], ""),
-    ([None, 503], ""),
-    (["hang up"], ""),
-    ([None, "hang up", "hang up"], ""),
-    (["half"], ""),
-    ([None, "half", "broken chunk"], ""),
-    (["stall"], ""),
-    ([None, "stall"], ""),
-    ([None, "part as 200"], ""),
-    (["gzip", "gzip"], ""),
+#: Answers to the GETs of a read after which the data are right.
+SURVIVED = [
+    ["short"], ["short", "short", "short"], [None, "short"], ["until it closes"], [503], [429, 503, 502], [None, 503],
+    ["hang up"], [None, "hang up", "hang up"], ["half"], [None, "half", "broken chunk"], ["stall"], [None, "stall"],
+    [None, "part as 200"], ["gzip", "gzip"],
+]  # fmt: skip
+FAULTS = [  # and with the error after others
+    *((faults, "") for faults in SURVIVED),
     ([503] * 9, "HTTP status 503, try again after 0 s; tried 4 times"),
     (["stall"] * 9, "the server sends nothing; tried 4 times"),
     ([None, *["hang up"] * 9], "Server disconnected; tried 4 times"),
@@ -122,8 +112,7 @@ def test_a_connection_without_bytes_is_lost_after_a_while(web):
     with csplat.open(web.url) as file:
         timeout = file._store._fs.client_kwargs["timeout"]
     assert timeout.total is None  # large files take longer than the five minutes of aiohttp
-    assert 0 < timeout.sock_read <= 60
-    assert 0 < timeout.sock_connect <= 60
+    assert 0 < timeout.sock_read <= 60 >= timeout.sock_connect > 0
 
 
 def test_a_server_that_asks_for_a_long_break_is_not_waited_for(web, monkeypatch):
@@ -167,25 +156,20 @@ def test_a_file_that_changes_between_requests_is_an_error(web, data, size):
 
 def test_errors_of_a_server_contain_no_secrets(web):
     address = web.url.replace("://", "://somebody:password@").replace("scene", "other") + "?key=secret"
-    for web.files["/other.csplat?key=secret"], error, message in (
-        (404, FileNotFoundError, "No such file"),
-        (403, PermissionError, "Permission"),
-        (500, StoreError, "status 500"),
-    ):
-        with pytest.raises(error, match=message) as raised:
+    for web.files["/other.csplat?key=secret"], error in (
+        (404, FileNotFoundError), (403, PermissionError), (500, StoreError),
+    ):  # fmt: skip
+        with pytest.raises(error, match=r"other\.csplat") as raised:
             csplat.open(address)
-        assert "other.csplat" in str(raised.value)
         assert not re.search("secret|password", str(raised.value))
 
 
 def test_other_file_systems_of_fsspec_are_used(data, box, tmp_path):
-    import fsspec
-
     (tmp_path / "scene.csplat").write_bytes(data)
     fsspec.filesystem("memory").pipe("/scene.csplat", data)
     for url in ("memory://scene.csplat", f"file://{tmp_path}/scene.csplat"):
         with csplat.open(url) as file:
-            assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
+            assert_part(file, data, box)
 
 
 def test_parts_are_read_from_s3(data, box):
@@ -193,7 +177,7 @@ def test_parts_are_read_from_s3(data, box):
     with s3({"scene.csplat": data}) as storage:
         with csplat.open("s3://scenes/scene.csplat", storage=storage) as file:
             assert 65536 == file.bytes_read
-            assert_same(decode(data, tiles=[tile.tile.index for tile in file.tiles(box)]), file.read(box))
+            assert_part(file, data, box)
             stream = io.BytesIO()
             part = file.extract(box, stream)
             file._store._fs.pipe("scenes/scene.csplat", bytes(reversed(data)))

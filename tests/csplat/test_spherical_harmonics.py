@@ -16,11 +16,7 @@ from csplat_render.conventions import ALPHA_CAP
 
 RNG = np.random.default_rng(4)
 DIRECTIONS = RNG.standard_normal((500, 3))
-
-
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
-
-
 ANY = np.linalg.qr(RNG.standard_normal((3, 3)))[0]
 
 
@@ -56,16 +52,12 @@ def spz_quarter_turn():
     return turn
 
 
-def test_the_basis_follows_the_definition():
+def test_the_basis_follows_the_definition_and_band_4_that_of_gsplat():
     for degree in range(5):
         expected = sh_by_definition(degree, DIRECTIONS)
         np.testing.assert_allclose(evaluate_sh(degree, DIRECTIONS), expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(expected[:, 16:], gsplat_basis(*DIRECTIONS.T), rtol=0, atol=1e-14)
     assert expected.shape[1] == BASIS_SIZE
-
-
-def test_band_4_has_the_order_and_the_signs_of_gsplat():
-    expected = gsplat_basis(*DIRECTIONS.T)
-    np.testing.assert_allclose(evaluate_sh(4, DIRECTIONS)[:, 16:], expected, rtol=0, atol=1e-14)
 
 
 def test_band_4_is_rotated_and_mirrored_as_in_spz():
@@ -82,8 +74,7 @@ def test_the_gradient_is_that_of_the_basis():
         weights = RNG.standard_normal((degree + 1) ** 2)
         for point in DIRECTIONS[:6]:
             gradient = np.array(sh_basis_gradient(degree, *point, weights))
-            across = np.linalg.svd(point[None])[2][1:]  # two directions at right angles to the point
-            for way in across:
+            for way in np.linalg.svd(point[None])[2][1:]:  # two directions at right angles to the point
                 ends = np.stack([point * np.cos(t) + way * np.sin(t) for t in (1e-5, -1e-5)])
                 slope = (evaluate_sh(degree, ends) @ weights) @ [1, -1] / 2e-5
                 assert gradient @ way == pytest.approx(slope, rel=1e-7, abs=1e-8)
@@ -98,48 +89,29 @@ def test_rotations_move_the_colour_of_each_direction():
             np.testing.assert_allclose(after[:, part] @ turn @ sh, before[:, part] @ sh, atol=1e-12)
 
 
-pytest.importorskip("numba", reason="the renderer requires the extra [render]")
-
-
 def stacked(*models):
     arrays = ("means", "quats", "scales", "opacities", "sh0", "shN")
     return SplatModel(**{name: np.concatenate([getattr(one, name) for one in models]) for name in arrays})
 
 
-def test_a_needle_is_rotated():
+def test_renders_have_the_values_of_the_definition():
     half = math.sqrt(0.5)
-    turned = (half, 0.0, 0.0, half)  # 90° about z: x becomes y, which points down
-    picture = render(one_splat(scale=(-1.0, -6.0, -6.0), quat=turned), camera()).alpha
-    assert picture[34, 32] > 0.04
-    assert picture[24, 42] == 0.0
-
-
-def test_alpha_is_capped_and_colours_are_clamped_at_zero():
-    model = replace(one_splat(alpha=1.0, scale=0.0), sh0=np.array([[-10.0, 0.0, 10.0]], np.float32))
-    result = render(model, camera())
+    needle = one_splat(scale=(-1.0, -6.0, -6.0), quat=(half, 0.0, 0.0, half))  # 90° about z: x becomes y: down
+    picture = render(needle, camera()).alpha
+    assert picture[34, 32] > 0.04 > picture[24, 42] == 0.0
+    capped = replace(one_splat(alpha=1.0, scale=0.0), sh0=np.array([[-10.0, 0.0, 10.0]], np.float32))
+    result = render(capped, camera())
     assert result.alpha[24, 32] == pytest.approx(ALPHA_CAP, abs=1e-6)
     assert result.rgb[24, 32] == pytest.approx([0.0, 0.5 * ALPHA_CAP, (0.5 + 10 * SH_C0) * ALPHA_CAP], abs=1e-5)
-
-
-def test_the_background_shines_through():
-    result = render(one_splat(), camera(), background=(0.1, 0.2, 0.3))
-    assert result.rgb[0, 0] == pytest.approx([0.1, 0.2, 0.3])
-    left = 1.0 - result.alpha[24, 32]
-    assert result.rgb[24, 32, 2] == pytest.approx(0.25 * (1 - left) + 0.3 * left, abs=1e-6)
+    stack = stacked(*[one_splat(alpha=0.95, scale=0.0, colour=(1, 1, 1))] * 5)
+    # 0.05⁴ is below 1e-4, the least transmittance: three are drawn.
+    assert render(stack, camera(65, 49)).alpha[24, 32] == pytest.approx(1 - 0.05**3, abs=1e-6)
 
 
 def test_splats_are_drawn_by_depth_then_by_index():
-    red, blue = one_splat(0.9, -1.0, (1, 0, 0), (0, 0, 0.5)), one_splat(0.9, -1.0, (0, 0, 1), (0, 0, -0.5))
-    both = stacked(red, blue)
-    pixel = render(both, camera()).rgb[24, 32]
-    assert pixel[2] > 5 * pixel[0]
+    both = stacked(one_splat(0.9, -1.0, (1, 0, 0), (0, 0, 0.5)), one_splat(0.9, -1.0, (0, 0, 1), (0, 0, -0.5)))
     level = replace(both, means=np.zeros((2, 3), np.float32))
-    pixel = render(level, camera()).rgb[24, 32]
-    assert pixel[0] > 5 * pixel[2]
-
-
-def test_a_pixel_is_finished_before_transmittance_falls_below_the_limit():
-    stack = stacked(*[one_splat(alpha=0.95, scale=0.0, colour=(1, 1, 1))] * 5)
-    alpha = render(stack, camera(65, 49)).alpha[24, 32]
-    # 0.05⁴ is below 1e-4: three are drawn.
-    assert alpha == pytest.approx(1 - 0.05**3, abs=1e-6)
+    red, _, blue = render(both, camera()).rgb[24, 32]
+    assert blue > 5 * red
+    red, _, blue = render(level, camera()).rgb[24, 32]
+    assert red > 5 * blue
