@@ -8,11 +8,7 @@ from csplat import _spec
 from csplat.decoder import Limits, decode, iter_tiles
 from csplat.errors import FormatError, LimitError
 from csplat_authoring.builder import build
-from csplat_authoring.samples import (
-    rich_scene,
-    rows_of,
-    scene,
-)
+from csplat_authoring.samples import rich_scene, rows_of, scene
 from csplat_authoring.scene import Codebook
 
 RICH = build(rich_scene()).data

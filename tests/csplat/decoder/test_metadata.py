@@ -7,14 +7,7 @@ from damage_cases import stated
 from tables import failures
 
 from csplat import _spec
-from csplat.decoder import (
-    decode,
-    decode_scene,
-    read_cameras,
-    read_declared_bounds,
-    read_metadata,
-    read_options,
-)
+from csplat.decoder import decode, decode_scene, read_cameras, read_declared_bounds, read_metadata, read_options
 from csplat.decoder.metadata import parse_json
 from csplat.errors import FormatError
 from csplat_authoring.builder import build
