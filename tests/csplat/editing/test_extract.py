@@ -1,12 +1,13 @@
 """Editing without decoding: parts of a file as files of their own, and several files as one."""
 
-import io
 import math
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from checked import cloud
+from damage_cases import flipped
 from editing_cases import STEPS, box_of, extract, merge
 from tables import failures
 
@@ -63,18 +64,16 @@ def test_a_part_keeps_the_metadata_but_no_declared_errors(data):
     assert part == extract(part, ALL)[1]
 
 
-COPIED = [
-    "rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed", "codebook_sh_1_4_escape",
-]  # fmt: skip
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [*COPIED, "empty"])
+@pytest.mark.parametrize("name", [
+    "rich", "combined_codebooks", "combined_tiles", "ancillary_extras", "chunks_reversed", "codebook_sh_1_4_escape",
+    "empty",
+])  # fmt: skip
 def test_a_part_of_all_tiles_and_two_merged_copies_of_a_vector_decode_to_the_same(name):
     path = VECTORS / f"{name}.csplat"
     whole = decode(path)
     if name != "empty":
-        _, part = extract(path.read_bytes(), (-1e300, -1e300, -1e300, 1e300, 1e300, 1e300))
+        _, part = extract(path.read_bytes(), [-1e300] * 3 + [1e300] * 3)
         assert () == validate(part).violations
         assert_joined([whole], decode(part))
         assert whole.extra.keys() == decode(part).extra.keys()
@@ -84,43 +83,24 @@ def test_a_part_of_all_tiles_and_two_merged_copies_of_a_vector_decode_to_the_sam
     assert_joined([whole] * 2, decode(twice))
 
 
-def _scene(**changes):
-    rng = np.random.default_rng(5)
-    means = rng.normal(size=(300, 3)).astype(np.float32) * 10
-    model = csplat.SplatModel(
-        means=means,
-        quats=np.tile(np.float32([1, 0, 0, 0]), (300, 1)),
-        scales=np.full((300, 3), -4, np.float32),
-        opacities=np.full(300, 0.5, np.float32),
-        sh0=np.zeros((300, 3), np.float32),
-        shN=np.zeros((300, 0, 3), np.float32),
-    )
-    return replace(model, **{key: change(means) if callable(change) else change for key, change in changes.items()})
-
-
-def _far(means):
-    means[7] = (3e7, -2e6, 1e5)
-    return means
-
-
+MEANS = np.random.default_rng(5).normal(size=(300, 3)).astype(np.float32) * 10
 SCENES = {
-    "ordinary": {},
-    "far from the origin": {"origin": (500_000.1, -4_649_776.3, 1e12)},
-    "an outlier": {"means": _far},
-    "huge": {"means": lambda means: means * np.float32(3e36)},
-    "subnormal": {"means": lambda means: means * np.float32(1e-41)},
-    "around zero": {"means": lambda means: np.where(np.abs(means) < 9, 0, means) * np.float32(-1)},
+    "ordinary": cloud(MEANS),
+    "far from the origin": cloud(MEANS, origin=(500_000.1, -4_649_776.3, 1e12)),
+    "an outlier": cloud([*MEANS, (3e7, -2e6, 1e5)]),
+    "huge": cloud(MEANS * np.float32(3e36)),
+    "subnormal": cloud(MEANS * np.float32(1e-41)),
+    "around zero": cloud(np.where(np.abs(MEANS) < 9, 0, MEANS) * np.float32(-1)),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SCENES)
 def test_a_box_that_touches_a_decoded_centre_returns_its_splat(name):
-    data = encode(_scene(**SCENES[name]), EncodeOptions(tile_splats=64))
+    data = encode(SCENES[name], EncodeOptions(tile_splats=64))
     means = decode(data).means.astype(np.float64)
     header = read_header(data)
     ends = np.cumsum([tile.splat_count for tile in header.tiles])
-    wrong = []
     with csplat.open(data) as file:
         for tile, (low, high) in enumerate(file.boxes):
             own = means[ends[tile] - header.tiles[tile].splat_count : ends[tile]]
@@ -131,17 +111,12 @@ def test_a_box_that_touches_a_decoded_centre_returns_its_splat(name):
                 tile = int(np.searchsorted(ends, row, side="right"))
                 box = [-math.inf] * 3 + [math.inf] * 3
                 box[axis], box[axis + 3] = means[row, axis], end  # corners in any order
-                found = [
-                    [one.tile.index for one in file.tiles(box)],
-                    file.cut(box=box),
-                    list(extract(data, box)[0].tiles),
-                    file.cut(box=[*means[row], *means[row]]),
-                ]
-                wrong += [(axis, end, tiles) for tiles in found if tile not in tiles]
+                found = [one.tile.index for one in file.tiles(box)]
+                for tiles in (found, file.cut(box=box), extract(data, box)[0].tiles, file.cut(box=[*means[row]] * 2)):
+                    assert tile in tiles, (axis, end)
                 box[axis] = math.nextafter(means[row, axis], end)
                 with pytest.raises(InputError, match="no tile touches the box"):
                     file.cut(box=box)
-    assert [] == wrong
 
 
 def test_a_box_that_nothing_touches_is_refused(data):
@@ -163,23 +138,19 @@ def assert_joined(parts, whole):
 @pytest.fixture(scope="module")
 def halves(sample):
     """Encode two files with the same steps and separate codebooks of SH and of shapes."""
-    order = np.argsort(sample.means[:, 0])
     options = EncodeOptions(
         preset="fast", sh_coding="codebook", codebook_size=64, escape_fraction=0.05, shape_codebook_size=64,
         shape_escape_fraction=0.05, tile_splats=170, keep_extra=True, **STEPS,
     )  # fmt: skip
-    ids = np.arange(len(sample), dtype=np.uint32)
-    model = replace(sample, extra={"id": ids})
-    return [encode(model.select(half), options) for half in np.array_split(order, 2)]
+    model = replace(sample, extra={"id": np.arange(len(sample), dtype=np.uint32)})
+    return [encode(model.select(half), options) for half in np.array_split(np.argsort(sample.means[:, 0]), 2)]
 
 
 @pytest.mark.slow
 def test_copied_bytes_are_checked(data, halves):
     def damaged(file):
         record = read_header(file).tiles[0].layers[0]
-        changed = bytearray(file)
-        changed[record.offset + record.size - 1] ^= 1
-        return bytes(changed)
+        return flipped(file, 8 * (record.offset + record.size - 1))
 
     with pytest.raises(FormatError, match="E_CRC"):
         extract(damaged(data), ALL)
@@ -207,14 +178,9 @@ def test_files_of_the_same_steps_are_copied_with_the_codebooks_of_each(sample, h
 
 @pytest.mark.slow
 def test_parts_of_a_file_share_their_codebooks_again(sample):
-    sample = sample.select(slice(0, 1000))
     whole = encode(sample, EncodeOptions(preset="balanced", tile_splats=120))
     middle = float(np.median(sample.means[:, 0]))
-    parts = []
-    for box in ((-1e3, -1e3, -1e3, middle, 1e3, 1e3), (middle, -1e3, -1e3, 1e3, 1e3, 1e3)):
-        stream = io.BytesIO()
-        csplat.extract(whole, box, stream)
-        parts.append(stream.getvalue())
+    parts = [extract(whole, box)[1] for box in ((*ALL[:3], middle, *ALL[4:]), (middle, *ALL[1:]))]
     done, data = merge(*parts)
     assert not done.why
     assert read_header(whole).codebooks == read_header(data).codebooks != ()
@@ -232,14 +198,12 @@ def check_references(path):
     header = read_header(data)
     found = set()
     for tile in header.tiles:
-        here = set()
         for layer in tile.layers.values():
             if layer.layer <= _spec.SH_DEGREE_MAX:
                 for at, id in codebook_references(memoryview(data), header, layer):
                     assert id == int.from_bytes(data[at : at + 2], "little")
-                    here.add(id)
-        assert here <= set(tile.codebook_ids)
-        found |= here
+                    assert id in tile.codebook_ids
+                    found.add(id)
     # If a stream is skipped wrongly, its end is not the end of the chunk: E_STREAM.
     if "codebook" in path.stem and header.codebooks:
         assert found
@@ -255,14 +219,11 @@ def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
     header = read_header(data)
     assert ("RDF", 2.0) == (header.coordinate_system, header.unit_metres)
     assert {"licence": "CC0-1.0"} == read_metadata(data)
-    assert (
-        "file 1 without axes: RDF is assumed, as the other files have",
-        "file 1 without a unit: 2 m is assumed, as the other files have",
-        "metadata left out, because not all files have the same: only, up",
-    ) == tuple(one.removesuffix(", cameras") for one in done.notes)
+    starts = ("file 1 without axes: RDF is", "file 1 without a unit: 2 m is", "metadata left out, ")
+    assert all(note.startswith(start) for note, start in zip(done.notes, starts, strict=True))
+    assert "only, up" in done.notes[2]
 
 
-# Re-encoded scenes.
 @pytest.mark.slow
 @pytest.mark.parametrize(("degree", "fields", "options", "reason"), [
     (1, {}, {"scale_step": 0.1}, "different steps of scales"),
@@ -271,11 +232,9 @@ def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
     (1, {"extra": {"id": np.arange(50, dtype=np.int32)}}, {}, "different extra columns"),
 ])  # fmt: skip
 def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, degree, fields, options, reason):
-    first, second = make_model(40, 1), make_model(50, degree, **fields)
-    files = [
-        encode(first, EncodeOptions(preset="fast", keep_extra=True, **STEPS)),
-        encode(second, EncodeOptions(preset="fast", keep_extra=True, **{**STEPS, **options})),
-    ]
+    common = {"preset": "fast", "keep_extra": True, **STEPS}
+    first = encode(make_model(40, 1), EncodeOptions(**common))
+    files = [first, encode(make_model(50, degree, **fields), EncodeOptions(**common | options))]
     done, data = merge(*files, options=EncodeOptions(preset="small", position_step=1e-4))
     assert reason in done.why
     assert () == validate(data).violations
@@ -286,8 +245,7 @@ def test_files_that_cannot_be_copied_are_re_encoded_with_a_reason(make_model, de
     wanted = np.concatenate([one.means.astype(np.float64) + one.origin for one in sources])
     found = model.means.astype(np.float64) + model.origin
     distance = np.linalg.norm(wanted[:, None] - found, axis=2)
-    assert distance.min(axis=1).max() < 1e-3
-    assert distance.min(axis=0).max() < 1e-3
+    assert max(distance.min(axis=1).max(), distance.min(axis=0).max()) < 1e-3
 
 
 @pytest.mark.slow
@@ -296,10 +254,9 @@ def test_scenes_that_contradict_each_other_or_have_no_partner_are_refused(make_m
         fields, message = case
         for name, its in zip("ab", fields, strict=True):
             (tmp_path / name).write_bytes(encode(make_model(5, 0, **its), EncodeOptions(preset="fast", **STEPS)))
-        with pytest.raises(InputError, match=message):
-            csplat.merge([tmp_path / "a", tmp_path / "b"], tmp_path / "out.csplat")
-        with pytest.raises(InputError, match="cannot be merged"):
-            csplat.merge([tmp_path / "b", tmp_path / "b", tmp_path / "a"], tmp_path / "out.csplat")
+        for files, expected in (("ab", message), ("bba", "cannot be merged")):
+            with pytest.raises(InputError, match=expected):
+                csplat.merge([tmp_path / one for one in files], tmp_path / "out.csplat")
 
     assert [] == failures({case[1]: case for case in CONTRADICTIONS}, check)
     for files in ("scene.csplat", [], ["scene.csplat"], b"x"):
