@@ -42,16 +42,10 @@ def test_a_file_of_many_buckets_is_valid_with_declared_errors(model, whole):
     assert 7 <= result.report.tile_count <= 12
 
 
-@pytest.fixture(scope="module")
-def with_levels(model, tmp_path_factory):
-    """The file of the scene with levels of detail."""
-    path = tmp_path_factory.mktemp("levels") / "out.csplat"
-    encode_large(source_from_model(model), path, FAST, levels=EveryFourth())
-    return path.read_bytes()
-
-
 @pytest.mark.slow
-def test_each_bucket_is_a_subtree_of_the_levels(whole, with_levels):
+def test_each_bucket_is_a_subtree_of_the_levels(model, whole, tmp_path):
+    encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, levels=EveryFourth())
+    with_levels = (tmp_path / "out.csplat").read_bytes()
     assert validate(with_levels).conforms
     with csplat_open(with_levels) as file:
         counts = [sum(node.splat_count for node in file.nodes if node.level == level) for level in range(3)]
@@ -68,8 +62,7 @@ def test_an_out_of_core_encoding_is_resumed_with_more_memory(model, whole, tmp_p
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
         encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding", after=2))
-    stages = []
-    resume = OutOfCoreOptions(resume=True)
+    stages, resume = [], OutOfCoreOptions(resume=True)
     encode_scene(source_from_model(model), target, FAST, resume, progress=lambda stage, _done: stages.append(stage))
     assert "coding" in stages
     assert "sorting" not in stages
@@ -91,10 +84,11 @@ def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
         cost = estimate_cost(scene, options, limits)
     assert (COUNT, 1, False) == (cost.splats, cost.sh_degree, cost.in_memory)
     assert 0 < cost.memory_bytes <= 300e6
-    stages = []
-    note = lambda stage, _done: stages.append(stage)  # noqa: E731
-    encoded = encode_file(str(ply), str(target), options, out_of_core=limits, progress=note)
-    assert {"sorting", "coding"} <= set(stages)
+    stages = set()
+    encoded = encode_file(
+        str(ply), str(target), options, out_of_core=limits, progress=lambda stage, _done: stages.add(stage)
+    )
+    assert {"sorting", "coding"} <= stages
     assert encoded.report.size_bytes == target.stat().st_size
     with open_scene(ply) as scene:
         assert encode(scene.model(), options) == target.read_bytes()
