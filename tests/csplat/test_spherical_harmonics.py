@@ -36,37 +36,12 @@ def gsplat_basis(x, y, z):
     return np.stack([*first, pSH20, fTmp0D * x, fTmp1C * fC1, fTmp2B * fC2, 0.6258357354491763 * fC3], axis=1)
 
 
-def spz_quarter_turn():
-    """Return the matrix of band 4 in `kAnalyticRotatePlusPiHalfAboutXTable` of SPZ's splat-types.h."""
-    s2, s5, s7, s14, s35 = np.sqrt([2.0, 5.0, 7.0, 14.0, 35.0])
-    turn = np.zeros((9, 9))
-    turn[0, [5, 7]] = -s14 / 4, s2 / 4
-    turn[1, [1, 3]] = -0.75, s7 / 4
-    turn[2, [5, 7]] = -s2 / 4, -s14 / 4
-    turn[3, [1, 3]] = s7 / 4, 0.75
-    turn[4, [4, 6, 8]] = 3 / 8, s5 / 4, s35 / 8
-    turn[5, [0, 2]] = s14 / 4, s2 / 4
-    turn[6, [4, 6, 8]] = s5 / 4, 0.5, -s7 / 4
-    turn[7, [0, 2]] = -s2 / 4, s14 / 4
-    turn[8, [4, 6, 8]] = s35 / 8, -s7 / 4, 0.125
-    return turn
-
-
 def test_the_basis_follows_the_definition_and_band_4_that_of_gsplat():
     for degree in range(5):
         expected = sh_by_definition(degree, DIRECTIONS)
         np.testing.assert_allclose(evaluate_sh(degree, DIRECTIONS), expected, rtol=0, atol=1e-14)
     np.testing.assert_allclose(expected[:, 16:], gsplat_basis(*DIRECTIONS.T), rtol=0, atol=1e-14)
     assert expected.shape[1] == BASIS_SIZE
-
-
-def test_band_4_is_rotated_and_mirrored_as_in_spz():
-    quarter = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # y, z become -z, y
-    np.testing.assert_allclose(sh_rotations(4, quarter)[3], spz_quarter_turn(), rtol=0, atol=1e-14)
-    x, y, z = signs = np.array([-1.0, 1.0, -1.0])
-    # `coordinateConverter` has these signs, except that it negates the last function with y, which contains y⁴ and y².
-    expected = [x * y, y * z, x * y, y * z, 1, x * z, 1, x * z, 1]
-    np.testing.assert_array_equal(sh_rotations(4, np.diag(signs))[3], np.diag(expected))
 
 
 def test_the_gradient_is_that_of_the_basis():

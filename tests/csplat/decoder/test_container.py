@@ -176,15 +176,12 @@ def test_coded_bytes_of_another_size_or_coder_are_refused(fields, clause):
         read(**fields)
 
 
-def test_inflating_stops_at_the_announced_size():
+def test_inflating_stops_at_the_announced_size_and_a_text_at_the_budget():
     bomb = deflate(bytes(20_000_000))
     tracemalloc.start()
     with pytest.raises(FormatError, match="more than 4 bytes"):
         read(bomb, coder=DEFLATE)
     assert tracemalloc.get_traced_memory()[1] < 5_000_000
     tracemalloc.stop()
-
-
-def test_a_text_beyond_the_budget_is_refused():
     with pytest.raises(LimitError, match=r"E_LIMIT at byte 12 \(STR-8\)"):
         read(count=2**32 - 1, packed=2**32 - 1, expected=None, json_bytes=80)

@@ -139,15 +139,18 @@ def test_morton_codes_of_any_width_and_the_largest_corners_and_axes_are_decoded(
     assert_decodes(scene(0, (tile(1, 2, 0, {_spec.ATTRIBUTE_MEANS: axis(rows, Stream(3))}, corner=corner),)))
 
 
-def test_the_model_passes_its_own_constructor():
+def test_the_model_passes_its_own_constructor_and_checks_are_reported():
     model = decode(RICH)
     SplatModel(**vars(model))
     assert {"title": "rich"} == model.metadata
     assert [5, 0, 65535, 1, 2] == model.extra["label"].tolist()
     assert np.dtype("<u2") == model.extra["label"].dtype
+    assert "all_chunk_crcs" in decode_scene(RICH).checks
+    assert "all_chunk_crcs" not in decode_scene(RICH, tiles=[0]).checks
+    assert 0.25 == decode_scene(RICH).declared_bounds.records[0].rms
 
 
-def test_any_buffer_path_or_stream_is_decoded(tmp_path):
+def test_any_buffer_path_or_stream_is_decoded_with_valid_arguments(tmp_path):
     path = tmp_path / "scene.csplat"
     path.write_bytes(RICH)
     full = decode(RICH)
@@ -158,12 +161,15 @@ def test_any_buffer_path_or_stream_is_decoded(tmp_path):
     for data in (5, None, memoryview(RICH)[::2], io.StringIO("text")):
         with pytest.raises(InputError):
             decode(data)
+    for arguments in ({"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 5}, {"sh_degree": -1}, {"threads": 0}):
+        with pytest.raises(InputError):
+            decode(RICH, **arguments)
 
 
 @pytest.mark.slow
 def test_parts_equal_the_same_parts_of_the_whole():
-    full, header, whole = decode(RICH), read_header(RICH), decode_integers(RICH)
-    places = [range(one.start, one.start + one.splat_count) for one in header.tiles]
+    full, whole = decode(RICH), decode_integers(RICH)
+    places = [range(one.start, one.start + one.splat_count) for one in read_header(RICH).tiles]
     for tiles, degree in itertools.product(([0], [1], [1, 0], []), (0, 1, 2, 3)):
         rows = [row for one in tiles for row in places[one]]
         part = decode(RICH, tiles=tiles, sh_degree=degree)
@@ -175,21 +181,8 @@ def test_parts_equal_the_same_parts_of_the_whole():
         assert whole["exponents"][tiles, : integers["exponents"].shape[1]].tolist() == integers["exponents"].tolist()
     for threads in (1, 2, 7):
         assert_same(full, decode(RICH, threads=threads))
-
-
-def test_tiles_are_decoded_one_by_one():
-    # CNF-4
-    full = decode(RICH)
-    found = list(iter_tiles(RICH))
-    assert [0, 1] == [one.tile.index for one in found]
-    for one in found:
-        assert_same(full, one, slice(one.tile.start, one.tile.start + one.tile.splat_count))
-
-
-def test_a_decode_reports_its_checks():
-    assert "all_chunk_crcs" in decode_scene(RICH).checks
-    assert "all_chunk_crcs" not in decode_scene(RICH, tiles=[0]).checks
-    assert 0.25 == decode_scene(RICH).declared_bounds.records[0].rms
+    for place, one in zip(places, iter_tiles(RICH), strict=True):  # CNF-4
+        assert_same(full, one, place)
 
 
 def test_a_damaged_layer_fails_only_when_read():
@@ -224,12 +217,6 @@ def test_an_unknown_chunk_is_skipped_and_its_crc_checked():
     decode(data, tiles=[0])
 
 
-def test_invalid_arguments_are_refused():
-    for arguments in ({"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 5}, {"sh_degree": -1}, {"threads": 0}):
-        with pytest.raises(InputError):
-            decode(RICH, **arguments)
-
-
 def refusal(data, **arguments) -> CsplatError:
     with pytest.raises((FormatError, UnsupportedError, LimitError)) as caught:
         decode(data, **arguments)
@@ -239,18 +226,18 @@ def refusal(data, **arguments) -> CsplatError:
     return error
 
 
-def test_every_prefix_is_refused_as_truncated():
+def test_prefixes_and_trailing_bytes_are_refused():
     # CNF-3
     for data in (SMALL, RICH):
         assert {"E_TRUNCATED"} == {refusal(data[:size], threads=1).code for size in range(len(data))}
     assert "E_MAGIC" == refusal(b"ply\n").code
-
-
-def test_every_prefix_with_its_size_and_checksums_repaired_is_refused():
-    for size in range(_spec.HEADER_SIZE, len(SMALL)):
+    for size in range(_spec.HEADER_SIZE, len(SMALL)):  # also with its size and checksums repaired
         cut = bytearray(SMALL[:size])
         cut[20:28] = size.to_bytes(8, "little")
         refusal(repair(bytes(cut)), threads=1)
+    for extra in (b"\0", b"\n", SMALL):
+        error = refusal(SMALL + extra)
+        assert ("E_TRAILING", len(SMALL)) == (error.code, error.offset)
 
 
 @pytest.mark.slow
@@ -271,12 +258,6 @@ def test_flipped_bits_with_all_checksums_repaired_are_refused_or_decoded():
     for bit in range(0, 8 * len(SMALL), 7):
         with suppress(CsplatError):
             assert 2 == len(decode(repair(flipped(SMALL, bit), records), threads=1))
-
-
-def test_trailing_bytes_are_refused():
-    for extra in (b"\0", b"\n", SMALL):
-        error = refusal(SMALL + extra)
-        assert ("E_TRAILING", len(SMALL)) == (error.code, error.offset)
 
 
 def test_errors_of_version_and_crc_name_the_stored_and_expected_values():

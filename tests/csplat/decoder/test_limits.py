@@ -28,11 +28,8 @@ def test_limits_are_enforced():
 
 def test_the_budget_includes_codebooks():
     sh, every = _spec.CODEBOOK_KIND_SH, {1: 9, 2: 15, 3: 21, 4: 27}
-    for kind, bands, columns in (
-        (_spec.CODEBOOK_KIND_SHAPE, (0, 0), {0: 6}),
-        (sh, (1, 4), every),
-        (sh, (2, 2), {2: 15}),
-    ):
+    shape = _spec.CODEBOOK_KIND_SHAPE
+    for kind, bands, columns in ((shape, (0, 0), {0: 6}), (sh, (1, 4), every), (sh, (2, 2), {2: 15})):
         entries = {layer: [[0] * c] * 7 for layer, c in columns.items()}
         data = build(replace(scene(4), codebooks=(Codebook(4, kind, entries, bands),))).data
         limit = 2 * 4 * (3 + 4 + 3 + 1 + 3 * 25) + 4 * 7 * sum(columns.values())
@@ -43,8 +40,7 @@ def test_the_budget_includes_codebooks():
 
 def test_unused_codebooks_are_checked_and_counted():
     entries = {1: rows_of(1, 40, 9, -60, 60)}
-    described = replace(scene(1), codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),))
-    built = build(described)
+    built = build(replace(scene(1), codebooks=(Codebook(4, _spec.CODEBOOK_KIND_SH, entries, (1, 1)),)))
     assert 2 == len(decode(built.data))
     with pytest.raises(LimitError):
         decode(built.data, limits=Limits(bytes=1600))

@@ -41,7 +41,7 @@ def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
     assert 2 in part.tiles
     assert 1 <= len(part.tiles) < len(header.tiles)
     whole, found = decode(data, tiles=part.tiles), decode(cut)
-    assert part.splat_count == len(found) == len(whole)
+    assert part.splat_count == len(found)
     assert_joined([whole], found)
     for index, tile in enumerate(header.tiles):
         least, most = box_of(tile, header)
@@ -120,10 +120,12 @@ def test_a_box_that_touches_a_decoded_centre_returns_its_splat(name):
 
 
 def test_a_box_that_nothing_touches_is_refused(data):
-    with pytest.raises(InputError, match="no tile touches the box 1000, 1000, 1000"):
-        extract(data, (1000, 1000, 1000, 1001, 1001, 1001))
-    with pytest.raises(InputError, match="six numbers other than NaN"):
-        extract(data, (0, 0, 0, 1, 1, math.nan))
+    for box, message in (
+        ([1000] * 6, "no tile touches the box 1000, 1000"),
+        ([0, 0, 0, 1, 1, math.nan], "six numbers"),
+    ):
+        with pytest.raises(InputError, match=message):
+            extract(data, box)
 
 
 def assert_joined(parts, whole):

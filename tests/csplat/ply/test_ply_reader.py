@@ -73,12 +73,9 @@ def test_reads_every_degree_and_encoding(tmp_path, degree, normals, kind):
     assert (0, degree) == (len(empty := read_ply(path, strict=True)), empty.sh_degree)
 
 
-def test_reads_more_rows_than_one_block(tmp_path):
+def test_reads_more_rows_than_one_block_and_columns_by_name_in_any_order(tmp_path):
     names, rows = written(tmp_path / "a.ply", 3, 10_000)
     assert_holds(read_ply(tmp_path / "a.ply"), names, rows)
-
-
-def test_reads_columns_by_name_in_any_order(tmp_path):
     names = columns_of(2)
     rows = random_rows(names)
     order, report = np.random.default_rng(5).permutation(len(names)), []

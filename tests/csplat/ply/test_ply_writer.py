@@ -33,7 +33,7 @@ def test_writes_the_columns_and_order_that_viewers_expect(tmp_path, make_model):
     assert not rows[:, 3:6].any()  # normals
 
 
-def test_metadata_survive_a_ply(tmp_path, make_model):
+def test_metadata_survive_a_ply_and_comments_of_other_programs_are_read(tmp_path, make_model):
     model = make_model(4, origin=(4.5e6, -1.25, 0.1), coordinate_system="RUB", unit_metres=0.01, antialiased=True,
         flat=True, metadata={"licence": "CC0-1.0", "comments": ["hello"]})  # fmt: skip
     write_ply(tmp_path / "a.ply", model)
@@ -42,9 +42,6 @@ def test_metadata_survive_a_ply(tmp_path, make_model):
         assert getattr(model, name) == getattr(again, name)
     assert_same_scene(model, again)
     assert {"comment SplatRenderMode: mip", "comment SplatRenderMode: 2dgs"} < set(header_of(tmp_path / "a.ply"))
-
-
-def test_antialiasing_comments_of_other_programs_are_read(tmp_path, make_model):
     write_ply(tmp_path / "a.ply", make_model(2, 0, antialiased=True))
     for message, antialiased, flat in (
         (b"antialiased 1", True, False), (b"antialiased 0", False, False), (b"csplat antialiased", True, False),
@@ -95,13 +92,10 @@ def test_writing_follows_a_symbolic_link_and_leaves_a_device(tmp_path, make_mode
     assert Path("/dev/null").is_char_device()
 
 
-def test_invalid_names_of_extra_columns_are_refused(tmp_path, make_model):
+def test_names_of_extra_columns_and_comments_cannot_break_the_header(tmp_path, make_model):
     for name in ("x", "opacity", "f_rest_0", "two words", "ü", ""):
         with pytest.raises(InputError, match="extra column"):
             write_ply(tmp_path / "a.ply", make_model(extra={name: np.arange(10.0)}))
-
-
-def test_comments_cannot_break_the_header(tmp_path, make_model):
     metadata = {"comments": ["one\nend_header", "naïve", 5], "licence": "a\nb"}
     write_ply(tmp_path / "a.ply", make_model(metadata=metadata))
     kept = {"comments": ["one", "end_header", "na?ve"], "licence": "a b"}
