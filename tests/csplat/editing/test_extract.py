@@ -86,6 +86,7 @@ def test_a_part_of_all_tiles_and_two_merged_copies_of_a_vector_decode_to_the_sam
 MEANS = np.random.default_rng(5).normal(size=(300, 3)).astype(np.float32) * 10
 SCENES = {
     "ordinary": cloud(MEANS),
+    "on a grid": cloud(np.round(MEANS)),
     "far from the origin": cloud(MEANS, origin=(500_000.1, -4_649_776.3, 1e12)),
     "an outlier": cloud([*MEANS, (3e7, -2e6, 1e5)]),
     "huge": cloud(MEANS * np.float32(3e36)),
