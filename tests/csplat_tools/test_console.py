@@ -54,17 +54,14 @@ def test_without_a_terminal_a_line_is_printed_every_ten_seconds(clock, capsys):
     display.report("encoding", 1.0)
     display.report("preparing the renderer", 0.0)  # without reports until it ends
     seen = lines(display, clock, capsys, 30)
-    assert 3 == len(seen)
-    assert "%" not in seen[-1]
+    assert (3, False) == (len(seen), "%" in seen[-1])
 
 
 def test_a_restarted_stage_estimates_its_own_time_left(clock, capsys):
     display = Display(terminal=False, clock=clock)
-    display.report("tiles", 0.9)
-    clock.now += 1000.0
-    display.report("tiles", 0.1)
-    clock.now += 20.0
-    display.report("tiles", 0.5)
+    for share, seconds in ((0.9, 1000.0), (0.1, 20.0), (0.5, 0.0)):
+        display.report("tiles", share)
+        clock.now += seconds
     display.tick()
     assert "50 %, about 20 s left" in capsys.readouterr().err
 
@@ -85,25 +82,16 @@ def test_long_runs_announce_their_time(clock, capsys):
         assert announced == ("2 to 5 minutes" in capsys.readouterr().err)
 
 
-def test_a_terminal_shows_bars_after_two_seconds(clock, monkeypatch):
+def test_a_terminal_shows_bars_after_two_seconds_and_removes_them_before_other_output(clock, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stderr", Terminal())
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("TERM", "xterm")
-    display = Display(terminal=True, clock=clock)
-    display.report("tiles", 0.25)
-    for seconds, shown in ((1.9, False), (1.1, True)):
-        clock.now += seconds
-        display.tick()
-        assert shown == ("25 %, about 9 s left" in sys.stderr.getvalue())
-    display.close()
-
-
-def test_bars_are_removed_before_other_output(clock, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "stderr", Terminal())
-    monkeypatch.setenv("TERM", "xterm")
     with displayed(Display(terminal=True, clock=clock)) as display:
-        clock.now += 5.0
-        display.tick()
+        display.report("tiles", 0.25)
+        for seconds, shown in ((1.9, False), (1.1, True)):
+            clock.now += seconds
+            display.tick()
+            assert shown == ("25 %, about 9 s left" in sys.stderr.getvalue())
         assert display._bars is not None
         print_data("data")
         assert display._bars is None
@@ -117,14 +105,12 @@ def test_quiet_and_nested_displays_show_nothing():
     with progress_bar(quiet=True) as progress:
         assert progress is None
     with progress_bar() as outer, progress_bar() as inner, progress_bar(quiet=True) as silent:
-        assert outer == inner
-        assert silent is None
+        assert (outer, None) == (inner, silent)
     with progress_bar() as later:
         assert later not in (None, outer)  # the first display went with its work
 
 
 def test_durations_are_short():
     assert ["0 s", "99 s", "2 minutes"] == [format_seconds(seconds) for seconds in (0.2, 99.4, 110.0)]
-    assert ["20 to 50 s", "1 to 2 minutes", "2 to 5 minutes"] == [
-        format_range(*between) for between in ((20.0, 50.0), (30.0, 110.0), (120.0, 290.0))
-    ]
+    ranges = {(20.0, 50.0): "20 to 50 s", (30.0, 110.0): "1 to 2 minutes", (120.0, 290.0): "2 to 5 minutes"}
+    assert ranges == {between: format_range(*between) for between in ranges}

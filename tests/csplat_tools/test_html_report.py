@@ -17,26 +17,13 @@ from csplat_tools.inspect.file_description import describe_file
 from csplat_tools.views import comparison_cameras, display_cameras, find_view_set
 from csplat_tools.views.view_sets import ViewSet
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-
-
-pytest.importorskip("scipy", reason="data sets need scipy: pip install 'csplat[render]'")
-
-
-pytest.importorskip("PIL.Image", reason="pictures need pillow: pip install 'csplat[render]'")
-
-
-pytest.importorskip("matplotlib", reason="plots require the extra [render]")
-
-
 pytestmark = pytest.mark.usefixtures("small_views")
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A scene and its file."""
-    folder = tmp_path_factory.mktemp("files")
-    scene = shell(8)
+    """A file and its scene."""
+    folder, scene = tmp_path_factory.mktemp("files"), shell(8)
     write_ply(folder / "scene.ply", scene)
     (folder / "a & b.csplat").write_bytes(encode(scene, EncodeOptions(preset="small")))
     return folder / "a & b.csplat", folder / "scene.ply"
@@ -51,39 +38,32 @@ def page(files):
 
 
 @pytest.mark.slow
-def test_the_page_agrees_with_the_text(files, page):
-    text = html.unescape(page.read_text())
-    facts = describe_file(files[0].read_bytes())
+def test_the_page_agrees_with_the_text_and_shows_source_and_file_without_external_references(files, page):
+    raw, facts, cell = page.read_text(), describe_file(files[0].read_bytes()), r"</td><td[^>]*>[^<]+</td>"
+    text = html.unescape(raw)
     assert "<h1>a & b.csplat: content</h1>" in text
-    assert "a & b" not in page.read_text()  # names are escaped
+    assert "a & b" not in raw  # names are escaped
     for name, one in facts.attributes.items():
-        assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td><td[^>]*>{one.size_bytes:,}</td>", text)
+        assert re.search(rf"<td[^>]*>{name}{cell}<td[^>]*>{one.size_bytes:,}</td>", text)
     for record in facts.declared_bounds.records:
-        assert re.search(
-            rf"{record.measure}</td><td[^>]*>[^<]+</td><td>{record.max:.4g}</td><td>{record.rms:.4g}<", text
-        )
+        assert re.search(rf"{record.measure}{cell}<td>{record.max:.4g}</td><td>{record.rms:.4g}<", text)
     for name in facts.layers:
-        assert re.search(rf"<td[^>]*>{name}</td><td[^>]*>[^<]+</td>", text)
-
-
-@pytest.mark.slow
-def test_the_page_shows_source_and_file_without_external_references(files, page):
-    text = page.read_text()
-    assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', text))
+        assert re.search(rf"<td[^>]*>{name}{cell}", text)
+    assert 4 == len(re.findall(r'<img src="data:image/webp;base64,', raw))
     compared = call("compare", files[1], files[0]).stdout
-    assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: similarity", text)[1]
-    assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", text))
-    assert all(link.startswith("data:image/webp") for link in re.findall(r'(?:src|href)="([^"]*)"', text))
-    assert "default-src 'none'" in text
+    assert re.search(r"^psnr +(\S+) dB", compared, re.MULTILINE)[1] == re.search(r"([\d.]+) dB: similarity", raw)[1]
+    assert {"http://www.w3.org/2000/svg"} == set(re.findall(r"[a-z]+://[^\"'\s<)]+", raw))
+    assert all(link.startswith("data:image/webp") for link in re.findall(r'(?:src|href)="([^"]*)"', raw))
+    assert "default-src 'none'" in raw
 
 
 @pytest.mark.slow
 def test_a_file_without_splats_has_a_page_which_is_not_replaced_without_force(tmp_path, make_model):
-    page = tmp_path / "a.html"
+    page, empty = tmp_path / "a.html", tmp_path / "empty.ply"
     page.write_text("mine")
-    (tmp_path / "empty.csplat").write_bytes(encode(make_model(0)))
-    write_ply(tmp_path / "empty.ply", make_model(0))
-    words = ("info", tmp_path / "empty.csplat", "--source", tmp_path / "empty.ply")
+    empty.with_suffix(".csplat").write_bytes(encode(make_model(0)))
+    write_ply(empty, make_model(0))
+    words = ("info", empty.with_suffix(".csplat"), "--source", empty)
     assert "--force replaces it" in call(*words, "--page", page, status=1).stderr
     assert "a.html exists" in call("train", tmp_path, tmp_path / "a.ply", "--page", page, status=1).stderr
     assert "mine" == page.read_text()
@@ -121,20 +101,18 @@ def test_without_the_renderer_the_page_has_no_comparison(files, tmp_path, monkey
 
 def test_bars_are_proportional_to_bytes():
     text = attribute_figure({"means": 100, "sh0": 300, "sh1": 50})
-    widths = [float(one) for one in re.findall(r'width="([\d.]+)" height="17"', text)]
-    assert 3 == len(widths)
-    np.testing.assert_allclose(np.array(widths) / widths[0], [1.0, 3.0, 0.5], atol=1e-3)
+    widths = np.array(re.findall(r'width="([\d.]+)" height="17"', text), float)
+    np.testing.assert_allclose(widths / widths[0], [1.0, 3.0, 0.5], atol=1e-3)
 
 
 def test_the_hardest_place_is_where_the_error_is():
     source = np.full((80, 120, 3), 0.5, np.float32)
-    slightly, badly = source + np.float32(0.05), source.copy()
+    badly, place = source.copy(), HardestPlaceSearch()
     badly[31:39, 70:80] = 1.0
-    place = HardestPlaceSearch()
     assert place.found() is None
     place.examine(0, source, source)
     assert 99.0 == place.found().psnr
-    for number, seen in ((1, badly), (2, slightly)):
+    for number, seen in ((1, badly), (2, source + np.float32(0.05))):
         place.examine(number, source, seen)
     found = place.found()
     assert 1 == found.view
@@ -148,30 +126,27 @@ def test_the_hardest_place_is_where_the_error_is():
 
 @pytest.mark.slow
 def test_display_views_show_detail(sample_path):
-    source = read_ply(sample_path)
-    views = find_view_set(source, count=0)
-    shown = display_cameras(source, views)
+    source, own = read_ply(sample_path), cameras(3)
+    shown = display_cameras(source, find_view_set(source, count=0))
     assert 2 <= len(shown) <= 6
     cloud, nearest = sample_cloud(source, 20_000, np.random.default_rng(1)), 0.4 * scene_frame(source).extent
     best = max(detail(cloud, camera, nearest) for camera in comparison_cameras(source))
     assert all(detail(cloud, camera, nearest) > 0.6 * best for camera in shown)
-    own = cameras(3)  # given by the user: displayed unchanged
-    assert display_cameras(source, ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own
+    assert display_cameras(source, ViewSet("cameras.json", (0.0, 0.0, 0.0), (), (), own)) is own  # given by the user
 
 
-def headings(page):
-    return re.findall("<h2>(.*?)</h2>", page)
+def parts(page):
+    """Return the headings and the captions of a page."""
+    return re.findall("<h2>(.*?)</h2>", page), re.findall("<figcaption>(.*?)</figcaption>", page)
 
 
 @pytest.mark.slow
 def test_a_page_shows_a_training_and_its_file(file_runs):
-    page = file_runs.page.read_text()
-    assert [
-        "Scores", "Renders", "Training", "Tuning", "Bytes by attribute", "Options",
-    ] == headings(page)  # fmt: skip
+    page, captions = file_runs.page.read_text(), ["image", "source", "before tuning", "file"]
+    headings = ["Scores", "Renders", "Training", "Tuning", "Bytes by attribute", "Options"]
+    assert (headings, captions * 2) == parts(page)
     for scores in file_runs.report["file"]["scores"].values():
         assert f"<td>{scores['psnr_mean']:.2f}</td>" in page
-    assert ["image", "source", "before tuning", "file"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
     assert 8 == page.count('src="data:image/')
     assert not re.search("(src|href)=.http", page)
 
@@ -180,13 +155,11 @@ def test_a_page_shows_a_training_and_its_file(file_runs):
 def test_a_page_of_a_training_without_a_file_agrees_with_compare(file_runs, tmp_path):
     compared, path = tmp_path / "compared.json", tmp_path / "page.html"
     file_runs.made("a.ply", "--resume", file_runs.checkpoint, "--page", path)
-    page = path.read_text()
-    assert ["Scores", "Renders", "Training", "Options"] == headings(page)
-    assert ["image", "trained scene"] * 2 == re.findall("<figcaption>(.*?)</figcaption>", page)
+    expected = ["Scores", "Renders", "Training", "Options"], ["image", "trained scene"] * 2
+    assert expected == parts(path.read_text())
     both = (file_runs.folder / name for name in ("a.ply", "a.csplat"))
     call("compare", *both, "--data", file_runs.data, "--report", compared)
     judged = json.loads(compared.read_text())["photographs"]
     for name, one in (("source", "a"), ("file", "b")):
-        scores = file_runs.report["file"]["scores"][name]
-        for score in ("psnr", "psnr_mean", "ssim"):
-            assert scores[score] == pytest.approx(judged[one][score], abs=1e-3)
+        scores = {score: file_runs.report["file"]["scores"][name][score] for score in ("psnr", "psnr_mean", "ssim")}
+        assert scores == pytest.approx({score: judged[one][score] for score in scores}, abs=1e-3)

@@ -1,6 +1,5 @@
 """Tests of csplat_tools.level_fitting."""
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -14,53 +13,35 @@ from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.level_fitting import LevelFitter, Work
 from csplat_tools.level_merging import merge_neighbours
 
-pytestmark = pytest.mark.usefixtures("little_level_work")
-
-SPLATS = 400
-WORK = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
-
 
 @pytest.fixture(scope="module")
-def model(sample_path):
-    return csplat.read_ply(sample_path).select(slice(0, SPLATS))
-
-
-@pytest.fixture(scope="module")
-def larger_model(sample_path):
-    return csplat.read_ply(sample_path).select(slice(0, 1200))
-
-
-def quarter(splats):
-    return merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(len(splats) / 4))[1]
+def sample(sample_path):
+    return csplat.read_ply(sample_path)
 
 
 @pytest.mark.long
-def test_fitted_levels_look_better_than_merged_ones(larger_model):
-    model = larger_model
+def test_fitted_levels_look_better_than_merged_ones(sample):
+    model, nodes = sample.select(slice(0, 1200)), np.zeros(1200, np.int64)
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
-    nodes, count = np.zeros(len(model), np.int64), len(model) // 4
     fitters = LevelFitter(model, is_part=True), LevelFitter(model)  # with all steps
-    levels = quarter(model), *(fitter.fit(model, nodes, count, 1)[1] for fitter in fitters)
+    levels = merge_neighbours(model, nodes, 300)[1], *(fitter.fit(model, nodes, 300, 1)[1] for fitter in fitters)
     merged, moved, chosen = (scorer.psnr(splats) for splats in levels)
     assert merged + 0.5 < moved < chosen
 
 
 @pytest.mark.slow
-def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(model):
-    """Behind a wall of opaque splats, no camera sees the others."""
+def test_every_node_keeps_a_splat_and_unseen_splats_are_thinned_out(sample):
+    # Behind a wall of opaque splats, no camera sees the others.
     rng = np.random.default_rng(0)
-    sides = rng.normal(size=(300, 3))
+    sides, within = rng.normal(size=(300, 3)), rng.uniform(-0.05, 0.05, (100, 3))
     sides = (sides / np.linalg.norm(sides, axis=1, keepdims=True)).astype(np.float32)
-    wall = replace(model.select(np.arange(300)), means=sides, scales=np.full((300, 3), -0.8, np.float32))
-    wall.opacities[:] = 1.0
-    hidden = replace(
-        model.select(np.arange(100)),
-        means=rng.uniform(-0.05, 0.05, (100, 3)).astype(np.float32),
-        scales=np.full((100, 3), -7.0, np.float32),
-        opacities=rng.uniform(0.1, 1.0, 100).astype(np.float32),
-    )
+    wall = replace(sample.select(np.arange(300)), means=sides, scales=np.full((300, 3), -0.8, np.float32))
+    hidden = replace(sample.select(np.arange(100)), means=within.astype(np.float32))
+    hidden = replace(hidden, scales=np.full((100, 3), -7.0, np.float32))
+    wall.opacities[:], hidden.opacities[:] = 1.0, rng.uniform(0.1, 1.0, 100)
     scene = replace(join_blocks(wall, [wall, hidden]), means_double=None)
-    kept, splats = LevelFitter(scene, work=WORK).fit(scene, np.repeat([0, 1, 2], [300, 99, 1]), 100, 1)
+    work = Work(splats_to_measure=0.0, views=(8, 8), splats_to_move=0.0, steps=(5, 5))
+    kept, splats = LevelFitter(scene, work=work).fit(scene, np.repeat([0, 1, 2], [300, 99, 1]), 100, 1)
     assert len(kept) == len(splats) <= 102
     assert {0, 1, 2} == set(kept)
     assert 12 <= np.count_nonzero(kept == 1) <= 38
@@ -74,8 +55,8 @@ class Crowded(LevelFitter):
         raise LimitError("MAX_INTERSECTIONS", 2)
 
 
-def test_merges_splats_that_are_too_many_to_be_rendered(model):
-    nodes = np.arange(len(model)) // 200
+def test_merges_splats_that_are_too_many_to_be_rendered(sample):
+    model, nodes = sample.select(slice(0, 400)), np.arange(400) // 200
     kept, splats = Crowded(model).fit(model, nodes, 100, 1)
-    assert len(kept) == len(splats) == len(model) // 4
+    assert len(kept) == len(splats) == 100
     assert {*nodes} == {*kept}

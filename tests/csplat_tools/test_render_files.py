@@ -37,21 +37,13 @@ def ply(tmp_path):
     return path
 
 
-def camera(image):
-    """Return a camera two units in front of the origin."""
-    return {
-        "K": [[60, 0, 32], [0, 60, 24], [0, 0, 1]],
-        "viewmat": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]],
-        "W": 64,
-        "H": 48,
-        "image": image,
-    }
-
-
 @pytest.fixture
 def cameras(tmp_path):
+    """Two cameras two units in front of the origin."""
+    viewmat = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2], [0, 0, 0, 1]]
+    one = {"K": [[60, 0, 32], [0, 60, 24], [0, 0, 1]], "viewmat": viewmat, "W": 64, "H": 48}
     path = tmp_path / "cameras.json"
-    path.write_text(json.dumps([camera("images/left.jpg"), camera("images/right.jpg")]))
+    path.write_text(json.dumps([{**one, "image": f"images/{side}.jpg"} for side in ("left", "right")]))
     return path
 
 
@@ -71,42 +63,33 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_the_background_surrounds_the_scene(ply, cameras, tmp_path):
-    call("render", ply, "--cameras", cameras, tmp_path / "out", "--background", "0,0,1")
-    picture = pixels(tmp_path / "out" / "left.png")
+def test_the_background_surrounds_the_scene_with_alpha_and_depth_next_to_the_render(ply, cameras, tmp_path):
+    out = tmp_path / "out"
+    call("render", ply, "--cameras", cameras, out, "--background", "0,0,1", "--alpha", "--depth")
+    assert ["left.alpha.png", "left.depth.npy", "left.png"] == names(out)[:3]
+    picture, alpha, depth = pixels(out / "left.png"), pixels(out / "left.alpha.png"), np.load(out / "left.depth.npy")
     assert (48, 64, 3) == picture.shape
     assert picture[24, 32, 0] > 240
     assert picture[24, 32, 2] < 10
-    assert [0, 0, 255] == picture[0, 0].tolist()
-    trained = replace(read_ply(ply), metadata={"training": {"background": [1, 1, 1]}})
-    write_ply(ply, trained)
-    call("render", ply, "--cameras", cameras, tmp_path / "trained")
-    assert [255, 255, 255] == pixels(tmp_path / "trained" / "left.png")[0, 0].tolist()
-
-
-def test_alpha_and_depth_are_written_next_to_the_render(ply, cameras, tmp_path):
-    call("render", ply, "--cameras", cameras, tmp_path / "out", "--alpha", "--depth")
-    assert ["left.alpha.png", "left.depth.npy", "left.png"] == names(tmp_path / "out")[:3]
-    alpha, depth = pixels(tmp_path / "out" / "left.alpha.png"), np.load(tmp_path / "out" / "left.depth.npy")
+    assert ([0, 0, 255], 0, 0.0) == (picture[0, 0].tolist(), alpha[0, 0], depth[0, 0])
     assert alpha[24, 32] > 240
-    assert 0 == alpha[0, 0]
     assert np.float32 == depth.dtype
     assert depth[24, 32] == pytest.approx(2.0, rel=1e-4)
-    assert 0.0 == depth[0, 0]
+    write_ply(ply, replace(read_ply(ply), metadata={"training": {"background": [1, 1, 1]}}))
+    call("render", ply, "--cameras", cameras, tmp_path / "trained", "--size", "128x96")
+    picture = pixels(tmp_path / "trained" / "left.png")
+    assert ((96, 128, 3), [255, 255, 255]) == (picture.shape, picture[0, 0].tolist())
+    assert picture[48, 64, 0] > 240
 
 
-def test_renders_of_an_orbit_are_numbered_and_have_the_given_size(ply, tmp_path):
-    call("render", ply, "--orbit", 3, "--size", "40x30", tmp_path / "out")
-    assert ["0000.png", "0001.png", "0002.png"] == names(tmp_path / "out")
-    picture = pixels(tmp_path / "out" / "0002.png")
-    assert (30, 40, 3) == picture.shape
-    assert picture[15, 20, 0] > 200
-
-
-def test_an_orbit_follows_cameras(ply, cameras, tmp_path):
+def test_renders_of_an_orbit_are_numbered_and_follow_cameras(ply, cameras, tmp_path):
+    call("render", ply, "--orbit", 3, "--size", "64x48", tmp_path / "around")
     call("render", ply, "--orbit", 2, "--cameras", cameras, "--size", "64x48", tmp_path / "along")
-    call("render", ply, "--orbit", 2, "--size", "64x48", tmp_path / "around")
-    ball = {name: np.count_nonzero(pixels(tmp_path / name / "0001.png")[..., 0] > 128) for name in ("along", "around")}
+    assert ["0000.png", "0001.png", "0002.png"] == names(tmp_path / "around")
+    pictures = {name: pixels(tmp_path / name / "0001.png") for name in ("along", "around")}
+    assert {(48, 64, 3)} == {picture.shape for picture in pictures.values()}
+    assert pictures["around"][24, 32, 0] > 200
+    ball = {name: np.count_nonzero(picture[..., 0] > 128) for name, picture in pictures.items()}
     assert 1.5 * ball["along"] < ball["around"]  # the cameras are ten radii away: the ball is small
 
 
@@ -121,57 +104,46 @@ def test_a_csplat_file_renders_like_its_ply(cameras, tmp_path, make_model):
     assert np.abs(a - b).mean() < 2.0
 
 
-def test_a_resized_camera_renders_the_same_view(ply, cameras, tmp_path):
-    call("render", ply, "--cameras", cameras, tmp_path / "out", "--size", "128x96")
-    picture = pixels(tmp_path / "out" / "left.png")
-    assert (96, 128, 3) == picture.shape
-    assert picture[48, 64, 0] > 240
-    assert "distorted" in refused("render", ply, "--cameras", cameras, tmp_path / "no", "--size", "64x64")
-
-
-def test_nothing_is_replaced_without_force(ply, cameras, tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out" / "right.png").write_bytes(b"mine")
-    assert "right.png exists: --force replaces it" in refused("render", ply, "--cameras", cameras, tmp_path / "out")
-    assert ["right.png"] == names(tmp_path / "out")
-    call("render", ply, "--cameras", cameras, tmp_path / "out", "--force")
-    assert (48, 64, 3) == pixels(tmp_path / "out" / "right.png").shape
+def test_nothing_is_replaced_without_force(ply, cameras, film_scene, tmp_path):
+    out, film = tmp_path / "out", tmp_path / "turn.gif"
+    out.mkdir()
+    (out / "right.png").write_bytes(b"mine")
+    film.write_bytes(b"mine")
+    assert "right.png exists: --force replaces it" in refused("render", ply, "--cameras", cameras, out)
+    assert ["right.png"] == names(out)
+    call("render", ply, "--cameras", cameras, out, "--force")
+    assert (48, 64, 3) == pixels(out / "right.png").shape
+    words = ("render", film_scene, "--orbit", 1, "--size", "32x24", film)
+    assert "turn.gif exists: --force replaces it" in refused(*words)
+    assert b"mine" == film.read_bytes()
+    assert "is given for two outputs" in refused(*words, "--force", "--report", film)
+    call(*words, "--force")
+    (frame,), _, _ = frames_of(film)  # a still image
+    assert (24, 32, 3) == frame.shape
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("out",),
-        ("out", "--data", "set", "--cameras", "x.json"),
-        ("out", "--cameras", "x.json", "--up", "z"),
-        ("out", "--orbit", "0"),
-        ("out", "--orbit", "3", "--size", "12"),
-        ("out", "--orbit", "3", "--backend", "wrong"),
-        ("a.tif", "--orbit", "3"),
-        ("turn.webp", "--orbit", "2", "--depth"),
-        ("turn.webp", "--orbit", "2", "--fps", "101"),
-    ],
-)
-def test_a_wrong_command_line_has_status_2(ply, tmp_path, words):
-    call("render", ply, tmp_path / words[0], *words[1:], status=2)
-    assert ["ball.ply"] == names(tmp_path)
+def test_a_wrong_command_line_is_refused(ply, cameras, tmp_path):
+    for words in (
+        "out", "out --data set --cameras x.json", "out --cameras x.json --up z", "out --orbit 0",
+        "out --orbit 3 --size 12", "out --orbit 3 --backend wrong", "a.tif --orbit 3", "turn.webp --orbit 2 --depth",
+        "turn.webp --orbit 2 --fps 101",
+    ):  # fmt: skip
+        name, *options = words.split()
+        call("render", ply, tmp_path / name, *options, status=2)
+    assert "distorted" in refused("render", ply, "--cameras", cameras, tmp_path / "no", "--size", "64x64")
+    assert ["ball.ply", "cameras.json"] == names(tmp_path)
+    with pytest.raises(InputError, match="not a folder"):
+        make_output_folder(str(cameras), ["a.png"], force=True)
 
 
-@pytest.mark.parametrize(
-    ("module", "package", "extra", "output"),
-    [("numba", "numba", "render", "out"), ("PIL", "pillow", "render", "out"), ("av", "av", "film", "turn.mp4")],
-)
-def test_missing_packages_are_named(ply, cameras, tmp_path, monkeypatch, module, package, extra, output):
-    monkeypatch.setitem(sys.modules, module, None)
-    line = f"error: this needs {package}: pip install 'csplat[{extra}]' (E_INPUT)\n"
-    assert line == refused("render", ply, "--cameras", cameras, tmp_path / output)
-
-
-def test_a_report_never_replaces_the_film(ply, tmp_path):
-    film = tmp_path / "turn.webp"
-    assert "is given for two outputs" in refused("render", ply, film, "--orbit", 2, "--report", film)
-    assert not film.exists()
+def test_missing_packages_are_named(ply, cameras, tmp_path, monkeypatch):
+    for module, package, extra, output in (
+        ("av", "av", "film", "turn.mp4"), ("PIL", "pillow", "render", "out"), ("numba", "numba", "render", "out"),
+    ):  # fmt: skip
+        monkeypatch.setitem(sys.modules, module, None)
+        line = f"error: this needs {package}: pip install 'csplat[{extra}]' (E_INPUT)\n"
+        assert line == refused("render", ply, "--cameras", cameras, tmp_path / output)
 
 
 def test_names_of_renders_are_unique_and_stay_inside_the_folder():
@@ -182,26 +154,16 @@ def test_names_of_renders_are_unique_and_stay_inside_the_folder():
         assert image_names([image])[0] in {"0000", "png"}
 
 
-def test_a_folder_that_is_a_file_is_refused(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="not a folder"):
-        make_output_folder(str(tmp_path / "file"), ["a.png"], force=True)
-
-
-def test_bytes_are_rounded_and_clipped():
+def test_bytes_are_rounded_and_clipped_and_panels_show_the_amplified_difference():
     values = np.array([-1.0, 0.0, 0.5, 1.0, 7.0, np.nan, np.inf], np.float32)
     assert [0, 0, 128, 255, 255, 0, 255] == to_uint8(values).tolist()
-
-
-def test_panels_show_both_renders_and_the_amplified_difference():
     a, b = np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1, 3), 0.45, np.float32)
     assert [[128] * 3, [115] * 3, [128] * 3] == side_by_side(a, b, 10.0)[0].tolist()
 
 
 def test_sizes_and_colours_are_parsed():
     assert (640, 480) == parse_size("640x480")
-    assert (0.0, 0.25, 1.0) == parse_colour("0,0.25,1")
-    assert (1.0, 1.0, 1.0) == parse_colour("white")
+    assert [(0.0, 0.25, 1.0), (1.0, 1.0, 1.0)] == [parse_colour(text) for text in ("0,0.25,1", "white")]
     for text in ("1,1", "0,0,2", "red", "nan,0,0", "0,0,0,0"):
         with pytest.raises(typer.BadParameter, match="expected red,green,blue"):
             parse_colour(text)
@@ -213,8 +175,7 @@ ORBIT = ("--orbit", 4, "--size", "64x48")
 @pytest.fixture(scope="module")
 def film_scene(tmp_path_factory):
     """A PLY with a recorded up direction, which would otherwise be estimated."""
-    path = tmp_path_factory.mktemp("film") / "scene.ply"
-    rng = np.random.default_rng(0)
+    path, rng = tmp_path_factory.mktemp("film") / "scene.ply", np.random.default_rng(0)
     colours = rng.standard_normal((200, 3)).astype(np.float32)
     write_ply(path, cloud(rng.standard_normal((200, 3)), 0.14, sh0=colours, metadata={"up": [0, -1, 0]}))
     return path
@@ -241,22 +202,17 @@ def frames_of(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("ending", "tolerance"), [("webp", 6.0), ("gif", 8.0), ("png", 0.0), ("apng", 0.0)])
-def test_a_film_equals_the_renders(film_scene, pictures, tmp_path, ending, tolerance):
-    film = tmp_path / f"turn.{ending}"
-    call("render", film_scene, *ORBIT, film, "--fps", 20)
-    frames, times, loop = frames_of(film)
+def test_a_film_equals_the_renders_and_is_reproducible(film_scene, pictures, tmp_path, ending, tolerance):
+    films = [tmp_path / f"{name}.{ending}" for name in ("one", "two")]
+    for film in films:
+        call("render", film_scene, *ORBIT, film, "--fps", 20)
+    assert films[0].read_bytes() == films[1].read_bytes()
+    assert [film.name for film in films] == names(tmp_path)
+    frames, times, loop = frames_of(films[0])
     assert ([50] * 4, 0) == (times, loop)
     for expected, frame in zip(pictures, frames, strict=True):
         assert (48, 64, 3) == frame.shape
         assert np.abs(expected - frame).mean() <= tolerance
-    assert [film.name] == names(tmp_path)
-
-
-@pytest.mark.slow
-def test_the_same_command_writes_the_same_film(film_scene, tmp_path):
-    for name in ("one.webp", "two.webp"):
-        call("render", film_scene, "--orbit", 2, "--size", "32x24", tmp_path / name)
-    assert (tmp_path / "one.webp").read_bytes() == (tmp_path / "two.webp").read_bytes()
 
 
 @pytest.mark.slow
@@ -278,41 +234,25 @@ def test_an_mp4_resembles_the_renders_and_is_reproducible(film_scene, tmp_path):
         assert np.abs(expected - frame).mean() < 8.0
 
 
-def test_an_existing_film_is_kept_without_force(film_scene, tmp_path):
-    film = tmp_path / "turn.gif"
-    film.write_bytes(b"mine")
-    words = ("render", film_scene, "--orbit", 1, "--size", "32x24", film)
-    assert "turn.gif exists: --force replaces it" in refused(*words)
-    assert b"mine" == film.read_bytes()
-    call(*words, "--force")
-    (frame,), _, _ = frames_of(film)  # a still image
-    assert (24, 32, 3) == frame.shape
-
-
-@pytest.mark.parametrize(
-    ("name", "sizes", "message"),
-    [
+def test_films_of_invalid_sizes_are_refused():
+    for name, sizes, message in (
         ("a.gif", [(4, 4), (5, 4)], "the cameras have 2 sizes"),
         ("a.webp", [(1920, 1080)] * 400, "more than 2 GiB: render into a folder"),
         ("a.webp", [(20_000, 10)] * 2, "at most 16383 per side"),
-    ],
-)
-def test_films_of_invalid_sizes_are_refused(name, sizes, message):
-    with pytest.raises(InputError, match=message):
-        check_film(name, sizes, 25.0)
+    ):
+        with pytest.raises(InputError, match=message):
+            check_film(name, sizes, 25.0)
 
 
 def test_durations_do_not_drift():
-    assert [33, 34, 33] == _durations(3, 30.0, 1000)
-    assert 10_000 == sum(_durations(300, 30.0, 1000))
-    assert [30, 40, 30] == _durations(3, 30.0, 100)
-    assert 10_000 == sum(_durations(300, 30.0, 100))
+    for unit, expected in ((1000, [33, 34, 33]), (100, [30, 40, 30])):
+        assert expected == _durations(3, 30.0, unit)
+        assert 10_000 == sum(_durations(300, 30.0, unit))
 
 
 def test_a_film_that_pillow_cannot_write_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(Image, "SAVE_ALL", {})
-    monkeypatch.setattr(Image, "SAVE", {})
-    monkeypatch.setattr(Image, "init", lambda: None)
+    for name, value in {"SAVE_ALL": {}, "SAVE": {}, "init": lambda: None}.items():
+        monkeypatch.setattr(Image, name, value)
     with pytest.raises(InputError, match="cannot write WEBP"):
         write_film(str(tmp_path / "a.webp"), [np.zeros((2, 2, 3), np.uint8)] * 2, 25.0)
-    assert [] == list(tmp_path.iterdir())
+    assert [] == names(tmp_path)

@@ -39,11 +39,10 @@ def scene():
 @pytest.fixture
 def cameras():
     """Two small views of the scene, and one of empty space."""
-    K = intrinsics(64, 48, 60.0)
-    up = (0.0, -1.0, 0.0)
+    K, up, centre = intrinsics(64, 48, 60.0), (0.0, -1.0, 0.0), (0.0, 0.0, 0.0)
     return [
-        look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), up, K, 64, 48),
-        look_at((4.0, 1.0, 0.0), (0.0, 0.0, 0.0), up, K, 64, 48, image="side.png"),
+        look_at((0.0, 0.0, -4.0), centre, up, K, 64, 48),
+        look_at((4.0, 1.0, 0.0), centre, up, K, 64, 48, image="side.png"),
         look_at((0.0, 0.0, 50.0), (0.0, 0.0, 90.0), up, K, 64, 48),
     ]
 
@@ -63,7 +62,7 @@ def errors_of(source, other, index=None):
 
 
 # Pairs.
-def test_a_source_index_pairs_shuffled_splats(scene):
+def test_splats_are_paired_by_a_source_index_their_order_or_declared_errors(scene, tmp_path):
     order = np.random.default_rng(1).permutation(len(scene))
     errors = errors_of(scene, scene.select(order), order)
     assert ("index", len(scene), 0) == (errors.pairing, errors.matched, errors.unmatched)
@@ -72,75 +71,54 @@ def test_a_source_index_pairs_shuffled_splats(scene):
         errors_of(scene, scene, np.arange(3))
     for other in (scene.select(order), scene.select(slice(0, 300))):
         assert errors_of(scene, other) is None  # a PLY has no bounds to search within
-
-
-def test_scenes_in_the_same_order_are_paired_by_it(scene):
-    moved = replace(scene, means=scene.means + np.float32(0.001))
-    errors = errors_of(scene, moved)
+    errors = errors_of(scene, replace(scene, means=scene.means + np.float32(0.001)))
     assert "order" == errors.pairing
     assert errors.errors["means"][1] == pytest.approx(0.001 * 3**0.5, rel=1e-3)
-
-
-def test_splats_of_a_file_are_paired_within_its_declared_errors(scene, tmp_path):
-    result = encode_with_report(scene, EncodeOptions(preset="balanced"))
-    path = tmp_path / "scene.csplat"
+    result, path = encode_with_report(scene, EncodeOptions(preset="balanced")), tmp_path / "scene.csplat"
     path.write_bytes(result.data)
-    found = attribute_errors(LoadedModel(scene, 1000), load_model(str(path)))
+    found, known = (
+        attribute_errors(LoadedModel(scene, 1000), load_model(str(path)), index)
+        for index in (None, result.source_index)
+    )
     assert ("search", len(scene), 0) == (found.pairing, found.matched, found.unmatched)
-    known = attribute_errors(LoadedModel(scene, 1000), load_model(str(path)), result.source_index)
     assert known.errors["means"] == pytest.approx(found.errors["means"])
 
 
 # Renders.
-def test_a_scene_compared_with_itself_scores_99(scene, cameras):
+def test_a_scene_compared_with_itself_scores_99_wherever_its_origin(scene, cameras):
     compared = compare_models(scene, scene, cameras)
-    assert (99.0, 99.0, 99.0) == (compared.psnr, compared.psnr_mean, compared.psnr_worst)
+    assert (99.0, 99.0, 99.0, None) == (compared.psnr, compared.psnr_mean, compared.psnr_worst, compared.lpips)
     assert compared.ssim == pytest.approx(1.0)
-    assert compared.lpips is None
     assert 0.1 < compared.cover < 1.0
+    shift = (10.0, -20.0, 5.0)
+    moved = replace(scene, means=scene.means - np.float32(shift), origin=shift)
+    assert compare_models(scene, moved, cameras).psnr > 90.0
 
 
 def test_psnr_is_pooled_over_clipped_errors_of_all_views(scene, cameras):
     other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
-    compared = compare_models(scene, other, cameras)
-    squares = []
+    compared, squares = compare_models(scene, other, cameras), []
     for camera in cameras:
         a, b = (np.clip(render(model, camera).rgb.astype(np.float64), 0.0, 1.0) for model in (scene, other))
         squares.append(np.square(a - b))
-    assert compared.psnr == pytest.approx(-10.0 * np.log10(np.mean(squares)), abs=1e-6)
     own = [99.0 if not errors.any() else -10.0 * np.log10(errors.mean()) for errors in squares]
-    assert compared.psnr_mean == pytest.approx(np.mean(own), abs=1e-6)
-    assert compared.psnr_worst == pytest.approx(min(own), abs=1e-6)
+    expected = (-10.0 * np.log10(np.mean(squares)), np.mean(own), min(own))
+    assert (compared.psnr, compared.psnr_mean, compared.psnr_worst) == pytest.approx(expected, abs=1e-6)
     assert compared.worst_view == int(np.argmin(own))
     assert (99.0, 0.0) == (compared.each[2].psnr, compared.each[2].cover)
     assert compared.psnr_covered < compared.psnr
     scorer = Scorer.of_source(scene, cameras)
     assert scorer.errors(other).tolist() == pytest.approx([view.mse for view in compared.each], rel=1e-12)
     assert scorer.psnr(other) == pytest.approx(compared.psnr, rel=1e-12)
-
-
-def test_references_beyond_the_memory_are_rendered_again(scene, cameras):
-    other = replace(scene, sh0=scene.sh0 + np.float32(0.3))
-    again = Scorer.of_source(scene, cameras, kept_bytes=0)
+    again = Scorer.of_source(scene, cameras, kept_bytes=0)  # references beyond the memory are rendered again
     assert not any(isinstance(reference, ReferenceImage) for reference in again.references)
-    assert compare_models(scene, other, cameras) == again.scores(other)
-
-
-def test_another_origin_changes_nothing(scene, cameras):
-    shift = (10.0, -20.0, 5.0)
-    moved = replace(scene, means=scene.means - np.float32(shift), origin=shift)
-    assert compare_models(scene, moved, cameras).psnr > 90.0
+    assert compared == again.scores(other)
 
 
 def test_views_and_progress_are_passed_to_callbacks(scene, cameras):
     shown, seen = [], []
-    compare_models(
-        scene,
-        scene,
-        cameras,
-        on_view=lambda number, a, b: shown.append((number, a.shape, b.shape)),
-        progress=lambda stage, done: seen.append((stage, done)),
-    )
+    calls = {"on_view": lambda number, a, b: shown.append((number, a.shape, b.shape))}
+    compare_models(scene, scene, cameras, progress=lambda *now: seen.append(now), **calls)
     assert [(n, (48, 64, 3), (48, 64, 3)) for n in range(3)] == shown
     assert ("comparing", 1.0) == seen[-1]
     with pytest.raises(InputError, match="at least one camera"):
@@ -149,8 +127,7 @@ def test_views_and_progress_are_passed_to_callbacks(scene, cameras):
 
 def test_the_cameras_of_psnr_only_depend_on_the_source(scene):
     cameras = comparison_cameras(scene)
-    assert 8 == len(cameras)
-    assert {(640, 480)} == {(camera.W, camera.H) for camera in cameras}
+    assert [(640, 480)] * 8 == [(camera.W, camera.H) for camera in cameras]
     again = comparison_cameras(replace(scene, cameras=[camera.to_json() for camera in cameras[:1]]))
     assert all(np.array_equal(a.viewmat, b.viewmat) for a, b in zip(cameras, again, strict=True))
 
@@ -167,19 +144,17 @@ def files(scene, tmp_path_factory):
 def test_json_has_psnr_at_the_top(files, camera_file):
     result = json.loads(call("compare", *files, "--cameras", camera_file, "--json").stdout)
     assert 20.0 < result["psnr"] < 99.0
-    assert 3 == len(result["views"])
-    assert ["cameras.json", "standard", [0.0, 0.0, 0.0]] == [result[key] for key in ("cameras", "mode", "background")]
+    assert ["cameras.json", "standard", [0.0] * 3] == [result[key] for key in ("cameras", "mode", "background")]
     assert result["ratio"] == pytest.approx(result["a"]["size_bytes"] / result["b"]["size_bytes"])
     assert result["attributes"]["errors"]["means"]["rms"] > 0.0
-    assert result["seconds"] > 0.0
+    assert (3, True) == (len(result["views"]), result["seconds"] > 0.0)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("small_views")
 def test_virtual_cameras_are_the_default(files):
     result = json.loads(call("compare", *files, "--json").stdout)
-    assert "virtual" == result["cameras"]
-    assert 8 == len(result["views"])
+    assert ("virtual", 8) == (result["cameras"], len(result["views"]))
     assert 10.0 < result["psnr"] < 90.0
 
 

@@ -7,10 +7,6 @@ import pytest
 
 from csplat_tools.optimise.rate_distortion import RateLine, RatePoint, log_bytes_at_error, log_bytes_at_size
 
-pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
-
-
-pytestmark = pytest.mark.usefixtures("small_views")
 LINE = RateLine(RatePoint(40.0, 1e-4, 1000), -0.23, 0.045)
 
 

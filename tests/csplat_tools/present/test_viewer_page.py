@@ -10,6 +10,7 @@ from command_line import call
 
 from csplat import encode, write_ply
 from csplat.errors import CsplatError
+from csplat_tools.present import viewer_page
 from csplat_tools.present.viewer_page import PAGE, WORKER, export_page, link_modules, web_files
 from csplat_tools.present.viewer_server import page_parameters
 from csplat_tools.scene_files import MetadataOverrides
@@ -22,27 +23,21 @@ def sample():
     return encode(cloud(rng.standard_normal((500, 3)), 0.3, sh0=rng.standard_normal((500, 3)).astype(np.float32)))
 
 
-def export(*words, status=0):
-    return call("export-html", *words, status=status)
-
-
-@pytest.fixture
-def cameras(tmp_path):
-    """A file with one camera."""
+@pytest.mark.slow
+def test_the_command_puts_cameras_and_axes_into_the_page_or_a_pipe(sample, tmp_path):
+    scene, cameras = tmp_path / "scene.csplat", tmp_path / "cameras.json"
+    scene.write_bytes(sample)
     viewmat = np.eye(4)
     viewmat[2, 3] = 6.5
     entry = {"K": [[90, 0, 40], [0, 90, 30], [0, 0, 1]], "viewmat": viewmat.tolist(), "W": 80, "H": 60}
-    (tmp_path / "cameras.json").write_text(json.dumps([entry]))
-    return tmp_path / "cameras.json"
-
-
-@pytest.mark.slow
-def test_the_command_puts_cameras_and_axes_into_the_page(sample, cameras, tmp_path):
-    (tmp_path / "scene.csplat").write_bytes(sample)
-    export(tmp_path / "scene.csplat", tmp_path / "page.html", "--cameras", cameras, "--up", "z")
+    cameras.write_text(json.dumps([entry]))
+    call("export-html", scene, tmp_path / "page.html", "--cameras", cameras, "--up", "z")
     wishes = page_parameters(str(cameras), MetadataOverrides(up=(0.0, 0.0, 1.0)))
     assert {"camera", "up"} == set(wishes)
     assert export_page(sample, "scene.csplat", wishes).page == (tmp_path / "page.html").read_bytes()
+    done = call("export-html", scene, "-", "--quiet")
+    assert ("", export_page(sample, "scene.csplat").page) == (done.stderr, done.stdout_bytes)
+    assert done.stdout_bytes.endswith(b"</html>\n")
 
 
 def test_the_page_is_ascii_and_has_every_module_once(sample):
@@ -84,25 +79,21 @@ def test_modules_become_functions_behind_those_that_they_import():
     ] == bodies
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
+def test_modules_that_cannot_be_linked_are_refused():
+    cannot = r"a\.mjs has a statement that cannot be linked: "
+    for text, message in (
         ("import './b.mjs';", r"import each other: a\.mjs -> b\.mjs -> a\.mjs"),
         ("import './gone.mjs';", r"a\.mjs imports gone\.mjs, which does not exist"),
-        ("export default 1;", r"a\.mjs has a statement that cannot be linked: export default 1;"),
-        ("export let n = 1;", r"a\.mjs has a statement that cannot be linked: export let n = 1;"),
-        ("export * from './b.mjs';", r"a\.mjs has a statement that cannot be linked: export \* from"),
-        ("import a from './b.mjs';", r"a\.mjs has a statement that cannot be linked: import a from"),
-    ],
-)
-def test_modules_that_cannot_be_linked_are_refused(text, expected):
-    with pytest.raises(AssertionError, match=expected):
-        link_modules({"a.mjs": text, "b.mjs": "import './a.mjs';"}, ["a.mjs"])
+        ("export default 1;", cannot + "export default 1;"), ("export let n = 1;", cannot + "export let n = 1;"),
+        ("export * from './b.mjs';", cannot + r"export \* from"), ("import a from './b.mjs';", cannot + "import a"),
+    ):  # fmt: skip
+        with pytest.raises(AssertionError, match=message):
+            link_modules({"a.mjs": text, "b.mjs": "import './a.mjs';"}, ["a.mjs"])
 
 
 def test_a_ply_is_encoded(make_model, tmp_path):
     write_ply(tmp_path / "scene.ply", make_model(50, 1))
-    done = export(tmp_path / "scene.ply", tmp_path / "page.html")
+    done = call("export-html", tmp_path / "scene.ply", tmp_path / "page.html")
     assert "encoded with the preset balanced" in done.stderr
     assert (tmp_path / "page.html").read_bytes().startswith(b"<!doctype html>")
 
@@ -111,25 +102,14 @@ def test_refusals_leave_the_page_unchanged(sample, sample_path, tmp_path):
     target, broken, middle = tmp_path / "page.html", tmp_path / "broken.csplat", len(sample) // 2
     target.write_text("mine")
     broken.write_bytes(sample[:middle] + bytes([sample[middle] ^ 1]) + sample[middle + 1 :])
-    assert "--force replaces it" in export(sample_path, target, status=1).stderr
-    assert "E_CRC" in export(broken, target, "--force", status=1).stderr
-    export(sample_path, target, "--force", "--up", "w", status=2)
+    assert "--force replaces it" in call("export-html", sample_path, target, status=1).stderr
+    assert "E_CRC" in call("export-html", broken, target, "--force", status=1).stderr
+    call("export-html", sample_path, target, "--force", "--up", "w", status=2)
     assert "mine" == target.read_text()
     assert ["broken.csplat", "page.html"] == sorted(path.name for path in tmp_path.iterdir())
 
 
-@pytest.mark.slow
-def test_the_page_can_be_written_to_a_pipe(sample, tmp_path):
-    (tmp_path / "scene.csplat").write_bytes(sample)
-    done = export(tmp_path / "scene.csplat", "-", "--quiet")
-    assert "" == done.stderr
-    assert export_page(sample, "scene.csplat").page == done.stdout_bytes
-    assert done.stdout_bytes.endswith(b"</html>\n")
-
-
 def test_an_incomplete_installation_is_an_error_of_its_own(monkeypatch, tmp_path):
-    import csplat_tools.present.viewer_page
-
-    monkeypatch.setattr(csplat_tools.present.viewer_page, "__file__", str(tmp_path / "a" / "b" / "viewer_page.py"))
+    monkeypatch.setattr(viewer_page, "__file__", str(tmp_path / "a" / "b" / "viewer_page.py"))
     with pytest.raises(CsplatError, match="reinstall csplat"):
         export_page(b"", "scene.csplat")

@@ -7,15 +7,11 @@ from functools import partial
 import numpy as np
 import pytest
 from captures import cameras, photograph, shell
-from command_line import call, change_options, invoke
-from finetune_cases import BLACK, BRIEF, tuned_subset, tuner_of
+from command_line import call, change_options
+from finetune_cases import BRIEF, tuned_subset, tuner_of
 
-from csplat import write_ply
 from csplat_render.camera_files import save_cameras
 from csplat_tools.training import tuning_run
-from csplat_trainer.tuning import renders_of, split_views
-
-pytest.importorskip("numba", reason="requires the extra [render]")
 
 
 @pytest.fixture(scope="module")
@@ -23,19 +19,10 @@ def source():
     return shell(8)
 
 
-@pytest.fixture(scope="module")
-def views(source):
-    return split_views(renders_of(source, cameras(14), BLACK, None), BLACK, validation_count=3)
-
-
-# the command
-ENCODE_OPTIONS = "csplat_tools.cli.finetune.EncodeOptions"
-
-
 @pytest.fixture(autouse=True)
 def bare(monkeypatch):
     """Make the command encode neither SH nor codebooks, which take time."""
-    change_options(monkeypatch, ENCODE_OPTIONS, sh_coding="none", shape_codebook_size=0)
+    change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none", shape_codebook_size=0)
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +30,21 @@ def capture(source, tmp_path_factory):
     return photograph(source, tmp_path_factory.mktemp("capture"))
 
 
+def change_run(patch, **options):
+    """Let the command tune with other options, which the command line does not have."""
+    patch.setattr(tuning_run, "run_finetuning", partial(tuning_run.run_finetuning, **options))
+
+
 @pytest.mark.slow
 def test_renders_for_tuning_may_use_a_camera_file(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr(tuning_run, "run_finetuning", partial(tuning_run.run_finetuning, prune_unseen=True))
+    change_run(monkeypatch, prune_unseen=True)
     save_cameras(tmp_path / "cameras.json", cameras(40))
-    words = ("finetune", capture / "scene.ply", "--self", "--cameras", tmp_path / "cameras.json")
-    facts = json.loads(call(*words, tmp_path / "s.csplat", *BRIEF, "--json", "-q").stdout)
+    away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(40)]
+    save_cameras(tmp_path / "away.json", away)
+    words = ("finetune", capture / "scene.ply", tmp_path / "s.csplat", "--self", *BRIEF, "--json", "-q", "--cameras")
+    facts = json.loads(call(*words, tmp_path / "cameras.json").stdout)
     assert (301, 300, 4) == (facts["source_splats"], facts["splats"], facts["validation"]["views"])
+    assert "no view shows any splat" in call(*words, tmp_path / "away.json", "--force", status=1).stderr
 
 
 class GrowingTuner(tuning_run.Tuner):
@@ -75,35 +70,15 @@ def test_a_tuning_that_outgrows_its_size_begins_smaller(source):
 
 
 @pytest.mark.slow
-def test_importance_is_per_source_splat(capture, tmp_path, monkeypatch):
-    words = ("finetune", capture / "scene.ply", "--data", capture, tmp_path / "s.csplat", *BRIEF)
-    weighted = partial(tuning_run.run_finetuning, importance=str(tmp_path / "w.npy"))
-    monkeypatch.setattr(tuning_run, "run_finetuning", weighted)
-    np.save(tmp_path / "w.npy", np.ones(300))
-    result = invoke(*words)
-    assert 1 == result.exit_code
-    assert "expected (301,)" in result.stderr
-    np.save(tmp_path / "w.npy", np.arange(301.0))
-    call(*words)
-
-
-@pytest.mark.slow
-def test_sensitivities_agree_with_the_command_sensitivity(capture, tmp_path, monkeypatch):
+def test_importance_is_per_source_splat_and_measured_as_by_the_command_sensitivity(capture, tmp_path, monkeypatch):
     call("sensitivity", capture / "scene.ply", tmp_path / "s.npz", "--data", capture)
     words = ("finetune", capture / "scene.ply", "--data", capture, *BRIEF, "--lambda", 0)
     call(*words, tmp_path / "b.csplat")
-    weighted = partial(tuning_run.run_finetuning, importance=str(tmp_path / "s.npz"))
-    monkeypatch.setattr(tuning_run, "run_finetuning", weighted)
+    change_run(monkeypatch, importance=str(tmp_path / "s.npz"))
     call(*words, tmp_path / "a.csplat")
     assert (tmp_path / "a.csplat").read_bytes() == (tmp_path / "b.csplat").read_bytes()
-
-
-def test_cameras_without_splats_in_view_are_refused(source, tmp_path, monkeypatch):
-    away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(40)]
-    save_cameras(tmp_path / "away.json", away)
-    write_ply(tmp_path / "scene.ply", source)
-    monkeypatch.setattr(tuning_run, "run_finetuning", partial(tuning_run.run_finetuning, prune_unseen=True))
-    words = ("finetune", tmp_path / "scene.ply", tmp_path / "s.csplat", "--self")
-    result = invoke(*words, "--cameras", tmp_path / "away.json")
-    assert 1 == result.exit_code
-    assert "no view shows any splat" in result.stderr
+    change_run(monkeypatch, importance=str(tmp_path / "w.npy"))
+    np.save(tmp_path / "w.npy", np.ones(300))
+    assert "expected (301,)" in call(*words, tmp_path / "s.csplat", status=1).stderr
+    np.save(tmp_path / "w.npy", np.arange(301.0))
+    call(*words, tmp_path / "s.csplat")

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from command_line import call
 
 import csplat
 import csplat_tools
@@ -20,20 +20,12 @@ from csplat.errors import CsplatError, InputError, LimitError
 from csplat.ply import write_ply
 from csplat.scene_source import source_from_model
 from csplat_render.camera import intrinsics, look_at
+from csplat_render.camera_files import save_cameras
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import renderer
-from csplat_tools.cli.app import app
 from csplat_tools.scene_files import LoadedModel, OpenedScene, open_scenes
 from csplat_tools.views import comparison_cameras
 from csplat_tools.views.sliced_renderer import SlicedScene, slice_limits
-
-pytest.importorskip("numba", reason="the renderer requires the extra [render]")
-
-
-def ply_of(model):
-    buffer = io.BytesIO()
-    write_ply(buffer, model)
-    return buffer.getvalue()
 
 
 @pytest.fixture
@@ -75,27 +67,23 @@ def test_tiles_before_a_damaged_one_are_decoded(many_tiles):
 
 @pytest.mark.slow
 def test_no_part_of_a_damaged_file_goes_to_standard_output(many_tiles):
-    data = bytearray(many_tiles.read_bytes())
-    whole = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
-    assert ply_of(decode(bytes(data))) == whole.stdout_bytes
+    data, whole = bytearray(many_tiles.read_bytes()), io.BytesIO()
+    write_ply(whole, decode(bytes(data)))
+    assert whole.getvalue() == call("decode", many_tiles, "-", "--quiet").stdout_bytes
     data[-1] ^= 1
     many_tiles.write_bytes(data)
-    found = CliRunner().invoke(app, ["decode", str(many_tiles), "-", "--quiet"])
-    assert (1, b"") == (found.exit_code, found.stdout_bytes)
+    assert b"" == call("decode", many_tiles, "-", "--quiet", status=1).stdout_bytes
 
 
-@pytest.mark.slow
 def test_the_limit_of_splats_is_per_file_and_that_of_bytes_per_tile(many_tiles):
-    with pytest.raises(LimitError, match="splats"):
-        open_tiles(many_tiles, limits=Limits(splats=599))
-    tile = max(one.splat_count for one in read_header(many_tiles.read_bytes()).tiles)
-    limits = Limits(bytes=tile * 4 * (11 + 27))
+    limits = Limits(bytes=max(tile.splat_count for tile in open_tiles(many_tiles).header.tiles) * 4 * (11 + 27))
     assert 600 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
     with pytest.raises(LimitError, match="bytes"):
         decode(many_tiles, limits=limits)
+    with pytest.raises(LimitError, match="splats"):
+        open_tiles(many_tiles, limits=Limits(splats=599))
 
 
-UP = (0.0, -1.0, 0.0)
 BEHIND = (0.3, 0.6, 0.1)
 LITTLE = 1  # byte of memory
 
@@ -108,14 +96,13 @@ def model(make_model):
 
 @pytest.fixture
 def view():
-    return look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), UP, intrinsics(70, 53, 60.0), 70, 53)
+    return look_at((0.0, 0.0, -4.0), (0.0, 0.0, 0.0), (0.0, -1.0, 0.0), intrinsics(70, 53, 60.0), 70, 53)
 
 
 @pytest.fixture
 def camera_file(view, tmp_path):
-    path = tmp_path / "cameras.json"
-    path.write_text(json.dumps([view.to_json()]))
-    return str(path)
+    save_cameras(tmp_path / "cameras.json", [view])
+    return str(tmp_path / "cameras.json")
 
 
 @pytest.fixture
@@ -137,13 +124,9 @@ def no_least(monkeypatch):
 
 def by_disk(model, every=1, progress=None):
     """Return a scene in blocks of 300 splats that is drawn in slices of about 100."""
-
-    def blocks():
-        return (model.select(slice(start, start + 300)) for start in range(0, len(model), 300))
-
-    scene = replace(source_from_model(model), blocks=blocks)
-    sample = model.select(slice(None, None, every))
-    return SlicedScene(scene, sample, every, LITTLE, progress, slice_bytes=60_000)
+    scene = source_from_model(model)
+    scene = replace(scene, blocks=lambda: (model.select(slice(at, at + 300)) for at in range(0, len(model), 300)))
+    return SlicedScene(scene, model.select(slice(None, None, every)), every, LITTLE, progress, slice_bytes=60_000)
 
 
 @pytest.fixture
@@ -161,11 +144,9 @@ def counts(monkeypatch):
 
 
 def assert_same_render(model, view, every=1, mode="standard"):
-    wanted = renderer(model, BEHIND, mode=mode)(view)
-    found = renderer(by_disk(model, every), BEHIND, mode=mode)(view)
-    for name in ("rgb", "alpha", "depth"):
+    wanted, found = (renderer(scene, BEHIND, mode=mode)(view) for scene in (model, by_disk(model, every)))
+    for name in ("rgb", "alpha", "depth", "ignored"):
         np.testing.assert_array_equal(getattr(wanted, name), getattr(found, name))
-    assert wanted.ignored == found.ignored
 
 
 def test_sliced_renders_equal_those_in_memory(model, view, counts):
@@ -186,16 +167,9 @@ def test_sliced_renders_equal_those_in_memory(model, view, counts):
 
 
 def test_splats_behind_opaque_pixels_are_not_drawn(model, view, counts):
-    wall = np.arange(len(model)) < 20
-    means, scales, opacities = model.means.copy(), model.scales.copy(), model.opacities.copy()
-    means[wall], scales[wall], opacities[wall] = (0.0, 0.0, -2.5), 3.0, 0.99
-    assert_same_render(replace(model, means=means, scales=scales, opacities=opacities), view)
+    model.means[:20], model.scales[:20], model.opacities[:20] = (0.0, 0.0, -2.5), 3.0, 0.99
+    assert_same_render(model, view)
     assert sum(counts) < 600
-
-
-def test_mode_exact_requires_scenes_in_memory(model, view):
-    with pytest.raises(InputError, match="exact"):
-        renderer(by_disk(model), BEHIND, mode="exact")(view)
 
 
 def test_slices_have_equal_costs_and_do_not_split_a_depth():
@@ -219,68 +193,59 @@ def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
             assert {LoadedModel} == {type(one) for one in both}
 
 
-def test_a_sample_has_every_nth_splat(files_of_both, model):
+def test_a_sample_has_every_nth_splat_and_gives_about_the_same_views(files_of_both, model, sample_path):
     with open_scenes(files_of_both[:2], LITTLE) as (source, _):
         found, every = replace(source, sample_splats=220).sample()
-    assert 7 == every
+    assert (7, 0) == (every, found.sh_degree)
     np.testing.assert_array_equal(model.means[::7], found.means)
-    assert 0 == found.sh_degree
-
-
-def test_a_sample_gives_about_the_same_views(sample_path):
     whole = csplat_tools.load_model(sample_path).model
     part = comparison_cameras(whole.select(slice(None, None, 2)), every=2)
-    for wanted, found in zip(comparison_cameras(whole), part, strict=True):
-        distance = np.linalg.norm(wanted.position)
-        assert np.linalg.norm(found.position) == pytest.approx(distance, rel=0.15)
+    for wanted, seen in zip(comparison_cameras(whole), part, strict=True):
+        assert np.linalg.norm(wanted.position) == pytest.approx(np.linalg.norm(seen.position), rel=0.15)
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_least")
 def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path, monkeypatch):
     source, encoded, index = files_of_both
-    words = ["compare", source, encoded, "--cameras", camera_file]
-
-    def run(*more):
-        result = CliRunner().invoke(app, [*words, *more])
-        assert 0 == result.exit_code, result.stderr
-        return result
+    words = ("compare", source, encoded, "--cameras", camera_file)
 
     def report(name):
-        result = run("--source-index", index, "--json", "--pictures", str(tmp_path / name))
+        result = call(*words, "--source-index", index, "--json", "--pictures", tmp_path / name)
         shown = json.loads(result.stdout)
-        return shown["attributes"].pop("errors"), shown | {"seconds": 0}, "rendered from the disk" in result.stderr
+        images = [image.read_bytes() for image in sorted((tmp_path / name).iterdir())]
+        by_disk = "rendered from the disk" in result.stderr
+        return by_disk, shown["attributes"].pop("errors"), (shown | {"seconds": 0}, images)
 
-    errors, report_in_memory, by_disk = report("memory")
+    by_disk, errors, in_memory = report("memory")
     assert not by_disk
     monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
-    others, report_of_disk, by_disk = report("disk")
+    by_disk, others, of_disk = report("disk")
     assert by_disk
-    assert report_in_memory == report_of_disk
+    assert bool(in_memory == of_disk)
     assert errors == {name: pytest.approx(error, rel=1e-12) for name, error in others.items()}
-    images = [[image.read_bytes() for image in sorted((tmp_path / name).iterdir())] for name in ("memory", "disk")]
-    assert bool(images[0] == images[1])
-    assert "the errors of splats are unknown" in run().stdout  # without an index
-    refused = CliRunner().invoke(app, ["compare", source, encoded, "--backend", "exact"])
-    assert 1 == refused.exit_code
+    assert "the errors of splats are unknown" in call(*words).stdout  # without an index
+    refused = call("compare", source, encoded, "--backend", "exact", status=1)
     assert "error: --backend exact requires both scenes in memory" in refused.stderr
 
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("no_least")
 def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, tmp_path):
-    source, moved = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
-    write_ply(source, model)
-    write_ply(moved, replace(model, means=model.means + np.float32(0.001)))
+    scenes = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
+    for path, shift in zip(scenes, (0.0, 0.001), strict=True):
+        write_ply(path, replace(model, means=model.means + np.float32(shift)))
     views = csplat_tools.find_view_set(model, cameras=camera_file, count=0)
-    wanted, shown = (csplat_tools.compare(source, moved, views=views, memory_bytes=most) for most in (None, LITTLE))
+    wanted, shown = (csplat_tools.compare(*scenes, views=views, memory_bytes=most) for most in (None, LITTLE))
     assert wanted.quality == shown.quality
     assert "order" == shown.attributes.pairing
     for name, error in shown.attributes.errors.items():
         assert wanted.attributes.errors[name] == pytest.approx(error, rel=1e-12)
 
 
-def test_too_little_memory_or_disk_space_is_an_error_before_drawing(files_of_both, monkeypatch):
+def test_what_cannot_be_drawn_is_an_error_before_drawing(model, view, files_of_both, monkeypatch):
+    with pytest.raises(InputError, match="exact"):
+        renderer(by_disk(model), BEHIND, mode="exact")(view)
     monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
     with pytest.raises(InputError, match=r"^the memory is 0 MB, expected at least 482 MB to draw these scenes$"):
         csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)

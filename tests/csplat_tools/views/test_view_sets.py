@@ -21,22 +21,14 @@ from csplat_tools.views.view_sets import pose_key
 from csplat_trainer.data import load
 from csplat_trainer.posed_images import evaluate
 
-pytest.importorskip("numba", reason="requires the extra [render]")
-
-
-KINDS = ("rgb", "rgba", "colmap")
-
 
 @pytest.fixture(scope="module")
 def sets(tmp_path_factory):
     """Write the same sixteen images as transforms.json without and with alpha, and as COLMAP."""
-    folder = tmp_path_factory.mktemp("sets") / "rgb"
-    folder.mkdir()
-    rgb = photograph(shell(3).select(slice(0, 100)), folder)
-    folders = {"rgb": rgb}
-    for kind in KINDS[1:]:
-        folders[kind] = rgb.parent / kind
-        shutil.copytree(rgb, folders[kind], dirs_exist_ok=True)
+    folders = {kind: tmp_path_factory.mktemp(kind) for kind in ("rgb", "rgba", "colmap")}
+    photograph(shell(3).select(slice(0, 100)), folders["rgb"])
+    for kind in ("rgba", "colmap"):
+        shutil.copytree(folders["rgb"], folders[kind], dirs_exist_ok=True)
     for path in (folders["rgba"] / "images").iterdir():
         with Image.open(path) as picture:
             picture.convert("RGBA").save(path)
@@ -62,29 +54,23 @@ def numbers(seen_from):
 @pytest.mark.parametrize(("kind", "every", "size"), [("rgb", 5, None), ("rgba", 10, (24, 20)), ("colmap", 5, (24, 20))])
 def test_each_image_has_one_role(sets, scene, kind, every, size):
     views = find_view_set(scene, data=DataOptions(str(sets[kind]), size, test_every=every))
-    assert list(range(0, 16, every)) == numbers(views.test)
+    assert list(range(0, 16, every)) == numbers(views.test) == numbers(views.image_test_scorer().cameras)
     roles = poses(views)
     assert sum(map(len, roles)) == len(set.union(*roles)) == 16
-    assert views.training
-    assert views.validation
+    assert all(roles)
     assert {size or (W, H)} == {(camera.W, camera.H) for camera in views.test}
-    assert BLACK == views.background
-    assert not views.virtual
-    assert numbers(views.test) == numbers(views.image_test_scorer().cameras)
+    assert (BLACK, False) == (views.background, views.virtual)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("count", "judging", "virtual"), [(3, 3, True), (39, 39, True), (40, 10, False), (120, 24, False)]
-)
-def test_a_camera_file_is_split_if_it_has_enough_views(scene, tmp_path, count, judging, virtual):
-    save_cameras(tmp_path / "cameras.json", cameras(count))
-    views = find_view_set(scene, cameras=str(tmp_path / "cameras.json"), count=20)
-    assert (judging, virtual) == (len(views.test), views.virtual)
-    assert (36, 12) == (len(views.training), len(views.validation)) or not virtual
-    roles = poses(views)
-    assert sum(map(len, roles)) == len(set.union(*roles))
-    assert virtual or count == sum(map(len, roles))
+def test_a_camera_file_is_split_if_it_has_enough_views(scene, tmp_path):
+    for count, judging, virtual in ((3, 3, True), (39, 39, True), (40, 10, False), (120, 24, False)):
+        save_cameras(tmp_path / "cameras.json", cameras(count))
+        views = find_view_set(scene, cameras=str(tmp_path / "cameras.json"), count=20)
+        assert (judging, virtual) == (len(views.test), views.virtual)
+        roles = poses(views)
+        assert sum(map(len, roles)) == len(set.union(*roles)) == (36 + 12 + count if virtual else count)
+        assert not virtual or (36, 12) == (len(views.training), len(views.validation))
 
 
 @pytest.mark.slow
@@ -97,11 +83,12 @@ def test_virtual_test_views_have_a_black_background(scene):
 
 def test_the_number_of_validation_views_may_be_chosen(sets, scene):
     data = DataOptions(str(sets["rgb"]))
-    for count, sizes in ((0, (14, 0, 2)), (4, (10, 4, 2))):
-        assert sizes == tuple(map(len, poses(find_view_set(scene, data=data, validation_count=count))))
+    for chosen, sizes in (
+        ({"validation_count": 0}, [14, 0, 2]), ({"validation_count": 4}, [10, 4, 2]), ({"split": "train"}, [0, 0, 14]),
+    ):  # fmt: skip
+        assert sizes == [*map(len, poses(find_view_set(scene, data=data, **chosen)))]
     with pytest.raises(InputError, match=r"none of .* for training"):
         find_view_set(scene, data=data, validation_count=14)
-    assert (0, 0, 14) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
 
 
 def test_a_folder_of_images_and_an_opened_set_have_the_same_views(sets, scene):
@@ -126,8 +113,8 @@ def test_validation_images_of_a_set_are_validation_views(sets, scene, tmp_path):
         roles = [list(range(8)), [8, 9, 10, 11], [12, 13, 14, 15]]
         assert roles == [numbers(role) for role in (views.training, views.validation, views.test)]
     assert 4 == len(views.image_validation_scorer().references)
-    assert (6, 2, 4) == tuple(map(len, poses(find_view_set(scene, data=data, validation_count=2))))
-    assert (0, 0, 8) == tuple(map(len, poses(find_view_set(scene, data=data, split="train"))))
+    for chosen, sizes in (({"validation_count": 2}, [6, 2, 4]), ({"split": "train"}, [0, 0, 8])):
+        assert sizes == [*map(len, poses(find_view_set(scene, data=data, **chosen)))]
 
 
 def test_a_view_of_two_roles_is_refused_at_any_size(scene):
@@ -145,13 +132,11 @@ def test_recorded_training_options_are_the_defaults(sets, scene):
     assert [0, 5, 10, 15] == numbers(views.test)
     assert ((0.0, 1.0, 0.0), 24, 0.05) == (views.background, views.test[0].W, views.test[0].near)
     assert not any("trained" in line for line in views.notes)
-    asked = DataOptions(str(sets["rgba"]), test_every=10)
-    views = find_view_set(trained, data=asked, background=WHITE)
+    views = find_view_set(trained, data=DataOptions(str(sets["rgba"]), test_every=10), background=WHITE)
     assert [0, 10] == numbers(views.test)
-    assert [
-        "test_every is 10, but the scene was trained with 5",
-        "background is white, but the scene was trained on 0,1,0",
-    ] == [line for line in views.notes if "trained" in line]
+    notes = [line for line in views.notes if "trained" in line]
+    assert "test_every is 10, but the scene was trained with 5" == notes[0]
+    assert ["background is white, but the scene was trained on 0,1,0"] == notes[1:]
 
 
 @pytest.mark.slow
@@ -164,31 +149,20 @@ def test_a_scene_without_a_training_record_is_noted_once(sets, scene):
 
 
 # Commands.
-@pytest.fixture
-def made(monkeypatch):
-    """Record the view sets that a command makes."""
-    known, check = [], ViewSet.__post_init__
-
-    def keep(views):
-        check(views)
-        known.append(views)
-
-    monkeypatch.setattr(ViewSet, "__post_init__", keep)
-    return known
 
 
 @pytest.mark.slow
-def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, made, tmp_path, monkeypatch):
-    ply, own = sets["rgba"] / "scene.ply", ("--data", sets["rgba"])
+def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, tmp_path, monkeypatch):
+    ply, made, check, found = sets["rgba"] / "scene.ply", [], ViewSet.__post_init__, {}
+    monkeypatch.setattr(ViewSet, "__post_init__", lambda views: check(views) or made.append(views))
     change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", size=(24, 20), test_every=5)
     change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", effort=1)
     change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
-    found = {}
 
     def run(*words):
         """Run a command; return its JSON and check the roles of its views."""
         made.clear()
-        result = json.loads(call(*words, *own, "--json").stdout)
+        result = json.loads(call(*words, "--data", sets["rgba"], "--json").stdout)
         assert any(views.images for views in made), words
         for views in made:
             roles = poses(views)
@@ -199,41 +173,40 @@ def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, 
         return result
 
     found["compare"] = run("compare", ply, ply)["photographs"]["a"]["psnr"]
-    simplified = run("simplify", ply, tmp_path / "half.ply", "--keep", "0.5", "--effort", "1")
-    found["simplify"] = simplified["photographs"]["source"]
+    simplified = run("simplify", ply, tmp_path / "half.ply", "--keep", "0.5", "--effort", "1")["photographs"]
+    found["simplify"] = simplified["source"]
     run("simplify", ply, tmp_path / "less.ply", "--max-psnr-drop", "1", "--effort", "1")
     run("sensitivity", ply, tmp_path / "s.npz")
-    words = ("--iterations", "2", "--keep", "0.7")
-    found["finetune"] = run("finetune", ply, tmp_path / "s.csplat", *words)["scores"]["source"]["psnr"]
+    tuned = run("finetune", ply, tmp_path / "s.csplat", "--iterations", "2", "--keep", "0.7")
+    found["finetune"] = tuned["scores"]["source"]["psnr"]
     found["tradeoff"] = run("tradeoff", ply, "--what", "precision=40")["points"][0]["photographs"]["a"]["psnr"]
     model = read_ply(ply)
     views = find_view_set(model, data=DataOptions(str(sets["rgba"]), (24, 20), test_every=5))
-    draw = renderer(model, views.background)
-    images, behind = views.images_of(views.test), np.array(views.background, np.float32)
-    found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, images, behind)["psnr"]
+    draw, behind = renderer(model, views.background), np.array(views.background, np.float32)
+    found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, views.images_of(views.test), behind)["psnr"]
     assert max(found.values()) - min(found.values()) < 0.01, found
     again = run("compare", ply, tmp_path / "half.ply")["photographs"]["b"]["psnr"]
-    assert simplified["photographs"]["psnr"] == pytest.approx(again, abs=0.01)
+    assert simplified["psnr"] == pytest.approx(again, abs=0.01)
 
 
 @pytest.mark.slow
 def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
     # The scene has another origin than the set, and the camera file has none.
-    place = np.array((500123.25, 4649876.5, 214.75))
-    shutil.copytree(sets["rgb"], tmp_path / "set")
-    document = json.loads((tmp_path / "set" / "transforms.json").read_text())
+    def psnr_by(data, model, other=None):
+        return find_view_set(model, data=DataOptions(str(data))).image_test_scorer().psnr(other or model)
+
+    place, near = np.array((500123.25, 4649876.5, 214.75)), sets["rgb"]
+    shutil.copytree(near, tmp_path / "set")
+    document = json.loads((near / "transforms.json").read_text())
     for frame in document["frames"]:
         pose = np.array(frame["transform_matrix"])
         pose[:3, 3] += place
         frame["transform_matrix"] = pose.tolist()
     (tmp_path / "set" / "transforms.json").write_text(json.dumps(document))
     far = replace(scene, origin=tuple(place))
-    scorer = find_view_set(scene, data=DataOptions(str(sets["rgb"]))).image_test_scorer()
-    wanted = pytest.approx(scorer.psnr(scene), abs=0.01)
-    assert wanted == find_view_set(far, data=DataOptions(str(tmp_path / "set"))).image_test_scorer().psnr(far)
     moved = replace(scene, means=scene.means - np.float32((10.0, -20.0, 5.0)), origin=(10.0, -20.0, 5.0))
-    assert wanted == scorer.psnr(moved)
-    assert wanted == find_view_set(moved, data=DataOptions(str(sets["rgb"]))).image_test_scorer().psnr(moved)
+    others = [psnr_by(tmp_path / "set", far), psnr_by(near, scene, moved), psnr_by(near, moved)]
+    assert others == pytest.approx([psnr_by(near, scene)] * 3, abs=0.01)
     own = cameras(3)
     save_cameras(tmp_path / "own.json", own)
     save_cameras(tmp_path / "far.json", [relative_to(-place, camera) for camera in own])
@@ -242,10 +215,19 @@ def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
     assert [False, True] == [any("around the scene's origin" in line for line in v.notes) for v in (one, other)]
 
 
+#: Words of a command after its name, and where its JSON has the scores of the source.
+SCORES = {
+    "compare": ("PLY PLY", ("photographs", "a")),
+    "finetune": ("PLY OUT/t.csplat --iterations 1", ("scores", "source")),
+    "simplify": ("PLY OUT/less.ply --keep 0.9", ("photographs", "source")),
+    "tradeoff": ("PLY --what presets", ("points", 0, "photographs", "a")),
+    "encode": ("PLY OUT/e.csplat --max-psnr-drop 3 --no-prune --preset fast", ("target", "photographs", "source")),
+}
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "every", "held_out", "commands"),
-    [("blender", 5, 4, ("compare", "finetune", "simplify", "tradeoff", "encode")), ("colmap", 10, 2, ("compare",))],
+    ("kind", "every", "held_out", "commands"), [("blender", 5, 4, list(SCORES)), ("colmap", 10, 2, ["compare"])]
 )
 def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands, monkeypatch):
     # No command gets a background, split or size: the PLY records them.
@@ -260,31 +242,18 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
     record = TrainingRecord.of(read_ply(ply).metadata)
     assert ((1.0, 1.0, 1.0) if kind == "blender" else BLACK, (24, 20)) == (record.background, record.size)
     trained = json.loads(log.read_text())["metrics"]
-    found = {name: score_of(name, ply, data, tmp_path) for name in commands}
-    assert {held_out} == {trained["views"]} | {views for views, _ in found.values() if views is not None}
-    scores = {"train": trained["psnr"], **{name: psnr for name, (_, psnr) in found.items()}}
-    assert max(scores.values()) - min(scores.values()) < 0.01, scores
+    scores, counts = [trained["psnr"]], {trained["views"]}
+    for name in commands:
+        words, place = SCORES[name]
+        given = words.replace("PLY", str(ply)).replace("OUT", str(tmp_path)).split()
+        found = report = json.loads(call(name, *given, "--data", data, "--json").stdout)
+        for key in place:
+            found = found[key]
+        scores.append(found if name in ("simplify", "encode") else found["psnr"])
+        counts |= {report["target"]["views"]} if name == "encode" else set()
+        counts |= {found["views"]} if isinstance(found, dict) and "views" in found else set()
+    assert {held_out} == counts
+    assert max(scores) - min(scores) < 0.01, dict(zip(["train", *commands], scores, strict=True))
 
 
 #: Words of a command after its name, and where its JSON has the scores.
-SCORES = {
-    "compare": (("PLY", "PLY"), ("photographs", "a")),
-    "finetune": (("PLY", "OUT/t.csplat", "--iterations", 1), ("scores", "source")),
-    "simplify": (("PLY", "OUT/less.ply", "--keep", 0.9), ("photographs", "source")),
-    "tradeoff": (("PLY", "--what", "presets"), ("points", 0, "photographs", "a")),
-    "encode": (
-        ("PLY", "OUT/e.csplat", "--max-psnr-drop", 3, "--no-prune", "--preset", "fast"),
-        ("target", "photographs", "source"),
-    ),
-}
-
-
-def score_of(name, ply, data, folder):
-    """Return the score of the source in the JSON of a command, and the number of views, if it is there."""
-    words, place = SCORES[name]
-    given = [str(word).replace("PLY", str(ply)).replace("OUT", str(folder)) for word in words]
-    found = report = json.loads(call(name, *given, "--data", data, "--json").stdout)
-    for key in place:
-        found = found[key]
-    scores = found if isinstance(found, dict) else {"psnr": found}
-    return report["target"]["views"] if name == "encode" else scores.get("views"), scores["psnr"]
