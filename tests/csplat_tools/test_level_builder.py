@@ -50,6 +50,7 @@ TREE = VECTORS / "valid" / "levels_of_a_tree.csplat"
 RICH = VECTORS / "valid" / "levels_of_the_rich_scene.csplat"
 NOTHING = next(VECTORS / one.file for one in load() if one.expect and one.expect["header"]["tile_count"] == 0)
 SPLATS = 400
+ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +85,7 @@ def quarter(splats):
 
 
 def same(one, other):
-    names = ("means", "quats", "scales", "opacities", "sh0", "shN")
-    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ARRAYS)
 
 
 def counts_by_level(data, levels):
@@ -173,28 +173,21 @@ def test_the_tiles_of_a_box_are_those_of_the_pseudo_code(spec, nodes, level, low
         assert spec.tiles_in_box(plain, whole, SimpleNamespace(low=box[0], high=box[1])) == part
 
 
-@pytest.mark.parametrize(
-    ("what", "message"),
-    [
-        ({"level": 1, "max_splats": 9}, "level and max_splats exclude each other"),
-        ({"level": -1}, "level is -1, expected 0 to 255"),
-        ({"level": 256}, "level is 256, expected 0 to 255"),
-        ({"pixel_size": -0.5}, "pixel_size is -0.5, expected 0 or more"),
-        ({"pixel_size": math.nan}, "pixel_size is nan, expected 0 or more"),
-        ({"pixel_size": [1.0, 2.0]}, "pixel_size has 2 numbers, expected one, or one for each of 13 nodes"),
-        ({"max_splats": -1}, "max_splats is -1, expected 0 or more"),
-        ({"box": (1, 2, 3)}, "box is \\(1, 2, 3\\), expected six numbers other than NaN"),
-        ({"box": (0, 0, 0, 1, 1, math.nan)}, "expected six numbers other than NaN"),
-        ({"box": ((0, 0, 0), (1, 1, 1))}, "expected six numbers other than NaN"),
-        ({"box": "000111x"}, "expected six numbers other than NaN"),
-        ({"box": 1.0}, "expected six numbers other than NaN"),
-        ({"box": (10**400, 0, 0, 1, 1, 1)}, "expected six numbers other than NaN"),
-        ({"box": (9e9, 0, 0, 9e9, 1, 1)}, "no tile touches the box"),
-    ],
-)
-def test_refuses_arguments_of_a_cut(what, message):
-    with csplat.open(TREE) as file, pytest.raises(InputError, match=message):
-        file.cut(**what)
+def test_refuses_arguments_of_a_cut():
+    exclusive, numbers = {"level": 1, "max_splats": 9}, "expected six numbers other than NaN"
+    boxes = ((0, 0, 0, 1, 1, math.nan), ((0, 0, 0), (1, 1, 1)), "000111x", 1.0, (10**400, 0, 0, 1, 1, 1))
+    with csplat.open(TREE) as file:
+        for what, message in (
+            (exclusive, "level and max_splats exclude each other"), ({"level": -1}, "level is -1, expected 0 to 255"),
+            ({"level": 256}, "level is 256, expected 0 to 255"), ({"max_splats": -1}, "max_splats is -1, expected 0"),
+            ({"pixel_size": -0.5}, "pixel_size is -0.5, expected 0 or more"),
+            ({"pixel_size": math.nan}, "pixel_size is nan, expected 0 or more"),
+            ({"pixel_size": [1.0, 2.0]}, "pixel_size has 2 numbers, expected one, or one for each of 13 nodes"),
+            ({"box": (1, 2, 3)}, r"box is \(1, 2, 3\), " + numbers), *(({"box": box}, numbers) for box in boxes),
+            ({"box": (9e9, 0, 0, 9e9, 1, 1)}, "no tile touches the box"),
+        ):  # fmt: skip
+            with pytest.raises(InputError, match=message):
+                file.cut(**what)
 
 
 def test_a_file_without_levels_is_one_node():
@@ -208,34 +201,28 @@ def test_a_file_without_levels_is_one_node():
 
 # Reading.
 @pytest.mark.slow
-def test_the_default_is_level_0_everywhere(data, model, path):
+def test_the_default_is_level_0_and_a_cut_has_the_values_of_its_tiles(data, model, path):
     header, whole = read_header(data), decode(data)
     assert len(model) == header.splat_count < sum(tile.splat_count for tile in header.all_tiles)
+    assert same(whole, csplat.read(path))
     with csplat.open(path) as file:
         assert same(whole, file.read())
         assert same(whole, file.read(tiles=file.cut()))
         assert len(header.tiles) == len(list(file.tiles())) == len(file.boxes)
-    assert same(whole, csplat.read(path))
-
-
-def test_a_cut_has_the_values_of_its_tiles(data):
-    with csplat.open(data) as file:
         tiles = file.cut(level=1)
-        assert {1} == {file.header.all_tiles[index].level for index in tiles}
-        parts = [decode(data, tiles=[index]) for index in tiles]
-        coarse = file.read(tiles=tiles)
-    for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-        assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(coarse, name))
-    assert all(len(decode(data, tiles=file.cut(max_splats=count))) <= count for count in (50, 100, 230, SPLATS))
+        assert {1} == {header.all_tiles[index].level for index in tiles}
+        coarse, parts = file.read(tiles=tiles), [decode(data, tiles=[index]) for index in tiles]
+        for name in ARRAYS:
+            assert np.array_equal(np.concatenate([getattr(part, name) for part in parts]), getattr(coarse, name))
+        assert all(len(decode(data, tiles=file.cut(max_splats=most))) <= most for most in (50, 100, 230, SPLATS))
 
 
 def test_a_cut_reads_its_part_of_a_file(data):
     with csplat.open(data) as file:
         (coarsest,) = file.cut(level=2)
-        before = file.bytes_read
+        before, tiles = file.bytes_read, file.header.all_tiles
         file.read(tiles=[coarsest])
         assert file.bytes_read - before < len(data) / 2
-        tiles = file.header.all_tiles
         first = tiles[coarsest].layers[0].offset
         assert _spec.HEADER_SIZE + file.header.index_size == file.header.chunk(_spec.CHUNK_TREE).offset < first
     assert all(first < tile.layers[0].offset for tile in tiles if tile.index != coarsest)
@@ -251,12 +238,17 @@ def test_coarser_levels_have_no_extra_columns():
 
 
 # Commands.
-def test_levels_of_a_file_are_scenes_to_convert(data, path, tmp_path):
+def test_levels_of_a_file_are_scenes_to_convert_and_listed_by_info(data, path, tmp_path):
     said = call("convert", path, tmp_path / "coarse.ply", "--level", 1).stderr
     assert "2 coarser levels of detail: level 1 alone is read" in said
     assert counts_by_level(data, [1]) == [len(csplat.read_ply(tmp_path / "coarse.ply"))]
     refused = call("convert", path, tmp_path / "coarse.ply", "--level", 3, "--force", status=1)
     assert "the level is 3, expected 0 to 2" in refused.stderr
+    levels = json.loads(call("info", path, "--json").stdout)["levels"]
+    assert [(0, 4), (1, 2), (2, 1)] == [(one["level"], one["nodes"]) for one in levels]
+    assert [[0.0, 0.0], [0.25, 0.5], [1.0, 1.0]] == [one["errors"] for one in levels]
+    tiles = [tile for tile in read_header(data).all_tiles if tile.level == 1]
+    assert sum(layer.size for tile in tiles for layer in tile.layers.values()) == levels[1]["size_bytes"]
 
 
 @pytest.mark.slow
@@ -283,23 +275,23 @@ def test_a_number_of_splats_selects_a_version(data, path, tmp_path):
 
 @pytest.mark.slow
 def test_render_and_compare_draw_a_level(data, path, tmp_path):
-    plain, cameras = tmp_path / "coarse.ply", tmp_path / "cameras.json"
+    plain, cameras = tmp_path / "coarse.ply", ("--cameras", tmp_path / "cameras.json")
     with csplat.open(data) as file:
         tiles = file.cut(level=1)
         coarse = file.read(tiles=tiles)
         size = sum(layer.size for index in tiles for layer in file.header.all_tiles[index].layers.values())
-    save_cameras(cameras, orbit_cameras(coarse, 2, 48, 36))
+    save_cameras(cameras[1], orbit_cameras(coarse, 2, 48, 36))
     csplat.write(plain, coarse)
 
     def images(name, scene, *words):
-        call("render", scene, tmp_path / name, "--cameras", cameras, *words)
+        call("render", scene, tmp_path / name, *cameras, *words)
         return [image.read_bytes() for image in sorted((tmp_path / name).iterdir())]
 
     assert images("a", path, "--level", 1) == images("b", plain) != images("c", path)
-    words = ("compare", plain, path, "--cameras", cameras, "--json")
-    same, scene = (json.loads(call(*words, *more).stdout) for more in (("--level", 1), ()))
-    assert 99 == same["psnr"] > scene["psnr"]
-    assert (len(coarse), size) == (same["b"]["splats"], same["b"]["size_bytes"])
+    words = ("compare", plain, path, *cameras, "--json")
+    level, scene = (json.loads(call(*words, *more).stdout) for more in (("--level", 1), ()))
+    assert 99 == level["psnr"] > scene["psnr"]
+    assert (len(coarse), size) == (level["b"]["splats"], level["b"]["size_bytes"])
 
 
 @pytest.mark.slow
@@ -315,20 +307,11 @@ def test_an_orbit_is_the_same_for_all_levels(path, tmp_path, monkeypatch, framed
 
 
 def test_values_of_the_option_level():
-    wanted = {None: (0, None), "2": (2, None), "255": (255, None)}
-    wanted |= {"256": (0, 256), "3k": (0, 3000), "1.5M": (0, 1_500_000)}
-    assert wanted == {text: parse_level(text) for text in wanted}
+    wanted = {None: (0, None), "2": (2, None), "255": (255, None), "256": (0, 256), "3k": (0, 3000)}
+    assert wanted | {"1.5M": (0, 1_500_000)} == {text: parse_level(text) for text in (*wanted, "1.5M")}
     for text in ("-1", "1.5", "k", "all", "5 k", ""):
         with pytest.raises(typer.BadParameter, match="expected a level, as in 1, or a number of splats, as in 500k"):
             parse_level(text)
-
-
-def test_info_lists_the_levels(data, path):
-    levels = json.loads(call("info", path, "--json").stdout)["levels"]
-    assert [(0, 4), (1, 2), (2, 1)] == [(one["level"], one["nodes"]) for one in levels]
-    assert [[0.0, 0.0], [0.25, 0.5], [1.0, 1.0]] == [one["errors"] for one in levels]
-    tiles = [tile for tile in read_header(data).all_tiles if tile.level == 1]
-    assert sum(layer.size for tile in tiles for layer in tile.layers.values()) == levels[1]["size_bytes"]
 
 
 @pytest.mark.slow
@@ -412,6 +395,8 @@ def test_the_number_of_levels_is_the_one_asked_for(model):
     assert {0, 1} == {node.level for node in nodes}
     assert 2 == sum(node.parent is None for node in nodes)  # four leaves have one parent, and two have the other
     assert 3 == LevelBuilder(3, leaf_splats=SPLATS).build(model)[-1].level
+    header = read_header(LevelBuilder().encode(model.select(slice(0, 0))).write().data)
+    assert (0, ()) == (header.splat_count, header.all_tiles)
 
 
 def test_parts_of_a_very_large_scene_are_merged_alone(model):
@@ -419,11 +404,6 @@ def test_parts_of_a_very_large_scene_are_merged_alone(model):
     fitted, merged = (builder.build_part(model, count, 1)[1].splats for count in (5000, 5001))
     assert (True, False) == tuple(same(quarter(model), splats) for splats in (merged, fitted))
     assert builder.seconds(5001) < builder.seconds(5000)
-
-
-def test_a_scene_without_splats_has_no_levels(model):
-    data = LevelBuilder().encode(model.select(slice(0, 0))).write().data
-    assert (0, ()) == (read_header(data).splat_count, read_header(data).all_tiles)
 
 
 def test_the_suite_of_encoders_reports_how_levels_look(model, data):

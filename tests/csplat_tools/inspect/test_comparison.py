@@ -21,8 +21,6 @@ from csplat_tools.inspect.comparison import attribute_errors
 from csplat_tools.scene_files import LoadedModel, load_model
 from csplat_tools.views import comparison_cameras
 
-pytest.importorskip("numba", reason="rendering requires the extra [render]")
-
 
 @pytest.fixture(scope="module")
 def scene():
@@ -123,45 +121,25 @@ def test_views_and_progress_are_passed_to_callbacks(scene, cameras):
     assert ("comparing", 1.0) == seen[-1]
     with pytest.raises(InputError, match="at least one camera"):
         compare_models(scene, scene, [])
+    virtual = comparison_cameras(scene)  # which only depend on the source
+    assert [(640, 480)] * 8 == [(camera.W, camera.H) for camera in virtual]
+    again = comparison_cameras(replace(scene, cameras=[camera.to_json() for camera in virtual[:1]]))
+    assert all(np.array_equal(a.viewmat, b.viewmat) for a, b in zip(virtual, again, strict=True))
 
 
-def test_the_cameras_of_psnr_only_depend_on_the_source(scene):
-    cameras = comparison_cameras(scene)
-    assert [(640, 480)] * 8 == [(camera.W, camera.H) for camera in cameras]
-    again = comparison_cameras(replace(scene, cameras=[camera.to_json() for camera in cameras[:1]]))
-    assert all(np.array_equal(a.viewmat, b.viewmat) for a, b in zip(cameras, again, strict=True))
-
-
-# The command.
-@pytest.fixture(scope="module")
-def files(scene, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("files")
-    write_ply(folder / "a.ply", scene)
-    (folder / "b.csplat").write_bytes(encode(scene, EncodeOptions(preset="small")))
-    return folder / "a.ply", folder / "b.csplat"
-
-
-def test_json_has_psnr_at_the_top(files, camera_file):
-    result = json.loads(call("compare", *files, "--cameras", camera_file, "--json").stdout)
+def test_json_has_psnr_at_the_top_and_renders_are_written_side_by_side(scene, camera_file, tmp_path):
+    write_ply(tmp_path / "a.ply", scene)
+    (tmp_path / "b.csplat").write_bytes(encode(scene, EncodeOptions(preset="small")))
+    words = ("compare", tmp_path / "a.ply", tmp_path / "b.csplat", "--cameras", camera_file)
+    result = json.loads(call(*words, "--json").stdout)
     assert 20.0 < result["psnr"] < 99.0
     assert ["cameras.json", "standard", [0.0] * 3] == [result[key] for key in ("cameras", "mode", "background")]
     assert result["ratio"] == pytest.approx(result["a"]["size_bytes"] / result["b"]["size_bytes"])
     assert result["attributes"]["errors"]["means"]["rms"] > 0.0
     assert (3, True) == (len(result["views"]), result["seconds"] > 0.0)
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("small_views")
-def test_virtual_cameras_are_the_default(files):
-    result = json.loads(call("compare", *files, "--json").stdout)
-    assert ("virtual", 8) == (result["cameras"], len(result["views"]))
-    assert 10.0 < result["psnr"] < 90.0
-
-
-def test_renders_are_written_side_by_side(files, camera_file, tmp_path):
-    words = ("compare", *files, "--cameras", camera_file, "--pictures", tmp_path / "out")
-    assert "psnr_worst" in call(*words).stdout
+    pictures = ("--pictures", tmp_path / "out")
+    assert "psnr_worst" in call(*words, *pictures).stdout
     assert ["0000.png", "0002.png", "side.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
     with Image.open(tmp_path / "out" / "side.png") as picture:
         assert (3 * 64, 48) == picture.size
-    assert "--force replaces it" in call(*words, status=1).stderr
+    assert "--force replaces it" in call(*words, *pictures, status=1).stderr

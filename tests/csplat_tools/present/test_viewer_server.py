@@ -96,17 +96,6 @@ def test_the_root_leads_to_the_page_and_the_page_to_scene_and_cameras(tmp_path, 
     assert [500.0, 500.0] == [one["K"][0][0] for one in json.loads(cameras[2])]
 
 
-@pytest.mark.slow
-def test_every_module_of_the_page_is_served_as_javascript(scene_path):
-    with served(scene_path) as server:
-        for name, path in web_files().items():
-            status, headers, body = ask(server, f"/{name}")
-            assert (200, path.read_bytes()) == (status, body)
-            assert path.suffix != ".mjs" or headers["Content-Type"].startswith("text/javascript")
-    assert {"tools/viewer/main.mjs", "tools/viewer/worker.mjs", "codec/js/decoder.mjs"} <= set(web_files())
-    assert not [name for name in web_files() if "test" in name or "node_modules" in name]
-
-
 def test_ranges_of_the_scene_and_its_tag(scene_path, make_model):
     data, path = scene_path.read_bytes(), "/scene/a%20scene.csplat"
     size = len(data)
@@ -138,10 +127,16 @@ ELSEWHERE = [
 
 
 @pytest.mark.slow
-def test_other_paths_are_not_served(scene_path):
+def test_modules_of_the_page_are_served_as_javascript_and_other_paths_are_not_served(scene_path):
     (scene_path.parent / "secret.txt").write_text("secret")
     with served(scene_path) as server:
+        for name, path in web_files().items():
+            status, headers, body = ask(server, f"/{name}")
+            assert (200, path.read_bytes()) == (status, body)
+            assert path.suffix != ".mjs" or headers["Content-Type"].startswith("text/javascript")
         answers = {path: ask(server, path) for path in ELSEWHERE}
+    assert {"tools/viewer/main.mjs", "tools/viewer/worker.mjs", "codec/js/decoder.mjs"} <= set(web_files())
+    assert not [name for name in web_files() if "test" in name or "node_modules" in name]
     assert dict.fromkeys(ELSEWHERE, 404) == {path: status for path, (status, _, _) in answers.items()}
     assert [] == [path for path, (_, _, body) in answers.items() if b"secret" in body]
 
@@ -256,7 +251,12 @@ def test_a_ply_of_any_name_is_encoded_in_memory(tmp_path, make_model):
     assert ["scene.csplat", "scene.ply"] == sorted(path.name for path in tmp_path.iterdir())
 
 
-def test_invalid_axes_and_directions_are_refused():
+def test_the_page_receives_the_given_up_direction_and_invalid_ones_are_refused():
+    for words, wishes in (
+        ({"up": None, "axes": "RFU"}, {"axes": "RFU"}), ({"up": "+Z"}, {"up": "0,0,1"}),
+        ({"up": "0,-2,0.2", "axes": "RDF"}, {"up": "0,-0.995037,0.099504", "axes": "RDF"}),
+    ):  # fmt: skip
+        assert wishes == page_parameters(None, parse_overrides(**words))
     for parse, message, texts in (
         (parse_axes, "expected three letters", ["RL", "RDX", "RUD", "rdf", "RDFF"]),
         (parse_up, "three numbers as", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"]),
@@ -264,14 +264,6 @@ def test_invalid_axes_and_directions_are_refused():
         for text in texts:
             with pytest.raises(typer.BadParameter, match=message):
                 parse(text)
-
-
-def test_the_page_receives_the_given_up_direction():
-    for words, wishes in (
-        ({"up": None, "axes": "RFU"}, {"axes": "RFU"}), ({"up": "+Z"}, {"up": "0,0,1"}),
-        ({"up": "0,-2,0.2", "axes": "RDF"}, {"up": "0,-0.995037,0.099504", "axes": "RDF"}),
-    ):  # fmt: skip
-        assert wishes == page_parameters(None, parse_overrides(**words))
 
 
 def test_damaged_files_and_other_formats_are_refused_before_they_are_served(tmp_path, scene_bytes):
@@ -299,36 +291,26 @@ def test_the_page_runs_from_the_server(tab, site, tmp_path, make_model):
         tab.page.goto("about:blank")  # hangs up, so that the server can end
 
 
-@contextmanager
-def command(*words):
-    line, pipe = [sys.executable, "-m", "csplat_tools", "view", *map(str, words)], subprocess.PIPE
-    streams = {"stdin": subprocess.DEVNULL, "stdout": pipe, "stderr": pipe, "text": True}
-    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    process = subprocess.Popen(line, **streams, env=environment, preexec_fn=heed_interrupts)  # noqa: PLW1509
-    with process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
 @pytest.mark.slow
 def test_the_command_prints_the_address_and_ends_with_status_0(sample_path):
-    with command(sample_path, "--no-browser") as process:
-        url = process.stdout.readline().strip()
-        assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
-        connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)
-        connection.request("GET", "/scene/sample.csplat")
-        assert len(read_ply(sample_path)) == len(decode(connection.getresponse().read()))
-        process.send_signal(signal.SIGINT)  # while the connection is still open
-        assert 0 == process.wait(timeout=10)
-        connection.close()
-        said = process.stderr.read()
+    line, pipe = [sys.executable, "-m", "csplat_tools", "view", str(sample_path), "--no-browser"], subprocess.PIPE
+    streams = {"stdin": subprocess.DEVNULL, "stdout": pipe, "stderr": pipe, "text": True}
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(line, **streams, env=environment, preexec_fn=heed_interrupts) as process:  # noqa: PLW1509
+        try:
+            url = process.stdout.readline().strip()
+            assert re.fullmatch(r"http://127\.0\.0\.1:\d+/", url)
+            connection = http.client.HTTPConnection(urlsplit(url).netloc, timeout=10)
+            connection.request("GET", "/scene/sample.csplat")
+            assert len(read_ply(sample_path)) == len(decode(connection.getresponse().read()))
+            process.send_signal(signal.SIGINT)  # while the connection is still open
+            assert 0 == process.wait(timeout=10)
+            connection.close()
+            said = process.stderr.read()
+        finally:
+            process.kill()
     found = [text in said for text in ("encoded with the preset fast", "Ctrl-C", "Traceback")]
     assert [True, True, False] == found, said
-
-
-def test_errors_of_the_command_are_reported(sample_path):
     for words, status, message in (
         (["absent.csplat"], 1, "No such file"), ([sample_path, "--up", "w"], 2, "up is 'w'"),
         ([sample_path, "--cameras", "absent.json"], 1, "absent.json"),

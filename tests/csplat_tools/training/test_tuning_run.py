@@ -10,6 +10,7 @@ from captures import cameras, photograph, shell
 from command_line import call, change_options
 from finetune_cases import BRIEF, tuned_subset, tuner_of
 
+from csplat import write_ply
 from csplat_render.camera_files import save_cameras
 from csplat_tools.training import tuning_run
 
@@ -36,15 +37,17 @@ def change_run(patch, **options):
 
 
 @pytest.mark.slow
-def test_renders_for_tuning_may_use_a_camera_file(capture, tmp_path, monkeypatch):
+def test_renders_for_tuning_may_use_a_camera_file(source, capture, tmp_path, monkeypatch):
     change_run(monkeypatch, prune_unseen=True)
     save_cameras(tmp_path / "cameras.json", cameras(40))
     away = [replace(camera, viewmat=np.diag([-1.0, 1.0, -1.0, 1.0]) @ camera.viewmat) for camera in cameras(40)]
     save_cameras(tmp_path / "away.json", away)
-    words = ("finetune", capture / "scene.ply", tmp_path / "s.csplat", "--self", *BRIEF, "--json", "-q", "--cameras")
-    facts = json.loads(call(*words, tmp_path / "cameras.json").stdout)
+    write_ply(tmp_path / "seen.ply", source)
+    words = (tmp_path / "s.csplat", "--self", *BRIEF, "--json", "-q", "--cameras")
+    facts = json.loads(call("finetune", capture / "scene.ply", *words, tmp_path / "cameras.json").stdout)
     assert (301, 300, 4) == (facts["source_splats"], facts["splats"], facts["validation"]["views"])
-    assert "no view shows any splat" in call(*words, tmp_path / "away.json", "--force", status=1).stderr
+    refused = call("finetune", tmp_path / "seen.ply", *words, tmp_path / "away.json", "--force", status=1)
+    assert "no view shows any splat" in refused.stderr
 
 
 class GrowingTuner(tuning_run.Tuner):

@@ -32,14 +32,31 @@ from csplat_tools.views.sliced_renderer import SlicedScene, slice_limits
 def many_tiles(make_model, tmp_path):
     """Return the path of a file of ten tiles."""
     data = csplat.encode(make_model(600, 2), csplat.EncodeOptions(preset="fast", tile_splats=60))
-    path = tmp_path / "scene.csplat"
-    path.write_bytes(data)
+    (tmp_path / "scene.csplat").write_bytes(data)
     assert len(read_header(data).tiles) == 10
-    return path
+    return tmp_path / "scene.csplat"
 
 
 @pytest.mark.slow
-def test_threads_and_released_pages_do_not_change_the_result(many_tiles, monkeypatch):
+def test_tiles_before_a_damaged_one_are_decoded_but_none_goes_to_standard_output(many_tiles):
+    data, whole = bytearray(many_tiles.read_bytes()), io.BytesIO()
+    tiles = read_header(data).tiles
+    write_ply(whole, decode(bytes(data)))
+    assert whole.getvalue() == call("decode", many_tiles, "-", "--quiet").stdout_bytes
+    for place in (4, 6):
+        layer = tiles[place].layers[0]
+        data[layer.offset + layer.size - 1] ^= 1
+    for threads in (1, 3):
+        models = open_tiles(bytes(data), threads=threads).models()
+        assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
+        with pytest.raises(CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
+            next(models)
+    many_tiles.write_bytes(data)
+    assert b"" == call("decode", many_tiles, "-", "--quiet", status=1).stdout_bytes
+
+
+@pytest.mark.slow
+def test_threads_and_released_pages_do_not_change_the_result_and_limits_are_per_file_or_tile(many_tiles, monkeypatch):
     monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
     expected = decode(many_tiles)
     for threads in (1, 3):
@@ -50,33 +67,7 @@ def test_threads_and_released_pages_do_not_change_the_result(many_tiles, monkeyp
             for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
                 together = np.concatenate([getattr(model, name) for model in models])
                 assert getattr(expected, name).tobytes() == together.tobytes()
-
-
-def test_tiles_before_a_damaged_one_are_decoded(many_tiles):
-    data = bytearray(many_tiles.read_bytes())
-    tiles = read_header(data).tiles
-    for place in (4, 6):
-        layer = tiles[place].layers[0]
-        data[layer.offset + layer.size - 1] ^= 1
-    for threads in (1, 3):
-        models = open_tiles(bytes(data), threads=threads).models()
-        assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
-        with pytest.raises(CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
-            next(models)
-
-
-@pytest.mark.slow
-def test_no_part_of_a_damaged_file_goes_to_standard_output(many_tiles):
-    data, whole = bytearray(many_tiles.read_bytes()), io.BytesIO()
-    write_ply(whole, decode(bytes(data)))
-    assert whole.getvalue() == call("decode", many_tiles, "-", "--quiet").stdout_bytes
-    data[-1] ^= 1
-    many_tiles.write_bytes(data)
-    assert b"" == call("decode", many_tiles, "-", "--quiet", status=1).stdout_bytes
-
-
-def test_the_limit_of_splats_is_per_file_and_that_of_bytes_per_tile(many_tiles):
-    limits = Limits(bytes=max(tile.splat_count for tile in open_tiles(many_tiles).header.tiles) * 4 * (11 + 27))
+    limits = Limits(bytes=max(map(len, models)) * 4 * (11 + 27))
     assert 600 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
     with pytest.raises(LimitError, match="bytes"):
         decode(many_tiles, limits=limits)
@@ -114,12 +105,6 @@ def files_of_both(model, tmp_path):
     encoded.write_bytes(result.data)
     np.save(index, result.source_index)
     return str(source), str(encoded), str(index)
-
-
-@pytest.fixture
-def no_least(monkeypatch):
-    """Accept any memory limit: small scenes fit into all that are accepted otherwise."""
-    monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
 
 
 def by_disk(model, every=1, progress=None):
@@ -173,12 +158,10 @@ def test_splats_behind_opaque_pixels_are_not_drawn(model, view, counts):
 
 
 def test_slices_have_equal_costs_and_do_not_split_a_depth():
-    near = np.array([0, 5, 1, 2, 4, 3], np.float32)
+    near, same = np.array([0, 5, 1, 2, 4, 3], np.float32), np.float32(2.0)
     taken = np.where(near > 0, 10.0, 0.0)
-    assert [] == slice_limits(near, taken, 1).tolist()
-    assert [] == slice_limits(0 * near, 0 * taken, 9).tolist()
+    assert [] == slice_limits(near, taken, 1).tolist() == slice_limits(0 * near, 0 * taken, 9).tolist()
     assert [2.0, 4.0] == slice_limits(near, taken, 3).tolist()
-    same = np.float32(2.0)
     assert [same, np.nextafter(same, np.float32(3.0))] == slice_limits(np.full(9, same), np.ones(9), 4).tolist()
 
 
@@ -205,8 +188,9 @@ def test_a_sample_has_every_nth_splat_and_gives_about_the_same_views(files_of_bo
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("no_least")
-def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_file, tmp_path, monkeypatch):
+def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, model, camera_file, tmp_path, monkeypatch):
+    # Any memory is accepted here, as small scenes fit into all that is accepted otherwise.
+    monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
     source, encoded, index = files_of_both
     words = ("compare", source, encoded, "--cameras", camera_file)
 
@@ -227,20 +211,14 @@ def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, camera_fi
     assert "the errors of splats are unknown" in call(*words).stdout  # without an index
     refused = call("compare", source, encoded, "--backend", "exact", status=1)
     assert "error: --backend exact requires both scenes in memory" in refused.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("no_least")
-def test_splats_of_one_order_are_measured_without_an_index(model, camera_file, tmp_path):
-    scenes = str(tmp_path / "a.ply"), str(tmp_path / "b.ply")
-    for path, shift in zip(scenes, (0.0, 0.001), strict=True):
-        write_ply(path, replace(model, means=model.means + np.float32(shift)))
-    views = csplat_tools.find_view_set(model, cameras=camera_file, count=0)
-    wanted, shown = (csplat_tools.compare(*scenes, views=views, memory_bytes=most) for most in (None, LITTLE))
-    assert wanted.quality == shown.quality
-    assert "order" == shown.attributes.pairing
-    for name, error in shown.attributes.errors.items():
-        assert wanted.attributes.errors[name] == pytest.approx(error, rel=1e-12)
+    moved, views = tmp_path / "moved.ply", csplat_tools.find_view_set(model, cameras=camera_file, count=0)
+    write_ply(moved, replace(model, means=model.means + np.float32(0.001)))
+    wanted, shown = (
+        csplat_tools.compare(source, str(moved), views=views, memory_bytes=most) for most in (None, LITTLE)
+    )
+    assert (wanted.quality, "order") == (shown.quality, shown.attributes.pairing)
+    others = {name: pytest.approx(error, rel=1e-12) for name, error in shown.attributes.errors.items()}
+    assert wanted.attributes.errors == others
 
 
 def test_what_cannot_be_drawn_is_an_error_before_drawing(model, view, files_of_both, monkeypatch):

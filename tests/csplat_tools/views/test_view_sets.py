@@ -15,11 +15,9 @@ from csplat.ply import read_ply
 from csplat.training_record import TRAINING, TrainingRecord
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import save_cameras
-from csplat_render.scorer import renderer
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
 from csplat_tools.views.view_sets import pose_key
 from csplat_trainer.data import load
-from csplat_trainer.posed_images import evaluate
 
 
 @pytest.fixture(scope="module")
@@ -73,14 +71,6 @@ def test_a_camera_file_is_split_if_it_has_enough_views(scene, tmp_path):
         assert not virtual or (36, 12) == (len(views.training), len(views.validation))
 
 
-@pytest.mark.slow
-def test_virtual_test_views_have_a_black_background(scene):
-    views = find_view_set(scene, count=5, validation_count=2, background=WHITE)
-    assert (21, 2, 8) == tuple(map(len, poses(views)))
-    assert BLACK == views.test_scorer(scene).background
-    assert WHITE == views.validation_scorer(scene).background
-
-
 def test_the_number_of_validation_views_may_be_chosen(sets, scene):
     data = DataOptions(str(sets["rgb"]))
     for chosen, sizes in (
@@ -89,13 +79,16 @@ def test_the_number_of_validation_views_may_be_chosen(sets, scene):
         assert sizes == [*map(len, poses(find_view_set(scene, data=data, **chosen)))]
     with pytest.raises(InputError, match=r"none of .* for training"):
         find_view_set(scene, data=data, validation_count=14)
+    one, other = cameras(2)
+    ViewSet("own", BLACK, [one], [], [other], origin=scene.origin)
+    with pytest.raises(InputError, match="own: a view is both a training and a test view"):
+        ViewSet("own", BLACK, [one], [], [other, resized(one, 2 * W, 2 * H)])
 
 
 def test_a_folder_of_images_and_an_opened_set_have_the_same_views(sets, scene):
-    whole, opened = DataOptions(str(sets["rgb"])), load(sets["rgb"])
-    wanted, named, found = (
-        find_view_set(scene, data=data) for data in (whole, DataOptions(str(sets["rgb"] / "images")), opened)
-    )
+    opened, folder = load(sets["rgb"]), sets["rgb"]
+    given = (DataOptions(str(folder)), DataOptions(str(folder / "images")), opened)
+    wanted, named, found = (find_view_set(scene, data=data) for data in given)
     assert (wanted.name, poses(wanted)) == (named.name, poses(named))
     assert (poses(wanted), wanted.background) == (poses(found), found.background)
     assert found.images[0].source is opened.train[0].source  # pixels are read once
@@ -117,13 +110,6 @@ def test_validation_images_of_a_set_are_validation_views(sets, scene, tmp_path):
         assert sizes == [*map(len, poses(find_view_set(scene, data=data, **chosen)))]
 
 
-def test_a_view_of_two_roles_is_refused_at_any_size(scene):
-    one, other = cameras(2)
-    ViewSet("own", BLACK, [one], [], [other], origin=scene.origin)
-    with pytest.raises(InputError, match="own: a view is both a training and a test view"):
-        ViewSet("own", BLACK, [one], [], [other, resized(one, 2 * W, 2 * H)])
-
-
 # Recorded training options.
 def test_recorded_training_options_are_the_defaults(sets, scene):
     record = TrainingRecord((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
@@ -140,53 +126,18 @@ def test_recorded_training_options_are_the_defaults(sets, scene):
 
 
 @pytest.mark.slow
-def test_a_scene_without_a_training_record_is_noted_once(sets, scene):
+def test_virtual_test_views_have_a_black_background_and_a_missing_training_record_is_noted_once(sets, scene):
+    views = find_view_set(scene, count=5, validation_count=2, background=WHITE)
+    assert (21, 2, 8) == tuple(map(len, poses(views)))
+    assert (BLACK, WHITE) == (views.test_scorer(scene).background, views.validation_scorer(scene).background)
+    assert () == find_view_set(scene, count=2).notes
     for kind in ("rgb", "rgba"):
         views = find_view_set(scene, data=DataOptions(str(sets[kind])))
         assert BLACK == views.background
         assert 1 == sum("the training background" in line for line in views.notes)
-    assert () == find_view_set(scene, count=2).notes
 
 
 # Commands.
-
-
-@pytest.mark.slow
-def test_no_command_uses_test_views_for_decisions_and_all_agree_on_scores(sets, tmp_path, monkeypatch):
-    ply, made, check, found = sets["rgba"] / "scene.ply", [], ViewSet.__post_init__, {}
-    monkeypatch.setattr(ViewSet, "__post_init__", lambda views: check(views) or made.append(views))
-    change_options(monkeypatch, "csplat_tools.cli.shared_options.DataOptions", size=(24, 20), test_every=5)
-    change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", effort=1)
-    change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
-
-    def run(*words):
-        """Run a command; return its JSON and check the roles of its views."""
-        made.clear()
-        result = json.loads(call(*words, "--data", sets["rgba"], "--json").stdout)
-        assert any(views.images for views in made), words
-        for views in made:
-            roles = poses(views)
-            assert sum(map(len, roles)) == len(set.union(*roles)), words
-            for camera in (*views.training, *views.validation):
-                assert camera.image is None or int(camera.image[-6:-4]) % 5, words
-            assert not views.images or numbers(views.test) in ([0, 5, 10, 15], []), words
-        return result
-
-    found["compare"] = run("compare", ply, ply)["photographs"]["a"]["psnr"]
-    simplified = run("simplify", ply, tmp_path / "half.ply", "--keep", "0.5", "--effort", "1")["photographs"]
-    found["simplify"] = simplified["source"]
-    run("simplify", ply, tmp_path / "less.ply", "--max-psnr-drop", "1", "--effort", "1")
-    run("sensitivity", ply, tmp_path / "s.npz")
-    tuned = run("finetune", ply, tmp_path / "s.csplat", "--iterations", "2", "--keep", "0.7")
-    found["finetune"] = tuned["scores"]["source"]["psnr"]
-    found["tradeoff"] = run("tradeoff", ply, "--what", "precision=40")["points"][0]["photographs"]["a"]["psnr"]
-    model = read_ply(ply)
-    views = find_view_set(model, data=DataOptions(str(sets["rgba"]), (24, 20), test_every=5))
-    draw, behind = renderer(model, views.background), np.array(views.background, np.float32)
-    found["evaluate"] = evaluate(lambda camera: draw(camera).rgb, views.images_of(views.test), behind)["psnr"]
-    assert max(found.values()) - min(found.values()) < 0.01, found
-    again = run("compare", ply, tmp_path / "half.ply")["photographs"]["b"]["psnr"]
-    assert simplified["psnr"] == pytest.approx(again, abs=0.01)
 
 
 @pytest.mark.slow
@@ -216,44 +167,70 @@ def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
 
 
 #: Words of a command after its name, and where its JSON has the scores of the source.
+#: A command, and where its JSON has the scores of the source on the test images.
 SCORES = {
-    "compare": ("PLY PLY", ("photographs", "a")),
-    "finetune": ("PLY OUT/t.csplat --iterations 1", ("scores", "source")),
-    "simplify": ("PLY OUT/less.ply --keep 0.9", ("photographs", "source")),
-    "tradeoff": ("PLY --what presets", ("points", 0, "photographs", "a")),
-    "encode": ("PLY OUT/e.csplat --max-psnr-drop 3 --no-prune --preset fast", ("target", "photographs", "source")),
+    "compare PLY PLY": ("photographs", "a"),
+    "finetune PLY OUT/t.csplat --iterations 1 --keep 0.7": ("scores", "source"),
+    "simplify PLY OUT/less.ply --keep 0.9": ("photographs", "source"),
+    "simplify PLY OUT/few.ply --max-psnr-drop 1 --effort 1": ("photographs", "source"),
+    "tradeoff PLY --what presets": ("points", 0, "photographs", "a"),
+    "encode PLY OUT/e.csplat --max-psnr-drop 3 --no-prune --preset fast": ("target", "photographs", "source"),
+    "sensitivity PLY OUT/s.npz": (),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("kind", "every", "held_out", "commands"), [("blender", 5, 4, list(SCORES)), ("colmap", 10, 2, ["compare"])]
+    ("kind", "every", "held_out", "commands"), [("blender", 5, 4, list(SCORES)), ("colmap", 10, 2, ["compare PLY PLY"])]
 )
-def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands, monkeypatch):
+def test_every_command_reports_the_score_of_the_training_and_decides_by_other_views(
+    tmp_path, kind, every, held_out, commands, monkeypatch
+):
     # No command gets a background, split or size: the PLY records them.
-    data, ply, log = tmp_path / "data", tmp_path / "s.ply", tmp_path / "log.json"
+    data, ply, log, made, check = (
+        tmp_path / "data",
+        tmp_path / "s.ply",
+        tmp_path / "log.json",
+        [],
+        ViewSet.__post_init__,
+    )
     data.mkdir()
     data = photograph_object(shell(3), data) if kind == "blender" else as_colmap(photograph(shell(3), data))
     quick = ("--max-splats", 60, "--sh-degree", 0, "--iterations", 10, "--size", "24x20", "--test-every", every)
     change_options(monkeypatch, "csplat_tools.cli.train.TrainOptions", init="box")
     change_options(monkeypatch, "csplat_tools.optimise.simplify.SimplifyOptions", refit=False)
     change_options(monkeypatch, "csplat_tools.cli.finetune.EncodeOptions", sh_coding="none")
+    monkeypatch.setattr(ViewSet, "__post_init__", lambda views: check(views) or made.append(views))
+
+    def run(words):
+        made.clear()
+        given = words.replace("PLY", str(ply)).replace("OUT", str(tmp_path)).split()
+        result = json.loads(call(*given, "--data", data, "--json").stdout)
+        assert any(views.images for views in made), words
+        for views in made:
+            roles = poses(views)
+            assert sum(map(len, roles)) == len(set.union(*roles)), words
+            assert not views.images or len(views.test) in (0, held_out), words
+            if kind == "blender":
+                assert all("test" not in (one.image or "") for one in (*views.training, *views.validation)), words
+        return result
+
     call("train", data, ply, *quick, "--report", log, "-q")
     record = TrainingRecord.of(read_ply(ply).metadata)
     assert ((1.0, 1.0, 1.0) if kind == "blender" else BLACK, (24, 20)) == (record.background, record.size)
     trained = json.loads(log.read_text())["metrics"]
-    scores, counts = [trained["psnr"]], {trained["views"]}
-    for name in commands:
-        words, place = SCORES[name]
-        given = words.replace("PLY", str(ply)).replace("OUT", str(tmp_path)).split()
-        found = report = json.loads(call(name, *given, "--data", data, "--json").stdout)
-        for key in place:
+    scores, counts, reports = {"train": trained["psnr"]}, {trained["views"]}, {words: run(words) for words in commands}
+    for words in commands[: len(SCORES) - 1]:
+        found = reports[words]
+        for key in SCORES[words]:
             found = found[key]
-        scores.append(found if name in ("simplify", "encode") else found["psnr"])
-        counts |= {report["target"]["views"]} if name == "encode" else set()
+        scores[words] = found["psnr"] if isinstance(found, dict) else found
         counts |= {found["views"]} if isinstance(found, dict) and "views" in found else set()
     assert {held_out} == counts
-    assert max(scores) - min(scores) < 0.01, dict(zip(["train", *commands], scores, strict=True))
+    assert max(scores.values()) - min(scores.values()) < 0.01, scores
+    if kind == "blender":
+        simplified = reports["simplify PLY OUT/less.ply --keep 0.9"]["photographs"]["psnr"]
+        assert simplified == pytest.approx(run("compare PLY OUT/less.ply")["photographs"]["b"]["psnr"], abs=0.01)
 
 
 #: Words of a command after its name, and where its JSON has the scores.
