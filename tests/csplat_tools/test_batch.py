@@ -13,7 +13,7 @@ import pytest
 from command_line import InThisProcess, call, heed_interrupts
 
 import csplat
-from csplat.errors import InputError
+from csplat import InputError
 from csplat_tools import batch, run_batch
 from csplat_tools.batch import find_tasks
 

@@ -6,16 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from csplat_tools.console import (
-    Display,
-    displayed,
-    format_range,
-    format_seconds,
-    note,
-    print_data,
-    progress_bar,
-    step_progress,
-)
+from csplat_tools import console
+from csplat_tools.console import Display, displayed, progress_bar, step_progress
 
 
 class Terminal(io.StringIO):
@@ -66,14 +58,11 @@ def test_a_restarted_stage_estimates_its_own_time_left(clock, capsys):
     assert "50 %, about 20 s left" in capsys.readouterr().err
 
 
-def test_a_stage_may_have_its_own_text(clock, capsys):
+def test_a_stage_may_have_its_own_text_and_long_runs_announce_their_time(clock, capsys):
     display = Display(terminal=False, clock=clock)
     with displayed(display), step_progress("training", lambda now: f"step {now.iteration}, 3 s left") as show:
         show(SimpleNamespace(iteration=40, iterations=50))
     assert "step 40, 3 s left" in lines(display, clock, capsys, 11)[0]
-
-
-def test_long_runs_announce_their_time(clock, capsys):
     for iterations, announced in ((range(1000, 1300, 100), True), (range(4600, 5000, 200), False)):
         with step_progress("training", lambda _: "", clock=clock) as show:
             for iteration in iterations:  # a run that resumes
@@ -93,24 +82,21 @@ def test_a_terminal_shows_bars_after_two_seconds_and_removes_them_before_other_o
             display.tick()
             assert shown == ("25 %, about 9 s left" in sys.stderr.getvalue())
         assert display._bars is not None
-        print_data("data")
+        console.print_data("data")
         assert display._bars is None
         display.tick()
-        note("a remark")
+        console.note("a remark")
         assert sys.stderr.getvalue().endswith("a remark\n")
     assert "data\n" == capsys.readouterr().out  # not on standard error, which has the bars
 
 
-def test_quiet_and_nested_displays_show_nothing():
+def test_quiet_and_nested_displays_show_nothing_and_durations_are_short():
     with progress_bar(quiet=True) as progress:
         assert progress is None
     with progress_bar() as outer, progress_bar() as inner, progress_bar(quiet=True) as silent:
         assert (outer, None) == (inner, silent)
     with progress_bar() as later:
         assert later not in (None, outer)  # the first display went with its work
-
-
-def test_durations_are_short():
-    assert ["0 s", "99 s", "2 minutes"] == [format_seconds(seconds) for seconds in (0.2, 99.4, 110.0)]
+    assert ["0 s", "99 s", "2 minutes"] == [console.format_seconds(seconds) for seconds in (0.2, 99.4, 110.0)]
     ranges = {(20.0, 50.0): "20 to 50 s", (30.0, 110.0): "1 to 2 minutes", (120.0, 290.0): "2 to 5 minutes"}
-    assert ranges == {between: format_range(*between) for between in ranges}
+    assert ranges == {between: console.format_range(*between) for between in ranges}

@@ -79,13 +79,7 @@ def test_the_page_opens_in_a_browser(tab, page):
     tab.page.goto(page.as_uri())
     assert "a & b.csplat: content" == tab.page.title()
     assert 0 == tab.page.evaluate("[...document.images].filter((one) => !one.naturalWidth).length")
-    root = "document.documentElement"
-    assert tab.page.evaluate(f"{root}.scrollWidth <= {root}.clientWidth")
-    grounds = []
-    for scheme in ("light", "dark"):
-        tab.page.emulate_media(color_scheme=scheme)
-        grounds.append(tab.page.evaluate("getComputedStyle(document.body).backgroundColor"))
-    assert grounds[0] != grounds[1]
+    assert tab.page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
 
 
 @pytest.mark.slow
@@ -99,15 +93,12 @@ def test_without_the_renderer_the_page_has_no_comparison(files, tmp_path, monkey
     assert not (tmp_path / "b.html").exists()
 
 
-def test_bars_are_proportional_to_bytes():
+def test_bars_are_proportional_to_bytes_and_the_hardest_place_is_where_the_error_is():
     text = attribute_figure({"means": 100, "sh0": 300, "sh1": 50})
     widths = np.array(re.findall(r'width="([\d.]+)" height="17"', text), float)
     np.testing.assert_allclose(widths / widths[0], [1.0, 3.0, 0.5], atol=1e-3)
-
-
-def test_the_hardest_place_is_where_the_error_is():
-    source = np.full((80, 120, 3), 0.5, np.float32)
-    badly, place = source.copy(), HardestPlaceSearch()
+    source, place = np.full((80, 120, 3), 0.5, np.float32), HardestPlaceSearch()
+    badly = source.copy()
     badly[31:39, 70:80] = 1.0
     assert place.found() is None
     place.examine(0, source, source)
@@ -115,8 +106,7 @@ def test_the_hardest_place_is_where_the_error_is():
     for number, seen in ((1, badly), (2, source + np.float32(0.05))):
         place.examine(number, source, seen)
     found = place.found()
-    assert 1 == found.view
-    assert (20, 30, 3) == found.source.shape == found.decoded.shape
+    assert (1, (20, 30, 3), (20, 30, 3)) == (found.view, found.source.shape, found.decoded.shape)
     assert 80 * 3 == np.count_nonzero(found.decoded == 255)
     assert found.psnr == pytest.approx(10.0 * np.log10(600.0 / (80 * 0.25)), abs=0.01)
     frame = np.argwhere((found.where == 255).all(axis=2))

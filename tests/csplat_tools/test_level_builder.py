@@ -18,8 +18,7 @@ from hypothesis import strategies as st
 
 import csplat
 import csplat_tools
-from csplat import InputError, LimitError, _spec, decode, read_header
-from csplat.decoder import decode_scene
+from csplat import InputError, LimitError, _spec, decode, decode_scene, read_header
 from csplat.decoder.container import SceneHeader
 from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
@@ -56,11 +55,6 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 @pytest.fixture(scope="module")
 def model(sample_path):
     return csplat.read_ply(sample_path).select(slice(0, SPLATS))
-
-
-@pytest.fixture(scope="module")
-def larger_model(sample_path):
-    return csplat.read_ply(sample_path).select(slice(0, 1200))
 
 
 @pytest.fixture(scope="module")
@@ -190,16 +184,20 @@ def test_refuses_arguments_of_a_cut():
                 file.cut(**what)
 
 
-def test_a_file_without_levels_is_one_node():
+def test_a_file_without_levels_is_one_node_and_coarser_levels_have_no_extra_columns():
     with csplat.open(VECTORS / "valid" / "two_tiles.csplat") as file:
         assert [0, 1] == file.cut() == file.cut(level=3) == file.cut(pixel_size=9.0) == file.cut(max_splats=5)
         with pytest.raises(LimitError, match="max_splats: needs 5, allowed 4"):
             file.cut(max_splats=4)
     with csplat.open(NOTHING) as file:
         assert ((), []) == (file.nodes, file.cut(max_splats=0))
+    with open_scene(RICH, max_splats=read_header(RICH).splat_count - 1) as scene:
+        assert [{}] == [block.extra for block in scene.blocks()]
+    with csplat.open(RICH) as file:
+        assert [{}, {}] == [file.read(tiles=tiles).extra for tiles in (file.cut(level=1), [0, 2])]
+        assert [["label"], ["label"]] == [list(file.read(**what).extra) for what in ({}, {"tiles": [0]})]
 
 
-# Reading.
 @pytest.mark.slow
 def test_the_default_is_level_0_and_a_cut_has_the_values_of_its_tiles(data, model, path):
     header, whole = read_header(data), decode(data)
@@ -228,16 +226,6 @@ def test_a_cut_reads_its_part_of_a_file(data):
     assert all(first < tile.layers[0].offset for tile in tiles if tile.index != coarsest)
 
 
-def test_coarser_levels_have_no_extra_columns():
-    assert ["label"] == list(decode(RICH.read_bytes()).extra)
-    with open_scene(RICH, max_splats=read_header(RICH).splat_count - 1) as scene:
-        assert [{}] == [block.extra for block in scene.blocks()]
-    with csplat.open(RICH) as file:
-        assert [{}, {}] == [file.read(tiles=tiles).extra for tiles in (file.cut(level=1), [0, 2])]
-        assert ["label"] == list(file.read(tiles=[0]).extra)
-
-
-# Commands.
 def test_levels_of_a_file_are_scenes_to_convert_and_listed_by_info(data, path, tmp_path):
     said = call("convert", path, tmp_path / "coarse.ply", "--level", 1).stderr
     assert "2 coarser levels of detail: level 1 alone is read" in said
@@ -327,44 +315,38 @@ def test_encode_writes_levels(tmp_path, model):
         assert "expected auto or 1 to 16" in " ".join(refused.output.split())
 
 
-# Parts and merged files.
-def test_a_part_has_whole_leaves_and_the_nodes_above_them(data):
-    def extract(*box):
+@pytest.mark.slow
+def test_a_part_has_whole_leaves_and_the_nodes_above_them_and_merged_files_are_a_forest(data, model):
+    def made(function, *given):
         stream = io.BytesIO()
-        return csplat.extract(data, box, stream), stream.getvalue()
+        return function(*given, stream), stream.getvalue()
 
     with csplat.open(data) as file:
         nodes, step = file.nodes, file.header.attributes[3].step
     middle = np.mean(nodes[0].tiles[0].corners(step), axis=0)
-    part, cut = extract(*middle, *middle)
+    part, cut = made(csplat.extract, data, (*middle, *middle))
     assert_valid(cut)
     assert same(decode(data, tiles=part.tiles), decode(cut, tiles=range(len(part.tiles))))
     kept = [node for node in csplat.open(cut).nodes if node.level == 0]
     assert sum(node.splat_count for node in kept) == part.splat_count == len(decode(cut))
     assert 1 <= len(kept) < 4
-    whole, copy = extract(*[-1e6] * 3, *[1e6] * 3)
+    whole, copy = made(csplat.extract, data, (*[-1e6] * 3, *[1e6] * 3))
     assert [node.error for node in nodes] == [node.error for node in csplat.open(copy).nodes]
     assert {0, 2} == {len(node.children) for data in (cut, copy) for node in csplat.open(data).nodes}
     assert len(whole.tiles) == len(read_header(data).all_tiles)
+    merged, twice = made(csplat.merge, [data, data])
+    assert "" == merged.why
+    assert_valid(twice)
+    levels = [node.level for node in csplat.open(twice).nodes]
+    assert sorted(levels) == levels
+    assert 2 == sum(node.parent is None for node in csplat.open(twice).nodes)
+    one, both = (decode(file, tiles=csplat.open(file).cut(level=1)).means for file in (data, twice))
+    assert np.array_equal(np.concatenate([one, one]), both)
+    merged, other = made(csplat.merge, [data, csplat.encode(model.select(slice(0, 100)))])
+    assert re.fullmatch("file 2 .* different steps of .*; levels of detail are left out", merged.why), merged.why
+    assert () == read_header(other).coarse_tiles
 
 
-@pytest.mark.slow
-def test_merged_files_are_a_forest(data, model):
-    again, other = io.BytesIO(), io.BytesIO()
-    assert "" == csplat.merge([data, data], again).why
-    assert_valid(again.getvalue())
-    with csplat.open(again.getvalue()) as file:
-        levels = [node.level for node in file.nodes]
-        assert sorted(levels) == levels
-        assert 2 == sum(node.parent is None for node in file.nodes)
-        once, twice = decode(data, tiles=csplat.open(data).cut(level=1)), file.read(tiles=file.cut(level=1))
-    assert np.array_equal(np.concatenate([once.means, once.means]), twice.means)
-    why = csplat.merge([data, csplat.encode(model.select(slice(0, 100)))], other).why
-    assert re.fullmatch("file 2 .* different steps of .*; levels of detail are left out", why), why
-    assert () == read_header(other.getvalue()).coarse_tiles
-
-
-# Building.
 def test_groups_hold_each_point_once_and_are_of_equal_size():
     for count, parts in ((1, 1), (2, 2), (7, 3), (40, 1), (40, 13), (40, 32), (40, 40)):
         groups = kd_groups(np.random.default_rng(count).normal(size=(count, 3)).astype(np.float32), parts)
@@ -390,16 +372,13 @@ def test_each_level_has_a_quarter_of_the_splats_of_the_finer_one_at_any_number_o
 
 
 @pytest.mark.slow
-def test_the_number_of_levels_is_the_one_asked_for(model):
+def test_the_number_of_levels_is_the_one_asked_for_and_parts_of_a_very_large_scene_are_merged_alone(model):
     nodes = LevelBuilder(1, leaf_splats=70).build(model)
     assert {0, 1} == {node.level for node in nodes}
     assert 2 == sum(node.parent is None for node in nodes)  # four leaves have one parent, and two have the other
     assert 3 == LevelBuilder(3, leaf_splats=SPLATS).build(model)[-1].level
     header = read_header(LevelBuilder().encode(model.select(slice(0, 0))).write().data)
     assert (0, ()) == (header.splat_count, header.all_tiles)
-
-
-def test_parts_of_a_very_large_scene_are_merged_alone(model):
     builder = LevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
     fitted, merged = (builder.build_part(model, count, 1)[1].splats for count in (5000, 5001))
     assert (True, False) == tuple(same(quarter(model), splats) for splats in (merged, fitted))
@@ -451,29 +430,25 @@ def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tm
 
 
 @pytest.mark.long
-def test_a_size_counts_all_levels(larger_model):
+def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_path):
+    model, out = csplat.read_ply(sample_path).select(slice(0, 1200)), tmp_path / "out.csplat"
     target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
-    result = encode_with_levels(larger_model, EncodeOptions(), LevelBuilder(1), target=target)
+    result = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
     assert 17_460 < len(result.data) == result.report.search.size_bytes <= 18_000
     assert_valid(result.data)
     assert [1200, 300] == counts_by_level(result.data, (0, 1))
-    alone = csplat.encode(larger_model, target=replace(target, size_bytes=int(0.72 * 18_000)))
-    scorer = Scorer.of_source(larger_model, virtual_cameras(larger_model, 3, 96, 72))
+    alone = csplat.encode(model, target=replace(target, size_bytes=int(0.72 * 18_000)))
+    scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
     assert scorer.psnr(decode(result.data)) > scorer.psnr(decode(alone)) - 0.3  # as a search for the rest of the size
-
-
-@pytest.mark.long
-def test_other_targets_and_an_importance_have_levels(larger_model, tmp_path):
-    weights, out = tmp_path / "weights.npy", tmp_path / "out.csplat"
-    np.save(weights, np.linspace(0.1, 1.0, 1200, dtype=np.float32))
-    kept = csplat.Target(keep=0.5, effort=1)
-    for what, count in (({"target": kept}, 600), ({"importance": str(weights)}, 1200)):
-        encoded = encode_file(LoadedModel(larger_model, 1), str(out), EncodeOptions(), levels=1, **what)
+    np.save(tmp_path / "weights.npy", np.linspace(0.1, 1.0, 1200, dtype=np.float32))
+    kept, weights = {"target": csplat.Target(keep=0.5, effort=1)}, {"importance": str(tmp_path / "weights.npy")}
+    for what, count in ((kept, 600), (weights, 1200)):
+        encoded = encode_file(LoadedModel(model, 1), str(out), EncodeOptions(), levels=1, **what)
         assert_valid(out.read_bytes())
         assert [count, count // 4] == counts_by_level(out, (0, 1))
         assert encoded.report.options["levels"]["count"] == 1
     target = csplat.Target(max_error={"means": 0.01})
-    bounded = encode_with_levels(larger_model, EncodeOptions(), LevelBuilder(1), target=target)
+    bounded = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
     assert bounded.report.search.size_bytes == len(bounded.data)
     assert 0.005 < bounded.report.errors["means"][0] <= 0.01
     assert_valid(bounded.data)

@@ -11,18 +11,9 @@ from checked import cloud
 from command_line import call
 from PIL import Image
 
-from csplat import read_ply, write_ply
-from csplat.errors import InputError
+from csplat import InputError, read_ply, write_ply
+from csplat_tools import render_files
 from csplat_tools.cli.shared_options import parse_colour
-from csplat_tools.render_files import (
-    _durations,
-    check_film,
-    image_names,
-    make_output_folder,
-    side_by_side,
-    to_uint8,
-    write_film,
-)
 
 
 @pytest.fixture
@@ -119,7 +110,7 @@ def test_a_wrong_command_line_is_refused(ply, cameras, tmp_path):
     assert "distorted" in refused("render", ply, "--cameras", cameras, tmp_path / "no", "--size", "64x64")
     assert ["ball.ply", "cameras.json"] == names(tmp_path)
     with pytest.raises(InputError, match="not a folder"):
-        make_output_folder(str(cameras), ["a.png"], force=True)
+        render_files.make_output_folder(str(cameras), ["a.png"], force=True)
 
 
 def test_missing_packages_are_named(ply, cameras, tmp_path, monkeypatch):
@@ -132,11 +123,11 @@ def test_missing_packages_are_named(ply, cameras, tmp_path, monkeypatch):
 
 
 def test_names_of_renders_are_unique_and_stay_inside_the_folder():
-    assert ["0000_a", "0001_a", "0002"] == image_names(["left/a.png", "right/a.png", None])
+    assert ["0000_a", "0001_a", "0002"] == render_files.image_names(["left/a.png", "right/a.png", None])
     for image in ("../../evil.png", "..\\..\\evil.png", "/etc/evil.png", "C:\\evil.jpg"):
-        assert ["evil"] == image_names([image])
+        assert ["evil"] == render_files.image_names([image])
     for image in ("", "..", "/", "...png", ".png"):
-        assert image_names([image])[0] in {"0000", "png"}
+        assert render_files.image_names([image])[0] in {"0000", "png"}
 
 
 def test_colours_are_parsed_rounded_and_clipped_and_differences_amplified():
@@ -145,9 +136,9 @@ def test_colours_are_parsed_rounded_and_clipped_and_differences_amplified():
         with pytest.raises(typer.BadParameter, match="expected red,green,blue"):
             parse_colour(text)
     values = np.array([-1.0, 0.0, 0.5, 1.0, 7.0, np.nan, np.inf], np.float32)
-    assert [0, 0, 128, 255, 255, 0, 255] == to_uint8(values).tolist()
+    assert [0, 0, 128, 255, 255, 0, 255] == render_files.to_uint8(values).tolist()
     a, b = np.full((1, 1, 3), 0.5, np.float32), np.full((1, 1, 3), 0.45, np.float32)
-    assert [[128] * 3, [115] * 3, [128] * 3] == side_by_side(a, b, 10.0)[0].tolist()
+    assert [[128] * 3, [115] * 3, [128] * 3] == render_files.side_by_side(a, b, 10.0)[0].tolist()
 
 
 ORBIT = ("--orbit", 4, "--size", "64x48")
@@ -221,12 +212,12 @@ def test_films_of_invalid_sizes_or_formats_are_refused_and_durations_do_not_drif
         ("a.webp", [(1920, 1080)] * 400, "more than 2 GiB: render into a folder"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=message):
-            check_film(name, sizes, 25.0)
+            render_files.check_film(name, sizes, 25.0)
     for unit, expected in ((1000, [33, 34, 33]), (100, [30, 40, 30])):
-        assert expected == _durations(3, 30.0, unit)
-        assert 10_000 == sum(_durations(300, 30.0, unit))
+        assert expected == render_files._durations(3, 30.0, unit)
+        assert 10_000 == sum(render_files._durations(300, 30.0, unit))
     for name, value in {"SAVE_ALL": {}, "SAVE": {}, "init": lambda: None}.items():
         monkeypatch.setattr(Image, name, value)
     with pytest.raises(InputError, match="cannot write WEBP"):
-        write_film(str(tmp_path / "a.webp"), [np.zeros((2, 2, 3), np.uint8)] * 2, 25.0)
+        render_files.write_film(str(tmp_path / "a.webp"), [np.zeros((2, 2, 3), np.uint8)] * 2, 25.0)
     assert [] == names(tmp_path)

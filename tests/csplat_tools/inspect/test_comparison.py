@@ -9,9 +9,7 @@ from checked import cloud
 from command_line import call
 from PIL import Image
 
-from csplat import EncodeOptions, encode, write_ply
-from csplat.encoder import encode_with_report
-from csplat.errors import InputError
+from csplat import EncodeOptions, InputError, encode, encode_with_report, write_ply
 from csplat.model import normalise_quats
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
@@ -59,7 +57,6 @@ def errors_of(source, other, index=None):
     return attribute_errors(LoadedModel(source, 1000), LoadedModel(other, 1000), index)
 
 
-# Pairs.
 def test_splats_are_paired_by_a_source_index_their_order_or_declared_errors(scene, tmp_path):
     order = np.random.default_rng(1).permutation(len(scene))
     errors = errors_of(scene, scene.select(order), order)
@@ -74,15 +71,12 @@ def test_splats_are_paired_by_a_source_index_their_order_or_declared_errors(scen
     assert errors.errors["means"][1] == pytest.approx(0.001 * 3**0.5, rel=1e-3)
     result, path = encode_with_report(scene, EncodeOptions(preset="balanced")), tmp_path / "scene.csplat"
     path.write_bytes(result.data)
-    found, known = (
-        attribute_errors(LoadedModel(scene, 1000), load_model(str(path)), index)
-        for index in (None, result.source_index)
-    )
+    models = LoadedModel(scene, 1000), load_model(str(path))
+    found, known = (attribute_errors(*models, index) for index in (None, result.source_index))
     assert ("search", len(scene), 0) == (found.pairing, found.matched, found.unmatched)
     assert known.errors["means"] == pytest.approx(found.errors["means"])
 
 
-# Renders.
 def test_a_scene_compared_with_itself_scores_99_wherever_its_origin(scene, cameras):
     compared = compare_models(scene, scene, cameras)
     assert (99.0, 99.0, 99.0, None) == (compared.psnr, compared.psnr_mean, compared.psnr_worst, compared.lpips)

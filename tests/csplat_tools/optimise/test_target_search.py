@@ -7,8 +7,7 @@ import pytest
 from analytic_search import AnalyticScene, Views, search
 from tables import failures
 
-from csplat import EncodeOptions
-from csplat.errors import InputError
+from csplat import EncodeOptions, InputError
 
 PLAIN = AnalyticScene()
 UNNEEDED = AnalyticScene(unneeded=4000)
@@ -172,7 +171,6 @@ def test_a_size_prunes_splats_if_that_raises_the_psnr_or_all_exceed_it():
     assert found.file.contents.splats < 4000
 
 
-# Views.
 @pytest.mark.slow
 @pytest.mark.parametrize("judging", [Views(1.5), Views(-1.5), Views(0.5, 2.0), Views(-0.5, -2.0)])
 def test_a_psnr_is_reached_if_test_and_validation_views_differ(judging):
@@ -202,8 +200,7 @@ def test_test_views_do_not_choose_the_file_of_a_size_or_drop(goal):
     assert {one.file} == set(one.scored)
 
 
-# Choices.
-def test_codings_are_chosen_by_their_gain():
+def test_codings_are_chosen_by_their_gain_or_by_the_caller():
     def check(case):
         scene, expected = case
         found = search(scene, psnr=38.0, no_prune=True)
@@ -223,6 +220,9 @@ def test_codings_are_chosen_by_their_gain():
     assert [] == failures(cases, check)
     fast = search(PLAIN, psnr=38.0, no_prune=True, options=EncodeOptions("fast"))
     assert {"scalar", "none"} >= {candidate["sh_coding"] for candidate in fast.report.tried}
+    for fixed in ({"sh_degree": 1, "sh_coding": "scalar"}, {"sh_coding": "codebook", "codebook_size": 64}):
+        for file in search(PLAIN, psnr=28.0, options=EncodeOptions(**fixed)).tried:
+            assert fixed == {name: getattr(file.contents.options, name) for name in fixed}
 
 
 def test_a_codebook_grows_until_the_goal_is_reached():
@@ -249,22 +249,14 @@ def test_quantisation_classes_are_used_if_files_become_smaller():
     assert any("2 quantisation classes" in line for line in graded.report.why)
 
 
-def test_options_of_the_caller_are_kept():
-    for fixed in ({"sh_degree": 1, "sh_coding": "scalar"}, {"sh_coding": "codebook", "codebook_size": 64}):
-        for file in search(PLAIN, psnr=28.0, options=EncodeOptions(**fixed)).tried:
-            assert fixed == {name: getattr(file.contents.options, name) for name in fixed}
-
-
-@pytest.mark.parametrize(("preset", "goal"), [("balanced", 43.2), ("small", 38.3)])
-def test_a_preset_whose_own_file_is_smaller_is_chosen(preset, goal):
-    scene = replace(NO_CODEBOOK, removal_psnr=2.0)
-    usual, saving = (
-        search(replace(scene, preset_saving=(preset, share)), psnr=goal, no_prune=True) for share in (0.0, 0.2)
-    )
-    assert (preset, None) == (saving.report.chosen["preset"], saving.report.chosen["attribute_psnr"])
-    assert any("at the precision of the preset" in line for line in saving.report.why)
-    assert len(saving.file) < len(usual.file)
-    assert usual.report.chosen["attribute_psnr"] is not None
+def test_a_preset_whose_own_file_is_smaller_is_chosen():
+    for preset, goal in (("balanced", 43.2), ("small", 38.3)):
+        scenes = (replace(NO_CODEBOOK, removal_psnr=2.0, preset_saving=(preset, share)) for share in (0.0, 0.2))
+        usual, saving = (search(scene, psnr=goal, no_prune=True) for scene in scenes)
+        assert (preset, None) == (saving.report.chosen["preset"], saving.report.chosen["attribute_psnr"])
+        assert any("at the precision of the preset" in line for line in saving.report.why)
+        assert len(saving.file) < len(usual.file)
+        assert usual.report.chosen["attribute_psnr"] is not None
 
 
 def test_unneeded_splats_are_pruned_unless_pruning_is_off():

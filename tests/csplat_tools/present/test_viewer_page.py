@@ -8,8 +8,7 @@ import pytest
 from checked import cloud
 from command_line import call
 
-from csplat import encode, write_ply
-from csplat.errors import CsplatError
+from csplat import CsplatError, encode, write_ply
 from csplat_tools.present import viewer_page
 from csplat_tools.present.viewer_page import PAGE, WORKER, export_page, link_modules, web_files
 from csplat_tools.present.viewer_server import page_parameters

@@ -19,22 +19,16 @@ from checked import cloud
 from chromium import ViewerPage
 from command_line import call, heed_interrupts
 
-from csplat import decode, encode, read_ply, write_ply
-from csplat.errors import FormatError, InputError
+from csplat import FormatError, InputError, decode, encode, read_ply, write_ply
 from csplat_tools.cli.shared_options import parse_axes, parse_overrides, parse_up
 from csplat_tools.present.viewer_page import web_files
 from csplat_tools.present.viewer_server import byte_range, open_server, open_viewer_scene, page_parameters
 
 
-@pytest.fixture(scope="module")
-def scene_bytes():
-    return encode(cloud(np.random.default_rng(0).standard_normal((200, 3))))
-
-
 @pytest.fixture
-def scene_path(tmp_path, scene_bytes):
+def scene_path(tmp_path):
     path = tmp_path / "a scene.csplat"
-    path.write_bytes(scene_bytes)
+    path.write_bytes(encode(cloud(np.random.default_rng(0).standard_normal((200, 3)))))
     return path
 
 
@@ -141,7 +135,6 @@ def test_modules_of_the_page_are_served_as_javascript_and_other_paths_are_not_se
     assert [] == [path for path, (_, _, body) in answers.items() if b"secret" in body]
 
 
-LOOPBACK = ["127.1", "LOCALHOST", "0:0:0:0:0:0:0:1", "::ffff:127.0.0.1"]
 ANYWHERE = "0.0.0.0"  # noqa: S104  # the documented value of --host
 GOOD = [
     "localhost", "LOCALHOST:80", "localhost.", "localhost:", "127.0.0.1:9", "127.0.0.2", "[::1]", "[::1]:80",
@@ -156,29 +149,14 @@ BAD = [
 ]  # fmt: skip
 
 
-def host_statuses(server, hosts):
-    """Return the statuses of requests for several hosts, on one connection."""
-    connection, found = http.client.HTTPConnection(*server.server_address[:2], timeout=10), {}
-    for host in hosts:
-        connection.putrequest("GET", "/", skip_host=True)
-        connection.putheader("Host", host)
-        connection.endheaders()
-        response = connection.getresponse()
-        response.read()
-        found[host] = response.status
-    connection.close()
-    return found
-
-
 @pytest.mark.slow
 def test_the_bound_address_decides_which_hosts_are_served(scene_path):
-    own = socket.gethostname()
-    served_at = []
-    for place in (*LOOPBACK, ANYWHERE):
+    own, served_at = socket.gethostname(), []
+    for place in ("127.1", "LOCALHOST", "0:0:0:0:0:0:0:1", "::ffff:127.0.0.1", ANYWHERE):
         good, bad = ([*GOOD, own, f"{own}.local:80"], BAD) if place == ANYWHERE else (GOOD, [*BAD, own])
         try:
             with served(scene_path, host=place) as server:
-                found = host_statuses(server, [*good, *bad])
+                found = {host: ask(server, "/", Host=host)[0] for host in (*good, *bad)}
         except InputError:  # a system without IPv6
             continue
         assert dict.fromkeys(good, 302) | dict.fromkeys(bad, 421) == found, place
@@ -258,25 +236,26 @@ def test_the_page_receives_the_given_up_direction_and_invalid_ones_are_refused()
     ):  # fmt: skip
         assert wishes == page_parameters(None, parse_overrides(**words))
     for parse, message, texts in (
-        (parse_axes, "expected three letters", ["RL", "RDX", "RUD", "rdf", "RDFF"]),
-        (parse_up, "three numbers as", ["", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z"]),
+        (parse_axes, "expected three letters", ("RL", "RDX", "RUD", "rdf", "RDFF")),
+        (parse_up, "three numbers as", ("", "w", "+-y", "0,0", "0,0,0", "0,nan,1", "x y z")),
     ):
         for text in texts:
             with pytest.raises(typer.BadParameter, match=message):
                 parse(text)
 
 
-def test_damaged_files_and_other_formats_are_refused_before_they_are_served(tmp_path, scene_bytes):
-    data = scene_bytes
+def test_damaged_files_and_other_formats_are_refused_before_they_are_served(scene_path):
+    data, text = scene_path.read_bytes(), scene_path.with_suffix(".txt")
+    text.write_text("no scene")
     for damaged, message in (
         (data[:-1], "E_TRUNCATED"), (data[:20], "E_TRUNCATED"), (b"", "E_TRUNCATED"), (data + b"x", "E_TRAILING"),
         (data[:100] + bytes([data[100] ^ 1]) + data[101:], "E_CRC"), (b"\0" + data[1:], "E_MAGIC"),
-        (b"no scene", "no format that csplat knows"),
     ):  # fmt: skip
-        path = tmp_path / ("a.txt" if damaged == b"no scene" else "a.csplat")
-        path.write_bytes(damaged)
-        with pytest.raises((FormatError, InputError), match=message), open_viewer_scene(str(path), preset="fast"):
+        scene_path.write_bytes(damaged)
+        with pytest.raises(FormatError, match=message), open_viewer_scene(str(scene_path), preset="fast"):
             pass
+    with pytest.raises(InputError, match="no format that csplat knows"), open_viewer_scene(str(text), preset="fast"):
+        pass
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ import json
 import tempfile
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,11 +14,8 @@ from command_line import call
 
 import csplat
 import csplat_tools
-from csplat import EncodeOptions, disk_files, file_source
+from csplat import EncodeOptions, InputError, disk_files, encode_with_report, file_source, write_ply
 from csplat.decoder import Limits, decode, decode_api, open_tiles, read_header
-from csplat.encoder import encode_with_report
-from csplat.errors import CsplatError, InputError, LimitError
-from csplat.ply import write_ply
 from csplat.scene_source import source_from_model
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
@@ -31,7 +29,7 @@ from csplat_tools.views.sliced_renderer import SlicedScene, slice_limits
 @pytest.fixture
 def many_tiles(make_model, tmp_path):
     """Return the path of a file of ten tiles."""
-    data = csplat.encode(make_model(600, 2), csplat.EncodeOptions(preset="fast", tile_splats=60))
+    data = csplat.encode(make_model(600, 2), EncodeOptions(preset="fast", tile_splats=60))
     (tmp_path / "scene.csplat").write_bytes(data)
     assert len(read_header(data).tiles) == 10
     return tmp_path / "scene.csplat"
@@ -49,7 +47,7 @@ def test_tiles_before_a_damaged_one_are_decoded_but_none_goes_to_standard_output
     for threads in (1, 3):
         models = open_tiles(bytes(data), threads=threads).models()
         assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
-        with pytest.raises(CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
+        with pytest.raises(csplat.CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
             next(models)
     many_tiles.write_bytes(data)
     assert b"" == call("decode", many_tiles, "-", "--quiet", status=1).stdout_bytes
@@ -69,9 +67,9 @@ def test_threads_and_released_pages_do_not_change_the_result_and_limits_are_per_
                 assert getattr(expected, name).tobytes() == together.tobytes()
     limits = Limits(bytes=max(map(len, models)) * 4 * (11 + 27))
     assert 600 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
-    with pytest.raises(LimitError, match="bytes"):
+    with pytest.raises(csplat.LimitError, match="bytes"):
         decode(many_tiles, limits=limits)
-    with pytest.raises(LimitError, match="splats"):
+    with pytest.raises(csplat.LimitError, match="splats"):
         open_tiles(many_tiles, limits=Limits(splats=599))
 
 
@@ -91,20 +89,14 @@ def view():
 
 
 @pytest.fixture
-def camera_file(view, tmp_path):
-    save_cameras(tmp_path / "cameras.json", [view])
-    return str(tmp_path / "cameras.json")
-
-
-@pytest.fixture
 def files_of_both(model, tmp_path):
     """Return the paths of a PLY, its encoded file and the source index."""
     result = encode_with_report(model, EncodeOptions(preset="fast"))
-    source, encoded, index = (tmp_path / name for name in ("scene.ply", "scene.csplat", "index.npy"))
+    source, encoded, index = (str(tmp_path / name) for name in ("scene.ply", "scene.csplat", "index.npy"))
     write_ply(source, model)
-    encoded.write_bytes(result.data)
+    Path(encoded).write_bytes(result.data)
     np.save(index, result.source_index)
-    return str(source), str(encoded), str(index)
+    return source, encoded, index
 
 
 def by_disk(model, every=1, progress=None):
@@ -188,10 +180,11 @@ def test_a_sample_has_every_nth_splat_and_gives_about_the_same_views(files_of_bo
 
 
 @pytest.mark.slow
-def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, model, camera_file, tmp_path, monkeypatch):
+def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, model, view, tmp_path, monkeypatch):
     # Any memory is accepted here, as small scenes fit into all that is accepted otherwise.
     monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
-    source, encoded, index = files_of_both
+    (source, encoded, index), camera_file = files_of_both, str(tmp_path / "cameras.json")
+    save_cameras(camera_file, [view])
     words = ("compare", source, encoded, "--cameras", camera_file)
 
     def report(name):

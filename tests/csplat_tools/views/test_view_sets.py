@@ -10,8 +10,7 @@ from captures import H, W, as_colmap, cameras, photograph, photograph_object, sh
 from command_line import call, change_options
 from PIL import Image
 
-from csplat.errors import InputError
-from csplat.ply import read_ply
+from csplat import InputError, read_ply
 from csplat.training_record import TRAINING, TrainingRecord
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import save_cameras
@@ -47,7 +46,6 @@ def numbers(seen_from):
     return [int(camera.image[-6:-4]) for camera in seen_from]
 
 
-# Roles.
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "every", "size"), [("rgb", 5, None), ("rgba", 10, (24, 20)), ("colmap", 5, (24, 20))])
 def test_each_image_has_one_role(sets, scene, kind, every, size):
@@ -110,7 +108,6 @@ def test_validation_images_of_a_set_are_validation_views(sets, scene, tmp_path):
         assert sizes == [*map(len, poses(find_view_set(scene, data=data, **chosen)))]
 
 
-# Recorded training options.
 def test_recorded_training_options_are_the_defaults(sets, scene):
     record = TrainingRecord((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
     trained = replace(scene, metadata={**scene.metadata, TRAINING: record.as_json()})
@@ -135,9 +132,6 @@ def test_virtual_test_views_have_a_black_background_and_a_missing_training_recor
         views = find_view_set(scene, data=DataOptions(str(sets[kind])))
         assert BLACK == views.background
         assert 1 == sum("the training background" in line for line in views.notes)
-
-
-# Commands.
 
 
 @pytest.mark.slow
@@ -166,7 +160,6 @@ def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
     assert [False, True] == [any("around the scene's origin" in line for line in v.notes) for v in (one, other)]
 
 
-#: Words of a command after its name, and where its JSON has the scores of the source.
 #: A command, and where its JSON has the scores of the source on the test images.
 SCORES = {
     "compare PLY PLY": ("photographs", "a"),
@@ -183,10 +176,8 @@ SCORES = {
 @pytest.mark.parametrize(
     ("kind", "every", "held_out", "commands"), [("blender", 5, 4, list(SCORES)), ("colmap", 10, 2, ["compare PLY PLY"])]
 )
-def test_every_command_reports_the_score_of_the_training_and_decides_by_other_views(
-    tmp_path, kind, every, held_out, commands, monkeypatch
-):
-    # No command gets a background, split or size: the PLY records them.
+def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, held_out, commands, monkeypatch):
+    # No command gets a background, split or size: the PLY records them. None decides by test views.
     data, ply, log, made, check = (
         tmp_path / "data",
         tmp_path / "s.ply",
@@ -231,6 +222,3 @@ def test_every_command_reports_the_score_of_the_training_and_decides_by_other_vi
     if kind == "blender":
         simplified = reports["simplify PLY OUT/less.ply --keep 0.9"]["photographs"]["psnr"]
         assert simplified == pytest.approx(run("compare PLY OUT/less.ply")["photographs"]["b"]["psnr"], abs=0.01)
-
-
-#: Words of a command after its name, and where its JSON has the scores.
