@@ -347,6 +347,7 @@ def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply):
 HEADER = {"coordinate_system", "origin", "unit_metres", "metadata", "antialiased", "flat"}
 
 
+@pytest.mark.slow
 def test_the_help_and_the_guide_list_all_formats(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     helped = call("convert", "--help").stdout.replace("│", "")

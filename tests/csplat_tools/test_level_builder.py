@@ -372,7 +372,7 @@ def test_each_level_has_a_quarter_of_the_splats_of_the_finer_one_at_any_number_o
 
 
 @pytest.mark.slow
-def test_the_number_of_levels_is_the_one_asked_for_and_parts_of_a_very_large_scene_are_merged_alone(model):
+def test_the_number_of_levels_is_the_one_asked_for_and_very_large_parts_are_merged_alone(model):
     nodes = LevelBuilder(1, leaf_splats=70).build(model)
     assert {0, 1} == {node.level for node in nodes}
     assert 2 == sum(node.parent is None for node in nodes)  # four leaves have one parent, and two have the other

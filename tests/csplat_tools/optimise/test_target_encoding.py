@@ -235,7 +235,7 @@ def measured(unequal):
 
 
 @pytest.mark.slow
-def test_quantisation_classes_reduce_the_size_at_equal_psnr_and_are_used_with_a_given_importance(unequal, measured):
+def test_quantisation_classes_reduce_the_size_also_with_a_given_importance(unequal, measured):
     judge, whole = Scorer.of_source(unequal, cameras(6), BLACK), WholeScene(unequal, None, measured, None)
     classes, plain = (
         whole.encode(EncodeOptions(attribute_psnr=psnr), use_classes=use_classes, draft=False).write()

@@ -123,7 +123,7 @@ def test_recorded_training_options_are_the_defaults(sets, scene):
 
 
 @pytest.mark.slow
-def test_virtual_test_views_have_a_black_background_and_a_missing_training_record_is_noted_once(sets, scene):
+def test_virtual_test_views_are_on_black_and_a_missing_training_record_is_noted_once(sets, scene):
     views = find_view_set(scene, count=5, validation_count=2, background=WHITE)
     assert (21, 2, 8) == tuple(map(len, poses(views)))
     assert (BLACK, WHITE) == (views.test_scorer(scene).background, views.validation_scorer(scene).background)
