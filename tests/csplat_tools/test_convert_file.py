@@ -287,6 +287,7 @@ def test_axes_are_converted_and_recorded(tmp_path, ply):
     assert np.allclose(source.means, found.means, atol=1e-3)
     assert (np.abs(np.sum(source.quats * found.quats, axis=1)) > 0.999).all()
     assert "axes         RUB, read as RDF" in call("info", tmp_path / "a.spz").stdout
+    assert "RUB" == json.loads(call("info", tmp_path / "a.spz", "--json").stdout)["file_axes"]
 
 
 @pytest.mark.slow
