@@ -330,17 +330,20 @@ def test_floaters_are_splats_without_neighbours():
 
 
 @pytest.mark.slow
-def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply):
-    out = tmp_path / "new" / "meta.json"
+@pytest.mark.parametrize("name", ["meta.json", "lod-meta.json"])
+def test_sog_is_written_to_a_folder_of_its_own(tmp_path, ply, name):
+    out = tmp_path / "new" / name
     call("convert", ply, out)
     assert 200 == len(csplat.read(out.parent))
     assert "exists: --force" in call("convert", ply, out, status=1).stderr
-    assert "is in the folder of" in call("convert", ply, ply.parent / "lod-meta.json", status=1).stderr
-    (out.parent / "other.bin").write_bytes(bytes(9_999_999))
+    if name == "meta.json":
+        (out.parent / "other.bin").write_bytes(bytes(9_999_999))
+    else:
+        assert "is in the folder of" in call("convert", ply, ply.parent / name, status=1).stderr
     assert " MB" not in call("convert", ply, out, "--sh-degree", "0", "--force").stderr
     assert " MB" not in call("info", out.parent).stdout
     assert 0 == csplat.read(out.parent).sh_degree
-    call("convert", ply, tmp_path / "no" / "such" / "meta.json", status=1)
+    call("convert", ply, tmp_path / "no" / "such" / name, status=1)
     assert not (tmp_path / "no").exists()
 
 
