@@ -1,14 +1,14 @@
 """csplat: a compressed format for 3D Gaussian splats.
 
     >>> import csplat
-    >>> model = csplat.read_ply("scene.ply")
+    >>> model = csplat.read("scene.ply")
     >>> data = csplat.encode(model, csplat.EncodeOptions(preset="small"))
     >>> data = csplat.encode(model, target=csplat.Target(psnr=38))  # doctest: +SKIP
     >>> model = csplat.decode(data)
     >>> with csplat.open("scene.csplat") as file:  # or https://…, s3://…: reads only the parts it needs
     ...     model = file.read(box=(-1, -1, -1, 1, 1, 1))
 
-Functions that read a *file* (`read_ply`, `decode`, `read_header`) accept a path, an open binary file or bytes.
+Functions that read a *file* (`read`, `open`, `decode`) accept a path, an open binary file or bytes.
 Functions that take a *scene* (`encode`, `write_ply`, `to_gsplat`) accept a `SplatModel`.
 
 All errors are `CsplatError`s: `FormatError`, `UnsupportedError` and `LimitError` concern the file, `InputError` the
@@ -27,15 +27,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from csplat.decoder import decode, decode_integers, decode_scene, read_header
+    from csplat.editing.extract import extract
     from csplat.editing.merge import merge
-    from csplat.editing.up_axis import with_up
     from csplat.encoder import EncodeOptions, EncodeResult, Target, encode, encode_with_report
     from csplat.errors import CsplatError, FormatError, InputError, LimitError, StoreError, UnsupportedError
-    from csplat.formats import read, write
+    from csplat.formats import open, read, write
     from csplat.interop import from_gsplat, to_gsplat
     from csplat.model import SplatModel
-    from csplat.ply import lint_ply, read_ply, write_ply
-    from csplat.splat_file import SplatFile, extract, open
+    from csplat.ply import lint_ply, write_ply
+    from csplat.scene import Scene
+    from csplat.scene_metadata import SceneMetadata
+    from csplat.splat_file import SplatFile
 
 __version__ = "0.1.0"
 
@@ -46,6 +48,8 @@ __all__ = [
     "FormatError",
     "InputError",
     "LimitError",
+    "Scene",
+    "SceneMetadata",
     "SplatFile",
     "SplatModel",
     "StoreError",
@@ -64,9 +68,7 @@ __all__ = [
     "open",
     "read",
     "read_header",
-    "read_ply",
     "to_gsplat",
-    "with_up",
     "write",
     "write_ply",
 ]
@@ -107,6 +109,8 @@ _MODULE_OF = {
     "FormatError": "csplat.errors",
     "InputError": "csplat.errors",
     "LimitError": "csplat.errors",
+    "Scene": "csplat.scene",
+    "SceneMetadata": "csplat.scene_metadata",
     "SplatFile": "csplat.splat_file",
     "SplatModel": "csplat.model",
     "StoreError": "csplat.errors",
@@ -117,16 +121,14 @@ _MODULE_OF = {
     "decode_scene": "csplat.decoder",
     "encode": "csplat.encoder",
     "encode_with_report": "csplat.encoder",
-    "extract": "csplat.splat_file",
+    "extract": "csplat.editing.extract",
     "from_gsplat": "csplat.interop",
     "lint_ply": "csplat.ply",
     "merge": "csplat.editing.merge",
-    "open": "csplat.splat_file",
+    "open": "csplat.formats",
     "read_header": "csplat.decoder",
     "read": "csplat.formats",
-    "read_ply": "csplat.ply",
     "to_gsplat": "csplat.interop",
-    "with_up": "csplat.editing.up_axis",
     "write": "csplat.formats",
     "write_ply": "csplat.ply.ply_writer",
 }

@@ -6,13 +6,14 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from mmap import mmap
 from pathlib import Path
 
 import numpy as np
 
 from csplat.decoder.container import view_of
 from csplat.errors import CsplatError, FormatError, LimitError, StoreError
-from csplat.file_source import File, named_errors, open_binary
+from csplat.file_source import File, map_file, named_errors, open_binary
 from csplat.system import Pages, read_at
 
 
@@ -99,6 +100,10 @@ class Store:
             error.path = error.path or self.name or None
             raise
 
+    def whole(self) -> bytes | memoryview | mmap | None:
+        """Return all bytes if they are in memory or can be mapped, otherwise `None`."""
+        return None
+
     def close(self) -> None:
         """Release the file."""
 
@@ -117,17 +122,25 @@ class MemoryStore(Store):
         name = file if isinstance(file, (str, os.PathLike)) else getattr(file, "name", None)
         super().__init__(os.fspath(name) if isinstance(name, (str, os.PathLike)) else "", len(self._view))
 
+    def whole(self) -> memoryview:
+        """Return the bytes."""
+        return self._view
+
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         return [bytes(self._view[start:stop]) for start, stop in ranges]
 
 
 class DiskStore(Store):
-    """A file on disk. It is not mapped: truncating a mapped file would kill the process that reads it."""
+    """A file on disk. Parts are not read from a mapping: truncating a mapped file would kill the process."""
 
     def __init__(self, path: Path) -> None:
         self._file = open_binary(path)
         self._stat = os.fstat(self._file.fileno())
         super().__init__(str(path), self._stat.st_size)
+
+    def whole(self) -> bytes | mmap:
+        """Map the file."""
+        return map_file(self.name)
 
     def _parts(self, ranges: Sequence[tuple[int, int]]) -> list[bytes]:
         with named_errors(self.name):

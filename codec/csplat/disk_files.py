@@ -36,6 +36,9 @@ _NAME_PART = 20  # characters of a file's name in that of its temporary file, wh
 _TEMPORARY = "csplat-"  # beginning of the names of files in the system's folder for temporary files
 _numbers = itertools.count()  # tells the temporary files of this process apart
 _MB = 1e6  # bytes
+#: Names of files that represent the whole folder they are in: SOG as a folder, and with levels.
+FOLDER_NAMES = ("meta.json", "lod-meta.json")
+
 #: Exceptions that NumPy raises for damaged headers of arrays.
 _NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
 _INTEGER_DIGITS = 300  # digits of the longest integer in JSON; longer ones exceed float64
@@ -169,6 +172,18 @@ def check_free_space(folder: str | os.PathLike[str], wanted_bytes: int, what: st
         raise InputError(
             f"{os.fspath(folder)} has {free / _MB:,.0f} MB free, {wanted_bytes / _MB:,.0f} MB are needed while {what}"
         )
+
+
+def size_on_disk(path: Path) -> int:
+    """Return the size in bytes of a file, or of all files of a folder; for SOG, without other files of its folder."""
+    manifest = path.name.lower() if path.name.lower() in FOLDER_NAMES else ""
+    if not (path.is_dir() or manifest):
+        return path.stat().st_size
+    folder = path if path.is_dir() else path.parent
+    manifest = manifest or next((name for name in reversed(FOLDER_NAMES) if (folder / name).is_file()), "")
+    inside = folder.iterdir() if manifest == "meta.json" else folder.rglob("*")
+    parts = (".webp", *FOLDER_NAMES) if manifest else ("",)
+    return sum(one.stat().st_size for one in inside if one.name.lower().endswith(parts) and one.is_file())
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from csplat.errors import InputError
 from csplat.plugins import load_plugins
+from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32, F64
 
 #: Highest spherical-harmonics degree of a model.
@@ -23,17 +24,13 @@ MAX_SH_DEGREE = 4
 #: Maximum deviation of the length of a unit quaternion from 1.
 QUAT_LENGTH_TOLERANCE = 1e-3
 
-#: Coordinate system of a scene whose source did not specify one.
-UNSPECIFIED = "unspecified"
-
-_AXIS_OF_LETTER = {"R": "x", "L": "x", "U": "y", "D": "y", "F": "z", "B": "z"}
 _BLOCK = 1 << 18  # values checked at a time
 _NO_SH: F32 = np.zeros((0, 0, 3), np.float32)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SplatModel:
-    """N splats, and the metadata that a viewer needs.
+    """N splats and the metadata of their scene.
 
     The arrays are neither copied nor made read-only; treat them as constant.
 
@@ -48,16 +45,7 @@ class SplatModel:
             coordinates keep the precision of float32 this way.
         means_double: [N, 3] float64, centres in the source's coordinates; `means` are these minus `origin`, rounded.
             `None` if `origin` and `means` are exact.
-        coordinate_system: directions of +x, +y and +z from the viewer's perspective, one letter each of R/L, U/D and
-            F/B: `"RDF"`; or `"unspecified"`.
-        unit_metres: length of one scene unit in metres; `None` if unknown.
-        antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
-        flat: splats are discs (2DGS); the smallest scale has no meaning.
-        cameras: training cameras, each {K, viewmat, W, H, near, image}; viewmat maps world to camera with OpenCV axes,
-            pixel centres are at +0.5. `None` if there are none.
-        metadata: JSON-compatible. Keys in use: `licence` (str), `comments` (list of str), `training` (see
-            `csplat.training_record`), `up` (see `csplat.editing.up_axis`), `view` (initial camera of a viewer, in the
-            form of `cameras`).
+        metadata: what else is known about the scene.
         extra: additional columns by name, each [N], integer or floating.
 
     Raises:
@@ -72,12 +60,7 @@ class SplatModel:
     sh0: F32
     shN: F32 = field(default_factory=lambda: _NO_SH)
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    coordinate_system: str = UNSPECIFIED
-    unit_metres: float | None = None
-    antialiased: bool = False
-    flat: bool = False
-    cameras: Sequence[Mapping[str, Any]] | None = None
-    metadata: Mapping[str, Any] = field(default_factory=dict)
+    metadata: SceneMetadata = field(default_factory=SceneMetadata)
     extra: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     means_double: F64 | None = None
 
@@ -100,11 +83,8 @@ class SplatModel:
         object.__setattr__(self, "origin", _parse_origin(self.origin))
         if self.means_double is not None:
             _check_doubles(self.means, self.means_double, self.origin)
-        if self.coordinate_system != UNSPECIFIED:
-            check_axes(self.coordinate_system)
-        unit = self.unit_metres
-        if unit is not None and not (math.isfinite(unit) and unit > 0):
-            raise InputError(f"unit_metres is {unit}, expected a length above 0 or None")
+        if not isinstance(self.metadata, SceneMetadata):
+            raise InputError(f"metadata is a {type(self.metadata).__name__}, expected SceneMetadata")
 
     def __len__(self) -> int:
         return len(self.means)
@@ -124,6 +104,10 @@ class SplatModel:
     def sh_degree(self) -> int:
         """Spherical-harmonics degree, 0 to `MAX_SH_DEGREE`."""
         return sh_degree_of(self.shN.shape[1])
+
+    def with_metadata(self, metadata: SceneMetadata) -> SplatModel:
+        """Return the splats with other metadata; the model itself if they are its own."""
+        return self if metadata is self.metadata else trusted_model(**{**vars(self), "metadata": metadata})
 
     def select(self, index: NDArray[Any] | slice) -> SplatModel:
         """Return the model of some splats, with the same metadata.
@@ -164,8 +148,7 @@ def check_model(caller: str, model: object) -> None:
     """Raise an `InputError` unless `model` is a `SplatModel`; it explains how to make one."""
     if not isinstance(model, SplatModel):
         raise InputError(
-            f"{caller} expects a SplatModel, not a {type(model).__name__}: read a PLY with csplat.read_ply(file),"
-            " a .csplat file with csplat.decode(file)"
+            f"{caller} expects a SplatModel, not a {type(model).__name__}: read a file with csplat.read(file)"
         )
 
 
@@ -284,10 +267,3 @@ def _check_doubles(means: F32, doubles: F64, origin: tuple[float, float, float])
     fits = isinstance(doubles, np.ndarray) and doubles.dtype == np.float64 and doubles.shape == means.shape
     if not fits or not np.array_equal((doubles - np.array(origin)).astype(np.float32), means):
         raise InputError("means_double and means disagree: means are float32(means_double - origin)")
-
-
-def check_axes(letters: str) -> None:
-    """Raise an `InputError` unless these are three letters, one each of R/L, U/D and F/B."""
-    axes = {_AXIS_OF_LETTER.get(letter) for letter in letters}
-    if len(letters) != 3 or axes != {"x", "y", "z"}:
-        raise InputError(f"the axes are {letters!r}, expected three letters, one each of R/L, U/D and F/B, such as RDF")

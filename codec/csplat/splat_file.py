@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from functools import cached_property
-from typing import Any, Self, TypeVar
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,36 +16,39 @@ from csplat.decoder import (
     DecodedTile,
     Limits,
     Node,
-    decode,
-    iter_packed,
-    iter_tiles,
-    read_cameras,
     read_header,
-    read_metadata,
 )
 from csplat.decoder.codebooks import wanted_codebooks
 from csplat.decoder.container import SceneHeader, Tile, check_length, read_file_header
-from csplat.decoder.decode_api import DecodeRequest, prepare_decode
+from csplat.decoder.decode_api import (
+    DecodeRequest,
+    decode_request,
+    prepare_decode,
+    request_packed,
+    request_tiles,
+)
 from csplat.decoder.limits import check_budget, float_bytes
+from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk, scene_metadata
 from csplat.decoder.reconstruct import boxes_touching, tile_boxes
 from csplat.decoder.tiles import wanted_layers
 from csplat.decoder.tree import read_nodes, select_tiles
-from csplat.disk_files import BinaryWriter
-from csplat.errors import InputError
+from csplat.errors import InputError, counted
 from csplat.file_source import File
-from csplat.model import SplatModel
+from csplat.lint import Finding
+from csplat.model import SplatModel, trusted_model
 from csplat.packed import PackedTile
 from csplat.remote_store import open_store
-from csplat.tile_copy import ExtractResult, write_extract
+from csplat.scene import Scene
+from csplat.scene_metadata import SceneMetadata
 from csplat.types import F64
 
 _T = TypeVar("_T")
 
 
-class SplatFile:
-    """A `.csplat` file opened by `csplat.open` to read parts of it; a context manager.
+class SplatFile(Scene):
+    """A `.csplat` file opened by `csplat.open`; parts of it can be read.
 
-    The parts read are checked as in a decode.
+    The parts read are checked as in a decode. The scene is level 0.
 
     Attributes:
         header: header and index.
@@ -53,41 +56,34 @@ class SplatFile:
 
     header: SceneHeader
 
-    def __init__(self, store: Store, limits: Limits) -> None:
+    def __init__(self, store: Store, limits: Limits, head: bytes = b"") -> None:
         self._store = store
         self._limits = limits
         self._open = True
         with self._store.named_errors():
-            window = FileWindow(store)
+            window = FileWindow(store, head)
             self._head = _read_head(store, window)
-            self.header = read_header(window.view)
+            self.header = header = read_header(window.view)
+        self.count, self.sh_degree, self.origin = header.splat_count, header.sh_degree, header.origin
+        self.extra = {one.name: np.dtype(one.dtype) for one in header.extras if one.dtype is not None}
+        self.reader, self.has_doubles, self.file_axes = self.models, False, ""
+        self.format, self.name, self.size_bytes = "csplat", store.name, store.size
+        self.findings, self.in_memory = [], None
+        if header.coarse_tiles:
+            self.findings.append(_levels_finding(header, "level 0 alone is read"))
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def __len__(self) -> int:
-        return self.splat_count
+    @classmethod
+    def open(cls, file: File, *, limits: Limits | None = None, storage: Mapping[str, Any] | None = None) -> SplatFile:
+        """Open a `.csplat` file; arguments and errors are those of `csplat.open`, which opens other formats, too."""
+        store = open_store(file, storage)
+        try:
+            return cls(store, limits or Limits())
+        except BaseException:
+            store.close()
+            raise
 
     def __repr__(self) -> str:
-        return f"SplatFile({self.name!r}, {self.splat_count} splats)"
-
-    @property
-    def splat_count(self) -> int:
-        """Number of splats in the file."""
-        return self.header.splat_count
-
-    @property
-    def name(self) -> str:
-        """Path or URL, without secrets, for messages."""
-        return self._store.name
-
-    @property
-    def size(self) -> int:
-        """Size of the file, bytes."""
-        return self._store.size
+        return f"SplatFile({self.name!r}, {self.count} splats)"
 
     @property
     def requests(self) -> int:
@@ -98,6 +94,13 @@ class SplatFile:
     def bytes_read(self) -> int:
         """Number of bytes read so far."""
         return self._store.bytes_read
+
+    @cached_property
+    def levels(self) -> tuple[int, ...]:  # type: ignore[override]  # requires the TREE chunk
+        """Number of splats of each level of detail, finest first; empty if there is one."""
+        last = max((tile.level for tile in self.header.coarse_tiles), default=0)
+        cuts = [select_tiles(self.header, self.nodes, level=level) for level in range(last + 1)] if last else []
+        return tuple(sum(tile.splat_count for tile in tiles) for tiles in cuts)
 
     @cached_property
     def boxes(self) -> F64:
@@ -120,25 +123,44 @@ class SplatFile:
             return read_nodes(window.view, self.header)
 
     @cached_property
-    def metadata(self) -> dict[str, Any] | None:
-        """Content of the META chunk, `None` if there is none; read on first access."""
+    def metadata(self) -> SceneMetadata:  # type: ignore[override]
+        """Metadata of the scene; read on first access."""
         with self._store.named_errors():
             window = self.window()
-            window.fetch(self._chunks(_spec.CHUNK_METADATA))
-            return read_metadata(window.view, limits=self._limits)
+            window.fetch(self._chunks(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS))
+            return scene_metadata(window.view, self.header, self._limits)
 
     @cached_property
-    def cameras(self) -> list[dict[str, Any]] | None:
-        """Content of the CAMS chunk, `None` if there is none; read on first access."""
+    def options(self) -> dict[str, Any] | None:
+        """The encoder's record of its options, if there is one; read on first access."""
         with self._store.named_errors():
             window = self.window()
-            window.fetch(self._chunks(_spec.CHUNK_CAMERAS))
-            return read_cameras(window.view, limits=self._limits)
+            window.fetch(self._chunks(_spec.CHUNK_OPTIONS))
+            options: dict[str, Any] | None = json_chunk(
+                window.view, self.header, _spec.CHUNK_OPTIONS, self._limits.json_bytes
+            )
+            return options
+
+    @cached_property
+    def declared_bounds(self) -> DeclaredBounds | None:
+        """Declared error bounds, if there are any; read on first access."""
+        with self._store.named_errors():
+            window = self.window()
+            window.fetch(self._chunks(_spec.CHUNK_STATED_ERRORS))
+            return bounds_chunk(window.view, self.header)
+
+    def loaded(self) -> SplatFile:
+        """Return this file, after decoding all splats and reading what is known about them; it may be closed then."""
+        if self.in_memory is None:
+            self.in_memory = self.read()
+        _ = self.metadata, self.declared_bounds
+        return self
 
     def close(self) -> None:
         """Close the file."""
         self._open = False
         self._store.close()
+        super().close()
 
     def cut(
         self,
@@ -182,6 +204,64 @@ class SplatFile:
             raise _nothing_touches(self.header, corners)
         return [tile.index for tile in chosen]
 
+    def version(self, *, level: int = 0, max_splats: int | None = None) -> Scene:
+        """Return a version of the scene, of which coarser ones have no extra columns.
+
+        Args:
+            level: level of detail; 0 is the finest.
+            max_splats: the version of at most this number of splats with the smallest errors instead of a level, or the
+                coarsest.
+
+        Raises:
+            InputError: there is no such level.
+            FormatError: the TREE chunk breaks a clause.
+        """
+        last = len(self.levels or (0,)) - 1
+        if level > last:
+            wanted = "0: it has no other levels" if last == 0 else f"0 to {last}"
+            raise InputError(f"{Path(self.name).name}: the level is {level}, expected {wanted}")
+        if last == 0 or (level == 0 and max_splats is None):
+            return self
+        most = None if max_splats is None else max(max_splats, self.levels[last])
+        chosen = select_tiles(self.header, self.nodes, level=None if most else level, max_splats=most)
+        count = sum(tile.splat_count for tile in chosen)
+        if count == self.count and not any(tile.level for tile in chosen):
+            return self
+        which = f"level {level} alone is read" if most is None else f"a version of {counted(count, 'splat')} is read"
+        return self.changed(
+            count=count,
+            reader=partial(self.models, [tile.index for tile in chosen]),
+            extra={},
+            findings=[_levels_finding(self.header, which)],
+            size_bytes=sum(layer.size for tile in chosen for layer in tile.layers.values()),
+        )
+
+    def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
+        """Decode tile by tile, each to a model with the metadata of the scene.
+
+        A file on disk is mapped, and its tiles are decoded in threads.
+
+        Args:
+            tiles: indices of the tiles to decode, in the order requested; default: all of level 0. Coarser tiles have
+                no extra columns.
+
+        Raises:
+            FormatError, LimitError: as in `csplat.decoder.iter_tiles`.
+            StoreError, OSError: as in `csplat.open`.
+        """
+        if not self._open:
+            raise InputError(f"{self.name} is closed")
+        metadata, origin, data = self.metadata, self.origin, self._store.whole()
+        if data is None:
+            decoded = self._decode(self._default_tiles() if tiles is None else tiles, None)
+        else:
+            request = prepare_decode(memoryview(data), self.header, self._limits, tiles, None)
+            decoded = request_tiles(request, threads=None)
+        with self._store.named_errors():
+            for tile in decoded:
+                arrays = {name: value for name, value in vars(tile).items() if name != "tile"}
+                yield trusted_model(**arrays, origin=origin, metadata=metadata)
+
     def tiles(self, box: Sequence[float] | None = None, *, sh_degree: int | None = None) -> Iterator[DecodedTile]:
         """Decode tile by tile; memory holds the codebooks, one tile and a few megabytes of the file.
 
@@ -197,11 +277,7 @@ class SplatFile:
             StoreError, OSError: as in `csplat.open`.
         """
         chosen = self._default_tiles() if box is None else [tile.index for tile in tiles_touching(self.header, box)]
-        with self._store.named_errors():
-            window = self.window()
-            job = prepare_decode(window.view, self._limits, chosen, sh_degree)
-            decoded = iter_tiles(window.view, limits=self._limits, tiles=chosen, sh_degree=sh_degree)
-        return self._iterate(window, job, decoded)
+        return self._decode(chosen, sh_degree)
 
     def packed_tiles(self, tiles: Sequence[int] | None = None, *, sh_degree: int | None = None) -> Iterator[PackedTile]:
         """Decode tile by tile to integers and the tables that tiles share, as a renderer on a GPU keeps them.
@@ -216,9 +292,9 @@ class SplatFile:
         chosen = self._default_tiles() if tiles is None else tiles
         with self._store.named_errors():
             window = self.window()
-            job = prepare_decode(window.view, self._limits, chosen, sh_degree)
-            decoded = iter_packed(window.view, limits=self._limits, tiles=chosen, sh_degree=sh_degree)
-        return self._iterate(window, job, decoded)
+            request = prepare_decode(window.view, self.header, self._limits, chosen, sh_degree)
+            decoded = request_packed(request)
+        return self._iterate(window, request, decoded)
 
     def read(
         self, box: Sequence[float] | None = None, *, tiles: Sequence[int] | None = None, sh_degree: int | None = None
@@ -250,17 +326,12 @@ class SplatFile:
             tiles = self._default_tiles()
         with self._store.named_errors():
             window = self.window()
-            job = prepare_decode(window.view, self._limits, tiles, sh_degree)
-            splat_bytes = float_bytes(self.header, job.degree)
-            check_budget(self.header, job.tiles, job.degree, splat_bytes, self._limits, whole=job.whole)
+            request = prepare_decode(window.view, self.header, self._limits, tiles, sh_degree)
             texts = self._chunks(_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
-            window.fetch([*texts, *_side(job), *_layers(job.tiles, job.degree)])
-            return decode(window.view, limits=self._limits, tiles=tiles, sh_degree=sh_degree)
-
-    def extract(self, box: Sequence[float], output: str | os.PathLike[str] | BinaryWriter) -> ExtractResult:
-        """Extract the tiles that touch a box; see `csplat.extract`."""
-        with self._store.named_errors():
-            return write_extract(self.window(), self.header, tiles_touching(self.header, box), self.nodes, output)
+            splat_bytes = float_bytes(self.header, request.degree)
+            check_budget(self.header, request.tiles, request.degree, splat_bytes, self._limits, whole=request.whole)
+            window.fetch([*texts, *_side(request), *_layers(request.tiles, request.degree)])
+            return decode_request(request).model
 
     def window(self) -> FileWindow:
         """Return a view into which parts of the file can be fetched."""
@@ -268,14 +339,21 @@ class SplatFile:
             raise InputError(f"{self.name} is closed")
         return FileWindow(self._store, self._head)
 
-    def _iterate(self, window: FileWindow, job: DecodeRequest, decoded: Iterator[_T]) -> Iterator[_T]:
-        side = _side(job)
-        for batch in _batches(job.tiles, job.degree, self._store.sizes.batch):
+    def _decode(self, tiles: Sequence[int] | None, sh_degree: int | None) -> Iterator[DecodedTile]:
+        with self._store.named_errors():
+            window = self.window()
+            request = prepare_decode(window.view, self.header, self._limits, tiles, sh_degree)
+            decoded = request_tiles(request)
+        return self._iterate(window, request, decoded)
+
+    def _iterate(self, window: FileWindow, request: DecodeRequest, decoded: Iterator[_T]) -> Iterator[_T]:
+        side = _side(request)
+        for batch in _batches(request.tiles, request.degree, self._store.sizes.batch):
             if not self._open:
                 raise InputError(f"{self.name} is closed")
             window.forget()
             with self._store.named_errors():
-                window.fetch([*side, *_layers(batch, job.degree)])
+                window.fetch([*side, *_layers(batch, request.degree)])
             for _ in batch:
                 with self._store.named_errors():
                     tile = next(decoded)
@@ -292,70 +370,9 @@ class SplatFile:
         return [(one.offset, one.size) for one in self.header.directory if one.type in kinds]
 
 
-def open(file: File, *, limits: Limits | None = None, storage: Mapping[str, Any] | None = None) -> SplatFile:
-    """Open a file to read parts of it; only header and index are read at once.
-
-    Args:
-        file: a path; a URL that fsspec supports (`https://…`, `s3://…`; requires the extra `remote`); an open binary
-            file, which is read to its end; or bytes.
-        limits: as in `decode`, for each part.
-        storage: options of fsspec's file system for the URL: `{"endpoint_url": …, "anon": True}`.
-
-    Examples:
-        >>> import csplat
-        >>> with csplat.open("scene.csplat") as file:
-        ...     for tile in file.tiles(sh_degree=0):
-        ...         print(len(tile.means), tile.shN.shape)
-        1000 (1000, 0, 3)
-
-    Raises:
-        FormatError, UnsupportedError: as in `read_header`, or the file is shorter or longer than its header specifies.
-        InputError: `file` has another type; storage options without a URL; the extra is not installed.
-        StoreError: the server does not answer, does not support ranges (HTTP Range), or closes the connection, also
-            when requests are repeated; or the file has changed since it was opened.
-        OSError: the file does not exist or cannot be read.
-    """
-    store = open_store(file, storage)
-    try:
-        return SplatFile(store, limits or Limits())
-    except BaseException:
-        store.close()
-        raise
-
-
-def extract(
-    file: File,
-    box: Sequence[float],
-    output: str | os.PathLike[str] | BinaryWriter,
-    *,
-    storage: Mapping[str, Any] | None = None,
-) -> ExtractResult:
-    """Write the tiles of a file that touch a box as a file of their own.
-
-    Tiles are copied whole, including splats outside the box; values are preserved bit for bit. Nodes of a file with
-    levels of detail are copied whole, those of coarser levels if everything below them is. Declared error bounds
-    and the encoder's options, which refer to the whole file, are omitted, as are chunks of unknown types. Only header,
-    index and the copied data are read, a few megabytes at a time.
-
-    Args:
-        file: as in `open`.
-        box: two corners, x, y, z each, in any order, possibly infinite, in scene units relative to the origin.
-        output: a path, written atomically and replaced if it exists; or an open binary file.
-        storage: as in `open`.
-
-    Examples:
-        >>> import csplat
-        >>> part = csplat.extract("scene.csplat", (-1, -1, -1, 1, 1, 1), "part.csplat")
-        >>> part.splat_count == len(csplat.decode("part.csplat"))
-        True
-
-    Raises:
-        InputError: the box is not six numbers, or no tile touches the box.
-        FormatError: the header, the index or a copied chunk breaks a clause.
-        UnsupportedError, StoreError, OSError: as in `open`, or the output cannot be written.
-    """
-    with open(file, storage=storage) as opened:
-        return opened.extract(box, output)
+def _levels_finding(header: SceneHeader, which: str) -> Finding:
+    last = max(tile.level for tile in header.coarse_tiles)
+    return Finding("levels", last, f"{counted(last, 'coarser level')} of detail: {which}", "note")
 
 
 def _read_head(store: Store, window: FileWindow) -> bytes:
@@ -370,9 +387,11 @@ def _read_head(store: Store, window: FileWindow) -> bytes:
     return bytes(window.view[: max(first, end)])
 
 
-def _side(job: DecodeRequest) -> list[tuple[int, int]]:
+def _side(request: DecodeRequest) -> list[tuple[int, int]]:
     """Return the ranges to read in addition to tiles: their codebooks, or all other chunks for a whole file."""
-    records = job.header.directory if job.whole else wanted_codebooks(job.header, job.tiles, job.degree)
+    records = (
+        request.header.directory if request.whole else wanted_codebooks(request.header, request.tiles, request.degree)
+    )
     return [(record.offset, record.size) for record in records]
 
 

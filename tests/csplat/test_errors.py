@@ -13,7 +13,7 @@ import csplat
 from csplat.errors import CsplatError, FormatError, InputError, LimitError, UnsupportedError
 
 
-@pytest.mark.parametrize("function", [csplat.read_ply, csplat.decode, csplat.read_header, csplat.lint_ply])
+@pytest.mark.parametrize("function", [csplat.read, csplat.decode, csplat.read_header, csplat.lint_ply])
 def test_other_objects_than_files_are_typed_errors(function, tmp_path):
     for wrong in (5, None, 1.5, ["scene.ply"], io.StringIO("ply\n")):
         with pytest.raises(InputError, match="expected"):

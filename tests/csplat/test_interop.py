@@ -15,6 +15,7 @@ from checked import flipped, refusals
 
 import csplat
 from csplat.errors import InputError
+from csplat.formats import read_scene
 from csplat.interop import to_gsplat
 
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -71,9 +72,9 @@ def no_torch(monkeypatch):
 def read_holding(no_torch):
     """Return a function that reads a checkpoint that holds an object."""
 
-    def read(said, **options):
+    def read(said, read=csplat.read, **options):
         no_torch(lambda *_, **__: said)
-        return csplat.read(STORED[0], **options)
+        return read(STORED[0], **options)
 
     return read
 
@@ -196,24 +197,24 @@ def test_checkpoints_of_several_gpus_are_one_scene(no_torch, make_model, tmp_pat
     for path in [*paths, tmp_path / "ckpt_6_rank7.pt"]:
         path.write_bytes(STORED[0].read_bytes())
     no_torch(lambda path, **_: {"splats": {name: one[int(path.stem[-1]) :: 3] for name, one in splats.items()}})
-    report = []
-    model = csplat.read(paths[1], report=report)
-    assert np.array_equal(model.means, splats["means"][[0, 3, 1, 4, 2]])
-    assert [("ranks", False)] == [(one.id, one.usual) for one in report]
+    scene = read_scene(paths[1])
+    assert np.array_equal(scene.model().means, splats["means"][[0, 3, 1, 4, 2]])
+    assert [("ranks", False)] == [(one.id, one.usual) for one in scene.findings]
     paths[1].unlink()
     with pytest.raises(InputError, match=r"ckpt_29_rank2\.pt has the splats of one of several .*: no ckpt_29_rank1"):
         csplat.read(paths[2])
     paths[2].unlink()
-    assert 2 == len(csplat.read(paths[0], report=report))
-    assert ("ranks", "note", True) == (report[-1].id, report[-1].kind, report[-1].usual)
+    scene = read_scene(paths[0])
+    assert 2 == scene.count
+    assert [("ranks", "note", True)] == [(one.id, one.kind, one.usual) for one in scene.findings]
 
 
 def test_values_are_checked_like_those_of_a_ply(read_holding, make_model):
     splats = made_splats(make_model, 0)
 
     def read(**changed):
-        report = []
-        return read_holding({"splats": {**splats, **changed}}, report=report), {one.id: one for one in report}
+        scene = read_holding({"splats": {**splats, **changed}}, read_scene)
+        return scene.model(), {one.id: one for one in scene.findings}
 
     many = {name: tensor(values) for name, values in to_gsplat(make_model(20, 0)).items()}
     many |= {"opacities": tensor(np.linspace(0, 1, 20, dtype="f4")), "scales": np.exp(many["scales"])}
@@ -229,7 +230,7 @@ def test_values_are_checked_like_those_of_a_ply(read_holding, make_model):
         (scales[:, :2], "flat-scales", scales[:, :2].min() - np.log(100)), (zero, "zero-scales", -88.0),
     ):  # fmt: skip
         model, found = read(scales=tensor(one))
-        assert (True, name == "flat-scales") == (name in found, model.flat)
+        assert (True, name == "flat-scales") == (name in found, model.metadata.flat)
         assert np.array_equal(scales[:, 0], model.scales[:, 0])
         np.testing.assert_allclose(
             model.scales[:, 2], np.broadcast_to(third, 5), rtol=1e-6 if name != "zero-scales" else 0.01

@@ -10,7 +10,6 @@ from tables import failures
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import open_scene
 from csplat.ply import lint_ply, read_ply
 from csplat.ply.columns import alpha_of_logits
 
@@ -87,7 +86,7 @@ def counts(path):
 
 def both(path, **options):
     """Read a file at once and in blocks."""
-    with open_scene(path) as scene:
+    with csplat.open(path) as scene:
         return read_ply(path, **options), scene.model()
 
 
@@ -172,7 +171,7 @@ def test_unusual_values_are_counted_and_repaired_unless_reading_is_strict(path):
         assert findings == {one: count for one, count in counts(path).items() if one not in others}
         for model in both(path):
             np.testing.assert_allclose(getattr(model, name), np.asarray(values, np.float32), rtol=1e-6, atol=1e-7)
-            assert ("flat-scales" in findings) == model.flat
+            assert ("flat-scales" in findings) == model.metadata.flat
         repaired = [one for one in ("nonfinite-rows", "zero-quats") if one in findings]
         assert repaired == [one.id for one in lint_ply(path) if one.kind == "repair"]
         if not repaired:
@@ -322,7 +321,7 @@ def test_the_filter_of_mip_splatting_is_fused(path):
     np.testing.assert_allclose(model.opacities, alphas * np.sqrt(squares.prod(1) / fused.prod(1)), rtol=1e-6)
     assert np.array_equal(rows["scale_1"][:20], model.scales[:20, 1])
     assert np.array_equal(alpha_of_logits(rows["opacity"][:20]), model.opacities[:20])
-    assert ({}, False) == (model.extra, model.antialiased)
+    assert ({}, False) == (model.extra, model.metadata.antialiased)
     assert np.array_equal(model.opacities, both(path)[1].opacities)
 
 
@@ -424,7 +423,7 @@ def test_headers_in_other_spellings_are_read(path, kind, written, message):
     assert message in found(path)["unusual-header"].text
     model = csplat.read(path)
     assert_splats_of_rows(model)
-    assert "by ??" in model.metadata["comments"][0].lower()
+    assert "by ??" in model.metadata.entries["comments"][0].lower()
 
 
 def halves_of(rows, names, order="<"):

@@ -21,7 +21,7 @@ aiohttp = pytest.importorskip("aiohttp", reason="URLs require the extra [remote]
 
 @pytest.fixture(scope="module")
 def data(sample_path):
-    return encode(csplat.read_ply(sample_path), EncodeOptions(preset="fast", tile_splats=1000))
+    return encode(csplat.read(sample_path), EncodeOptions(preset="fast", tile_splats=1000))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_parts_are_read_from_a_web_server(web, data, box):
 
 
 def test_a_coarser_version_is_read_without_the_rest(web, sample_path):
-    model = csplat.read_ply(sample_path)
+    model = csplat.read(sample_path)
     leaves = np.array_split(np.argsort(model.means[:, 0]), 3)
     nodes = [LevelNode(0, 3, rows=rows) for rows in leaves]
     nodes.append(LevelNode(1, None, splats=model.select(slice(0, None, 8)), error=1.0))

@@ -1,11 +1,10 @@
 """Tests of csplat_render.camera_paths."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from cameras_cases import ball, figure, niche, same
 from checked import cloud
+from models import with_facts
 from tables import failures
 
 from csplat.errors import InputError
@@ -35,7 +34,7 @@ def test_an_orbit_shows_an_object_entirely(size):
 @pytest.mark.parametrize("up", [[0.0, 0.0, 1.0], [0.0, -0.8, 0.6]])
 def test_an_orbit_goes_around_the_recorded_up(up):
     model, _ = figure()
-    cameras = orbit_cameras(replace(model, metadata={"up": up}), 8, 64, 48)
+    cameras = orbit_cameras(with_facts(model, entries={"up": up}), 8, 64, 48)
     right, down = (np.array([camera.viewmat[row, :3] @ np.array(up) for camera in cameras]) for row in (0, 1))
     assert np.ptp([camera.position @ np.array(up) for camera in cameras]) < 1e-5
     assert np.abs(right).max() < 1e-5
@@ -72,7 +71,7 @@ def test_a_path_along_cameras_has_their_positions_and_directions(spread):
     assert np.linalg.norm(middle - places.mean(axis=0)) < 0.4
     far = look_at([0, 5000.0, 0], [0, 0, 0], [0, 0, 1], SMALL_K, 64, 48)
     assert same(cameras, orbit_cameras(niche(), 24, 64, 48, along=[*known, far]))
-    carrying = replace(niche(), cameras=[camera.to_json() for camera in known])
+    carrying = with_facts(niche(), cameras=[camera.to_json() for camera in known])
     assert same(cameras, orbit_cameras(carrying, 24, 64, 48))  # the recorded cameras
     for camera in orbit_cameras(niche(), 3, 64, 48, along=known[:1]):  # one camera does not move
         assert np.allclose(known[0].viewmat, camera.viewmat)
@@ -81,14 +80,14 @@ def test_a_path_along_cameras_has_their_positions_and_directions(spread):
 @pytest.mark.slow
 def test_a_path_sways_around_the_recorded_first_view():
     first = look_at([2.4, -0.8, 0.3], [0, 0, 0], [0, -1, 0], SMALL_K, 64, 48)
-    cameras = orbit_cameras(replace(niche(), metadata={"view": first.to_json(), "up": [0, -1, 0]}), 24, 64, 48)
+    cameras = orbit_cameras(with_facts(niche(), entries={"view": first.to_json(), "up": [0, -1, 0]}), 24, 64, 48)
     places = np.stack([camera.position for camera in cameras])
     assert np.allclose(places.mean(axis=0), first.position, atol=0.25)
     assert np.allclose(np.linalg.norm(places, axis=1), np.linalg.norm(first.position), atol=0.01)
     assert 0.4 < np.ptp(places[:, 2]) < 3.0  # sideways
     assert 0.05 < np.ptp(places[:, 1]) < 0.5 * np.ptp(places[:, 2])  # up and down
     assert all(camera.viewmat[2, :3] @ -camera.position > 0.99 * np.linalg.norm(camera.position) for camera in cameras)
-    unread = replace(niche(), metadata={"view": {"K": 1}, "up": [0, -1, 0]})
+    unread = with_facts(niche(), entries={"view": {"K": 1}, "up": [0, -1, 0]})
     assert 24 == len(orbit_cameras(unread, 24, 64, 48))  # the arc of a scene without a valid view
 
 

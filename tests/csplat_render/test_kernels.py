@@ -227,7 +227,7 @@ def lpips(a, b):
     kernel = np.full((11, 11, 3, 64), 0.1, np.float32)
     return float(convolve((a - b) / SCALE, kernel, np.zeros(64, np.float32), 4, 2).mean())
 
-model = csplat.read_ply(sys.argv[1]).select(np.arange(40))
+model = csplat.read(sys.argv[1]).select(np.arange(40))
 prepare_renderer(quiet=True, simplify=True)
 warm_up(gradients=False, ssim=True, lpips=True)
 before = compiled()

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from models import with_facts
 from oracle import GROUPS, adversarial, extreme_splats, facing
 from sensitivity_cases import scene, small_scene, views
 from tables import failures
@@ -12,6 +13,7 @@ from tables import failures
 from csplat.errors import InputError
 from csplat.model import sh_degree_of
 from csplat.ply import read_ply
+from csplat.scene_metadata import SceneMetadata
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.pruning_error import measure_pruning_error, pruning_error_exact
 from csplat_render.virtual_cameras import virtual_cameras
@@ -38,7 +40,7 @@ NEEDLES = replace(scene(count=30, seed=4), scales=np.tile(np.float32([-0.5, -6.0
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("model", [scene(30), NEEDLES], ids=["usual", "needles"])
 def test_pruning_errors_agree_with_removing_splats_one_by_one(model, antialiased):
-    model = replace(model, antialiased=antialiased)
+    model = with_facts(model, antialiased=antialiased)
     options = {"background": (0.2, 0.5, 0.9), "transmittance_min": 0.0}
     expected = pruning_error_exact(model, views(2), np.arange(30), **options)
     wide = measure_pruning_error(model, views(2), dtype=np.float64, **options)
@@ -124,7 +126,9 @@ def test_non_finite_rows_are_unseen_and_change_nothing():
 def measured(arrays, view, *, antialiased=False):
     """Measure arrays that a `SplatModel` would refuse."""
     degree = sh_degree_of(arrays["shN"].shape[1])
-    return measure_pruning_error(Unchecked(**arrays, sh_degree=degree, antialiased=antialiased), [view])
+    return measure_pruning_error(
+        Unchecked(**arrays, sh_degree=degree, metadata=SceneMetadata(antialiased=antialiased)), [view]
+    )
 
 
 @dataclass(frozen=True)
@@ -132,7 +136,7 @@ class Unchecked(UncheckedSplats):
     """The fields of a model that `measure_pruning_error` reads, without validation."""
 
     sh_degree: int
-    antialiased: bool
+    metadata: SceneMetadata
 
     def __len__(self):
         return len(self.means)

@@ -5,7 +5,7 @@ import pytest
 from cameras_cases import ball, niche, same
 from checked import cloud
 
-from csplat import read_ply
+from csplat.ply import read_ply
 from csplat_render.camera_files import load_cameras
 from csplat_render.scene_frame import covered_fraction, sample_cloud, scene_frame
 from csplat_render.virtual_cameras import OBJECT_DISTANCES, SURROUNDING_DISTANCES, virtual_cameras

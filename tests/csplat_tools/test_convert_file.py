@@ -16,16 +16,18 @@ import numpy as np
 import pytest
 from checked import checked, cloud
 from command_line import call, invoke
+from models import with_facts
 from tables import failures
 from typer.testing import CliRunner
 
 import csplat
-from csplat import CsplatError, EncodeOptions, InputError, LimitError, decode, formats, read_ply, write_ply
+from csplat import CsplatError, EncodeOptions, InputError, LimitError, decode, formats, write_ply
 from csplat.editing.transform import convert_axes
 from csplat.formats import spz
 from csplat.formats.format import ARRAYS
 from csplat.out_of_core import OutOfCoreOptions
-from csplat.scene_source import source_from_model
+from csplat.ply import read_ply
+from csplat.scene import Scene
 from csplat_conformance.manifest import load
 from csplat_tools import scene_files
 from csplat_tools.cli.app import app
@@ -136,7 +138,7 @@ def test_sog_reports_what_its_codes_do_not_reach(tmp_path, make_model):
     found = csplat.write(tmp_path / "b.sog", replace(model, opacities=np.full(3000, 1e-3, "f4"), sh0=colours))
     error = np.abs(np.sort(csplat.read(tmp_path / "b.sog").sh0[:, 0])[-1] - 1000)
     assert bool(found) == (error > 125)
-    (found,) = csplat.write(tmp_path / "c.sog", replace(model, antialiased=True, flat=True))
+    (found,) = csplat.write(tmp_path / "c.sog", with_facts(model, antialiased=True, flat=True))
     assert "SOG cannot hold that splats are discs and antialiased" == found.text
 
 
@@ -227,7 +229,7 @@ def test_every_format_is_written_to_a_pipe_and_to_a_device(tmp_path, ply):
         call("convert", ply, pipe, "--to", name)
         reader.join(10)
         assert pipe.is_fifo()
-        with formats.open_scene(copy, name) as scene:
+        with csplat.open(copy, name) as scene:
             assert 200 == scene.count
         call("convert", ply, os.devnull, "--to", name)
         assert Path(os.devnull).is_char_device()
@@ -259,7 +261,7 @@ def test_changes_are_along_the_axes_of_the_file_or_of_to_axes(tmp_path, make_mod
     def check(case):
         (suffix, axes), (words, change) = case
         source, target = tmp_path / f"in.{suffix}", tmp_path / f"out.{suffix}"
-        csplat.write(source, replace(make_model(30, 1), coordinate_system="RDF"))
+        csplat.write(source, with_facts(make_model(30, 1), coordinate_system="RDF"))
         said = call("convert", source, target, "--force", *words.split()).stderr
         assert f"{words.split()[0]}: along the axes" in said
         assert ("= RDF of --to-axes" if "--to-axes" in words else f"x, y, z = {axes}; --to-axes") in said
@@ -277,7 +279,7 @@ def test_axes_are_converted_and_recorded(tmp_path, ply):
     call("convert", ply, tmp_path / "a.ply", "--to-axes", "RUB")
     call("convert", tmp_path / "a.ply", tmp_path / "b.ply", "--to-axes", "RDF")
     source, there, back = (read_ply(path) for path in (ply, tmp_path / "a.ply", tmp_path / "b.ply"))
-    assert ("RUB", "RDF") == (there.coordinate_system, back.coordinate_system)
+    assert ("RUB", "RDF") == (there.metadata.coordinate_system, back.metadata.coordinate_system)
     assert (source.means * np.float32([1, -1, -1]) == there.means).all()
     assert all((getattr(source, name) == getattr(back, name)).all() for name in ("means", "quats", "shN"))
     to = json.loads(call("convert", ply, tmp_path / "a.spz", "--json").stdout)  # which has fixed axes
@@ -313,7 +315,7 @@ def test_filters_are_applied_in_the_documented_order_a_crop_sphere_in_world_coor
     assert np.allclose(source.scales[inside] + np.log(2.0), found.scales, atol=1e-5)
     assert 1 == found.sh_degree
     model = make_model(200, 0, origin=(100.0, 0.0, 0.0))
-    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).apply(source_from_model(model))
+    kept = Filters(crop_sphere=(100.0, 0.0, 0.0, 0.7)).apply(Scene.of(model))
     assert (np.linalg.norm(model.means, axis=1) <= 0.7).sum() == kept.count == len(kept.model())
 
 
@@ -325,7 +327,7 @@ def test_floaters_are_splats_without_neighbours():
     assert [3000, 3001] == np.flatnonzero(find_floaters(points, sizes)).tolist()
     assert not find_floaters(points[:5], sizes[:5]).any()
     assert not find_floaters(np.zeros((20, 3)), np.ones(20)).any()
-    left = Filters(drop_floaters=True).apply(source_from_model(cloud(points, sizes)))
+    left = Filters(drop_floaters=True).apply(Scene.of(cloud(points, sizes)))
     assert 3001 == left.count == len(left.model())
 
 
@@ -382,8 +384,7 @@ def test_arrays_that_are_exact_in_two_formats_are_converted_exactly(tmp_path, ma
         filters = Filters(to_axes=other.axes or "RDF")
         converted = convert_file(str(a), str(b), read_as=first, write_as=second, filters=filters)
         source, found = (
-            convert_axes(source_from_model(formats.read(path, name)), "RDF").model()
-            for path, name in ((a, first), (b, second))
+            convert_axes(Scene.of(formats.read(path, name)), "RDF").model() for path, name in ((a, first), (b, second))
         )
         assert len(source) == converted.count == len(found)
         for name in one.exact & other.exact:
@@ -435,7 +436,7 @@ def test_tile_wise_scenes_and_plys_equal_those_of_one_decode(tmp_path):
     def check(vector):
         path.write_bytes(vector.data)
         expected = decode(vector.data, threads=1)
-        with formats.open_scene(path) as scene:
+        with csplat.open(path) as scene:
             assert len(expected) == scene.count
             np.testing.assert_equal(asdict(scene.model()), asdict(expected))
         wanted = ply_of(expected)
@@ -476,4 +477,4 @@ def test_a_packed_scene_is_unpacked_once_and_one_that_exceeds_the_memory_refused
     monkeypatch.setattr(scene_files, "available_memory_bytes", lambda: 4000)
     for path in (encoded, ply):
         with pytest.raises(LimitError, match="allowed 4000"):
-            scene_files.load_model(path)
+            scene_files.load_scene(path)

@@ -10,7 +10,8 @@ import pytest
 from captures import cameras, shell
 from command_line import call
 
-from csplat import EncodeOptions, encode, read_ply, write_ply
+from csplat import EncodeOptions, encode, write_ply
+from csplat.ply import read_ply
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_tools.html_report import HardestPlaceSearch, attribute_figure
 from csplat_tools.inspect.file_description import describe_file

@@ -17,15 +17,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import csplat
-import csplat_tools
 from csplat import InputError, LimitError, _spec, decode, decode_scene, read_header
 from csplat.decoder.container import SceneHeader
 from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
 from csplat.encoder.levels import LevelNode, encode_levels
-from csplat.formats import open_scene
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
-from csplat.scene_source import source_from_model
+from csplat.scene import Scene
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders import all_inputs
 from csplat_conformance.encoders.file_checks import SplatPairs
@@ -41,7 +39,7 @@ from csplat_tools.convert_file import convert_file
 from csplat_tools.encode_file import choose_levels, encode_file
 from csplat_tools.level_builder import LevelBuilder, encode_with_levels, kd_groups
 from csplat_tools.level_merging import merge_neighbours
-from csplat_tools.scene_files import LoadedModel
+from csplat_tools.scene_files import load_scene
 
 pytestmark = pytest.mark.usefixtures("little_level_work")
 
@@ -54,7 +52,7 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 @pytest.fixture(scope="module")
 def model(sample_path):
-    return csplat.read_ply(sample_path).select(slice(0, SPLATS))
+    return csplat.read(sample_path).select(slice(0, SPLATS))
 
 
 @pytest.fixture(scope="module")
@@ -191,7 +189,7 @@ def test_a_file_without_levels_is_one_node_and_coarser_levels_have_no_extra_colu
             file.cut(max_splats=4)
     with csplat.open(NOTHING) as file:
         assert ((), []) == (file.nodes, file.cut(max_splats=0))
-    with open_scene(RICH, max_splats=read_header(RICH).splat_count - 1) as scene:
+    with csplat.open(RICH, max_splats=read_header(RICH).splat_count - 1) as scene:
         assert [{}] == [block.extra for block in scene.blocks()]
     with csplat.open(RICH) as file:
         assert [{}, {}] == [file.read(tiles=tiles).extra for tiles in (file.cut(level=1), [0, 2])]
@@ -229,7 +227,7 @@ def test_a_cut_reads_its_part_of_a_file(data):
 def test_levels_of_a_file_are_scenes_to_convert_and_listed_by_info(data, path, tmp_path):
     said = call("convert", path, tmp_path / "coarse.ply", "--level", 1).stderr
     assert "2 coarser levels of detail: level 1 alone is read" in said
-    assert counts_by_level(data, [1]) == [len(csplat.read_ply(tmp_path / "coarse.ply"))]
+    assert counts_by_level(data, [1]) == [len(csplat.read(tmp_path / "coarse.ply"))]
     refused = call("convert", path, tmp_path / "coarse.ply", "--level", 3, "--force", status=1)
     assert "the level is 3, expected 0 to 2" in refused.stderr
     levels = json.loads(call("info", path, "--json").stdout)["levels"]
@@ -248,7 +246,7 @@ def test_a_number_of_splats_selects_a_version(data, path, tmp_path):
     coarser = counts_by_level(data, range(3))
     assert len({*counts.values()}) == 3
     for most, wanted in counts.items():
-        with open_scene(path, max_splats=most) as scene, open_scene(streamed, max_splats=most) as level:
+        with csplat.open(path, max_splats=most) as scene, csplat.open(streamed, max_splats=most) as level:
             assert (wanted, wanted) == (scene.count, sum(map(len, scene.blocks())))
             assert max(one for one in coarser if one <= most) == level.count
     csplat.write(tmp_path / "a.ply", csplat.decode(data))
@@ -258,7 +256,7 @@ def test_a_number_of_splats_selects_a_version(data, path, tmp_path):
         (tmp_path / "a.ply", {}, "the scene, which has no other version, has 400 splats, expected at most 9"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=message):
-            csplat_tools.load_model(scene, max_splats=9, **words)
+            load_scene(scene, max_splats=9, **words)
 
 
 @pytest.mark.slow
@@ -397,7 +395,7 @@ def test_the_suite_of_encoders_reports_how_levels_look(model, data):
 def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
     out = tmp_path / "plain.csplat"
     for levels in ({}, {"levels": "auto"}):  # one node of 4,096 splats has no coarser one
-        encode_file(LoadedModel(model, 1), str(out), EncodeOptions(), **levels)
+        encode_file(load_scene(model), str(out), EncodeOptions(), **levels)
         assert csplat.encode(model) == out.read_bytes()
     wanted = {(10**9, None): None, (4096, "auto"): None, (4097, "auto"): LevelBuilder(), (9, 2): LevelBuilder(2)}
     assert wanted == {(count, levels): choose_levels(count, EncodeOptions(), levels) for count, levels in wanted}
@@ -425,13 +423,13 @@ def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tm
     # Other processes would fit with all steps.
     threads, memory_bytes = (1, 2_000_000_000) if fitted_splats == 400 else (2, None)
     options, limits = replace(options, threads=threads), OutOfCoreOptions(memory_bytes=memory_bytes)
-    encode_scene(source_from_model(model), tmp_path / "out.csplat", options, limits, levels=builder)
+    encode_scene(Scene.of(model), tmp_path / "out.csplat", options, limits, levels=builder)
     assert bool(data == (tmp_path / "out.csplat").read_bytes())
 
 
 @pytest.mark.long
 def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_path):
-    model, out = csplat.read_ply(sample_path).select(slice(0, 1200)), tmp_path / "out.csplat"
+    model, out = csplat.read(sample_path).select(slice(0, 1200)), tmp_path / "out.csplat"
     target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
     result = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
     assert 17_460 < len(result.data) == result.report.search.size_bytes <= 18_000
@@ -443,7 +441,7 @@ def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_p
     np.save(tmp_path / "weights.npy", np.linspace(0.1, 1.0, 1200, dtype=np.float32))
     kept, weights = {"target": csplat.Target(keep=0.5, effort=1)}, {"importance": str(tmp_path / "weights.npy")}
     for what, count in ((kept, 600), (weights, 1200)):
-        encoded = encode_file(LoadedModel(model, 1), str(out), EncodeOptions(), levels=1, **what)
+        encoded = encode_file(load_scene(model), str(out), EncodeOptions(), levels=1, **what)
         assert_valid(out.read_bytes())
         assert [count, count // 4] == counts_by_level(out, (0, 1))
         assert encoded.report.options["levels"]["count"] == 1

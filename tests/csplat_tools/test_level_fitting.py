@@ -7,7 +7,7 @@ import pytest
 
 import csplat
 from csplat import LimitError
-from csplat.scene_source import join_blocks
+from csplat.scene import join_blocks
 from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.level_fitting import LevelFitter, Work
@@ -16,7 +16,7 @@ from csplat_tools.level_merging import merge_neighbours
 
 @pytest.fixture(scope="module")
 def sample(sample_path):
-    return csplat.read_ply(sample_path)
+    return csplat.read(sample_path)
 
 
 @pytest.mark.long

@@ -2,16 +2,17 @@
 
 import json
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import typer
 from checked import cloud
 from command_line import call
+from models import with_facts
 from PIL import Image
 
-from csplat import InputError, read_ply, write_ply
+from csplat import InputError, write_ply
+from csplat.ply import read_ply
 from csplat_tools import render_files
 from csplat_tools.cli.shared_options import parse_colour
 
@@ -20,7 +21,7 @@ from csplat_tools.cli.shared_options import parse_colour
 def ply(tmp_path):
     """One red, opaque ball of radius 0.2 around the origin."""
     red, path = np.array([[1.7, -1.8, -1.8]], np.float32), tmp_path / "ball.ply"
-    write_ply(path, cloud([[0, 0, 0]], 0.2, opacities=np.ones(1, np.float32), sh0=red, metadata={"up": [0, -1, 0]}))
+    write_ply(path, cloud([[0, 0, 0]], 0.2, opacities=np.ones(1, np.float32), sh0=red, entries={"up": [0, -1, 0]}))
     return path
 
 
@@ -62,7 +63,7 @@ def test_the_background_surrounds_the_scene_with_alpha_and_depth_next_to_the_ren
     assert alpha[24, 32] > 240
     assert np.float32 == depth.dtype
     assert depth[24, 32] == pytest.approx(2.0, rel=1e-4)
-    write_ply(ply, replace(read_ply(ply), metadata={"training": {"background": [1, 1, 1]}}))
+    write_ply(ply, with_facts(read_ply(ply), entries={"training": {"background": [1, 1, 1]}}))
     call("render", ply, "--cameras", cameras, tmp_path / "trained", "--size", "128x96")
     picture = pixels(tmp_path / "trained" / "left.png")
     assert ((96, 128, 3), [255, 255, 255]) == (picture.shape, picture[0, 0].tolist())
@@ -149,7 +150,7 @@ def film_scene(tmp_path_factory):
     """A PLY with a recorded up direction, which would otherwise be estimated."""
     path, rng = tmp_path_factory.mktemp("film") / "scene.ply", np.random.default_rng(0)
     colours = rng.standard_normal((200, 3)).astype(np.float32)
-    write_ply(path, cloud(rng.standard_normal((200, 3)), 0.14, sh0=colours, metadata={"up": [0, -1, 0]}))
+    write_ply(path, cloud(rng.standard_normal((200, 3)), 0.14, sh0=colours, entries={"up": [0, -1, 0]}))
     return path
 
 

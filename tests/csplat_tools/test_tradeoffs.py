@@ -5,14 +5,14 @@ import re
 import shlex
 import sys
 from collections import Counter
-from dataclasses import replace
 
 import pytest
 from captures import photograph, shell
 from command_line import call
 
 from csplat import EncodeOptions, InputError, Target
-from csplat_tools import load_model, parse_grid, tradeoff
+from csplat_tools import parse_grid, tradeoff
+from csplat_tools.scene_files import load_scene
 from csplat_tools.tradeoffs import Tradeoff, TradeoffRow, format_tradeoff, make_tradeoff_page, measure_grid
 from csplat_tools.views import BLACK, ViewSet
 
@@ -68,7 +68,7 @@ def measured(make_model):
     """Return a function for made-up measurements: `measured((size, psnr), ..., images=PSNR)`."""
 
     def make(*points, images=None):
-        source = replace(load_model(make_model(10)), name="a & b.ply")
+        source = load_scene(make_model(10)).changed(name="a & b.ply")
         grid = parse_grid(f"precision={':'.join(str(20 + number) for number in range(len(points)))}")
         rows = [row_of(setting, *point, images) for setting, point in zip(grid, points, strict=True)]
         return Tradeoff(source, ViewSet("lego", BLACK, (), (), ()), rows, {"targets=60": "out of <reach>"})

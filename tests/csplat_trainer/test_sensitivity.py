@@ -38,12 +38,12 @@ def derivatives(model, views, change):
     slopes = []
     for view in views:
         decisions, pictures = Decisions(), []
-        render_exact(loose(model), view, antialiased=model.antialiased, decisions=decisions)
+        render_exact(loose(model), view, antialiased=model.metadata.antialiased, decisions=decisions)
         for step in (STEP, -STEP):
             moved = loose(model)
             change(moved, step)
             decisions.replay()
-            pictures.append(render_exact(moved, view, antialiased=model.antialiased, decisions=decisions).rgb)
+            pictures.append(render_exact(moved, view, antialiased=model.metadata.antialiased, decisions=decisions).rgb)
         slopes.append((pictures[0] - pictures[1]) / (2 * STEP))
     return slopes
 

@@ -14,10 +14,10 @@ from PIL import Image
 from posed_sets import to_opengl
 from train_cases import QUICK, SIZE, assert_resumes_identically
 
-from csplat import decode, read_ply, write_ply
+from csplat import decode, write_ply
 from csplat.encoder import EncodeOptions, EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
-from csplat.training_record import TrainingRecord
+from csplat.ply import read_ply
 from csplat_render.camera import Camera, relative_to
 from csplat_tools.training.training_run import plan_training, tuning_after
 from csplat_trainer.data import DataSet
@@ -87,7 +87,7 @@ def test_a_scene_has_the_origin_of_its_data_set_and_an_extent_without_outlier_ca
     plain = train(data, brief(30)).model
     placed = replace(data, origin=tuple(place), coordinate_system="RFU")
     moved = train(placed, brief(30), outputs=Outputs(tmp_path / "c.npz")).model
-    assert (tuple(place), "RFU") == (moved.origin, moved.coordinate_system)
+    assert (tuple(place), "RFU") == (moved.origin, moved.metadata.coordinate_system)
     assert np.array_equal(plain.means, moved.means)
     shifted = [replace(one, camera=relative_to(shift, one.camera)) for one in data.train]
     other = DataSet("other", shifted, [], origin=tuple(place + shift))
@@ -112,19 +112,19 @@ def test_splats_start_within_the_hull_of_all_masks_or_in_a_box(data, make_model)
     opaque = training_images(make_model, alpha=False)
     model = train(opaque, brief(60)).model
     assert np.isfinite(model.means).all()
-    assert (0.0, 0.0, 0.0) == TrainingRecord.of(model.metadata).background
+    assert (0.0, 0.0, 0.0) == model.metadata.training.background
     for init, message in (("hull", "requires images with alpha"), ("points", "requires points")):
         with pytest.raises(InputError, match=message):
             train(opaque, brief(init=init))
 
 
 def test_the_first_view_of_surroundings_is_a_training_camera(data):
-    assert "view" not in train(data, brief(strategy="none")).model.metadata  # an object
+    assert "view" not in train(data, brief(strategy="none")).model.metadata.entries  # an object
     rng = np.random.default_rng(0)
     far = rng.standard_normal((60, 3)) * 40.0
     points = np.concatenate([0.1 * rng.standard_normal((200, 3)), far]).astype(np.float32)
     given = DataSet("surrounded", data.train, data.test, points, np.full((260, 3), 0.5, np.float32))
-    view = Camera.from_json(train(given, brief(strategy="none", max_splats=260)).model.metadata["view"])
+    view = Camera.from_json(train(given, brief(strategy="none", max_splats=260)).model.metadata.entries["view"])
     taken = [one.camera for one in data.train]
     assert 1 == sum(np.allclose(view.viewmat, one.viewmat, atol=1e-5) for one in taken)
     assert (SIZE, SIZE, taken[0].near) == (view.W, view.H, view.near)
@@ -167,7 +167,7 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
     ply, log = tmp_path / "a.ply", tmp_path / "log.json"
     result = call("train", folder, ply, "--background", background, "--report", log, *reading, *FEW_WORDS)
     assert ("", 5) == (result.stdout, len(json.loads(log.read_text())["losses"]))
-    record = TrainingRecord.of(read_ply(ply).metadata)
+    record = read_ply(ply).metadata.training
     assert (every, size) == (record.test_every, None if record.size is None else "{}x{}".format(*record.size))
     assert record.background == ((1.0, 1.0, 1.0) if alpha or background == "white" else (0.0, 0.0, 0.0))
     assert str(record) in result.stderr
@@ -188,7 +188,7 @@ def test_the_command_trains_to_a_file_and_resumes(file_runs, tmp_path):
     assert (len(model), len(first)) == (report["file"]["splats"], report["file"]["size_bytes"])
     assert {"source", "before tuning", "file"} == set(report["file"]["scores"])
     assert "held-out images" in file_runs.messages
-    record = TrainingRecord.of(model.metadata)
+    record = model.metadata.training
     assert (1.0, 1.0, 1.0) == record.background
     assert str(record) in call("info", file_runs.folder / "a.csplat").stdout
     for name in ("run.npz", "run.tuning.npz"):

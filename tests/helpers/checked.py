@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from models import model_of
 from numpy.polynomial import Legendre
 
 import csplat
@@ -12,7 +13,7 @@ from csplat.encoder import EncodeOptions, encode_with_report
 from csplat.encoder.error_bounds import measured_sums
 from csplat.errors import InputError
 from csplat.formats import detect_format
-from csplat.model import SplatModel, normalise_quats
+from csplat.model import normalise_quats
 from csplat_conformance.validator import validate
 
 
@@ -74,7 +75,7 @@ def cloud(means, sizes=0.03, **fields):
         "opacities": np.full(count, 0.9, np.float32),
         "sh0": np.zeros((count, 3), np.float32),
     }
-    return SplatModel(**{**arrays, **fields})
+    return model_of(**{**arrays, **fields})
 
 
 def covariances(quats, scales):

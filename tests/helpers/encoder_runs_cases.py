@@ -58,7 +58,7 @@ def refuse(at):
 
 def model_of(name, folder):
     (folder / "in.ply").write_bytes(INPUTS[name].make())
-    return csplat.read_ply(folder / "in.ply")
+    return csplat.read(folder / "in.ply")
 
 
 def judged(name, model, change=lambda scene: scene, **options):

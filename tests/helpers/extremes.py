@@ -17,11 +17,11 @@ from types import SimpleNamespace
 import numpy as np
 from captures import cameras, shell, views_of
 
-from csplat import EncodeOptions, decode, read_ply
+from csplat import EncodeOptions, decode
 from csplat.decoder import read_declared_bounds, read_header
 from csplat.encoder import EncodePlan, Target, encode_with_report, fix_quantisation
 from csplat.errors import InputError
-from csplat.ply import lint_ply
+from csplat.ply import lint_ply, read_ply
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render import render
 from csplat_render.rasteriser import Rasteriser

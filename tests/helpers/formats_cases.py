@@ -12,8 +12,8 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 def same(a, b):
     assert all((getattr(a, name) == getattr(b, name)).all() for name in ARRAYS)
-    assert (a.origin, a.coordinate_system, a.antialiased, a.flat, a.metadata) == (
-        b.origin, b.coordinate_system, b.antialiased, b.flat, b.metadata,
+    assert (a.origin, a.metadata.coordinate_system, a.metadata.antialiased, a.metadata.flat, a.metadata) == (
+        b.origin, b.metadata.coordinate_system, b.metadata.antialiased, b.metadata.flat, b.metadata,
     )  # fmt: skip
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from csplat import EncodeOptions
 from csplat.encoder import LevelNode
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
-from csplat.scene_source import join_blocks
+from csplat.scene import join_blocks
 
 WHOLE = 600  # splats per bucket
 COUNT = 6 * WHOLE

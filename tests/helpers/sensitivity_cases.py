@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from models import model_of
 
-from csplat.model import SplatModel, normalise_quats
+from csplat.model import normalise_quats
 from csplat_render.camera import intrinsics, look_at
 
 pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[render]'")
@@ -11,7 +12,7 @@ pytest.importorskip("numba", reason="rendering needs numba: pip install 'csplat[
 
 def small_scene(count=6, degree=2, seed=0, **fields):
     rng = np.random.default_rng(seed)
-    return SplatModel(
+    return model_of(
         means=rng.normal(0, 0.5, (count, 3)).astype(np.float32),
         quats=normalise_quats(rng.normal(size=(count, 4)).astype(np.float32)),
         scales=rng.normal(-1.6, 0.4, (count, 3)).astype(np.float32),

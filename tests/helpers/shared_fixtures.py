@@ -12,9 +12,10 @@ import filelock
 import hypothesis
 import numpy as np
 import pytest
+from models import model_of
 
 from csplat import _spec
-from csplat.model import SplatModel, normalise_quats
+from csplat.model import normalise_quats
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -156,7 +157,7 @@ def make_model():
             "opacities": rng.random(count).astype(np.float32), "sh0": normal(3),
             "shN": normal((degree + 1) ** 2 - 1, 3),
         }  # fmt: skip
-        return SplatModel(**{**arrays, **fields})
+        return model_of(**{**arrays, **fields})
 
     return make
 

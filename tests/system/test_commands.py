@@ -12,8 +12,9 @@ import pytest
 from command_line import PROGRAM, heed_interrupts, invoke, printed, refused, status_of
 
 import csplat
-from csplat import _spec, read_ply
+from csplat import _spec
 from csplat.errors import InputError
+from csplat.ply import read_ply
 from csplat_tools.file_streams import check_output, write_bytes
 
 pytestmark = pytest.mark.usefixtures("no_estimated_up")

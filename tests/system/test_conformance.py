@@ -24,7 +24,7 @@ def invoke(*words):
 def copying(folder, name):
     """Return the command line of an encoder that copies our file of an input, and its source index."""
     (folder / "sound.ply").write_bytes(INPUTS[name].make())
-    result = encode_with_report(csplat.read_ply(folder / "sound.ply"))
+    result = encode_with_report(csplat.read(folder / "sound.ply"))
     (folder / "sound.csplat").write_bytes(result.data)
     np.save(folder / "sound.npy", result.source_index)
     code = "import shutil, sys\n"

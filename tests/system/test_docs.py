@@ -67,7 +67,7 @@ def test_the_readme_shows_measured_figures_of_this_encoder(sample_path):
     assert MEASURED["source"]["size_bytes"] == sample_path.stat().st_size
     for name, one in PRESETS.items():
         assert f"| `{name}` | {one['size_bytes']:,} | {one['psnr']:.1f} | {one['seconds']:.1f} |" in README
-        size = len(csplat.encode(csplat.read_ply(sample_path), csplat.EncodeOptions(name)))
+        size = len(csplat.encode(csplat.read(sample_path), csplat.EncodeOptions(name)))
         assert one["size_bytes"] == pytest.approx(size, rel=0.02)
     shown = PRESETS["balanced"]
     assert f"`csplat encode`: {shown['size_bytes'] / 1000:.0f} kB, {shown['psnr']:.1f} dB" in README
@@ -115,7 +115,7 @@ def test_python_examples_run(sample_path, tmp_path, monkeypatch, capsys):
     for folder in ("scenes", "encoded"):
         (tmp_path / folder).mkdir()
     for name in ("scene.ply", "scenes/one.ply"):
-        csplat.write_ply(tmp_path / name, csplat.read_ply(sample_path).select(range(200)))
+        csplat.write_ply(tmp_path / name, csplat.read(sample_path).select(range(200)))
     (tmp_path / "scenes" / "two.ply").write_bytes(b"not a PLY")
     names = {}
     exec(blocks(README, "python")[0], names)  # noqa: S102  # the README's own lines

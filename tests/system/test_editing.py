@@ -5,7 +5,8 @@ import pytest
 from command_line import call
 from editing_cases import STEPS, box_of, extract, merge
 
-from csplat import EncodeOptions, encode, read_header, read_ply
+from csplat import EncodeOptions, encode, read_header
+from csplat.ply import read_ply
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,8 @@ from checked import covariances
 from chromium import absent, read_pixels
 from command_line import call, invoke
 
-from csplat import EncodeOptions, decode, encode, read_ply
+from csplat import EncodeOptions, decode, encode
+from csplat.ply import read_ply
 from csplat.spherical_harmonics import evaluate_sh
 from csplat_tools.present.viewer_page import export_element
 
@@ -169,9 +170,9 @@ def test_the_samples_in_python(tmp_path, model, monkeypatch, capsys):
         exec(program, {"__name__": "__main__"})  # noqa: S102  # the guide's own lines
         said.append(capsys.readouterr().out)
     whole, part, cut = said
-    assert f"{len(model)} float32 4 {model.coordinate_system}\n" == whole
+    assert f"{len(model)} float32 4 {model.metadata.coordinate_system}\n" == whole
     first, *tiles, last = part.splitlines()
-    assert first.startswith(f"{len(model)} {model.coordinate_system} {{")
+    assert first == f"{len(model)} {model.metadata.coordinate_system} {model.metadata.licence}"
     assert [str(place) for place in range(10)] == [line.split()[0] for line in tiles if not line.startswith(" ")]
     assert last.endswith(f" of {(tmp_path / 'scene.csplat').stat().st_size}")
     assert 0 < len(decode(tmp_path / "part.csplat")) < len(model)

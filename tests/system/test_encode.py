@@ -19,8 +19,9 @@ import pytest
 from command_line import PROGRAM, invoke, printed, refused, status_of
 from typer.main import get_command
 
-from csplat import decode, read_ply, write_ply
+from csplat import decode, write_ply
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat.ply import read_ply
 from csplat_tools.cli.app import app
 
 pytestmark = pytest.mark.usefixtures("no_estimated_up")
@@ -88,8 +89,8 @@ def test_encode_takes_metadata_that_a_ply_lacks(tmp_path, ply):
     metadata = ("--up", "z", "--unit-metres", "0.5", "--antialiased", "--licence", "CC0")
     printed("encode", ply, tmp_path / "out.csplat", *metadata)
     model = decode(tmp_path / "out.csplat")
-    assert ([0, 0, 1], "CC0") == (model.metadata["up"], model.metadata["licence"])
-    assert (0.5, True) == (model.unit_metres, model.antialiased)
+    assert ([0, 0, 1], "CC0") == (model.metadata.entries["up"], model.metadata.entries["licence"])
+    assert (0.5, True) == (model.metadata.unit_metres, model.metadata.antialiased)
 
 
 def test_repairs_are_reported_even_if_quiet(tmp_path, make_model):

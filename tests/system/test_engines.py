@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from chromium import absent
 
-from csplat import EncodeOptions, decode, encode, read_ply
+from csplat import EncodeOptions, decode, encode
 from csplat.editing.transform import convert_axes
 from csplat.encoder import EncodePlan, LevelNode, encode_levels
 from csplat.formats import write, write_levels
-from csplat.scene_source import source_from_model
+from csplat.ply import read_ply
+from csplat.scene import Scene
 from csplat_bench.browser import serve
 from csplat_bench.engine_stage import ENGINES, pinhole, served
 from csplat_bench.subjects.engine_images import settled_image, up_in_world
@@ -55,7 +56,7 @@ def files(packages, sample_path):
             "flipped": data[:-9] + bytes([data[-9] ^ 4]) + data[-8:],
             "cut": data[: len(data) // 2],
             "text": b"no scene",
-            "left": encode(convert_axes(source_from_model(model), "LUF").model(), FAST),
+            "left": encode(convert_axes(Scene.of(model), "LUF").model(), FAST),
         }.items():
             (folder / f"{name}.csplat").write_bytes(content)
         write(folder / "scene.ply", model, "ply")
@@ -166,7 +167,7 @@ def test_a_budget_selects_the_version_of_a_file_with_levels(trial, files):
 def test_engines_draw_streamed_sog_of_csplat(browser, files, engine):
     folder, _, model, camera = files
     coarser = model.select(slice(0, None, 4))
-    write_levels(folder / engine / "lod-meta.json", [source_from_model(one) for one in (model, coarser)])
+    write_levels(folder / engine / "lod-meta.json", [Scene.of(one) for one in (model, coarser)])
     with started(browser, files, engine) as streamed:
         image, _ = shown(streamed, f"{engine}/lod-meta.json")
     ours, quarter = (ENGINES[engine].render(one, camera, 3) for one in (model, coarser))

@@ -17,9 +17,10 @@ from extremes import CONDITIONS, COUNT, DRAWN, FEW, NAMES, PRESETS, QUICK, asser
 from tables import failures
 from typer.testing import CliRunner
 
-from csplat import EncodeOptions, decode, encode, read_ply, write_ply
+from csplat import EncodeOptions, decode, encode, write_ply
 from csplat.encoder import Target, encode_with_report
 from csplat.errors import InputError, LimitError
+from csplat.ply import read_ply
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.virtual_cameras import virtual_cameras

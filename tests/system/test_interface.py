@@ -21,7 +21,9 @@ import csplat_trainer
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat.plugins import load_plugins
+from csplat.ply import read_ply
 from csplat_tools.cli.app import app
+from csplat_tools.scene_files import load_scene
 
 
 @pytest.fixture
@@ -61,7 +63,7 @@ def test_every_listed_name_exists():
 @pytest.mark.parametrize("package", [csplat, csplat_render, csplat_tools])
 def test_examples_of_the_documentation_run(package, tmp_path, sample_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    model = csplat.read_ply(sample_path).select(slice(0, 1000))
+    model = csplat.read(sample_path).select(slice(0, 1000))
     csplat.write_ply("scene.ply", model)
     (tmp_path / "scene.csplat").write_bytes(csplat.encode(model, csplat.EncodeOptions(preset="fast")))
     shown = {id(one): one for one in (package, *(getattr(package, name) for name in package.__all__))}
@@ -77,13 +79,13 @@ def test_examples_of_the_documentation_run(package, tmp_path, sample_path, monke
 @pytest.mark.parametrize("form", FORMS.values(), ids=FORMS)
 def test_files_may_be_paths_streams_or_bytes(files, form):
     model, ply, coded = files
-    assert_same(csplat.read_ply(ply), csplat.read_ply(form(ply)))
+    assert_same(csplat.read(ply), csplat.read(form(ply)))
     assert_same(csplat.decode(coded.read_bytes()), csplat.decode(form(coded)))
     assert len(model) == csplat.read_header(form(coded)).splat_count
     assert csplat.lint_ply(ply) == csplat.lint_ply(form(ply))
     for path in (ply, coded):
-        loaded = csplat_tools.load_model(form(path))
-        assert (len(model), path.stat().st_size) == (len(loaded.model), loaded.size_bytes)
+        loaded = load_scene(form(path))
+        assert (len(model), path.stat().st_size) == (loaded.count, loaded.size_bytes)
 
 
 def test_open_files_are_written_read_from_their_position_and_named(files, tmp_path):
@@ -93,10 +95,10 @@ def test_open_files_are_written_read_from_their_position_and_named(files, tmp_pa
     csplat.write_ply(stream, model)
     assert b"before" + ply.read_bytes() == stream.getvalue()
     stream.seek(6)
-    assert_same(csplat.read_ply(ply), csplat.read_ply(stream))
+    assert_same(csplat.read(ply), csplat.read(stream))
     (tmp_path / "wrong.ply").write_bytes(b"nothing of the kind")
     with (tmp_path / "wrong.ply").open("rb") as stream, pytest.raises(InputError, match=r"wrong\.ply is not a PLY"):
-        csplat.read_ply(stream)
+        csplat.read(stream)
 
 
 def test_objects_and_files_of_another_kind_are_refused_with_a_remedy(files, tmp_path):
@@ -104,16 +106,16 @@ def test_objects_and_files_of_another_kind_are_refused_with_a_remedy(files, tmp_
     out = tmp_path / "out.ply"
     for wrong in ("scene.ply", b"ply", None, 5):
         for call in (csplat.encode, csplat.encode_with_report, lambda wrong: csplat.write_ply(out, wrong)):
-            with pytest.raises(InputError, match=r"expects a SplatModel.*csplat\.read_ply"):
+            with pytest.raises(InputError, match=r"expects a SplatModel.*csplat\.read"):
                 call(wrong)
     assert not out.exists()
     with pytest.raises(InputError, match=r"EncodeOptions\(preset="):
         csplat.encode(model, "small")
-    for call, wrong in ((csplat.read_ply, coded), (csplat.decode, ply)):
+    for call, wrong in ((read_ply, coded), (csplat.decode, ply)):
         for form in FORMS.values():
             with pytest.raises(CsplatError):
                 call(form(wrong))
-    with pytest.raises(csplat.FormatError, match=r"a PLY, which csplat\.read_ply reads"):
+    with pytest.raises(csplat.FormatError, match=r"a PLY, which csplat\.read reads"):
         csplat.decode(ply)
 
 
@@ -131,7 +133,7 @@ import csplat, csplat_render, csplat_tools, csplat_trainer
 from csplat_render.virtual_cameras import virtual_cameras
 assert not {{"scipy", "torch"}} & set(sys.modules)
 path = {str(files[1])!r}
-model = csplat.read_ply(path)
+model = csplat.read(path)
 csplat.encode(model, target=csplat.Target(max_error={{"means": 0.01}}))
 for call in (
     lambda: csplat.encode(model, target=csplat.Target(psnr=40.0)),
@@ -228,7 +230,8 @@ def test_commands_call_the_public_functions(files, monkeypatch, words, given):
     encodes = words[0] == "encode"
     place = (csplat_tools.level_builder, "encode_with_report") if encodes else (csplat_tools, words[0])
     (scene, *_), named = arguments_of(monkeypatch, *place, words)
-    assert_same(csplat.read_ply(files[1]), getattr(scene, "model", getattr(scene, "source", scene)))
+    model = scene.model() if isinstance(scene, csplat.Scene) else getattr(scene, "source", scene)
+    assert_same(csplat.read(files[1]), model)
     if encodes:
         assert csplat.Target(**given) == named["target"]
         assert ("max_error" in given) == (named["views"] is None)
@@ -240,10 +243,10 @@ def test_the_size_of_a_model_is_that_of_a_plain_ply(files):
     pytest.importorskip("numba", reason="comparing requires the extra [render]")
     model, ply, coded = files
     size = ply.stat().st_size - len(ply.read_bytes().partition(b"end_header\n")[0]) - len(b"end_header\n")
-    assert size == csplat_tools.load_model(model).size_bytes
-    loaded = csplat_tools.load_model(coded)
-    assert loaded is csplat_tools.load_model(loaded)
-    assert replace(loaded, size_bytes=1).header == csplat.read_header(coded)
+    assert size == load_scene(model).size_bytes
+    loaded = load_scene(coded)
+    assert loaded is load_scene(loaded)
+    assert loaded.header == csplat.read_header(coded)
 
 
 @pytest.mark.slow
@@ -252,7 +255,7 @@ def test_the_size_of_a_model_is_that_of_a_plain_ply(files):
     ("import csplat, csplat_tools, csplat_trainer", "numba|numpy|typer|rich|torch|csplat_render"),
     ("import sys; sys.modules['plyfile'] = None; import csplat.decoder; csplat.decode; del sys.modules['plyfile']",
         r"(plyfile|torch|numba|deflate|typer|rich|csplat_tools|csplat\.(encoder|ply|lint|detect|disk_files)).*"),
-    ("from csplat import read_ply", r"csplat\.(encoder|decoder).*"),
+    ("from csplat.ply import read_ply", r"csplat\.(encoder|decoder).*"),
     ("import csplat_render.rasteriser, csplat_render.reference_rasteriser",
         r"(torch|csplat_trainer|csplat_tools|plyfile)(\..*)?"),
     ("from csplat_tools.cli.app import app; app(['encode', 'scene.ply', 'o.csplat'], standalone_mode=False)",
@@ -270,7 +273,9 @@ def test_arrays_are_not_copied_and_optional_fields_may_be_left_out(make_model):
     arrays = {name: getattr(make_model(4, 0), name) for name in ARRAYS[:5]}
     bare = SplatModel(**arrays)
     assert all(getattr(bare, name) is array for name, array in arrays.items())
-    assert (4, 0, (4, 0, 3), "unspecified") == (len(bare), bare.sh_degree, bare.shN.shape, bare.coordinate_system)
+    assert (4, 0, (4, 0, 3), "unspecified") == (
+        len(bare), bare.sh_degree, bare.shN.shape, bare.metadata.coordinate_system,
+    )  # fmt: skip
     assert [0, 1, 2, 3] == [make_model(5, degree).sh_degree for degree in range(4)]
 
 
@@ -292,7 +297,7 @@ def test_values_at_their_limits_are_accepted(make_model):
     assert 2 == len(make_model(2, opacities=np.array([0, 1], np.float32)))
     assert (1e7, 2.0, 3.0) == make_model(origin=np.array([1e7, 2, 3])).origin
     for letters in ("RDF", "RUB", "LUF", "FRU", "BLD"):
-        assert letters == make_model(coordinate_system=letters).coordinate_system
+        assert letters == make_model(coordinate_system=letters).metadata.coordinate_system
 
 
 @pytest.mark.parametrize("index", [slice(2, 5), np.array([4, 1, 1]), np.arange(10) % 3 == 0, slice(0, 0)])
@@ -302,7 +307,7 @@ def test_select_keeps_rows_of_every_array(make_model, index):
     for name in ARRAYS:
         assert np.array_equal(getattr(model, name)[index], getattr(part, name))
     assert np.array_equal(model.extra["id"][index], part.extra["id"])
-    assert (model.origin, model.coordinate_system) == (part.origin, part.coordinate_system)
+    assert (model.origin, model.metadata.coordinate_system) == (part.origin, part.metadata.coordinate_system)
 
 
 def test_normalised_quats_have_unit_length_and_stay_unchanged():

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 from checked import checked
 from chromium import absent
+from models import model_of
 from shared_fixtures import PEERS, of_peers
 
 import csplat
 from csplat.editing.transform import rotate_scene
 from csplat.formats import write_levels
 from csplat.model import SplatModel, normalise_quats
-from csplat.scene_source import source_from_model
+from csplat.scene import Scene
 
 pytestmark = [pytest.mark.slow, pytest.mark.peers]
 
@@ -33,7 +34,7 @@ def made(degree, reach, antialiased):
     }  # fmt: skip
     arrays["opacities"][:40] = np.repeat([0.001, 0.01, 0.99, 0.999], 10)
     arrays = {name: values.astype("f4") for name, values in arrays.items()}
-    return SplatModel(**arrays, antialiased=antialiased)
+    return model_of(**arrays, antialiased=antialiased)
 
 
 #: Programs that fix the fraction of SPZ's positions at 12 bits reach 2,048 at most.
@@ -83,7 +84,7 @@ class Spz:
             "alphas": np.log(model.opacities / (1 - model.opacities)), "colors": model.sh0, "sh": model.shN,
         }  # fmt: skip
         cloud = {name: values.ravel().tolist() for name, values in flat.items()}
-        cloud |= {"numPoints": len(model), "shDegree": model.sh_degree, "antialiased": model.antialiased}
+        cloud |= {"numPoints": len(model), "shDegree": model.sh_degree, "antialiased": model.metadata.antialiased}
         cloud |= {"extensions": [], "version": 4 if format == "spz4" else 3}
         path.with_suffix(".in").write_text(json.dumps(cloud))
         self.run(path, path.with_suffix(".in"))
@@ -95,7 +96,7 @@ class Spz:
         arrays = {name: np.array(cloud[one], "f4").reshape(cloud["numPoints"], -1) for name, one in names.items()}
         arrays |= {"quats": arrays["quats"][:, [3, 0, 1, 2]], "opacities": np.array(cloud["alphas"], "f4")}
         arrays["shN"] = arrays["shN"].reshape(cloud["numPoints"], (cloud["shDegree"] + 1) ** 2 - 1, 3)
-        return SplatModel(**arrays, antialiased=cloud["antialiased"])
+        return model_of(**arrays, antialiased=cloud["antialiased"])
 
 
 class Converter:
@@ -178,7 +179,7 @@ def differences(source, found, format, allowed):
     found = found.select(order)
     if format.startswith("spz"):
         fields = {"scales": np.clip(source.scales, -10, 5.9375), "shN": np.clip(source.shN, -1, 127 / 128)}
-        source = SplatModel(**{**vars(source), **fields})
+        source = model_of(**{**vars(source), **fields})
     off = {name: np.abs(getattr(source, name) - getattr(found, name)) for name in allowed if name != "degrees"}
     off["degrees"] = degrees(source.quats.astype(float), found.quats.astype(float))
     if format == "sog":  # WebP may change the colours of invisible splats
@@ -212,7 +213,7 @@ def check(found, peer, format, scene, writer):
     wrong, reordered = differences(source, found, format, bounds(format, writer, float(reach)))
     assert {} == wrong
     assert ((writer, format) in REORDERED) == reordered
-    assert (source.antialiased and not {peer, format} & NOT_ANTIALIASED) == found.antialiased
+    assert (source.metadata.antialiased and not {peer, format} & NOT_ANTIALIASED) == found.metadata.antialiased
     assert source.sh_degree == found.sh_degree
 
 
@@ -233,7 +234,7 @@ def test_other_programs_read_files_of_csplat(tmp_path, peer, format, scene):
 def test_splat_transform_reads_the_levels_of_streamed_sog(tmp_path):
     source, peer = SCENES["near"], PROGRAMS["splat-transform"]
     levels, path = [source, source.select(slice(0, 70))], tmp_path / "a" / "lod-meta.json"
-    write_levels(path, [source_from_model(one) for one in levels])
+    write_levels(path, [Scene.of(one) for one in levels])
     for number, level in enumerate(levels):
         peer.run(path, tmp_path / "level.ply", "ply", "-L", number)
         found = csplat.read(tmp_path / "level.ply")

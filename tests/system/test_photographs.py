@@ -11,8 +11,9 @@ from command_line import call, invoke
 from PIL import Image
 from posed_sets import to_opengl, write_document
 
-from csplat import EncodeOptions, encode, read_ply, write_ply
+from csplat import EncodeOptions, encode, write_ply
 from csplat.errors import InputError
+from csplat.ply import read_ply
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from command_line import invoke, printed, refused
 
-from csplat import _spec, read_ply, write_ply
+from csplat import _spec, write_ply
+from csplat.ply import read_ply
 
 pytestmark = pytest.mark.usefixtures("no_estimated_up")
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from chromium import ViewerPage
 
-from csplat import EncodeOptions, decode, encode, read_header, read_ply
+from csplat import EncodeOptions, decode, encode, read_header
+from csplat.ply import read_ply
 from csplat_conformance.validator import validate
 from csplat_render import camera
 from csplat_tools.level_builder import LevelBuilder
@@ -249,7 +250,7 @@ def test_the_file_gives_the_first_view(viewer, make_model):
 
     view = look_at([0.0, -3.0, -5.0])  # the view of the metadata: it has precedence over the cameras
     metadata = {"view": view, "title": "A <b>cloud</b>", "licence": "CC0"}
-    viewer.show(encode(make_model(100, 0, cameras=cameras, metadata=metadata)))
+    viewer.show(encode(make_model(100, 0, cameras=cameras, entries=metadata)))
     assert list(np.ravel(view["viewmat"])) == viewer.viewmat
     assert "A <b>cloud</b>" == viewer.text("#title")
     viewer.page.keyboard.press("i")
@@ -277,7 +278,7 @@ def test_the_address_has_precedence_over_the_file(tab, site, make_model):
 
 def test_backgrounds_begin_with_the_background_of_training(viewer, make_model):
     training = {"background": [1, 1, 0.4], "near": 0.2}
-    viewer.show(encode(make_model(1, 0, opacities=np.zeros(1, np.float32), metadata={"training": training})))
+    viewer.show(encode(make_model(1, 0, opacities=np.zeros(1, np.float32), entries={"training": training})))
     behind = []
     for _ in range(5):
         behind.append(viewer.picture()[0, 0, :3].tolist())
@@ -293,7 +294,7 @@ def downloaded(page, selector):
 
 
 def test_turning_upright_can_be_kept(viewer, make_model):
-    viewer.show(encode(make_model(60, 1, metadata={"title": "Lying down"})))
+    viewer.show(encode(make_model(60, 1, entries={"title": "Lying down"})))
     page = viewer.page
     page.context.grant_permissions(["clipboard-read", "clipboard-write"])
     page.click("#upright")
@@ -306,7 +307,7 @@ def test_turning_upright_can_be_kept(viewer, make_model):
     assert command == page.evaluate("navigator.clipboard.readText()")
     name, kept = downloaded(page, "#keep-download")
     assert "scene.csplat" == name
-    assert {"title": "Lying down", "up": [0, 0, 1]} == decode(kept).metadata
+    assert {"title": "Lying down", "up": [0, 0, 1]} == decode(kept).metadata.entries
     assert validate(kept).conforms
     page.keyboard.press("Escape")
     assert viewer.hides("#keep")

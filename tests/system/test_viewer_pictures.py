@@ -9,11 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import cloud
+from models import with_facts
 
 import csplat
-from csplat import EncodeOptions, decode, encode, read_ply
+from csplat import EncodeOptions, decode, encode
 from csplat.decoder import read_header
 from csplat.model import normalise_quats
+from csplat.ply import read_ply
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.virtual_cameras import virtual_cameras
@@ -125,7 +127,7 @@ def test_the_sample_looks_as_the_rasteriser_draws_it_at_a_fraction_of_its_memory
 def test_the_antialiased_flag_is_honoured(engine, part, camera):
     pictures = []
     for flag in (False, True):
-        model = opened(engine, replace(part, antialiased=flag))
+        model = opened(engine, with_facts(part, antialiased=flag))
         pictures.append(engine.picture(camera))
         assert psnr(pictures[-1], reference(model, camera)) >= GOOD
     assert psnr(*pictures) < 44

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from csplat_tools.batch import Batch, run_batch
     from csplat_tools.inspect.comparison import Comparison, compare
     from csplat_tools.optimise.simplify import Simplified, SimplifyOptions, simplify
-    from csplat_tools.scene_files import LoadedModel, SceneLike, load_model
+    from csplat_tools.scene_files import SceneLike
     from csplat_tools.tradeoffs import Tradeoff, parse_grid, tradeoff
     from csplat_tools.views import DataOptions, ViewSet, find_view_set
 
@@ -29,7 +29,6 @@ __all__ = [
     "Batch",
     "Comparison",
     "DataOptions",
-    "LoadedModel",
     "SceneLike",
     "Simplified",
     "SimplifyOptions",
@@ -37,7 +36,6 @@ __all__ = [
     "ViewSet",
     "compare",
     "find_view_set",
-    "load_model",
     "parse_grid",
     "run_batch",
     "simplify",
@@ -51,7 +49,6 @@ _MODULE_OF = {
     "Batch": "csplat_tools.batch",
     "Comparison": "csplat_tools.inspect.comparison",
     "DataOptions": "csplat_tools.views",
-    "LoadedModel": "csplat_tools.scene_files",
     "SceneLike": "csplat_tools.scene_files",
     "Simplified": "csplat_tools.optimise.simplify",
     "SimplifyOptions": "csplat_tools.optimise.simplify",
@@ -59,7 +56,6 @@ _MODULE_OF = {
     "ViewSet": "csplat_tools.views",
     "compare": "csplat_tools.inspect.comparison",
     "find_view_set": "csplat_tools.views",
-    "load_model": "csplat_tools.scene_files",
     "parse_grid": "csplat_tools.tradeoffs",
     "run_batch": "csplat_tools.batch",
     "simplify": "csplat_tools.optimise.simplify",

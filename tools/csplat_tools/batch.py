@@ -16,7 +16,6 @@ import subprocess
 import sys
 import threading
 import time
-import zlib
 from collections import Counter, deque
 from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, ProcessPoolExecutor, wait
@@ -29,11 +28,20 @@ from io import StringIO
 from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, Literal
 
-from csplat.decoder import open_tiles
-from csplat.disk_files import parse_json, read_text, remove_unfinished, resolve_links, temporary_folder
+import csplat
+from csplat.decoder import check_chunks
+from csplat.disk_files import (
+    FOLDER_NAMES,
+    parse_json,
+    read_text,
+    remove_unfinished,
+    resolve_links,
+    size_on_disk,
+    temporary_folder,
+)
 from csplat.errors import CsplatError, InputError, missing_package
 from csplat.file_source import read_bytes
-from csplat.formats import formats, open_scene
+from csplat.formats import formats
 from csplat.out_of_core.bucket_workers import open_client
 from csplat.remote_store import is_url
 from csplat.system import core_count, interrupts_held, split_words
@@ -41,7 +49,6 @@ from csplat.types import Progress, null_progress
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import is_csplat, write_bytes
-from csplat_tools.scene_files import FOLDER_NAMES, size_on_disk
 
 PAGE = "index.html"
 _MARK = "<!-- csplat batch -->"  # in our pages; a page without it is somebody else's, and is kept
@@ -409,13 +416,9 @@ def _check_existing(output: Path, source: Path | None) -> int | None:
     splats = None  # another kind of file, which was complete when it appeared
     try:
         if output.is_file() and is_csplat(output):
-            request = open_tiles(output).request  # checks all but the tiles
-            splats = request.header.splat_count
-            for layer in (layer for tile in request.header.all_tiles for layer in tile.layers.values()):
-                if zlib.crc32(request.view[layer.offset : layer.offset + layer.size]) != layer.crc:
-                    raise InputError(f"the chunk at byte {layer.offset} is damaged")
+            splats = check_chunks(output).splat_count
         elif output.is_dir() or output.name.lower().endswith(tuple(end for one in formats() for end in one.suffixes)):
-            with open_scene(output) as scene:
+            with csplat.open(output) as scene:
                 splats = scene.count
     except (CsplatError, OSError) as error:
         raise InputError(f"the output exists, and is invalid: {error}; --force replaces it") from None

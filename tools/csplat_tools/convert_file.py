@@ -11,19 +11,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.decoder import Limits, open_tiles
-from csplat.disk_files import resolve_links
+import csplat
+from csplat.decoder import Limits
+from csplat.disk_files import resolve_links, size_on_disk
 from csplat.editing.transform import axes_rotation, convert_axes, rotate_scene, scale_scene, translate_scene
-from csplat.editing.up_axis import UP
 from csplat.errors import InputError
-from csplat.formats import format_by_name, format_by_suffix, open_scene, survey_losses, write_levels
+from csplat.formats import format_by_name, format_by_suffix, survey_losses, write_levels
 from csplat.formats.format import ARRAYS
 from csplat.lint import Finding
-from csplat.model import UNSPECIFIED, SplatModel
-from csplat.scene_source import SceneSource, drop_bands
+from csplat.model import SplatModel
+from csplat.scene import Scene
+from csplat.scene_metadata import UNSPECIFIED, UP
+from csplat.splat_file import SplatFile
 from csplat.types import F64, Mask, Progress
 from csplat_tools.file_streams import is_one_way, local_path, mapped_csplat, write_model
-from csplat_tools.scene_files import MetadataOverrides, findings_as_json, size_on_disk, with_progress
+from csplat_tools.scene_files import MetadataOverrides, findings_as_json, with_progress
 
 _CELL = 0.01  # radius of a splat's neighbourhood, as a fraction of the scene's extent
 _SPREAD = 4.0  # the same in standard deviations of the splat, used if it is larger
@@ -58,21 +60,21 @@ class Filters:
     drop_floaters: bool = False
     sh_degree: int | None = None
 
-    def apply(self, scene: SceneSource) -> SceneSource:
+    def apply(self, scene: Scene) -> Scene:
         """Return the changed scene."""
         if self.to_axes is not None:
             scene = convert_axes(scene, self.to_axes)
-        letters = scene.metadata_model.coordinate_system
+        letters = scene.metadata.coordinate_system
         turn = np.eye(3) if self.axes is None or self.axes == letters else axes_rotation(self.axes, letters)
         if self.rotate is not None:
             matrix = turn @ _rotation(self.rotate) @ turn.T
-            scene = _map_blocks(scene, lambda model: _rotate_in_axes(model, matrix))
+            scene = scene.map(lambda model: _rotate_in_axes(model, matrix))
         if self.scale is not None:
             factor = self.scale
-            scene = _map_blocks(scene, lambda model: scale_scene(model, factor))
+            scene = scene.map(lambda model: scale_scene(model, factor))
         if self.translate is not None:
             x, y, z = (turn @ self.translate).tolist()
-            scene = _map_blocks(scene, lambda model: translate_scene(model, (x, y, z)))
+            scene = scene.map(lambda model: translate_scene(model, (x, y, z)))
         if self.crop_box is not None:
             corners = np.sort(np.array(self.crop_box).reshape(2, 3) @ turn.T, axis=0)
             scene = _select(scene, lambda model: _inside_box(model, corners))
@@ -83,17 +85,19 @@ class Filters:
             scene = _without_floaters(scene)
         if self.sh_degree is not None:
             degree = self.sh_degree
-            scene = _map_blocks(scene, lambda model: drop_bands(model, degree))
+            scene = scene.with_sh_degree(degree)
         return scene
 
 
 def _rotate_in_axes(model: SplatModel, matrix: F64) -> SplatModel:
     """Rotate a scene whose axes keep their names; an up direction in its metadata rotates with it."""
-    turned, letters = rotate_scene(model, matrix), model.coordinate_system
+    turned, letters = rotate_scene(model, matrix), model.metadata.coordinate_system
     if letters == UNSPECIFIED:
         return turned
-    metadata = {name: value for name, value in turned.metadata.items() if name != UP or name in model.metadata}
-    return replace(turned, coordinate_system=letters, metadata=metadata)
+    entries = dict(turned.metadata.entries)
+    if UP not in model.metadata.entries:
+        entries.pop(UP, None)
+    return replace(turned, metadata=replace(turned.metadata, coordinate_system=letters, entries=entries))
 
 
 def find_floaters(points: F64, sizes: F64) -> Mask:
@@ -135,14 +139,7 @@ def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
     return key
 
 
-def _map_blocks(scene: SceneSource, change: Callable[[SplatModel], SplatModel]) -> SceneSource:
-    blocks = scene.blocks
-    return replace(
-        scene, metadata_model=change(scene.metadata_model), blocks=lambda: (change(model) for model in blocks())
-    )
-
-
-def _select(scene: SceneSource, keep: Callable[[SplatModel], Mask]) -> SceneSource:
+def _select(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
     def blocks() -> Iterator[SplatModel]:
         for model in scene.blocks():
             kept = keep(model)
@@ -150,10 +147,10 @@ def _select(scene: SceneSource, keep: Callable[[SplatModel], Mask]) -> SceneSour
                 yield model.select(kept)
 
     count = sum(int(np.count_nonzero(keep(model))) for model in scene.blocks())
-    return replace(scene, count=count, blocks=blocks)
+    return scene.changed(count=count, reader=blocks)
 
 
-def _without_floaters(scene: SceneSource) -> SceneSource:
+def _without_floaters(scene: Scene) -> Scene:
     """Drop isolated splats; keeps centres and sizes of all splats in memory, 16 bytes each."""
     points, sizes = np.empty((scene.count, 3), np.float32), np.empty(scene.count, np.float32)
     at = 0
@@ -171,7 +168,7 @@ def _without_floaters(scene: SceneSource) -> SceneSource:
             if kept.any():
                 yield model.select(kept)
 
-    return replace(scene, count=scene.count - int(np.count_nonzero(floats)), blocks=blocks)
+    return scene.changed(count=scene.count - int(np.count_nonzero(floats)), reader=blocks)
 
 
 def _inside_box(model: SplatModel, corners: F64) -> Mask:
@@ -282,7 +279,7 @@ def convert_file(
         write_as: name of the target's format; `None`: by the file name ending.
         level: level of detail to read if the source has several; 0 is the finest. Streamed SOG (a target
             lod-meta.json) gets it and all coarser ones.
-        max_splats: as in `open_scene`; streamed SOG gets one level then.
+        max_splats: as in `csplat.open`; streamed SOG gets one level then.
         overrides: overrides of the source's metadata.
         filters: changes of the scene. By default, they are along `to_axes`, otherwise along the axes of the source's
             format, if these are fixed, although the scene is read along others.
@@ -306,8 +303,8 @@ def convert_file(
     changes, sh_degree = filters or Filters(), None if filters is None else filters.sh_degree
     with local_path(source) as local, ExitStack() as stack:
 
-        def opened(number: int) -> SceneSource:
-            scene = open_scene(local, read_as, level=number, max_splats=max_splats, sh_degree=sh_degree)
+        def opened(number: int) -> Scene:
+            scene = csplat.open(local, read_as, level=number, max_splats=max_splats, sh_degree=sh_degree)
             return stack.enter_context(scene)
 
         reader = opened(level)
@@ -315,20 +312,18 @@ def convert_file(
         more = [opened(number) for number in range(level + 1, len(reader.levels))] if has_levels else []
         if more and changes.drop_floaters:
             raise InputError("floaters cannot be dropped from several levels: coarser ones have too few splats to tell")
-        before = (overrides or MetadataOverrides()).apply_to_scene(reader).metadata_model.coordinate_system
+        before = (overrides or MetadataOverrides()).apply(reader.metadata).coordinate_system
         own = reader.file_axes if overrides is None or overrides.coordinate_system is None else ""
         filter_axes = changes.axes or changes.to_axes or own or before
         changes = replace(changes, axes=None if filter_axes == UNSPECIFIED else filter_axes)
         levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
         scene, counts = levels[0], tuple(one.count for one in levels if one.count)
-        lost = writes.losses(scene.metadata_model)
-        rounded = tuple(
-            name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.metadata_model.sh_degree)
-        )
+        lost = writes.losses(scene)
+        rounded = tuple(name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.sh_degree))
         result = Conversion(
-            reader.format, writes.name, reader.count, scene.count, scene.metadata_model.sh_degree, counts or (0,),
-            size_on_disk(local), writes.expected_bytes(scene.metadata_model, scene.count), lost, rounded, (),
-            (before, writes.axes or scene.metadata_model.coordinate_system), filter_axes, (),
+            reader.format, writes.name, reader.count, scene.count, scene.sh_degree, counts or (0,),
+            size_on_disk(local), writes.expected_bytes(scene), lost, rounded, (),
+            (before, writes.axes or scene.metadata.coordinate_system), filter_axes, (),
         )  # fmt: skip
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {result.lost_words()}")
@@ -373,13 +368,12 @@ def decode_file(
         CsplatError: the file is not valid, or too large; no PLY is written then.
         OSError: a file cannot be read or written.
     """
-    with mapped_csplat(source) as data:
-        opened = open_tiles(data, limits=None if max_splats is None else Limits(splats=max_splats))
-        decoded = SceneSource(opened.header.splat_count, opened.metadata_model, opened.models)
+    limits = None if max_splats is None else Limits(splats=max_splats)
+    with mapped_csplat(source) as data, SplatFile.open(data, limits=limits) as decoded:
         # All bands are decoded, even if some are dropped, so that damage anywhere is found.
         scene = Filters(sh_degree=sh_degree).apply((overrides or MetadataOverrides()).apply_to_scene(decoded))
         if is_one_way(target):
             for _ in with_progress(decoded, "checking", progress).blocks():
                 pass
         write_model(target, with_progress(scene, "decoding", progress), absolute=absolute)
-    return scene.count, scene.metadata_model.sh_degree
+    return scene.count, scene.sh_degree

@@ -9,29 +9,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import csplat
 from csplat._spec import MEASURE_NAMES
+from csplat.disk_files import size_on_disk
 from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target
 from csplat.errors import InputError, counted
-from csplat.formats import detect_format, open_scene
+from csplat.formats import detect_format
 from csplat.lint import Finding, refuse
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.out_of_core import EncodingCost, OutOfCoreOptions, encode_scene, estimate_cost
 from csplat.ply.column_names import dropped_columns
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
 from csplat.system import default_memory_bytes
 from csplat.types import Progress
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
 from csplat_tools.level_builder import LevelBuilder, encode_with_levels, read_streamed_levels
 from csplat_tools.optional_packages import require_renderer
-from csplat_tools.scene_files import (
-    CHEAP_TO_REOPEN,
-    LoadedModel,
-    MetadataOverrides,
-    findings_as_json,
-    read_source,
-    size_on_disk,
-)
+from csplat_tools.scene_files import CHEAP_TO_REOPEN, MetadataOverrides, findings_as_json, read_source
 
 _MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
 _LEVELS_FACTOR = 4  # memory with levels of detail divided by that without: renders, and splats in several forms
@@ -68,7 +63,7 @@ def choose_levels(count: int, options: EncodeOptions, levels: Levels) -> LevelBu
     return builder
 
 
-def describe_levels(scene: SceneSource, options: EncodeOptions, limits: OutOfCoreOptions) -> list[str]:
+def describe_levels(scene: Scene, options: EncodeOptions, limits: OutOfCoreOptions) -> list[str]:
     """Format the use and the cost of levels of detail as a line, for a scene that is encoded without.
 
     Args:
@@ -131,7 +126,7 @@ class EncodedFile:
 
 
 def encode_file(
-    source: str | LoadedModel,
+    source: str | Scene,
     output: str,
     options: EncodeOptions,
     *,
@@ -144,6 +139,7 @@ def encode_file(
     source_index: str | None = None,
     levels: Levels = None,
     out_of_core: OutOfCoreOptions | None = None,
+    format: str | None = None,
     progress: Progress | None = None,
 ) -> EncodedFile:
     """Read a scene file, encode it, and write the .csplat file.
@@ -163,6 +159,7 @@ def encode_file(
         levels: number of levels of detail above the scene, 1 to 16; "auto": until the coarsest has 4,096 splats;
             `None`: none. Those of streamed SOG are taken instead.
         out_of_core: memory, disk and workers.
+        format: as for `csplat.open`.
         progress: progress callback.
 
     Raises:
@@ -180,18 +177,23 @@ def encode_file(
         raise InputError("a target, an importance and a source index exclude options for scenes larger than memory")
     start = time.perf_counter()
     builder = None
-    if isinstance(source, LoadedModel):
+    if isinstance(source, Scene):
         read = source
     else:
         with source_path(source) as local, ExitStack() as stack:
-            opened: SceneSource | None = None
+            opened: Scene | None = None
             # A target or an importance may prune splats, whose levels are built anew.
-            if levels is not None and target is None and importance is None and detect_format(local).name == "sog":
+            if (
+                levels is not None
+                and target is None
+                and importance is None
+                and detect_format(local, format).name == "sog"
+            ):
                 builder = _levels_of_source(local, options, levels, limits)
-            if not in_memory and builder is None and may_exceed_memory(local, limits, levels):
+            if not in_memory and builder is None and may_exceed_memory(local, limits, levels, format):
                 if progress is not None:
                     progress("opening", 0.0)
-                opened = stack.enter_context(open_scene(local, sh_degree=read_degree(options)))
+                opened = stack.enter_context(csplat.open(local, format, sh_degree=read_degree(options)))
                 builder = choose_levels(opened.count, options, levels)
                 if limits.resume or not estimate_cost(opened, options, limits, builder).in_memory:
                     return _encode_out_of_core(
@@ -201,24 +203,25 @@ def encode_file(
                 if opened.format in CHEAP_TO_REOPEN:
                     opened = None
             read = read_source(
-                local, overrides, strict=strict, keep_extra=options.keep_extra, sh_degree=read_degree(options),
-                opened=opened, progress=progress,
+                local, overrides, format=format, strict=strict, keep_extra=options.keep_extra,
+                sh_degree=read_degree(options), opened=opened, progress=progress,
             )  # fmt: skip
     if builder is None:
-        builder = choose_levels(len(read.model), options, levels)
+        builder = choose_levels(read.count, options, levels)
+    model = read.model()
     if importance is not None:
         from csplat_tools.importance_file import encode_by_importance  # imports trainer and renderer
 
         result = encode_by_importance(
-            read.model, options, importance, target=target, views=views, prune_unseen=prune_unseen, levels=builder,
+            model, options, importance, target=target, views=views, prune_unseen=prune_unseen, levels=builder,
             progress=progress,
         )  # fmt: skip
     else:
-        result = encode_with_levels(read.model, options, builder, target=target, views=views, progress=progress)
+        result = encode_with_levels(model, options, builder, target=target, views=views, progress=progress)
     write_bytes(output, result.data)
     if source_index is not None:
         write_array(source_index, result.source_index)
-    return EncodedFile(read.model, result.report, result, read.findings, read.size_bytes, time.perf_counter() - start)
+    return EncodedFile(model, result.report, result, tuple(read.findings), read.size_bytes, time.perf_counter() - start)
 
 
 def _levels_of_source(
@@ -229,7 +232,7 @@ def _levels_of_source(
     Raises:
         InputError: the scene does not fit in memory; or as in `choose_levels`.
     """
-    with open_scene(local) as scene:
+    with csplat.open(local) as scene:
         counts = scene.levels
     builder = choose_levels(counts[0], options, levels) if len(counts) > 1 else None
     if builder is None:
@@ -242,18 +245,18 @@ def _levels_of_source(
     return replace(builder, nodes=read_streamed_levels(local, builder.count))
 
 
-def may_exceed_memory(path: Path, limits: OutOfCoreOptions, levels: Levels = None) -> bool:
+def may_exceed_memory(path: Path, limits: OutOfCoreOptions, levels: Levels = None, format: str | None = None) -> bool:
     """Return True if a scene may not fit in memory, which can only be decided after opening it."""
     if limits.scheduler is not None or limits.resume or limits.always:
         return True
     bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
     size = size_on_disk(path)
     factor = _MEMORY_FACTOR * (1 if levels is None else _LEVELS_FACTOR)
-    return size > _SMALL and (detect_format(path).name != "ply" or size * factor > bound)
+    return size > _SMALL and (detect_format(path, format).name != "ply" or size * factor > bound)
 
 
 def _encode_out_of_core(
-    reader: SceneSource,
+    reader: Scene,
     local: Path,
     target: str,
     options: EncodeOptions,
@@ -269,8 +272,8 @@ def _encode_out_of_core(
     if target == STANDARD_STREAM:
         raise InputError("the scene does not fit in memory, and cannot be written to standard output: name a file")
     findings = [*reader.findings]
-    if reader.metadata_model.extra and not options.keep_extra:
-        findings.append(dropped_columns(list(reader.metadata_model.extra)))
+    if reader.extra and not options.keep_extra:
+        findings.append(dropped_columns(list(reader.extra)))
     refuse(findings, strict=strict)
     scene = (overrides or MetadataOverrides()).apply_to_scene(reader)
     size = size_on_disk(local)
@@ -282,7 +285,7 @@ def _encode_out_of_core(
         if folder.exists():
             note(f"{folder} holds the finished part: --resume continues from it")
         raise
-    return EncodedFile(scene.metadata_model, report, None, tuple(findings), size, time.perf_counter() - start)
+    return EncodedFile(scene.empty(), report, None, tuple(findings), size, time.perf_counter() - start)
 
 
 def format_cost(cost: EncodingCost) -> str:

@@ -30,7 +30,7 @@ from csplat.formats import formats
 from csplat.model import SplatModel
 from csplat.ply import write_ply, write_scene_ply
 from csplat.remote_store import is_url
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
 from csplat_tools.console import STANDARD_OUTPUT
 
 STANDARD_STREAM = "-"
@@ -326,9 +326,9 @@ def write_json(path: str, value: Any) -> None:
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 
-def write_model(path: str, model: SplatModel | SceneSource, *, absolute: bool) -> None:
+def write_model(path: str, model: SplatModel | Scene, *, absolute: bool) -> None:
     """Write a PLY to a file, or to standard output for `-`; `absolute` adds the origin and writes doubles."""
-    write: Callable[..., None] = write_scene_ply if isinstance(model, SceneSource) else write_ply
+    write: Callable[..., None] = write_scene_ply if isinstance(model, Scene) else write_ply
     with _output_stream(path) as stream:
         write(stream, model, absolute=absolute)
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import csplat
 from csplat.encoder import (
     BUCKET_SPLATS,
     EncodedTiles,
@@ -34,11 +35,10 @@ from csplat.encoder import (
     encode_with_report,
     meet_bounds,
 )
-from csplat.formats import open_scene
 from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
 from csplat.plugins import load_plugins
-from csplat.scene_source import join_blocks
+from csplat.scene import join_blocks
 from csplat.types import F32, I64, Progress, null_progress
 
 # Modules that render are imported where they are used: the cost of levels can be estimated without them.
@@ -338,11 +338,11 @@ def read_streamed_levels(path: Path, last: int | None = None) -> list[LevelNode]
         InputError: the file is damaged, or no streamed SOG.
         OSError: it cannot be read.
     """
-    with open_scene(path) as scene:
+    with csplat.open(path) as scene:
         count = len(scene.levels) if last is None else min(len(scene.levels), last + 1)
     levels = []
     for level in range(count):
-        with open_scene(path, level=level) as scene:
+        with csplat.open(path, level=level) as scene:
             levels.append((scene.model(), read_leaf_numbers(path, level)))
     return chain_leaves(levels)
 

@@ -141,7 +141,7 @@ def _squared_errors(rasteriser: Rasteriser, coarse: SplatModel, fine: SplatModel
 
 def _image(rasteriser: Rasteriser, splats: SplatModel, camera: Camera) -> F32:
     """Return red, green, blue and alpha, [4, H, W]."""
-    image = rasteriser.forward(splats, camera, antialiased=splats.antialiased)
+    image = rasteriser.forward(splats, camera, antialiased=splats.metadata.antialiased)
     return np.concatenate([np.clip(image.rgb, 0.0, 1.0).transpose(2, 0, 1), image.alpha[None]])
 
 

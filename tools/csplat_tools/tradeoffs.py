@@ -19,6 +19,7 @@ from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, PresetName, Target, encode_with_report
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel
+from csplat.scene import Scene
 from csplat.types import Progress, null_progress
 from csplat_tools import html_report as html
 from csplat_tools.console import NUMBER, format_bytes, format_table, parse_size_bytes
@@ -26,7 +27,7 @@ from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.html_report import INK, draw_svg
 from csplat_tools.inspect.comparison import compare
 from csplat_tools.optional_packages import describe_machine, require_renderer
-from csplat_tools.scene_files import LoadedModel, SceneLike, load_model, read_source
+from csplat_tools.scene_files import SceneLike, load_scene, read_source, scene_sizes
 from csplat_tools.views import ViewSet, describe_views, find_view_set
 
 if TYPE_CHECKING:
@@ -162,7 +163,7 @@ class Tradeoff:
         machine: processor, system and versions.
     """
 
-    source: LoadedModel
+    source: Scene
     views: ViewSet
     rows: Sequence[TradeoffRow]
     failures: dict[str, str]
@@ -186,7 +187,7 @@ class Tradeoff:
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
         return {
-            "scene": {"name": self.source.name, **self.source.as_json()},
+            "scene": {"name": self.source.name, **scene_sizes(self.source)},
             "views": {"cameras": self.views.name, "count": len(self.views.test)},
             "machine": self.machine,
             "pareto": [row.setting.name for row in self.front],
@@ -229,15 +230,15 @@ def tradeoff(
         OSError: the scene cannot be read.
     """
     require_renderer()
-    source = load_model(scene) if isinstance(scene, (SplatModel, LoadedModel)) else read_source(scene)
-    if not len(source.model):
+    source = load_scene(scene) if isinstance(scene, (SplatModel, Scene)) else read_source(scene)
+    if not source.count:
         raise InputError("the scene has no splats")
-    around = views or find_view_set(source.model)
+    around = views or find_view_set(source.model())
 
     def measure(setting: GridSetting) -> TradeoffRow:
         start = time.perf_counter()
         used = around if setting.target else None
-        made = encode_with_report(source.model, setting.options, target=setting.target, views=used, progress=progress)
+        made = encode_with_report(source.model(), setting.options, target=setting.target, views=used, progress=progress)
         encode_seconds = time.perf_counter() - start
         decoded, decode_seconds = _decode(made.data)
         compared = compare(source, decoded, views=around, source_index=made.source_index, progress=progress)
@@ -334,7 +335,7 @@ def format_tradeoff(tradeoff: Tradeoff) -> str:
 def _summary(tradeoff: Tradeoff) -> str:
     source, views = tradeoff.source, tradeoff.views
     text = (
-        f"{source.name}: {len(source.model):,} splats, SH degree {source.model.sh_degree},"
+        f"{source.name}: {len(source.model()):,} splats, SH degree {source.model().sh_degree},"
         f" {format_bytes(source.size_bytes)}; scored on {describe_views(len(views.test), views.name)}"
     )
     psnr = tradeoff.source_image_psnr

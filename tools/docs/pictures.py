@@ -80,7 +80,7 @@ def measure(peers: Path) -> dict[str, Any]:
     Returns:
         The content of `measured.json`.
     """
-    source = csplat.read_ply(SAMPLE)
+    source = csplat.read(SAMPLE)
     scorer = Scorer.of_source(source, comparison_cameras(source))
     rows: list[dict[str, Any]] = []
     for name in _PRESETS:
@@ -107,7 +107,7 @@ def measure(peers: Path) -> dict[str, Any]:
 
 def draw_scene() -> None:
     """Render the source and a file of it from one camera, on a transparent background."""
-    source = csplat.read_ply(SAMPLE)
+    source = csplat.read(SAMPLE)
     decoded = csplat.decode(csplat.encode(source, csplat.EncodeOptions(preset=SHOWN)))
     for name, model in (("source", source), (SHOWN, decoded)):
         picture = Image.fromarray(_cut_out(model, _camera()), "RGBA")
@@ -168,7 +168,7 @@ def _peer(scorer: Scorer, command: list[str], path: Path) -> dict[str, Any]:
     back = path.with_name(path.name + ".ply")
     for given, made in ((SAMPLE, path), (path, back)):
         subprocess.run([*command, "-q", "-w", "-g", "cpu", str(given), str(made)], check=True, capture_output=True)
-    name, psnr = path.suffix[1:].upper(), round(scorer.psnr(csplat.read_ply(back)), 2)
+    name, psnr = path.suffix[1:].upper(), round(scorer.psnr(csplat.read(back)), 2)
     return {"name": name, "series": name, "size_bytes": path.stat().st_size, "psnr": psnr}
 
 

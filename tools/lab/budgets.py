@@ -219,7 +219,6 @@ INPUTS: dict[str, Callable[[], Files]] = {
 
 def _read(path: Path) -> None:
     """Read a file as commands do, whole."""
-    from csplat import formats
     from csplat.archives import read_archive
 
     name = path.name
@@ -246,7 +245,7 @@ def _read(path: Path) -> None:
 
         csplat.decode(path.read_bytes())
     else:
-        with formats.open_scene(path) as scene:
+        with csplat.open(path) as scene:
             for _ in scene.blocks():
                 pass
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Literal, overload
 import numpy as np
 
 from csplat.errors import missing_package
+from csplat.model import SplatModel
 from csplat_render.camera import Camera
 from csplat_render.conventions import Backend, Mode
 
@@ -85,7 +86,7 @@ def render(
     Examples:
         >>> import csplat, csplat_render
         >>> from csplat_render.camera_paths import orbit_cameras
-        >>> model = csplat.read_ply("scene.ply")
+        >>> model = csplat.read("scene.ply")
         >>> camera = orbit_cameras(model, 1, 64, 48)[0]
         >>> csplat_render.render(model, camera, mode="exact").rgb.shape
         (48, 64, 3)
@@ -112,7 +113,7 @@ def render(
         raise missing_package(error) from None
 
     if antialiased is None:
-        antialiased = bool(getattr(splats, "antialiased", False))
+        antialiased = isinstance(splats, SplatModel) and splats.metadata.antialiased
     if mode == "exact":
         return render_exact(splats, camera, background=background, antialiased=antialiased, sh_degree=sh_degree)
     rasteriser = Rasteriser(mode, np.float32, gradients=False, threads=threads)

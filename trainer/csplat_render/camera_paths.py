@@ -15,10 +15,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from csplat.editing.up_axis import up_of
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.training_record import VIEW
+from csplat.scene_metadata import VIEW
 from csplat.types import F64, Mask
 from csplat_render.camera import Camera, camera_outliers, direction_at, intrinsics, look_at, orbit
 from csplat_render.scene_frame import Cloud, SceneFrame, detail, sample_cloud, scene_frame
@@ -76,9 +75,9 @@ def orbit_cameras(
         raise InputError(f"an orbit of {count} cameras, expected at least 1")
     frame, K = scene_frame(with_estimated_up(model)), intrinsics(width, height, FIELD_OF_VIEW)
     if not along and frame.kind == "surrounding":
-        along = [Camera.from_json(one) for one in model.cameras or ()]
+        along = [Camera.from_json(one) for one in model.metadata.cameras or ()]
     if along:
-        eyes, ahead, up = _path_along(along, count, up_of(model.metadata, model.coordinate_system))
+        eyes, ahead, up = _path_along(along, count, model.metadata.up)
         near = min(frame.near, *(camera.near for camera in along))
         return [look_at(eye, eye + way, up, K, width, height, near) for eye, way in zip(eyes, ahead, strict=True)]
     if len(model) == 0:
@@ -162,7 +161,7 @@ def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int,
 def _first_view(model: SplatModel) -> Camera | None:
     """Return the camera of a scene's initial view; `None` if it is absent or invalid."""
     try:
-        return Camera.from_json(model.metadata[VIEW]) if VIEW in model.metadata else None
+        return Camera.from_json(model.metadata.entries[VIEW]) if VIEW in model.metadata.entries else None
     except InputError:
         return None
 

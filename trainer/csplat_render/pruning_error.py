@@ -77,7 +77,7 @@ def measure_pruning_error(
     contributions = Contributions(dtype, transmittance_min=transmittance_min, threads=threads)
     error, seen, behind = np.zeros(len(model)), np.zeros(len(model), np.bool_), np.asarray(background, np.float64)
     for number, camera in enumerate(cameras):
-        view = contributions.project_view(model, camera, antialiased=model.antialiased, basis=False)
+        view = contributions.project_view(model, camera, antialiased=model.metadata.antialiased, basis=False)
         render = contributions.measure_pruning(view, error, seen, background=behind)
         if on_render is not None:
             on_render(render)
@@ -111,7 +111,11 @@ def pruning_error_exact(
 
     def render(splats: SplatModel, camera: Camera) -> Array:
         return render_exact(
-            splats, camera, background=background, antialiased=model.antialiased, transmittance_min=transmittance_min
+            splats,
+            camera,
+            background=background,
+            antialiased=model.metadata.antialiased,
+            transmittance_min=transmittance_min,
         ).rgb
 
     for camera in cameras:

@@ -15,7 +15,6 @@ from typing import Literal
 
 import numpy as np
 
-from csplat.editing.up_axis import up_of
 from csplat.model import SplatModel
 from csplat.types import F64, I64
 from csplat_render.camera import DEFAULT_NEAR, Camera, direction_at, look_at
@@ -232,7 +231,7 @@ def weighted_quantiles(values: F64, weights: F64, at: tuple[float, ...]) -> F64:
 
 def _up(model: SplatModel, half: F64) -> F64:
     """Return the scene's own up direction, else the short axis of a flat scene, else −y, the default of PLY."""
-    stored = up_of(model.metadata, model.coordinate_system)
+    stored = model.metadata.up
     if stored is not None:
         direction: F64 = np.array(stored)
         direction /= np.sqrt(np.sum(direction**2))  # stored with six digits

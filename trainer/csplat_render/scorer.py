@@ -217,9 +217,11 @@ def renderer(
     from csplat_render.reference_rasteriser import render_exact
 
     if mode == "exact":
-        return lambda camera: render_exact(model, camera, background=background, antialiased=model.antialiased)
+        return lambda camera: render_exact(model, camera, background=background, antialiased=model.metadata.antialiased)
     rasteriser = Rasteriser(mode, gradients=False, threads=threads)
-    return lambda camera: rasteriser.forward(model, camera, background=background, antialiased=model.antialiased)
+    return lambda camera: rasteriser.forward(
+        model, camera, background=background, antialiased=model.metadata.antialiased
+    )
 
 
 def _render_reference(render: Callable[[Camera], Render], camera: Camera) -> ReferenceImage:

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from csplat.editing.up_axis import Direction, up_of, with_up
 from csplat.model import SplatModel
+from csplat.scene_metadata import Direction
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.scene_frame import detail, sample_cloud, scene_frame
 from csplat_render.virtual_cameras import FIELD_OF_VIEW
@@ -34,7 +34,7 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
     Returns:
         The axis; `None` if the scene or its cameras determine it, if the estimate is uncertain, and for surroundings.
     """
-    if len(model) == 0 or model.cameras or up_of(model.metadata, model.coordinate_system) is not None:
+    if len(model) == 0 or model.metadata.cameras or model.metadata.up is not None:
         return None
     frame = scene_frame(model)
     if frame.kind != "object":
@@ -65,4 +65,4 @@ def estimate_up(model: SplatModel, every: int = 1) -> Direction | None:
 
 def with_estimated_up(model: SplatModel) -> SplatModel:
     """Return the scene for viewing, with the estimated up direction if it does not specify its own."""
-    return with_up(model, estimate_up(model))
+    return model.with_metadata(model.metadata.with_up(estimate_up(model)))

@@ -78,4 +78,4 @@ def _rasteriser(model: SplatModel) -> GsplatRasteriser:
         from csplat_trainer.gsplat_rasteriser import GsplatRasteriser
     except ImportError:
         raise InputError(MISSING_TORCH) from None
-    return GsplatRasteriser(antialiased=model.antialiased)
+    return GsplatRasteriser(antialiased=model.metadata.antialiased)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.model import SplatModel, normalise_quats
+from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32
 from csplat_render.kernels import parallel_kernel, relaxed_kernel
 
@@ -121,7 +122,7 @@ def to_model(values: ParameterArrays, *, antialiased: bool = False) -> SplatMode
         opacities=sigmoid(values["logits"]),
         sh0=values["sh0"].copy(),
         shN=values["shN"].copy(),
-        antialiased=antialiased,
+        metadata=SceneMetadata(antialiased=antialiased),
     )
 
 

@@ -183,7 +183,7 @@ class _Derivatives(Rasteriser):
 
     def add(self, camera: Camera, background: ArrayLike) -> None:
         """Add one view."""
-        self.forward(self._model, camera, background=background, antialiased=self._model.antialiased)
+        self.forward(self._model, camera, background=background, antialiased=self._model.metadata.antialiased)
         last = self._last
         assert last is not None
         a, n = last.splats, len(self._model)

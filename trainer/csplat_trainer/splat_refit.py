@@ -69,7 +69,7 @@ def refit_splats(
     Returns:
         The scene; splats that no view shows are unchanged.
     """
-    views = _TrainingViews(cameras, references, background, model.antialiased, threads)
+    views = _TrainingViews(cameras, references, background, model.metadata.antialiased, threads)
     refit = _FloatRefit(views, steps, seed, progress, model, moves=moves)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
     refit.run(factor * _step_length(views.rms(refit.splats())))
@@ -99,7 +99,7 @@ def quantisation_aware_refit(
         Values for `FixedQuantisation.encode`.
     """
     model = fixed.encode_plan.model
-    views = _TrainingViews(cameras, references, background, model.antialiased, threads)
+    views = _TrainingViews(cameras, references, background, model.metadata.antialiased, threads)
     refit = _QuantisedRefit(views, steps, seed, progress, fixed)
     rms, pruning_rms = views.rms(refit.scene.dequantise()[0]), views.rms(before)
     quantised = max(rms**2 - pruning_rms**2, _LEAST_QUANTISED * rms**2)

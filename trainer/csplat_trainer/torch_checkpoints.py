@@ -33,7 +33,8 @@ from csplat.lint import Finding, too_many_bands
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.ply.columns import AttributeArrays, RowStatistics, choose_thickness, list_findings, survey_arrays
 from csplat.ply.comments import CommentMetadata, split_origin
-from csplat.scene_source import SceneSource, join_blocks, source_from_model
+from csplat.scene import Scene, join_blocks
+from csplat.scene_metadata import SceneMetadata
 from csplat.spherical_harmonics import SH_C0
 
 _MAGICS = (b"PK\x03\x04", b"\x80")  # a zip, or a pickle as written by torch before 1.6
@@ -71,7 +72,7 @@ _NAMES = {
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     paths, findings = _rank_files(path)
     parts = [_read(one, sh_degree) for one in paths]
     models = [one.model for one in parts]
@@ -88,7 +89,7 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
         model = replace(model, means=means, origin=origin, means_double=doubles)
         text = f"positions are in doubles: {len(means)} means are float32 relative to {origin}"
         findings.append(Finding("double-means", len(means), text, "note"))
-    yield replace(source_from_model(model), findings=findings)
+    yield Scene.of(model).changed(findings=findings)
 
 
 class _CheckpointPart(NamedTuple):
@@ -286,7 +287,7 @@ def _checked_part(splats: Mapping[str, Any], size: int, sh_degree: int | None) -
     if _FILTER in splats:
         text = f"{_FILTER} of Mip-Splatting is ignored, not fused: export the scene as PLY, which fuses it"
         findings.append(Finding("filter-3d", 1, text, "repair"))
-    model = replace(from_gsplat(splats), flat=is_flat)
+    model = replace(from_gsplat(splats), metadata=SceneMetadata(flat=is_flat))
     arrays = AttributeArrays(
         splats["means"], splats["quats"], splats["scales"], splats["opacities"].reshape(-1), model.sh0, model.shN
     )

@@ -14,10 +14,9 @@ import numpy as np
 from numpy.random import Generator
 
 import csplat
-from csplat.editing.up_axis import with_up
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.training_record import TRAINING, VIEW
+from csplat.scene_metadata import TRAINING, VIEW
 from csplat.types import F32, I64
 from csplat_render.camera import Camera, central_camera
 from csplat_render.lpips import Lpips, load_lpips
@@ -280,11 +279,11 @@ class _Training:
 
     def _model(self) -> SplatModel:
         model = to_model(self._engine.parameters.on_cpu().values, antialiased=self._options.antialiased)
-        metadata = {TRAINING: self._data.trained_on(self._colour).as_json()}
+        entries = {TRAINING: self._data.trained_on(self._colour).as_json()}
         if scene_frame(model).kind == "surrounding":  # an object can be viewed from any side
-            metadata[VIEW] = _first_view([image.camera for image in self._data.train])
-        model = replace(model, metadata=metadata, origin=self._data.origin)
-        return with_up(model, self._data.up, self._data.coordinate_system)
+            entries[VIEW] = _first_view([image.camera for image in self._data.train])
+        metadata = replace(model.metadata, entries=entries).with_up(self._data.up, self._data.coordinate_system)
+        return replace(model, metadata=metadata, origin=self._data.origin)
 
     def _full_log(self, metrics: dict[str, Any] | None) -> dict[str, Any]:
         return {

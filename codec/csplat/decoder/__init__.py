@@ -9,10 +9,11 @@ encoder, and the classes of `csplat.packed` with the renderer.
 | `decode_scene` | the same, with header, options, declared error bounds and the checks made |
 | `iter_tiles` | the splats tile by tile, in bounded memory |
 | `iter_packed` | the integers tile by tile, with codebooks as tables, for a renderer |
-| `open_tiles` | metadata, and the tiles as models, which can be decoded repeatedly |
+| `check_chunks` | header and index, after checking the CRC of every chunk |
 | `read_header` | header and index; the beginning of a file suffices |
 | `decode_integers` | the integer arrays of spec 9.2, for conformance |
-| `read_metadata`, `read_cameras`, `read_options`, `read_declared_bounds` | one chunk |
+| `read_metadata` | the metadata of the scene |
+| `read_options`, `read_declared_bounds` | one chunk |
 
 Modules, each of which builds on the previous ones: `container` (file header, frames of chunks), `index`, `entropy`
 (streams), `blocks` (integers of one attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `packed`,
@@ -23,20 +24,18 @@ from csplat.decoder.container import ExtraColumn, SceneHeader, Tile
 from csplat.decoder.decode_api import (
     DecodedScene,
     DecodedTile,
-    TileReader,
+    check_chunks,
     decode,
     decode_integers,
     decode_scene,
     iter_packed,
     iter_tiles,
-    open_tiles,
 )
 from csplat.decoder.index import read_header
 from csplat.decoder.limits import Limits
 from csplat.decoder.metadata import (
     DeclaredBound,
     DeclaredBounds,
-    read_cameras,
     read_declared_bounds,
     read_metadata,
     read_options,
@@ -53,14 +52,12 @@ __all__ = [
     "Node",
     "SceneHeader",
     "Tile",
-    "TileReader",
+    "check_chunks",
     "decode",
     "decode_integers",
     "decode_scene",
     "iter_packed",
     "iter_tiles",
-    "open_tiles",
-    "read_cameras",
     "read_declared_bounds",
     "read_header",
     "read_metadata",

@@ -222,7 +222,7 @@ def read_file_header(view: memoryview) -> _spec.Header:
     offsets = _spec.HEADER_OFFSETS
     if header.magic != _spec.MAGIC:
         instead = describe_substitute(bytes(view[:_SUBSTITUTE_SIZE]))
-        detail = "a PLY, which csplat.read_ply reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
+        detail = "a PLY, which csplat.read reads" if magic[:4] in (b"ply\n", b"ply\r") else instead
         raise FormatError(_spec.ERROR_MAGIC, 0, "HDR-1", detail, found=magic.hex(" "), wanted=_spec.MAGIC.hex(" "))
     if (header.version_major, header.version_minor) != (_spec.VERSION_MAJOR, _spec.VERSION_MINOR):
         raise UnsupportedError(

@@ -17,7 +17,7 @@ from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
 from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk, view_of
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits, check_budget, float_bytes, integer_bytes
-from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk
+from csplat.decoder.metadata import DeclaredBounds, bounds_chunk, json_chunk, scene_metadata
 from csplat.decoder.packed import pack_tables, pack_tile
 from csplat.decoder.reconstruct import (
     SplatArrays,
@@ -28,11 +28,12 @@ from csplat.decoder.reconstruct import (
     write_tile,
 )
 from csplat.decoder.tiles import read_tile
-from csplat.decoder.tree import Node, read_nodes
+from csplat.decoder.tree import read_nodes
 from csplat.errors import InputError, LimitError, counted
 from csplat.file_source import PageReleaser
 from csplat.model import SplatModel, trusted_model
 from csplat.packed import PackedTile
+from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32
 
 if TYPE_CHECKING:
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 
 _THREADS_MAX = 8  # maximum by default; more threads are limited by memory bandwidth
 
-_Texts = tuple[Mapping[str, Any], Sequence[Mapping[str, Any]] | None]  # metadata, cameras
 _T = TypeVar("_T")
 
 
@@ -115,47 +115,6 @@ class DecodeRequest:
         return replace(self.header, extras=()) if any(tile.level for tile in self.tiles) else self.header
 
 
-@dataclass(frozen=True)
-class TileReader:
-    """An open file whose tiles are decoded on demand. All other chunks have been checked.
-
-    Attributes:
-        metadata_model: the scene without its splats.
-        options: the encoder's record of its options, if there is one.
-        declared_bounds: declared error bounds, if there are any.
-        request: the file.
-        threads: as in `decode`.
-    """
-
-    metadata_model: SplatModel
-    options: dict[str, Any] | None
-    declared_bounds: DeclaredBounds | None
-    request: DecodeRequest
-    threads: int | None
-
-    @property
-    def header(self) -> SceneHeader:
-        """Header and index."""
-        return self.request.header
-
-    @property
-    def nodes(self) -> tuple[Node, ...]:
-        """Nodes of the levels of detail."""
-        return read_nodes(self.request.view, self.header)
-
-    def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
-        """Decode tiles one after the other, each to a model with the metadata of `metadata_model`.
-
-        Args:
-            tiles: indices of the tiles to decode, in the order requested; default: all of level 0.
-        """
-        header = self.header
-        chosen = header.tiles if tiles is None else [header.all_tiles[index] for index in tiles]
-        texts = self.metadata_model.metadata, self.metadata_model.cameras
-        for _, arrays in _iterate(replace(self.request, tiles=chosen), self.threads):
-            yield _model_of(header, arrays, texts)
-
-
 def decode(
     data: File,
     *,
@@ -205,7 +164,11 @@ def decode_scene(
     threads: int | None = None,
 ) -> DecodedScene:
     """Decode a file, and return its other content and the checks made as well; arguments and errors as in `decode`."""
-    request = prepare_decode(data, limits, tiles, sh_degree)
+    return decode_request(_request_of(data, limits, tiles, sh_degree), threads)
+
+
+def decode_request(request: DecodeRequest, threads: int | None = None) -> DecodedScene:
+    """Decode what was requested, as `decode_scene` does."""
     header, degree = request.output_header, request.degree
     check_budget(header, request.tiles, degree, float_bytes(header, degree), request.limits, whole=request.whole)
     count = sum(tile.splat_count for tile in request.tiles)
@@ -217,9 +180,9 @@ def decode_scene(
         write_tile(source, header, degree, table, part)
 
     options, bounds = read_side_chunks(request)
-    texts = _read_texts(request)
+    metadata = scene_metadata(request.view, request.header, request.limits)
     _write_all(request, write, threads)
-    model = _model_of(header, arrays, texts)
+    model = _model_of(header, arrays, metadata)
     checks = ("header_crc", "index_crc", "chunk_crc")
     return DecodedScene(
         request.header, model, options, bounds, (*checks, "all_chunk_crcs") if request.whole else checks
@@ -235,7 +198,7 @@ def decode_integers(
     threads: int | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Decode the integer arrays of spec 9.2, by default those of all levels; arguments and errors as in `decode`."""
-    request = prepare_decode(data, limits, tiles, sh_degree, every_level=True)
+    request = _request_of(data, limits, tiles, sh_degree, every_level=True)
     header, degree = request.header, request.degree
     check_budget(header, request.tiles, degree, integer_bytes(degree), request.limits, whole=request.whole)
     count = sum(tile.splat_count for tile in request.tiles)
@@ -247,7 +210,7 @@ def decode_integers(
         write_integers(source, header, part, out["exponents"][index])
 
     read_side_chunks(request)
-    _read_texts(request)
+    scene_metadata(request.view, request.header, request.limits)
     _write_all(request, write, threads)
     return out
 
@@ -258,7 +221,7 @@ def iter_tiles(
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
     sh_degree: int | None = None,
-    threads: int = 1,
+    threads: int | None = 1,
 ) -> Iterator[DecodedTile]:
     """Decode tile by tile; memory holds the codebooks and one tile per thread.
 
@@ -269,14 +232,19 @@ def iter_tiles(
         limits: as in `decode`; `limits.bytes` applies to each tile.
         tiles: as in `decode`.
         sh_degree: as in `decode`.
-        threads: number of tiles decoded at the same time.
+        threads: number of tiles decoded at the same time; `None`: as in `decode`.
     """
-    request = _prepare_tiles(data, limits, tiles, sh_degree)
+    return request_tiles(_request_of(data, limits, tiles, sh_degree), threads)
+
+
+def request_tiles(request: DecodeRequest, threads: int | None = 1) -> Iterator[DecodedTile]:
+    """Decode what was requested tile by tile, as `iter_tiles` does."""
+    _check_tile_budget(request)
 
     def iterate() -> Iterator[DecodedTile]:
         read_side_chunks(request)
         if request.whole:
-            _read_texts(request)
+            scene_metadata(request.view, request.header, request.limits)
         for tile, arrays in _iterate(request, threads):
             yield DecodedTile(tile, **vars(arrays))
 
@@ -289,19 +257,24 @@ def iter_packed(
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
     sh_degree: int | None = None,
-    threads: int = 1,
+    threads: int | None = 1,
 ) -> Iterator[PackedTile]:
     """Decode to integers and tables tile by tile, see `csplat.packed`; extra columns are left out.
 
     Arguments and errors are those of `iter_tiles`.
     """
-    request = _prepare_tiles(data, limits, tiles, sh_degree)
+    return request_packed(_request_of(data, limits, tiles, sh_degree), threads)
+
+
+def request_packed(request: DecodeRequest, threads: int | None = 1) -> Iterator[PackedTile]:
+    """Decode what was requested to integers and tables, as `iter_packed` does."""
+    _check_tile_budget(request)
     header = request.header
 
     def iterate() -> Iterator[PackedTile]:
         read_side_chunks(request)
         if request.whole:
-            _read_texts(request)
+            scene_metadata(request.view, request.header, request.limits)
         with np.errstate(all="ignore"):
             books = read_codebooks(request.view, header, request.tiles, request.degree)
         tables = pack_tables(books, header)
@@ -312,35 +285,44 @@ def iter_packed(
     return iterate()
 
 
-def open_tiles(data: File, *, limits: Limits | None = None, threads: int | None = None) -> TileReader:
-    """Open a file to decode its tiles on demand.
+def check_chunks(data: File, *, limits: Limits | None = None) -> SceneHeader:
+    """Check header, index, metadata and the CRC of every chunk, without decoding the tiles.
 
     Args:
-        data: as in `iter_tiles`.
-        limits: as in `iter_tiles`.
-        threads: as in `decode`. The order of the tiles does not depend on it.
+        data, limits: as in `iter_tiles`.
 
     Raises:
-        CsplatError: as in `decode`; a damaged tile raises at its turn.
+        CsplatError: as in `decode`.
     """
-    request = _prepare_tiles(data, limits, None, None)
-    header = request.header
-    options, bounds = read_side_chunks(request)
-    empty = _model_of(header, SplatArrays.empty(0, request.degree, header), _read_texts(request))
-    return TileReader(empty, options, bounds, request, threads)
+    request = _request_of(data, limits, None, None)
+    read_side_chunks(request)
+    scene_metadata(request.view, request.header, request.limits)
+    for tile in request.header.tiles:
+        for layer in tile.layers.values():
+            open_chunk(request.view, layer, _spec.CHUNK_TILE, TILE_FLAGS, "CHK-8")
+    return request.header
 
 
 def prepare_decode(
-    data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None, *, every_level: bool = False
+    view: memoryview,
+    header: SceneHeader,
+    limits: Limits | None,
+    tiles: Sequence[int] | None,
+    sh_degree: int | None,
+    *,
+    every_level: bool = False,
 ) -> DecodeRequest:
-    """Check header and index; arguments and errors as in `decode`.
+    """Return what is to be decoded of a file whose header and index have been checked.
 
     Args:
-        data, limits, tiles, sh_degree: as in `decode`.
+        view: the whole file.
+        header: header and index.
+        limits, tiles, sh_degree: as in `decode`.
         every_level: decode all levels by default.
+
+    Raises:
+        InputError: an argument is invalid.
     """
-    view = view_of(data)
-    header = parse_header(view, whole=True)
     degree = header.sh_degree
     if sh_degree is not None:
         if not 0 <= sh_degree <= _spec.SH_DEGREE_MAX:
@@ -357,15 +339,18 @@ def prepare_decode(
     return DecodeRequest(view, header, chosen, degree, limits or Limits(), whole)
 
 
-def _prepare_tiles(
-    data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None
+def _request_of(
+    data: File, limits: Limits | None, tiles: Sequence[int] | None, sh_degree: int | None, *, every_level: bool = False
 ) -> DecodeRequest:
-    """Prepare a decode that holds one tile in memory at a time."""
-    request = prepare_decode(data, limits, tiles, sh_degree)
+    view = view_of(data)
+    return prepare_decode(view, parse_header(view, whole=True), limits, tiles, sh_degree, every_level=every_level)
+
+
+def _check_tile_budget(request: DecodeRequest) -> None:
+    """Check a decode that holds one tile in memory at a time."""
     header, degree = request.output_header, request.degree
     splat_bytes = float_bytes(header, degree)
     check_budget(header, request.tiles, degree, splat_bytes, request.limits, whole=request.whole, at_once=False)
-    return request
 
 
 def _allocate(count: int, make: Callable[[], _T], request: DecodeRequest) -> _T:
@@ -393,12 +378,6 @@ def read_side_chunks(request: DecodeRequest) -> tuple[dict[str, Any] | None, Dec
         check_unnamed_codebooks(view, header)
     options = json_chunk(view, header, _spec.CHUNK_OPTIONS, request.limits.json_bytes)
     return options, bounds_chunk(view, header)
-
-
-def _read_texts(request: DecodeRequest) -> _Texts:
-    view, header, json_bytes = request.view, request.header, request.limits.json_bytes
-    metadata = json_chunk(view, header, _spec.CHUNK_METADATA, json_bytes)
-    return metadata or {}, json_chunk(view, header, _spec.CHUNK_CAMERAS, json_bytes)
 
 
 def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], None], threads: int | None) -> None:
@@ -486,16 +465,6 @@ def _thread_count(threads: int | None, task_count: int) -> int:
     return max(1, min(threads, task_count))
 
 
-def _model_of(header: SceneHeader, arrays: SplatArrays, texts: _Texts) -> SplatModel:
+def _model_of(header: SceneHeader, arrays: SplatArrays, metadata: SceneMetadata) -> SplatModel:
     """Make the model without its constructor's checks: the clauses of spec 7 are stricter."""
-    metadata, cameras = texts
-    return trusted_model(
-        **vars(arrays),
-        origin=header.origin,
-        coordinate_system=header.coordinate_system,
-        unit_metres=header.unit_metres,
-        antialiased=header.antialiased,
-        flat=header.flat,
-        cameras=cameras,
-        metadata=metadata,
-    )
+    return trusted_model(**vars(arrays), origin=header.origin, metadata=metadata)

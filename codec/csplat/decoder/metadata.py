@@ -13,6 +13,7 @@ from csplat.decoder.entropy import read_stream
 from csplat.decoder.index import parse_header
 from csplat.decoder.limits import Limits
 from csplat.errors import FormatError, LimitError
+from csplat.scene_metadata import SceneMetadata
 
 if TYPE_CHECKING:
     from csplat.file_source import File
@@ -70,16 +71,26 @@ class DeclaredBounds:
     records: tuple[DeclaredBound, ...]
 
 
-def read_metadata(data: File, *, limits: Limits | None = None) -> dict[str, Any] | None:
-    """Return the content of the META chunk, `None` if there is none."""
-    value: dict[str, Any] | None = _read_text(data, _spec.CHUNK_METADATA, limits)
-    return value
+def read_metadata(data: File, *, limits: Limits | None = None) -> SceneMetadata:
+    """Return the metadata of a scene: flags, axes and unit of the index, and the contents of META and CAMS."""
+    view = view_of(data)
+    return scene_metadata(view, parse_header(view, whole=True), limits or Limits())
 
 
-def read_cameras(data: File, *, limits: Limits | None = None) -> list[dict[str, Any]] | None:
-    """Return the content of the CAMS chunk, `None` if there is none."""
-    value: list[dict[str, Any]] | None = _read_text(data, _spec.CHUNK_CAMERAS, limits)
-    return value
+def scene_metadata(view: memoryview, header: SceneHeader, limits: Limits) -> SceneMetadata:
+    """Return the metadata of a scene whose header has been parsed.
+
+    Raises:
+        FormatError, LimitError: as in `json_chunk`.
+    """
+    return SceneMetadata(
+        coordinate_system=header.coordinate_system,
+        unit_metres=header.unit_metres,
+        antialiased=header.antialiased,
+        flat=header.flat,
+        entries=json_chunk(view, header, _spec.CHUNK_METADATA, limits.json_bytes) or {},
+        cameras=json_chunk(view, header, _spec.CHUNK_CAMERAS, limits.json_bytes),
+    )
 
 
 def read_options(data: File, *, limits: Limits | None = None) -> dict[str, Any] | None:

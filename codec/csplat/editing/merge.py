@@ -23,8 +23,8 @@ from csplat.decoder import read_header
 from csplat.decoder.container import SceneHeader, Tile
 from csplat.decoder.tiles import codebook_references
 from csplat.disk_files import BinaryWriter, open_writer, temporary_file, temporary_folder
+from csplat.editing.extract import ChunkPrefetcher, TileCopier, chunk_payload, copy_nodes, scene_fields
 from csplat.editing.transform import DEFAULT_AXES
-from csplat.editing.up_axis import CONTRADICTS, up_of
 from csplat.encoder import EncodeOptions
 from csplat.encoder.container import (
     FileChunk,
@@ -42,12 +42,11 @@ from csplat.encoder.container import (
 from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
 from csplat.file_source import File, open_binary
-from csplat.model import UNSPECIFIED, SplatModel
+from csplat.model import SplatModel
 from csplat.out_of_core import OutOfCoreOptions, encode_scene
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
+from csplat.scene_metadata import CONTRADICTS, UNSPECIFIED, SceneMetadata
 from csplat.splat_file import SplatFile
-from csplat.splat_file import open as opened
-from csplat.tile_copy import ChunkPrefetcher, TileCopier, chunk_payload, copy_nodes, scene_fields
 
 #: Fields that must be equal because they determine how all splats of a file are rendered: words for messages, name.
 _SHARED_FIELDS = (("units", "unit_metres"), ("antialiasing", "antialiased"), ("flatness", "flat"))
@@ -117,7 +116,7 @@ def merge(
     if isinstance(files, (str, bytes, os.PathLike)) or len(files) < 2:
         raise InputError("merge takes a list of two files or more")
     with ExitStack() as stack:
-        scenes = [stack.enter_context(opened(file, storage=storage)) for file in files]
+        scenes = [stack.enter_context(SplatFile.open(file, storage=storage)) for file in files]
         names = [scene.name or f"file {number}" for number, scene in enumerate(scenes, 1)]
         _refuse_other_axes(scenes, names)
         for words, field in _SHARED_FIELDS:
@@ -162,7 +161,7 @@ def _refuse_other_axes(scenes: Sequence[SplatFile], names: Sequence[str]) -> Non
         texts = [f"none, for which {DEFAULT_AXES} is assumed," if one == UNSPECIFIED else one for one in axes]
         remedy = "turn one with csplat convert --to-axes, or name the axes of one without with --axes"
         _refuse_contradiction("axes", known, names, texts, remedy)
-    ups = [up_of(scene.metadata or {}, one) for scene, one in zip(scenes, axes, strict=True)]
+    ups = [scene.metadata.up for scene in scenes]
     directions = [(np.array(one), name) for one, name in zip(ups, names, strict=True) if one is not None]
     for up, name in directions[1:]:
         first, first_name = directions[0]
@@ -188,9 +187,9 @@ def _notes(scenes: Sequence[SplatFile], names: Sequence[str]) -> tuple[str, ...]
     if 0 < len(open_units) < len(scenes):
         unit = next(one.unit_metres for one in headers if one.unit_metres is not None)
         notes.append(f"{', '.join(open_units)} without a unit: {unit:g} m is assumed, as the other files have")
-    metadata = [scene.metadata or {} for scene in scenes]
-    left_out = sorted(set().union(*metadata) - _common_entries(metadata).keys())
-    cameras = [scene.cameras for scene in scenes]
+    entries = [scene.metadata.entries for scene in scenes]
+    left_out = sorted(set().union(*entries) - _common_entries(entries).keys())
+    cameras = [scene.metadata.cameras for scene in scenes]
     if left_out := [*left_out, *(["cameras"] if any(one != cameras[0] for one in cameras) else [])]:
         notes.append(f"metadata left out, because not all files have the same: {', '.join(left_out)}")
     return tuple(notes)
@@ -241,12 +240,16 @@ def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
 def _common_chunks(scenes: Sequence[SplatFile]) -> list[FileChunk]:
     """Return chunks of the metadata and cameras that all files have in common."""
     chunks = []
-    if metadata := _common_entries([scene.metadata or {} for scene in scenes]):
-        chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(metadata, DeflateSettings())))
-    cameras = [scene.cameras for scene in scenes]
-    if cameras[0] is not None and all(one == cameras[0] for one in cameras):
-        chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(cameras[0], DeflateSettings())))
+    if entries := _common_entries([scene.metadata.entries for scene in scenes]):
+        chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(entries, DeflateSettings())))
+    if (cameras := _common_cameras(scenes)) is not None:
+        chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(cameras), DeflateSettings())))
     return chunks
+
+
+def _common_cameras(scenes: Sequence[SplatFile]) -> Sequence[Mapping[str, Any]] | None:
+    first, *others = (scene.metadata.cameras for scene in scenes)
+    return first if all(cameras == first for cameras in others) else None
 
 
 def _common_entries(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -269,9 +272,8 @@ def _encode_again(
     scenes: Sequence[SplatFile], output: str | os.PathLike[str] | BinaryWriter, options: EncodeOptions, why: str
 ) -> MergeResult:
     """Decode the scenes tile by tile and encode them together, in memory if they fit."""
-    metadata_model = _metadata_model(scenes)
-    whole = SceneSource(sum(map(len, scenes)), metadata_model, partial(_blocks, scenes, metadata_model))
-    dropped = {column.name for scene in scenes for column in scene.header.extras} - metadata_model.extra.keys()
+    whole = _merged_scene(scenes)
+    dropped = {column.name for scene in scenes for column in scene.header.extras} - whole.extra.keys()
     with temporary_folder() as folder:
         path = folder / "merged.csplat"
         encode_scene(whole, path, options, OutOfCoreOptions(folder=folder / "work"))
@@ -280,49 +282,47 @@ def _encode_again(
         return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))
 
 
-def _metadata_model(scenes: Sequence[SplatFile]) -> SplatModel:
-    """Return the metadata of the merged scene: a common origin, and the extra columns that all files have."""
+def _merged_scene(scenes: Sequence[SplatFile]) -> Scene:
+    """Return all splats with a common origin, and the extra columns that all files have."""
     headers = [scene.header for scene in scenes]
     origins = np.array([header.origin for header in headers])
     x, y, z = map(float, (origins.min(axis=0) + origins.max(axis=0)) / 2.0)  # minimises float32 rounding
     axes = (header.coordinate_system for header in headers if header.coordinate_system != UNSPECIFIED)
-    bands = (max(header.sh_degree for header in headers) + 1) ** 2 - 1
-    cameras = [scene.cameras for scene in scenes]
-    return SplatModel(
-        means=np.zeros((0, 3), np.float32),
-        quats=np.zeros((0, 4), np.float32),
-        scales=np.zeros((0, 3), np.float32),
-        opacities=np.zeros(0, np.float32),
-        sh0=np.zeros((0, 3), np.float32),
-        shN=np.zeros((0, bands, 3), np.float32),
+    whole = Scene(
+        sum(map(len, scenes)),
+        max(header.sh_degree for header in headers),
+        lambda: _blocks(scenes, whole.empty()),
         origin=(x, y, z),
-        means_double=np.zeros((0, 3), np.float64) if (origins != origins[0]).any() else None,
-        coordinate_system=next(axes, UNSPECIFIED),
-        unit_metres=next((header.unit_metres for header in headers if header.unit_metres), None),
-        antialiased=headers[0].antialiased,
-        flat=headers[0].flat,
-        cameras=cameras[0] if all(one == cameras[0] for one in cameras) else None,
-        metadata=_common_entries([scene.metadata or {} for scene in scenes]),
+        has_doubles=bool((origins != origins[0]).any()),
+        metadata=SceneMetadata(
+            coordinate_system=next(axes, UNSPECIFIED),
+            unit_metres=next((header.unit_metres for header in headers if header.unit_metres), None),
+            antialiased=headers[0].antialiased,
+            flat=headers[0].flat,
+            cameras=_common_cameras(scenes),
+            entries=_common_entries([scene.metadata.entries for scene in scenes]),
+        ),
         extra={
-            column.name: np.zeros(0, column.dtype)
+            column.name: np.dtype(column.dtype)
             for column in headers[0].extras
             if column.dtype is not None and all(column in header.extras for header in headers)
         },
     )
+    return whole
 
 
-def _blocks(scenes: Sequence[SplatFile], metadata_model: SplatModel) -> Iterator[SplatModel]:
+def _blocks(scenes: Sequence[SplatFile], empty: SplatModel) -> Iterator[SplatModel]:
     for scene in scenes:
         for tile in scene.tiles():
-            shN = np.zeros((len(tile.means), *metadata_model.shN.shape[1:]), np.float32)
+            shN = np.zeros((len(tile.means), *empty.shN.shape[1:]), np.float32)
             shN[:, : tile.shN.shape[1]] = tile.shN
             means, doubles = tile.means, None
-            if metadata_model.means_double is not None:
+            if empty.means_double is not None:
                 doubles = tile.means.astype(np.float64) + scene.header.origin
-                means = (doubles - metadata_model.origin).astype(np.float32)
+                means = (doubles - empty.origin).astype(np.float32)
             yield replace(
-                metadata_model, means=means, quats=tile.quats, scales=tile.scales, opacities=tile.opacities,
-                sh0=tile.sh0, shN=shN, extra={name: tile.extra[name] for name in metadata_model.extra},
+                empty, means=means, quats=tile.quats, scales=tile.scales, opacities=tile.opacities,
+                sh0=tile.sh0, shN=shN, extra={name: tile.extra[name] for name in empty.extra},
                 means_double=doubles,
             )  # fmt: skip
 

@@ -6,7 +6,7 @@ rotation. Colours change by the parity of their SH bands. So axes can be convert
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any, TypeVar
@@ -14,12 +14,11 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from csplat.editing.up_axis import UP, Direction, unit_up, up_of, up_of_axes
 from csplat.errors import InputError
-from csplat.model import UNSPECIFIED, SplatModel, check_axes, normalise_quats, sh_degree_of
-from csplat.scene_source import SceneSource
+from csplat.model import SplatModel, normalise_quats, sh_degree_of
+from csplat.scene import Scene
+from csplat.scene_metadata import UNSPECIFIED, VIEW, Direction, SceneMetadata, check_axes, unit_up, up_of_axes
 from csplat.spherical_harmonics import evaluate_sh
-from csplat.training_record import VIEW
 from csplat.types import F32, F64
 
 _Rows = TypeVar("_Rows", F32, F64)
@@ -57,7 +56,7 @@ def axes_rotation(before: str, after: str) -> F64:
     return np.array([[(old == new) - float(old == _OPPOSITE[new]) for old in before] for new in after]) + 0.0
 
 
-def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
+def convert_axes(scene: Scene, axes: str) -> Scene:
     """Convert a scene to the axes of a format.
 
     A scene without named axes is assumed to have x right, y down and z forward. If it has an up direction, it is also
@@ -67,16 +66,13 @@ def convert_axes(scene: SceneSource, axes: str) -> SceneSource:
         scene: the scene.
         axes: directions of +x, +y and +z, three letters.
     """
-    matrix = _rotation_to(scene.metadata_model, axes)
+    matrix = _rotation_to(scene.metadata, axes)
 
     def transform_block(model: SplatModel) -> SplatModel:
-        return replace(rotate_scene(model, matrix), coordinate_system=axes)
+        turned = rotate_scene(model, matrix)
+        return replace(turned, metadata=replace(turned.metadata, coordinate_system=axes))
 
-    def blocks() -> Iterator[SplatModel]:
-        yield from map(transform_block, scene.blocks())
-
-    same = scene.metadata_model.coordinate_system == axes
-    return scene if same else SceneSource(scene.count, transform_block(scene.metadata_model), blocks, scene.findings)
+    return scene if scene.metadata.coordinate_system == axes else scene.map(transform_block)
 
 
 def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
@@ -109,7 +105,7 @@ def rotate_scene(model: SplatModel, rotation: ArrayLike) -> SplatModel:
         shN=_rotate_sh(model.shN, matrix),
         origin=(x, y, z),
         means_double=doubles,
-        **_rotate_metadata(model, matrix),
+        metadata=rotate_metadata(model.metadata, matrix),
     )
 
 
@@ -126,14 +122,15 @@ def scale_scene(model: SplatModel, factor: float) -> SplatModel:
         doubles = None if model.means_double is None else model.means_double * factor
         means = model.means.astype(np.float64) * factor if doubles is None else doubles - origin
         x, y, z = origin.tolist()
+        metadata = _with_cameras(model.metadata, lambda camera: _scale_camera(camera, factor))
+        unit = metadata.unit_metres
         return replace(
             model,
             means=means.astype(np.float32),
             scales=(model.scales.astype(np.float64) + np.log(factor)).astype(np.float32),
             origin=(x, y, z),
             means_double=doubles,
-            unit_metres=None if model.unit_metres is None else model.unit_metres / factor,
-            **_with_cameras(model, lambda camera: _scale_camera(camera, factor)),
+            metadata=replace(metadata, unit_metres=None if unit is None else unit / factor),
         )
 
 
@@ -168,8 +165,7 @@ def stretch_scene(model: SplatModel, matrix: ArrayLike) -> SplatModel:
             scales=np.log(np.maximum(axes, np.finfo(np.float32).tiny)).astype(np.float32),
             origin=(x, y, z),
             means_double=doubles,
-            cameras=None,
-            metadata={name: value for name, value in model.metadata.items() if name != VIEW},
+            metadata=replace(model.metadata.with_entries(view=None), cameras=None),
         )
 
 
@@ -178,14 +174,14 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
     step = np.array(offset, np.float64)
     doubles = None if model.means_double is None else model.means_double + step
     means = model.means + step if doubles is None else doubles - np.array(model.origin)
-    cameras = _with_cameras(model, lambda camera: _translate_camera(camera, step))
-    return replace(model, means=means.astype(np.float32), means_double=doubles, **cameras)
+    metadata = _with_cameras(model.metadata, lambda camera: _translate_camera(camera, step))
+    return replace(model, means=means.astype(np.float32), means_double=doubles, metadata=metadata)
 
 
-def _rotation_to(metadata_model: SplatModel, axes: str) -> F64:
-    known = metadata_model.coordinate_system != UNSPECIFIED
-    matrix = axes_rotation(metadata_model.coordinate_system if known else DEFAULT_AXES, axes)
-    up, wanted = up_of(metadata_model.metadata), up_of_axes(axes)
+def _rotation_to(metadata: SceneMetadata, axes: str) -> F64:
+    known = metadata.coordinate_system != UNSPECIFIED
+    matrix = axes_rotation(metadata.coordinate_system if known else DEFAULT_AXES, axes)
+    up, wanted = metadata.stated_up, up_of_axes(axes)
     if known or up is None or wanted is None:
         return matrix
     tilted: F64 = _tilt(_multiply_rows(matrix, np.array(up, np.float64)), np.array(wanted)) @ matrix
@@ -226,7 +222,7 @@ def _rotate_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
     order = np.abs(matrix).argmax(axis=1)
     whole = np.count_nonzero(matrix) == 3
     # M R S Rᵀ Mᵀ = (M R Mᵀ) (M S Mᵀ) (M R Mᵀ)ᵀ, and M S Mᵀ is diagonal. The third scale of discs must stay the third.
-    if whole and not (model.flat and order[2] != 2):
+    if whole and not (model.metadata.flat and order[2] != 2):
         turn = np.eye(4)
         turn[1:, 1:] = np.rint(proper)
         return _multiply_rows(turn, model.quats), model.scales[:, order]
@@ -298,31 +294,27 @@ def sphere_lattice(count: int) -> F64:
     return np.stack([ring * np.cos(angle), ring * np.sin(angle), height], axis=1)
 
 
-def _rotate_metadata(model: SplatModel, matrix: F64) -> dict[str, Any]:
-    """Return the rotated axes, metadata and cameras as fields of a model."""
-    letters = model.coordinate_system
-    fields = _with_cameras(model, lambda camera: _rotate_camera(camera, matrix))
-    up = up_of(model.metadata)
+def rotate_metadata(metadata: SceneMetadata, matrix: F64) -> SceneMetadata:
+    """Rotate axes, up direction and cameras; axes that are no longer coordinate axes become an up direction."""
+    letters, up = metadata.coordinate_system, metadata.stated_up
+    metadata = _with_cameras(metadata, lambda camera: _rotate_camera(camera, matrix))
     if letters != UNSPECIFIED:
         whole = np.count_nonzero(matrix) == 3
         up = up_of_axes(letters) if up is None and not whole else up
         pairs = zip(np.abs(matrix).argmax(axis=1), matrix.sum(axis=1), strict=True)
         named = "".join(letters[old] if sign > 0.0 else _OPPOSITE[letters[old]] for old, sign in pairs)
-        fields["coordinate_system"] = named if whole else UNSPECIFIED
-    if up is not None:
-        fields["metadata"] = {**fields.get("metadata", model.metadata), UP: list(unit_up((matrix @ up).tolist()))}
-    return fields
+        metadata = replace(metadata, coordinate_system=named if whole else UNSPECIFIED)
+    return metadata if up is None else metadata.with_entries(up=list(unit_up((matrix @ up).tolist())))
 
 
-def _with_cameras(model: SplatModel, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> dict[str, Any]:
-    """Return the fields of a model with changed cameras; a view that is not a valid camera stays unchanged."""
-    fields: dict[str, Any] = {}
-    if model.cameras:
-        fields["cameras"] = [change(camera) for camera in model.cameras]
-    if VIEW in model.metadata:
+def _with_cameras(metadata: SceneMetadata, change: Callable[[Mapping[str, Any]], dict[str, Any]]) -> SceneMetadata:
+    """Return metadata with changed cameras; a view that is not a valid camera stays unchanged."""
+    if metadata.cameras:
+        metadata = replace(metadata, cameras=[change(camera) for camera in metadata.cameras])
+    if VIEW in metadata.entries:
         with suppress(TypeError, ValueError, KeyError, IndexError):
-            fields["metadata"] = {**model.metadata, VIEW: change(model.metadata[VIEW])}
-    return fields
+            return metadata.with_entries(view=change(metadata.entries[VIEW]))
+    return metadata
 
 
 def _rotate_camera(camera: Mapping[str, Any], matrix: F64) -> dict[str, Any]:

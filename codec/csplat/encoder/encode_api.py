@@ -45,7 +45,7 @@ def encode(
     Examples:
         >>> import csplat
         >>> from pathlib import Path
-        >>> model = csplat.read_ply("scene.ply")
+        >>> model = csplat.read("scene.ply")
         >>> data = csplat.encode(model, csplat.EncodeOptions(preset="fast"))
         >>> Path("small.csplat").write_bytes(data) == len(data)
         True
@@ -79,7 +79,7 @@ def encode_with_report(
 
     Examples:
         >>> import csplat
-        >>> model = csplat.read_ply("scene.ply")
+        >>> model = csplat.read("scene.ply")
         >>> largest, rms = csplat.encode_with_report(model).report.errors["opacities"]  # declared by the file
         >>> 0.0 < rms < largest < 0.1
         True

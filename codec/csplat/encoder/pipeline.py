@@ -53,7 +53,8 @@ from csplat.encoder.shape_codebook import (
 from csplat.encoder.target import SearchReport
 from csplat.encoder.tiling import QuantisedTile, TileSplats, quantise_and_sort
 from csplat.errors import InputError, counted
-from csplat.model import UNSPECIFIED, SplatModel
+from csplat.model import SplatModel
+from csplat.scene_metadata import UNSPECIFIED
 from csplat.types import F32, Progress, null_progress
 
 Integers = NDArray[Any]
@@ -434,12 +435,12 @@ def declared_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float,
 
 def file_chunks(plan: EncodePlan, errors: ErrorSums, settings: dict[str, Any]) -> list[FileChunk]:
     """Return the chunks other than tiles and codebooks: metadata, cameras, options, declared errors."""
-    model, deflate, chunks = plan.model, plan.parameters.deflate, []
+    metadata, deflate, chunks = plan.model.metadata, plan.parameters.deflate, []
     try:
-        if model.metadata:
-            chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(dict(model.metadata), deflate)))
-        if model.cameras is not None:
-            chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(model.cameras), deflate)))
+        if metadata.entries:
+            chunks.append(FileChunk(_spec.CHUNK_METADATA, json_payload(dict(metadata.entries), deflate)))
+        if metadata.cameras is not None:
+            chunks.append(FileChunk(_spec.CHUNK_CAMERAS, json_payload(list(metadata.cameras), deflate)))
     except (TypeError, ValueError) as problem:
         raise InputError(f"metadata or cameras cannot be written as JSON: {problem}") from None
     chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, deflate)))
@@ -449,16 +450,16 @@ def file_chunks(plan: EncodePlan, errors: ErrorSums, settings: dict[str, Any]) -
 
 def scene_fields(plan: EncodePlan, codebooks: FileCodebooks, chunks: Sequence[FileChunk]) -> SceneFields:
     """Return the scene fields of header and index."""
-    model, parameters = plan.model, plan.parameters
+    metadata, parameters = plan.model.metadata, plan.parameters
     directions = {letter: id for id, letter in _spec.DIRECTION_LETTER.items()}
-    letters = ("", "", "") if model.coordinate_system == UNSPECIFIED else tuple(model.coordinate_system)
-    flags = model.antialiased * _spec.SCENE_FLAG_ANTIALIASED | model.flat * _spec.SCENE_FLAG_FLAT
+    letters = ("", "", "") if metadata.coordinate_system == UNSPECIFIED else tuple(metadata.coordinate_system)
+    flags = metadata.antialiased * _spec.SCENE_FLAG_ANTIALIASED | metadata.flat * _spec.SCENE_FLAG_FLAT
     return SceneFields(
         sh_degree=parameters.sh_degree,
         scene_flags=flags,
         axes=bytes(directions[letter] for letter in letters),
-        unit_metres=model.unit_metres or 0.0,
-        origin=model.origin,
+        unit_metres=metadata.unit_metres or 0.0,
+        origin=plan.model.origin,
         attributes=parameters.attribute_records(),
         extras=plan.extras,
         codebooks=codebooks.records,

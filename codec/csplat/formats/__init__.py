@@ -9,27 +9,30 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from contextvars import ContextVar
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import TYPE_CHECKING
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
-from csplat.decoder import decode, open_tiles
-from csplat.decoder.tree import select_tiles
+from csplat._spec import MAGIC
+from csplat.byte_store import Store
+from csplat.decoder import Limits, decode
 from csplat.detect import detect_content, detect_name, read_head, refusal
-from csplat.disk_files import local_file, work_folder
+from csplat.disk_files import local_file, size_on_disk, temporary_folder, work_folder
 from csplat.editing.transform import DEFAULT_AXES, convert_axes
-from csplat.errors import InputError, counted
-from csplat.file_source import File
+from csplat.errors import InputError
+from csplat.file_source import Buffer, File, open_binary
 from csplat.formats.format import ARRAYS, Format, ValueRange
 from csplat.lint import Finding, refuse
 from csplat.model import MAX_SH_DEGREE, SplatModel, check_model, check_sh_degree
 from csplat.plugins import load_plugins
 from csplat.ply import lint_ply, open_ply, read_ply, write_scene_ply
 from csplat.ply.columns import HUGE_LOG
-from csplat.scene_source import SceneSource, drop_bands, source_from_model
+from csplat.remote_store import is_url, open_store
+from csplat.scene import Scene
+from csplat.splat_file import SplatFile
 
 if TYPE_CHECKING:
     from csplat.formats.common import ClampStatistics
@@ -37,15 +40,14 @@ if TYPE_CHECKING:
 __all__ = [
     "ARRAYS",
     "Format",
-    "assume_format",
     "detect_format",
     "format_by_name",
     "format_by_suffix",
     "formats",
     "lint_file",
-    "open_scene",
+    "open",
     "read",
-    "read_all",
+    "read_scene",
     "survey_losses",
     "write",
     "write_levels",
@@ -53,7 +55,6 @@ __all__ = [
 ]
 
 _PLY, _CSPLAT = "ply", "csplat"  # `read` calls their own readers, which load a file in one pass without extra copies
-_assumed: ContextVar[str | None] = ContextVar("assumed", default=None)  # set by `assume_format`
 
 
 def formats() -> tuple[Format, ...]:
@@ -68,17 +69,13 @@ def read(
     strict: bool = False,
     keep_extra: bool = False,
     sh_degree: int | None = None,
-    report: list[Finding] | None = None,
 ) -> SplatModel:
-    """Read a scene in any format.
+    """Read a scene in any format into memory.
 
     Args:
-        file: path of a file or folder, an open binary file, or bytes.
-        format: name of the format, as in `formats()`, if neither content nor name identify it.
+        file, format, sh_degree: as in `open`.
         strict: refuse files that need repairs.
         keep_extra: keep columns that are not splat attributes.
-        sh_degree: drop the SH bands above this degree, 0 to 4; the file's own degree may exceed 4. `None`: keep all.
-        report: findings, including repairs, are appended to this list.
 
     Examples:
         >>> import csplat
@@ -90,77 +87,113 @@ def read(
         FormatError: it is a .csplat file that violates the specification.
         OSError: it cannot be read.
     """
+    return read_scene(file, format, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree).model()
+
+
+def read_scene(
+    file: File,
+    format: str | None = None,
+    *,
+    strict: bool = False,
+    keep_extra: bool = False,
+    sh_degree: int | None = None,
+) -> Scene:
+    """Read a scene into memory as `read` does, with its findings, format, name and size."""
+    if is_url(file):
+        with open(file, format, sh_degree=sh_degree) as opened:
+            return _loaded(opened, strict=strict, keep_extra=keep_extra)
     with local_file(file) as path:
-        found = _readable_format(path, format)
+        found, findings = detect_format(path, format), list[Finding]()
         if found.name == _PLY:
-            return read_ply(path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=report)
-        if found.name == _CSPLAT:
+            model = read_ply(path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
+        elif found.name == _CSPLAT:
             check_sh_degree(sh_degree)
             model = decode(path, sh_degree=None if sh_degree is None else min(sh_degree, found.degree))
-            return model if keep_extra or not model.extra else replace(model, extra={})
-        with _open(found, path, sh_degree=sh_degree) as scene:
-            return read_all(scene, strict=strict, keep_extra=keep_extra, report=report)
+        else:
+            with open(path, format, sh_degree=sh_degree) as opened:
+                return _loaded(opened, strict=strict, keep_extra=keep_extra)
+        scene = Scene.of(model if keep_extra or not model.extra else replace(model, extra={}))
+        return scene.changed(findings=findings, format=found.name, name=path.name, size_bytes=size_on_disk(path))
 
 
-def read_all(
-    scene: SceneSource, *, strict: bool = False, keep_extra: bool = False, report: list[Finding] | None = None
-) -> SplatModel:
-    """Read all splats of an open scene; arguments are those of `read`."""
-    model = scene.model()
-    if report is not None:
-        report += scene.findings
+def _loaded(opened: Scene, *, strict: bool, keep_extra: bool) -> Scene:
+    scene = (opened if keep_extra else opened.without_extra()).loaded()
     refuse(scene.findings, strict=strict)
-    return model if keep_extra or not model.extra else replace(model, extra={})
+    return scene
 
 
-@contextmanager
-def assume_format(format: str | None) -> Iterator[None]:
-    """Within the context, read files as this format unless their content identifies another one.
-
-    Args:
-        format: name of the format; `None`: use file names, as usual.
-
-    Raises:
-        InputError: csplat cannot read a format of that name.
-    """
-    if format is not None and format_by_name(format).open is None:
-        raise InputError(f"the format is {format}, which csplat does not read")
-    token = _assumed.set(format)
-    try:
-        yield
-    finally:
-        _assumed.reset(token)
-
-
-@contextmanager
-def open_scene(
+def open(
     file: File,
     format: str | None = None,
     *,
     level: int = 0,
     max_splats: int | None = None,
     sh_degree: int | None = None,
-) -> Iterator[SceneSource]:
-    """Open a scene in any format to read it block by block.
+    limits: Limits | None = None,
+    storage: Mapping[str, Any] | None = None,
+) -> Scene:
+    """Open a scene in any format; its splats are read when they are needed.
+
+    Of a `.csplat` file, only header and index are read, and the scene is a `SplatFile`, of which parts can be read. A
+    file of another format is read from disk; one at a URL is downloaded, and an open file or bytes are copied to a
+    temporary file.
 
     Args:
-        file: as in `read`.
-        format: as in `read`.
+        file: path of a file or folder; a URL that fsspec supports (`https://…`, `s3://…`; requires the extra `remote`);
+            an open binary file, which is read to its end; or bytes.
+        format: name of the format, as in `formats()`, for a file whose content does not identify it; default: by its
+            name.
         level: level of detail, if the file has several; 0 is the finest.
-        max_splats: open the best version of at most this number of splats instead: of a .csplat file the cut with the
+        max_splats: open the best version of at most this number of splats instead: of a `.csplat` file the cut with the
             smallest errors, of streamed SOG the finest level. `None`: open `level`.
-        sh_degree: as in `read`.
+        sh_degree: drop the SH bands above this degree, 0 to 4; the file's own degree may exceed 4. `None`: keep all.
+        limits: limits of a `.csplat` file, as in `decode`, for each part.
+        storage: options of fsspec's file system for the URL: `{"endpoint_url": …, "anon": True}`.
 
-    Yields:
-        The scene; its blocks can be read until the context ends.
+    Examples:
+        >>> import csplat
+        >>> with csplat.open("scene.csplat") as file:
+        ...     for tile in file.tiles(sh_degree=0):
+        ...         print(len(tile.means), tile.shN.shape)
+        1000 (1000, 0, 3)
+        >>> with csplat.open("scene.ply") as scene:
+        ...     sum(len(block) for block in scene.blocks())
+        1000
 
     Raises:
         InputError: csplat cannot read the format, the file is incomplete, or the coarsest version has more than
-            `max_splats` splats. Reading a block may raise it, too.
-        OSError: the file cannot be read.
+            `max_splats` splats; `file` has another type; storage options without a URL; the extra is not installed.
+            Reading a block may raise it, too.
+        FormatError, UnsupportedError: as in `read_header`, or a `.csplat` file is shorter or longer than its header
+            specifies.
+        StoreError: the server does not answer, does not support ranges (HTTP Range), or closes the connection, also
+            when requests are repeated; or the file has changed since it was opened.
+        OSError: the file does not exist or cannot be read.
     """
-    with local_file(file) as path, _open(_readable_format(path, format), path, level, max_splats, sh_degree) as scene:
-        yield scene
+    with ExitStack() as stack:
+        if is_url(file) or isinstance(file, Buffer):
+            store = open_store(file, storage)
+            stack.callback(store.close)
+            (head,) = store.read([(0, min(store.size, store.sizes.first))])
+            if MAGIC.startswith(head[: len(MAGIC)]):  # of an empty file, too, whose error is that of `decode`
+                opened = SplatFile(store, limits or Limits(), head)
+                return _version_of(_CSPLAT_FORMAT, opened, store.name, level, max_splats, sh_degree).keep_open(
+                    stack.pop_all()
+                )
+            file = stack.enter_context(_copied(store))
+        elif storage:
+            raise InputError("storage options require a URL, and the file is not one")
+        path = stack.enter_context(local_file(file))
+        found = detect_format(path, format)
+        scene = stack.enter_context(
+            SplatFile.open(path, limits=limits)
+            if found.name == _CSPLAT
+            else _opened(found, path, level, max_splats, sh_degree)
+        )
+        scene = _version_of(found, scene, path.name, level, max_splats, sh_degree)
+        if not scene.format:
+            scene = scene.changed(format=found.name, name=path.name, size_bytes=size_on_disk(path))
+        return scene.keep_open(stack.pop_all())  # which closes a `SplatFile` itself a second time, without effect
 
 
 def lint_file(path: Path) -> list[Finding]:
@@ -176,13 +209,13 @@ def lint_file(path: Path) -> list[Finding]:
         InputError: csplat cannot read the format, or cannot parse the header.
         OSError: the file cannot be read.
     """
-    found = _readable_format(path, None)
+    found = detect_format(path)
     if found.name == _PLY:
         return lint_ply(path)
-    with _open(found, path, lenient=True) as scene:
+    with _opened(found, path) as scene:
         if all(one.repairable for one in scene.findings):
             try:
-                for _ in scene.blocks():
+                for _ in _along_default_axes(found, scene).blocks():
                     pass
             except InputError as error:
                 return [*scene.findings, Finding("malformed", 1, str(error), "error")]
@@ -211,17 +244,15 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
         OSError: the file cannot be written.
     """
     check_model("write", model)
-    return write_scene(path, source_from_model(model), format)
+    return write_scene(path, Scene.of(model), format)
 
 
-def write_scene(path: str | os.PathLike[str], scene: SceneSource, format: str | None = None) -> list[Finding]:
+def write_scene(path: str | os.PathLike[str], scene: Scene, format: str | None = None) -> list[Finding]:
     """Write a scene block by block; arguments and result are those of `write`."""
     return write_levels(path, [scene], format)
 
 
-def write_levels(
-    path: str | os.PathLike[str], levels: Sequence[SceneSource], format: str | None = None
-) -> list[Finding]:
+def write_levels(path: str | os.PathLike[str], levels: Sequence[Scene], format: str | None = None) -> list[Finding]:
     """Write the levels of detail of a scene block by block.
 
     Args:
@@ -241,7 +272,7 @@ def write_levels(
     if found.write is None:
         raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
     statistics = _clamp_statistics()
-    scenes = [statistics.watch(_with_fewer_bands(scene, found.degree), found.ranges) for scene in levels]
+    scenes = [statistics.watch(scene.with_sh_degree(found.degree), found.ranges) for scene in levels]
     if found.write_levels is not None and found.takes_levels(target):
         findings = found.write_levels(target, scenes)
     elif len(scenes) != 1:
@@ -251,12 +282,12 @@ def write_levels(
     return [*_lost_contents(found, levels), *_clamped_values(found, levels, statistics), *(findings or ())]
 
 
-def survey_losses(levels: Sequence[SceneSource], format: str) -> list[Finding]:
+def survey_losses(levels: Sequence[Scene], format: str) -> list[Finding]:
     """Return what `write_levels` returns without writing, except findings that depend on how positions are coded."""
     found = format_by_name(format)
     statistics = _clamp_statistics()
     for scene in levels if found.ranges else ():
-        for _ in statistics.watch(_with_fewer_bands(scene, found.degree), found.ranges).blocks():
+        for _ in statistics.watch(scene.with_sh_degree(found.degree), found.ranges).blocks():
             pass
     return [*_lost_contents(found, levels), *_clamped_values(found, levels, statistics)]
 
@@ -267,13 +298,13 @@ def _clamp_statistics() -> ClampStatistics:
     return ClampStatistics()
 
 
-def _lost_contents(found: Format, levels: Sequence[SceneSource]) -> list[Finding]:
-    lost = found.losses(levels[0].metadata_model) if levels else ()
+def _lost_contents(found: Format, levels: Sequence[Scene]) -> list[Finding]:
+    lost = found.losses(levels[0]) if levels else ()
     return [Finding("lost-contents", len(lost), f"{found.title} cannot hold {', '.join(lost)}", "loss")] if lost else []
 
 
-def _clamped_values(found: Format, levels: Sequence[SceneSource], statistics: ClampStatistics) -> list[Finding]:
-    degree = max((scene.metadata_model.sh_degree for scene in levels), default=0)
+def _clamped_values(found: Format, levels: Sequence[Scene], statistics: ClampStatistics) -> list[Finding]:
+    degree = max((scene.sh_degree for scene in levels), default=0)
 
     def holders(name: str, least: float, most: float) -> list[str]:
         return [
@@ -286,21 +317,29 @@ def _clamped_values(found: Format, levels: Sequence[SceneSource], statistics: Cl
     return statistics.findings(found.title, holders)
 
 
-def detect_format(path: Path) -> Format:
-    """Identify the format of a file or folder by its content, otherwise by its name.
+def detect_format(path: Path, format: str | None = None) -> Format:
+    """Identify the format of a file or folder by its content.
+
+    Args:
+        path: path of the file or folder.
+        format: name of the format if the content does not identify it; default: by its name.
 
     Raises:
         InputError: csplat cannot read the format, or the content makes the format of its name unlikely. The message
             names the probable format and a converter.
         OSError: the file cannot be read.
     """
-    head, assumed = read_head(path), _assumed.get()
+    if format is not None and format_by_name(format).open is None:
+        raise InputError(f"the format is {format}, which csplat does not read")
+    head = read_head(path)
     kind = detect_content(path, head)
     found = None if kind is None else _find(kind.name)
+    if found is None and format is not None:
+        return format_by_name(format)
     if found is not None:
+        if found.open is None:
+            raise InputError(f"{path.name} is {found.title}, which csplat does not read")
         return found
-    if assumed is not None:
-        return format_by_name(assumed)
     kind = kind or (detect_name(path) if head or path.is_dir() else None)
     found = None if kind is None else _find(kind.name)
     if kind is None or (found is None and kind.remedy):
@@ -341,36 +380,7 @@ def format_by_name(name: str) -> Format:
     return found
 
 
-@contextmanager
-def _open_csplat(path: Path, level: int = 0, max_splats: int | None = None) -> Iterator[SceneSource]:
-    """Open a version (`Format.open`, `Format.open_level`); a file with level 0 alone is read as a whole."""
-    opened = open_tiles(path)
-    header, last = opened.header, max((tile.level for tile in opened.header.coarse_tiles), default=0)
-    if level > last:
-        wanted = "0: it has no other levels" if last == 0 else f"0 to {last}"
-        raise InputError(f"{path.name}: the level is {level}, expected {wanted}")
-    if last == 0:
-        yield SceneSource(header.splat_count, opened.metadata_model, opened.models)
-        return
-    cuts = [select_tiles(header, opened.nodes, level=one) for one in range(last + 1)]
-    counts = tuple(sum(tile.splat_count for tile in tiles) for tiles in cuts)
-    tiles = cuts[level]
-    if max_splats is not None:  # the caller refuses a coarsest version that is too large
-        tiles = select_tiles(header, opened.nodes, max_splats=max(max_splats, counts[last]))
-    is_scene = len(tiles) == len(header.tiles) and all(tile.level == 0 for tile in tiles)
-    count = sum(tile.splat_count for tile in tiles)
-    metadata_model = opened.metadata_model if is_scene else replace(opened.metadata_model, extra={})
-
-    def blocks() -> Iterator[SplatModel]:
-        for model in opened.models(None if is_scene else [tile.index for tile in tiles]):
-            yield model if is_scene or not model.extra else replace(model, extra={})  # coarser tiles have none
-
-    which = f"level {level} alone is read" if max_splats is None else f"a version of {counted(count, 'splat')} is read"
-    findings = [Finding("levels", last, f"{counted(last, 'coarser level')} of detail: {which}", "note")]
-    yield SceneSource(count, metadata_model, blocks, findings, levels=counts)
-
-
-def _write_csplat(path: Path, scene: SceneSource) -> None:
+def _write_csplat(path: Path, scene: Scene) -> None:
     from csplat.encoder import EncodeOptions  # imported lazily: reading does not load the encoder
     from csplat.out_of_core import OutOfCoreOptions, encode_scene
 
@@ -390,8 +400,7 @@ _PLY_FORMAT = Format(
 )
 _CSPLAT_FORMAT = Format(
     name=_CSPLAT,
-    open=_open_csplat,
-    open_level=_open_csplat,
+    open=SplatFile.open,
     write=_write_csplat,
     degree=MAX_SH_DEGREE,
     splat_bytes=(7.0, 8.0, 9.0, 10.0, 10.3),
@@ -414,52 +423,50 @@ def _find(name: str) -> Format | None:
     return _own_formats().get(name) or load_plugins("csplat.formats").get(name)
 
 
-def _readable_format(path: Path, format: str | None) -> Format:
-    found = detect_format(path) if format is None else format_by_name(format)
-    if found.open is None:
-        raise InputError(f"{path.name} is {found.title}, which csplat does not read")
-    return found
-
-
 @contextmanager
-def _open(
-    found: Format,
-    path: Path,
-    level: int = 0,
-    max_splats: int | None = None,
-    sh_degree: int | None = None,
-    *,
-    lenient: bool = False,
-) -> Iterator[SceneSource]:
-    """Open a scene along the default axes; `lenient` accepts findings that are errors."""
-    assert found.open is not None
+def _copied(store: Store) -> Iterator[Path]:
+    """Copy a file to a temporary folder."""
+    with temporary_folder() as folder:
+        path = folder / (PurePosixPath(urlsplit(store.name).path).name or "data")
+        with open_binary(path, "x") as stream:
+            for start in range(0, store.size, store.sizes.batch):
+                stream.writelines(store.read([(start, min(start + store.sizes.batch, store.size))]))
+        yield path
+
+
+def _opened(
+    found: Format, path: Path, level: int = 0, max_splats: int | None = None, sh_degree: int | None = None
+) -> AbstractContextManager[Scene]:
+    """Open a file of another format than csplat."""
     check_sh_degree(sh_degree)
+    assert found.open is not None
     if level and max_splats is not None:
         raise InputError("level and max_splats exclude each other")
     if level and found.open_level is None:
         raise InputError(f"{path.name} is {found.title}, which has no levels: level {level} cannot be read")
     if found.open_level is not None:
-        opened = found.open_level(path, level, max_splats)
-    elif found.open_bands is not None and sh_degree is not None:
-        opened = found.open_bands(path, sh_degree)
-    else:
-        opened = found.open(path)
-    with opened as all_bands:
-        if max_splats is not None and all_bands.count > max_splats:
-            which = "the coarsest version" if all_bands.levels else "the scene, which has no other version,"
-            raise InputError(f"{path.name}: {which} has {all_bands.count:,} splats, expected at most {max_splats:,}")
-        refuse([] if lenient else all_bands.findings, strict=False)
-        scene = all_bands if sh_degree is None else _with_fewer_bands(all_bands, sh_degree)
-        if found.axes:
-            scene = replace(convert_axes(scene, DEFAULT_AXES), file_axes=all_bands.metadata_model.coordinate_system)
-        yield replace(scene, format=found.name)
+        return found.open_level(path, level, max_splats)
+    if found.open_bands is not None and sh_degree is not None:
+        return found.open_bands(path, sh_degree)
+    return found.open(path)
 
 
-def _with_fewer_bands(scene: SceneSource, sh_degree: int) -> SceneSource:
-    if sh_degree >= scene.metadata_model.sh_degree:
-        return scene
-    return replace(
-        scene,
-        metadata_model=drop_bands(scene.metadata_model, sh_degree),
-        blocks=lambda: (drop_bands(model, sh_degree) for model in scene.blocks()),
+def _version_of(
+    found: Format, opened: Scene, name: str, level: int, max_splats: int | None, sh_degree: int | None
+) -> Scene:
+    """Return the requested version of an opened scene along the default axes."""
+    check_sh_degree(sh_degree)
+    if level and max_splats is not None:
+        raise InputError("level and max_splats exclude each other")
+    scene = opened.version(level=level, max_splats=max_splats) if isinstance(opened, SplatFile) else opened
+    if max_splats is not None and scene.count > max_splats:
+        which = "the coarsest version" if scene.levels else "the scene, which has no other version,"
+        raise InputError(f"{name}: {which} has {scene.count:,} splats, expected at most {max_splats:,}")
+    refuse(scene.findings, strict=False)
+    return _along_default_axes(found, scene if sh_degree is None else scene.with_sh_degree(sh_degree))
+
+
+def _along_default_axes(found: Format, scene: Scene) -> Scene:
+    return (
+        convert_axes(scene, DEFAULT_AXES).changed(file_axes=scene.metadata.coordinate_system) if found.axes else scene
     )

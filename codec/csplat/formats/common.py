@@ -22,7 +22,7 @@ from csplat.lint import Finding
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import LOG_OF_0, RowStatistics, count_huge_rows, list_findings
 from csplat.portable_math import log
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64, I64, U8
 
@@ -34,22 +34,22 @@ _HUGE = float(np.exp(87.0))  # scene units; huge values are only counted if a st
 def finite_scene(
     blocks: Callable[[], Iterator[tuple[Rows, ...]]],
     decode: Callable[..., SplatModel],
-    metadata_model: SplatModel,
+    empty: SplatModel,
     *,
     zero_quat: int = 0,
-) -> SceneSource:
+) -> Scene:
     """Build a scene from structured rows, dropping and counting rows with NaN or infinity.
 
     Args:
         blocks: yields tuples of rows, at most `BLOCK_SPLATS`, and further arrays of the same length.
         decode: called with the natural logarithms of the scales and such a tuple, returns a model.
-        metadata_model: as in `SceneSource`.
+        empty: the model of no rows, with the metadata of the scene.
         zero_quat: value of each component of a rotation of length 0 in the file.
 
     Returns:
         The scene; its findings contain an error if there are rows but none is finite.
     """
-    total, kept, empty, scale_range, statistics = 0, 0, 0, RangeStatistics(), RowStatistics()
+    total, kept, blank, scale_range, statistics = 0, 0, 0, RangeStatistics(), RowStatistics()
     for rows, *_ in blocks():
         good = _finite_rows(rows)
         found = rows if good.all() else rows[good]
@@ -58,7 +58,7 @@ def finite_scene(
         colours = [found["shN"]] if "shN" in (rows.dtype.names or ()) and found["shN"].dtype.kind == "f" else []
         huge = max(scale_range.most, -scale_range.least) > _HUGE
         statistics.huge += count_huge_rows(log_scales(scales.astype(np.float32)) if huge else scales[:0], *colours)
-        empty += _count_empty_rows(rows)
+        blank += _count_empty_rows(rows)
         zero = np.logical_and.reduce([found["quats"][:, part] == zero_quat for part in range(4)])
         statistics.zero_quats += int(np.count_nonzero(zero))
         total += len(rows)
@@ -66,9 +66,9 @@ def finite_scene(
     statistics.nonfinite = total - kept
     are_logs, findings = classify_scales(scale_range, "scale", strict=False)
     findings = list_findings(statistics, total) + findings
-    if empty:
-        text = f"{counted(empty, 'splat')} whose bytes are all 0, which are invisible: kept"
-        findings.append(Finding("zero-rows", empty, f"{text}; an interrupted download may leave them", "note"))
+    if blank:
+        text = f"{counted(blank, 'splat')} whose bytes are all 0, which are invisible: kept"
+        findings.append(Finding("zero-rows", blank, f"{text}; an interrupted download may leave them", "note"))
 
     def models() -> Iterator[SplatModel]:
         for parts in blocks():
@@ -78,7 +78,7 @@ def finite_scene(
                 scales = kept[0]["scales"].astype(np.float32)
                 yield decode(scales if are_logs else log_scales(scales), *kept)
 
-    return SceneSource(kept, metadata_model, models, findings)
+    return Scene.like(empty, kept, models, findings)
 
 
 def _count_empty_rows(rows: Rows) -> int:
@@ -171,7 +171,7 @@ class ClampStatistics:
     def __init__(self) -> None:
         self._scenes: list[dict[str, tuple[ValueRange, RangeStatistics]]] = []
 
-    def watch(self, scene: SceneSource, ranges: Mapping[str, ValueRange]) -> SceneSource:
+    def watch(self, scene: Scene, ranges: Mapping[str, ValueRange]) -> Scene:
         """Return the scene with blocks that are counted; only the last iteration over them counts.
 
         Args:
@@ -194,7 +194,7 @@ class ClampStatistics:
                     statistics.add(getattr(model, name), rows.start)
                 yield model
 
-        return replace(scene, blocks=blocks)
+        return scene.changed(reader=blocks)
 
     def findings(self, title: str, holders: Callable[[str, float, float], Sequence[str]]) -> list[Finding]:
         """Return a finding for each attribute with clamped values.
@@ -361,7 +361,7 @@ _IN_MEMORY = 1 << 24  # bytes; smaller scenes are sorted without a file
 
 
 @contextmanager
-def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource]:
+def sorted_along_curve(scene: Scene, folder: Path) -> Iterator[Scene]:
     """Sort a scene along a Z curve, which keeps neighbours together; splats in one cell keep their order.
 
     Args:
@@ -377,11 +377,11 @@ def sorted_along_curve(scene: SceneSource, folder: Path) -> Iterator[SceneSource
     """
     curve = _ZCurve.through(scene)
     with sorted_parts(scene, folder, curve.codes, curve.splits) as parts:
-        yield replace(scene, metadata_model=parts.metadata_model, blocks=parts.blocks)
+        yield Scene.like(parts.empty, scene.count, parts.blocks, scene.findings)
 
 
 @contextmanager
-def sorted_shells(scene: SceneSource, folder: Path) -> Iterator[list[SceneSource]]:
+def sorted_shells(scene: Scene, folder: Path) -> Iterator[list[Scene]]:
     """Sort a scene like `sorted_along_curve`, and divide it by the distance from its middle.
 
     Yields:
@@ -391,7 +391,7 @@ def sorted_shells(scene: SceneSource, folder: Path) -> Iterator[list[SceneSource
     with sorted_parts(scene, folder, curve.codes, curve.splits) as parts:
         starts = [0, *(np.searchsorted(curve.splits, _SHELL_CODES) + 1), len(parts.counts)]
         yield [
-            replace(scene, metadata_model=parts.metadata_model, count=count, blocks=partial(parts.blocks, start, stop))
+            Scene.like(parts.empty, count, partial(parts.blocks, start, stop))
             for start, stop in pairwise(starts)
             if (count := int(parts.counts[start:stop].sum()))
         ]
@@ -402,12 +402,12 @@ class SortedParts:
     """A scene that is sorted by keys and divided.
 
     Attributes:
-        metadata_model: the scene without splats and extra columns.
+        empty: the model of none of the splats, without extra columns.
         counts: number of splats of each part.
         rows: returns the parts from one index to another as rows for `scene_of_rows`, one by one.
     """
 
-    metadata_model: SplatModel
+    empty: SplatModel
     counts: I64
     rows: Callable[[int, int], Iterator[Rows]]
 
@@ -417,14 +417,14 @@ class SortedParts:
         for rows in self.rows(start, len(self.counts) if stop is None else stop):
             left = [np.concatenate([*left, rows])]
             while len(left[0]) >= BLOCK_SPLATS:
-                yield _model_of_rows(self.metadata_model, left[0][:BLOCK_SPLATS])
+                yield _model_of_rows(self.empty, left[0][:BLOCK_SPLATS])
                 left = [left[0][BLOCK_SPLATS:]]
         if left and len(left[0]):
-            yield _model_of_rows(self.metadata_model, left[0])
+            yield _model_of_rows(self.empty, left[0])
 
 
 @contextmanager
-def sorted_parts(scene: SceneSource, folder: Path, keys: Callable[[F32], I64], splits: I64) -> Iterator[SortedParts]:
+def sorted_parts(scene: Scene, folder: Path, keys: Callable[[F32], I64], splits: I64) -> Iterator[SortedParts]:
     """Sort a scene by keys of positions, and divide it at some keys; splats with the same key keep their order.
 
     Args:
@@ -438,8 +438,8 @@ def sorted_parts(scene: SceneSource, folder: Path, keys: Callable[[F32], I64], s
         InputError: raised by the blocks of the scene.
         OSError: the folder is full.
     """
-    metadata_model = replace(scene.metadata_model, extra={}, means_double=None)
-    dtype = np.dtype([(name, "<f4", getattr(metadata_model, name).shape[1:]) for name in ARRAYS])
+    empty = replace(scene.empty(), extra={}, means_double=None)
+    dtype = np.dtype([(name, "<f4", getattr(empty, name).shape[1:]) for name in ARRAYS])
     with tempfile.SpooledTemporaryFile(_IN_MEMORY, dir=str(folder)) as spool:
         runs = []  # per block written: the offsets of its parts
         for model in scene.blocks():
@@ -459,7 +459,7 @@ def sorted_parts(scene: SceneSource, folder: Path, keys: Callable[[F32], I64], s
         def rows_of(start: int, stop: int) -> Iterator[Rows]:
             return _merge_runs(spool, runs, keys, dtype, start, stop)
 
-        yield SortedParts(metadata_model, counts, rows_of)
+        yield SortedParts(empty, counts, rows_of)
 
 
 def _merge_runs(
@@ -477,19 +477,19 @@ def _merge_runs(
         yield rows
 
 
-def scene_of_rows(metadata_model: SplatModel, rows: Rows) -> SceneSource:
+def scene_of_rows(empty: SplatModel, rows: Rows) -> Scene:
     """Return the scene of rows with the fields of `ARRAYS`; its blocks copy them."""
 
     def blocks() -> Iterator[SplatModel]:
         for start in range(0, len(rows), BLOCK_SPLATS):
-            yield _model_of_rows(metadata_model, rows[start : start + BLOCK_SPLATS])
+            yield _model_of_rows(empty, rows[start : start + BLOCK_SPLATS])
 
-    return SceneSource(len(rows), metadata_model, blocks)
+    return Scene.like(empty, len(rows), blocks)
 
 
-def _model_of_rows(metadata_model: SplatModel, rows: Rows) -> SplatModel:
+def _model_of_rows(empty: SplatModel, rows: Rows) -> SplatModel:
     arrays: dict[str, Any] = {name: np.ascontiguousarray(rows[name]) for name in ARRAYS}
-    return replace(metadata_model, **arrays)
+    return replace(empty, **arrays)
 
 
 @dataclass(frozen=True)
@@ -507,7 +507,7 @@ class _ZCurve:
     splits: I64
 
     @classmethod
-    def through(cls, scene: SceneSource) -> _ZCurve:
+    def through(cls, scene: Scene) -> _ZCurve:
         stride = -(-scene.count // _CURVE_SAMPLE) or 1
         taken, at = [np.zeros((0, 3), np.float32)], 0
         for model in scene.blocks():

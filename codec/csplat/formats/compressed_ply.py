@@ -30,7 +30,7 @@ from csplat.lint import Finding, trailing_bytes
 from csplat.model import SplatModel
 from csplat.ply.comments import format_comments, parse_comments
 from csplat.ply.ply_header import read_ply_header
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, U8, U32
 
@@ -66,7 +66,7 @@ class _Element:
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[SceneSource]:
+def _open(path: Path) -> Iterator[Scene]:
     elements, comments, findings = _parse_header(path)
     chunk, vertex, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
     if chunk is None or vertex is None:
@@ -106,11 +106,11 @@ def _open(path: Path) -> Iterator[SceneSource]:
         low, high = (f"{names[kind * 6 + end * 3 + axis]} {bounds[row, kind, end, axis]:.6g}" for end in (0, 1))
         raise InputError(f"{path.name}: chunk {row} has {low}, expected at most {high}")
     try:
-        metadata = parse_comments(comments)
-        metadata_model = SplatModel(
+        parsed = parse_comments(comments)
+        empty = SplatModel(
             **_unpack(np.zeros(0, vertex.dtype), bounds[:0], None, kept),
-            origin=metadata.origin or (0.0, 0.0, 0.0),
-            **metadata.fields(),
+            origin=parsed.origin or (0.0, 0.0, 0.0),
+            metadata=parsed.metadata,
         )
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
@@ -121,9 +121,9 @@ def _open(path: Path) -> Iterator[SceneSource]:
             coefficients = None if sh is None else sh.read(path, start, stop)
             words = vertex.read(path, start, stop)
             chunk_bounds = bounds[start // _CHUNK : -(-stop // _CHUNK)]
-            yield replace(metadata_model, **_unpack(words, chunk_bounds, coefficients, kept))
+            yield replace(empty, **_unpack(words, chunk_bounds, coefficients, kept))
 
-    yield SceneSource(vertex.count, metadata_model, blocks, [*findings, *metadata.findings])
+    yield Scene.like(empty, vertex.count, blocks, [*findings, *parsed.findings])
 
 
 def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Finding]]:
@@ -227,16 +227,16 @@ def _sh_values() -> F32:
     return values.astype(np.float32)
 
 
-def _write(path: Path, scene: SceneSource) -> list[Finding]:
+def _write(path: Path, scene: Scene) -> list[Finding]:
     """Write a scene sorted along a Z curve, so that splats far from the others have chunks of their own.
 
     A splat far away would make the positions of all splats in its chunk coarse. Invisible splats fill chunks up.
     """
-    rest, moved = 3 * scene.metadata_model.shN.shape[1], MovedSplats()
+    rest, moved = 3 * ((scene.sh_degree + 1) ** 2 - 1), MovedSplats()
     with atomic_writer(path, seekable=True) as stream, sorted_shells(scene, work_folder(path)) as shells:
         filling = sum(-shell.count % _CHUNK for shell in shells[:-1])
         count = scene.count + filling
-        header = _build_header(scene.metadata_model, count, rest)
+        header = _build_header(scene, count, rest)
         sizes = 4 * len(_BOUNDS + _COLOUR_BOUNDS) * -(-count // _CHUNK), 4 * len(_PACKED_COLUMNS) * count
         offsets = [len(header), len(header) + sizes[0], len(header) + sum(sizes)]
         stream.write(header)
@@ -299,11 +299,11 @@ def _pack(values: F32, bits: tuple[int, int, int]) -> tuple[U32, F32, F32]:
     return words, low, high
 
 
-def _build_header(metadata_model: SplatModel, count: int, rest: int) -> bytes:
+def _build_header(scene: Scene, count: int, rest: int) -> bytes:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        *(f"comment {line}" for line in format_comments(metadata_model, absolute=False)),
+        *(f"comment {line}" for line in format_comments(scene.metadata, scene.origin, absolute=False)),
     ]
     lines += [f"element chunk {-(-count // _CHUNK)}", *(f"property float {name}" for name in _BOUNDS + _COLOUR_BOUNDS)]
     lines += [f"element vertex {count}", *(f"property uint {name}" for name in _PACKED_COLUMNS)]

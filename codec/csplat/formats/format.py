@@ -10,23 +10,23 @@ from typing import Any
 
 from csplat.detect import KINDS
 from csplat.lint import Finding
-from csplat.model import UNSPECIFIED, SplatModel
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
+from csplat.scene_metadata import UNSPECIFIED
 
 #: Splat attributes common to all formats.
 ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 # Opening a file raises InputError if it is incomplete or of another format, OSError if it cannot be read. Reading its
 # blocks raises the same errors; it is possible until the context ends.
-OpenScene = Callable[[Path], AbstractContextManager[SceneSource]]
+OpenScene = Callable[[Path], AbstractContextManager[Scene]]
 # A level of detail, 0 is the finest; or, if it is given, the best version of at most this number of splats.
-OpenLevel = Callable[[Path, int, int | None], AbstractContextManager[SceneSource]]
-OpenBands = Callable[[Path, int], AbstractContextManager[SceneSource]]  # highest SH degree to read
+OpenLevel = Callable[[Path, int, int | None], AbstractContextManager[Scene]]
+OpenBands = Callable[[Path, int], AbstractContextManager[Scene]]  # highest SH degree to read
 # Writing raises InputError if the format cannot represent the scene (too many splats, positions out of range), OSError
 # if the file cannot be written. The path appears when the file is complete. Returned are findings about values that the
 # format stores badly, apart from those outside `Format.ranges`; or nothing.
-WriteScene = Callable[[Path, SceneSource], Sequence[Finding] | None]
-WriteLevels = Callable[[Path, Sequence[SceneSource]], Sequence[Finding] | None]  # the levels of a scene, finest first
+WriteScene = Callable[[Path, Scene], Sequence[Finding] | None]
+WriteLevels = Callable[[Path, Sequence[Scene]], Sequence[Finding] | None]  # the levels of a scene, finest first
 
 
 @dataclass(frozen=True)
@@ -101,33 +101,29 @@ class Format:
         """Return True if a file of this name holds all levels of detail of a scene."""
         return self.write_levels is not None and path.name.lower() == self.levels_name
 
-    def expected_bytes(self, model: SplatModel, count: int) -> int | None:
+    def expected_bytes(self, scene: Scene) -> int | None:
         """Return the approximate size of a file; `None` if it depends on the scene."""
-        return round(count * self.splat_bytes[min(model.sh_degree, self.degree)]) if self.splat_bytes else None
+        return round(scene.count * self.splat_bytes[min(scene.sh_degree, self.degree)]) if self.splat_bytes else None
 
-    def losses(self, model: SplatModel) -> tuple[str, ...]:
-        """Describe the parts of a scene that this format cannot store, in a few words each; precision is not listed.
-
-        Args:
-            model: `metadata_model` of a `SceneSource`, or a model.
-        """
+    def losses(self, scene: Scene) -> tuple[str, ...]:
+        """Describe the parts of a scene that this format cannot store, in a few words each; precision is not listed."""
         lost = []
-        if model.sh_degree > self.degree:
-            bands = range(self.degree + 1, model.sh_degree + 1)
+        if scene.sh_degree > self.degree:
+            bands = range(self.degree + 1, scene.sh_degree + 1)
             lost.append(f"SH band{'s' if len(bands) > 1 else ''} {' and '.join(map(str, bands))}")
         for name, (words, is_there) in _PARTS.items():
-            if name not in self.carries and is_there(model):
-                lost.append(f"{words} {', '.join(model.extra)}" if name == "extra" else words)
+            if name not in self.carries and is_there(scene):
+                lost.append(f"{words} {', '.join(scene.extra)}" if name == "extra" else words)
         return tuple(lost)
 
 
-_PARTS: dict[str, tuple[str, Callable[[SplatModel], Any]]] = {
-    "antialiased": ("that it is antialiased", lambda model: model.antialiased),
-    "origin": ("the origin", lambda model: any(model.origin)),
-    "coordinate_system": ("the axes", lambda model: model.coordinate_system != UNSPECIFIED),
-    "unit_metres": ("the length of a unit", lambda model: model.unit_metres is not None),
-    "flat": ("that splats are discs", lambda model: model.flat),
-    "cameras": ("cameras", lambda model: model.cameras),
-    "metadata": ("metadata", lambda model: model.metadata),
-    "extra": ("extra columns", lambda model: model.extra),
+_PARTS: dict[str, tuple[str, Callable[[Scene], Any]]] = {
+    "antialiased": ("that it is antialiased", lambda scene: scene.metadata.antialiased),
+    "origin": ("the origin", lambda scene: any(scene.origin)),
+    "coordinate_system": ("the axes", lambda scene: scene.metadata.coordinate_system != UNSPECIFIED),
+    "unit_metres": ("the length of a unit", lambda scene: scene.metadata.unit_metres is not None),
+    "flat": ("that splats are discs", lambda scene: scene.metadata.flat),
+    "cameras": ("cameras", lambda scene: scene.metadata.cameras),
+    "metadata": ("metadata", lambda scene: scene.metadata.entries),
+    "extra": ("extra columns", lambda scene: scene.extra),
 }

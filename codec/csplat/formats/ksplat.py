@@ -23,7 +23,7 @@ from csplat.formats.common import finite_scene, sh0_from_bytes
 from csplat.formats.format import Format
 from csplat.lint import trailing_bytes
 from csplat.model import SplatModel, normalise_quats
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.types import F32, F64
 
 Rows = NDArray[Any]
@@ -81,7 +81,7 @@ class _SectionHead(NamedTuple):
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[SceneSource]:
+def _open(path: Path) -> Iterator[Scene]:
     data = map_file(path)
     if len(data) < _HEADER_SIZE:
         raise InputError(f"{path.name} is truncated: it ends within its header")
@@ -114,8 +114,8 @@ def _open(path: Path) -> Iterator[SceneSource]:
         )
 
     no_rows = np.empty(0, _row_type(level, 0))
-    metadata_model = decode(np.zeros((0, 3), np.float32), no_rows, np.zeros((0, 3)), np.zeros((0, 1)))
-    scene = finite_scene(blocks, decode, metadata_model)
+    empty = decode(np.zeros((0, 3), np.float32), no_rows, np.zeros((0, 3)), np.zeros((0, 1)))
+    scene = finite_scene(blocks, decode, empty)
     scene.findings.extend(trailing_bytes(len(data) - end))
     yield scene
 

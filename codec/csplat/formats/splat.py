@@ -21,7 +21,7 @@ from csplat.formats.common import finite_scene, round_to_bytes, sh0_from_bytes
 from csplat.formats.format import Format, ValueRange
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply.columns import LOG_OF_0
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32
 
@@ -37,7 +37,7 @@ _PRINTABLE = np.array([32 <= byte < 127 or byte in b"\t\n\r" for byte in range(2
 
 
 @contextmanager
-def _open(path: Path) -> Iterator[SceneSource]:
+def _open(path: Path) -> Iterator[Scene]:
     data = map_file(path)
     if len(data) % _ROW.itemsize:
         raise InputError(f"{path.name} has {len(data):,} bytes, expected a multiple of {_ROW.itemsize} (.splat)")
@@ -90,7 +90,7 @@ def _decode_rows(scales: F32, rows: NDArray[Any]) -> SplatModel:
     )
 
 
-def _write(path: Path, scene: SceneSource) -> None:
+def _write(path: Path, scene: Scene) -> None:
     with atomic_writer(path) as stream:
         for model in scene.blocks():
             rows = np.empty(len(model), _ROW)

@@ -38,7 +38,8 @@ from csplat.formats.common import MovedSplats, decode_smallest_three, encode_sma
 from csplat.formats.format import Format, ValueRange
 from csplat.lint import Finding, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
+from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32, U8
 
 #: Directions of +x, +y and +z: right, up, back.
@@ -239,7 +240,7 @@ _SH_STEP = 4  # quantisation step of SH coefficients, in units of the 256 levels
 
 
 @contextmanager
-def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
+def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     with open_binary(path) as file:
         packed = read_spz_file(file, path.name, path.stat().st_size)
     degree = packed.degree if sh_degree is None else min(packed.degree, sh_degree)
@@ -248,14 +249,14 @@ def _open(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
         for start in range(0, packed.count, BLOCK_SPLATS):
             yield decode_block(packed, slice(start, start + BLOCK_SPLATS), degree)
 
-    yield SceneSource(packed.count, decode_block(packed, slice(0, 0), degree), blocks, packed.findings)
+    yield Scene.like(decode_block(packed, slice(0, 0), degree), packed.count, blocks, packed.findings)
 
 
-def write_spz(path: Path, scene: SceneSource, *, version: int) -> list[Finding]:
+def write_spz(path: Path, scene: Scene, *, version: int) -> list[Finding]:
     """Write version 3 or 4, without extensions (`Format.write`)."""
     scene = convert_axes(scene, SPZ_AXES)
-    degree, bits = scene.metadata_model.sh_degree, _choose_fraction_bits(path, scene)
-    flags = ANTIALIASED if scene.metadata_model.antialiased else 0
+    degree, bits = scene.sh_degree, _choose_fraction_bits(path, scene)
+    flags = ANTIALIASED if scene.metadata.antialiased else 0
     packed = SpzArrays(path.name, version, scene.count, degree, bits, flags)
     data, moved = packed.allocate(), MovedSplats()
     for rows, block in scene.numbered():
@@ -289,8 +290,7 @@ def decode_block(packed: SpzArrays, rows: slice, degree: int) -> SplatModel:
         opacities=np.divide(alphas[:, 0], 255, dtype=np.float32),
         sh0=(np.divide(colours, 255, dtype=np.float32) - np.float32(0.5)) / _COLOUR,
         shN=shN.reshape(len(rest), coefficients, 3),
-        coordinate_system=packed.axes,
-        antialiased=bool(packed.flags & ANTIALIASED),
+        metadata=SceneMetadata(coordinate_system=packed.axes, antialiased=bool(packed.flags & ANTIALIASED)),
     )
 
 
@@ -323,7 +323,7 @@ def _decode_rotations(rotations: U8) -> F32:
     return xyzw[:, [3, 0, 1, 2]]
 
 
-def _choose_fraction_bits(path: Path, scene: SceneSource) -> int:
+def _choose_fraction_bits(path: Path, scene: Scene) -> int:
     """Choose the number of fractional bits of positions: enough for the median splat, limited by the scene's extent."""
     reach, scales = 0.0, np.zeros(256, np.int64)
     for block in scene.blocks():

@@ -32,7 +32,7 @@ from csplat.errors import missing_package
 from csplat.file_source import open_binary
 from csplat.model import SplatModel
 from csplat.out_of_core.disk_buckets import Bucket, damaged_file, read_bucket, write_splats
-from csplat.scene_source import join_blocks
+from csplat.scene import join_blocks
 from csplat.system import map_in_processes
 from csplat.types import Progress, null_progress
 

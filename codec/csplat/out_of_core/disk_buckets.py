@@ -27,7 +27,7 @@ from csplat.encoder.sh_codebook import largest_sh
 from csplat.errors import InputError
 from csplat.file_source import open_binary, read_bytes
 from csplat.model import SplatModel
-from csplat.scene_source import SceneSource, with_progress
+from csplat.scene import Scene
 from csplat.types import Progress
 
 Records = NDArray[np.void]
@@ -80,7 +80,7 @@ class DiskBuckets:
     @classmethod
     def of(
         cls,
-        scene: SceneSource,
+        scene: Scene,
         folder: Path,
         key: dict[str, Any],
         *,
@@ -108,7 +108,7 @@ class DiskBuckets:
         """
         done = _read_state(folder, key, resume=resume)
         if done is not None:
-            return cls(folder, scene.metadata_model, bucket_splats, **done)
+            return cls(folder, scene.empty(), bucket_splats, **done)
         for path in folder.glob("section-*"):  # an interrupted sort starts again
             path.unlink()
         check_free_space(
@@ -237,19 +237,19 @@ def _write_json(path: Path, value: Any) -> None:
         stream.write(json.dumps(value).encode())
 
 
-def _sort(scene: SceneSource, folder: Path, bucket_splats: int, progress: Progress) -> DiskBuckets:
+def _sort(scene: Scene, folder: Path, bucket_splats: int, progress: Progress) -> DiskBuckets:
     """Read the scene twice: survey it, then sort its splats into spill files."""
-    curve, largest = _survey(with_progress(scene, "looking", progress), folder, bucket_splats)
-    counts = _spill(with_progress(scene, "sorting", progress), folder, curve)
-    store = DiskBuckets(folder, scene.metadata_model, bucket_splats, counts, largest, 0.0)
+    curve, largest = _survey(scene.with_progress("looking", progress), folder, bucket_splats)
+    counts = _spill(scene.with_progress("sorting", progress), folder, curve)
+    store = DiskBuckets(folder, scene.empty(), bucket_splats, counts, largest, 0.0)
     chosen = contrast_buckets(store.buckets)
     return replace(store, contrast=measure_contrast(read_bucket(folder, store.model, bucket) for bucket in chosen))
 
 
-def _survey(scene: SceneSource, folder: Path, bucket_splats: int) -> tuple[BucketCurve, float]:
+def _survey(scene: Scene, folder: Path, bucket_splats: int) -> tuple[BucketCurve, float]:
     """Write the sample; return the curve through it and the largest magnitude of all SH coefficients."""
     rows, largest = sample_rows(scene.count, bucket_splats), 0.0
-    sample = np.empty(len(rows), _record_type(scene.metadata_model))
+    sample = np.empty(len(rows), _record_type(scene.empty()))
     for where, block in scene.numbered():
         first, last = np.searchsorted(rows, (where.start, where.stop))
         sample[first:last] = _records(block, rows[first:last] - where.start, sample.dtype)
@@ -259,9 +259,9 @@ def _survey(scene: SceneSource, folder: Path, bucket_splats: int) -> tuple[Bucke
     return BucketCurve.through(np.ascontiguousarray(sample["means"]), scene.count, bucket_splats), largest
 
 
-def _spill(scene: SceneSource, folder: Path, curve: BucketCurve) -> list[int]:
+def _spill(scene: Scene, folder: Path, curve: BucketCurve) -> list[int]:
     """Write all splats to spill files, each in the scene's order; return the number of splats in each."""
-    dtype, counts = _record_type(scene.metadata_model), np.zeros(curve.count, np.int64)
+    dtype, counts = _record_type(scene.empty()), np.zeros(curve.count, np.int64)
     pending: list[list[Records]] = [[] for _ in range(curve.count)]
     pending_bytes = 0
 

@@ -28,7 +28,7 @@ from csplat.out_of_core.bucket_workers import (
     roots_path,
 )
 from csplat.out_of_core.disk_buckets import PENDING_BYTES, DiskBuckets, read_splats, splat_bytes
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
 from csplat.system import default_memory_bytes
 from csplat.types import Progress, null_progress
 
@@ -111,7 +111,7 @@ class EncodingCost:
 
 
 def estimate_cost(
-    scene: SceneSource,
+    scene: Scene,
     options: EncodeOptions,
     limits: OutOfCoreOptions | None = None,
     levels: LevelMaker | None = None,
@@ -128,9 +128,9 @@ def estimate_cost(
         InputError: there is too little memory.
     """
     limits = limits or OutOfCoreOptions()
-    count, degree = scene.count, options.kept_degree(scene.metadata_model.sh_degree)
+    count, degree = scene.count, options.kept_degree(scene.sh_degree)
     bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
-    row = splat_bytes(_with_written_columns(scene, options).metadata_model)
+    row = splat_bytes(_with_written_columns(scene, options).empty())
     workers, passes, disk = options.thread_count, 1, int(count * row * _CODED)
     per_bucket = min(count, options.bucket_splats)
     is_one = count <= (options.bucket_splats if levels is None else levels.whole_splats)
@@ -165,7 +165,7 @@ def _building_bytes(count: int, row: int) -> int:
 
 
 def encode_scene(
-    scene: SceneSource,
+    scene: Scene,
     target: str | os.PathLike[str],
     options: EncodeOptions | None = None,
     limits: OutOfCoreOptions | None = None,
@@ -181,7 +181,7 @@ def encode_scene(
     folder. Scripts must guard their own code by `if __name__ == "__main__":`, because worker processes import it.
 
     Args:
-        scene: the scene, for example from `csplat.formats.open_scene`.
+        scene: the scene, for example from `csplat.open`.
         target: path of the file, which appears when complete.
         options: options of the encoder.
         limits: memory, disk and workers.
@@ -230,9 +230,9 @@ def encode_scene(
     return report
 
 
-def _with_written_columns(scene: SceneSource, options: EncodeOptions) -> SceneSource:
+def _with_written_columns(scene: Scene, options: EncodeOptions) -> Scene:
     """Return the scene without extra columns unless they are written; its blocks may still have them."""
-    return scene if options.keep_extra else replace(scene, metadata_model=replace(scene.metadata_model, extra={}))
+    return scene if options.keep_extra else scene.changed(extra={})
 
 
 def _encode_buckets(

@@ -5,8 +5,8 @@
 | `csplat origin X Y Z` | x, y, z are relative to this origin |
 | `csplat absolute_origin X Y Z` | x, y, z are absolute, in doubles |
 | `csplat coordinate_system RDF` | directions of the axes |
-| `csplat up X Y Z`, `csplat unit_metres U`, `csplat licence TEXT` | as in `SplatModel` |
-| `csplat training {JSON}`, `csplat view {JSON}` | the training (`csplat.training_record`) and the initial view |
+| `csplat up X Y Z`, `csplat unit_metres U`, `csplat licence TEXT` | as in `SceneMetadata` |
+| `csplat training {JSON}`, `csplat view {JSON}` | the training (`TrainingRecord`) and the initial view |
 | `SplatRenderMode: mip`, `SplatRenderMode: 2dgs` | antialiased, flat; also used by other programs |
 """
 
@@ -23,11 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.disk_files import parse_json
-from csplat.editing.up_axis import UP, unit_up, up_of
 from csplat.errors import InputError
 from csplat.lint import Finding
-from csplat.model import UNSPECIFIED, SplatModel
-from csplat.training_record import TRAINING, VIEW, TrainingRecord
+from csplat.scene_metadata import LICENCE, TRAINING, UNSPECIFIED, UP, VIEW, SceneMetadata, TrainingRecord, unit_up
 from csplat.types import F32, F64
 
 _PREFIX = "csplat"
@@ -49,31 +47,21 @@ _MODES: dict[tuple[str, ...], str] = {
 _NEAR_SPREADS = 16.0
 
 
-@dataclass
+@dataclass(frozen=True)
 class CommentMetadata:
     """Scene metadata from header comments, with defaults.
 
     Attributes:
         origin: origin of the scene; `None` if no comment specifies one.
         origin_is_added: True if x, y and z in the file are absolute, that is, include the origin.
-        coordinate_system, unit_metres, antialiased, flat: as in `SplatModel`.
-        metadata: `comments` (lines that csplat does not interpret), `licence`, `training`, `up`, `view`.
+        metadata: the scene's metadata; comments that csplat does not interpret are its `comments`.
         findings: findings about the comments of other programs.
     """
 
     origin: tuple[float, float, float] | None = None
     origin_is_added: bool = False
-    coordinate_system: str = UNSPECIFIED
-    unit_metres: float | None = None
-    antialiased: bool = False
-    flat: bool = False
-    metadata: dict[str, Any] = field(default_factory=dict)
-    findings: list[Finding] = field(default_factory=list)
-
-    def fields(self) -> dict[str, Any]:
-        """Return the fields of a `SplatModel` other than the origin."""
-        names = ("coordinate_system", "unit_metres", "antialiased", "flat", "metadata")
-        return {name: getattr(self, name) for name in names}
+    metadata: SceneMetadata = field(default_factory=SceneMetadata)
+    findings: tuple[Finding, ...] = ()
 
 
 def parse_comments(comments: Sequence[str]) -> CommentMetadata:
@@ -83,7 +71,8 @@ def parse_comments(comments: Sequence[str]) -> CommentMetadata:
         InputError: the value of a csplat comment is invalid. It is not ignored, because a wrong origin would move the
             scene and a wrong background would invalidate comparisons.
     """
-    metadata = CommentMetadata()
+    fields: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     others: list[str] = []
     vertical: list[str] = []
     by_brush = any(comment.strip().lower() == _BRUSH for comment in comments)
@@ -91,56 +80,54 @@ def parse_comments(comments: Sequence[str]) -> CommentMetadata:
         words = comment.split()
         mode = _MODES.get(tuple(comment.lower().split()))
         if words[:2] == [_PREFIX, TRAINING]:
-            metadata.metadata[TRAINING] = _training(comment).as_json()
+            entries[TRAINING] = _training(comment).as_json()
         elif words[:2] == [_PREFIX, VIEW]:
-            metadata.metadata[VIEW] = _view(comment)
+            entries[VIEW] = _view(comment)
         elif mode is not None:
-            metadata.antialiased |= mode == "antialiased"
-            metadata.flat |= mode == "flat"
+            fields |= {mode: True} if mode else {}
         elif _VERTICAL_AXIS.fullmatch(comment.strip()) and not by_brush:
             vertical.append(comment.strip())
-        elif words[:1] != [_PREFIX] or len(words) < 2 or not _set_field(metadata, words[1], words[2:]):
+        elif words[:1] != [_PREFIX] or len(words) < 2 or not _set_field(fields, entries, words[1], words[2:]):
             others.append(comment)
-    others += _set_vertical_axis(metadata, vertical)
-    if others:
-        metadata.metadata["comments"] = others
-    return metadata
+    origin, origin_is_added = fields.pop("origin", None), fields.pop("origin_is_added", False)
+    metadata = SceneMetadata(**fields, entries=entries)
+    metadata, ignored, findings = _with_vertical_axis(metadata, vertical)
+    if others or ignored:
+        metadata = metadata.with_entries(comments=[*others, *ignored])
+    return CommentMetadata(origin, origin_is_added, metadata, findings)
 
 
-def format_comments(model: SplatModel, *, absolute: bool) -> list[str]:
-    """Format the metadata of a model as comment lines, without the word `comment`.
+def format_comments(metadata: SceneMetadata, origin: Sequence[float], *, absolute: bool) -> list[str]:
+    """Format metadata as comment lines, without the word `comment`.
 
     Args:
-        model: the scene.
+        metadata, origin: metadata and origin of the scene.
         absolute: positions are written with the origin added.
 
     Returns:
         ASCII lines, without lines for defaults; other characters become question marks.
     """
-    lines = [line for one in _strings(model.metadata.get("comments")) for line in one.splitlines()]
-    if absolute or any(model.origin):
+    lines = [line for comment in metadata.comments for line in comment.splitlines()]
+    if absolute or any(origin):
         key = "absolute_origin" if absolute else "origin"
-        lines.append(f"{_PREFIX} {key} {' '.join(repr(value) for value in model.origin)}")
-    if model.coordinate_system != UNSPECIFIED:
-        lines.append(f"{_PREFIX} coordinate_system {model.coordinate_system}")
-    up = up_of(model.metadata)
-    if up is not None:
-        lines.append(f"{_PREFIX} {UP} {' '.join(repr(value) for value in up)}")
-    if model.unit_metres is not None:
-        lines.append(f"{_PREFIX} unit_metres {model.unit_metres!r}")
-    if model.flat:
+        lines.append(f"{_PREFIX} {key} {' '.join(repr(value) for value in origin)}")
+    if metadata.coordinate_system != UNSPECIFIED:
+        lines.append(f"{_PREFIX} coordinate_system {metadata.coordinate_system}")
+    if metadata.stated_up is not None:
+        lines.append(f"{_PREFIX} {UP} {' '.join(repr(value) for value in metadata.stated_up)}")
+    if metadata.unit_metres is not None:
+        lines.append(f"{_PREFIX} unit_metres {metadata.unit_metres!r}")
+    if metadata.flat:
         lines.append("SplatRenderMode: 2dgs")
-    if model.antialiased:
+    if metadata.antialiased:
         lines.append("SplatRenderMode: mip")
-    licence = model.metadata.get("licence")
-    if isinstance(licence, str):
-        lines.append(f"{_PREFIX} licence {' '.join(licence.split())}")
-    view = model.metadata.get(VIEW)
+    if metadata.licence is not None:
+        lines.append(f"{_PREFIX} {LICENCE} {' '.join(metadata.licence.split())}")
+    view = metadata.entries.get(VIEW)
     if isinstance(view, dict) and _is_json(view):
         lines.append(f"{_PREFIX} {VIEW} {json.dumps(view)}")
-    trained = TrainingRecord.of(model.metadata)
-    if trained is not None:
-        lines.append(f"{_PREFIX} {TRAINING} {json.dumps(trained.as_json())}")
+    if metadata.training is not None:
+        lines.append(f"{_PREFIX} {TRAINING} {json.dumps(metadata.training.as_json())}")
     return [line.encode("ascii", "replace").decode("ascii") for line in lines]
 
 
@@ -170,46 +157,42 @@ def split_origin(means: NDArray[Any], metadata: CommentMetadata) -> tuple[F32, t
         return rounded, origin, None if exact else positions
 
 
-def _set_vertical_axis(metadata: CommentMetadata, comments: Sequence[str]) -> Sequence[str]:
-    """Set the up direction from comments on the vertical axis unless it is known; return the comments to keep."""
+def _with_vertical_axis(
+    metadata: SceneMetadata, comments: Sequence[str]
+) -> tuple[SceneMetadata, Sequence[str], tuple[Finding, ...]]:
+    """Add the up direction from comments on the vertical axis unless it is known; also return the comments to keep."""
     if not comments:
-        return ()
+        return metadata, (), ()
     directions = set()
     for comment in comments:
-        found = _VERTICAL_AXIS.fullmatch(comment)
-        assert found is not None, "it was matched before"
-        sign, axis = found.groups()
-        directions.add(tuple((-1.0 if sign == "-" else 1.0) * (axis.lower() == one) + 0.0 for one in "xyz"))
+        match = _VERTICAL_AXIS.fullmatch(comment)
+        assert match is not None, "it was matched before"
+        sign, axis = match.groups()
+        directions.add(tuple((-1.0 if sign == "-" else 1.0) * (axis.lower() == name) + 0.0 for name in "xyz"))
     if len(directions) > 1:
         text = f"the comments {' and '.join(map(repr, comments))} contradict each other: ignored"
-        metadata.findings.append(Finding("vertical-axis", len(comments), text, "note"))
-        return comments
-    stated = up_of(metadata.metadata, metadata.coordinate_system)
-    if stated is not None:
-        return () if stated == directions.pop() else comments
-    metadata.metadata[UP] = list(directions.pop())
+        return metadata, comments, (Finding("vertical-axis", len(comments), text, "note"),)
+    direction = directions.pop()
+    if metadata.up is not None:
+        return metadata, () if metadata.up == direction else comments, ()
     text = f"the comment {comments[0]!r} specifies the up axis"
-    metadata.findings.append(Finding("vertical-axis", 1, text, "note"))
-    return ()
+    return metadata.with_entries(up=list(direction)), (), (Finding("vertical-axis", 1, text, "note"),)
 
 
-def _set_field(metadata: CommentMetadata, key: str, values: Sequence[str]) -> bool:
-    """Set the field of a csplat comment; return False if its key is unknown."""
+def _set_field(fields: dict[str, Any], entries: dict[str, Any], key: str, values: Sequence[str]) -> bool:
+    """Set the field or entry of a csplat comment; return False if its key is unknown."""
     if key in ("origin", "absolute_origin"):
-        x, y, z = _numbers(key, values, 3)
-        metadata.origin, metadata.origin_is_added = (x, y, z), key == "absolute_origin"
+        fields |= {"origin": tuple(_numbers(key, values, 3)), "origin_is_added": key == "absolute_origin"}
     elif key == "coordinate_system" and len(values) == 1:
-        metadata.coordinate_system = values[0]
+        fields[key] = values[0]
     elif key == UP:
-        metadata.metadata[UP] = _up(values)
+        entries[UP] = _up(values)
     elif key == "unit_metres":
-        (metadata.unit_metres,) = _numbers(key, values, 1)
-    elif key == "antialiased" and not values:
-        metadata.antialiased = True
-    elif key == "flat" and not values:
-        metadata.flat = True
-    elif key == "licence" and values:
-        metadata.metadata["licence"] = " ".join(values)
+        (fields[key],) = _numbers(key, values, 1)
+    elif key in ("antialiased", "flat") and not values:
+        fields[key] = True
+    elif key == LICENCE and values:
+        entries[LICENCE] = " ".join(values)
     else:
         return False
     return True
@@ -268,10 +251,6 @@ def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
         line = " ".join((_PREFIX, key, *values))
         raise InputError(f"the header comment {line[:_SHOWN]!r} does not contain {count} finite numbers")
     return numbers
-
-
-def _strings(value: object) -> list[str]:
-    return [one for one in value if isinstance(one, str)] if isinstance(value, list) else []
 
 
 def _choose_origin(positions: F64) -> tuple[float, float, float]:

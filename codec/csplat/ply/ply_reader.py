@@ -13,7 +13,7 @@ import textwrap
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import islice
 from pathlib import Path
@@ -49,7 +49,7 @@ from csplat.ply.ply_header import (
     truncated_finding,
 )
 from csplat.ply.ply_rows import is_list, lines_without_lists, row_type, skip_lists
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.types import F32, F64
 
 _EMPTY = Finding("empty", 0, "the file contains no splats", "note")
@@ -92,7 +92,7 @@ def read_ply(
 
     Examples:
         >>> import csplat
-        >>> model = csplat.read_ply("scene.ply")
+        >>> model = csplat.read("scene.ply")
         >>> model
         SplatModel(1000 splats, sh_degree=3)
         >>> model.scales.shape, model.scales.dtype  # natural logarithms
@@ -143,8 +143,8 @@ def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
 
 
 @contextmanager
-def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
-    """Open a PLY to read it block by block (`csplat.formats.open_scene`); otherwise as `read_ply`.
+def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
+    """Open a PLY to read it block by block (`csplat.open`); otherwise as `read_ply`.
 
     A first pass determines values that depend on all splats: the number of splats that are kept, the origin of doubles,
     and the thickness of discs.
@@ -155,8 +155,8 @@ def open_ply(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
     assert ply is not None, "only an error leaves no rows"
     survey = _survey(ply, findings)
     refuse(findings, strict=False)
-    metadata = _empty_model(ply, survey)
-    yield SceneSource(survey.kept_count, metadata, partial(_model_blocks, ply, survey, keep_extra=True), findings)
+    blocks = partial(_model_blocks, ply, survey, keep_extra=True)
+    yield Scene.like(_empty_model(ply, survey), survey.kept_count, blocks, findings)
 
 
 class PlyContent(NamedTuple):
@@ -258,7 +258,7 @@ class _OpenPly:
     path: Path
     rows: Rows
     columns: ColumnMap
-    metadata: CommentMetadata
+    comments: CommentMetadata
 
     def blocks(self, max_rows: int | None = None) -> Iterator[Rows]:
         return _row_blocks(self.path, self.rows, max_rows)
@@ -302,7 +302,7 @@ def _load(
     findings += list_findings(statistics, len(ply.rows))
     if len(ply.rows) == 0:
         findings.append(_EMPTY)
-    positions = split_origin(arrays.means, ply.metadata)
+    positions = split_origin(arrays.means, ply.comments)
     if ply.columns.double:
         findings.append(_doubles_finding(ply, len(arrays.means), positions[1]))
     return _build_model(arrays, positions, ply)
@@ -337,7 +337,7 @@ def _survey(ply: _OpenPly, findings: list[Finding]) -> _Survey:
     findings += list_findings(statistics, len(ply.rows))
     if not ply.columns.double:
         return _Survey(kept_count, thinnest, None)
-    positions = split_origin(np.concatenate([np.zeros((0, 3)), *means]), ply.metadata)
+    positions = split_origin(np.concatenate([np.zeros((0, 3)), *means]), ply.comments)
     findings.append(_doubles_finding(ply, kept_count, positions[1]))
     return _Survey(kept_count, thinnest, positions)
 
@@ -345,7 +345,7 @@ def _survey(ply: _OpenPly, findings: list[Finding]) -> _Survey:
 def _empty_model(ply: _OpenPly, survey: _Survey) -> SplatModel:
     """Return a model with the metadata and no splats."""
     arrays = gather_arrays([], 0, ply.rows.dtype, ply.columns, keep_extra=True)
-    means, origin, doubles = split_origin(arrays.means, ply.metadata)
+    means, origin, doubles = split_origin(arrays.means, ply.comments)
     if survey.positions is not None:
         origin, doubles = survey.positions[1], None
     return _build_model(arrays, (means, origin, doubles), ply)
@@ -360,7 +360,7 @@ def _model_blocks(ply: _OpenPly, survey: _Survey, *, keep_extra: bool) -> Iterat
         )
         part = slice(start, start + len(arrays.means))
         if survey.positions is None:
-            positions = split_origin(arrays.means, ply.metadata)
+            positions = split_origin(arrays.means, ply.comments)
         else:
             means, origin, doubles = survey.positions
             positions = means[part], origin, None if doubles is None else doubles[part]
@@ -376,7 +376,7 @@ def _doubles_finding(ply: _OpenPly, count: int, origin: tuple[float, float, floa
 
 
 def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) -> SplatModel:
-    means, origin, doubles = positions
+    (means, origin, doubles), metadata = positions, ply.comments.metadata
     return SplatModel(
         means=means,
         quats=arrays.quats,
@@ -385,7 +385,7 @@ def _build_model(arrays: AttributeArrays, positions: _Positions, ply: _OpenPly) 
         sh0=arrays.sh0,
         shN=arrays.shN,
         origin=origin,
-        **{**ply.metadata.fields(), "flat": ply.metadata.flat or len(ply.columns.scales) == 2},
+        metadata=replace(metadata, flat=True) if len(ply.columns.scales) == 2 else metadata,
         extra=arrays.extra,
         means_double=doubles,
     )

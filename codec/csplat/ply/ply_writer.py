@@ -13,7 +13,7 @@ from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
 from csplat.ply.columns import logits_of_alpha
 from csplat.ply.comments import format_comments
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
 
 _BLOCK_SIZE = 1 << 20  # bytes of rows that are built at a time; they fit in the cache
 
@@ -43,7 +43,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
 
     Examples:
         >>> import csplat
-        >>> model = csplat.read_ply("scene.ply")
+        >>> model = csplat.read("scene.ply")
         >>> csplat.write_ply("half.ply", model.select(slice(0, None, 2)))
 
     Raises:
@@ -51,15 +51,15 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
         OSError: the file cannot be written.
     """
     check_model("write_ply", model)
-    write_scene_ply(file, SceneSource(len(model), model.select(slice(0, 0)), lambda: iter([model])), absolute=absolute)
+    write_scene_ply(file, Scene.like(model, len(model), lambda: iter([model])), absolute=absolute)
 
 
-def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: SceneSource, *, absolute: bool = False) -> None:
+def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: Scene, *, absolute: bool = False) -> None:
     """Write a scene block by block; arguments are those of `write_ply`."""
-    dtype = _row_dtype(scene.metadata_model, absolute=absolute)
+    dtype = _row_dtype(scene, absolute=absolute)
     step = max(1, _BLOCK_SIZE // dtype.itemsize)
     with open_writer(file) as stream:
-        stream.write(_header(scene.metadata_model, scene.count, absolute=absolute))
+        stream.write(_header(scene, absolute=absolute))
         rows = np.zeros(min(step, scene.count), dtype)
         for model in scene.blocks():
             for start in range(0, len(model), step):
@@ -69,8 +69,8 @@ def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: SceneSou
                 stream.write(block.view(np.uint8).data)
 
 
-def _row_dtype(model: SplatModel, *, absolute: bool) -> np.dtype[Any]:
-    coefficients = model.shN.shape[1]
+def _row_dtype(scene: Scene, *, absolute: bool) -> np.dtype[Any]:
+    coefficients = (scene.sh_degree + 1) ** 2 - 1
     return np.dtype(
         [
             ("means", "<f8" if absolute else "<f4", 3),
@@ -80,26 +80,26 @@ def _row_dtype(model: SplatModel, *, absolute: bool) -> np.dtype[Any]:
             ("logits", "<f4"),
             ("scales", "<f4", 3),
             ("quats", "<f4", 4),
-            *((f"extra {name}", column.dtype.newbyteorder("<")) for name, column in model.extra.items()),
+            *((f"extra {name}", dtype.newbyteorder("<")) for name, dtype in scene.extra.items()),
         ]
     )
 
 
-def _header(model: SplatModel, count: int, *, absolute: bool) -> bytes:
+def _header(scene: Scene, *, absolute: bool) -> bytes:
     # Comments come last because SIBR's viewer expects the element on the third line.
     position = "double" if absolute else "float"
-    rest_count = 3 * model.shN.shape[1]
+    rest_count = 3 * ((scene.sh_degree + 1) ** 2 - 1)
     floats = ["nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     floats += [f"f_rest_{index}" for index in range(rest_count)]
     floats += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {scene.count}"]
     lines += [f"property {position} {name}" for name in ("x", "y", "z")]
     lines += [f"property float {name}" for name in floats]
-    for name, column in model.extra.items():
+    for name, dtype in scene.extra.items():
         if name in {"x", "y", "z", *floats}:
             raise InputError(f"extra column {name!r} has the name of a splat attribute in a PLY")
-        lines.append(f"property {_ply_type(name, column.dtype)} {name}")
-    lines += [f"comment {line}" for line in format_comments(model, absolute=absolute)]
+        lines.append(f"property {_ply_type(name, dtype)} {name}")
+    lines += [f"comment {line}" for line in format_comments(scene.metadata, scene.origin, absolute=absolute)]
     return "\n".join([*lines, "end_header\n"]).encode("ascii")
 
 

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.decoder import DeclaredBounds, SceneHeader, TileReader
+from csplat.decoder import DeclaredBounds, SceneHeader
 from csplat.disk_files import finite_or_none
 from csplat.model import SplatModel
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
+from csplat.splat_file import SplatFile
 from csplat.types import I64, Progress
 from csplat_conformance.declared_bounds.measurement import (
     PairErrors,
@@ -174,8 +175,8 @@ def verify_bounds(
 
 
 def verify_bounds_by_tile(
-    scene: SceneSource,
-    opened: TileReader,
+    scene: Scene,
+    opened: SplatFile,
     source_index: NDArray[Any],
     splats_max: int,
     *,
@@ -185,8 +186,8 @@ def verify_bounds_by_tile(
 
     The arguments and errors are those of `measure_pairs_by_tile`.
     """
-    names = measure_names(scene.metadata_model, opened.metadata_model)
-    degree = scene.metadata_model.sh_degree
+    names = measure_names(scene.empty(), opened.empty())
+    degree = scene.sh_degree
     claims = _read_claims(names, scene.count, degree, opened.header, opened.declared_bounds)
     if claims.wrong:
         return _outcome(claims)

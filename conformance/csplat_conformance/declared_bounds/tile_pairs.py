@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat.decoder import SceneHeader, Tile, TileReader
-from csplat.scene_source import BLOCK_SPLATS, SceneSource, with_progress
+from csplat.decoder import SceneHeader, Tile
+from csplat.scene import BLOCK_SPLATS, Scene
+from csplat.splat_file import SplatFile
 from csplat.types import Progress, null_progress
 from csplat_conformance.declared_bounds.measurement import (
     PairErrors,
@@ -30,7 +31,7 @@ _SPLAT_BYTES = 80  # bytes per source splat in addition to its arrays: keys, ord
 _BASE_BYTES = 200_000_000  # bytes of the program, of blocks of the source, and of tiles during decoding
 
 
-def comparison_bytes(opened: TileReader, source_count: int, source_bytes: int) -> int:
+def comparison_bytes(opened: SplatFile, source_count: int, source_bytes: int) -> int:
     """Estimate the memory in which a file and its source can be compared as a whole, bytes.
 
     Args:
@@ -40,25 +41,22 @@ def comparison_bytes(opened: TileReader, source_count: int, source_bytes: int) -
     """
     splat_bytes = _COMPARE_FACTOR * _splat_bytes(opened)
     source = max(source_count * (splat_bytes + _SPLAT_BYTES), source_bytes)
-    return int(source + opened.header.splat_count * splat_bytes)
+    return int(source + opened.count * splat_bytes)
 
 
-def splats_in_memory(opened: TileReader, memory_bytes: int) -> int:
+def splats_in_memory(opened: SplatFile, memory_bytes: int) -> int:
     """Return how many source splats `measure_pairs_by_tile` may hold at once within a limit of the memory."""
     row_bytes = _COMPARE_FACTOR * _splat_bytes(opened) + _SPLAT_BYTES
     return max(BLOCK_SPLATS, int((memory_bytes - _BASE_BYTES) / row_bytes))
 
 
-def _splat_bytes(opened: TileReader) -> int:
-    metadata_model = opened.metadata_model
-    return 4 * (11 + 3 * (metadata_model.sh_degree + 1) ** 2) + sum(
-        column.itemsize for column in metadata_model.extra.values()
-    )
+def _splat_bytes(opened: SplatFile) -> int:
+    return 4 * (11 + 3 * (opened.sh_degree + 1) ** 2) + sum(dtype.itemsize for dtype in opened.extra.values())
 
 
 def measure_pairs_by_tile(
-    scene: SceneSource,
-    opened: TileReader,
+    scene: Scene,
+    opened: SplatFile,
     source_index: NDArray[Any],
     splats_max: int,
     *,
@@ -78,8 +76,8 @@ def measure_pairs_by_tile(
             source is incomplete.
         OSError: a file cannot be read.
     """
-    check_source_index(source_index, scene.count, opened.header.splat_count)
-    names = [name for name in opened.metadata_model.extra if name in scene.metadata_model.extra]
+    check_source_index(source_index, scene.count, opened.count)
+    names = [name for name in opened.extra if name in scene.extra]
     groups = list(_groups(opened.header, splats_max)) or [[]]
     parts, lines, reach = [], {}, 0.0
     for number, tiles in enumerate(groups):
@@ -88,16 +86,16 @@ def measure_pairs_by_tile(
         rows = source_index[start : start + sum(tile.splat_count for tile in tiles)]
         order = np.argsort(rows)
         ascending, found = rows[order], []
-        for place, model in with_progress(scene, "measuring splats", report).numbered():
+        for place, model in scene.with_progress("measuring splats", report).numbered():
             block = Source.of(model)
-            reach = max(reach, block.reach(opened.metadata_model.origin))
+            reach = max(reach, block.reach(opened.origin))
             first, end = np.searchsorted(ascending, (place.start, place.stop))
             block = replace(block, extra={name: block.extra[name] for name in names})
             found.append(block.select(ascending[first:end] - place.start))
-        source = Source.concatenate(found) if found else Source.of(scene.metadata_model)
+        source = Source.concatenate(found) if found else Source.of(scene.empty())
         positions = np.empty(len(order), np.int64)
         positions[order] = np.arange(len(order))
-        models = opened.models([tile.index for tile in tiles]) if tiles else [opened.metadata_model]
+        models = opened.models([tile.index for tile in tiles]) if tiles else [opened.empty()]
         for decoded in models:
             own, positions = np.split(positions, [len(decoded)])
             parts.append((start, len(decoded), measure_pairs(source, decoded, own)))

@@ -13,7 +13,8 @@ from csplat import _spec
 from csplat.decoder import DecodedScene, decode_scene
 from csplat.disk_files import read_array
 from csplat.errors import CsplatError, InputError
-from csplat.model import UNSPECIFIED, SplatModel
+from csplat.model import SplatModel
+from csplat.scene_metadata import UNSPECIFIED
 from csplat.types import F64, I64
 from csplat_conformance.conformance_report import Status
 from csplat_conformance.declared_bounds import Source, check_source_index, find_wrong_extras
@@ -115,10 +116,10 @@ def _wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> lis
 def _wrong_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
     """Return metadata that the encoder guessed, because a PLY does not specify axes, unit and filters."""
     facts = {
-        "axes": (decoded.coordinate_system, UNSPECIFIED),
-        "unit_metres": (decoded.unit_metres, None),
-        "antialiased": (decoded.antialiased, False),
-        "flat": (decoded.flat, False),
+        "axes": (decoded.metadata.coordinate_system, UNSPECIFIED),
+        "unit_metres": (decoded.metadata.unit_metres, None),
+        "antialiased": (decoded.metadata.antialiased, False),
+        "flat": (decoded.metadata.flat, False),
     }
     wrong = [
         ("SRC-3", f"{name} is {found}, but the source does not specify it")

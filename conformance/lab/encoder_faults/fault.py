@@ -15,6 +15,7 @@ import numpy as np
 import plyfile
 
 import csplat
+from csplat import ply as plys
 from csplat.encoder.error_bounds import ErrorSums, distance_errors, measured_sums
 
 PLAIN, DEGREE_2, DEGREE_3 = "ordinary/degree_1", "ordinary/degree_2", "ordinary/degree_3"
@@ -164,7 +165,7 @@ def change_header(change):
 # Scenes to measure errors against -------------------------------------------------------------------
 def as_read(ply):
     """Read a scene with our reader: alpha and unit quaternions in float32."""
-    return csplat.read_ply(ply)
+    return plys.read_ply(ply)
 
 
 def in_binary64(ply):

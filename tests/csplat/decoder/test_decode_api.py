@@ -19,6 +19,7 @@ from damage_cases import BUILT, RICH, SMALL, flipped, stated
 from csplat import SplatModel, _spec
 from csplat.decoder import decode, decode_integers, decode_scene, iter_tiles, read_header, read_metadata
 from csplat.errors import CsplatError, FormatError, InputError, LimitError, UnsupportedError
+from csplat.scene_metadata import SceneMetadata
 from csplat_authoring.builder import build, chunk_records, repair
 from csplat_authoring.reference import expected
 from csplat_authoring.samples import (
@@ -142,7 +143,7 @@ def test_morton_codes_of_any_width_and_the_largest_corners_and_axes_are_decoded(
 def test_the_model_passes_its_own_constructor_and_checks_are_reported():
     model = decode(RICH)
     SplatModel(**vars(model))
-    assert {"title": "rich"} == model.metadata
+    assert {"title": "rich"} == model.metadata.entries
     assert [5, 0, 65535, 1, 2] == model.extra["label"].tolist()
     assert np.dtype("<u2") == model.extra["label"].dtype
     assert "all_chunk_crcs" in decode_scene(RICH).checks
@@ -207,7 +208,7 @@ def test_the_header_is_read_from_the_first_bytes():
 
 def test_an_unknown_chunk_is_skipped_and_its_crc_checked():
     built = build(scene(0, chunks=(Chunk(b"zzzz", payload=b"anything", flags=0),)))
-    assert read_metadata(built.data) is None
+    assert SceneMetadata() == read_metadata(built.data)
     decode(built.data)
     offset_, size = next(span for name, span in built.spans.items() if "zzzz" in name)
     data = bytearray(built.data)

@@ -7,9 +7,10 @@ from damage_cases import stated
 from tables import failures
 
 from csplat import _spec
-from csplat.decoder import decode, decode_scene, read_cameras, read_declared_bounds, read_metadata, read_options
+from csplat.decoder import decode, decode_scene, read_declared_bounds, read_metadata, read_options
 from csplat.decoder.metadata import parse_json
 from csplat.errors import FormatError
+from csplat.scene_metadata import SceneMetadata
 from csplat_authoring.builder import build
 from csplat_authoring.samples import scene
 from csplat_authoring.scene import Chunk
@@ -47,8 +48,7 @@ def test_the_three_json_texts_are_read():
     }
     data = build(scene(chunks=tuple(Chunk(*one) for one in texts.items()))).data
     model = decode(data)
-    assert ({"licence": "CC0"}, [{"W": 2}]) == (model.metadata, model.cameras)
-    assert ({"licence": "CC0"}, [{"W": 2}]) == (read_metadata(data), read_cameras(data))
+    assert SceneMetadata(entries={"licence": "CC0"}, cameras=[{"W": 2}]) == model.metadata == read_metadata(data)
     assert {"preset": "small"} == read_options(data) == decode_scene(data).options
     assert read_declared_bounds(data) is None
 

@@ -9,13 +9,15 @@ import pytest
 from checked import cloud
 from damage_cases import flipped
 from editing_cases import STEPS, box_of, extract, merge
+from models import with_facts
 from tables import failures
 
 import csplat
 import csplat_conformance
-from csplat import EncodeOptions, FormatError, InputError, _spec, decode, encode, read_header, read_ply
+from csplat import EncodeOptions, FormatError, InputError, _spec, decode, encode, read_header
 from csplat.decoder import read_declared_bounds, read_metadata, read_options
 from csplat.decoder.tiles import codebook_references
+from csplat.ply import read_ply
 from csplat_conformance.validator import validate
 
 VECTORS = Path(csplat_conformance.__file__).parent / "vectors" / "valid"
@@ -54,7 +56,7 @@ def test_a_part_has_the_tiles_that_touch_the_box_bit_for_bit(data):
 def test_a_part_keeps_the_metadata_but_no_declared_errors(data):
     part = extract(data, ALL)[1]
     assert read_metadata(data) == read_metadata(part)
-    assert decode(data).cameras == decode(part).cameras
+    assert decode(data).metadata.cameras == decode(part).metadata.cameras
     assert read_declared_bounds(data) is not None
     assert read_declared_bounds(part) is None
     assert read_options(part) is None
@@ -188,7 +190,7 @@ def test_parts_of_a_file_share_their_codebooks_again(sample):
     assert not done.why
     assert read_header(whole).codebooks == read_header(data).codebooks != ()
     assert read_metadata(whole) == read_metadata(data)
-    assert decode(whole).cameras == decode(data).cameras
+    assert decode(whole).metadata.cameras == decode(data).metadata.cameras
     assert_joined([decode(part) for part in parts], decode(data))
 
 
@@ -215,13 +217,13 @@ def check_references(path):
 def test_merging_fills_in_metadata_and_drops_contradictions(make_model):
     options = EncodeOptions(preset="fast", **STEPS)
     models = [make_model(40, 1), make_model(50, 1, coordinate_system="RDF", unit_metres=2.0)]
-    models[0] = replace(models[0], metadata={"licence": "CC0-1.0", "only": 1, "up": [0, -1, 0]})
-    models[1] = replace(models[1], metadata={"licence": "CC0-1.0", "up": [0, -0.8, 0.6]}, cameras=[])
+    models[0] = with_facts(models[0], entries={"licence": "CC0-1.0", "only": 1, "up": [0, -1, 0]})
+    models[1] = with_facts(models[1], entries={"licence": "CC0-1.0", "up": [0, -0.8, 0.6]}, cameras=[])
     done, data = merge(*(encode(model, options) for model in models))
     assert not done.why
     header = read_header(data)
     assert ("RDF", 2.0) == (header.coordinate_system, header.unit_metres)
-    assert {"licence": "CC0-1.0"} == read_metadata(data)
+    assert {"licence": "CC0-1.0"} == read_metadata(data).entries
     starts = ("file 1 without axes: RDF is", "file 1 without a unit: 2 m is", "metadata left out, ")
     assert all(note.startswith(start) for note, start in zip(done.notes, starts, strict=True))
     assert "only, up" in done.notes[2]
@@ -272,8 +274,8 @@ CONTRADICTIONS = [
     (({"coordinate_system": "RDF"}, {"coordinate_system": "RUB"}), "axes cannot be merged: RDF in .*a, RUB in .*b"),
     (({}, {"coordinate_system": "RUB"}), "none, for which RDF is assumed, in .*a, RUB in .*b: turn one with"),
     (({"coordinate_system": "LUF"}, {}), "axes cannot be merged: LUF in .*a, none, for which RDF is assumed, in .*b"),
-    (({"metadata": {"up": [0, 0, 1]}}, {"metadata": {"up": [0, 1, 0]}}), "up direct.*: 0,0,1 in .*a, 0,1,0 in .*b"),
-    (({"coordinate_system": "RDF"}, {"metadata": {"up": [0, 1, 0]}}), "up directions cannot be merged: 0,-1,0 in .*a"),
+    (({"entries": {"up": [0, 0, 1]}}, {"entries": {"up": [0, 1, 0]}}), "up direct.*: 0,0,1 in .*a, 0,1,0 in .*b"),
+    (({"coordinate_system": "RDF"}, {"entries": {"up": [0, 1, 0]}}), "up directions cannot be merged: 0,-1,0 in .*a"),
     (({"unit_metres": 1.0}, {"unit_metres": 0.01}), "units cannot be merged: 1.0 in .*a, 0.01 in .*b"),
     (({"antialiased": True}, {}), "antialiasing cannot be merged: yes in .*a, no in .*b"),
     (({}, {"flat": True}), "flatness cannot be merged: no in .*a, yes in .*b"),

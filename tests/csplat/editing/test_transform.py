@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from checked import cloud, covariances, sh_by_definition
 
-from csplat import decode, encode, read_ply, write_ply
+from csplat import decode, encode, write_ply
 from csplat.editing.transform import (
     axes_rotation,
     convert_axes,
@@ -18,9 +18,9 @@ from csplat.editing.transform import (
     stretch_scene,
     translate_scene,
 )
-from csplat.editing.up_axis import up_of
 from csplat.errors import InputError
-from csplat.scene_source import source_from_model
+from csplat.ply import read_ply
+from csplat.scene import Scene
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_paths import orbit_cameras
 from csplat_render.up_estimate import estimate_up, with_estimated_up
@@ -34,13 +34,13 @@ for name in ("numba", "scipy", "PIL"):
 
 def test_up_survives_ply_and_csplat_files_unless_it_is_invalid(tmp_path, make_model):
     path, up = tmp_path / "a.ply", {"up": [0.0, -0.995037, 0.099504]}
-    write_ply(path, make_model(metadata={"up": [0, -1, 0.1]}))
+    write_ply(path, make_model(entries={"up": [0, -1, 0.1]}))
     data = path.read_bytes()
     first = decode(encode(read_ply(path)))
     write_ply(path, first)
-    assert up == first.metadata == decode(encode(read_ply(path))).metadata
-    write_ply(path, make_model(metadata={"up": "there"}))
-    assert {} == read_ply(path).metadata
+    assert up == first.metadata.entries == decode(encode(read_ply(path))).metadata.entries
+    write_ply(path, make_model(entries={"up": "there"}))
+    assert {} == read_ply(path).metadata.entries
     for words in (b"", b"0 0 0", b"1 2", b"nan 0 1", b"x y z"):
         with pytest.raises(InputError, match="csplat up"):
             read_ply(data.replace(b"\ncomment csplat up 0.0 -0.995037 0.099504\n", b"\ncomment csplat up %s\n" % words))
@@ -59,7 +59,7 @@ def photographed_from(up, **fields):
 @pytest.mark.slow
 def test_an_object_was_photographed_from_above():
     for up in ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)):
-        assert list(up) == with_estimated_up(photographed_from(up)).metadata["up"]  # what `estimate_up` returns
+        assert list(up) == with_estimated_up(photographed_from(up)).metadata.entries["up"]  # what `estimate_up` returns
         assert up == parse_up(up_word(up))
 
 
@@ -68,7 +68,7 @@ def test_no_up_is_estimated_without_evidence_or_if_one_is_recorded():
     for up in ((0, 0, 0), (0.6, 0.6, 0.6)):  # seen from all sides; between the axes
         assert estimate_up(photographed_from(up)) is None
     assert estimate_up(photographed_from((0, 0, 1)).select(np.arange(0))) is None
-    for fields in ({"metadata": {"up": [1, 0, 0]}}, {"coordinate_system": "RDF"}):
+    for fields in ({"entries": {"up": [1, 0, 0]}}, {"coordinate_system": "RDF"}):
         model = photographed_from((0, 0, 1), **fields)
         assert estimate_up(model) is None
         assert with_estimated_up(model) is model
@@ -83,7 +83,7 @@ def test_renders_for_display_are_upright_and_test_views_do_not_move():
         assert abs(camera.viewmat[0, 1]) < 1e-6
         assert camera.viewmat[1, 1] < 0.0  # down the picture
     assert all(camera.viewmat[1, 1] > 0.0 for camera in views.test)  # -y is up, as in a PLY without metadata
-    assert "up" not in decode(encode(model)).metadata  # nor is an estimate recorded
+    assert "up" not in decode(encode(model)).metadata.entries  # nor is an estimate recorded
 
 
 @pytest.mark.parametrize(("name", "up"), [("donut", (0, 0, 1)), ("horse", None)])
@@ -190,43 +190,43 @@ def test_changing_axes_and_back_is_exact(make_model, degree):
 
 
 def test_axis_letters_up_and_cameras_follow_a_rotation(make_model):
-    model = make_model(3, 0, coordinate_system="RDF", cameras=[CAMERA], metadata={"view": CAMERA, "up": [0, 0, 1]})
-    assert "LUF" == rotate_scene(model, axes_rotation("RDF", "LUF")).coordinate_system
+    model = make_model(3, 0, coordinate_system="RDF", cameras=[CAMERA], entries={"view": CAMERA, "up": [0, 0, 1]})
+    assert "LUF" == rotate_scene(model, axes_rotation("RDF", "LUF")).metadata.coordinate_system
     for axes in ("RUB", "FRD", "UFL", "LDF"):
         after = rotate_scene(model, axes_rotation("RDF", axes))
-        assert axes == after.coordinate_system
-        assert tuple(axes_rotation("RDF", axes)[:, 2]) == up_of(after.metadata)
-        for camera in (after.cameras[0], after.metadata["view"]):
+        assert axes == after.metadata.coordinate_system
+        assert tuple(axes_rotation("RDF", axes)[:, 2]) == after.metadata.up
+        for camera in (after.metadata.cameras[0], after.metadata.entries["view"]):
             view, mirrored = np.array(camera["viewmat"]), np.linalg.det(axes_rotation("RDF", axes)) < 0
             assert 1.0 == np.linalg.det(view)
             assert (34 if mirrored else 30) == camera["K"][0][2]
             seen = np.array([-1, 1, 1] if mirrored else [1, 1, 1]) * (view[:3, :3] @ axes_rotation("RDF", axes))
             assert (seen == np.eye(3)).all()
     named = rotate_scene(make_model(3, 0, coordinate_system="RDF"), ANY)
-    assert "unspecified" == named.coordinate_system
-    assert np.abs(-ANY[:, 1] - up_of(named.metadata)).max() < 1e-6
+    assert "unspecified" == named.metadata.coordinate_system
+    assert np.abs(-ANY[:, 1] - named.metadata.up).max() < 1e-6
 
 
 @pytest.mark.parametrize(("fields", "up"), [
     ({"coordinate_system": "RFU"}, (0, 0, 1)),
     ({}, (0, -1, 0)),
-    ({"metadata": {"up": [0, 0, 1]}}, (0, 0, 1)),
-    ({"metadata": {"up": [0, 1, 0]}}, (0, 1, 0)),
-    ({"metadata": {"up": [0.1, -1, 0.2]}}, (0.1, -1, 0.2)),
+    ({"entries": {"up": [0, 0, 1]}}, (0, 0, 1)),
+    ({"entries": {"up": [0, 1, 0]}}, (0, 1, 0)),
+    ({"entries": {"up": [0.1, -1, 0.2]}}, (0.1, -1, 0.2)),
 ])  # fmt: skip
 def test_converted_axes_put_up_where_the_format_expects_it(make_model, fields, up):
     model = make_model(5, 1, **fields, origin=(1.0, 2.0, 3.0))
-    scene = convert_axes(source_from_model(model), "LUF")
+    scene = convert_axes(Scene.of(model), "LUF")
     after = scene.model()
-    assert "LUF" == scene.metadata_model.coordinate_system == after.coordinate_system
-    assert (0, 1, 0) == up_of(after.metadata, "LUF")
+    assert "LUF" == scene.metadata.coordinate_system == after.metadata.coordinate_system
+    assert (0, 1, 0) == after.metadata.up
     heights = model.means @ np.array(up) / np.linalg.norm(up)
     assert np.abs(heights - after.means[:, 1]).max() < 1e-6
     assert convert_axes(scene, "LUF") is scene
 
 
 def test_lengths_and_cameras_follow_a_scale_and_a_translation(make_model):
-    model = make_model(5, 1, origin=(1e6, 2.0, 3.0), unit_metres=2.0, cameras=[CAMERA], metadata={"view": CAMERA})
+    model = make_model(5, 1, origin=(1e6, 2.0, 3.0), unit_metres=2.0, cameras=[CAMERA], entries={"view": CAMERA})
     doubles = model.means + np.array(model.origin)
     model = replace(model, means_double=doubles, means=(doubles - model.origin).astype(np.float32))
     for after, factor, offset in (
@@ -236,10 +236,11 @@ def test_lengths_and_cameras_follow_a_scale_and_a_translation(make_model):
     ):
         assert np.abs(model.means_double * factor + offset - after.means - after.origin).max() < 1e-6
         assert np.abs(model.scales + np.log(factor) - after.scales).max() < 1e-6
-        assert 2.0 / factor == after.unit_metres
-        assert 0.1 * factor == after.cameras[0]["near"]
+        assert 2.0 / factor == after.metadata.unit_metres
+        assert 0.1 * factor == after.metadata.cameras[0]["near"]
     after = translate_scene(model, (1.0, -2.0, 0.5))
-    for camera in (after.cameras[0], after.metadata["view"]):  # its rotation is the identity, as in `CAMERA`
+    # Their rotation is the identity, as in `CAMERA`.
+    for camera in (after.metadata.cameras[0], after.metadata.entries["view"]):
         assert np.allclose(model.means, after.means + np.array(camera["viewmat"])[:3, 3], atol=1e-5)
 
 

@@ -12,9 +12,10 @@ import pytest
 from command_line import call
 from posed_sets import write_blender, write_colmap_set, write_transforms
 
-from csplat import decode, read_ply, write_ply
-from csplat.editing.up_axis import unit_up, up_of, with_up
+from csplat import decode, write_ply
 from csplat.errors import InputError
+from csplat.ply import read_ply
+from csplat.scene_metadata import SceneMetadata, unit_up
 from csplat_render.camera_paths import orbit_cameras
 from csplat_trainer.data import load
 from csplat_trainer.training_loop import train
@@ -38,21 +39,21 @@ def test_a_direction_gets_unit_length_and_other_values_are_refused():
 
 
 def test_up_of_the_metadata_comes_before_the_axes():
-    assert (0, 0, 1) == up_of({}, "RFU")
-    assert (0, -1, 0) == up_of({}, "RDF")
-    assert (1, 0, 0) == up_of({"up": [1, 0, 0]}, "RFU")
-    assert (0, 0, 1) == up_of({"up": "there"}, "RFU")
-    assert up_of({}) is None
-    assert up_of({"up": [0, 0, 0]}) is None
+    assert (0, 0, 1) == SceneMetadata("RFU").up
+    assert (0, -1, 0) == SceneMetadata("RDF").up
+    assert (1, 0, 0) == SceneMetadata("RFU", entries={"up": [1, 0, 0]}).up
+    assert (0, 0, 1) == SceneMetadata("RFU", entries={"up": "there"}).up
+    assert SceneMetadata().up is None
+    assert SceneMetadata(entries={"up": [0, 0, 0]}).up is None
 
 
 def test_setting_up_drops_axes_that_contradict_it(make_model):
-    model = make_model(coordinate_system="RDF", metadata={"up": [0.0, -1.0, 0.0]})
-    leaning, lying = with_up(model, (0, -1, 0.1)), with_up(model, (0, 0, 1))
-    assert ("RDF", [0.0, -0.995037, 0.099504]) == (leaning.coordinate_system, leaning.metadata["up"])
-    assert ("unspecified", [0.0, 0.0, 1.0]) == (lying.coordinate_system, lying.metadata["up"])
-    turned = with_up(model, coordinate_system="RFU")
-    assert ("RFU", {}) == (turned.coordinate_system, turned.metadata)
+    model = make_model(coordinate_system="RDF", entries={"up": [0.0, -1.0, 0.0]})
+    leaning, lying = model.metadata.with_up((0, -1, 0.1)), model.metadata.with_up((0, 0, 1))
+    assert ("RDF", [0.0, -0.995037, 0.099504]) == (leaning.coordinate_system, leaning.entries["up"])
+    assert ("unspecified", [0.0, 0.0, 1.0]) == (lying.coordinate_system, lying.entries["up"])
+    turned = model.metadata.with_up(coordinate_system="RFU")
+    assert ("RFU", {}) == (turned.coordinate_system, turned.entries)
 
 
 def trained(write, up):
@@ -87,11 +88,11 @@ def test_all_commands_agree_on_up(tmp_path, make_model, make, words, axes, up):
         info = json.loads(call("info", path, "--json").stdout)
         assert (axes, None if up is None else list(up)) == (info["coordinate_system"], info["up"])
     scene, wishes = in_page(path)
-    assert (up, {}) == (up_of(scene.metadata, scene.coordinate_system), wishes)
+    assert (up, {}) == (scene.metadata.up, wishes)
     shown = "unknown" if up is None else " ".join(f"{value:g}" for value in up)
     assert re.search(rf"\nup +{shown}\n", call("info", tmp_path / "b.csplat").stdout)
     model = read_ply(tmp_path / "b.ply")
-    assert (scene.coordinate_system, scene.metadata.get("up")) == (model.coordinate_system, model.metadata.get("up"))
+    assert scene.metadata.with_entries(comments=None) == model.metadata.with_entries(comments=None)
     direction = np.array(up or (0, -1, 0)) / np.linalg.norm(up or 1)  # without a recorded up: as in a PLY
     for camera in orbit_cameras(model, 2, 64, 48):
         assert abs(camera.viewmat[0, :3] @ direction) < 1e-6

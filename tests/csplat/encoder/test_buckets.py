@@ -6,10 +6,12 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from large_cases import COUNT, FAST, WHOLE
+from models import with_facts
 
-from csplat import decode, read_ply
+from csplat import decode
 from csplat.encoder import buckets, encode_plan, encode_tiles
 from csplat.encoder.buckets import BucketCurve, bucket_rows
+from csplat.ply import read_ply
 
 
 @pytest.fixture(scope="module")
@@ -18,7 +20,7 @@ def model(sample_path):
     many = sample.select(rng.integers(0, len(sample), COUNT))
     means = many.means + rng.normal(0, 0.05, many.means.shape).astype(np.float32)
     extra = {"confidence": np.arange(COUNT, dtype=np.uint16)}
-    return replace(many, means=means, extra=extra, metadata={"licence": "CC0"})
+    return with_facts(replace(many, means=means, extra=extra), entries={"licence": "CC0"})
 
 
 @pytest.mark.slow

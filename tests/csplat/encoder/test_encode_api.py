@@ -18,6 +18,7 @@ from csplat import SplatModel, _spec
 from csplat.decoder import read_options
 from csplat.encoder import PRESETS, EncodeOptions, encode, encode_with_report
 from csplat.errors import InputError
+from csplat.scene_metadata import SceneMetadata
 
 PRESET_NAMES = tuple(PRESETS)
 
@@ -82,12 +83,12 @@ def test_errors_of_means_in_doubles_are_declared_against_the_doubles(make_model)
 
 def test_all_metadata_decode(make_model):
     given = {
-        "origin": (4.5e6, -1e7, 12.25), "coordinate_system": "RDF", "unit_metres": 0.5, "antialiased": True,
-        "flat": True, "metadata": {"title": "Übung", "comments": ["one"]},
+        "coordinate_system": "RDF", "unit_metres": 0.5, "antialiased": True,
+        "flat": True, "entries": {"title": "Übung", "comments": ["one"]},
         "cameras": [{"K": [[1, 0, 2], [0, 1, 2], [0, 0, 1]], "viewmat": np.eye(4).tolist(), "W": 4, "H": 4}],
     }  # fmt: skip
-    decoded, _ = round_trip(make_model(20, 1, **given))
-    assert given == {name: getattr(decoded, name) for name in given}
+    decoded, _ = round_trip(make_model(20, 1, **given, origin=(4.5e6, -1e7, 12.25)))
+    assert (SceneMetadata(**given), (4.5e6, -1e7, 12.25)) == (decoded.metadata, decoded.origin)
 
 
 def test_up_to_255_extra_columns_keep_their_bits_in_any_byte_order(make_model):
@@ -243,7 +244,7 @@ def test_invalid_importances_and_metadata_are_refused(make_model):
     large = " " * (_spec.BUDGET_JSON_BYTES // _spec.JSON_BYTE_COST)
     for value, message in (({1, 2}, "JSON"), (large, "more than decoders accept by default: store fewer, or none")):
         with pytest.raises(InputError, match=message):
-            encode(make_model(3, 0, metadata={"title": value}))
+            encode(make_model(3, 0, entries={"title": value}))
 
 
 def test_important_splats_have_smaller_errors(make_model):

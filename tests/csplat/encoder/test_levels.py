@@ -23,7 +23,7 @@ ARRAYS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 @pytest.fixture(scope="module")
 def model(sample_path):
-    return csplat.read_ply(sample_path).select(slice(0, SPLATS))
+    return csplat.read(sample_path).select(slice(0, SPLATS))
 
 
 def quarter(splats):

@@ -1,18 +1,18 @@
 """PlayCanvas' compressed PLY: files built word by word, and round trips."""
 
-import functools
 import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from checked import assert_damage_is_refused_or_read
+from models import with_facts
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import detect_format, format_by_suffix, lint_file, open_scene
+from csplat.formats import compressed_ply, detect_format, format_by_suffix, lint_file, read_scene
 from csplat.ply import read_ply
-from csplat.scene_source import BLOCK_SPLATS
+from csplat.scene import BLOCK_SPLATS
 
 BOUNDS = "min_x min_y min_z max_x max_y max_z min_scale_x min_scale_y min_scale_z max_scale_x max_scale_y max_scale_z"
 COLOURS = "min_r min_g min_b max_r max_g max_b"
@@ -51,7 +51,7 @@ def test_packed_words_are_recognised_and_read(tmp_path):
     np.testing.assert_allclose(model.quats[0], [2**-0.5, (0.5 - 2 * half**2) ** 0.5, -half, half], atol=1e-6)
     assert [-4, 4, 0.5 / 32] == model.shN[0, :, 0].tolist()
     assert [(index + 0.5) / 32 - 4 for index in (3, 6)] == model.shN[0, 0, 1:].tolist()
-    assert {"comments": ["made by hand"]} == model.metadata
+    assert {"comments": ["made by hand"]} == model.metadata.entries
 
 
 def test_old_and_empty_elements_rounded_bounds_and_band_4_are_read(tmp_path):
@@ -87,9 +87,13 @@ def test_splats_far_away_do_not_make_others_coarse(tmp_path, make_model):
 @pytest.mark.slow
 def test_written_files_read_back_within_a_step(tmp_path, make_model):
     path, model = tmp_path / "a.compressed.ply", make_model(700, 3, antialiased=True, origin=(1.0, 2.0, 3.0))
-    csplat.write(path, replace(model, metadata={"licence": "CC0"}))
+    csplat.write(path, with_facts(model, entries={"licence": "CC0"}))
     back = csplat.read(path)
-    assert (True, (1.0, 2.0, 3.0), {"licence": "CC0"}) == (back.antialiased, back.origin, back.metadata)
+    assert (True, (1.0, 2.0, 3.0), {"licence": "CC0"}) == (
+        back.metadata.antialiased,
+        back.origin,
+        back.metadata.entries,
+    )
     # Splats are reordered; the nearest mean identifies each.
     rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
     assert 700 == len(set(rows))
@@ -99,7 +103,7 @@ def test_written_files_read_back_within_a_step(tmp_path, make_model):
     assert np.abs((model.quats[rows] * back.quats).sum(1)).min() > 1 - 5e-6
     large = model.select(np.arange(BLOCK_SPLATS + 300) % 300)  # blocks consist of whole chunks
     csplat.write(path, large)
-    with open_scene(path) as scene:
+    with csplat.open(path) as scene:
         assert [BLOCK_SPLATS, 300] == [len(one) for one in scene.blocks()]
         assert np.abs(np.sort(large.means[:, 0]) - np.sort(scene.model().means[:, 0])).max() < 0.01
     csplat.write(path, make_model(0, 2))
@@ -135,13 +139,17 @@ def test_unusual_files_are_read_and_reported():
         (SMALL.replace(b"\n", b"\r", header.count(b"\n") + 1), []),
         (SMALL + SMALL, ["trailing-bytes"]),
     ):
-        report = []
-        assert [4, 10, -1] == csplat.read(data, report=report).means[0].tolist()
-        assert found == [one.id for one in report]
+        scene = read_scene(data)
+        assert [4, 10, -1] == scene.model().means[0].tolist()
+        assert found == [one.id for one in scene.findings]
 
 
 @pytest.mark.slow
 def test_damage_is_refused_or_read(tmp_path):
     sizes, places = range(0, len(SMALL), 29), range(0, len(SMALL), 7)
-    read = functools.partial(csplat.read, format="compressed-ply")
+
+    def read(path):  # other formats, which damage may turn a file into, have tests of their own
+        with compressed_ply.FORMAT.open(path) as scene:
+            return scene.model()
+
     assert_damage_is_refused_or_read(tmp_path / "a.ply", SMALL, sizes, places, read)

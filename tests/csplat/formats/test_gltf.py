@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from checked import assert_damage_is_refused_or_read, checked, refusals
+from models import with_facts
 
 import csplat
 from csplat.editing.transform import rotate_scene
@@ -79,7 +80,7 @@ def many(**changed):
 def test_attributes_are_read():
     said, data = document(TWO | BAND)
     model = read(said, data)
-    assert "LUF" == model.coordinate_system
+    assert "LUF" == model.metadata.coordinate_system
     assert TWO["POSITION"].tolist() == model.means.tolist()
     assert [[1, 0, 0, 0], [0, 1, 0, 0]] == model.quats.tolist()
     assert np.log(np.float32([1, 2, 0.5])).tolist() == model.scales[0].tolist()
@@ -154,10 +155,11 @@ def test_nodes_that_are_shown_are_read_whatever_the_file_requires():
 def test_a_written_scene_reads_back(tmp_path, make_model):
     path, origin = tmp_path / "a.glb", (1.5, -2.0, 0.1)
     for degree in (0, 3):
-        model = make_model(50, degree, origin=origin, antialiased=True, metadata={"licence": "CC0"})
+        model = make_model(50, degree, origin=origin, antialiased=True, entries={"licence": "CC0"})
         csplat.write(path, model)
         back = checked(path)
-        assert ("LUF", True, "CC0") == (back.coordinate_system, back.antialiased, back.metadata["licence"])
+        facts = back.metadata
+        assert ("LUF", True, "CC0") == (facts.coordinate_system, facts.antialiased, facts.licence)
         turned = rotate_scene(back, np.diag([-1.0, -1.0, 1.0]))
         assert model.origin == turned.origin
         assert all((getattr(model, name) == getattr(turned, name)).all() for name in ARRAYS)
@@ -168,9 +170,9 @@ def test_a_written_scene_reads_back(tmp_path, make_model):
     colours = (np.float32([0.0, 0.5, 1.0]) - 0.5) / np.float32(0.28209479)  # as of points, for other programs
     csplat.write(path, replace(model, sh0=np.tile(colours, (50, 1)), opacities=np.full(50, 0.2, "f4")))
     assert bytes([0, 55, 255, 51]) * 50 in path.read_bytes()
-    csplat.write(path, replace(model, unit_metres=0.5, coordinate_system="LUF", origin=(0.0, 0.0, 0.0)))
+    csplat.write(path, with_facts(replace(model, origin=(0.0, 0.0, 0.0)), unit_metres=0.5, coordinate_system="LUF"))
     metres = checked(path)
-    assert 1.0 == metres.unit_metres
+    assert 1.0 == metres.metadata.unit_metres
     assert (model.means * np.float32(0.5) == metres.means).all()
     assert np.abs(model.scales + np.log(0.5) - metres.scales).max() < 1e-6
 
@@ -367,7 +369,7 @@ OLD, NEW = "KHR_spz_gaussian_splats_compression", f"{PREFIX}_compression_spz_2"
 
 def packed(tmp_path, model, name=NEW, *, bounds=None, draft=False):
     """Return the JSON and buffer of a GLB with an SPZ, under one of the extension's names, and the model in it."""
-    csplat.write(tmp_path / "a.spz", replace(model, coordinate_system="RUB"))
+    csplat.write(tmp_path / "a.spz", with_facts(model, coordinate_system="RUB"))
     data, inner = (tmp_path / "a.spz").read_bytes(), {name: {"bufferView": 0}}
     splats = {} if draft else {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
     extensions = inner if name == OLD else {PREFIX: {**splats, "extensions": inner}}
@@ -393,7 +395,7 @@ def test_spz_in_a_glb_is_read(tmp_path, make_model, name, degree):
     said["nodes"][0]["translation"] = [10, 20, 30]
     found, back = linted(tmp_path / "a.glb", said, data)
     assert ["spz-axes"] == list(found)
-    assert ("LUF", degree, 50) == (back.coordinate_system, back.sh_degree, len(back))
+    assert ("LUF", degree, 50) == (back.metadata.coordinate_system, back.sh_degree, len(back))
     assert np.allclose(alone.means + np.array([10, 20, 30]), back.means, atol=1e-5)
     assert (alone.shN == back.shN).all()
     assert (alone.scales == back.scales).all()

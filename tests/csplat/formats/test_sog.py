@@ -10,14 +10,16 @@ import numpy as np
 import pytest
 from checked import assert_damage_is_refused_or_read, flipped, refusals
 from formats_cases import same, zip_of
+from models import with_facts
 from tables import failures
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import detect_format, open_scene, write_levels
+from csplat.formats import detect_format, read_scene, write_levels
 from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel, normalise_quats
-from csplat.scene_source import source_from_model
+from csplat.scene import Scene
+from csplat.scene_metadata import SceneMetadata
 from csplat_conformance.manifest import VECTORS
 from csplat_conformance.validator import validate
 from csplat_tools.convert_file import Filters, convert_file
@@ -101,7 +103,7 @@ def test_both_versions_are_read(tmp_path, version):
     three = (flat["quats.webp"][1, :3] / 255 * 2 - 1) / 2**0.5  # x of splat 1 is omitted
     quat = np.array([three[0], np.sqrt(max(0, 1 - (three**2).sum())), *three[1:]])
     np.testing.assert_allclose(model.quats[1], quat / np.linalg.norm(quat), atol=1e-6)
-    assert (version == 2, False) == (model.antialiased, model.flat)
+    assert (version == 2, False) == (model.metadata.antialiased, model.metadata.flat)
 
 
 def test_folder_json_and_zip_give_the_same_scene(tmp_path):
@@ -118,7 +120,7 @@ def test_tags_of_rotations_and_the_first_entry_of_a_codebook_may_be_missing(tmp_
     pictures["quats.webp"][0, 0, 3] = 17
     meta["scales"]["codebook"][0] = None
     pictures["scales.webp"][:] = 0
-    with open_scene(zipped(tmp_path / "a.sog", files_of(meta, pictures))) as scene:
+    with csplat.open(zipped(tmp_path / "a.sog", files_of(meta, pictures))) as scene:
         assert [1, 0, 0, 0] == scene.model().quats[0].tolist()
         assert [("zero-quats", 1)] == [(one.id, one.count) for one in scene.findings]
         np.testing.assert_allclose(scene.model().scales, 1 / 16 - 12 - 254 / 16 / 255, rtol=1e-6)  # extrapolated
@@ -164,7 +166,7 @@ def test_leaves_of_streamed_sog_are_numbered_and_become_nodes_of_a_file(tmp_path
 
 def files_read(path, level):
     """Return the file of `levels` from which each splat comes, by its first colour."""
-    with open_scene(path, level=level) as scene:
+    with csplat.open(path, level=level) as scene:
         return scene.model().sh0[:, 0].tolist()
 
 
@@ -177,9 +179,9 @@ def test_a_level_is_read_with_the_nearest_of_parts_without_it(tmp_path):
     zips = [zipped(tmp_path / f"{number}.zip", one | junk) for number, one in enumerate((files, below))]
     for place in (path, path / "lod-meta.json", *zips):
         assert (finest, [2] * 5 + [3] * 5) == (files_read(place, 0), files_read(place, 1))
-    with open_scene(path) as scene:
+    with csplat.open(path) as scene:
         model = scene.model()
-        assert (13, (13, 10), 1, True) == (scene.count, scene.levels, model.sh_degree, model.antialiased)
+        assert (13, (13, 10), 1, True) == (scene.count, scene.levels, model.sh_degree, model.metadata.antialiased)
     assert [5, 6, 7] == np.flatnonzero(model.shN.any(axis=(1, 2))).tolist()
     with pytest.raises(InputError, match="level is 2, expected 0 to 1"):
         files_read(path, 2)
@@ -210,9 +212,9 @@ def test_zips_of_several_scenes_and_of_other_programs_are_refused(tmp_path):
     ):
         with pytest.raises(InputError, match=message):
             csplat.read(zipped(tmp_path / "a.zip", contents))
-    report = []
-    assert COUNT == len(csplat.read(zipped(tmp_path / "a.zip", {**scene, "a/b/scene.PLY": b"ply"}), report=report))
-    assert [("note", "the zip also holds a/b/scene.PLY: not read")] == [(one.kind, one.text) for one in report]
+    found = read_scene(zipped(tmp_path / "a.zip", {**scene, "a/b/scene.PLY": b"ply"}))
+    assert COUNT == found.count
+    assert [("note", "the zip also holds a/b/scene.PLY: not read")] == [(one.kind, one.text) for one in found.findings]
     with pytest.raises(InputError, match=not_sog + r"a folder, not a scene: name room\.ply"):
         csplat.read(foldered(tmp_path / "foreign", foreign))
     foldered(folder, other)
@@ -233,8 +235,8 @@ def test_names_in_a_zip_may_contain_backslashes_and_capitals(tmp_path):
         (zipped(tmp_path / "c.sog", loud), capitals),
         (zipped(tmp_path / "d.zip", loud, "scene/"), capitals),
     ):
-        report = []
-        model = csplat.read(path, report=report)
+        found = read_scene(path)
+        model, report = found.model(), found.findings
         assert [("note", message)] == [(one.kind, one.text) for one in report]
         assert (13 if "filenames" in message else COUNT) == len(model)
     two = {**{name: data for name, data in files.items() if name != "sh0.webp"}, "SH0.webp": b"", "Sh0.webp": b""}
@@ -349,7 +351,7 @@ def test_written_files_read_back_within_a_step_and_equal_a_folder(tmp_path, make
     csplat.write(path, model)
     csplat.write(folder / "meta.json", model)
     back, first = csplat.read(path), path.read_bytes()
-    assert back.antialiased
+    assert back.metadata.antialiased
     rows = np.array([np.argmin(((model.means - one) ** 2).sum(1)) for one in back.means])
     assert 600 == len(set(rows))
     # Half of the largest step: 65,535 steps divide the logarithms.
@@ -359,8 +361,8 @@ def test_written_files_read_back_within_a_step_and_equal_a_folder(tmp_path, make
         assert all_of(folder) == {name: archive.read(name) for name in archive.namelist()}
     csplat.write(path, model)
     assert first == path.read_bytes()
-    csplat.write(path, replace(model, antialiased=False, flat=True))
-    assert csplat.read(path).flat
+    csplat.write(path, with_facts(model, antialiased=False, flat=True))
+    assert csplat.read(path).metadata.flat
 
 
 @pytest.mark.slow
@@ -392,10 +394,12 @@ def streamed(tmp_path_factory):
     means = np.stack([cells % SIDE, cells // SIDE % SIDE, cells // SIDE**2], axis=1).astype(np.float32)
     quats, scales, sh0, *shN = (rng.standard_normal((count, size), np.float32) for size in (4, 3, 3, 3, 3, 3))
     opacities, shN = rng.random(count, np.float32), np.stack(shN, axis=1)
-    finest = SplatModel(means, normalise_quats(quats), scales - 4, opacities, sh0, shN, antialiased=True)
+    finest = SplatModel(
+        means, normalise_quats(quats), scales - 4, opacities, sh0, shN, metadata=SceneMetadata(antialiased=True)
+    )
     levels = [finest, finest.select(slice(0, 4_000)), finest.select((means[:, :2] < SIDE / 4).all(axis=1))]
     path = tmp_path_factory.mktemp("streamed") / "scene" / "lod-meta.json"
-    write_levels(path, [source_from_model(one) for one in levels])
+    write_levels(path, [Scene.of(one) for one in levels])
     return path, levels
 
 
@@ -414,9 +418,9 @@ def leaves_of(node):
 def test_levels_of_streamed_sog_read_back_within_a_step(streamed):
     path, levels = streamed
     for number, level in enumerate(levels):
-        with open_scene(path.parent, level=number) as scene:
+        with csplat.open(path.parent, level=number) as scene:
             back = scene.model()
-        assert (tuple(map(len, levels)), 1, True) == (scene.levels, back.sh_degree, back.antialiased)
+        assert (tuple(map(len, levels)), 1, True) == (scene.levels, back.sh_degree, back.metadata.antialiased)
         wanted, found = (one.select(np.argsort(places_of(one))) for one in (level, back))
         assert np.array_equal(places_of(wanted), places_of(found))
         assert_within_a_step(wanted, found, SIDE * np.log1p(SIDE) / 65535)
@@ -459,7 +463,7 @@ def test_chunks_of_streamed_sog_have_about_equal_sizes(tmp_path, make_model):
         sizes[run["file"]] += run["count"]
     assert count == sum(sizes)
     assert abs(sizes[0] - sizes[1]) < 2 << 14
-    with open_scene(tmp_path / "a") as scene:
+    with csplat.open(tmp_path / "a") as scene:
         assert count == sum(map(len, scene.blocks()))
 
 
@@ -478,14 +482,14 @@ def test_all_levels_of_a_file_are_converted(tmp_path):
     assert len(made.levels) > 1
     assert () == made.findings
     for number, count in enumerate(made.levels):
-        with csplat.open(RICH) as file, open_scene(out, level=number) as scene:
+        with csplat.open(RICH) as file, csplat.open(out, level=number) as scene:
             cut, back = file.read(tiles=file.cut(level=number)), scene.model()
         assert count == len(cut) == len(back)
         np.testing.assert_allclose(np.sort(2 * cut.means, axis=0), np.sort(back.means, axis=0), rtol=1e-3, atol=1e-3)
     assert made.levels[1:] == convert_file(str(RICH), str(tmp_path / "b" / "lod-meta.json"), level=1).levels
     with pytest.raises(InputError, match="floaters cannot be dropped from several levels"):
         convert_file(str(RICH), str(tmp_path / "c" / "lod-meta.json"), filters=Filters(drop_floaters=True))
-    with pytest.raises(InputError, match="which has one level, found 2"), open_scene(RICH) as scene:
+    with pytest.raises(InputError, match="which has one level, found 2"), csplat.open(RICH) as scene:
         write_levels(tmp_path / "d.ply", [scene, scene])
     assert {"a", "b"} == {one.name for one in tmp_path.iterdir()}
 
@@ -500,7 +504,7 @@ def test_streamed_sog_replaces_only_streamed_sog_and_only_if_it_succeeds(tmp_pat
     assert 10 == len(csplat.read(path))
     with pytest.raises(InputError, match="is in the folder of"):
         convert_file(str(path.parent / "0_0"), str(path))
-    scene = source_from_model(make_model(20, 0))
+    scene = Scene.of(make_model(20, 0))
     reads = []
 
     def blocks():
@@ -512,7 +516,7 @@ def test_streamed_sog_replaces_only_streamed_sog_and_only_if_it_succeeds(tmp_pat
     for target in (path, tmp_path / "b" / "lod-meta.json"):
         reads.clear()
         with pytest.raises(InputError, match="was removed"):
-            write_levels(target, [replace(scene, blocks=blocks)])
+            write_levels(target, [replace(scene, reader=blocks)])
     (tmp_path / "a" / "notes.txt").write_text("mine")
     with pytest.raises(InputError, match=r"a contains notes\.txt, and a new folder replaces it: name another"):
         csplat.write(path, make_model(10, 0))
@@ -522,8 +526,8 @@ def test_streamed_sog_replaces_only_streamed_sog_and_only_if_it_succeeds(tmp_pat
 
 def test_real_files_are_read(data_dir):
     for name, count, degree in (("angel.sog", 71_359, 0), ("statue", 289_444, 3)):
-        with open_scene(data_dir / "sog" / name) as scene:
-            assert (count, degree) == (scene.count, scene.metadata_model.sh_degree)
+        with csplat.open(data_dir / "sog" / name) as scene:
+            assert (count, degree) == (scene.count, scene.sh_degree)
             assert count == sum(map(len, scene.blocks()))
 
 

@@ -11,9 +11,9 @@ from checked import assert_damage_is_refused_or_read
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import assume_format, lint_file, open_scene
+from csplat.formats import lint_file
 from csplat.ply.columns import LOG_OF_0
-from csplat.scene_source import BLOCK_SPLATS
+from csplat.scene import BLOCK_SPLATS
 
 ROW = struct.pack("<6f8B", 1.5, -2, 3e9, 1, 0.5, 0, 0, 255, 51, 102, 128, 0, 128, 128)
 
@@ -25,14 +25,14 @@ def test_rows_of_a_splat_are_read():
     assert [[0, -1, 0, 0], [1, 0, 0, 0]] == model.quats.tolist()
     assert model.opacities[0] == np.float32(0.4)
     np.testing.assert_allclose(np.array([-0.5, 0.5, -0.3]) / 0.28209479, model.sh0[0], rtol=1e-6)
-    assert (0, "unspecified") == (model.sh_degree, model.coordinate_system)
+    assert (0, "unspecified") == (model.sh_degree, model.metadata.coordinate_system)
 
 
 def test_written_splats_read_back(tmp_path, make_model):
     path, count = tmp_path / "a.splat", BLOCK_SPLATS + 5
     model = make_model(count, 0, sh0=np.random.default_rng(0).uniform(-1.7, 1.7, (count, 3)).astype("f4"))
     csplat.write(path, model)
-    with open_scene(path) as scene:
+    with csplat.open(path) as scene:
         assert [BLOCK_SPLATS, 5] == [len(block) for block in scene.blocks()]
         found = scene.model()
     assert (model.means == found.means).all()
@@ -54,7 +54,7 @@ def test_splats_that_are_not_finite_are_dropped_and_counted(tmp_path):
     table["s"][1, 0], table["r"][3, 4] = np.inf, np.nan
     for data, kept in ((ROW + b"".join(bad) + ROW, 2), (ksplat(1, [section(table, 1, 1)]), 3)):
         (tmp_path / "a.splat").write_bytes(data)
-        with open_scene(tmp_path / "a.splat") as scene:
+        with csplat.open(tmp_path / "a.splat") as scene:
             assert kept == scene.count == len(scene.model())
             assert [("nonfinite-rows", 2)] == [(one.id, one.count) for one in scene.findings]
     with pytest.raises(InputError, match="none is left"):
@@ -89,7 +89,7 @@ def test_implausible_splat_files_are_refused_unless_the_format_is_given(tmp_path
     with pytest.raises(InputError, match=message):
         csplat.read(tmp_path / "a.splat")
     if len(data) % 32 == 0 and "web page" not in message:  # a web page is refused in any case
-        with assume_format("splat"), open_scene(tmp_path / "a.splat") as scene:
+        with csplat.open(tmp_path / "a.splat", "splat") as scene:
             assert "splat" == scene.format
 
 
@@ -188,14 +188,14 @@ def test_ksplat_rows_of_each_level_are_read(level, degree):
     np.testing.assert_allclose(np.array([-0.5, -0.3, 0.5]) / 0.28209479, model.sh0[0], rtol=1e-6)
     numbers = (np.arange(8)[:, None] + [0, 8, 16])[: (0, 3, 8)[degree]]
     np.testing.assert_allclose(numbers / 60 - 2 if level == 2 else numbers / 8, model.shN[4], atol=1e-6)
-    assert "unspecified" == model.coordinate_system
+    assert "unspecified" == model.metadata.coordinate_system
 
 
 @pytest.mark.slow
 def test_sections_of_several_degrees_are_one_scene():
     counts = ((3, 0), (BLOCK_SPLATS + 2, 2), (0, 0))
     sections = [section(rows(1, count, degree), 1, degree, bucket=count) for count, degree in counts]
-    with open_scene(ksplat(1, [*sections, (bytes(42), b"")])) as scene:
+    with csplat.open(ksplat(1, [*sections, (bytes(42), b"")])) as scene:
         assert [3, BLOCK_SPLATS, 2] == [len(block) for block in scene.blocks()]
         model = scene.model()
     assert 2 == model.sh_degree

@@ -13,7 +13,8 @@ from formats_cases import same
 
 import csplat
 from csplat.errors import InputError
-from csplat.formats import format_by_name
+from csplat.formats import format_by_name, read_scene
+from csplat.scene import Scene
 
 WIDTHS = {1: (6, 1, 3, 3, 3), 2: (9, 1, 3, 3, 3), 3: (9, 1, 3, 3, 4), 4: (9, 1, 3, 3, 4)}
 AXES = struct.pack("<IIII", 0xABCD0001, 4, 7, 0xADBE0003) + struct.pack("<II", 4, 6)
@@ -64,7 +65,7 @@ def test_each_version_is_read(version, positions, rotation, bare):
     half = sqrt(0.5)
     wanted = {3: [0, half, -half, 0], 4: [-half, 0, half, 0]}.get(version, [0, sqrt(1 / 3), -sqrt(1 / 3), -sqrt(1 / 3)])
     np.testing.assert_allclose([wanted], model.quats, atol=4e-4)  # the root of a rounding error
-    assert ("RUB", True) == (model.coordinate_system, model.antialiased)
+    assert ("RUB", True) == (model.metadata.coordinate_system, model.metadata.antialiased)
 
 
 def test_the_omitted_component_of_a_rotation_is_restored():
@@ -86,7 +87,7 @@ def test_gzip_members_are_joined_and_a_file_may_have_no_splats():
 @pytest.mark.parametrize("version", [3, 4])
 def test_the_axes_extension_is_read_and_others_are_skipped(version):
     def axes(extensions=AXES, flags=2):
-        return checked(spz(version, splats(version), flags=flags, extensions=extensions)).coordinate_system
+        return checked(spz(version, splats(version), flags=flags, extensions=extensions)).metadata.coordinate_system
 
     assert ("RDF", "RUB") == (axes(), axes(flags=0))
     with pytest.raises(InputError, match="axes number 17"):
@@ -101,15 +102,13 @@ def test_version_4_stores_degree_4_and_version_3_leaves_its_band_out(tmp_path, m
         found = csplat.read(tmp_path / "a.spz").shN
         assert (40, coefficients, 3) == found.shape
         assert np.abs(model.shN[:, :coefficients] - found).max() <= 2.01 / 128
-        assert (name == "spz") == ("SH band 4" in format_by_name(name).losses(model))
+        assert (name == "spz") == ("SH band 4" in format_by_name(name).losses(Scene.of(model)))
 
 
 def test_bytes_after_the_splats_are_reported(tmp_path):
     def found(data):
         (tmp_path / "a.spz").write_bytes(data)
-        report = []
-        csplat.read(tmp_path / "a.spz", report=report)
-        return [(one.id, one.count) for one in report]
+        return [(one.id, one.count) for one in read_scene(tmp_path / "a.spz").findings]
 
     whole = spz(3, splats(3))
     assert [] == found(whole) == found(spz(3, splats(3), flags=2, extensions=AXES))

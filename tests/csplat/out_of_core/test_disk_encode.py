@@ -1,17 +1,24 @@
 """Out-of-core encoding: the same bytes as in memory, resumed runs, full disks, lost workers."""
 
+import errno
+import multiprocessing
 import os
+import resource
+import shutil
+import signal
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from large_cases import COUNT, FAST, WHOLE, EveryFourth, Interrupt, encode_large
+from models import with_facts
 
-from csplat import EncodeOptions, decode, encode, encode_with_report, read_ply, write_ply
-from csplat import open as csplat_open
-from csplat.formats import open_scene
+import csplat
+from csplat import EncodeOptions, InputError, decode, encode, encode_with_report, write_ply
 from csplat.out_of_core import OutOfCoreOptions, encode_scene, estimate_cost
-from csplat.scene_source import source_from_model
+from csplat.ply import read_ply
+from csplat.scene import Scene
 from csplat_conformance.validator import validate
 from csplat_tools.encode_file import encode_file, may_exceed_memory
 
@@ -22,7 +29,7 @@ def model(sample_path):
     many = sample.select(rng.integers(0, len(sample), COUNT))
     means = many.means + rng.normal(0, 0.05, many.means.shape).astype(np.float32)
     extra = {"confidence": np.arange(COUNT, dtype=np.uint16)}
-    return replace(many, means=means, extra=extra, metadata={"licence": "CC0"})
+    return with_facts(replace(many, means=means, extra=extra), entries={"licence": "CC0"})
 
 
 @pytest.fixture(scope="module")
@@ -44,10 +51,10 @@ def test_a_file_of_many_buckets_is_valid_with_declared_errors(model, whole):
 
 @pytest.mark.slow
 def test_each_bucket_is_a_subtree_of_the_levels(model, whole, tmp_path):
-    encode_large(source_from_model(model), tmp_path / "out.csplat", FAST, levels=EveryFourth())
+    encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, levels=EveryFourth())
     with_levels = (tmp_path / "out.csplat").read_bytes()
     assert validate(with_levels).conforms
-    with csplat_open(with_levels) as file:
+    with csplat.open(with_levels) as file:
         counts = [sum(node.splat_count for node in file.nodes if node.level == level) for level in range(3)]
         assert COUNT == counts[0]
         assert COUNT / 4 <= counts[1] < COUNT / 4 + len(file.nodes)
@@ -61,9 +68,9 @@ def test_each_bucket_is_a_subtree_of_the_levels(model, whole, tmp_path):
 def test_an_out_of_core_encoding_is_resumed_with_more_memory(model, whole, tmp_path):
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
-        encode_large(source_from_model(model), target, FAST, progress=Interrupt("coding", after=2))
+        encode_large(Scene.of(model), target, FAST, progress=Interrupt("coding", after=2))
     stages, resume = [], OutOfCoreOptions(resume=True)
-    encode_scene(source_from_model(model), target, FAST, resume, progress=lambda stage, _done: stages.append(stage))
+    encode_scene(Scene.of(model), target, FAST, resume, progress=lambda stage, _done: stages.append(stage))
     assert "coding" in stages
     assert "sorting" not in stages
     assert whole == target.read_bytes()
@@ -72,7 +79,7 @@ def test_an_out_of_core_encoding_is_resumed_with_more_memory(model, whole, tmp_p
 
 @pytest.fixture
 def ply(model, tmp_path):
-    write_ply(tmp_path / "scene.ply", replace(model, extra={}, metadata={}))
+    write_ply(tmp_path / "scene.ply", with_facts(replace(model, extra={}), entries={}))
     return tmp_path / "scene.ply"
 
 
@@ -80,7 +87,7 @@ def ply(model, tmp_path):
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
     options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
-    with open_scene(ply) as scene:
+    with csplat.open(ply) as scene:
         cost = estimate_cost(scene, options, limits)
     assert (COUNT, 1, False) == (cost.splats, cost.sh_degree, cost.in_memory)
     assert 0 < cost.memory_bytes <= 300e6
@@ -90,7 +97,7 @@ def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
     )
     assert {"sorting", "coding"} <= stages
     assert encoded.report.size_bytes == target.stat().st_size
-    with open_scene(ply) as scene:
+    with csplat.open(ply) as scene:
         assert encode(scene.model(), options) == target.read_bytes()
 
 
@@ -106,3 +113,256 @@ def test_only_large_files_may_exceed_the_memory(ply, tmp_path):
     csplat_file = tmp_path / "scene.csplat"
     csplat_file.write_bytes(b"CSPLAT")
     assert may_leave(csplat_file, 5 << 20, memory_bytes=1 << 40)  # its decoded size is unknown
+
+
+@pytest.mark.slow
+def test_out_of_core_encoding_gives_the_bytes_of_memory(model, whole, tmp_path):
+    stages = {}
+    note = lambda stage, done: stages.update({stage: done})  # noqa: E731
+    report = encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, progress=note)
+    assert whole == (tmp_path / "out.csplat").read_bytes()
+    assert ["out.csplat"] == [path.name for path in tmp_path.iterdir()]
+    assert (len(model), len(whole)) == (report.splat_count, report.size_bytes)
+    assert {"looking", "sorting", "codebook", "coding", "writing"} == set(stages)
+    assert 1.0 == stages["looking"] == stages["sorting"] == stages["coding"]
+
+
+@pytest.fixture(scope="module")
+def with_levels(model, tmp_path_factory):
+    """The file of the scene with levels of detail."""
+    path = tmp_path_factory.mktemp("levels") / "out.csplat"
+    encode_large(Scene.of(model), path, FAST, levels=EveryFourth())
+    return path.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [None, 900_000_000])
+def test_levels_do_not_depend_on_processes_or_memory(model, with_levels, tmp_path, memory):
+    target = tmp_path / "out.csplat"
+    encode_large(Scene.of(model), target, replace(FAST, threads=2), levels=EveryFourth(), memory_bytes=memory)
+    assert with_levels == target.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stage", "after"), [("sorting", 0), ("coding", 3), ("writing", 0)])
+def test_an_interrupted_encoding_with_levels_is_resumed(model, with_levels, tmp_path, stage, after):
+    target, scene = tmp_path / "out.csplat", Scene.of(model)
+    with pytest.raises(KeyboardInterrupt):
+        encode_large(scene, target, FAST, levels=EveryFourth(), progress=Interrupt(stage, after=after))
+    assert not target.exists()
+    with pytest.raises(InputError, match="was started with levels"):
+        encode_large(scene, target, FAST, resume=True)
+    encode_large(scene, target, FAST, levels=EveryFourth(), resume=True)
+    assert with_levels == target.read_bytes()
+    assert [target] == list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_disk_that_fills_up_while_levels_are_written_is_reported(model, with_levels, tmp_path):
+    target, before = tmp_path / "out.csplat", resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(stage, _done):
+        if stage == "coding":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (5_000, before[1]))
+
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            encode_large(Scene.of(model), target, FAST, levels=EveryFourth(), progress=fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not target.exists()
+    assert not list((tmp_path / "out.csplat.work").glob("*.part*"))
+    encode_large(Scene.of(model), target, FAST, levels=EveryFourth(), resume=True)
+    assert with_levels == target.read_bytes()
+
+
+def test_a_scene_built_in_one_piece_requires_its_memory(model, tmp_path):
+    with pytest.raises(InputError, match="300 MB of memory are too little for this scene, which requires 3"):
+        encode_large(
+            Scene.of(model), tmp_path / "out.csplat", FAST, levels=EveryFourth(COUNT), memory_bytes=300_000_000
+        )
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
+    encode_large(Scene.of(model), tmp_path / "out.csplat", replace(FAST, threads=2))
+    assert whole == (tmp_path / "out.csplat").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "options",
+    [
+        EncodeOptions(preset="fast", sh_coding="scalar", keep_extra=True, bucket_splats=WHOLE),
+        EncodeOptions(preset="small", sh_degree=0, bucket_splats=WHOLE),
+        EncodeOptions(preset="fast", sh_degree=1, adaptive=0.5, tile_splats=300, bucket_splats=WHOLE),
+    ],
+)
+def test_options_give_the_bytes_of_memory(model, options, tmp_path):
+    encode_large(Scene.of(model), tmp_path / "out.csplat", options)
+    assert encode(model, options) == (tmp_path / "out.csplat").read_bytes()
+
+
+@pytest.mark.slow
+def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
+    origin = (4.5e5, 5.4e6, 100.0)
+    doubles = model.means.astype(np.float64) + np.array(origin) + 1e-9
+    scales, shN = model.scales.copy(), model.shN.copy()
+    scales[17], scales[1600], shN[3200] = 95.0, 1e5, 3e8
+    means = (doubles - np.array(origin)).astype(np.float32)
+    hard = replace(model, means=means, origin=origin, means_double=doubles, scales=scales, shN=shN)
+    options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
+    encode_large(Scene.of(hard), tmp_path / "out.csplat", options)
+    assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stage", "after"), [("looking", 0), ("sorting", 0), ("codebook", 0), ("coding", 3)])
+def test_an_interrupted_encoding_is_resumed(model, whole, tmp_path, stage, after):
+    target, scene = tmp_path / "out.csplat", Scene.of(model)
+    with pytest.raises(KeyboardInterrupt):
+        encode_large(scene, target, FAST, progress=Interrupt(stage, after=after))
+    assert not target.exists()
+    assert (tmp_path / "out.csplat.work").is_dir()
+    with pytest.raises(InputError, match="left from an interrupted encoding"):
+        encode_large(scene, target, FAST)
+    with pytest.raises(
+        InputError, match=r"started with options .*: continue with the former options, or remove the folder"
+    ):
+        encode_large(scene, target, replace(FAST, seed=1), resume=True)
+    coded = []
+    encode_large(scene, target, FAST, resume=True, progress=lambda stage, _done: coded.append(stage))
+    assert whole == target.read_bytes()
+    if stage == "coding":
+        assert "sorting" not in coded
+    assert [target] == list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_an_encoding_with_a_killed_worker_is_resumed(model, whole, tmp_path):
+    target, two = tmp_path / "out.csplat", replace(FAST, threads=2)
+
+    def kill(stage, _done):
+        if stage == "coding":
+            for child in multiprocessing.active_children():
+                os.kill(child.pid, signal.SIGKILL)
+
+    with pytest.raises(OSError, match="a worker process was killed") as error:
+        encode_large(Scene.of(model), target, two, progress=kill)
+    assert errno.ENOMEM == error.value.errno
+    assert not target.exists()
+    encode_large(Scene.of(model), target, two, resume=True)
+    assert whole == target.read_bytes()
+
+
+def test_a_full_disk_is_reported_and_the_encoding_resumed(model, whole, tmp_path, monkeypatch):
+    target = tmp_path / "out.csplat"
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "disk_usage", lambda _path: SimpleNamespace(free=1000))
+        with pytest.raises(InputError, match="0 MB free, 1 MB are needed"):
+            encode_large(Scene.of(model), target, FAST)
+    assert not list(tmp_path.iterdir())
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def fill(stage, _done):
+        if stage == "sorting":  # a part of each bucket can be written
+            resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, before[1]))
+
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            encode_large(Scene.of(model), target, FAST, progress=fill)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert not target.exists()
+    assert [10_000] == [path.stat().st_size for path in (tmp_path / "out.csplat.work").glob("section-*")]
+    encode_large(Scene.of(model), target, FAST, resume=True)
+    assert whole == target.read_bytes()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["sample", "section-000003", "tiles-000001", "state.json"])
+def test_a_damaged_work_file_is_named(model, tmp_path, kind):
+    target = tmp_path / "out.csplat"
+    with pytest.raises(KeyboardInterrupt):
+        encode_large(Scene.of(model), target, FAST, progress=Interrupt("coding", after=2))
+    path = tmp_path / "out.csplat.work" / kind
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 if kind != "state.json" else 0] ^= 0x10
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=f"{kind} is damaged: remove out.csplat.work"):
+        encode_large(Scene.of(model), target, FAST, resume=True)
+    assert not target.exists()
+
+
+def test_a_folder_with_other_fields_of_state_is_refused(model, tmp_path):
+    target = tmp_path / "out.csplat"
+    with pytest.raises(KeyboardInterrupt):
+        encode_large(Scene.of(model), target, FAST, progress=Interrupt("coding"))
+    path = tmp_path / "out.csplat.work" / "state.json"
+    path.write_text(path.read_text().replace("largest_sh", "largest"))
+    with pytest.raises(InputError, match=r"state\.json is damaged: remove out.csplat.work"):
+        encode_large(Scene.of(model), target, FAST, resume=True)
+
+
+def test_a_folder_with_other_files_is_refused_and_kept(model, tmp_path):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    (folder / "one.jpg").write_bytes(b"dear to somebody")
+    for resume in (False, True):
+        with pytest.raises(InputError, match="photographs is not empty"):
+            encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, folder=folder, resume=resume)
+    assert b"dear to somebody" == (folder / "one.jpg").read_bytes()
+
+
+def test_a_scene_that_shrinks_while_it_is_read_is_refused(model, tmp_path):
+    times = []
+
+    def blocks():
+        times.append(1)
+        yield model.select(slice(0, COUNT if len(times) == 1 else 3000))
+
+    with pytest.raises(InputError, match="the scene has 3,000 splats, expected 3,600"):
+        encode_large(Scene.of(model).changed(reader=blocks), tmp_path / "out.csplat", FAST)
+    assert not (tmp_path / "out.csplat").exists()
+
+
+def test_too_little_memory_is_refused(model, tmp_path):
+    with pytest.raises(InputError, match="100 MB of memory are too little for this scene, which requires 2"):
+        encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
+    with pytest.raises(InputError, match="a codebook of shapes requires the scene in memory"):
+        encode_large(Scene.of(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+@pytest.mark.remote
+def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, with_levels, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
+    target = tmp_path / "out.csplat"
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=":0", silence_logs=50
+    ) as cluster:
+        victims = [one.pid for one in cluster.workers.values()]
+
+        def kill(stage, _done):
+            if stage == "coding" and victims:
+                os.kill(victims.pop(), signal.SIGKILL)
+                victims.clear()
+
+        encode_large(Scene.of(model), target, FAST, scheduler=cluster.scheduler_address, progress=kill)
+        assert not victims
+        assert whole == target.read_bytes()
+        encode_large(Scene.of(model), target, FAST, scheduler=cluster.scheduler_address, levels=EveryFourth())
+    assert with_levels == target.read_bytes()
+
+
+@pytest.mark.remote
+def test_an_unreachable_cluster_is_reported(model, tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
+    monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))
+    with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
+        encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, scheduler="tcp://127.0.0.1:9")
+
+
+def partial_client(client):
+    return lambda address, **options: client(address, **{**options, "timeout": 0.2})

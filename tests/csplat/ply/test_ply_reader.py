@@ -16,7 +16,7 @@ from csplat import decode, encode
 from csplat.errors import InputError
 from csplat.ply import read_ply, write_ply
 from csplat.ply.columns import LOGIT_OF_0, LOGIT_OF_1, alpha_of_logits, logits_of_alpha
-from csplat.training_record import TrainingRecord
+from csplat.scene_metadata import TrainingRecord
 
 
 def write_rows(path, names, rows, *, kind="binary_little_endian", comments=(), after=b""):
@@ -91,7 +91,7 @@ def test_header_comments_are_kept_in_ascii(tmp_path, kind):
     report = []
     model = read_ply(tmp_path / "a.ply", strict=True, report=report)
     assert_holds(model, names, rows)
-    assert ["made by", "a machine", "end_header", "?? end_header", "caf??"] == model.metadata["comments"]
+    assert ["made by", "a machine", "end_header", "?? end_header", "caf??"] == model.metadata.entries["comments"]
     assert {"non-ascii-header", "unnormalised-quats"} == {one.id for one in report}
     write_ply(tmp_path / "b.ply", model)
     assert model.metadata == read_ply(tmp_path / "b.ply").metadata
@@ -123,7 +123,7 @@ def test_a_comment_on_the_vertical_axis_sets_up(tmp_path, comments, up, kept, no
     written(tmp_path / "a.ply", 0, comments=comments)
     report = []
     model = read_ply(tmp_path / "a.ply", strict=True, report=report)
-    assert (up, kept) == (model.metadata.get("up"), model.metadata.get("comments", []))
+    assert (up, kept) == (model.metadata.entries.get("up"), model.metadata.entries.get("comments", []))
     assert noted == any(one.id == "vertical-axis" for one in report)
     write_ply(tmp_path / "b.ply", model)
     assert model.metadata == read_ply(tmp_path / "b.ply").metadata
@@ -207,13 +207,13 @@ TRAINED = TrainingRecord((1.0, 1.0, 1.0), 5, (238, 134), 0.003, "bilder  für al
     ({"training": TRAINED.as_json()}, 'training {"background": [1.0, 1.0, 1.0], "test_every": 5'),
 ])  # fmt: skip
 def test_the_training_record_and_the_first_view_survive_files(tmp_path, make_model, metadata, line):
-    write_ply(tmp_path / "a.ply", make_model(metadata=metadata))
+    write_ply(tmp_path / "a.ply", make_model(entries=metadata))
     model = read_ply(tmp_path / "a.ply")
-    assert metadata == model.metadata
+    assert metadata == model.metadata.entries
     write_ply(tmp_path / "b.ply", decode(encode(model)))
     again = read_ply(tmp_path / "b.ply").metadata
-    assert metadata == again
-    assert "view" in metadata or TRAINED == TrainingRecord.of(again)
+    assert metadata == again.entries
+    assert "view" in metadata or TRAINED == again.training
     assert header_of(tmp_path / "b.ply")[-1].startswith(f"comment csplat {line}")
 
 

@@ -35,10 +35,10 @@ def test_writes_the_columns_and_order_that_viewers_expect(tmp_path, make_model):
 
 def test_metadata_survive_a_ply_and_comments_of_other_programs_are_read(tmp_path, make_model):
     model = make_model(4, origin=(4.5e6, -1.25, 0.1), coordinate_system="RUB", unit_metres=0.01, antialiased=True,
-        flat=True, metadata={"licence": "CC0-1.0", "comments": ["hello"]})  # fmt: skip
+        flat=True, entries={"licence": "CC0-1.0", "comments": ["hello"]})  # fmt: skip
     write_ply(tmp_path / "a.ply", model)
     again = read_ply(tmp_path / "a.ply", strict=True)
-    for name in ("origin", "coordinate_system", "unit_metres", "antialiased", "flat", "metadata"):
+    for name in ("origin", "metadata"):
         assert getattr(model, name) == getattr(again, name)
     assert_same_scene(model, again)
     assert {"comment SplatRenderMode: mip", "comment SplatRenderMode: 2dgs"} < set(header_of(tmp_path / "a.ply"))
@@ -48,7 +48,7 @@ def test_metadata_survive_a_ply_and_comments_of_other_programs_are_read(tmp_path
         (b"SplatRenderMode: default", False, False), (b"splatrendermode: 2DGS", False, True),
     ):  # fmt: skip
         found = read_ply((tmp_path / "a.ply").read_bytes().replace(b"SplatRenderMode: mip", message))
-        assert (antialiased, flat, {}) == (found.antialiased, found.flat, found.metadata)
+        assert (antialiased, flat, {}) == (found.metadata.antialiased, found.metadata.flat, found.metadata.entries)
 
 
 def test_absolute_positions_are_doubles_and_keep_the_origin(tmp_path, make_model):
@@ -66,8 +66,8 @@ def test_invalid_metadata_are_not_written(tmp_path, make_model):
     for metadata in (
         {"training": "on a laptop"}, {"view": "from above"}, {"view": {"near": np.inf}}, {"view": {"K": np.eye(3)}},
     ):  # fmt: skip
-        write_ply(tmp_path / "b.ply", make_model(metadata=metadata))
-        assert {} == read_ply(tmp_path / "b.ply").metadata
+        write_ply(tmp_path / "b.ply", make_model(entries=metadata))
+        assert {} == read_ply(tmp_path / "b.ply").metadata.entries
 
 
 def test_a_file_is_replaced_only_once_it_is_complete(tmp_path, make_model):
@@ -97,6 +97,6 @@ def test_names_of_extra_columns_and_comments_cannot_break_the_header(tmp_path, m
         with pytest.raises(InputError, match="extra column"):
             write_ply(tmp_path / "a.ply", make_model(extra={name: np.arange(10.0)}))
     metadata = {"comments": ["one\nend_header", "naïve", 5], "licence": "a\nb"}
-    write_ply(tmp_path / "a.ply", make_model(metadata=metadata))
+    write_ply(tmp_path / "a.ply", make_model(entries=metadata))
     kept = {"comments": ["one", "end_header", "na?ve"], "licence": "a b"}
-    assert kept == read_ply(tmp_path / "a.ply", strict=True).metadata
+    assert kept == read_ply(tmp_path / "a.ply", strict=True).metadata.entries

@@ -14,12 +14,13 @@ from tables import failures
 from typer.testing import CliRunner
 
 from csplat import _spec
-from csplat.decoder import decode, decode_scene, open_tiles, read_header
+from csplat.decoder import decode, decode_scene, read_header
 from csplat.disk_files import read_array
 from csplat.encoder import EncodeOptions, encode, encode_with_report
 from csplat.errors import CsplatError
 from csplat.ply import write_ply
-from csplat.scene_source import source_from_model
+from csplat.scene import Scene
+from csplat.splat_file import SplatFile
 from csplat_conformance.declared_bounds import Source, verify_bounds, verify_bounds_by_tile
 from csplat_tools.cli.app import app
 from csplat_tools.inspect.file_description import describe_file
@@ -153,13 +154,13 @@ OPTIONS = EncodeOptions(preset="fast", tile_splats=300, keep_extra=True)
 
 def both(source, data, index):
     """Verify in memory and tile by tile, with equal results; return them as JSON, numbers rounded to nine digits."""
-    opened = open_tiles(data)
+    opened = SplatFile.open(data)
 
     def blocks():
         return (source.select(slice(start, start + 170)) for start in range(0, len(source), 170))
 
     at_once = verify_bounds(Source.of(source), decode(data), opened.header, opened.declared_bounds, index)
-    by_tile = verify_bounds_by_tile(replace(source_from_model(source), blocks=blocks), opened, index, 400)
+    by_tile = verify_bounds_by_tile(Scene.of(source).changed(reader=blocks), opened, index, 400)
     assert at_once.clauses == by_tile.clauses
     found = rounded(at_once.as_json())
     assert found == rounded(by_tile.as_json())

@@ -135,7 +135,7 @@ def test_broken_inputs_are_broken_and_must_not_be_accepted(tmp_path):
     def check(name):
         assert INPUTS[name].must_refuse
         with pytest.raises(InputError):
-            csplat.read_ply(written(tmp_path, name))
+            csplat.read(written(tmp_path, name))
 
     report = run_encoder(PLACES, EncoderSuiteOptions("broken/*"), run=take)
     assert {"accepted an input without splats"} == {one.message for one in report.failures}
@@ -148,7 +148,7 @@ def test_broken_inputs_are_broken_and_must_not_be_accepted(tmp_path):
 def test_an_input_equals_its_scene(tmp_path):
     # Written there by hand, read here by our reader: the two share no code.
     def check(one):
-        found = Source.of(csplat.read_ply(written(tmp_path, one.name), keep_extra=True))
+        found = Source.of(csplat.read(written(tmp_path, one.name), keep_extra=True))
         wanted = one.source()
         for array in ("means", "opacities", "sh0", "shN"):
             np.testing.assert_array_equal(getattr(found, array), getattr(wanted, array), array)
@@ -167,7 +167,7 @@ def test_our_encoder_refuses_degree_5(tmp_path):
     blue = plyfile.PlyData.read(path)["vertex"].data["f_rest_71"]  # after 70 of red and green
     np.testing.assert_array_equal(blue, source.shN[:, 1, 2])
     with pytest.raises(InputError, match="SH degree 5, expected at most 4: --sh-degree 4"):
-        csplat.read_ply(path)
+        csplat.read(path)
 
 
 def test_figures_for_comparison_are_of_the_inputs_and_of_this_encoder(tmp_path):
@@ -178,5 +178,5 @@ def test_figures_for_comparison_are_of_the_inputs_and_of_this_encoder(tmp_path):
         assert {"csplat"} <= set(by) <= {"csplat", "spz"}, name
         assert all((numbers["psnr"] is not None) == ENCODABLE[name].renders for numbers in by.values()), name
     for name in ("ordinary/degree_3", "nasty/far_doubles"):
-        size = len(csplat.encode(csplat.read_ply(written(tmp_path, name))))
+        size = len(csplat.encode(csplat.read(written(tmp_path, name))))
         assert size == pytest.approx(figures[name]["csplat"]["bytes"], rel=0.01)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from encoder_runs_cases import INPUTS, PLAIN, judged
+from models import model_of
 
 import csplat
 from csplat.decoder import decode_scene
@@ -60,7 +61,7 @@ def test_splats_without_a_near_source_are_named(plain):
     ({"extra": {"id": np.zeros(216, "<u4")}}, "the source has no extra column 'id'"),
 ])  # fmt: skip
 def test_facts_that_differ_from_the_source_break_their_clause(plain, fact, message):
-    content, *_ = judged(PLAIN, replace(plain, **fact), keep_extra=True)
+    content, *_ = judged(PLAIN, model_of(**{**vars(plain), **fact}), keep_extra=True)
     assert (Status.FAILED, ("SRC-3",)) == (content.status, content.clauses)
     assert message in content.message
 

@@ -49,7 +49,7 @@ def device():
 @pytest.fixture(scope="module")
 def sample(sample_path):
     """The sample scene, its file with codebooks, and a view."""
-    model = csplat.read_ply(sample_path)
+    model = csplat.read(sample_path)
     return model, csplat.encode(model, csplat.EncodeOptions(preset="balanced")), virtual_cameras(model)[0]
 
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from checked import cloud
 from command_line import call
+from models import with_facts
 from PIL import Image
 
 from csplat import EncodeOptions, InputError, encode, encode_with_report, write_ply
@@ -16,7 +17,7 @@ from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_tools.inspect.comparison import attribute_errors
-from csplat_tools.scene_files import LoadedModel, load_model
+from csplat_tools.scene_files import load_scene
 from csplat_tools.views import comparison_cameras
 
 
@@ -54,7 +55,7 @@ def compare_models(source, other, cameras, **words):
 
 
 def errors_of(source, other, index=None):
-    return attribute_errors(LoadedModel(source, 1000), LoadedModel(other, 1000), index)
+    return attribute_errors(load_scene(source), load_scene(other), index)
 
 
 def test_splats_are_paired_by_a_source_index_their_order_or_declared_errors(scene, tmp_path):
@@ -71,7 +72,7 @@ def test_splats_are_paired_by_a_source_index_their_order_or_declared_errors(scen
     assert errors.errors["means"][1] == pytest.approx(0.001 * 3**0.5, rel=1e-3)
     result, path = encode_with_report(scene, EncodeOptions(preset="balanced")), tmp_path / "scene.csplat"
     path.write_bytes(result.data)
-    models = LoadedModel(scene, 1000), load_model(str(path))
+    models = load_scene(scene), load_scene(str(path))
     found, known = (attribute_errors(*models, index) for index in (None, result.source_index))
     assert ("search", len(scene), 0) == (found.pairing, found.matched, found.unmatched)
     assert known.errors["means"] == pytest.approx(found.errors["means"])
@@ -117,7 +118,7 @@ def test_views_and_progress_are_passed_to_callbacks(scene, cameras):
         compare_models(scene, scene, [])
     virtual = comparison_cameras(scene)  # which only depend on the source
     assert [(640, 480)] * 8 == [(camera.W, camera.H) for camera in virtual]
-    again = comparison_cameras(replace(scene, cameras=[camera.to_json() for camera in virtual[:1]]))
+    again = comparison_cameras(with_facts(scene, cameras=[camera.to_json() for camera in virtual[:1]]))
     assert all(np.array_equal(a.viewmat, b.viewmat) for a, b in zip(virtual, again, strict=True))
 
 

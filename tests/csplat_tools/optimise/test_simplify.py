@@ -9,7 +9,8 @@ import pytest
 from captures import views_of
 from command_line import call, change_options, change_views
 
-from csplat import InputError, Target, read_ply, write_ply
+from csplat import InputError, Target, write_ply
+from csplat.ply import read_ply
 from csplat_render.camera_files import save_cameras
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_render.scene_frame import sample_cloud, scene_frame, surface_areas

@@ -130,7 +130,7 @@ LARGE = [pytest.param(name, marks=pytest.mark.long) for name in ("exploded", "al
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["one splat", *LARGE])
 def test_extreme_scenes_meet_a_psnr(name):
-    source = extremes.scene(name)[0]
+    source = extremes.scene(name)
     views = judged_by(cameras(40)) if name == "one splat" else around(source)
     decoded = decode(found_within(source, views, psnr=17.0).data)
     assert views.test_scorer(source).psnr(decoded) >= 17.0

@@ -19,7 +19,8 @@ from checked import cloud
 from chromium import ViewerPage
 from command_line import call, heed_interrupts
 
-from csplat import FormatError, InputError, decode, encode, read_ply, write_ply
+from csplat import FormatError, InputError, decode, encode, write_ply
+from csplat.ply import read_ply
 from csplat_tools.cli.shared_options import parse_axes, parse_overrides, parse_up
 from csplat_tools.present.viewer_page import web_files
 from csplat_tools.present.viewer_server import byte_range, open_server, open_viewer_scene, page_parameters

@@ -11,17 +11,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from command_line import call
+from models import with_facts
 
 import csplat
 import csplat_tools
 from csplat import EncodeOptions, InputError, disk_files, encode_with_report, file_source, write_ply
-from csplat.decoder import Limits, decode, decode_api, open_tiles, read_header
-from csplat.scene_source import source_from_model
+from csplat.decoder import Limits, decode, decode_api, iter_tiles, read_header
+from csplat.ply import read_ply
+from csplat.scene import Scene
+from csplat.splat_file import SplatFile
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.camera_files import save_cameras
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.scorer import renderer
-from csplat_tools.scene_files import LoadedModel, OpenedScene, open_scenes
+from csplat_tools.scene_files import open_scenes, sample_scene, scene_sizes
 from csplat_tools.views import comparison_cameras
 from csplat_tools.views.sliced_renderer import SlicedScene, slice_limits
 
@@ -45,10 +48,10 @@ def test_tiles_before_a_damaged_one_are_decoded_but_none_goes_to_standard_output
         layer = tiles[place].layers[0]
         data[layer.offset + layer.size - 1] ^= 1
     for threads in (1, 3):
-        models = open_tiles(bytes(data), threads=threads).models()
-        assert [tile.splat_count for tile in tiles[:4]] == [len(next(models)) for _ in range(4)]
+        decoded = iter_tiles(bytes(data), threads=threads)
+        assert [tile.splat_count for tile in tiles[:4]] == [len(next(decoded).means) for _ in range(4)]
         with pytest.raises(csplat.CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
-            next(models)
+            next(decoded)
     many_tiles.write_bytes(data)
     assert b"" == call("decode", many_tiles, "-", "--quiet", status=1).stdout_bytes
 
@@ -57,20 +60,19 @@ def test_tiles_before_a_damaged_one_are_decoded_but_none_goes_to_standard_output
 def test_threads_and_released_pages_do_not_change_the_result_and_limits_are_per_file_or_tile(many_tiles, monkeypatch):
     monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
     expected = decode(many_tiles)
-    for threads in (1, 3):
-        opened = open_tiles(many_tiles, threads=threads)
-        for _ in range(2):
-            models = list(opened.models())
-            assert [tile.splat_count for tile in opened.header.tiles] == [len(model) for model in models]
-            for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
-                together = np.concatenate([getattr(model, name) for model in models])
-                assert getattr(expected, name).tobytes() == together.tobytes()
-    limits = Limits(bytes=max(map(len, models)) * 4 * (11 + 27))
-    assert 600 == sum(map(len, open_tiles(many_tiles, limits=limits).models()))
+    opened = SplatFile.open(many_tiles.read_bytes())
+    tiles = [list(iter_tiles(many_tiles, threads=threads)) for threads in (1, 3)]
+    for models in (*tiles, list(opened.models()), list(opened.models())):
+        assert [tile.splat_count for tile in opened.header.tiles] == [len(model.means) for model in models]
+        for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
+            together = np.concatenate([getattr(model, name) for model in models])
+            assert getattr(expected, name).tobytes() == together.tobytes()
+    limits = Limits(bytes=max(map(len, opened.models())) * 4 * (11 + 27))
+    assert 600 == sum(map(len, SplatFile.open(many_tiles.read_bytes(), limits=limits).models()))
     with pytest.raises(csplat.LimitError, match="bytes"):
         decode(many_tiles, limits=limits)
     with pytest.raises(csplat.LimitError, match="splats"):
-        open_tiles(many_tiles, limits=Limits(splats=599))
+        next(SplatFile.open(many_tiles.read_bytes(), limits=Limits(splats=599)).models())
 
 
 BEHIND = (0.3, 0.6, 0.1)
@@ -101,8 +103,9 @@ def files_of_both(model, tmp_path):
 
 def by_disk(model, every=1, progress=None):
     """Return a scene in blocks of 300 splats that is drawn in slices of about 100."""
-    scene = source_from_model(model)
-    scene = replace(scene, blocks=lambda: (model.select(slice(at, at + 300)) for at in range(0, len(model), 300)))
+    scene = Scene.like(
+        model, len(model), lambda: (model.select(slice(at, at + 300)) for at in range(0, len(model), 300))
+    )
     return SlicedScene(scene, model.select(slice(None, None, every)), every, LITTLE, progress, slice_bytes=60_000)
 
 
@@ -131,7 +134,7 @@ def test_sliced_renders_equal_those_in_memory(model, view, counts):
     crowd[:900, 2] = flat[:, 2] = 0.25
     for scene, options in (
         (model, {"mode": "fast"}),
-        (replace(model, antialiased=True), {}),
+        (with_facts(model, antialiased=True), {}),
         (model, {"every": 700}),  # the sample decides the slices
         (replace(model, means=crowd), {}),  # splats of one depth are drawn in their order
         (replace(model, means=flat), {}),
@@ -159,21 +162,21 @@ def test_slices_have_equal_costs_and_do_not_split_a_depth():
 
 def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
     with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
-        assert {LoadedModel} == {type(one) for one in loaded}
-        assert {OpenedScene} == {type(one) for one in opened}
-        assert [one.as_json() for one in loaded] == [one.as_json() for one in opened]
+        assert all(scene.in_memory is not None for scene in loaded)
+        assert [None, None] == [scene.in_memory for scene in opened]
+        assert [scene_sizes(scene) for scene in loaded] == [scene_sizes(scene) for scene in opened]
         with open_scenes(opened) as again:
             assert opened == again
         with open_scenes((loaded[0], files_of_both[1]), LITTLE) as both:
-            assert {LoadedModel} == {type(one) for one in both}
+            assert all(scene.in_memory is not None for scene in both)
 
 
 def test_a_sample_has_every_nth_splat_and_gives_about_the_same_views(files_of_both, model, sample_path):
     with open_scenes(files_of_both[:2], LITTLE) as (source, _):
-        found, every = replace(source, sample_splats=220).sample()
+        found, every = sample_scene(source, splats_max=220)
     assert (7, 0) == (every, found.sh_degree)
     np.testing.assert_array_equal(model.means[::7], found.means)
-    whole = csplat_tools.load_model(sample_path).model
+    whole = read_ply(sample_path)
     part = comparison_cameras(whole.select(slice(None, None, 2)), every=2)
     for wanted, seen in zip(comparison_cameras(whole), part, strict=True):
         assert np.linalg.norm(wanted.position) == pytest.approx(np.linalg.norm(seen.position), rel=0.15)

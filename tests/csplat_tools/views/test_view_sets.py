@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from captures import H, W, as_colmap, cameras, photograph, photograph_object, shell
 from command_line import call, change_options
+from models import with_facts
 from PIL import Image
 
-from csplat import InputError, read_ply
-from csplat.training_record import TRAINING, TrainingRecord
+from csplat import InputError
+from csplat.ply import read_ply
+from csplat.scene_metadata import TRAINING, TrainingRecord
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import save_cameras
 from csplat_tools.views import BLACK, WHITE, DataOptions, ViewSet, find_view_set
@@ -110,7 +112,7 @@ def test_validation_images_of_a_set_are_validation_views(sets, scene, tmp_path):
 
 def test_recorded_training_options_are_the_defaults(sets, scene):
     record = TrainingRecord((0.0, 1.0, 0.0), 5, (24, 20), 0.05)
-    trained = replace(scene, metadata={**scene.metadata, TRAINING: record.as_json()})
+    trained = with_facts(scene, entries={**scene.metadata.entries, TRAINING: record.as_json()})
     views = find_view_set(trained, data=DataOptions(str(sets["rgba"])))
     assert [0, 5, 10, 15] == numbers(views.test)
     assert ((0.0, 1.0, 0.0), 24, 0.05) == (views.background, views.test[0].W, views.test[0].near)
@@ -207,7 +209,7 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
         return result
 
     call("train", data, ply, *quick, "--report", log, "-q")
-    record = TrainingRecord.of(read_ply(ply).metadata)
+    record = read_ply(ply).metadata.training
     assert ((1.0, 1.0, 1.0) if kind == "blender" else BLACK, (24, 20)) == (record.background, record.size)
     trained = json.loads(log.read_text())["metrics"]
     scores, counts, reports = {"train": trained["psnr"]}, {trained["views"]}, {words: run(words) for words in commands}

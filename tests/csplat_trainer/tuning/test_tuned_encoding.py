@@ -30,7 +30,7 @@ def test_finetune_takes_a_model_and_views_and_reports_every_step():
 
 @pytest.mark.slow
 def test_finetune_takes_a_data_set_and_writes_no_file_that_decodes_differently(tmp_path, monkeypatch):
-    model, data = csplat.read_ply(photograph(SOURCE, tmp_path) / "scene.ply"), csplat_trainer.load(tmp_path)
+    model, data = csplat.read(photograph(SOURCE, tmp_path) / "scene.ply"), csplat_trainer.load(tmp_path)
     tuned = csplat_trainer.finetune(model, data, COARSE, replace(QUICK, iterations=2))
     assert (len(data.train), 2) == (tuned.log["train_views"], tuned.log["steps"])
 

@@ -200,7 +200,7 @@ def tuned_facts(capture, out, *words):
 def test_the_command_tunes_and_reports(tuned_file):
     facts, data = json.loads(tuned_file.report.read_text()), tuned_file.path.read_bytes()
     assert "14 training and 2 test images" in tuned_file.messages
-    source, decoded = csplat.read_ply(tuned_file.source.ply), decode(data)
+    source, decoded = csplat.read(tuned_file.source.ply), decode(data)
     assert (len(source), len(decoded)) == (facts["source_splats"], facts["splats"])
     assert facts["unseen"] == len(source) - len(decoded)
     assert len(data) == facts["size_bytes"] == sum(facts["bytes_by_attribute"].values()) + facts["overhead_bytes"]

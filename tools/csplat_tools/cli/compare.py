@@ -10,13 +10,14 @@ import typer
 
 from csplat.disk_files import read_array
 from csplat.errors import InputError, counted
+from csplat.system import default_memory_bytes
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.inspect.text_reports import format_comparison
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
-from csplat_tools.scene_files import OpenedScene, load_model, open_scenes
+from csplat_tools.scene_files import findings_of, load_scene, open_scenes, sample_scene
 from csplat_tools.views import Split
 
 if TYPE_CHECKING:
@@ -82,17 +83,16 @@ def compare(
     require_renderer()
     mode, device = shared.parse_backend(backend, out)
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
-    given = b if (chosen, max_splats) == (0, None) else load_model(b, level=chosen, max_splats=max_splats)
+    given = b if (chosen, max_splats) == (0, None) else load_scene(b, level=chosen, max_splats=max_splats)
     with open_scenes((a, given)) as (source, other), out.bar() as progress:
-        if isinstance(source, OpenedScene):
+        if source.in_memory is None:
             if mode == "exact":
                 raise InputError("--backend exact requires both scenes in memory, and they do not fit: use cpu")
-            out.remark(
-                f"A and B do not fit in {format_bytes(source.memory_bytes)} of memory: they are rendered from the disk"
-            )
+            bound = format_bytes(default_memory_bytes())
+            out.remark(f"A and B do not fit in {bound} of memory: they are rendered from the disk")
         for name, one in ((a, source), (b, other)):
-            out.print_findings(one.findings, Path(name).name)
-        model, every = source.sample(progress)
+            out.print_findings(findings_of(one), Path(name).name)
+        model, every = sample_scene(source, progress=progress)
         around = views.find(model, out, count=0, split=split, every=every)
         if mode == "exact":
             from csplat_tools.views.view_sets import total_render_seconds

@@ -9,16 +9,15 @@ from typing import Annotated
 
 import typer
 
+from csplat.disk_files import FOLDER_NAMES
 from csplat.editing.transform import DEFAULT_AXES
 from csplat.errors import counted
-from csplat.formats import assume_format
-from csplat.model import UNSPECIFIED
+from csplat.scene_metadata import UNSPECIFIED
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes, note
 from csplat_tools.convert_file import Conversion, Filters, convert_file
 from csplat_tools.file_streams import STANDARD_STREAM
-from csplat_tools.scene_files import FOLDER_NAMES
 
 
 def convert(
@@ -88,10 +87,10 @@ def convert(
     is_new_folder = Path(output).name in FOLDER_NAMES and not folder.exists()
     if not dry_run and not Path(output).is_dir():
         out.check(str(folder) if is_new_folder else output, inputs=(source,))
-    with out.bar() as progress, assume_format(read_as):
+    with out.bar() as progress:
         made = convert_file(
-            source, output, write_as=write_as, level=chosen, max_splats=max_splats, overrides=overrides,
-            filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
+            source, output, read_as=read_as, write_as=write_as, level=chosen, max_splats=max_splats,
+            overrides=overrides, filters=filters, no_loss=no_loss, dry_run=dry_run, progress=progress,
         )  # fmt: skip
     out.print_findings(made.findings)
     if made.source_count and not made.count:

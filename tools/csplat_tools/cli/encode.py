@@ -7,11 +7,11 @@ from typing import Annotated
 
 import typer
 
+import csplat
 from csplat.encoder import EncodeOptions, Target
-from csplat.formats import assume_format, open_scene
 from csplat.model import SplatModel
 from csplat.out_of_core import OutOfCoreOptions, estimate_cost
-from csplat.scene_source import source_from_model
+from csplat.scene import Scene
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output, default_output
@@ -29,7 +29,7 @@ from csplat_tools.encode_file import (
 )
 from csplat_tools.file_streams import check_name, source_path
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
-from csplat_tools.scene_files import LoadedModel, read_source
+from csplat_tools.scene_files import read_source
 from csplat_tools.views import ViewSet
 
 _UP_SPLATS = 50_000  # splats for an estimate of the up direction, about; all of a million would take 1.4 CPU s
@@ -133,31 +133,32 @@ def encode(
     level_count = shared.parse_levels(levels)
     overrides = shared.parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased or None, licence=licence)
     limits = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, scheduler=scheduler)
-    with out.bar() as progress, assume_format(read_as):
+    with out.bar() as progress:
         if dry_run:
-            _publish_estimate(source, options, limits, level_count, out)
+            _publish_estimate(source, read_as, options, limits, level_count, out)
             return
         out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
         check_name(output, ".csplat", "encode", source)
-        scene: str | LoadedModel = source
+        scene: str | Scene = source
         around = None
         if target is not None:
             if target.is_rendered:
                 require_renderer()
             scene = read_source(
-                source, overrides, keep_extra=keep_extra, sh_degree=read_degree(options), progress=progress
-            )
+                source, overrides, format=read_as, keep_extra=keep_extra, sh_degree=read_degree(options),
+                progress=progress,
+            )  # fmt: skip
             if max_error is not None:
-                target = replace(target, max_error=shared.parse_max_error(max_error, scene.model.unit_metres))
+                target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))
             if target.is_rendered:
-                around = _find_views(scene.model, options, target, views, out)
+                around = _find_views(scene.model(), options, target, views, out)
         encoded = encode_file(
             scene, output, options, target=target, views=around, overrides=overrides, importance=importance,
-            source_index=source_index, levels=level_count, out_of_core=limits, progress=progress,
+            source_index=source_index, levels=level_count, out_of_core=limits, format=read_as, progress=progress,
         )  # fmt: skip
         _publish(encoded, source, output, out, up=up)
         if level_count is None:
-            written = replace(source_from_model(encoded.source), count=encoded.report.splat_count)
+            written = Scene.of(encoded.source).changed(count=encoded.report.splat_count)
             out.remark(*describe_levels(written, options, limits))
 
 
@@ -180,10 +181,10 @@ def _publish(encoded: EncodedFile, source: str, output: str, out: Output, *, up:
 
 
 def _publish_estimate(
-    source: str, options: EncodeOptions, limits: OutOfCoreOptions, levels: Levels, out: Output
+    source: str, read_as: str | None, options: EncodeOptions, limits: OutOfCoreOptions, levels: Levels, out: Output
 ) -> None:
     """Report memory, disk space and time that an encoding would take."""
-    with source_path(source) as local, open_scene(local, sh_degree=read_degree(options)) as scene:
+    with source_path(source) as local, csplat.open(local, read_as, sh_degree=read_degree(options)) as scene:
         found = estimate_cost(scene, options, limits, choose_levels(scene.count, options, levels))
         lines = describe_levels(scene, options, limits) if levels is None else []
     out.publish(found.as_json(), format_cost(found))

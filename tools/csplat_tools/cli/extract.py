@@ -6,9 +6,10 @@ from typing import Annotated
 
 import typer
 
+import csplat
 from csplat.errors import counted
-from csplat.model import UNSPECIFIED
-from csplat.splat_file import open as opened
+from csplat.scene_metadata import UNSPECIFIED
+from csplat.splat_file import SplatFile
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes
@@ -44,9 +45,9 @@ def extract(
     assert corners is not None
     out.check(output, inputs=(source,))
     check_name(output, ".csplat", "extract", source)
-    with out.bar(), opened(csplat_file(source)) as file, whole_output(output) as stream:
-        part = file.extract(corners, stream)
-        size, read, requests, axes = file.size, file.bytes_read, file.requests, file.header.coordinate_system
+    with out.bar(), SplatFile.open(csplat_file(source)) as file, whole_output(output) as stream:
+        part = csplat.extract(file, corners, stream)
+        size, read, requests, axes = file.size_bytes, file.bytes_read, file.requests, file.header.coordinate_system
     which = "which it does not name" if axes == UNSPECIFIED else f"x, y, z = {axes}"
     out.remark(f"--box: along the axes of {source}, {which}")
     out.remark(

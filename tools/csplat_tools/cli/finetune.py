@@ -86,13 +86,14 @@ def finetune(
     out.check(output, inputs=(source, *views.inputs, resume), named=named)
     check_name(output, ".csplat", "finetune", source)
     with out.bar():
-        read = read_source(source, MetadataOverrides(), sh_degree=read_degree(encoding))
-        out.print_findings(read.findings)
+        scene = read_source(source, MetadataOverrides(), sh_degree=read_degree(encoding))
+        out.print_findings(scene.findings)
+        model = scene.model()
         kept_back = tuning.default_validation_count(tuning.VIEWS, cameras=cameras, data=data)
-        around = views.find(read.model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=kept_back)
+        around = views.find(model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=kept_back)
         around.read_images()
         result = tuning.run_finetuning(
-            read.model, around, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
+            model, around, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
             target=target, source_index=source_index, page=page, quiet=out.quiet,
         )  # fmt: skip
     out.remark(format_tuning_report(result))

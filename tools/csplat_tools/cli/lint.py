@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+import csplat
 from csplat import formats
 from csplat.errors import InputError
 from csplat.lint import Finding
@@ -14,7 +15,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.error_lines import EXIT_FAILED
 from csplat_tools.console import format_table
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, source_path, write_model
-from csplat_tools.scene_files import findings_as_json, without_extra_columns
+from csplat_tools.scene_files import findings_as_json
 
 
 def lint(
@@ -48,8 +49,8 @@ def lint(
             findings = [one for one in findings if one.id != "extra-columns"]
         errors = any(one.kind == "error" for one in findings)
         if fix is not None and not errors:
-            with formats.open_scene(path) as scene:
-                write_model(fix, scene if keep_extra else without_extra_columns(scene), absolute=False)
+            with csplat.open(path) as scene:
+                write_model(fix, scene if keep_extra else scene.without_extra(), absolute=False)
     clean = all(one.kind == "note" for one in findings)
     table = _table(findings)
     if fix == STANDARD_STREAM:

@@ -17,7 +17,7 @@ from csplat_tools.file_streams import STANDARD_STREAM, check_name
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.present.scene_renders import find_cameras, render_film, render_folder
 from csplat_tools.render_files import DEFAULT_FPS, MAX_FPS, is_film
-from csplat_tools.scene_files import load_model, splats_to_frame
+from csplat_tools.scene_files import load_scene, splats_to_frame
 
 _NOT_WRITTEN = (".avi", ".bmp", ".exr", ".hdr", ".m4v", ".mkv", ".mov", ".mpg", ".tif", ".tiff", ".webm")
 
@@ -85,10 +85,10 @@ def render(
     require_renderer()
     mode, device = shared.parse_backend(backend, out)
     with out.bar() as progress:
-        read = load_model(source, level=chosen, max_splats=max_splats)
+        read = load_scene(source, level=chosen, max_splats=max_splats)
         out.print_findings(read.findings)
-        model, notes = overrides.apply(read.model), list[str]()
-        to_frame = model if orbit is None else overrides.apply(splats_to_frame(source, read.model))
+        model, notes = overrides.apply_to_model(read.model()), list[str]()
+        to_frame = model if orbit is None else overrides.apply_to_model(splats_to_frame(source, read.model()))
         data_set = None if data is None else shared.open_data(data, size=pixels)
         shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)

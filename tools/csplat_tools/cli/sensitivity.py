@@ -11,7 +11,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name
 from csplat_tools.inspect.text_reports import format_sensitivity
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
-from csplat_tools.scene_files import load_model
+from csplat_tools.scene_files import load_scene
 
 #: Cost of the measurement, in renders of all views.
 _PASSES = 4.4
@@ -47,9 +47,9 @@ def sensitivity(
     from csplat_tools.views.view_sets import total_render_seconds
 
     with out.bar() as progress:
-        read = load_model(source)
+        read = load_scene(source)
         out.print_findings(read.findings)
-        model = read.model
+        model = read.model()
         are_virtual = data is None and cameras is None
         prepare_renderer(quiet=out.quiet, simplify=are_virtual)
         around = views.find(

@@ -16,10 +16,10 @@ from typing import Annotated, Any, Literal, TypeVar
 import typer
 
 from csplat.disk_files import resolve_links
-from csplat.editing.up_axis import Direction, unit_up
 from csplat.encoder import PresetName, Target
 from csplat.errors import InputError
-from csplat.model import MAX_SH_DEGREE, SplatModel, check_axes
+from csplat.model import MAX_SH_DEGREE, SplatModel
+from csplat.scene_metadata import Direction, check_axes, unit_up
 from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output

@@ -11,7 +11,7 @@ from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name, write_model
 from csplat_tools.inspect.text_reports import format_simplification
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
-from csplat_tools.scene_files import load_model
+from csplat_tools.scene_files import load_scene
 
 #: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
 #: for the fraction to keep (20 and 45); half of the cost is fitting.
@@ -63,9 +63,9 @@ def simplify(
     out.check(output, inputs=(source, *views.inputs))
     check_name(output, ".ply", "simplify", source)
     with out.bar() as progress:
-        read = load_model(source)
+        read = load_scene(source)
         out.print_findings(read.findings)
-        model = overrides.apply(read.model)
+        model = overrides.apply_to_model(read.model())
         prepare_renderer(quiet=out.quiet, simplify=True)
         around = views.find(model, out)
         passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)

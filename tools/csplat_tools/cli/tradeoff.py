@@ -60,10 +60,10 @@ def tradeoff(
         read = read_source(source)
         out.print_findings(read.findings)
         prepare_renderer(quiet=out.quiet, simplify=bool(searches), ssim=True)
-        around = views.find(read.model, out)
-        if len(read.model):
+        around = views.find(read.model(), out)
+        if len(read.model()):
             out.announce_time(
-                lambda: sum(expected_search_seconds(read.model, *search, around) for search in searches),
+                lambda: sum(expected_search_seconds(read.model(), *search, around) for search in searches),
                 "--what presets,precision takes less",
             )
         words = [*(["--cameras", cameras] if cameras else []), *(["--data", data] if data else [])]

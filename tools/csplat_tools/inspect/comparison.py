@@ -11,12 +11,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from csplat import scene_source as scenes
-from csplat.decoder import open_tiles
 from csplat.disk_files import check_free_space, finite_or_none, temporary_root
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
+from csplat.splat_file import SplatFile
+from csplat.system import default_memory_bytes
 from csplat.types import F32, Progress, null_progress
 from csplat_conformance.declared_bounds import (
     Source,
@@ -35,10 +35,9 @@ from csplat_render.gpu.scoring import compare_scenes
 from csplat_render.lpips import load_lpips
 from csplat_render.metrics import Distance, Scores, ViewScore
 from csplat_render.scorer import OnView, Renderable, Scorer
-from csplat_tools.file_streams import is_csplat
 from csplat_tools.optional_packages import require_images, require_renderer
 from csplat_tools.render_files import image_names, make_output_folder, side_by_side, write_png
-from csplat_tools.scene_files import LoadedModel, OpenedScene, SceneLike, open_scenes
+from csplat_tools.scene_files import SceneLike, open_scenes, sample_scene, scene_sizes
 from csplat_tools.views import Colour, ViewSet, find_view_set
 from csplat_tools.views.sliced_renderer import SlicedScene
 
@@ -84,7 +83,7 @@ class Comparison:
     """The outcome of comparing two scenes.
 
     Attributes:
-        a, b: the source, and the scene compared with it; `OpenedScene` if they do not fit in memory together.
+        a, b: the source, and the scene compared with it; not in memory if they do not fit together.
         attributes: errors of B's splats; `None` if pairs of splats cannot be found, which is usual out of core without
             a source index.
         quality: scores of B's renders against A's.
@@ -97,8 +96,8 @@ class Comparison:
         seconds: time of reading, matching, rendering and writing.
     """
 
-    a: LoadedModel | OpenedScene
-    b: LoadedModel | OpenedScene
+    a: Scene
+    b: Scene
     attributes: AttributeErrors | None
     quality: Scores
     ignored: int
@@ -120,8 +119,8 @@ class Comparison:
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
         return {
-            "a": self.a.as_json(),
-            "b": self.b.as_json(),
+            "a": scene_sizes(self.a),
+            "b": scene_sizes(self.b),
             "ratio": self.ratio,
             "attributes": None if self.attributes is None else self.attributes.as_json(),
             "cameras": self.cameras,
@@ -139,8 +138,8 @@ class Comparison:
 
 
 def compare(
-    a: SceneLike | OpenedScene,
-    b: SceneLike | OpenedScene,
+    a: SceneLike,
+    b: SceneLike,
     *,
     views: ViewSet | None = None,
     source_index: NDArray[np.integer[Any]] | None = None,
@@ -158,7 +157,8 @@ def compare(
     """Compare a scene with its source, as `csplat compare` does. Requires the packages of the render extra.
 
     Args:
-        a, b: the source, and the scene compared with it: models, or files in any format.
+        a, b: the source, and the scene compared with it: models, open scenes, or files in any
+            format.
         views: the views; A and B are scored on the test views, against their images, too, if there are any. `None`:
             the eight virtual views of `psnr`, 640×480, on black (`find_view_set`).
         source_index: [N] the index in A of each splat of B.
@@ -187,6 +187,7 @@ def compare(
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
+    bound = default_memory_bytes() if memory_bytes is None else memory_bytes
     require_renderer()
     if pictures is not None:
         require_images()
@@ -202,7 +203,7 @@ def compare(
             viewers.append(_ImageWriter(os.fspath(pictures), names, image_scorer, amplification, force=force))
         first: SplatModel | Renderable
         second: SplatModel | Renderable
-        first, second, errors = _measure(source, other, views.test, source_index, progress)
+        first, second, errors = _measure(source, other, views.test, bound, source_index, progress)
         if prepare is not None:
             prepare()
         image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
@@ -226,8 +227,8 @@ def compare(
 
 
 def attribute_errors(
-    source: LoadedModel,
-    other: LoadedModel,
+    source: Scene,
+    other: Scene,
     source_index: NDArray[Any] | None = None,
     *,
     progress: Progress | None = None,
@@ -235,8 +236,8 @@ def attribute_errors(
     """Measure the errors of a scene's splats against those of its source.
 
     Args:
-        source: the source.
-        other: the scene whose errors are measured.
+        source: the source, in memory.
+        other: the scene whose errors are measured, in memory.
         source_index: [N] integers, the index in the source of each splat of `other`; `None`: unknown.
         progress: progress callback of a search.
 
@@ -246,18 +247,19 @@ def attribute_errors(
     Raises:
         InputError: `source_index` is not one index of a source splat for each splat of `other`.
     """
-    ours, theirs = Source.of(source.model), other.model
+    model, theirs = source.model(), other.model()
+    ours = Source.of(model)
     if source_index is not None:
         return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
-    if _same_order(source.model, theirs):
+    if _same_order(model, theirs):
         return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
-    declared, header = other.declared_bounds, other.header
-    if header is None or declared is None or not len(theirs):
+    declared = other.declared_bounds if isinstance(other, SplatFile) else None
+    if declared is None or not isinstance(other, SplatFile) or not len(theirs):
         return None
     bounds = {record.measure: record.max for record in declared.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:
         return None
-    found = find_partners(ours, theirs, bounds, lattice_radii(theirs, header), progress=progress)
+    found = find_partners(ours, theirs, bounds, lattice_radii(theirs, other.header), progress=progress)
     matched = np.flatnonzero(found >= 0)
     if not len(matched):
         return None
@@ -266,38 +268,38 @@ def attribute_errors(
 
 
 def attribute_errors_out_of_core(
-    source: OpenedScene,
-    other: OpenedScene,
+    source: Scene,
+    other: Scene,
+    memory_bytes: int,
     source_index: NDArray[Any] | None = None,
     *,
     progress: Progress | None = None,
 ) -> AttributeErrors | None:
     """Measure errors as `attribute_errors` does, out of core, without search; an index requires a .csplat file."""
     if source_index is not None:
-        if not is_csplat(other.path):
+        if not isinstance(other, SplatFile):
             return None
-        opened = open_tiles(other.path)
-        most = splats_in_memory(opened, source.memory_bytes)
-        pairs = measure_pairs_by_tile(source.scene, opened, source_index, most, progress=progress)
+        most = splats_in_memory(other, memory_bytes)
+        pairs = measure_pairs_by_tile(source, other, source_index, most, progress=progress)
         found = {name: (one.max, one.rms) for name, one in pairs.measured.items()}
         return AttributeErrors("index", other.count, 0, found)
-    if source.count != other.count or not _same_order(source.sample(progress)[0], other.sample(progress)[0]):
+    if source.count != other.count or not _same_order(
+        *(sample_scene(one, progress=progress)[0] for one in (source, other))
+    ):
         return None
     parts = [
         (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
-        for start, ours, theirs in _paired_blocks(source.scene, other.scene, progress)
+        for start, ours, theirs in _paired_blocks(source, other, progress)
     ]
     found = {name: (one.max, one.rms) for name, one in merge_errors(parts).items()}
     return AttributeErrors("order", other.count, 0, found)
 
 
-def _paired_blocks(
-    a: SceneSource, b: SceneSource, progress: Progress | None
-) -> Iterator[tuple[int, SplatModel, SplatModel]]:
+def _paired_blocks(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
     """Yield paired blocks of two scenes in the same order, with the index of the first splat."""
-    first = scenes.with_progress(a, "measuring splats", progress or null_progress).blocks()
-    second = scenes.with_progress(b, "", null_progress).blocks()
-    start, ours, theirs = 0, a.metadata_model, b.metadata_model
+    first = a.with_progress("measuring splats", progress or null_progress).blocks()
+    second = b.with_progress("", null_progress).blocks()
+    start, ours, theirs = 0, a.empty(), b.empty()
     while start < a.count:
         ours, theirs = ours if len(ours) else next(first), theirs if len(theirs) else next(second)
         count = min(len(ours), len(theirs))
@@ -321,26 +323,26 @@ def _same_order(source: SplatModel, other: SplatModel) -> bool:
     return float(np.median(distances)) <= _NEAR * spread
 
 
-def _views(source: LoadedModel | OpenedScene, background: Colour | None, progress: Progress | None) -> ViewSet:
-    model, every = source.sample(progress)
+def _views(source: Scene, background: Colour | None, progress: Progress | None) -> ViewSet:
+    model, every = sample_scene(source, progress=progress)
     return find_view_set(model, background=background, count=0, every=every)
 
 
 def _measure(
-    source: LoadedModel | OpenedScene,
-    other: LoadedModel | OpenedScene,
+    source: Scene,
+    other: Scene,
     cameras: Sequence[Camera],
+    memory_bytes: int,
     source_index: NDArray[np.integer[Any]] | None,
     progress: Progress | None,
 ) -> tuple[SplatModel | SlicedScene, SplatModel | SlicedScene, AttributeErrors | None]:
     """Return both scenes in a form to render, and the errors of B's splats."""
-    if isinstance(source, LoadedModel) and isinstance(other, LoadedModel):
-        return source.model, other.model, attribute_errors(source, other, source_index, progress=progress)
-    assert isinstance(source, OpenedScene)
-    assert isinstance(other, OpenedScene)
+    if source.in_memory is not None and other.in_memory is not None:
+        return source.in_memory, other.in_memory, attribute_errors(source, other, source_index, progress=progress)
     kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
     first, second = (
-        SlicedScene(one.scene, *one.sample(progress), one.memory_bytes - kept, progress) for one in (source, other)
+        SlicedScene(one, *sample_scene(one, progress=progress), memory_bytes - kept, progress)
+        for one in (source, other)
     )
     for one in (first, second):
         if one.memory_bytes < one.least_bytes:
@@ -351,7 +353,7 @@ def _measure(
         max(first.disk_bytes, second.disk_bytes),
         "scenes are rendered: TMPDIR sets another folder",
     )
-    return first, second, attribute_errors_out_of_core(source, other, source_index, progress=progress)
+    return first, second, attribute_errors_out_of_core(source, other, memory_bytes, source_index, progress=progress)
 
 
 def _on_gpu(scene: SplatModel | Renderable, device: Device) -> GpuScene:

@@ -14,25 +14,24 @@ from mmap import mmap
 from pathlib import Path
 from typing import Any
 
+import csplat
 from csplat import _spec
 from csplat.decoder import (
     DeclaredBounds,
     SceneHeader,
-    read_cameras,
     read_declared_bounds,
     read_header,
     read_metadata,
     read_options,
 )
 from csplat.decoder.tree import read_nodes
-from csplat.disk_files import finite_or_none
-from csplat.editing.up_axis import UP, up_of
+from csplat.disk_files import finite_or_none, size_on_disk
 from csplat.errors import FormatError
-from csplat.formats import format_by_name, open_scene
-from csplat.model import SplatModel
-from csplat.training_record import TRAINING, VIEW, TrainingRecord
+from csplat.formats import format_by_name
+from csplat.scene import Scene
+from csplat.scene_metadata import TRAINING, UP, VIEW, SceneMetadata
 from csplat_tools.console import format_bytes
-from csplat_tools.scene_files import findings_as_json, size_on_disk
+from csplat_tools.scene_files import findings_as_json
 
 _NULLABLE = ("bits_per_splat",)  # values that the JSON contains even if they are `None`
 _STREAM_CLAUSE = "STR-6"
@@ -138,8 +137,8 @@ class FileDescription:
         codebooks: codebooks in the order of the index.
         overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
             chunks.
-        cameras: number of cameras; `None` without the chunk, as for the following fields.
-        options, metadata: the file's JSON.
+        metadata: metadata of the scene.
+        options: the encoder's record of its options; `None` if there is none.
         declared_bounds: the declared error bounds, and counts of the source.
     """
 
@@ -149,9 +148,8 @@ class FileDescription:
     levels: Sequence[LevelSummary]
     codebooks: Sequence[CodebookSummary]
     overhead: Mapping[str, int]
-    cameras: int | None
+    metadata: SceneMetadata
     options: Mapping[str, Any] | None
-    metadata: Mapping[str, Any] | None
     declared_bounds: DeclaredBounds | None
 
     @property
@@ -174,7 +172,7 @@ class FileDescription:
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
         header, tiles = self.header, self.header.tiles
-        up = up_of(self.metadata or {}, header.coordinate_system)
+        metadata, up = self.metadata, self.metadata.up
         largest = {"max_scale": finite_or_none(max(tile.max_scale for tile in tiles))} if tiles else {}
         return {
             "format": f"csplat {header.version[0]}.{header.version[1]}",
@@ -203,9 +201,9 @@ class FileDescription:
                 {"type": chunk.type.decode("ascii"), "size_bytes": chunk.size, "offset_bytes": chunk.offset}
                 for chunk in header.directory
             ],
-            "cameras": self.cameras,
+            "cameras": None if metadata.cameras is None else len(metadata.cameras),
             "options": self.options,
-            "metadata": self.metadata,
+            "metadata": dict(metadata.entries) or None,
             "stated_errors": None if self.declared_bounds is None else _bounds_as_json(self.declared_bounds),
         }
 
@@ -223,7 +221,6 @@ def describe_file(data: bytes | mmap) -> FileDescription:
     header = read_header(data)
     use = attribute_usage(data, header)
     attributes = {name: _attribute(header, name, one) for name, one in use.items()}
-    cameras = read_cameras(data)
     return FileDescription(
         header,
         attributes,
@@ -231,9 +228,8 @@ def describe_file(data: bytes | mmap) -> FileDescription:
         _levels(data, header),
         [_codebook(header, record) for record in header.codebooks],
         _overhead(header, use),
-        None if cameras is None else len(cameras),
-        read_options(data),
         read_metadata(data),
+        read_options(data),
         read_declared_bounds(data),
     )
 
@@ -248,8 +244,8 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
         InputError: the file is in no readable format, or truncated.
         OSError: the file cannot be read.
     """
-    with open_scene(path) as scene:
-        metadata_model, size, count = scene.metadata_model, size_on_disk(path), scene.count
+    with csplat.open(path) as scene:
+        metadata, size, count = scene.metadata, size_on_disk(path), scene.count
         per_splat = size / count if count else None
         report = {
             "format": scene.format,
@@ -257,27 +253,27 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
             "bytes_per_splat": per_splat,
             "splats": count,
             "levels": list(scene.levels),
-            "sh_degree": metadata_model.sh_degree,
-            "coordinate_system": metadata_model.coordinate_system,
-            "file_axes": scene.file_axes or metadata_model.coordinate_system,
-            "origin": list(metadata_model.origin),
-            "unit_metres": metadata_model.unit_metres,
-            "antialiased": metadata_model.antialiased,
-            "flat": metadata_model.flat,
-            "extra": {name: str(column.dtype) for name, column in metadata_model.extra.items()},
-            "metadata": dict(metadata_model.metadata),
+            "sh_degree": scene.sh_degree,
+            "coordinate_system": metadata.coordinate_system,
+            "file_axes": scene.file_axes or metadata.coordinate_system,
+            "origin": list(scene.origin),
+            "unit_metres": metadata.unit_metres,
+            "antialiased": metadata.antialiased,
+            "flat": metadata.flat,
+            "extra": {name: str(dtype) for name, dtype in scene.extra.items()},
+            "metadata": dict(metadata.entries),
             "defects": findings_as_json(scene.findings),
         }
         average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
-        words = describe_placement(metadata_model, count, metadata_model.metadata)
+        words = describe_placement(scene, count, metadata)
         if scene.file_axes:
-            words["axes"] = f"{scene.file_axes}, read as {metadata_model.coordinate_system}"
+            words["axes"] = f"{scene.file_axes}, read as {metadata.coordinate_system}"
         if scene.levels:
             words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
-        if metadata_model.extra:
-            words["extra"] = ", ".join(f"{name} ({column.dtype})" for name, column in metadata_model.extra.items())
-        if metadata_model.metadata:
-            words["metadata"] = json.dumps(metadata_model.metadata, sort_keys=True)
+        if scene.extra:
+            words["extra"] = ", ".join(f"{name} ({dtype})" for name, dtype in scene.extra.items())
+        if metadata.entries:
+            words["metadata"] = json.dumps(metadata.entries, sort_keys=True)
         lines = [f"{format_by_name(scene.format).title}, {format_bytes(size)}{average}"]
         lines += [f"{name:12} {value}" for name, value in words.items()]
         lines += [str(one) for one in scene.findings if not one.usual]
@@ -335,37 +331,35 @@ def format_headline(file: FileDescription) -> str:
 def describe_scene(file: FileDescription) -> dict[str, str]:
     """Describe the scene in words, by title."""
     header = file.header
-    words = describe_placement(header, header.splat_count, file.metadata or {})
+    words = describe_placement(header, header.splat_count, file.metadata)
     words["tiles"] = _tiles(file)
     extras = ", ".join(f"{one.name} ({one.dtype or 'unknown type'})" for one in header.extras)
     if extras:
         words["extra"] = extras
-    if file.cameras is not None:
-        words["cameras"] = str(file.cameras)
-    trained = TrainingRecord.of(file.metadata or {})
-    if trained is not None:
-        words["trained on"] = str(trained)
-    view = (file.metadata or {}).get(VIEW)
-    if view is not None:
+    if file.metadata.cameras is not None:
+        words["cameras"] = str(len(file.metadata.cameras))
+    if file.metadata.training is not None:
+        words["trained on"] = str(file.metadata.training)
+    if file.metadata.entries.get(VIEW) is not None:
         words["first view"] = "a camera of the metadata"
     return words
 
 
-def describe_placement(scene: SceneHeader | SplatModel, count: int, metadata: Mapping[str, Any]) -> dict[str, str]:
+def describe_placement(scene: SceneHeader | Scene, count: int, metadata: SceneMetadata) -> dict[str, str]:
     """Describe splat count, axes, up direction, unit, origin and flags in words, by title.
 
     Args:
-        scene: header of a .csplat file, or metadata of another one.
+        scene: header of a .csplat file, or another scene.
         count: number of splats.
         metadata: metadata of the scene.
     """
-    flags = [name for name in ("antialiased", "flat") if getattr(scene, name)]
-    up = up_of(metadata, scene.coordinate_system)
+    flags = [name for name in ("antialiased", "flat") if getattr(metadata, name)]
+    up, unit = metadata.up, metadata.unit_metres
     return {
         "splats": f"{count:,}, SH degree {scene.sh_degree}",
-        "axes": str(scene.coordinate_system),
+        "axes": metadata.coordinate_system,
         "up": "unknown" if up is None else " ".join(f"{value:g}" for value in up),
-        "unit": "unknown" if scene.unit_metres is None else f"{scene.unit_metres:g} m",
+        "unit": "unknown" if unit is None else f"{unit:g} m",
         "origin": " ".join(f"{value:.17g}" for value in scene.origin),
         "flags": ", ".join(flags) or "none",
     }
@@ -392,13 +386,9 @@ def describe_coding(attribute: AttributeSummary) -> str:
 
 def other_metadata(file: FileDescription) -> dict[str, object]:
     """Return the metadata that `describe_scene` does not describe."""
-    metadata = dict(file.metadata or {})
-    if TrainingRecord.of(metadata) is not None:
-        del metadata[TRAINING]
-    if up_of(metadata) is not None:
-        del metadata[UP]
-    metadata.pop(VIEW, None)
-    return metadata
+    metadata = file.metadata
+    described = {VIEW: True, TRAINING: metadata.training is not None, UP: metadata.stated_up is not None}
+    return {key: value for key, value in metadata.entries.items() if not described.get(key)}
 
 
 def _bits(size_bytes: int, count: int) -> float | None:

@@ -20,7 +20,7 @@ from csplat_tools.inspect.file_description import (
     format_headline,
     other_metadata,
 )
-from csplat_tools.scene_files import load_model
+from csplat_tools.scene_files import load_scene
 
 _ATTRIBUTES = {
     "opacities": "opacity of each splat",
@@ -113,17 +113,17 @@ def _compare(data: bytes | mmap, source: str, progress: Progress | None) -> _Sou
     from csplat_render.scorer import Scorer
     from csplat_tools.views import display_cameras, find_view_set
 
-    loaded, model = load_model(source), decode(data)
-    views = find_view_set(loaded.model, count=0)
-    hardest, shown = html.HardestPlaceSearch(), display_cameras(loaded.model, views)
-    scores = views.test_scorer(loaded.model).scores(model, progress=progress)
-    showing = Scorer.of_source(loaded.model, shown, views.test_background)
+    loaded, model = load_scene(source), decode(data)
+    views = find_view_set(loaded.model(), count=0)
+    hardest, shown = html.HardestPlaceSearch(), display_cameras(loaded.model(), views)
+    scores = views.test_scorer(loaded.model()).scores(model, progress=progress)
+    showing = Scorer.of_source(loaded.model(), shown, views.test_background)
     showing.scores(model, ssim=False, on_view=hardest.examine)
     place = hardest.found()
     assert place is not None
     name = "standard input" if source == STANDARD_STREAM else PurePath(source).name
     measurements = {
-        "source": f"{name}: {len(loaded.model):,} splats, {format_bytes(loaded.size_bytes)},"
+        "source": f"{name}: {len(loaded.model()):,} splats, {format_bytes(loaded.size_bytes)},"
         f" {loaded.size_bytes / len(data):.1f} times the bytes of the file",
         "PSNR": f"{scores.psnr:.2f} dB: similarity of renders of the file and of the source, from"
         f" {len(scores.each)} views all around; at 30 dB a difference is visible, at 40 dB hardly",

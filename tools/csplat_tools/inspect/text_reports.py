@@ -68,7 +68,7 @@ def _scene_sizes(compared: Comparison, a: str, b: str) -> str:
     for name, one in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
         count = one.count
         per_splat = f"{one.size_bytes / count:.2f}" if count else "-"
-        rows.append((name, one.size_bytes, count, one.metadata_model.sh_degree, per_splat))
+        rows.append((name, one.size_bytes, count, one.sh_degree, per_splat))
     table = format_table(("", "bytes", "splats", "SH", "bytes/splat"), rows)
     ratio = compared.ratio
     return f"{table}\nB is {ratio:.2f} times smaller than A" if ratio >= 1.0 else f"{table}\nB is larger than A"
@@ -98,10 +98,8 @@ def _scores(compared: Comparison) -> str:
     head, *others = format_table(("renders", views), rows).splitlines()
     lines = [head, *(f"{line}  {_SCORE_EXPLANATIONS[name]}" for line, (name, _) in zip(others, rows, strict=True))]
     lines += _ignored_lines(compared)
-    if compared.a.metadata_model.antialiased != compared.b.metadata_model.antialiased:
-        lines.append(
-            f"only {'A' if compared.a.metadata_model.antialiased else 'B'} is antialiased, and was rendered so"
-        )
+    if compared.a.metadata.antialiased != compared.b.metadata.antialiased:
+        lines.append(f"only {'A' if compared.a.metadata.antialiased else 'B'} is antialiased, and was rendered so")
     return "\n".join(lines)
 
 

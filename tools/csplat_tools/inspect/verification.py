@@ -8,11 +8,12 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from csplat import formats
-from csplat.decoder import decode, open_tiles
-from csplat.disk_files import read_array
+import csplat
+from csplat.decoder import decode
+from csplat.disk_files import read_array, size_on_disk
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE
+from csplat.splat_file import SplatFile
 from csplat.system import available_memory_bytes, default_memory_bytes
 from csplat.types import Progress
 from csplat_conformance.declared_bounds import (
@@ -25,7 +26,6 @@ from csplat_conformance.declared_bounds import (
 )
 from csplat_conformance.validator import Validation, validate
 from csplat_tools.file_streams import mapped_csplat, source_path
-from csplat_tools.scene_files import size_on_disk
 
 _INDEX_BYTES = 1 << 27  # largest size of a source index, which is read as a whole
 
@@ -101,7 +101,7 @@ def verify_file(
 def _verify_bounds(
     data: bytes | mmap, source: str, rows: NDArray[Any] | None, memory_bytes: int | None, progress: Progress | None
 ) -> BoundsVerification:
-    opened = open_tiles(data)
+    opened = SplatFile.open(data)
     header, bounds = opened.header, opened.declared_bounds
     degree = MAX_SH_DEGREE  # bands above have not been read by the encoder
     if memory_bytes is None:
@@ -109,13 +109,13 @@ def _verify_bounds(
     with source_path(source) as local:
         needed = comparison_bytes(opened, bounds.source_count if bounds else 0, size_on_disk(local))
         if needed <= memory_bytes:
-            model = formats.read(local, keep_extra=bool(header.extras), sh_degree=degree)
+            model = csplat.read(local, keep_extra=bool(header.extras), sh_degree=degree)
             return verify_bounds(Source.of(model), decode(data), header, bounds, rows, progress=progress)
         if rows is None:
             raise InputError(
                 f"the declared errors were not checked: this takes {needed / 1e6:,.0f} MB of memory, expected at most "
                 f"{memory_bytes / 1e6:,.0f} MB; give --source-index, which takes less, or free more memory"
             )
-        with formats.open_scene(local, sh_degree=degree) as scene:
+        with csplat.open(local, sh_degree=degree) as scene:
             most = splats_in_memory(opened, memory_bytes)
             return verify_bounds_by_tile(scene, opened, rows, most, progress=progress)

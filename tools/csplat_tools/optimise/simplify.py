@@ -19,7 +19,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.pruning import PrunedSubset, Pruner
 from csplat_tools.optimise.rate_distortion import AIM, error_of_psnr
 from csplat_tools.optional_packages import require_renderer
-from csplat_tools.scene_files import SceneLike, load_model
+from csplat_tools.scene_files import SceneLike, load_scene
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
 
 _TRIES = 4  # largest number of refits in the search for the fewest splats of a PSNR
@@ -141,7 +141,7 @@ def simplify(
     """
     require_renderer()
     target.require("simplify", "keep", "psnr", "max_psnr_drop")
-    source, start = load_model(scene).model, time.perf_counter()
+    source, start = load_scene(scene).model(), time.perf_counter()
     options = options or SimplifyOptions(effort=target.effort)
     if not len(source):
         raise InputError("a scene without splats cannot be simplified")

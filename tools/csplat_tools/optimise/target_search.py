@@ -35,7 +35,7 @@ from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, SearchReport, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene_source import drop_bands
+from csplat.scene import drop_bands
 from csplat.types import Progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame

@@ -11,7 +11,6 @@ import numpy as np
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.training_record import TrainingRecord
 from csplat.types import F32, Progress
 from csplat_render import Backend, Camera, Mode
 from csplat_render.camera import resized
@@ -206,7 +205,7 @@ def _renders(
 ) -> Iterator[Render]:
     if prepare is not None:
         prepare()
-    record = TrainingRecord.of(model.metadata)
+    record = model.metadata.training
     behind = background or (record.background if record else BLACK)
     draw = renderer(on_backend(model, backend), behind, mode=mode)
     for number, camera in enumerate(cameras):

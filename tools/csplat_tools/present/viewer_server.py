@@ -26,12 +26,11 @@ from urllib.parse import quote, unquote, urlencode, urlsplit
 
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
 from csplat.decoder import SceneHeader, decode, read_header
-from csplat.editing.up_axis import Direction
 from csplat.encoder import EncodeOptions, PresetName, encode_with_report
 from csplat.errors import CsplatError, FormatError, InputError
 from csplat.file_source import open_binary, read_bytes
 from csplat.lint import Finding
-from csplat.model import UNSPECIFIED
+from csplat.scene_metadata import UNSPECIFIED, Direction
 from csplat.types import Progress
 from csplat_render.camera_files import load_cameras
 from csplat_render.up_estimate import estimate_up
@@ -317,9 +316,9 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
 
 def _encode_scene(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewerScene:
     source = read_source(str(path), progress=progress)
-    data = encode_with_report(source.model, EncodeOptions(preset=preset), progress=progress).data
-    header, up = read_header(data), estimate_up(source.model)
-    return ViewerScene(f"{stem}.csplat", data, len(data), header, up, source.findings, source.size_bytes)
+    data = encode_with_report(source.model(), EncodeOptions(preset=preset), progress=progress).data
+    header, up = read_header(data), estimate_up(source.model())
+    return ViewerScene(f"{stem}.csplat", data, len(data), header, up, tuple(source.findings), source.size_bytes)
 
 
 class _Handler(BaseHTTPRequestHandler):

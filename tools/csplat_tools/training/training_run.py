@@ -10,7 +10,6 @@ import csplat_trainer
 from csplat.disk_files import resolve_links
 from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError, counted
-from csplat.training_record import TrainingRecord
 from csplat_render.kernels import thread_count
 from csplat_render.lpips import load_lpips
 from csplat_tools.console import note, step_progress
@@ -66,13 +65,13 @@ def run_training(
     """
     data_set = _load(data, options, files)
     result = _train(data_set, options, files, plot=plot, threads=threads, quiet=quiet)
-    model = (overrides or MetadataOverrides()).apply(result.model)
+    model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
         views = find_view_set(model, data=data_set, validation_count=0)
         write_training_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
     if not quiet:
-        record = TrainingRecord.of(result.model.metadata)
+        record = result.model.metadata.training
         note(f"the metadata of {output} contain the options for comparing it with its images: {record}")
     return result.log
 
@@ -115,7 +114,7 @@ def run_training_to_file(
     for one in data_set.val:  # training does not read these; finds damaged ones before it
         _ = one.pixels, one.mask
     result = _train(data_set, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
-    model = (overrides or MetadataOverrides()).apply(result.model)
+    model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     views = find_view_set(model, data=data_set, validation_count=0)  # the tuning splits the training views
     known = None
     if result.metrics is not None and options.eval_views == 0 and options.device == "cpu":

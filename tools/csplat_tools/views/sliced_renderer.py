@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.scene_source import BLOCK_SPLATS, SceneSource, source_from_model
+from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.types import F32, F64, Progress
 from csplat_conformance.declared_bounds import Source
 from csplat_render import Camera, Mode
@@ -45,13 +45,13 @@ class SlicedScene:
 
     Attributes:
         scene: its splats.
-        sample, every: as returned by `OpenedScene.sample`.
+        sample, every: as returned by `sample_scene`.
         memory_bytes: approximate limit of the memory.
         progress: progress callback of a render.
         slice_bytes: least memory for a slice, bytes.
     """
 
-    scene: SceneSource
+    scene: Scene
     sample: SplatModel
     every: int
     memory_bytes: int
@@ -61,7 +61,7 @@ class SlicedScene:
     @property
     def origin(self) -> tuple[float, float, float]:
         """The scene's origin, to which cameras are relative."""
-        return self.scene.metadata_model.origin
+        return self.scene.origin
 
     @property
     def disk_bytes(self) -> int:
@@ -71,7 +71,7 @@ class SlicedScene:
     @property
     def record(self) -> np.dtype[Any]:
         """Type of a splat's record on the disk."""
-        return record_type(_source(self.scene.metadata_model))
+        return record_type(_source(self.scene.empty()))
 
     @property
     def splat_bytes(self) -> float:
@@ -122,8 +122,8 @@ class _SlicedRender:
 
     def drawn(self) -> RenderResult:
         """Draw all slices, and return the render."""
-        limits = self._limits(map(_source, source_from_model(self._scene.sample).blocks()), 1, self._scene.every)
-        self._draw(_source(self._scene.scene.metadata_model))  # the background, in case no splat is visible
+        limits = self._limits(map(_source, Scene.of(self._scene.sample).blocks()), 1, self._scene.every)
+        self._draw(_source(self._scene.scene.empty()))  # the background, in case no splat is visible
         self._sort_and_draw(self._blocks, self._scene.scene.count, limits, first=True)
         self._report(1.0)
         assert self._last is not None
@@ -139,9 +139,7 @@ class _SlicedRender:
 
     def _visible_splats(self, splats: HasSplats) -> tuple[F32, F64, int]:
         """Return depths and memory for drawing in bytes, both 0 if invisible; and the number of ignored splats."""
-        seen = self._rasteriser.find_visible(
-            splats, self._camera, antialiased=self._scene.scene.metadata_model.antialiased
-        )
+        seen = self._rasteriser.find_visible(splats, self._camera, antialiased=self._scene.scene.metadata.antialiased)
         return seen.near, np.where(seen.near > 0, self._splat_bytes + _PAIR_BYTES * seen.tiles, 0.0), seen.ignored
 
     def _blocks(self) -> Iterator[Source]:
@@ -199,7 +197,7 @@ class _SlicedRender:
     def _draw(self, splats: HasSplats) -> None:
         found = self._rasteriser.forward(
             splats, self._camera, background=self._background, state=self._state,
-            antialiased=self._scene.scene.metadata_model.antialiased,
+            antialiased=self._scene.scene.metadata.antialiased,
         )  # fmt: skip
         self._last = replace(found, radii=np.empty(0, np.float32))
         self._done, self._pairs = self._done + found.drawn, self._pairs + found.intersections

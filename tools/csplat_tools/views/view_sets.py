@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from csplat.disk_files import resolve_links
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
-from csplat.training_record import TrainingRecord
+from csplat.scene_metadata import TrainingRecord
 from csplat_render import Camera, Mode
 from csplat_render.camera import relative_to, resized
 from csplat_render.camera_files import load_cameras
@@ -350,7 +350,7 @@ def _views_of_file(
 ) -> ViewSet:
     report: list[str] = []
     given = list({pose_key(camera): camera for camera in load_cameras(path, report, source.origin)}.values())
-    record = TrainingRecord.of(source.metadata)
+    record = source.metadata.training
     colour, notes = _choose_background(background, record)
     few = len(given) < _SPLIT_FROM
     if few:
@@ -376,7 +376,7 @@ def _views_of_data(
     validation_count: int | None,
     split: Split,
 ) -> ViewSet:
-    record = TrainingRecord.of(source.metadata)
+    record = source.metadata.training
     name, found, notes = (
         _open_data_set(data, record) if isinstance(data, DataOptions) else (data.name, data, list[str]())
     )

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat import scene as csplat_scene
 from csplat.editing.transform import convert_axes
 from csplat.formats.format import Format
 from csplat.model import SplatModel
 from csplat.ply import read_ply
-from csplat.scene_source import source_from_model
 from csplat.spherical_harmonics import SH_C0, evaluate_sh
 from csplat_bench.browser import open_page, serve
 from csplat_bench.peers import npm_pinned
@@ -161,13 +161,13 @@ def chosen_view(scene: Scene) -> tuple[SplatModel, Camera]:
         cameras,
         key=lambda camera: psnr(screen_render(model, camera), screen_render(model, camera, sh_degree=0)),
     )
-    return replace(model, cameras=[chosen.to_json()]), chosen
+    return replace(model, metadata=replace(model.metadata, cameras=[chosen.to_json()])), chosen
 
 
 def placed_in(form: Format, model: SplatModel) -> tuple[SplatModel, Camera]:
     """Return a scene along a format's axes, and its camera."""
-    placed = convert_axes(source_from_model(model), form.axes).metadata_model if form.axes else model
-    return placed, Camera.from_json((placed.cameras or [])[0])
+    placed = convert_axes(csplat_scene.Scene.of(model), form.axes).empty() if form.axes else model
+    return placed, Camera.from_json((placed.metadata.cameras or [])[0])
 
 
 def pinhole(camera: Camera, model: SplatModel) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Origin, canonicalise_shape, cluster, encode_tiles
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
-from csplat.scene_source import drop_bands
+from csplat.scene import drop_bands
 from csplat.types import F32, F64, I64, Progress
 from csplat_render import Camera
 from csplat_render.scorer import Scorer, renderer
@@ -205,7 +205,7 @@ class SourceRenders:
         low = drop_bands(model, sh_degree)
         found, _ = fit_colours(
             low, self.cameras, self.references, steps=_FIT_STEPS, least_gain=0.01, background=self.background,
-            antialiased=low.antialiased, threads=self.threads, progress=progress,
+            antialiased=low.metadata.antialiased, threads=self.threads, progress=progress,
         )  # fmt: skip
         return replace(low, sh0=np.ascontiguousarray(found[:, 0]), shN=np.ascontiguousarray(found[:, 1:]))
 

@@ -20,9 +20,9 @@ from pathlib import Path
 
 import numpy as np
 
+from csplat import scene as scenes
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply, write_scene_ply
-from csplat.scene_source import SceneSource
 from csplat_bench.made_scenes import copies, crowd
 from csplat_bench.protocol import AbsentError
 from csplat_render import Camera
@@ -126,7 +126,7 @@ def _make(path: Path, model: SplatModel, given: Sequence[Camera], made: re.Match
         return
     if made["degree"] is not None:
         model = replace(model, shN=np.ascontiguousarray(model.shN[:, : (int(made["degree"]) + 1) ** 2 - 1]))
-    write_scene_ply(path, SceneSource(count, model.select(slice(0, 0)), partial(copies, model, count)))
+    write_scene_ply(path, scenes.Scene.like(model, count, partial(copies, model, count)))
 
 
 def _describe(name: str, path: Path, cameras: Sequence[Camera]) -> Scene:

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from csplat import read_ply
+from csplat.ply import read_ply
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at
 from csplat_render.metrics import psnr
@@ -57,7 +57,7 @@ def test_the_recipe_makes_the_same_scene_twice(recipe, small, tmp_path):
     assert np.mean(losses[-3:]) < 0.9 * np.mean(losses[:3])
     assert 2 == result.metrics["views"]
     model = read_ply(tmp_path / "one.ply", strict=True)
-    assert (3, "RDF", "CC0-1.0") == (model.sh_degree, model.coordinate_system, model.metadata["licence"])
+    assert (3, "RDF", "CC0-1.0") == (model.sh_degree, model.metadata.coordinate_system, model.metadata.licence)
     assert 100 < len(model) <= 200
     assert model.opacities.min() >= 0.0099
 
@@ -115,8 +115,8 @@ def test_the_sample_has_no_defects_and_all_kinds_of_splats(sample_path):
     report = []
     model = read_ply(sample_path, strict=True, report=report)
     assert [] == report
-    assert ("RDF", "CC0-1.0", 3) == (model.coordinate_system, model.metadata["licence"], model.sh_degree)
-    assert ["made by tools/sample/make_sample.py"] == model.metadata["comments"]
+    assert ("RDF", "CC0-1.0", 3) == (model.metadata.coordinate_system, model.metadata.licence, model.sh_degree)
+    assert ["made by tools/sample/make_sample.py"] == model.metadata.entries["comments"]
     assert sample_path.stat().st_size < 2.6e6
     assert 6000 <= len(model) <= 10_000
     sizes = np.sort(model.scales, axis=1)

@@ -11,7 +11,7 @@ from csplat import EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder.error_bounds import covariance_errors
 from csplat.errors import InputError
-from csplat.scene_source import drop_bands
+from csplat.scene import drop_bands
 from csplat_bench.reductions import ATTRIBUTES, Reduction, cluster_attributes, encode_reduced, prune_opacity
 from csplat_conformance.declared_bounds import Source, verify_bounds
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from csplat.errors import InputError, LimitError
+from csplat.model import SplatModel
 from csplat.packed import PackedTile
 from csplat.types import F32, F64
 from csplat_render.camera import Camera
@@ -216,7 +217,8 @@ def _tiles_of(
             for tile in scene.packed_tiles(sh_degree=sh_degree):
                 yield pack_tile(tile, tables, shift, antialiased=own)
             continue
-        own = bool(getattr(scene, "antialiased", False)) if antialiased is None else antialiased
+        is_antialiased = isinstance(scene, SplatModel) and scene.metadata.antialiased
+        own = is_antialiased if antialiased is None else antialiased
         splats = checked_splats(scene, np.float32)
         degree = checked_degree(sh_degree, splats.shN.shape[1])
         for start in range(0, len(splats.means), MODEL_TILE):

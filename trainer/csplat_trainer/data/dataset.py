@@ -12,13 +12,11 @@ from PIL import ExifTags, Image
 from scipy.ndimage import map_coordinates
 
 from csplat.disk_files import read_json, read_text
-from csplat.editing.up_axis import Direction
 from csplat.errors import InputError, counted
 from csplat.image_opener import open_image
 from csplat.lint import Finding
-from csplat.model import UNSPECIFIED
 from csplat.ply.ply_reader import parse_ply
-from csplat.training_record import TrainingRecord
+from csplat.scene_metadata import UNSPECIFIED, Direction, TrainingRecord
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import DEFAULT_NEAR, Camera, camera_outliers, nearest_point
 from csplat_trainer.data.image_files import abbreviate, match_names, normalise_name, printable

@@ -10,9 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from csplat.editing.up_axis import Direction, unit_up, up_of_axes
 from csplat.errors import InputError, counted
-from csplat.model import UNSPECIFIED
+from csplat.scene_metadata import UNSPECIFIED, Direction, unit_up, up_of_axes
 from csplat.types import F64
 from csplat_render.camera import MAX_IMAGE_SIZE, camera_outliers, nearest_point
 from csplat_trainer.data.colmap import find_model, read_colmap

@@ -55,7 +55,7 @@ class GsplatTuning:
     ) -> None:
         self._fixed = fixed
         self._rasteriser = GsplatRasteriser(
-            antialiased=fixed.encode_plan.model.antialiased, rasterization=rasterization, device=device
+            antialiased=fixed.encode_plan.model.metadata.antialiased, rasterization=rasterization, device=device
         )
         on = self._rasteriser.device
         self.parameters = DeviceParameters(parameters or initial_parameters(fixed), on)

@@ -15,7 +15,6 @@ from csplat.decoder import decode
 from csplat.encoder import DecodedValues, EncodeOptions, EncodePlan, EncodeResult, Importance, Origin, fix_quantisation
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
-from csplat.training_record import TrainingRecord
 from csplat.types import I64
 from csplat_render.camera import relative_to
 from csplat_trainer.data import DataSet
@@ -105,7 +104,7 @@ def finetune(
     Examples:
         >>> import csplat, csplat_trainer
         >>> data = csplat_trainer.load("capture")  # doctest: +SKIP
-        >>> found = csplat_trainer.finetune(csplat.read_ply("scene.ply"), data)  # doctest: +SKIP
+        >>> found = csplat_trainer.finetune(csplat.read("scene.ply"), data)  # doctest: +SKIP
         >>> len(found.data) < len(found.plain.data)  # doctest: +SKIP
         True
 
@@ -159,7 +158,7 @@ def finetune(
 
 def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
     """Return the training images of a data set, in front of the background that the scene records."""
-    record = TrainingRecord.of(model.metadata)
+    record = model.metadata.training
     background = data.background if record is None else record.background
     shift = np.subtract(model.origin, data.origin)
     training = [TuningView(relative_to(shift, one.camera), one) for one in data.train]

@@ -64,7 +64,7 @@ class CpuTuning:
         threads: int | None = None,
     ) -> None:
         self._scene = TunedScene(fixed, parameters)
-        self._background, self._antialiased = background, fixed.encode_plan.model.antialiased
+        self._background, self._antialiased = background, fixed.encode_plan.model.metadata.antialiased
         self._rasteriser = Rasteriser(threads=threads)
         self._losses = SizedLosses(options.loss)
 

@@ -120,6 +120,6 @@ def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, t
     rasteriser = Rasteriser(gradients=False, threads=threads)
     views = []
     for camera in cameras:
-        render = rasteriser.forward(source, camera, background=background, antialiased=source.antialiased).rgb
+        render = rasteriser.forward(source, camera, background=background, antialiased=source.metadata.antialiased).rgb
         views.append(TuningView(camera, np.clip(render, -_FLOAT16_MAX, _FLOAT16_MAX).astype(np.float16)))
     return views

@@ -34,7 +34,8 @@ from csplat.lint import Finding, too_many_bands, trailing_bytes
 from csplat.model import MAX_SH_DEGREE, SplatModel, normalise_quats
 from csplat.ply.columns import RowStatistics, alpha_of_logits, count_huge_rows, list_findings
 from csplat.ply.comments import CommentMetadata, parse_comments
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
+from csplat.scene_metadata import LICENCE, SceneMetadata
 from csplat.spherical_harmonics import SH_C0, evaluate_sh
 from csplat.types import F32, F64
 
@@ -259,7 +260,7 @@ class _GltfReading:
         def block(rows: slice) -> SplatModel:
             model = decode_block(packed, rows, degree)
             return replace(
-                model if stored else rotate_scene(model, rotation), coordinate_system=AXES, antialiased=False
+                model if stored else rotate_scene(model, rotation), metadata=SceneMetadata(coordinate_system=AXES)
             )
 
         return block, packed.count
@@ -285,7 +286,7 @@ class _GltfReading:
 
 
 @contextmanager
-def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]:
+def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     """Open a file (`Format.open`, `Format.open_bands`)."""
     file = open_document(path)
     reading = _GltfReading(
@@ -296,17 +297,16 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]
         raise InputError(f"{path.name} shows no splats: no mesh of its scene has {EXTENSION}")
     _conclude(reading)
     try:
-        metadata = _read_metadata(file)
-        origin = np.array(metadata.origin or (0.0, 0.0, 0.0))
-        if metadata.origin is None and np.abs(instances[0].translation).max() >= _FAR:
+        comments = _read_comments(file)
+        origin = np.array(comments.origin or (0.0, 0.0, 0.0))
+        if comments.origin is None and np.abs(instances[0].translation).max() >= _FAR:
             origin = instances[0].translation
         x, y, z = origin.tolist()
         degree = max(one.decode(slice(0, 0)).sh_degree for one in instances)
         empty = _pad_bands(instances[0].decode(slice(0, 0)), degree)
-        fields = {**metadata.fields(), "coordinate_system": AXES}
-        if reading.antialiased and all(reading.antialiased):
-            fields["antialiased"] = True
-        metadata_model = replace(empty, origin=(x, y, z), **fields)
+        antialiased = comments.metadata.antialiased or (bool(reading.antialiased) and all(reading.antialiased))
+        metadata = replace(comments.metadata, coordinate_system=AXES, antialiased=antialiased)
+        empty = replace(empty, origin=(x, y, z), metadata=metadata)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
 
@@ -317,11 +317,11 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[SceneSource]
                 try:
                     block = one.decode(rows)
                     if len(block):
-                        yield _place_block(_pad_bands(block, degree), one, metadata_model)
+                        yield _place_block(_pad_bands(block, degree), one, empty)
                 except InputError as error:
                     raise InputError(f"{path.name}, splats {rows.start} to {rows.stop - 1}: {error}") from None
 
-    yield SceneSource(reading.count - reading.statistics.nonfinite, metadata_model, blocks, reading.findings)
+    yield Scene.like(empty, reading.count - reading.statistics.nonfinite, blocks, reading.findings)
 
 
 def _conclude(reading: _GltfReading) -> None:
@@ -424,28 +424,27 @@ def _pad_bands(block: SplatModel, degree: int) -> SplatModel:
     return replace(block, shN=np.pad(block.shN, ((0, 0), (0, missing), (0, 0)))) if missing else block
 
 
-def _place_block(block: SplatModel, instance: _Instance, metadata_model: SplatModel) -> SplatModel:
+def _place_block(block: SplatModel, instance: _Instance, empty: SplatModel) -> SplatModel:
     """Transform some splats from their primitive to the scene."""
     if not np.array_equal(instance.linear, np.eye(3)):
         block = stretch_scene(block, instance.linear)
-    offset = instance.translation - np.array(metadata_model.origin)
+    offset = instance.translation - np.array(empty.origin)
     if offset.any():
         with np.errstate(over="ignore"):
             block = replace(block, means=(block.means.astype(np.float64) + offset).astype(np.float32))
-    fields = ("origin", "coordinate_system", "unit_metres", "antialiased", "flat", "metadata")
-    return replace(block, **{name: getattr(metadata_model, name) for name in fields})
+    return replace(block, origin=empty.origin, metadata=empty.metadata)
 
 
-def _read_metadata(file: GltfDocument) -> CommentMetadata:
+def _read_comments(file: GltfDocument) -> CommentMetadata:
     extras = file.root["asset"].get("extras")
     lines = extras.get("csplat", []) if isinstance(extras, dict) else []
     if not isinstance(lines, list) or not all(isinstance(line, str) for line in lines):
         raise InputError("asset/extras/csplat is not a list of strings")
-    metadata = parse_comments(lines)
+    comments = parse_comments(lines)
     holder = file.root["asset"].get("copyright")
-    if isinstance(holder, str):
-        metadata.metadata.setdefault("licence", holder)
-    return metadata
+    if isinstance(holder, str) and LICENCE not in comments.metadata.entries:
+        return replace(comments, metadata=comments.metadata.with_entries(licence=holder))
+    return comments
 
 
 _DIRECTIONS = 96  # six per coefficient of degree 3; 1,000 would change the colours of a scene by 0.01 of 255 steps

@@ -19,7 +19,7 @@ from csplat.formats.gltf.gltf_document import BIN, GLB_HEAD, JSON, MAGIC
 from csplat.formats.gltf.gltf_reader import AXES, COLOURS, EXTENSION, sh_names
 from csplat.model import SplatModel
 from csplat.ply.comments import format_comments
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
@@ -27,22 +27,18 @@ _FLOAT, _BYTE, _ARRAY_BUFFER = 5126, 5121, 34962
 _LARGEST_FILE = (1 << 32) - 1  # bytes; the size of a .glb is a u32
 
 
-def write_gltf(path: Path, scene: SceneSource) -> None:
+def write_gltf(path: Path, scene: Scene) -> None:
     """Write a scene (`Format.write`)."""
     if path.suffix.lower() == ".gltf":
         raise InputError(f"{path.name}: glTF is written as a single file, name it {path.with_suffix('.glb').name}")
     if not scene.count:
         raise InputError(f"{path.name}: no splats are left to write, and glTF has no empty meshes")
-    unit = scene.metadata_model.unit_metres
+    unit = scene.metadata.unit_metres
     if unit not in (None, 1.0):
-        before, metres = scene, float(unit)
-        scene = SceneSource(
-            scene.count,
-            scale_scene(scene.metadata_model, metres),
-            lambda: (scale_scene(one, metres) for one in before.blocks()),
-        )
+        metres = float(unit)
+        scene = scene.map(lambda block: scale_scene(block, metres))
     scene = convert_axes(scene, AXES)
-    attributes = _attributes(scene.metadata_model)  # empty arrays: their names, dtypes and widths
+    attributes = _attributes(scene.empty())  # empty arrays: their names, dtypes and widths
     row_sizes = [column.dtype.itemsize * math.prod(column.shape[1:]) for column in attributes.values()]
     lowest, highest = np.full(3, np.inf), np.full(3, -np.inf)
     for block in scene.blocks():
@@ -92,14 +88,12 @@ def _point_colours(model: SplatModel) -> NDArray[np.uint8]:
 
 
 def _build_json(
-    scene: SceneSource, attributes: dict[str, NDArray[Any]], offsets: list[int], bounds: tuple[F64, F64]
+    scene: Scene, attributes: dict[str, NDArray[Any]], offsets: list[int], bounds: tuple[F64, F64]
 ) -> dict[str, Any]:
-    metadata_model = scene.metadata_model
     asset: dict[str, Any] = {"version": "2.0", "generator": "csplat"}
-    lines = format_comments(metadata_model, absolute=False)
-    licence = metadata_model.metadata.get("licence")
-    if isinstance(licence, str):
-        asset["copyright"] = licence
+    lines = format_comments(scene.metadata, scene.origin, absolute=False)
+    if scene.metadata.licence is not None:
+        asset["copyright"] = scene.metadata.licence
     kinds = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
     accessors: list[dict[str, Any]] = []
     for index, column in enumerate(attributes.values()):
@@ -120,7 +114,7 @@ def _build_json(
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, **({"translation": list(metadata_model.origin)} if any(metadata_model.origin) else {})}],
+        "nodes": [{"mesh": 0, **({"translation": list(scene.origin)} if any(scene.origin) else {})}],
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +23,8 @@ from csplat.lint import Finding
 from csplat.model import SplatModel
 from csplat.ply.columns import alpha_of_logits
 from csplat.portable_math import exp
-from csplat.scene_source import BLOCK_SPLATS, SceneSource
+from csplat.scene import BLOCK_SPLATS, Scene
+from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32, I64, U8, U16
 
 _MAX_OFFSET = 1 << 40  # splats
@@ -32,7 +33,7 @@ _Range = tuple[int, int, int]  # file index, first splat, end
 
 
 @contextmanager
-def open_sog(path: Path, level: int = 0, max_splats: int | None = None) -> Iterator[SceneSource]:
+def open_sog(path: Path, level: int = 0, max_splats: int | None = None) -> Iterator[Scene]:
     """Open a file or folder (`Format.open`, `Format.open_level`)."""
     parts, name = find_parts(path)
     with parts.kept_open():
@@ -63,7 +64,7 @@ def read_leaf_numbers(path: Path, level: int = 0) -> I64:
     return np.concatenate([*numbers, np.full(around, len(leaves), np.int64)])
 
 
-def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: int | None) -> SceneSource:
+def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: int | None) -> Scene:
     meta = parts.json(name)
     if isinstance(meta.value, dict) and not any(one in meta for one in _KEYS):
         where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
@@ -77,27 +78,13 @@ def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: 
     sog = read_meta(parts, name)
     images = SogImages.of(sog)
     degree = COEFFICIENTS.index(images.palette.shape[1])
-    metadata_model = _empty_model(degree, antialiased=sog.antialiased, flat=sog.flat)
+    metadata = SceneMetadata(antialiased=sog.antialiased, flat=sog.flat)
 
     def blocks() -> Iterator[SplatModel]:
         for arrays in images.blocks(degree):
-            yield replace(metadata_model, **arrays)
+            yield SplatModel(**arrays, metadata=metadata)
 
-    return SceneSource(sog.count, metadata_model, blocks, [*parts.findings, *_list_findings(images)])
-
-
-def _empty_model(degree: int, *, antialiased: bool, flat: bool) -> SplatModel:
-    three = np.zeros((0, 3), np.float32)
-    return SplatModel(
-        means=three,
-        quats=np.zeros((0, 4), np.float32),
-        scales=three,
-        opacities=np.zeros(0, np.float32),
-        sh0=three,
-        shN=np.zeros((0, COEFFICIENTS[degree], 3), np.float32),
-        antialiased=antialiased,
-        flat=flat,
-    )
+    return Scene(sog.count, degree, blocks, metadata, findings=[*parts.findings, *_list_findings(images)])
 
 
 def _list_findings(images: SogImages) -> list[Finding]:
@@ -107,7 +94,7 @@ def _list_findings(images: SogImages) -> list[Finding]:
     return [Finding("zero-quats", images.zeros, text, "repair")]
 
 
-def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int | None) -> SceneSource:
+def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int | None) -> Scene:
     """Open a level of streamed SOG with its environment; blocks are read one file at a time.
 
     With `max_splats`, open the finest level of at most this number of splats, else the coarsest.
@@ -139,8 +126,7 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
             parts.refuse(f"the level uses splats up to {taken[-1][1]:,} of {name}, which has {sog.count:,}")
         metas.append((sog, taken))
     degree = max([read_degree(sog) for sog, _ in metas], default=0)
-    metadata_model = _empty_model(
-        degree,
+    metadata = SceneMetadata(
         antialiased=bool(metas) and all(sog.antialiased for sog, _ in metas),
         flat=bool(metas) and all(sog.flat for sog, _ in metas),
     )
@@ -157,13 +143,13 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
                 keep[start:stop] = True
             at = 0
             for arrays in images.blocks(degree):
-                model = replace(metadata_model, **arrays)
+                model = SplatModel(**arrays, metadata=metadata)
                 chosen = keep[at : at + len(model)]
                 at += len(model)
                 if chosen.any():
                     yield model if chosen.all() else model.select(chosen)
 
-    return SceneSource(counts[level], metadata_model, blocks, findings, levels=tuple(counts))
+    return Scene(counts[level], degree, blocks, metadata, findings=findings, levels=tuple(counts))
 
 
 def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict[int, _Range]]]:

@@ -24,7 +24,8 @@ from csplat.formats.format import ValueRange
 from csplat.formats.sog.sog_reader import ENTRIES, LEAST_TAG
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.scene_source import SceneSource, join_blocks
+from csplat.scene import Scene, join_blocks
+from csplat.scene_metadata import SceneMetadata
 from csplat.types import F32, F64, U8, U32
 
 _LEAST_WEIGHT = 1e-3  # relative to a splat of opacity 1 and median area
@@ -42,7 +43,7 @@ _SAMPLE = 1 << 20  # number of splats from which codebooks and palette are compu
 _CHANNELS = {"means_l.webp": 3, "means_u.webp": 3, "quats.webp": 4, "scales.webp": 3, "sh0.webp": 4}
 
 
-def write_sog(path: Path, scene: SceneSource) -> list[Finding]:
+def write_sog(path: Path, scene: Scene) -> list[Finding]:
     """Write a zip or, if the path ends in meta.json, files next to it (`Format.write`).
 
     Raises:
@@ -58,11 +59,11 @@ def write_sog(path: Path, scene: SceneSource) -> list[Finding]:
             for name, data in encode_files(ordered, losses):  # meta.json comes last
                 with atomic_writer(path if name == "meta.json" else path.with_name(name)) as stream:
                     stream.write(data)
-            return losses.findings(scene.metadata_model)
+            return losses.findings(scene.metadata)
         with atomic_writer(path) as stream, zipfile.ZipFile(stream, "w") as archive:
             for name, data in encode_files(ordered, losses):
                 archive.writestr(zipfile.ZipInfo(name, _DATE), data)
-    return losses.findings(scene.metadata_model)
+    return losses.findings(scene.metadata)
 
 
 @dataclass(frozen=True)
@@ -72,15 +73,15 @@ class SogLosses:
     clamped: ClampStatistics = field(default_factory=ClampStatistics)
     moved: MovedSplats = field(default_factory=MovedSplats)
 
-    def findings(self, metadata_model: SplatModel) -> list[Finding]:
-        """Return the findings; `metadata_model` is that of the scene."""
-        both = metadata_model.antialiased and metadata_model.flat
+    def findings(self, metadata: SceneMetadata) -> list[Finding]:
+        """Return the findings; `metadata` is that of the scene."""
+        both = metadata.antialiased and metadata.flat
         lost = [Finding("lost-contents", 1, "SOG cannot hold that splats are discs and antialiased", "loss")] * both
         found = self.clamped.findings("the 256 codes of SOG", lambda *_: ("ply", "gltf", "csplat"))
         return [*lost, *found, *self.moved.findings("SOG has 16 bits for the logarithms of positions")]
 
 
-def encode_files(scene: SceneSource, losses: SogLosses) -> Iterator[tuple[str, bytes]]:
+def encode_files(scene: Scene, losses: SogLosses) -> Iterator[tuple[str, bytes]]:
     """Yield the name and bytes of each file of a SOG. Takes 17 bytes of memory per splat, 21 with SH."""
     count = scene.count
     width = max(1, math.ceil(math.sqrt(count) / 4)) * 4
@@ -93,8 +94,8 @@ def encode_files(scene: SceneSource, losses: SogLosses) -> Iterator[tuple[str, b
     roots = np.sqrt(weights_of(sample))
     scales, colours = _build_codebook(sample.scales, roots), _build_codebook(sample.sh0, roots)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "csplat"}, "count": count}
-    if scene.metadata_model.antialiased or scene.metadata_model.flat:
-        meta["model"] = "antialiased" if scene.metadata_model.antialiased else "2dgs"
+    if scene.metadata.antialiased or scene.metadata.flat:
+        meta["model"] = "antialiased" if scene.metadata.antialiased else "2dgs"
     meta |= {
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
         "scales": {"codebook": _shortest_decimals(scales), "files": ["scales.webp"]},
@@ -122,12 +123,12 @@ def encode_files(scene: SceneSource, losses: SogLosses) -> Iterator[tuple[str, b
         codes["scales.webp"][rows] = _nearest_codes(scales, model.scales)
         codes["sh0.webp"][rows, :3] = _nearest_codes(colours, model.sh0)
         codes["sh0.webp"][rows, 3] = np.rint(model.opacities * np.float32(255))
-    if scene.metadata_model.sh_degree and count:
+    if scene.sh_degree and count:
         values, entries, labels = _build_palette(scene, sample, weights_of)
         codes["shN_labels.webp"] = labels[:, None].astype("<u2").view(np.uint8)
         meta["shN"] = {
             "count": len(entries) * ENTRIES,
-            "bands": scene.metadata_model.sh_degree,
+            "bands": scene.sh_degree,
             "codebook": _shortest_decimals(values),
             "files": ["shN_centroids.webp", "shN_labels.webp"],
         }
@@ -143,7 +144,7 @@ def _range_of(codebook: F32) -> ValueRange:
     return ValueRange(low, high, 2.0 * max(float(np.diff(codebook)[[0, -1]].max()), _COARSE * (high - low)))
 
 
-def _sample(scene: SceneSource) -> tuple[F64, F64, SplatModel]:
+def _sample(scene: Scene) -> tuple[F64, F64, SplatModel]:
     """Return the bounds of the logarithms of all positions, and at most `_SAMPLE` evenly spaced splats."""
     step = -(-scene.count // _SAMPLE) or 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -153,8 +154,8 @@ def _sample(scene: SceneSource) -> tuple[F64, F64, SplatModel]:
         low, high = np.minimum(low, logs.min(0)), np.maximum(high, logs.max(0))
         taken.append(model.select(np.arange(-rows.start % step, len(model), step)))
     if not taken:
-        return np.zeros(3), np.zeros(3), scene.metadata_model
-    return low, high, join_blocks(scene.metadata_model, taken)
+        return np.zeros(3), np.zeros(3), scene.empty()
+    return low, high, join_blocks(scene.empty(), taken)
 
 
 def _signed_logs(means: F32) -> F64:
@@ -220,15 +221,13 @@ def _nearest_codes(codebook: F32, columns: F32) -> U8:
     return codes.astype(np.uint8)
 
 
-def _build_palette(
-    scene: SceneSource, sample: SplatModel, weights_of: Callable[[SplatModel], F32]
-) -> tuple[F32, U8, U32]:
+def _build_palette(scene: Scene, sample: SplatModel, weights_of: Callable[[SplatModel], F32]) -> tuple[F32, U8, U32]:
     """Cluster the SH vectors of all splats.
 
     Returns:
         The codebook of coefficients, the palette image, and the label of each splat.
     """
-    coefficients = scene.metadata_model.shN.shape[1]
+    coefficients = (scene.sh_degree + 1) ** 2 - 1
     lengths = np.sqrt(np.einsum("nkc,nkc->n", sample.shN, sample.shN))
     step = np.float32(max(float(np.quantile(lengths, 0.999)) / _NORM, 1e-6))
     limit = 2 * _NORM / (3 * coefficients) ** 0.5

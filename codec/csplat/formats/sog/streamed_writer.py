@@ -28,7 +28,7 @@ from csplat.formats.common import scene_of_rows, sorted_parts
 from csplat.formats.sog.sog_writer import SogLosses, encode_files
 from csplat.lint import Finding
 from csplat.model import SplatModel
-from csplat.scene_source import SceneSource
+from csplat.scene import Scene
 from csplat.types import F32, F64, I64
 
 #: Name of the file that lists all others.
@@ -74,7 +74,7 @@ class _LevelStatistics:
     chunks: I64
 
 
-def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> list[Finding]:
+def write_streamed_sog(path: Path, levels: Sequence[Scene]) -> list[Finding]:
     """Write a folder of streamed SOG (`Format.write_levels`).
 
     Takes about 430 MB of memory for chunks of 500,000 splats without SH, 640 MB with degree 3, for scenes of any size;
@@ -113,7 +113,7 @@ def write_streamed_sog(path: Path, levels: Sequence[SceneSource]) -> list[Findin
             "tree": _describe_node(tree, bounds, leaves)[0],
         }  # fmt: skip
         write_file(temporary / LEVELS_NAME, json.dumps(meta, separators=(",", ":")).encode("ascii"))
-    return losses.findings(levels[0].metadata_model)
+    return losses.findings(levels[0].metadata)
 
 
 def _check_folder(folder: Path) -> None:
@@ -131,7 +131,7 @@ def _check_folder(folder: Path) -> None:
         raise InputError(f"{folder} {reason}, and a new folder replaces it: name another, as in scene/{LEVELS_NAME}")
 
 
-def _cut_space(scene: SceneSource) -> tuple[_Cut | int, int]:
+def _cut_space(scene: Scene) -> tuple[_Cut | int, int]:
     """Cut space by medians of a sample of positions; return the tree and the number of leaves."""
     step = -(-scene.count // _SAMPLE)
     sample = np.concatenate([model.means[-rows.start % step :: step] for rows, model in scene.numbered()])
@@ -167,7 +167,7 @@ def _number_leaves(tree: _Cut | int, means: F32) -> I64:
     return numbers
 
 
-def _survey(scene: SceneSource, tree: _Cut | int, leaf_count: int) -> _LevelStatistics:
+def _survey(scene: Scene, tree: _Cut | int, leaf_count: int) -> _LevelStatistics:
     counts = np.zeros(leaf_count, np.int64)
     centres, extents = (np.stack([np.full((leaf_count, 3), one) for one in (np.inf, -np.inf)], axis=1) for _ in "ce")
     for model in scene.blocks():
@@ -209,7 +209,7 @@ def _list_runs(
 
 
 def _write_chunks(
-    folders: Sequence[Path], scene: SceneSource, tree: _Cut | int, statistics: _LevelStatistics, losses: SogLosses
+    folders: Sequence[Path], scene: Scene, tree: _Cut | int, statistics: _LevelStatistics, losses: SogLosses
 ) -> None:
     low, high = statistics.centres[:, 0], statistics.centres[:, 1]
     scales = np.divide(2**_CELL_BITS - 1, high - low, out=np.zeros_like(low), where=high > low)
@@ -224,7 +224,7 @@ def _write_chunks(
     with sorted_parts(scene, folders[0].parent, keys, splits) as parts:
         for folder, rows in zip(folders, parts.rows(0, len(folders)), strict=True):
             folder.mkdir()
-            for name, data in encode_files(scene_of_rows(parts.metadata_model, rows), losses):
+            for name, data in encode_files(scene_of_rows(parts.empty, rows), losses):
                 write_file(folder / name, data)
 
 

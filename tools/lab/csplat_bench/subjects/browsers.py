@@ -93,7 +93,7 @@ def _open_once(url: str, data: bytes, go: Callable[[str], Any], ask: Callable[[s
         kept = decode(base64.b64decode(text, validate=True))
     except ValueError:
         raise OSError(str(text)) from None
-    if kept.metadata["up"] != [0, 0, 1] or len(kept) != count:
+    if kept.metadata.entries["up"] != [0, 0, 1] or len(kept) != count:
         raise OSError("the file with another up axis is not that of the scene")
     return seconds
 

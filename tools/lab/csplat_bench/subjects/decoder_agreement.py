@@ -18,8 +18,9 @@ from typing import Any, TypedDict
 
 import numpy as np
 
-from csplat import EncodeOptions, decoder, encode, read_ply
+from csplat import EncodeOptions, decoder, encode
 from csplat.errors import CsplatError
+from csplat.ply import read_ply
 from csplat_bench.made_scenes import ARRAYS
 from csplat_bench.protocol import Measure, Setup
 from csplat_bench.scenes import ROOT, find_scene

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 
 from csplat.editing.transform import DEFAULT_AXES
-from csplat.editing.up_axis import up_of_axes
 from csplat.formats import format_by_name, read, write
 from csplat.formats.format import Format
 from csplat.image_opener import open_image
-from csplat.model import UNSPECIFIED, SplatModel
+from csplat.model import SplatModel
+from csplat.scene_metadata import UNSPECIFIED, up_of_axes
 from csplat_bench.engine_stage import ENGINES, Image, chosen_view, opened_page, pinhole, placed_in, screen_render
 from csplat_bench.protocol import AbsentError, Measure, Setup
 from csplat_bench.scenes import find_scene
@@ -88,7 +88,7 @@ def _draw(
     """
     engine = ENGINES[name]
     placed, camera = placed_in(form, model)
-    ours = Camera.from_json((model.cameras or [])[0])
+    ours = Camera.from_json((model.metadata.cameras or [])[0])
     page.set_viewport_size({"width": camera.W, "height": camera.H})
     page.goto(url.rpartition("/")[0] + "/page.html")
     words = [name, url, pinhole(camera, model), {"webgpu": webgpu}, 1000 * _TIMEOUT_SECONDS]
@@ -126,7 +126,7 @@ def settled_image(page: Any, pause: float = _PAUSE_SECONDS) -> Image:
 
 def up_in_world(placed: SplatModel, world: Sequence[float]) -> str:
     """Return how the up direction of a file's axes lies in a world whose y points up: upright, or how not."""
-    axes = placed.coordinate_system
+    axes = placed.metadata.coordinate_system
     up = up_of_axes(DEFAULT_AXES if axes == UNSPECIFIED else axes)
     if up is None:
         return "unknown"

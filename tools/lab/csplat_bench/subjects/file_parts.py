@@ -19,6 +19,7 @@ import numpy as np
 
 import csplat
 from csplat.errors import missing_package
+from csplat.splat_file import SplatFile
 from csplat_bench.measuring import timed
 from csplat_bench.protocol import AbsentError, Measure, Setup
 from csplat_bench.scenes import find_scene
@@ -37,9 +38,9 @@ def measure_parts(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measur
     """Yield the function that opens the file of a scene and reads the part."""
     scene, path = find_scene(name, setup.data, setup.work), setup.work / f"{Path(name).stem}.parts.csplat"
     options = csplat.EncodeOptions(preset="fast", tile_splats=setup.options.get("tile_splats", 4096))
-    path.write_bytes(csplat.encode(csplat.read_ply(scene.path), options))
-    with csplat.open(path) as file:
-        header, size = file.header, file.size
+    path.write_bytes(csplat.encode(csplat.read(scene.path), options))
+    with SplatFile.open(path) as file:
+        header, size = file.header, file.size_bytes
         box = middle_box(file, setup.options.get("share", 0.01))
     with ExitStack() as stack:
         addresses: dict[str, Address] = {}
@@ -70,7 +71,7 @@ def middle_box(file: csplat.SplatFile, share: float) -> tuple[float, ...]:
 def read_part(address: Address, box: tuple[float, ...], degree: int) -> dict[str, Any]:
     """Open a file and read a box; return splats, requests, bytes and seconds."""
     url, storage = address
-    file, opening = timed(csplat.open, url, storage=storage)
+    file, opening = timed(SplatFile.open, url, storage=storage)
     with file:
         model, reading = timed(file.read, box, sh_degree=degree)
         return {

@@ -19,7 +19,8 @@ import csplat
 from csplat import _spec
 from csplat.decoder import Node, SceneHeader, decode
 from csplat.model import SplatModel
-from csplat.scene_source import join_blocks
+from csplat.scene import join_blocks
+from csplat.splat_file import SplatFile
 from csplat_bench.protocol import Measure, Setup
 from csplat_bench.scenes import find_scene
 from csplat_bench.suites import Case
@@ -32,19 +33,22 @@ from csplat_tools.views import comparison_cameras
 @contextmanager
 def measure_first_bytes(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that draws the beginning of a file."""
-    model = csplat.read_ply(find_scene(name, setup.data, setup.work).path)
+    model = csplat.read(find_scene(name, setup.data, setup.work).path)
     files = {False: csplat.encode(model), True: LevelBuilder().encode(model).write().data}
     cameras = comparison_cameras(model)
     rasteriser = Rasteriser(gradients=False)
 
     def render(splats: SplatModel) -> list[Any]:
-        return [rasteriser.forward(splats, one, antialiased=splats.antialiased).rgb.clip(0.0, 1.0) for one in cameras]
+        return [
+            rasteriser.forward(splats, one, antialiased=splats.metadata.antialiased).rgb.clip(0.0, 1.0)
+            for one in cameras
+        ]
 
     finished = {levels: render(decode(data)) for levels, data in files.items()}
 
     def measure(case: Case) -> Mapping[str, Any]:
         data = files[case["levels"]]
-        with csplat.open(data) as file:
+        with SplatFile.open(data) as file:
             header, nodes = file.header, file.nodes
         size = first_whole(nodes) if case.get("first") else round(case["share"] * len(data))
         shown = show(data, header, nodes, size)

@@ -66,7 +66,7 @@ def measure_gpu(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]
         device = open_device(software=bool(setup.options.get("software")))
     except InputError as error:
         raise AbsentError(str(error)) from None
-    data = csplat.encode(csplat.read_ply(find_scene(name, setup.data, setup.work).path))
+    data = csplat.encode(csplat.read(find_scene(name, setup.data, setup.work).path))
     single = csplat.decode(data)
     width, height = setup.options["size"]
     frames = setup.options["frames"]
@@ -79,7 +79,7 @@ def measure_gpu(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]
         common = {"splats": len(model), "sh_degree": model.sh_degree, "gpu": str(device.adapter)}
         if case["layout"] == "gsplat":
             return {**common, **_measure_gsplat(model, cameras, frames)}
-        with csplat.open(data) as file:
+        with SplatFile.open(data) as file:
             packed = case["layout"] == "packed"
             scene = GpuScene(device, [_MovedFile(file, place) for place in places] if packed else [model])
         renderer = GpuRenderer(scene)

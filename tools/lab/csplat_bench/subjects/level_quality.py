@@ -49,7 +49,7 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
     rasteriser = Rasteriser(gradients=False)
 
     def render(splats: SplatModel, camera: Camera) -> np.ndarray:
-        return rasteriser.forward(splats, camera, antialiased=splats.antialiased).rgb.clip(0.0, 1.0)
+        return rasteriser.forward(splats, camera, antialiased=splats.metadata.antialiased).rgb.clip(0.0, 1.0)
 
     @cache
     def build(maker: str) -> tuple[dict[int, SplatModel], float]:

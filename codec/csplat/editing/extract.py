@@ -1,12 +1,14 @@
-"""Copy tiles from one file to another without decoding their streams."""
+"""Extract a part of a file: copy tiles to another file without decoding their streams."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Container, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import accumulate
+from typing import Any
 
 from csplat import _spec
 from csplat.byte_store import FileWindow
@@ -24,6 +26,8 @@ from csplat.encoder.container import (
     file_pieces,
     tree_chunk,
 )
+from csplat.file_source import File
+from csplat.splat_file import SplatFile, tiles_touching
 
 #: Chunks that are copied to an extract; declared bounds and options refer to the whole file.
 _KEPT = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS)
@@ -45,7 +49,44 @@ class ExtractResult:
     size: int
 
 
-def write_extract(
+def extract(
+    file: File | SplatFile,
+    box: Sequence[float],
+    output: str | os.PathLike[str] | BinaryWriter,
+    *,
+    storage: Mapping[str, Any] | None = None,
+) -> ExtractResult:
+    """Write the tiles of a file that touch a box as a file of their own.
+
+    Tiles are copied whole, including splats outside the box; values are preserved bit for bit. Nodes of a file with
+    levels of detail are copied whole, those of coarser levels if everything below them is. Declared error bounds
+    and the encoder's options, which refer to the whole file, are omitted, as are chunks of unknown types. Only header,
+    index and the copied data are read, a few megabytes at a time.
+
+    Args:
+        file: a `.csplat` file as in `csplat.open`, or one that is open.
+        box: two corners, x, y, z each, in any order, possibly infinite, in scene units relative to the origin.
+        output: a path, written atomically and replaced if it exists; or an open binary file.
+        storage: as in `csplat.open`.
+
+    Examples:
+        >>> import csplat
+        >>> part = csplat.extract("scene.csplat", (-1, -1, -1, 1, 1, 1), "part.csplat")
+        >>> part.splat_count == len(csplat.decode("part.csplat"))
+        True
+
+    Raises:
+        InputError: the box is not six numbers, or no tile touches the box.
+        FormatError: the header, the index or a copied chunk breaks a clause.
+        UnsupportedError, StoreError, OSError: as in `csplat.open`, or the output cannot be written.
+    """
+    opening = nullcontext(file) if isinstance(file, SplatFile) else SplatFile.open(file, storage=storage)
+    with opening as opened:
+        tiles = tiles_touching(opened.header, box)
+        return _write_extract(opened.window(), opened.header, tiles, opened.nodes, output)
+
+
+def _write_extract(
     window: FileWindow,
     header: SceneHeader,
     tiles: Sequence[Tile],

@@ -1,0 +1,263 @@
+"""Represent the metadata of a scene: `SceneMetadata`, with its up direction and its training record (spec 5.4)."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from csplat.errors import InputError
+
+Direction = tuple[float, float, float]
+
+#: Coordinate system of a scene whose source did not specify one.
+UNSPECIFIED = "unspecified"
+
+#: Keys of entries.
+COMMENTS = "comments"
+LICENCE = "licence"
+TRAINING = "training"
+UP = "up"
+VIEW = "view"
+
+#: Cosine of the angle between up directions that contradict each other; at larger angles another axis is closer to up.
+CONTRADICTS = math.cos(math.radians(45.0))
+
+_AXIS_OF_LETTER = {"R": "x", "L": "x", "U": "y", "D": "y", "F": "z", "B": "z"}
+_DIGITS = 6  # decimals; hides differences in the last bits between machines
+_UNIT = 1e-5  # tolerance for the length of a unit vector of six digits
+_MAX_COUNT = 2**31 - 1
+_COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
+
+
+@dataclass(frozen=True)
+class SceneMetadata:
+    """What is known about a scene besides its splats.
+
+    Attributes:
+        coordinate_system: directions of +x, +y and +z from the viewer's perspective, one letter each of R/L, U/D and
+            F/B: `"RDF"`; or `"unspecified"`.
+        unit_metres: length of one scene unit in metres; `None` if unknown.
+        antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
+        flat: splats are discs (2DGS); the smallest scale has no meaning.
+        cameras: training cameras, each {K, viewmat, W, H, near, image}; viewmat maps world to camera with OpenCV axes,
+            pixel centres are at +0.5. `None` if there are none.
+        entries: JSON-compatible. Keys in use: `licence` (str), `comments` (list of str), `training` (a
+            `TrainingRecord`), `up` (three numbers), `view` (initial camera of a viewer, in the form of `cameras`).
+            Properties return their values if these are valid.
+
+    Raises:
+        InputError: the coordinate system or the unit is invalid.
+    """
+
+    coordinate_system: str = UNSPECIFIED
+    unit_metres: float | None = None
+    antialiased: bool = False
+    flat: bool = False
+    cameras: Sequence[Mapping[str, Any]] | None = None
+    entries: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.coordinate_system != UNSPECIFIED:
+            check_axes(self.coordinate_system)
+        unit = self.unit_metres
+        if unit is not None and not (math.isfinite(unit) and unit > 0):
+            raise InputError(f"unit_metres is {unit}, expected a length above 0 or None")
+
+    @property
+    def stated_up(self) -> Direction | None:
+        """Unit vector of the entry `up`; `None` if there is no valid one."""
+        try:
+            return unit_up(self.entries[UP]) if UP in self.entries else None
+        except InputError:
+            return None
+
+    @property
+    def up(self) -> Direction | None:
+        """Up direction of the scene, a unit vector: the entry `up`, else that of the axes; `None` if unknown."""
+        return self.stated_up or up_of_axes(self.coordinate_system)
+
+    @property
+    def training(self) -> TrainingRecord | None:
+        """Training record; `None` if there is no valid one."""
+        try:
+            return TrainingRecord.from_json(self.entries[TRAINING]) if TRAINING in self.entries else None
+        except InputError:
+            return None
+
+    @property
+    def licence(self) -> str | None:
+        """Licence; `None` if there is none."""
+        licence = self.entries.get(LICENCE)
+        return licence if isinstance(licence, str) else None
+
+    @property
+    def comments(self) -> list[str]:
+        """Comments of the scene's source."""
+        comments = self.entries.get(COMMENTS)
+        return [comment for comment in comments if isinstance(comment, str)] if isinstance(comments, list) else []
+
+    def with_entries(self, **entries: Any) -> SceneMetadata:
+        """Return the metadata with some entries added or replaced; `None` removes an entry."""
+        merged = {**self.entries, **entries}
+        return replace(self, entries={key: value for key, value in merged.items() if entries.get(key, key) is not None})
+
+    def with_up(self, up: Direction | None = None, coordinate_system: str | None = None) -> SceneMetadata:
+        """Return the metadata with another up direction or other axes; what contradicts them is removed.
+
+        Args:
+            up: three finite numbers, not all 0; `None`: unchanged. Without `coordinate_system`, existing axes with a
+                different up are removed.
+            coordinate_system: as above; `None`: unchanged. Without `up`, an existing up direction is removed.
+
+        Examples:
+            >>> import csplat
+            >>> csplat.SceneMetadata(coordinate_system="RDF").with_up((0, 0, 1)).coordinate_system
+            'unspecified'
+
+        Raises:
+            InputError: an argument is invalid.
+        """
+        if up is None and coordinate_system is None:
+            return self
+        entries = dict(self.entries)
+        letters = self.coordinate_system if coordinate_system is None else coordinate_system
+        if coordinate_system is not None:
+            entries.pop(UP, None)
+        if up is not None:
+            entries[UP] = list(unit_up(up))
+            before = up_of_axes(letters) if coordinate_system is None else None
+            if before is not None and sum(a * b for a, b in zip(before, entries[UP], strict=True)) < CONTRADICTS:
+                letters = UNSPECIFIED
+        return replace(self, entries=entries, coordinate_system=letters)
+
+
+@dataclass(frozen=True)
+class TrainingRecord:
+    """Training settings that a comparison of the scene with its images must repeat.
+
+    Attributes:
+        background: red, green and blue of the background, 0..1.
+        test_every: N if every Nth image was held out, 0 if none; `None`: the data set specifies the test images.
+        size: width and height that the images were scaled to, pixels; `None`: not scaled.
+        near: near plane of the cameras, scene units; `None`: unknown.
+        images: folder of images in a COLMAP data set; `None`: the reader's choice.
+    """
+
+    background: tuple[float, float, float]
+    test_every: int | None = None
+    size: tuple[int, int] | None = None
+    near: float | None = None
+    images: str | None = None
+
+    @classmethod
+    def from_json(cls, record: object) -> TrainingRecord:
+        """Parse the result of `as_json`, ignoring unknown members.
+
+        Raises:
+            InputError: the background is missing, or a member has the wrong type or range.
+        """
+        if not isinstance(record, Mapping):
+            raise InputError(f"{TRAINING} is {record!r}, expected an object")
+        background = _member(
+            record, "background", lambda value: _are(value, 3, _is_fraction), "three numbers of 0 to 1"
+        )
+        size = _member(record, "size", lambda value: _are(value, 2, _is_count), "two whole numbers above 0")
+        near = _member(record, "near", _is_length, "a number above 0")
+        every = _member(record, "test_every", _is_interval, "0, or a whole number above 1")
+        images = _member(record, "images", _is_name, "a name")
+        if background is None:
+            raise InputError(f"{TRAINING} has no background")
+        red, green, blue = (float(value) for value in background)
+        return cls((red, green, blue), every, None if size is None else (size[0], size[1]), near, images)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the record as JSON, without unknown values."""
+        record: dict[str, Any] = {"background": list(self.background)}
+        for name in ("test_every", "near", "images"):
+            if getattr(self, name) is not None:
+                record[name] = getattr(self, name)
+        return record if self.size is None else {**record, "size": list(self.size)}
+
+    def __str__(self) -> str:
+        """Return a description in words."""
+        colour = _COLOURS.get(self.background) or " ".join(f"{value:g}" for value in self.background)
+        words = [f"{colour} background"]
+        if self.test_every is not None:
+            words.append(f"1 in {self.test_every} photographs held out" if self.test_every else "none held out")
+        if self.size is not None:
+            words.append(f"scaled to {self.size[0]}×{self.size[1]}")
+        if self.images is not None:
+            words.append(f"from {self.images}")
+        if self.near is not None:
+            words.append(f"near plane {self.near:.4g}")
+        return ", ".join(words)
+
+
+def up_of_axes(coordinate_system: str) -> Direction | None:
+    """Return the up direction of named axes; `None` if they are unspecified."""
+    if coordinate_system == UNSPECIFIED:
+        return None
+    x, y, z = ({"U": 1.0, "D": -1.0}.get(letter, 0.0) for letter in coordinate_system)
+    return x, y, z
+
+
+def unit_up(values: object) -> Direction:
+    """Normalise a direction to unit length, rounded to six digits.
+
+    Args:
+        values: three finite numbers, not all 0.
+
+    Raises:
+        InputError: the values are invalid.
+    """
+    numbers = list(values) if isinstance(values, Sequence) and not isinstance(values, str) else []
+    if len(numbers) == 3 and all(type(value) in (int, float) and abs(value) < math.inf for value in numbers):
+        largest = max(abs(value) for value in numbers)
+        if largest > 0.0:
+            parts = [value / largest for value in numbers]  # squares of large numbers overflow
+            length = math.hypot(*parts)
+            length = length if abs(length * largest - 1.0) > _UNIT else 1.0 / largest  # unit vectors stay unchanged
+            x, y, z = (round(part / length, _DIGITS) + 0.0 for part in parts)
+            return x, y, z
+    raise InputError(f"{UP} is {values!r}, expected three finite numbers, not all 0")
+
+
+def check_axes(letters: str) -> None:
+    """Raise an `InputError` unless these are three letters, one each of R/L, U/D and F/B."""
+    axes = {_AXIS_OF_LETTER.get(letter) for letter in letters}
+    if len(letters) != 3 or axes != {"x", "y", "z"}:
+        raise InputError(f"the axes are {letters!r}, expected three letters, one each of R/L, U/D and F/B, such as RDF")
+
+
+def _member(record: Mapping[str, Any], name: str, is_valid: Callable[[Any], bool], expected: str) -> Any:
+    value = record.get(name)
+    if value is not None and not is_valid(value):
+        raise InputError(f"{name} of {TRAINING} is {value!r}, expected {expected}")
+    return value
+
+
+def _are(values: object, count: int, is_valid: Callable[[Any], bool]) -> bool:
+    return isinstance(values, list | tuple) and len(values) == count and all(is_valid(value) for value in values)
+
+
+def _is_fraction(value: Any) -> bool:
+    return type(value) in (int, float) and 0.0 <= value <= 1.0
+
+
+def _is_length(value: Any) -> bool:
+    return type(value) in (int, float) and 0.0 < value <= sys.float_info.max
+
+
+def _is_interval(value: Any) -> bool:
+    return type(value) is int and (value == 0 or 1 < value <= _MAX_COUNT)
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and value.isprintable() and value != ""  # excludes surrogates and line breaks
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 < value <= _MAX_COUNT
