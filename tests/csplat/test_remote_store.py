@@ -179,7 +179,7 @@ def test_parts_are_read_from_s3(data, box):
             assert 65536 == file.bytes_read
             assert_part(file, data, box)
             stream = io.BytesIO()
-            part = file.extract(box, stream)
+            part = csplat.extract(file, box, stream)
             file._store._fs.pipe("scenes/scene.csplat", bytes(reversed(data)))
             with pytest.raises(StoreError, match="has changed while it was read"):
                 file.read(tiles=[5])

@@ -36,8 +36,8 @@ from csplat_render.scorer import Scorer
 from csplat_render.virtual_cameras import virtual_cameras
 from csplat_tools.cli.shared_options import parse_level
 from csplat_tools.convert_file import convert_file
-from csplat_tools.encode_file import choose_levels, encode_file
-from csplat_tools.level_builder import LevelBuilder, encode_with_levels, kd_groups
+from csplat_tools.encode_file import encode_file
+from csplat_tools.level_builder import FittedLevelBuilder, choose_levels, kd_groups
 from csplat_tools.level_merging import merge_neighbours
 from csplat_tools.scene_files import load_scene
 
@@ -356,7 +356,7 @@ def test_groups_hold_each_point_once_and_are_of_equal_size():
 
 @pytest.mark.slow
 def test_each_level_has_a_quarter_of_the_splats_of_the_finer_one_at_any_number_of_threads(model):
-    nodes, others = (LevelBuilder(leaf_splats=100, root_splats=30).build(model, threads) for threads in (1, 2))
+    nodes, others = (FittedLevelBuilder(leaf_splats=100, root_splats=30).build(model, threads) for threads in (1, 2))
     counts = [0] * (nodes[-1].level + 1)
     for node, other in zip(nodes, others, strict=True):
         counts[node.level] += len(node.rows) if node.level == 0 else len(node.splats)
@@ -371,13 +371,13 @@ def test_each_level_has_a_quarter_of_the_splats_of_the_finer_one_at_any_number_o
 
 @pytest.mark.slow
 def test_the_number_of_levels_is_the_one_asked_for_and_very_large_parts_are_merged_alone(model):
-    nodes = LevelBuilder(1, leaf_splats=70).build(model)
+    nodes = FittedLevelBuilder(1, leaf_splats=70).build(model)
     assert {0, 1} == {node.level for node in nodes}
     assert 2 == sum(node.parent is None for node in nodes)  # four leaves have one parent, and two have the other
-    assert 3 == LevelBuilder(3, leaf_splats=SPLATS).build(model)[-1].level
-    header = read_header(LevelBuilder().encode(model.select(slice(0, 0))).write().data)
+    assert 3 == FittedLevelBuilder(3, leaf_splats=SPLATS).build(model)[-1].level
+    header = read_header(csplat.encode(model.select(slice(0, 0)), levels=FittedLevelBuilder()))
     assert (0, ()) == (header.splat_count, header.all_tiles)
-    builder = LevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
+    builder = FittedLevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
     fitted, merged = (builder.build_part(model, count, 1)[1].splats for count in (5000, 5001))
     assert (True, False) == tuple(same(quarter(model), splats) for splats in (merged, fitted))
     assert builder.seconds(5001) < builder.seconds(5000)
@@ -397,7 +397,12 @@ def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
     for levels in ({}, {"levels": "auto"}):  # one node of 4,096 splats has no coarser one
         encode_file(load_scene(model), str(out), EncodeOptions(), **levels)
         assert csplat.encode(model) == out.read_bytes()
-    wanted = {(10**9, None): None, (4096, "auto"): None, (4097, "auto"): LevelBuilder(), (9, 2): LevelBuilder(2)}
+    wanted = {
+        (10**9, None): None,
+        (4096, "auto"): None,
+        (4097, "auto"): FittedLevelBuilder(),
+        (9, 2): FittedLevelBuilder(2),
+    }
     assert wanted == {(count, levels): choose_levels(count, EncodeOptions(), levels) for count, levels in wanted}
     for levels in (0, 17):
         with pytest.raises(InputError, match=f"levels is {levels}, expected 1 to 16, or auto"):
@@ -412,9 +417,9 @@ def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
 @pytest.mark.parametrize("fitted_splats", [400, 399])
 def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path, fitted_splats):
     options = EncodeOptions(bucket_splats=300, threads=1)
-    builder = LevelBuilder(2, leaf_splats=300, whole_splats=300, fitted_splats=fitted_splats, bucket_splats=300)
+    builder = FittedLevelBuilder(2, leaf_splats=300, whole_splats=300, fitted_splats=fitted_splats, bucket_splats=300)
     assert ("fitted" if fitted_splats == 400 else "merged") == builder.settings(len(model))["splats"]
-    data = builder.encode(model, options).write({"levels": builder.settings(len(model))}).data
+    data = csplat.encode(model, options, levels=builder)
     with csplat.open(data) as file:
         assert [0, 0, 1, 1, 2] == [node.level for node in file.nodes]
         errors = [node.error for node in file.nodes]
@@ -431,7 +436,7 @@ def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tm
 def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_path):
     model, out = csplat.read(sample_path).select(slice(0, 1200)), tmp_path / "out.csplat"
     target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
-    result = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
+    result = csplat.encode_with_report(model, levels=FittedLevelBuilder(1), target=target)
     assert 17_460 < len(result.data) == result.report.search.size_bytes <= 18_000
     assert_valid(result.data)
     assert [1200, 300] == counts_by_level(result.data, (0, 1))
@@ -446,7 +451,7 @@ def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_p
         assert [count, count // 4] == counts_by_level(out, (0, 1))
         assert encoded.report.options["levels"]["count"] == 1
     target = csplat.Target(max_error={"means": 0.01})
-    bounded = encode_with_levels(model, EncodeOptions(), LevelBuilder(1), target=target)
+    bounded = csplat.encode_with_report(model, levels=FittedLevelBuilder(1), target=target)
     assert bounded.report.search.size_bytes == len(bounded.data)
     assert 0.005 < bounded.report.errors["means"][0] <= 0.01
     assert_valid(bounded.data)

@@ -50,7 +50,7 @@ class EveryFourth:
         nodes = [replace(node, error=float(node.level), squares=(0.5,)) for node in encoded.nodes]
         return replace(encoded, nodes=nodes)
 
-    def encode(self, model, options, progress):
+    def encode_plan(self, plan, codebooks=None, progress=None):
         raise NotImplementedError
 
 

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 import csplat
 import csplat_render
 import csplat_tools
-import csplat_tools.level_builder
+import csplat_tools.encode_file
 import csplat_trainer
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel, normalise_quats
@@ -164,7 +164,7 @@ def test_a_target_of_largest_errors_needs_no_search(files, tmp_path):
     assert all(isinstance(stage, str) and 0.0 <= done <= 1.0 for stage, done in stages)
 
 
-def test_a_search_is_called_by_its_entry_point(files, monkeypatch):
+def test_a_search_and_a_builder_of_levels_are_called_by_their_entry_points(files, tmp_path, monkeypatch):
     from csplat_tools.optimise.target_encoding import meet_target
 
     assert {"target": meet_target} == load_plugins("csplat.search")
@@ -179,10 +179,19 @@ def test_a_search_is_called_by_its_entry_point(files, monkeypatch):
         csplat.encode_with_report(files[0], target=target, views="views", importance=weights)
     (model, options), named = raised.value.args
     assert (files[0], csplat.EncodeOptions()) == (model, options)
-    assert {"target": target, "views": "views", "importance": weights, "progress": None} == named
+    named.pop("progress")
+    assert {"target": target, "views": "views", "importance": weights, "levels": None} == named
     monkeypatch.setattr(place, lambda _: {})
     with pytest.raises(InputError, match=r"no search for targets is installed.*pip install 'csplat\[render\]'"):
         csplat.encode(files[0], target=target)
+    with pytest.raises(InputError, match="no builder of levels of detail is installed"):
+        csplat.encode(files[0], levels="auto")
+    monkeypatch.setattr(place, lambda _: {"builder": lambda *given: given == (60, csplat.EncodeOptions(), 2) or None})
+    with pytest.raises(AttributeError, match="encode_plan"):  # what was built is called
+        csplat.encode(files[0], levels=2)
+    monkeypatch.setattr(place, lambda _: {"builder": lambda *_: None})  # too few splats for levels
+    csplat.encode(files[0], out=tmp_path / "out.csplat", levels="auto")
+    assert csplat.encode(files[0]) == (tmp_path / "out.csplat").read_bytes()
 
 
 @pytest.mark.parametrize(("named", "message"), [
@@ -228,7 +237,7 @@ def test_commands_call_the_public_functions(files, monkeypatch, words, given):
     monkeypatch.chdir(files[1].parent)
     words = words.split()
     encodes = words[0] == "encode"
-    place = (csplat_tools.level_builder, "encode_with_report") if encodes else (csplat_tools, words[0])
+    place = (csplat_tools.encode_file, "encode_with_report") if encodes else (csplat_tools, words[0])
     (scene, *_), named = arguments_of(monkeypatch, *place, words)
     model = scene.model() if isinstance(scene, csplat.Scene) else getattr(scene, "source", scene)
     assert_same(csplat.read(files[1]), model)

@@ -15,7 +15,7 @@ from csplat import EncodeOptions, decode, encode, read_header
 from csplat.ply import read_ply
 from csplat_conformance.validator import validate
 from csplat_render import camera
-from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_builder import FittedLevelBuilder
 
 pytestmark = pytest.mark.slow
 FAST = EncodeOptions(preset="fast", tile_splats=500)
@@ -103,7 +103,7 @@ def test_a_broken_or_absent_file_is_explained(viewer, sample):
 
 
 def test_a_damaged_part_is_reported_next_to_the_scene(viewer, model):
-    data = bytearray(LevelBuilder(leaf_splats=400, root_splats=100).encode(model, FAST).write().data)
+    data = bytearray(FittedLevelBuilder(leaf_splats=400, root_splats=100).encode(model, FAST).write().data)
     layer = read_header(bytes(data)).tiles[0].layers[0]
     data[layer.offset + layer.size // 2] ^= 1
     viewer.show(bytes(data))

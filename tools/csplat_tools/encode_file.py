@@ -12,7 +12,7 @@ from typing import Any, Literal
 import csplat
 from csplat._spec import MEASURE_NAMES
 from csplat.disk_files import size_on_disk
-from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target
+from csplat.encoder import EncodeOptions, EncodeReport, EncodeResult, Target, encode_with_report
 from csplat.errors import InputError, counted
 from csplat.formats import detect_format
 from csplat.lint import Finding, refuse
@@ -24,8 +24,7 @@ from csplat.system import default_memory_bytes
 from csplat.types import Progress
 from csplat_tools.console import format_bytes, format_estimate, format_table, note
 from csplat_tools.file_streams import STANDARD_STREAM, source_path, write_array, write_bytes
-from csplat_tools.level_builder import LevelBuilder, encode_with_levels, read_streamed_levels
-from csplat_tools.optional_packages import require_renderer
+from csplat_tools.level_builder import FittedLevelBuilder, LevelCount, choose_levels, read_streamed_levels
 from csplat_tools.scene_files import CHEAP_TO_REOPEN, MetadataOverrides, findings_as_json, read_source
 
 _MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
@@ -33,10 +32,6 @@ _LEVELS_FACTOR = 4  # memory with levels of detail divided by that without: rend
 _SMALL = 4 << 20  # bytes; smaller files of any format always fit in memory
 
 _MANY_SPLATS = 1_000_000  # a file of these has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
-#: Largest number of levels to ask for: 4^16 splats are more than a scene can have.
-LEVELS_MAX = 16
-
-Levels = int | Literal["auto"] | None
 
 
 def read_degree(options: EncodeOptions) -> int | None:
@@ -46,21 +41,6 @@ def read_degree(options: EncodeOptions) -> int | None:
     models support can be read only if bands are dropped.
     """
     return None if options.sh_degree is None else MAX_SH_DEGREE
-
-
-def choose_levels(count: int, options: EncodeOptions, levels: Levels) -> LevelBuilder | None:
-    """Return the builder of the levels of detail of a scene of `count` splats; `None`: the file has none.
-
-    Raises:
-        InputError: the number of levels is out of range, or the extra `render` is not installed.
-    """
-    if isinstance(levels, int) and not 1 <= levels <= LEVELS_MAX:
-        raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, or auto")
-    builder = LevelBuilder(None if levels == "auto" else levels, bucket_splats=options.bucket_splats)
-    if levels is None or not count or (levels == "auto" and count <= builder.root_splats):
-        return None
-    require_renderer()
-    return builder
 
 
 def describe_levels(scene: Scene, options: EncodeOptions, limits: OutOfCoreOptions) -> list[str]:
@@ -77,7 +57,7 @@ def describe_levels(scene: Scene, options: EncodeOptions, limits: OutOfCoreOptio
         return []
     try:
         cost = estimate_cost(scene, options, limits)
-        more = estimate_cost(scene, options, limits, LevelBuilder(bucket_splats=options.bucket_splats))
+        more = estimate_cost(scene, options, limits, FittedLevelBuilder(bucket_splats=options.bucket_splats))
     except InputError:
         return []
     seconds, growth = more.seconds - cost.seconds, more.file_bytes / cost.file_bytes - 1.0
@@ -137,7 +117,7 @@ def encode_file(
     importance: str | None = None,
     prune_unseen: bool = False,
     source_index: str | None = None,
-    levels: Levels = None,
+    levels: LevelCount = None,
     out_of_core: OutOfCoreOptions | None = None,
     format: str | None = None,
     progress: Progress | None = None,
@@ -217,7 +197,9 @@ def encode_file(
             progress=progress,
         )  # fmt: skip
     else:
-        result = encode_with_levels(model, options, builder, target=target, views=views, progress=progress)
+        result = encode_with_report(
+            model, options, levels=builder, target=target, views=views, progress=progress
+        )  # fmt: skip
     write_bytes(output, result.data)
     if source_index is not None:
         write_array(source_index, result.source_index)
@@ -226,7 +208,7 @@ def encode_file(
 
 def _levels_of_source(
     local: Path, options: EncodeOptions, levels: int | Literal["auto"], limits: OutOfCoreOptions
-) -> LevelBuilder | None:
+) -> FittedLevelBuilder | None:
     """Return the builder that takes the levels of streamed SOG; `None` if it has one level, or none are to be written.
 
     Raises:
@@ -245,7 +227,9 @@ def _levels_of_source(
     return replace(builder, nodes=read_streamed_levels(local, builder.count))
 
 
-def may_exceed_memory(path: Path, limits: OutOfCoreOptions, levels: Levels = None, format: str | None = None) -> bool:
+def may_exceed_memory(
+    path: Path, limits: OutOfCoreOptions, levels: LevelCount = None, format: str | None = None
+) -> bool:
     """Return True if a scene may not fit in memory, which can only be decided after opening it."""
     if limits.scheduler is not None or limits.resume or limits.always:
         return True
@@ -262,7 +246,7 @@ def _encode_out_of_core(
     options: EncodeOptions,
     limits: OutOfCoreOptions,
     start: float,
-    levels: LevelBuilder | None,
+    levels: FittedLevelBuilder | None,
     *,
     overrides: MetadataOverrides | None,
     strict: bool,

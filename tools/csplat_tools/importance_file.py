@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat.disk_files import read_array
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, Target
+from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, Target, encode_with_report
 from csplat.errors import InputError
 from csplat.file_source import open_binary
 from csplat.model import SplatModel
 from csplat.types import Progress
 from csplat_render.scene_frame import scene_frame
-from csplat_tools.level_builder import LevelBuilder, encode_with_levels
+from csplat_tools.level_builder import FittedLevelBuilder
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
 
 _ZIP = b"PK"  # first bytes of a .npz file
@@ -61,7 +61,7 @@ def encode_by_importance(
     target: Target | None = None,
     views: Any = None,
     prune_unseen: bool = False,
-    levels: LevelBuilder | None = None,
+    levels: FittedLevelBuilder | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
     """Encode a scene with the importance of its splats.
@@ -86,20 +86,20 @@ def encode_by_importance(
         raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
     weights = encoder_importance(found, model)
     if target is not None:
-        return encode_with_levels(
-            model, options, levels, target=target, views=views, importance=weights, progress=progress
+        return encode_with_report(
+            model, options, levels=levels, target=target, views=views, importance=weights, progress=progress
         )
     notes = _class_notes(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
-        result = encode_with_levels(model, options, levels, importance=weights, progress=progress)
+        result = encode_with_report(model, options, levels=levels, importance=weights, progress=progress)
         return _with_notes(result, *notes)
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
         raise InputError(f"{path}: no view saw any splat, so all would be pruned")
     pruned = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
     left = weights.select(rows) if isinstance(weights, Importance) else None
-    result = encode_with_levels(
-        model.select(rows), options, levels, importance=left, origin=Origin(len(model), rows),
+    result = encode_with_report(
+        model.select(rows), options, levels=levels, importance=left, origin=Origin(len(model), rows),
         metadata={"pruned": pruned}, progress=progress,
     )  # fmt: skip
     if stored.missed_share > 0.0:  # NaN if no view was held out

@@ -10,10 +10,10 @@ in streamed SOG, are taken instead.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +24,17 @@ from csplat.encoder import (
     EncodedTiles,
     EncodeOptions,
     EncodePlan,
-    EncodeResult,
     FileCodebooks,
-    Importance,
     LevelNode,
-    Origin,
-    Target,
     bucket_rows,
     encode_levels,
-    encode_with_report,
-    meet_bounds,
 )
+from csplat.errors import InputError
 from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
-from csplat.plugins import load_plugins
 from csplat.scene import join_blocks
 from csplat.types import F32, I64, Progress, null_progress
+from csplat_tools.optional_packages import require_renderer
 
 # Modules that render are imported where they are used: the cost of levels can be estimated without them.
 
@@ -52,9 +47,15 @@ _SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 4e-5
 _Fit = Callable[[SplatModel, I64, int, int], tuple[I64, SplatModel]]
 
 
+#: Largest number of levels to ask for: 4^16 splats are more than a scene can have.
+LEVELS_MAX = 16
+
+LevelCount = int | Literal["auto"] | None
+
+
 @dataclass(frozen=True)
-class LevelBuilder:
-    """Builds levels of detail (`csplat.out_of_core.bucket_workers.LevelMaker`).
+class FittedLevelBuilder:
+    """Builds levels of detail of a scene by fitting them to renders (`csplat.encoder.levels.LevelBuilder`).
 
     Attributes:
         count: number of levels above 0; `None`: until one node has `root_splats`.
@@ -91,16 +92,6 @@ class LevelBuilder:
         if count <= self.whole_splats:
             return count * _SECONDS_WHOLE
         return count * (_SECONDS_FITTED if count <= self.fitted_splats else _SECONDS_MERGED)
-
-    def encode(
-        self, model: SplatModel, options: EncodeOptions | None = None, progress: Progress = null_progress
-    ) -> EncodedTiles:
-        """Encode a scene with its levels, in memory.
-
-        Raises:
-            InputError: a value fits no lattice, or an option is not allowed for the model.
-        """
-        return self.encode_plan(EncodePlan.of(model, options, progress=progress), progress=progress)
 
     def encode_plan(
         self, plan: EncodePlan, codebooks: FileCodebooks | None = None, progress: Progress = null_progress
@@ -233,48 +224,19 @@ class LevelBuilder:
         return nodes
 
 
-def encode_with_levels(
-    model: SplatModel,
-    options: EncodeOptions,
-    levels: LevelBuilder | None,
-    *,
-    target: Target | None = None,
-    views: Any = None,
-    importance: NDArray[Any] | Importance | None = None,
-    origin: Origin | None = None,
-    metadata: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
-) -> EncodeResult:
-    """Encode a scene in memory, with levels of detail if there is a builder.
-
-    Args:
-        model: the scene.
-        options: options of the encoder.
-        levels: builds levels of detail, whose bytes count for a target; `None`: the file has none.
-        target, views, importance, origin, metadata, progress: as for `csplat.encode_with_report`.
+def choose_levels(count: int, options: EncodeOptions, levels: LevelCount) -> FittedLevelBuilder | None:
+    """Return the builder of the levels of detail of a scene of `count` splats; `None`: the file has none.
 
     Raises:
-        InputError, OSError: as for `csplat.encode_with_report`.
+        InputError: the number of levels is out of range, or the extra `render` is not installed.
     """
-    if levels is None:
-        return encode_with_report(
-            model, options, target=target, views=views, importance=importance, origin=origin, metadata=metadata,
-            progress=progress,
-        )  # fmt: skip
-    search = None
-    if target is not None:
-        if target.is_rendered:
-            meet_target = load_plugins("csplat.search")["target"]
-            found: EncodeResult = meet_target(
-                model, options, target=target, views=views, importance=importance, levels=levels, progress=progress
-            )
-            return found
-        bounded, options = meet_bounds(model, options, target, importance=importance, progress=progress)
-        search = bounded.report.search
-    plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
-    encoded = levels.encode_plan(plan, progress=progress or null_progress)
-    result = encoded.write({**(metadata or {}), "levels": levels.settings(len(model))})
-    return result if search is None else result.with_search(replace(search, size_bytes=result.size_bytes))
+    if isinstance(levels, int) and not 1 <= levels <= LEVELS_MAX:
+        raise InputError(f"levels is {levels}, expected 1 to {LEVELS_MAX}, or auto")
+    builder = FittedLevelBuilder(None if levels == "auto" else levels, bucket_splats=options.bucket_splats)
+    if levels is None or not count or (levels == "auto" and count <= builder.root_splats):
+        return None
+    require_renderer()
+    return builder
 
 
 def join_roots(nodes: Sequence[LevelNode]) -> SplatModel:

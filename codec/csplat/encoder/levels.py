@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +43,52 @@ class LevelNode:
     rows: Rows | None = None
     splats: SplatModel | None = None
     error: float = 0.0
+
+
+class LevelBuilder(Protocol):
+    """Builds levels of detail, and measures their errors; picklable. No result depends on `threads`."""
+
+    @property
+    def whole_splats(self) -> int:
+        """Number of splats up to which a scene is built in one piece, in memory."""
+        ...
+
+    def settings(self, count: int) -> dict[str, Any]:
+        """Return what the OPTS chunk of a scene of `count` splats states, JSON-compatible."""
+        ...
+
+    def seconds(self, count: int) -> float:
+        """Return the approximate time for the levels of a scene of `count` splats, by one process."""
+        ...
+
+    def encode_plan(
+        self, plan: EncodePlan, codebooks: FileCodebooks | None = None, progress: Progress = null_progress
+    ) -> EncodedTiles:
+        """Encode a planned scene with its levels, in memory; arguments as for `encode_levels`."""
+        ...
+
+    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
+        """Build the nodes of a bucket of a scene of `scene_count` splats."""
+        ...
+
+    def build_top(
+        self, roots: Iterable[SplatModel], threads: int | None, progress: Progress
+    ) -> tuple[list[int | None], list[LevelNode]]:
+        """Build the nodes above all buckets.
+
+        Args:
+            roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
+            threads: number of threads; `None`: all.
+            progress: called with the stage and the completed fraction of it.
+
+        Returns:
+            The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
+        """
+        ...
+
+    def measure(self, encoded: EncodedTiles, threads: int | None, progress: Progress) -> EncodedTiles:
+        """Return the same tiles with errors of the nodes that have none yet."""
+        ...
 
 
 def encode_levels(

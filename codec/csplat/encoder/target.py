@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from numbers import Real
-from typing import Any
+from typing import Any, Protocol
 
 from csplat._spec import MEASURE_NAMES
 from csplat.errors import InputError
@@ -14,6 +14,15 @@ from csplat.types import PSNR_CAP
 
 _DROPS = (0.001, 60.0)  # allowed range of `max_psnr_drop`, dB
 _EFFORTS = (1, 9)  # allowed range of `effort`
+
+
+class Views(Protocol):
+    """Views that a search for a target renders, as `csplat_tools.ViewSet`."""
+
+    @property
+    def name(self) -> str:
+        """Name of the views, for reports."""
+        ...
 
 
 @dataclass(frozen=True)

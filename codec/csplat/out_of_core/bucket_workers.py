@@ -9,78 +9,32 @@ from __future__ import annotations
 import json
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from csplat import _spec
 from csplat.disk_files import atomic_writer
 from csplat.encoder.container import FileNode, FileTile, LazyPayload, chunk_crc
-from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.encode_plan import EncodePlan, Origin, clip_scales
 from csplat.encoder.error_bounds import ErrorSums
-from csplat.encoder.levels import LevelNode, encode_levels
+from csplat.encoder.levels import LevelBuilder, encode_levels
 from csplat.encoder.pipeline import EncodedTile, EncodedTiles, encode_tiles
 from csplat.encoder.sh_codebook import FileCodebooks, assign_splats
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import missing_package
 from csplat.file_source import open_binary
-from csplat.model import SplatModel
 from csplat.out_of_core.disk_buckets import Bucket, damaged_file, read_bucket, write_splats
 from csplat.scene import join_blocks
 from csplat.system import map_in_processes
-from csplat.types import Progress, null_progress
+from csplat.types import null_progress
 
 _HEAD = struct.Struct("<QI")  # size and CRC-32 of the records
-
-
-class LevelMaker(Protocol):
-    """Builds levels of detail, and measures their errors; picklable. No result depends on `threads`."""
-
-    @property
-    def whole_splats(self) -> int:
-        """Number of splats up to which a scene is built in one piece, in memory."""
-        ...
-
-    def settings(self, count: int) -> dict[str, Any]:
-        """Return what the OPTS chunk of a scene of `count` splats states, JSON-compatible."""
-        ...
-
-    def seconds(self, count: int) -> float:
-        """Return the approximate time for the levels of a scene of `count` splats, by one process."""
-        ...
-
-    def encode(self, model: SplatModel, options: EncodeOptions, progress: Progress) -> EncodedTiles:
-        """Encode a scene with its levels, in memory."""
-        ...
-
-    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
-        """Build the nodes of a bucket of a scene of `scene_count` splats."""
-        ...
-
-    def build_top(
-        self, roots: Iterable[SplatModel], threads: int | None, progress: Progress
-    ) -> tuple[list[int | None], list[LevelNode]]:
-        """Build the nodes above all buckets.
-
-        Args:
-            roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
-            threads: number of threads; `None`: all.
-            progress: called with the stage and the completed fraction of it.
-
-        Returns:
-            The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
-        """
-        ...
-
-    def measure(self, encoded: EncodedTiles, threads: int | None, progress: Progress) -> EncodedTiles:
-        """Return the same tiles with errors of the nodes that have none yet."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +51,7 @@ class BucketCoding:
     folder: Path
     plan: EncodePlan
     codebooks: FileCodebooks
-    levels: LevelMaker | None = None
+    levels: LevelBuilder | None = None
 
 
 def coded_path(folder: Path, bucket: Bucket) -> Path:

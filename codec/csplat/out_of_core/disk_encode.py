@@ -16,12 +16,11 @@ from csplat.disk_files import atomic_writer
 from csplat.encoder import EncodedTiles, EncodeOptions, EncodePlan, EncodeReport, Origin, encode_tiles
 from csplat.encoder.container import FileNode, order_nodes
 from csplat.encoder.error_bounds import ErrorSums
-from csplat.encoder.levels import encode_coarse
+from csplat.encoder.levels import LevelBuilder, encode_coarse
 from csplat.encoder.pipeline import EncodedTile
 from csplat.errors import InputError
 from csplat.out_of_core.bucket_workers import (
     BucketCoding,
-    LevelMaker,
     code_buckets,
     coded_path,
     read_coded,
@@ -114,7 +113,7 @@ def estimate_cost(
     scene: Scene,
     options: EncodeOptions,
     limits: OutOfCoreOptions | None = None,
-    levels: LevelMaker | None = None,
+    levels: LevelBuilder | None = None,
 ) -> EncodingCost:
     """Estimate the cost of an encoding, and decide where it takes place.
 
@@ -170,7 +169,7 @@ def encode_scene(
     options: EncodeOptions | None = None,
     limits: OutOfCoreOptions | None = None,
     *,
-    levels: LevelMaker | None = None,
+    levels: LevelBuilder | None = None,
     source: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
@@ -185,7 +184,7 @@ def encode_scene(
         target: path of the file, which appears when complete.
         options: options of the encoder.
         limits: memory, disk and workers.
-        levels: builds levels of detail (`csplat_tools.level_builder.LevelBuilder`); `None`: the file has none.
+        levels: builds levels of detail (`csplat_tools.level_builder`); `None`: the file has none.
         source: identity of the scene, JSON-compatible; checked when resuming.
         progress: called with the stage and the completed fraction of it, 0 to 1.
 
@@ -208,7 +207,8 @@ def encode_scene(
         if levels is None:
             encoded = encode_tiles(EncodePlan.of(scene.model(), options, progress=progress), progress=progress)
         else:
-            encoded = levels.encode(scene.model(), options, progress)
+            plan = EncodePlan.of(scene.model(), options, progress=progress)
+            encoded = levels.encode_plan(plan, progress=progress)
         with atomic_writer(target) as stream:
             return encoded.write_to(stream, settings, progress=progress)
     scene = _with_written_columns(scene, options)
@@ -240,7 +240,7 @@ def _encode_buckets(
     options: EncodeOptions,
     workers: int,
     scheduler: str | None,
-    levels: LevelMaker | None,
+    levels: LevelBuilder | None,
     progress: Progress,
 ) -> EncodedTiles:
     """Plan the encoding on the sample, encode the buckets that are not encoded yet, and the levels above them."""

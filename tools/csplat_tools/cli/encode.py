@@ -18,8 +18,6 @@ from csplat_tools.cli.command_output import Output, default_output
 from csplat_tools.console import note
 from csplat_tools.encode_file import (
     EncodedFile,
-    Levels,
-    choose_levels,
     describe_levels,
     encode_file,
     format_cost,
@@ -28,6 +26,7 @@ from csplat_tools.encode_file import (
     read_degree,
 )
 from csplat_tools.file_streams import check_name, source_path
+from csplat_tools.level_builder import LevelCount, choose_levels
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import read_source
 from csplat_tools.views import ViewSet
@@ -181,7 +180,7 @@ def _publish(encoded: EncodedFile, source: str, output: str, out: Output, *, up:
 
 
 def _publish_estimate(
-    source: str, read_as: str | None, options: EncodeOptions, limits: OutOfCoreOptions, levels: Levels, out: Output
+    source: str, read_as: str | None, options: EncodeOptions, limits: OutOfCoreOptions, levels: LevelCount, out: Output
 ) -> None:
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local, csplat.open(local, read_as, sh_degree=read_degree(options)) as scene:

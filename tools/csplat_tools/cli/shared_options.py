@@ -24,7 +24,7 @@ from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import NUMBER, parse_size_bytes, print_data
-from csplat_tools.encode_file import LEVELS_MAX, Levels
+from csplat_tools.level_builder import LEVELS_MAX, LevelCount
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
 
@@ -459,7 +459,7 @@ def parse_target(
     )  # fmt: skip
 
 
-def parse_levels(text: str | None) -> Levels:
+def parse_levels(text: str | None) -> LevelCount:
     """Parse a number of levels of detail, or `auto`; return `None` for `None`."""
     if text is None or text == "auto":
         return None if text is None else "auto"

@@ -27,7 +27,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 
 if TYPE_CHECKING:
-    from csplat_tools.level_builder import LevelBuilder
+    from csplat_tools.level_builder import FittedLevelBuilder
 
 _SPLAT_SECONDS = 4e-5  # CPU seconds per splat of encoding and scoring all: 12 s for 306,000 of garden500k
 
@@ -174,7 +174,7 @@ class Candidate:
     test_errors: F64 | None = field(default=None, repr=False)
     test_psnr: float | None = None
 
-    def with_levels(self, levels: LevelBuilder, progress: Progress | None) -> Candidate:
+    def with_levels(self, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
         """Return the same splats in a file with levels of detail, which is not measured in the test views yet."""
         coded, entries = self.coded, self.subset.metadata(self.validation_psnr) or {}
         found = levels.encode_plan(coded.plan, coded.codebooks, progress or null_progress)

@@ -16,7 +16,7 @@ from csplat_tools.views import ViewSet, find_view_set
 from csplat_tools.views.view_sets import render_seconds
 
 if TYPE_CHECKING:
-    from csplat_tools.level_builder import LevelBuilder
+    from csplat_tools.level_builder import FittedLevelBuilder
     from csplat_tools.optimise.simplify import SimplifyOptions
 
 
@@ -28,7 +28,7 @@ def meet_target(
     views: ViewSet | None = None,
     importance: Weights | None = None,
     simplifying: SimplifyOptions | None = None,
-    levels: LevelBuilder | None = None,
+    levels: FittedLevelBuilder | None = None,
     progress: Progress | None = None,
 ) -> EncodeResult:
     """Search for the file that meets a target which requires rendering.

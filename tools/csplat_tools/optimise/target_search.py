@@ -41,7 +41,7 @@ from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.console import format_bytes
-from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_builder import FittedLevelBuilder
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, Coding, Subset, Weights, WholeScene
 from csplat_tools.optimise.pruning import REFIT_GAIN, Pruner
 from csplat_tools.optimise.rate_distortion import (
@@ -638,7 +638,7 @@ def search_target(
     *,
     importance: Weights | None,
     options: SimplifyOptions,
-    levels: LevelBuilder | None,
+    levels: FittedLevelBuilder | None,
     progress: Progress | None,
 ) -> tuple[Candidate, SearchReport]:
     """Search for the file that meets a target, by rendering candidates.
@@ -698,7 +698,7 @@ def search_target(
     return found, report
 
 
-def _best_with_levels(search: TargetSearch, levels: LevelBuilder, progress: Progress | None) -> Candidate:
+def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
     """Return the best file with levels of detail, whose bytes count for a size.
 
     Their bytes are only known once they are built for the splats of a file. So the size that is left for level 0 is

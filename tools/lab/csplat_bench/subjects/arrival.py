@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import csplat
 from csplat.encoder import EncodeOptions, PresetName, encode
 from csplat.formats import format_by_name, write
 from csplat.ply import read_ply
@@ -43,7 +44,7 @@ from csplat_bench.scenes import Scene, find_scene
 from csplat_bench.slow_line import SLOW, Line
 from csplat_bench.suites import Case
 from csplat_render.metrics import psnr
-from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_builder import FittedLevelBuilder
 from csplat_tools.render_files import write_png
 
 _STEPS = {"db25": 25.0, "db30": 30.0, "db38": 38.0}  # dB
@@ -192,7 +193,7 @@ def _transform(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]
 
 
 def _with_levels(scene: Scene, folder: Path, _: object) -> None:
-    (folder / f"{scene.name}.csplat").write_bytes(LevelBuilder().encode(read_ply(scene.path)).write().data)
+    (folder / f"{scene.name}.csplat").write_bytes(csplat.encode(csplat.read(scene.path), levels=FittedLevelBuilder()))
 
 
 def _in_levels(scene: Scene, folder: Path, transform: Callable[[], Sequence[str]]) -> None:

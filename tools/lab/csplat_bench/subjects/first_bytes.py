@@ -26,7 +26,7 @@ from csplat_bench.scenes import find_scene
 from csplat_bench.suites import Case
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.rasteriser import Rasteriser
-from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_builder import FittedLevelBuilder
 from csplat_tools.views import comparison_cameras
 
 
@@ -34,7 +34,7 @@ from csplat_tools.views import comparison_cameras
 def measure_first_bytes(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that draws the beginning of a file."""
     model = csplat.read(find_scene(name, setup.data, setup.work).path)
-    files = {False: csplat.encode(model), True: LevelBuilder().encode(model).write().data}
+    files = {False: csplat.encode(model), True: csplat.encode(model, levels=FittedLevelBuilder())}
     cameras = comparison_cameras(model)
     rasteriser = Rasteriser(gradients=False)
 

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from csplat.decoder import decode
+from csplat.encoder import EncodePlan
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply
 from csplat_bench.measuring import run_program
@@ -33,7 +34,7 @@ from csplat_render.camera import resized
 from csplat_render.metrics import psnr_of_mse, ssim
 from csplat_render.rasteriser import Rasteriser
 from csplat_render.virtual_cameras import virtual_cameras
-from csplat_tools.level_builder import LevelBuilder
+from csplat_tools.level_builder import FittedLevelBuilder
 from csplat_tools.level_merging import merge_neighbours
 
 _CAMERAS = 8
@@ -57,11 +58,11 @@ def measure_levels(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measu
         start = time.perf_counter()
         if maker == "merged":
             levels, splats = {0: model}, model
-            while len(splats) > LevelBuilder.root_splats:
+            while len(splats) > FittedLevelBuilder.root_splats:
                 splats = merge_neighbours(splats, np.zeros(len(splats), np.int64), math.ceil(_SHARE * len(splats)))[1]
                 levels[len(levels)] = splats
             return levels, time.perf_counter() - start
-        encoded = LevelBuilder().encode(model)
+        encoded = FittedLevelBuilder().encode_plan(EncodePlan.of(model))
         seconds, nodes = time.perf_counter() - start, encoded.nodes
         numbers = sorted({node.level for node in nodes})
         return {n: decode(encoded.part([node for node in nodes if node.level == n])) for n in numbers}, seconds
