@@ -1,4 +1,7 @@
-"""Checkpoints and tensors of gsplat, splatfacto and INRIA as scenes; without torch an error names the extra."""
+"""Checkpoints and tensors of gsplat, splatfacto and INRIA as scenes; without torch an error names the extra.
+
+Also: csplat_trainer.torch_checkpoints.
+"""
 
 import io
 import pickle

@@ -1,4 +1,8 @@
-"""Defects of PLY files: their name in lint, the result of reading, and the error of strict reading."""
+"""Defects of PLY files: their name in lint, the result of reading, and the error of strict reading.
+
+Also: csplat.ply.column_names, csplat.ply.columns, csplat.ply.ply_header, csplat.ply.ply_rows,
+csplat_tools.cli.lint.
+"""
 
 import re
 import tracemalloc

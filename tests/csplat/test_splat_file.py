@@ -1,4 +1,7 @@
-"""Files that are read in parts from a disk, memory or a store; `test_remote_servers.py` tests servers."""
+"""Files that are read in parts from a disk, memory or a store; `test_remote_servers.py` tests servers.
+
+Also: csplat.byte_store.
+"""
 
 import io
 import math

@@ -1,4 +1,8 @@
-"""The conformance runner against decoders that are correct, misbehave, or have a planted fault."""
+"""The conformance runner against decoders that are correct, misbehave, or have a planted fault.
+
+Also: csplat_conformance.adapter, csplat_conformance.answers, csplat_conformance.protocol,
+csplat_conformance.tolerance.
+"""
 
 from __future__ import annotations
 

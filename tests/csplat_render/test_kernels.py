@@ -1,4 +1,7 @@
-"""Kernels: threads run every lane once and pass errors on; a fork gets its own; warming up compiles everything."""
+"""Kernels: threads run every lane once and pass errors on; a fork gets its own; warming up compiles everything.
+
+Also: csplat_render.warmup.
+"""
 
 import importlib
 import json

@@ -1,4 +1,7 @@
-"""The rasteriser: renders and gradients against the exact twin, numbers worked out by hand, and adversarial inputs."""
+"""The rasteriser: renders and gradients against the exact twin, numbers worked out by hand, and adversarial inputs.
+
+Also: csplat_render.binning, csplat_render.blending, csplat_render.projection, csplat_render.reference_rasteriser.
+"""
 
 import itertools
 import math

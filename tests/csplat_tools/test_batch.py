@@ -1,4 +1,7 @@
-"""`csplat batch`: selection of scenes, repetition, files of others, interrupts, and clusters."""
+"""`csplat batch`: selection of scenes, repetition, files of others, interrupts, and clusters.
+
+Also: csplat_tools.cli.batch.
+"""
 
 import json
 import os

@@ -1,4 +1,7 @@
-"""`csplat convert`: conversion between all formats, filters, reports of losses."""
+"""`csplat convert`: conversion between all formats, filters, reports of losses.
+
+Also: csplat_tools.cli.convert, csplat_tools.cli.decode.
+"""
 
 import io
 import json

@@ -1,4 +1,7 @@
-"""Levels of detail: cuts through the nodes, reading, copying and encoding them, and the first builder."""
+"""Levels of detail: cuts through the nodes, reading, copying and encoding them, and the first builder.
+
+Also: csplat.decoder.tree, csplat_tools.level_errors.
+"""
 
 import io
 import json

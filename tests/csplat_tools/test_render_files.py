@@ -1,4 +1,7 @@
-"""`csplat render`: images, and films in the formats that Pillow writes and as MP4; refusals."""
+"""`csplat render`: images, and films in the formats that Pillow writes and as MP4; refusals.
+
+Also: csplat_tools.cli.render, csplat_tools.present.scene_renders.
+"""
 
 import json
 import sys

@@ -1,4 +1,7 @@
-"""`csplat tradeoff`: grids, failures, the Pareto front, the table, JSON, the page, and commands that repeat a row."""
+"""`csplat tradeoff`: grids, failures, the Pareto front, the table, JSON, the page, and commands that repeat a row.
+
+Also: csplat_tools.cli.tradeoff.
+"""
 
 import json
 import re

@@ -1,4 +1,8 @@
-"""Training, tuning and measuring through gsplat's interface, for which `gsplat_twin` stands in, against the CPU."""
+"""Training, tuning and measuring through gsplat's interface, for which `gsplat_twin` stands in, against the CPU.
+
+Also: csplat_trainer.gsplat_derivatives, csplat_trainer.gsplat_engine, csplat_trainer.torch_losses,
+csplat_trainer.torch_quantisers, csplat_trainer.tuning.gsplat_tuning.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace

@@ -1,4 +1,7 @@
-"""Sensitivity of splats, against finite differences of the exact renderer; the command."""
+"""Sensitivity of splats, against finite differences of the exact renderer; the command.
+
+Also: csplat_render.contributions, csplat_tools.cli.sensitivity.
+"""
 
 import json
 from dataclasses import replace

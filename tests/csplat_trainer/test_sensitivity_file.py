@@ -1,4 +1,7 @@
-"""Tests of csplat_trainer.sensitivity_file."""
+"""Tests of csplat_trainer.sensitivity_file.
+
+Also: csplat_tools.importance_file.
+"""
 
 from dataclasses import replace
 

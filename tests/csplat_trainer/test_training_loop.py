@@ -1,4 +1,9 @@
-"""Training: the loop, resumed runs, `csplat train` to a PLY or a file; checkpoints, gains of images."""
+"""Training: the loop, resumed runs, `csplat train` to a PLY or a file; checkpoints, gains of images.
+
+Also: csplat_tools.cli.train, csplat_tools.training.training_run, csplat_trainer.engine,
+csplat_trainer.fit_checkpoint, csplat_trainer.fitter, csplat_trainer.image_gains, csplat_trainer.initial_splats,
+csplat_trainer.pruning.
+"""
 
 from __future__ import annotations
 

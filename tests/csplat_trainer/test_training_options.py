@@ -1,4 +1,7 @@
-"""Tests of csplat_trainer.training_options."""
+"""Tests of csplat_trainer.training_options.
+
+Also: csplat_trainer.training_report.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The command line: output, statuses, messages; no partial files, no tracebacks."""
+"""The command line: output, statuses, messages; no partial files, no tracebacks.
+
+Also: csplat_tools.cli.app.
+"""
 
 import json
 import os

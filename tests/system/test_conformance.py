@@ -1,3 +1,8 @@
+"""Tests of system.conformance.
+
+Also: csplat_tools.cli.conformance.
+"""
+
 import json
 import re
 import shlex

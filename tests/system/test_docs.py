@@ -1,4 +1,7 @@
-"""README and documentation: links resolve, figures are the measured ones, examples run."""
+"""README and documentation: links resolve, figures are the measured ones, examples run.
+
+Also: csplat_tools.inspect.file_report.
+"""
 
 import importlib
 import itertools

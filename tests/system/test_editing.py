@@ -1,3 +1,8 @@
+"""Tests of system.editing.
+
+Also: csplat_tools.cli.extract, csplat_tools.cli.merge.
+"""
+
 from dataclasses import replace
 
 import numpy as np

@@ -1,3 +1,9 @@
+"""Tests of system.encode.
+
+Also: csplat_tools.cli.command_output, csplat_tools.cli.encode, csplat_tools.cli.shared_options,
+csplat_tools.encode_file, csplat_tools.file_streams.
+"""
+
 import errno
 import gzip
 import io

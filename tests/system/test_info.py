@@ -1,3 +1,9 @@
+"""Tests of system.info.
+
+Also: csplat_tools.cli.error_lines, csplat_tools.cli.info, csplat_tools.inspect.file_description,
+csplat_tools.inspect.text_reports.
+"""
+
 import json
 import os
 import sys

@@ -1,4 +1,7 @@
-"""The Python interface: names, imports, errors, `SplatModel`, forms of files, and the commands that call it."""
+"""The Python interface: names, imports, errors, `SplatModel`, forms of files, and the commands that call it.
+
+Also: csplat.model, csplat.types, csplat_tools.optional_packages.
+"""
 
 import doctest
 import gzip

@@ -37,6 +37,18 @@ def test_every_file_that_a_page_about_the_code_names_exists(page, least):
     assert [] == sorted(name for name in named - found if "NAME" not in name)
 
 
+@in_a_checkout
+def test_each_module_has_a_file_of_tests_or_is_named_in_the_head_of_another():
+    heads = [(ROOT / path).read_text("utf-8").partition("import ")[0] for path in listed("tests/**/test_*.py")]
+    named = set(re.findall(r"csplat[\w.]*\w", "\n".join(heads)))
+    roots = ("codec/csplat", "trainer", "tools/csplat_tools", "conformance/csplat_conformance")
+    modules = [Path(path) for path in listed(*(f"{root}/**/*.py" for root in roots), "codec/csplat/*.py")]
+    inside = [Path(*path.parts[1:]) for path in modules if not path.stem.startswith("_")]
+    assert len(inside) > 200
+    untested = [path for path in inside if not (ROOT / "tests" / path.with_name(f"test_{path.name}")).exists()]
+    assert [] == [path for path in untested if ".".join(path.with_suffix("").parts) not in named]
+
+
 def test_a_release_names_its_own_repository_and_refuses_another_version(tmp_path):
     def prepared(tag, url):
         return runpy.run_path(ROOT / "tools" / "release" / "prepare.py")["main"](["--tag", tag, "--url", url], tmp_path)

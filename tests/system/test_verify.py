@@ -1,3 +1,8 @@
+"""Tests of system.verify.
+
+Also: csplat_tools.cli.verify, csplat_tools.inspect.verification.
+"""
+
 import json
 
 import numpy as np

@@ -1,4 +1,7 @@
-"""Damaged files, fields, streams and JSON texts: each is refused by a typed error with code, offset and clause."""
+"""Damaged files, fields, streams and JSON texts: each is refused by a typed error with code, offset and clause.
+
+Also: csplat.decoder.entropy, csplat.decoder.index, csplat.decoder.reconstruct, csplat.decoder.tiles.
+"""
 
 from __future__ import annotations
 

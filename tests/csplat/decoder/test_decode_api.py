@@ -1,4 +1,7 @@
-"""Whole files and parts of them; the files come from the conformance suite's writer, never from our encoder."""
+"""Whole files and parts of them; the files come from the conformance suite's writer, never from our encoder.
+
+Also: csplat.decoder.blocks.
+"""
 
 from __future__ import annotations
 

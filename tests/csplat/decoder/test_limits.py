@@ -1,4 +1,7 @@
-"""Tests of csplat.decoder.limits."""
+"""Tests of csplat.decoder.limits.
+
+Also: csplat.decoder.codebooks.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,7 @@
-"""Editing without decoding: parts of a file as files of their own, and several files as one."""
+"""Editing without decoding: parts of a file as files of their own, and several files as one.
+
+Also: csplat.editing.merge.
+"""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""The up axis: read, estimated and kept; scenes in other coordinates; everything that shows a scene agrees on up."""
+"""The up axis: read, estimated and kept; scenes in other coordinates; everything that shows a scene agrees on up.
+
+Also: csplat_render.up_estimate.
+"""
 
 from __future__ import annotations
 

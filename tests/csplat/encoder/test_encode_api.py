@@ -1,4 +1,8 @@
-"""Scenes survive encoding and decoding within the errors that the file states, or they are refused."""
+"""Scenes survive encoding and decoding within the errors that the file states, or they are refused.
+
+Also: csplat.encoder.coding_parameters, csplat.encoder.encode_options, csplat.encoder.pipeline,
+csplat.encoder.sh_codebook.
+"""
 
 import itertools
 import math

@@ -1,4 +1,7 @@
-"""Codebooks: k-means finds near entries at any thread count; codebooks of shapes make smaller files."""
+"""Codebooks: k-means finds near entries at any thread count; codebooks of shapes make smaller files.
+
+Also: csplat.encoder.shape_codebook.
+"""
 
 from __future__ import annotations
 

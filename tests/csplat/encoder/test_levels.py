@@ -1,4 +1,7 @@
-"""Tests of csplat.encoder.levels."""
+"""Tests of csplat.encoder.levels.
+
+Also: csplat.encoder.container.
+"""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""Tests of csplat.encoder.splat_importance."""
+"""Tests of csplat.encoder.splat_importance.
+
+Also: csplat.encoder.quantisation_classes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Tests of csplat.encoder.target."""
+"""Tests of csplat.encoder.target.
+
+Also: csplat.encoder.error_targets.
+"""
 
 from dataclasses import replace
 

@@ -1,4 +1,8 @@
-"""Formats: detection, reading in blocks, writing, refusals; archives; plug-ins of other packages; notebooks."""
+"""Formats: detection, reading in blocks, writing, refusals; archives; plug-ins of other packages; notebooks.
+
+Also: csplat.archives, csplat.detect, csplat.file_source, csplat.formats.common, csplat.plugins,
+csplat_tools.present.notebook.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""glTF with splats: files built byte by byte, round trips, refusals."""
+"""glTF with splats: files built byte by byte, round trips, refusals.
+
+Also: csplat.formats.gltf.gltf_document, csplat.formats.gltf.gltf_reader, csplat.formats.gltf.gltf_writer.
+"""
 
 import base64
 import json

@@ -1,4 +1,8 @@
-"""SOG, versions 1 and 2, in folders, zips and levels: files built byte by byte, and round trips."""
+"""SOG, versions 1 and 2, in folders, zips and levels: files built byte by byte, and round trips.
+
+Also: csplat.formats.sog.sog_files, csplat.formats.sog.sog_reader, csplat.formats.sog.sog_writer,
+csplat.formats.sog.streamed_writer.
+"""
 
 import io
 import json

@@ -1,4 +1,7 @@
-""".splat and .ksplat: rows, sections, buckets and levels, read from bytes written by hand; .splat is also written."""
+""".splat and .ksplat: rows, sections, buckets and levels, read from bytes written by hand; .splat is also written.
+
+Also: csplat.formats.ksplat.
+"""
 
 import gzip
 import itertools

@@ -1,4 +1,7 @@
-"""Out-of-core encoding: the same bytes as in memory, resumed runs, full disks, lost workers."""
+"""Out-of-core encoding: the same bytes as in memory, resumed runs, full disks, lost workers.
+
+Also: csplat.out_of_core.bucket_workers, csplat.out_of_core.disk_buckets.
+"""
 
 import errno
 import multiprocessing

@@ -1,4 +1,7 @@
-"""PLY: columns, headers, comments and doubles, read and written; refusals; a limit of memory."""
+"""PLY: columns, headers, comments and doubles, read and written; refusals; a limit of memory.
+
+Also: csplat.ply.comments.
+"""
 
 import gzip
 import tracemalloc

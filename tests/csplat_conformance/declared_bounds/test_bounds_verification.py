@@ -1,4 +1,7 @@
-"""Verification of declared errors, in memory and tile by tile, and descriptions of files."""
+"""Verification of declared errors, in memory and tile by tile, and descriptions of files.
+
+Also: csplat_conformance.declared_bounds.tile_pairs.
+"""
 
 import json
 from contextlib import suppress

@@ -1,4 +1,7 @@
-"""The encoder suite's runs of a program: what a program may not do, and what is kept, counted and written."""
+"""The encoder suite's runs of a program: what a program may not do, and what is kept, counted and written.
+
+Also: csplat_conformance.encoders.reference_ply, csplat_conformance.fields.
+"""
 
 import itertools
 import json

@@ -1,4 +1,7 @@
-"""The encoder suite: our encoder at every preset, faulty encoders, refusals, inputs, and the command."""
+"""The encoder suite: our encoder at every preset, faulty encoders, refusals, inputs, and the command.
+
+Also: csplat_conformance.encoders.surface_scenes.
+"""
 
 import json
 import tempfile

@@ -1,4 +1,7 @@
-"""The encoder suite's checks of the errors that a file states, and where pictures must judge instead."""
+"""The encoder suite's checks of the errors that a file states, and where pictures must judge instead.
+
+Also: csplat_conformance.encoders.render_checks.
+"""
 
 import types
 from contextlib import contextmanager

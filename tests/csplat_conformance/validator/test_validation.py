@@ -1,4 +1,9 @@
-"""The strict validator: every violation by its clause, of vectors, of damaged files, and of files with many defects."""
+"""The strict validator: every violation by its clause, of vectors, of damaged files, and of files with many defects.
+
+Also: csplat_conformance.validator.ancillary_chunks, csplat_conformance.validator.index,
+csplat_conformance.validator.streams, csplat_conformance.validator.tiles, csplat_conformance.validator.tree,
+csplat_conformance.validator.values.
+"""
 
 import json
 import random

@@ -1,4 +1,7 @@
-"""Tests of csplat_render.gpu.packing."""
+"""Tests of csplat_render.gpu.packing.
+
+Also: csplat.decoder.packed, csplat.packed.
+"""
 
 import numpy as np
 import pytest

@@ -1,6 +1,8 @@
 """The renderer on a GPU, by an adapter that emulates one, and the layout that its shaders read.
 
 Tests of the area need wgpu (extra `gpu`) and a Vulkan driver; Debian's mesa-vulkan-drivers has one for the CPU.
+
+Also: csplat_render.gpu.device, csplat_render.gpu.scoring.
 """
 
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""`csplat compare`: pairs of splats, scores of renders, and the definition of `psnr`."""
+"""`csplat compare`: pairs of splats, scores of renders, and the definition of `psnr`.
+
+Also: csplat_render.scorer, csplat_tools.cli.compare.
+"""
 
 import json
 from dataclasses import replace

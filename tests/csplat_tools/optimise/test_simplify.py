@@ -1,4 +1,7 @@
-"""Simplification: views, pruning order, refits, SH bands, and the command."""
+"""Simplification: views, pruning order, refits, SH bands, and the command.
+
+Also: csplat_tools.cli.simplify, csplat_tools.views.sufficient_views.
+"""
 
 import json
 from dataclasses import asdict, replace

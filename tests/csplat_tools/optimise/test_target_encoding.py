@@ -1,6 +1,9 @@
 """Targets: options, the command, and on real scenes the files of three searches, refits, measurements and reports.
 
 test_target_search.py tests the logic of the search on analytic scenes.
+
+Also: csplat_tools.optimise.candidates, csplat_tools.optimise.pruning, csplat_tools.optimise.scene_sensitivity,
+csplat_tools.optimise.search_report.
 """
 
 import json

@@ -1,4 +1,7 @@
-"""`csplat view`: answers and refusals of its server, and the end of the command."""
+"""`csplat view`: answers and refusals of its server, and the end of the command.
+
+Also: csplat_tools.cli.view.
+"""
 
 import http.client
 import json

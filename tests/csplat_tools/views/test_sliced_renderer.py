@@ -1,4 +1,7 @@
-"""Scenes decoded tile by tile, and drawn and compared without being in memory: results equal those in memory."""
+"""Scenes decoded tile by tile, and drawn and compared without being in memory: results equal those in memory.
+
+Also: csplat_tools.scene_files, csplat_tools.views.splat_spool.
+"""
 
 import io
 import json

@@ -1,4 +1,7 @@
-"""Lenses of data sets, images that are straightened, and sets whose sizes, lenses or poses contradict the images."""
+"""Lenses of data sets, images that are straightened, and sets whose sizes, lenses or poses contradict the images.
+
+Also: csplat_trainer.data.foreign_sets, csplat_trainer.data.lens.
+"""
 
 import json
 import math

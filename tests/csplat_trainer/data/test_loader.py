@@ -1,4 +1,7 @@
-"""Readers of data sets, on tiny sets."""
+"""Readers of data sets, on tiny sets.
+
+Also: csplat_trainer.data.dataset, csplat_trainer.data.transforms.
+"""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,7 @@
-"""Tests of csplat_trainer.tuning.tuned_encoding."""
+"""Tests of csplat_trainer.tuning.tuned_encoding.
+
+Also: csplat_trainer.device_measurements.
+"""
 
 from dataclasses import replace
 

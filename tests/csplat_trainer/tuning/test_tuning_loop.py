@@ -1,4 +1,8 @@
-"""Fine-tuning: learning, determinism, resumed runs, ends of a run, and the reports and files of the command."""
+"""Fine-tuning: learning, determinism, resumed runs, ends of a run, and the reports and files of the command.
+
+Also: csplat_tools.cli.finetune, csplat_tools.training.tuning_report, csplat_trainer.tuning.tuning_engine,
+csplat_trainer.tuning.tuning_options.
+"""
 
 import json
 import math

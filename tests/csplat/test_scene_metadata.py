@@ -1,4 +1,4 @@
-"""Tests of csplat.editing.up_axis."""
+"""Tests of csplat.scene_metadata."""
 
 from __future__ import annotations
 
