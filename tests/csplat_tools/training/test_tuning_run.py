@@ -1,4 +1,7 @@
-"""Tests of csplat_tools.training.tuning_run."""
+"""Tests of csplat_tools.training.tuning_run.
+
+Also: csplat_trainer.device_measurements.
+"""
 
 import json
 from dataclasses import replace

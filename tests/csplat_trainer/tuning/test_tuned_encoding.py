@@ -1,7 +1,4 @@
-"""Tests of csplat_trainer.tuning.tuned_encoding.
-
-Also: csplat_trainer.device_measurements.
-"""
+"""Tests of csplat_trainer.tuning.tuned_encoding."""
 
 from dataclasses import replace
 
