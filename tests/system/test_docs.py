@@ -130,6 +130,17 @@ def test_python_examples_run(sample_path, tmp_path, monkeypatch, capsys):
     assert {"index.html", "one.csplat"} == {path.name for path in (tmp_path / "encoded").iterdir()}
 
 
+@pytest.mark.long
+def test_the_python_example_with_a_target_runs(sample_path, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    csplat.write("scene.ply", csplat.read(sample_path).select(range(200)))
+    names = {}
+    for program in blocks(README, "python"):
+        exec(program, names)  # noqa: S102  # the README's own lines
+    assert 0 < len(names["coarse"]) <= 200
+    assert 37.5 < float(capsys.readouterr().out) < 60.0
+
+
 @pytest.mark.slow
 @pytest.mark.usefixtures("small_views")
 def test_the_tutorial_runs(tmp_path, monkeypatch):
