@@ -36,11 +36,11 @@ _FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 def answer(data: bytes, limits: Limits | None = None, threads: int | None = None) -> Answer:
     """Decode a file to floats and to integers; both must accept it, or refuse it with the same error.
 
-    Only integers are decoded at all levels, so damage in a coarser level may be found by them alone.
+    Only integers are decoded at all levels, so they alone may reveal damage in a coarser level.
 
     Args:
         data: the file.
-        limits: budgets; default: those of the registry.
+        limits: budgets; default: the registry's budgets.
         threads: see `csplat.decode`.
     """
     began = time.monotonic()
@@ -62,7 +62,7 @@ def cuts_of(data: bytes, lines: Sequence[str]) -> list[list[int] | str]:
 
     Args:
         data: the file.
-        lines: a cut each: `level 1`, `pixel_size 0.5`, `pixel_size 0.5 0.25`, `splats 100`, `level 0 box 0 0 0 1 1 1`.
+        lines: the cuts: `level 1`, `pixel_size 0.5`, `pixel_size 0.5 0.25`, `splats 100`, `level 0 box 0 0 0 1 1 1`.
 
     Returns:
         For each cut, the indices of its tiles or an error code.
@@ -124,7 +124,7 @@ def _decode(data: bytes, limits: Limits | None, threads: int | None) -> tuple[di
             results.append(error)
     model, integers = results
     if isinstance(integers, CsplatError) and _has_levels(data):
-        raise integers  # `decode` leaves coarser payloads unread, and of two faults it may find the other one first
+        raise integers  # `decode` leaves coarser payloads unread, so it may report another fault
     if isinstance(model, CsplatError) or isinstance(integers, CsplatError):
         # A budget counts the bytes of the returned arrays, which differ between the two functions.
         if _place(model) != _place(integers) and not any(isinstance(result, LimitError) for result in results):
@@ -174,7 +174,7 @@ def main(words: Sequence[str] | None = None) -> int:
     """Decode a file by the protocol: write files and return 0, or print a line of JSON and return 1.
 
     Args:
-        words: command-line arguments; default: those of this process.
+        words: command-line arguments; default: this process's arguments.
     """
     parser = argparse.ArgumentParser(prog="csplat_conformance.adapter", description=__doc__)
     parser.add_argument("input", type=Path)

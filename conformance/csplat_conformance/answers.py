@@ -116,7 +116,7 @@ def _check_refused(vector: Vector, answer: Answer, exact: bool) -> Outcome:
     expected = vector.error
     status, message = answer.status, answer.message
     details = {}
-    # Budgets do not count: another decoder may have a larger one.
+    # Budgets do not count: another decoder may have a larger budget.
     if expected["optional"] and expected["code"] != _spec.ERROR_LIMIT and status in (Status.PASSED, Status.REFUSED):
         details = {"payload": expected["optional"], "accepted": status is Status.PASSED}
     if status is Status.PASSED:
@@ -132,8 +132,8 @@ def _check_refused(vector: Vector, answer: Answer, exact: bool) -> Outcome:
 
 def _match_refusal(answer: Answer, expected: Mapping[str, Any], exact: bool) -> tuple[Status, str]:
     """Compare a refusal. Only `exact` compares codes: another order of checks may find another code first."""
-    found = _describe_error(answer.code, answer.clause, answer.offset)
-    planted = f"planted {_describe_error(expected['code'], expected['clause'], expected['offset'])}, reported {found}"
+    actual = _describe_error(answer.code, answer.clause, answer.offset)
+    planted = f"planted {_describe_error(expected['code'], expected['clause'], expected['offset'])}, reported {actual}"
     if exact:
         same = (answer.code, answer.clause, answer.offset) == (expected["code"], expected["clause"], expected["offset"])
         return (Status.PASSED, "") if same else (Status.FAILED, planted)
@@ -156,8 +156,8 @@ def check_payload_consistency(outcomes: Iterable[Outcome]) -> tuple[list[Outcome
         and a line for each type with accepted payloads.
     """
     result, notes = list(outcomes), []
-    for kind in sorted({one.details["payload"] for one in result if "payload" in one.details}):
-        chosen = [i for i, one in enumerate(result) if one.details.get("payload") == kind]
+    for kind in sorted({outcome.details["payload"] for outcome in result if "payload" in outcome.details}):
+        chosen = [i for i, outcome in enumerate(result) if outcome.details.get("payload") == kind]
         accepted = [i for i in chosen if result[i].details["accepted"]]
         if len(accepted) == len(chosen):
             notes.append(f"leaves {kind} unread (CHK-6)")
@@ -181,17 +181,17 @@ def _compare(vector: Vector, answer: Answer, parts: tuple[str, ...], near: Float
         return Status.NO_OUTPUT, "nothing was written"
     if "header" in parts:
         return _compare_header(vector.expect["header"], answer.header)
-    found: list[tuple[Status, str]] = []
+    wrong: list[tuple[Status, str]] = []
     for part in parts:
         for name, summary in vector.expect[part].items():
             key = f"{part}.{name}"
-            found += _compare_size(key, summary, answer.arrays.get(key)) or _compare_values(vector, answer, key, near)
+            wrong += _compare_size(key, summary, answer.arrays.get(key)) or _compare_values(vector, answer, key, near)
         more = [key for key in answer.arrays if key.split(".", 1)[0] == part]
         extra = [key for key in more if key.split(".", 1)[1] not in vector.expect[part]]
-        found += [(Status.FAILED, f"{key}: unexpected array") for key in extra]
-    if not found:
+        wrong += [(Status.FAILED, f"{key}: unexpected array") for key in extra]
+    if not wrong:
         return Status.PASSED, ""
-    return max((status for status, _ in found), key=_severity), "; ".join(text for _, text in found)
+    return max((status for status, _ in wrong), key=_severity), "; ".join(text for _, text in wrong)
 
 
 def _severity(status: Status) -> int:
@@ -200,7 +200,7 @@ def _severity(status: Status) -> int:
 
 
 def whole_number(text: str) -> float:
-    """Convert a JSON integer; beyond 2^53 to a float, since JavaScript writes 2^65 as an integer."""
+    """Convert a JSON integer. Numbers beyond 2^53 become floats, because JavaScript writes 2^65 as an integer."""
     value = float(text)
     return int(text) if abs(value) <= 2**53 else value
 
@@ -210,11 +210,11 @@ def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tupl
         return Status.WRONG_ANSWER, "no header.json"
     wrong = []
     for key, value in expect.items():
-        have = found.get(key)
-        if key == "scene_flags" and isinstance(have, list):
-            have, value = sorted(map(str, have)), sorted(value)  # noqa: PLW2901 - a set, whose order has no meaning
-        if have != value:
-            wrong.append(f"header.{key} is {have!r}, expected {value!r}")
+        reported = found.get(key)
+        if key == "scene_flags" and isinstance(reported, list):
+            reported, value = sorted(map(str, reported)), sorted(value)  # noqa: PLW2901 - an unordered set
+        if reported != value:
+            wrong.append(f"header.{key} is {reported!r}, expected {value!r}")
     return (Status.FAILED, "; ".join(wrong)) if wrong else (Status.PASSED, "")
 
 
@@ -243,12 +243,12 @@ def _compare_values(vector: Vector, answer: Answer, key: str, near: FloatsByVect
 
 
 def cuts_of_vector(vector: Vector) -> list[str]:
-    """Return the cuts to request, such as `level 1`; none for an invalid file or one of a single tile."""
+    """Return the cuts to request, such as `level 1`; none if the file is invalid or has a single tile."""
     return [text for text, _ in vector.expect.get("cuts", ())]
 
 
 def compare_cuts(vector: Vector, answer: Answer) -> Outcome:
-    """Compare the cuts of an answer with those of the manifest (L5)."""
+    """Compare the cuts of an answer with the cuts in the manifest (L5)."""
     status, message = answer.status, answer.message
     if status is Status.PASSED:
         status, message = _compare_cuts(vector.expect["cuts"], answer.cuts)

@@ -108,7 +108,7 @@ class ConformanceReport:
     @property
     def failures(self) -> list[Outcome]:
         """The checks that did not pass."""
-        return [one for one in self.outcomes if not one.good]
+        return [outcome for outcome in self.outcomes if not outcome.good]
 
     @property
     def passed(self) -> bool:
@@ -121,18 +121,18 @@ class ConformanceReport:
 
     def counts(self, level: str | None = None) -> dict[str, int]:
         """Return the number of checks of a level, or of all levels, in total and by result."""
-        return _counts((one for one in self.outcomes if level in (None, one.level)), self.extra)
+        return _counts((outcome for outcome in self.outcomes if level in (None, outcome.level)), self.extra)
 
 
 def _levels(report: ConformanceReport) -> list[str]:
-    return sorted({one.level for one in report.outcomes})
+    return sorted({outcome.level for outcome in report.outcomes})
 
 
 def _counts(outcomes: Iterable[Outcome], extra: Sequence[Status]) -> dict[str, int]:
     counts = dict.fromkeys(("checks", "passed", *map(str, extra), "failed", "skipped"), 0)
-    for one in outcomes:
+    for outcome in outcomes:
         counts["checks"] += 1
-        counts[str(one.status) if one.good else "failed"] += 1
+        counts[str(outcome.status) if outcome.good else "failed"] += 1
     return counts
 
 
@@ -143,8 +143,10 @@ def to_table(report: ConformanceReport, *, verbose: bool = False) -> str:
         report: the run.
         verbose: include a line for every check.
     """
-    shown = [one for one in report.outcomes if verbose or one.message or not one.good]
-    lines = _align_columns([(one.level, _word(one.status), one.name, _remark(one)) for one in shown])
+    shown = [outcome for outcome in report.outcomes if verbose or outcome.message or not outcome.good]
+    lines = _align_columns(
+        [(outcome.level, _word(outcome.status), outcome.name, _remark(outcome)) for outcome in shown]
+    )
     lines += [""] * bool(lines)
     lines += [*report.notes]
     counts = [*report.levels().items(), ("all", report.counts())]
@@ -187,7 +189,7 @@ def to_json(report: ConformanceReport) -> dict[str, Any]:
         "passed": report.passed,
         "levels": report.levels(),
         "notes": list(report.notes),
-        "outcomes": [_outcome_json(one) for one in report.outcomes],
+        "outcomes": [_outcome_json(outcome) for outcome in report.outcomes],
     }
 
 
@@ -212,9 +214,9 @@ def to_junit(report: ConformanceReport) -> str:
 
 
 def _junit_suite(report: ConformanceReport, level: str) -> str:
-    outcomes = [one for one in report.outcomes if one.level == level]
+    outcomes = [outcome for outcome in report.outcomes if outcome.level == level]
     name = f"csplat.{report.suite}.{level}"
-    cases = [_junit_case(one, name) for one in outcomes]
+    cases = [_junit_case(outcome, name) for outcome in outcomes]
     head = f'  <testsuite name="{_xml(name)}" {_junit_totals(outcomes)}>'
     facts = [("subject", report.subject), *(("note", note) for note in report.notes)]
     properties = "".join(f'<property name="{name}" value="{_xml(value)}"/>' for name, value in facts)
@@ -222,10 +224,10 @@ def _junit_suite(report: ConformanceReport, level: str) -> str:
 
 
 def _junit_totals(outcomes: Sequence[Outcome]) -> str:
-    errors = sum(one.status in _ERRORS for one in outcomes)
-    failures = sum(not one.good for one in outcomes) - errors
-    skipped = sum(one.status in _OPEN for one in outcomes)
-    seconds = sum(one.seconds for one in outcomes)
+    errors = sum(outcome.status in _ERRORS for outcome in outcomes)
+    failures = sum(not outcome.good for outcome in outcomes) - errors
+    skipped = sum(outcome.status in _OPEN for outcome in outcomes)
+    seconds = sum(outcome.seconds for outcome in outcomes)
     return f'tests="{len(outcomes)}" failures="{failures}" errors="{errors}" skipped="{skipped}" time="{seconds:.3f}"'
 
 

@@ -80,7 +80,7 @@ class DecoderSuiteOptions:
 
 
 def parse_levels(text: str, last: int = LEVELS[-1]) -> tuple[int, ...]:
-    """Parse levels: `3` means all up to 3, `1,3` those two; `last` is the last level.
+    """Parse levels: `3` means levels 1 to 3, `1,3` only levels 1 and 3; `last` is the last level.
 
     Raises:
         InputError: there are no such levels.
@@ -150,7 +150,7 @@ def run_command(
         progress: called with the number of vectors that are done.
 
     Raises:
-        InputError: a command line that cannot be run; a pattern of `options` matches nothing.
+        InputError: a command line cannot be run, or a pattern of `options` matches nothing.
     """
     options = options or DecoderSuiteOptions()
     if command is not None:
@@ -201,8 +201,8 @@ def _make_report(
     progress: CountProgress | None,
 ) -> ConformanceReport:
     outcomes: list[Outcome] = []
-    for done, some in enumerate(results, 1):
-        outcomes += some
+    for done, vector_outcomes in enumerate(results, 1):
+        outcomes += vector_outcomes
         if progress:
             progress(done, vector_count)
     outcomes, notes = check_payload_consistency(outcomes)

@@ -99,12 +99,12 @@ def select_names(patterns: str | None, names: Collection[str], what: str) -> set
         what: noun for the names, for messages.
 
     Raises:
-        InputError: a pattern matches none of them.
+        InputError: a pattern matches no name.
     """
     chosen: set[str] = set()
     for pattern in () if patterns is None else patterns.split(","):
-        found = {*fnmatch.filter(names, pattern.strip()), *fnmatch.filter(names, f"{pattern.strip()}-*")}
-        if not found:
+        matches = {*fnmatch.filter(names, pattern.strip()), *fnmatch.filter(names, f"{pattern.strip()}-*")}
+        if not matches:
             raise InputError(f"no {what} matches {pattern.strip()!r}")
-        chosen |= found
+        chosen |= matches
     return set(names) if patterns is None else chosen

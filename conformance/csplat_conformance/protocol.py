@@ -100,17 +100,17 @@ def ask_cuts(command: str, path: Path, cuts: Sequence[str], timeout: float) -> A
 
 
 def _read_cuts(end: ProcessEnd) -> Answer:
-    found: list[list[int] | str] = []
+    cuts: list[list[int] | str] = []
     for line in end.stdout.decode("utf-8", "replace").splitlines():
         words = line.split()
         if all(_NUMBER.fullmatch(word) for word in words):
-            found.append([int(word) for word in words])
+            cuts.append([int(word) for word in words])
         elif len(words) == 1 and words[0].startswith("E_"):
-            found.append(words[0])
+            cuts.append(words[0])
         else:
-            message = f"line {len(found) + 1} is {line[:_MESSAGE_MAX]!r}, expected numbers of tiles, or an error code"
+            message = f"line {len(cuts) + 1} is {line[:_MESSAGE_MAX]!r}, expected numbers of tiles, or an error code"
             return Answer(Status.WRONG_ANSWER, message, seconds=end.seconds)
-    return Answer(Status.PASSED, cuts=found, seconds=end.seconds)
+    return Answer(Status.PASSED, cuts=cuts, seconds=end.seconds)
 
 
 def _read_refusal(end: ProcessEnd, left: list[str]) -> Answer:
@@ -267,8 +267,8 @@ def _make_absolute(argument: str) -> str:
     option, equals, path = argument.partition("=") if argument.startswith("-") else ("", "", argument)
     like_a_path = _has_separator(path) or bool(Path(path).suffix)
     # Path.exists() raises an error for arguments that are too long for a path.
-    found = like_a_path and os.path.exists(path)  # noqa: PTH110 - see above
-    return option + equals + _absolute_path(path) if found else argument
+    is_path = like_a_path and os.path.exists(path)  # noqa: PTH110 - see above
+    return option + equals + _absolute_path(path) if is_path else argument
 
 
 def _absolute_path(path: str) -> str:

@@ -104,23 +104,23 @@ def _score_view(vector: Vector, number: int, command: str, timeout: float) -> Ou
             return _outcome(vector, number, end.status, end.message + last_words(end), seconds)
         if end.returncode:
             return _outcome(vector, number, Status.REFUSED, f"exit status 1{last_words(end)}", seconds)
-        found = sorted(outdir.rglob("*.png"))
-        if len(found) != 1:
-            wrong = Status.WRONG_ANSWER if found else Status.NO_OUTPUT
-            return _outcome(vector, number, wrong, f"{len(found)} PNG files were written, expected one", seconds)
+        pngs = sorted(outdir.rglob("*.png"))
+        if len(pngs) != 1:
+            wrong = Status.WRONG_ANSWER if pngs else Status.NO_OUTPUT
+            return _outcome(vector, number, wrong, f"{len(pngs)} PNG files were written, expected one", seconds)
         try:
-            return _compare_render(vector, number, read_png(found[0].read_bytes()), seconds)
+            return _compare_render(vector, number, read_png(pngs[0].read_bytes()), seconds)
         except InputError as error:
             return _outcome(vector, number, Status.WRONG_ANSWER, str(error), seconds)
 
 
 def _compare_render(vector: Vector, number: int, image: U8, seconds: float) -> Outcome:
     view = vector.views[number]
-    found = psnr(read_png((VECTORS / view["picture"]).read_bytes()), image)
-    passed = found >= view["psnr"]
-    message = "" if passed else f"PSNR of {view['picture']} is {found:.1f} dB, expected {view['psnr']:g}"
+    score = psnr(read_png((VECTORS / view["picture"]).read_bytes()), image)
+    passed = score >= view["psnr"]
+    message = "" if passed else f"PSNR of {view['picture']} is {score:.1f} dB, expected {view['psnr']:g}"
     status = Status.PASSED if passed else Status.FAILED
-    return _outcome(vector, number, status, message, seconds, psnr=round(found, 2))
+    return _outcome(vector, number, status, message, seconds, psnr=round(score, 2))
 
 
 def _outcome(
@@ -194,7 +194,7 @@ def _decode_png(data: bytes) -> U8:
 
 
 def _undo_filters(rows: U8, channels: int) -> U8:
-    """Undo the filter of each row (PNG, section 9)."""
+    """Undo the filter of each row, [H, 1 + W * channels] (PNG, section 9)."""
     out = np.zeros((len(rows), rows.shape[1] - 1), np.uint8)
     above = np.zeros(rows.shape[1] - 1, np.uint8)
     for y, (kind, *_) in enumerate(rows[:, :1].tolist()):

@@ -1,6 +1,6 @@
 """Verify the error bounds that a file declares against its source (spec 5.5).
 
-With a source index, maximum, rms and counts are verified. Without one, each splat of the file must have a splat of the
+With a source index, maximum, rms and counts are verified. Without it, each splat of the file must have a splat of the
 source within the declared maxima; rms and counts are then not verified.
 """
 
@@ -50,7 +50,7 @@ class WorstSplat:
     Attributes:
         splat: index of the splat in the file.
         tile: index of its tile.
-        source_splat: index of its source splat or, if that is unknown, of the nearest one.
+        source_splat: index of its source splat or, if that is unknown, of the nearest source splat.
         found: the error, in the measure's unit.
     """
 
@@ -66,7 +66,7 @@ class MeasureVerification:
 
     Attributes:
         name: name in the registry of measures.
-        declared_max, declared_rms: bounds in the file; `None` if it declares none of this measure.
+        declared_max, declared_rms: bounds in the file; `None` if it declares no bound of this measure.
         measured_max, measured_rms: errors of the pairs; `None` without a source index.
         holds: whether the bounds hold as far as checked; `None` if there are none, or if it is undecided.
         worst: the splat with the largest error. Without a source index, `None` unless a splat has no partner because
@@ -90,7 +90,7 @@ class BoundsVerification:
         measures: in the order of the registry.
         failures: a line for each contradiction; empty if the bounds hold.
         clauses: the clauses of the spec that the failures violate.
-        unverified: measures without a declared bound: refitted ones, or all.
+        unverified: measures without a declared bound: refitted measures, or all.
         rms_verified: whether rms and counts were verified, too.
     """
 
@@ -123,15 +123,15 @@ class BoundsVerification:
             "not_proved": list(self.unverified),
             "notes": list(self.notes),
             "measures": {
-                one.name: {
-                    "stated_max": one.declared_max,
-                    "stated_rms": one.declared_rms,
-                    "measured_max": finite_or_none(one.measured_max),
-                    "measured_rms": finite_or_none(one.measured_rms),
-                    "holds": one.holds,
-                    "worst": one.worst and {**vars(one.worst), "found": finite_or_none(one.worst.found)},
+                measure.name: {
+                    "stated_max": measure.declared_max,
+                    "stated_rms": measure.declared_rms,
+                    "measured_max": finite_or_none(measure.measured_max),
+                    "measured_rms": finite_or_none(measure.measured_rms),
+                    "holds": measure.holds,
+                    "worst": measure.worst and {**vars(measure.worst), "found": finite_or_none(measure.worst.found)},
                 }
-                for one in self.measures
+                for measure in self.measures
             },
         }
 
@@ -184,7 +184,7 @@ def verify_bounds_by_tile(
 ) -> BoundsVerification:
     """Verify the error bounds of a file in bounded memory, with the result of `verify_bounds`.
 
-    The arguments and errors are those of `measure_pairs_by_tile`.
+    See `measure_pairs_by_tile` for the arguments and errors.
     """
     names = measure_names(scene.empty(), opened.empty())
     degree = scene.sh_degree
@@ -238,7 +238,7 @@ def _outcome(
 ) -> BoundsVerification:
     wrong = claims.wrong if wrong is None else wrong
     clauses = tuple(dict.fromkeys(clause for clause, _ in wrong))
-    ordered = tuple(sorted(measures, key=lambda one: claims.names.index(one.name)))
+    ordered = tuple(sorted(measures, key=lambda measure: claims.names.index(measure.name)))
     return BoundsVerification(ordered, tuple(line for _, line in wrong), clauses, claims.unverified, rms_verified)
 
 
@@ -247,17 +247,17 @@ def _judge_pairs(
 ) -> BoundsVerification:
     bounds, measures = claims.bounds, []
     failures = [("SRC-3", line) for line in pairs.extras]
-    for name, found in pairs.measured.items():
+    for name, error in pairs.measured.items():
         worst = None
         if header.splat_count:
-            splat = found.worst
-            worst = WorstSplat(splat, tile_of(header, splat), int(source_index[splat]), found.max)
+            splat = error.worst
+            worst = WorstSplat(splat, tile_of(header, splat), int(source_index[splat]), error.max)
         if name not in bounds:
-            measures.append(MeasureVerification(name, None, None, found.max, found.rms, None, worst))
+            measures.append(MeasureVerification(name, None, None, error.max, error.rms, None, worst))
             continue
-        wrong = find_contradictions(name, found[:2], bounds[name], pairs.reach, worst)
+        wrong = find_contradictions(name, error[:2], bounds[name], pairs.reach, worst)
         failures += [("SER-5", line) for line in wrong]
-        measures.append(MeasureVerification(name, *bounds[name], found.max, found.rms, not wrong, worst))
+        measures.append(MeasureVerification(name, *bounds[name], error.max, error.rms, not wrong, worst))
     return _outcome(claims, measures, failures, rms_verified=bool(measures))
 
 
@@ -298,25 +298,25 @@ def _search_partners(
 ) -> BoundsVerification:
     bounds = claims.bounds
     largest = {name: pair[0] for name, pair in bounds.items()}
-    found = find_partners(source, decoded, largest, lattice_radii(decoded, header), progress=progress)
-    alone = np.flatnonzero(found == UNMATCHED)
-    undecided = int(np.count_nonzero(found == UNDECIDED))
+    partners = find_partners(source, decoded, largest, lattice_radii(decoded, header), progress=progress)
+    alone = np.flatnonzero(partners == UNMATCHED)
+    undecided = int(np.count_nonzero(partners == UNDECIDED))
     lines = []
     if undecided:
         lines.append(f"{undecided} splats have too many similar splats in the source: specify a source index")
     worst: dict[str, WorstSplat] = {}
-    some = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, len(source))))
+    searched_count = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, len(source))))
     if len(alone):
-        worst = _find_worst(source, decoded, header, largest, alone[:some], progress)
+        worst = _find_worst(source, decoded, header, largest, alone[:searched_count], progress)
         many = f"{len(alone)} splats of the file have" if len(alone) > 1 else "1 splat of the file has"
         lines.append(f"{many} no splat of the source within the stated maxima")
         lines += [
-            f"{name}: {one.found:.9g} is above the stated {largest[name]:.9g}: splat {one.splat} (tile {one.tile}),"
-            f" nearest source splat {one.source_splat}"
-            for name, one in worst.items()
+            f"{name}: {splat.found:.9g} is above the stated {largest[name]:.9g}: splat {splat.splat}"
+            f" (tile {splat.tile}), nearest source splat {splat.source_splat}"
+            for name, splat in worst.items()
         ]
     # It is unknown which bounds the other splats without a partner exceed.
-    undecided_bounds = len(alone) > some
+    undecided_bounds = len(alone) > searched_count
     measures = [
         MeasureVerification(
             name,
@@ -341,7 +341,7 @@ def _find_worst(
 ) -> dict[str, WorstSplat]:
     """Return by measure the splat of `rows` that exceeds its bound most.
 
-    Each splat is compared with the one of the nearest source splats that exceeds the fewest bounds.
+    Each splat is compared with whichever nearby source splat exceeds the fewest bounds.
     """
     worst: dict[str, WorstSplat] = {}
     if not len(source):
@@ -366,7 +366,7 @@ def _find_worst(
 
 
 def _nearest_points(means: NDArray[np.float64], point: NDArray[np.float32]) -> I64:
-    """Return the indices of the centres nearest to a point, the nearest first."""
+    """Return the indices of the centres, [M, 3], nearest to a point, [3], the nearest first."""
     with np.errstate(over="ignore"):
         distances = np.square(means - point).sum(axis=1)
     near = np.argpartition(distances, min(_NEAREST, len(means) - 1))[:_NEAREST]

@@ -1,4 +1,4 @@
-"""Measure the differences between decoded splats and those of their source (spec 5.5, 5.6).
+"""Measure the differences between decoded splats and their source splats (spec 5.5, 5.6).
 
 The code is independent of the encoder's, so that each reveals errors of the other. Arithmetic is float64, in blocks
 that fit the cache. Sums do not depend on the number of threads.
@@ -172,7 +172,7 @@ def measure_pairs(
 
     Returns:
         The errors by measure. The maximum is over components; the square of a vector is the sum over components. A
-        band that only one of the two has counts as zero in the other.
+        band that only one scene has counts as zero in the other.
 
     Raises:
         InputError: `source_index` is not one valid index for each decoded splat.
@@ -271,11 +271,12 @@ def check_source_index(
         block: numbers to check at a time.
 
     Raises:
-        InputError: the array does not have one index of a source splat for each splat of the file, or one occurs twice.
+        InputError: the array does not have an index of a source splat for each splat of the file, or an index occurs
+            twice.
     """
     if index.shape != (decoded_count,) or index.dtype.kind not in "iu":
-        found = f"{index.dtype} of shape {list(index.shape)}"
-        raise InputError(f"the source index is {found}, expected integers of shape [{decoded_count}]")
+        actual = f"{index.dtype} of shape {list(index.shape)}"
+        raise InputError(f"the source index is {actual}, expected integers of shape [{decoded_count}]")
     seen = np.zeros(source_count if once else 0, bool)
     for start in range(0, decoded_count, block):  # the index may be larger than memory
         part = index[start : start + block]
@@ -311,12 +312,14 @@ def _subtract(a: NDArray[Any], b: NDArray[Any]) -> F64:
 
 
 def _band(model: Source | SplatModel, rows: SplatRows | slice, band: int) -> F32:
+    """Return the coefficients of a band, [n, 2l + 1, 3]; zeros, [1, 2l + 1, 3], if the scene lacks it."""
     if band > model.sh_degree:
         return np.zeros((1, 2 * band + 1, 3), np.float32)
     return model.shN[rows, band * band - 1 : (band + 1) ** 2 - 1]
 
 
 def _distances(source: Source, decoded: SplatModel, source_rows: SplatRows, decoded_rows: SplatRows | slice) -> F64:
+    """Return the distances between the centres of pairs, [n]."""
     moved = _subtract(decoded.means[decoded_rows], source.means[source_rows])
     shift = np.subtract(decoded.origin, source.origin)
     if shift.any():
@@ -364,6 +367,7 @@ def _entry(a: tuple[F64, F64, F64], b: tuple[F64, F64, F64], variances: F64) -> 
 
 
 def _frobenius(entries: F64) -> F64:
+    """Return the norms, [n], of symmetric matrices given by the entries of `_covariances`, [6, n]."""
     squares = np.square(entries)
     norms: F64 = np.sqrt(squares[:3].sum(axis=0) + 2.0 * squares[3:].sum(axis=0))
     return norms
@@ -376,11 +380,11 @@ def find_wrong_extras(source: Source, decoded: SplatModel, source_index: SplatRo
     """
     lines = []
     for name, column in decoded.extra.items():
-        other = source.extra.get(name)
+        source_column = source.extra.get(name)
         if name in _NORMALS:
             continue
-        if other is None:
+        if source_column is None:
             lines.append(f"the source has no extra column {name!r}")
-        elif column.tobytes() != other[source_index].astype(column.dtype).tobytes():
+        elif column.tobytes() != source_column[source_index].astype(column.dtype).tobytes():
             lines.append(f"the extra column {name!r} differs from that of the source")
     return lines

@@ -62,9 +62,9 @@ def find_partners(
     Returns:
         [N] index of a source splat within the bounds, `UNMATCHED` or `UNDECIDED`.
     """
-    found = np.full(len(decoded), UNMATCHED, np.int64)
+    partners = np.full(len(decoded), UNMATCHED, np.int64)
     if not len(source):
-        return found
+        return partners
     reach = source.reach(decoded.origin)
     source = source.about(decoded.origin)
     bounds = {name: bound + bound_tolerance(name, bound, reach) for name, bound in bounds.items()}
@@ -72,21 +72,21 @@ def find_partners(
     bound = bounds["means"]
     levels = _radius_levels(radii, bound)
     for radius in np.unique(np.append(levels, bound)):
-        rows = np.flatnonzero((found == UNMATCHED) & (levels <= radius))
+        rows = np.flatnonzero((partners == UNMATCHED) & (levels <= radius))
         if not len(rows):
             continue
         search = partial(_search_grid, _Grid(source, float(radius), bounds), source, decoded, bounds, candidates_max)
         parts = [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
         with ThreadPoolExecutor(threads) as pool:
-            for part, partners in zip(parts, pool.map(search, parts), strict=True):
-                found[part] = partners
+            for part, matches in zip(parts, pool.map(search, parts), strict=True):
+                partners[part] = matches
                 if progress is not None:
-                    progress(STAGE, float(np.count_nonzero(found >= 0)) / len(found))
-    return found
+                    progress(STAGE, float(np.count_nonzero(partners >= 0)) / len(partners))
+    return partners
 
 
 def _radius_levels(radii: F64, bound: float) -> F64:
-    """Round radii up to powers of two, but not beyond the bound, to limit the number of grids."""
+    """Round radii, [N], up to powers of two, but not beyond the bound, to limit the number of grids."""
     with np.errstate(divide="ignore"):
         exponents = np.ceil(np.log2(radii))
     rounded: F64 = np.minimum(np.exp2(np.maximum(exponents, -1000.0)), bound)
@@ -109,7 +109,7 @@ class _Grid:
         self.keys: U64 = keys[self.order]
 
     def cells(self, model: Source | SplatModel, rows: slice | NDArray[Any]) -> list[tuple[F64, F64]]:
-        """Return for each axis the cell of each splat and the nearer neighbour."""
+        """Return for each axis the cell of each splat and the nearer neighbour, [n] each."""
         columns = [*model.means[rows].T, model.opacities[rows], model.sh0[rows, 1]]
         return [_cells(column.astype(np.float64), width) for column, width in zip(columns, self.widths, strict=True)]
 
@@ -125,7 +125,7 @@ def _cells(values: F64, width: float) -> tuple[F64, F64]:
 
 
 def _hash(cells: list[F64]) -> U64:
-    """Mix the bits of the cells. A collision only costs a comparison."""
+    """Mix the bits of the cells, [n] per axis. A collision only costs a comparison."""
     mixed = np.zeros(len(cells[0]), np.uint64)
     for cell in cells:
         mixed ^= (cell + 0.0).view(np.uint64)  # -0 becomes 0
@@ -142,10 +142,10 @@ def _search_grid(
     candidates_max: int,
     rows: I64,
 ) -> I64:
-    found = np.full(len(rows), UNMATCHED, np.int64)
+    partners = np.full(len(rows), UNMATCHED, np.int64)
     cells = grid.cells(decoded, rows)
     for probe in range(1 << _AXES):
-        left = np.flatnonzero(found == UNMATCHED)
+        left = np.flatnonzero(partners == UNMATCHED)
         if not len(left):
             break
         keys = _hash([pair[probe >> axis & 1][left] for axis, pair in enumerate(cells)])
@@ -158,19 +158,19 @@ def _search_grid(
             if not len(left):
                 break
             if nth == candidates_max:
-                found[left] = UNDECIDED
+                partners[left] = UNDECIDED
                 break
             candidates = grid.order[slots]
             good = _pairs_within(source, decoded, candidates, rows[left], bounds)
-            found[left[good]] = candidates[good]
+            partners[left[good]] = candidates[good]
             left, keys, slots = left[~good], keys[~good], slots[~good] + 1
-    return found
+    return partners
 
 
 def _pairs_within(
     source: Source, decoded: SplatModel, source_rows: I64, decoded_rows: I64, bounds: Mapping[str, float]
 ) -> NDArray[np.bool_]:
-    """Return which pairs are within the bounds; SH and covariance are compared only if the others are."""
+    """Return [n] bool, which pairs are within the bounds. SH and covariance are compared only if the rest is."""
     good = np.ones(len(source_rows), bool)
     for names in (_FIRST, bounds.keys() - _FIRST):
         pairs = np.flatnonzero(good)

@@ -85,14 +85,14 @@ def measure_pairs_by_tile(
         start = tiles[0].start if tiles else 0
         rows = source_index[start : start + sum(tile.splat_count for tile in tiles)]
         order = np.argsort(rows)
-        ascending, found = rows[order], []
+        ascending, blocks = rows[order], []
         for place, model in scene.with_progress("measuring splats", report).numbered():
             block = Source.of(model)
             reach = max(reach, block.reach(opened.origin))
             first, end = np.searchsorted(ascending, (place.start, place.stop))
             block = replace(block, extra={name: block.extra[name] for name in names})
-            found.append(block.select(ascending[first:end] - place.start))
-        source = Source.concatenate(found) if found else Source.of(scene.empty())
+            blocks.append(block.select(ascending[first:end] - place.start))
+        source = Source.concatenate(blocks) if blocks else Source.of(scene.empty())
         positions = np.empty(len(order), np.int64)
         positions[order] = np.arange(len(order))
         models = opened.models([tile.index for tile in tiles]) if tiles else [opened.empty()]
@@ -109,10 +109,10 @@ def _report_part(progress: Progress, number: int, count: int, stage: str, share:
 
 
 def _groups(header: SceneHeader, splats_max: int) -> Iterator[list[Tile]]:
-    """Yield groups of successive tiles with at most this many splats, or with one tile."""
+    """Yield groups of successive tiles with at most `splats_max` splats, or with a single tile."""
     group: list[Tile] = []
     for tile in header.tiles:
-        if group and sum(one.splat_count for one in group) + tile.splat_count > splats_max:
+        if group and sum(member.splat_count for member in group) + tile.splat_count > splats_max:
             yield group
             group = []
         group.append(tile)

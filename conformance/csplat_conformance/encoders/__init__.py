@@ -4,7 +4,7 @@
     >>> run_encoder("my-encoder {ply} {out}").passed                                 # doctest: +SKIP
     True
 
-There are four levels, each built on the previous one:
+There are four levels, each built on the previous level:
 
 | level | the encoder |
 |---|---|

@@ -17,7 +17,7 @@ from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders.reference_ply import PlyLayout, PlyRows, source_of_rows, write_ply
 from csplat_conformance.encoders.surface_scenes import SPACING_MIN, surface_scene
 
-PSNR_MIN = 30.0  #: lowest PSNR of renders, dB, unless an input sets another one
+PSNR_MIN = 30.0  #: lowest PSNR of renders, dB, unless an input sets another limit
 PITCH = 0.1  #: scene units between neighbours
 _JITTER = 0.2  # fraction of the pitch, in each direction
 SEPARATION = PITCH * (1.0 - 2.0 * _JITTER)  #: smallest distance between neighbours of a cloud, scene units

@@ -49,7 +49,7 @@ def failed_verdict(wrong: list[Defect], details: dict[str, Any]) -> Verdict:
 
 
 def join_lines(lines: tuple[str, ...]) -> str:
-    """Join the first lines into one, and add the number of the others."""
+    """Join the first lines into a single line, and add the number of remaining lines."""
     rest = f"; and {len(lines) - _LINES_MAX} more" if len(lines) > _LINES_MAX else ""
     return "; ".join(lines[:_LINES_MAX]) + rest
 
@@ -200,11 +200,11 @@ def find_side_effects(first: EncoderRun, again: EncoderRun | None) -> list[Defec
     if not again.wrote:
         how = again.end.message or f"exit status {again.end.returncode}, {'a' if again.out.is_file() else 'no'} file"
         return [*wrong, ("CNF-10", _with_line(f"a second run ended differently: {how}", again.end))]
-    one, other = first.out.read_bytes(), again.out.read_bytes()
-    if one != other:
-        at = _first_difference(one, other)
-        sizes = "" if len(one) == len(other) else f" ({len(one):,} and {len(other):,} bytes)"
-        where = _field_at(one, at)
+    data, repeated = first.out.read_bytes(), again.out.read_bytes()
+    if data != repeated:
+        at = _first_difference(data, repeated)
+        sizes = "" if len(data) == len(repeated) else f" ({len(data):,} and {len(repeated):,} bytes)"
+        where = _field_at(data, at)
         text = f"two runs gave different files{sizes}: first at byte {at}{f', in {where}' if where else ''}"
         wrong.append(("CNF-10", text))
     elif first.index is not None and again.index is not None and _index_bytes(first) != _index_bytes(again):

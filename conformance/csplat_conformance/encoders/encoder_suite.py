@@ -129,7 +129,7 @@ def write_inputs(folder: Path, pattern: str | None = None) -> dict[str, Any]:
     """Write the PLY of every input, `ordinary/degree_3.ply`, and a list of them, `inputs.json`.
 
     Args:
-        folder: folder for the files; existing ones are replaced.
+        folder: folder for the files; existing files are replaced.
         pattern: shell patterns of the inputs' names; `None` for all.
 
     Returns:
@@ -162,7 +162,7 @@ def select_inputs(pattern: str | None) -> list[EncoderInput]:
         pattern: see `EncoderSuiteOptions`.
 
     Raises:
-        InputError: a pattern matches none.
+        InputError: a pattern matches no input.
     """
     inputs = all_inputs()
     names = select_names(pattern, [case.name for case in inputs], "input")
@@ -220,7 +220,7 @@ def _run_all(
     run: CommandRunner | None,
     steps: _StepCounter,
 ) -> tuple[list[EncoderRun], list[Future[EncoderRun] | None]]:
-    """Run all inputs, then start the repetitions of those that gave a file."""
+    """Run all inputs, then repeat the runs that wrote a file."""
 
     def again(case: EncoderInput, first: EncoderRun) -> EncoderRun:
         if run is None:
@@ -248,10 +248,10 @@ def _declined_notes(declined: dict[str, bool]) -> list[str]:
     """Return a line with the number of declined inputs for each group, as a warning if all were declined."""
     notes = []
     for group in dict.fromkeys(name.partition("/")[0] for name in declined):
-        those = [was_declined for name, was_declined in declined.items() if name.partition("/")[0] == group]
-        if any(those):
-            prefix = "warning: " if all(those) and len(those) > 1 else ""
-            notes.append(f"{prefix}{group}: {sum(those)} of {len(those)} declined")
+        answers = [was_declined for name, was_declined in declined.items() if name.partition("/")[0] == group]
+        if any(answers):
+            prefix = "warning: " if all(answers) and len(answers) > 1 else ""
+            notes.append(f"{prefix}{group}: {sum(answers)} of {len(answers)} declined")
     return notes
 
 

@@ -149,7 +149,7 @@ def find_truncation(
         stated: names of the measures to examine.
 
     Returns:
-        A line for each attribute that shows signs.
+        A line for each attribute that shows signs of truncation.
     """
     return [line for measure, line in _truncated_attributes(source, decoded, header, index) if measure in stated]
 
@@ -248,7 +248,7 @@ def _chroma(rgb: F64) -> F64:
 
 
 def _aligned_quats(source: NDArray[np.float32], decoded: NDArray[np.float32]) -> tuple[F64, F64]:
-    """Return x, y, z of the rotations of both, with the source's in the axis order and sign of the file's.
+    """Return x, y, z of both scenes' rotations, [n, 3], the source's in the axis order and sign of the file's.
 
     Splats whose rotations differ too much are omitted.
     """

@@ -32,14 +32,14 @@ def check_stream(data: bytes) -> tuple[Verdict, DecodedScene | None]:
     if not data:
         return Verdict(Status.PARTIAL_OUTPUT, "the file is empty"), None
     validation = validate(data)
-    found = validation.violations
-    if found:
-        clauses = tuple(dict.fromkeys(one.clause for one in found))
-        cut = {one.code for one in found} <= _TRUNCATION
-        rest = f" and {len(found) - _VIOLATIONS_MAX} more" if len(found) > _VIOLATIONS_MAX else ""
-        message = "; ".join(map(str, found[:_VIOLATIONS_MAX])) + rest
+    violations = validation.violations
+    if violations:
+        clauses = tuple(dict.fromkeys(violation.clause for violation in violations))
+        cut = {violation.code for violation in violations} <= _TRUNCATION
+        rest = f" and {len(violations) - _VIOLATIONS_MAX} more" if len(violations) > _VIOLATIONS_MAX else ""
+        message = "; ".join(map(str, violations[:_VIOLATIONS_MAX])) + rest
         status = Status.PARTIAL_OUTPUT if cut else Status.FAILED
-        return Verdict(status, message, clauses, found[0].code), None
+        return Verdict(status, message, clauses, violations[0].code), None
     try:
         scene = decode_scene(data)
     except CsplatError as error:  # a defect of the validator or of the decoder
@@ -122,9 +122,9 @@ def _wrong_metadata(source: Source, decoded: SplatModel) -> list[Defect]:
         "flat": (decoded.metadata.flat, False),
     }
     wrong = [
-        ("SRC-3", f"{name} is {found}, but the source does not specify it")
-        for name, (found, expected) in facts.items()
-        if found != expected
+        ("SRC-3", f"{name} is {value}, but the source does not specify it")
+        for name, (value, expected) in facts.items()
+        if value != expected
     ]
     if decoded.sh_degree > source.sh_degree:
         wrong.append(("SRC-3", f"the SH degree is {decoded.sh_degree}, but the source has {source.sh_degree}"))
@@ -149,11 +149,11 @@ def check_index(path: Path, source: Source, count: int, pairs: SplatPairs) -> tu
     if not path.exists():
         return pairs, [(_INDEX_CLAUSE, "no source index was written")]
     try:
-        found = read_array(path)
-        check_source_index(found, len(source), count)
+        stored = read_array(path)
+        check_source_index(stored, len(source), count)
     except (InputError, OSError) as error:
         return pairs, [(_INDEX_CLAUSE, str(error).replace(str(path), "the source index"))]
-    index = found.astype(np.int64)
+    index = stored.astype(np.int64)
     paired = np.flatnonzero(pairs.source_index >= 0)
     near = pairs.source_index[paired]
     # Only the encoder can distinguish splats with equal centres.
@@ -179,7 +179,7 @@ class SplatPairs:
     Attributes:
         source_index: [N], source splat of each decoded splat; −1 if none is near.
         strays: number of decoded splats without a source splat.
-        surplus: number of decoded splats whose source splat is paired with another one.
+        surplus: number of decoded splats whose source splat is paired with another decoded splat.
         missing: number of source splats without a decoded splat.
         examples: first decoded splat of `strays` and of `surplus`; −1 if there is none.
     """
@@ -220,16 +220,17 @@ def pair_splats(source: F64, decoded: F64, separation: float) -> SplatPairs:
 
 
 def _first_index(which: NDArray[np.bool_]) -> int:
+    """Return the index of the first True, or −1 if there is none."""
     return int(which.argmax()) if which.any() else _NONE
 
 
 def _nearest(centres: F64, decoded: F64, separation: float) -> I64:
-    """Return for each decoded centre the source centre that is nearer than half of `separation`, or −1."""
+    """Return [N], for each decoded centre the source centre that is nearer than half of `separation`, or −1."""
     keys = _keys(_cells(centres, separation))
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     own = _cells(decoded, separation)
-    found = np.full(len(decoded), _NONE, np.int64)
+    nearest = np.full(len(decoded), _NONE, np.int64)
     left = np.arange(len(decoded))
     # A splat's own cell comes first, because it is sufficient for most splats.
     for step in sorted(product((-1, 0, 1), repeat=3), key=lambda step: sum(map(abs, step))):
@@ -241,12 +242,13 @@ def _nearest(centres: F64, decoded: F64, separation: float) -> I64:
             rows, candidates = left[more], order[first[more] + nth]
             moved = decoded[rows] - centres[candidates]
             good = np.sqrt(np.square(moved).sum(axis=1)) < separation / 2.0
-            found[rows[good]] = candidates[good]
-        left = left[found[left] == _NONE]
-    return found
+            nearest[rows[good]] = candidates[good]
+        left = left[nearest[left] == _NONE]
+    return nearest
 
 
 def _cells(points: F64, side: float) -> I64:
+    """Return the cells of points, both [n, 3]."""
     with np.errstate(over="ignore", invalid="ignore"):
         cells = np.clip(np.floor(points / side), -_CELL_MAX, _CELL_MAX)
     result: I64 = np.nan_to_num(cells).astype(np.int64)
@@ -254,7 +256,7 @@ def _cells(points: F64, side: float) -> I64:
 
 
 def _keys(cells: I64) -> NDArray[np.uint64]:
-    """Hash cells. A collision only costs a comparison."""
+    """Hash cells, [n, 3]. A collision only costs a comparison."""
     keys = np.zeros(len(cells), np.uint64)
     for axis, factor in enumerate(_MIX):
         keys ^= cells[:, axis].astype(np.uint64) * factor

@@ -1,6 +1,6 @@
-"""Write PLY files like those of trainers, and return their sources independently of the PLY reader under test.
+"""Write PLY files as trainers do, and return their sources independently of the PLY reader under test.
 
-The columns are those of the reference implementation of 3D Gaussian splatting: centres, base colour `f_dc`, higher
+The columns follow the reference implementation of 3D Gaussian splatting: centres, base colour `f_dc`, higher
 coefficients `f_rest` channel by channel, the logit of the opacity, logarithms of the standard deviations, and a
 quaternion w x y z of any length.
 """
@@ -94,7 +94,7 @@ class PlyLayout:
     Attributes:
         format: format in the header: `ascii`, `binary_little_endian` or `binary_big_endian`.
         normals: whether to write columns nx, ny, nz, like most trainers; zero unless the rows have values.
-        dtype: type of all columns except the extra ones, `f4` or `f8`.
+        dtype: type of all columns except extra columns, `f4` or `f8`.
         means_dtype: type of x, y, z, if it differs.
         comments: comment lines of the header, with any characters; bytes that are not UTF-8 as surrogates.
         obj_info: `obj_info` lines of the header.
@@ -139,7 +139,7 @@ def write_ply(splats: PlyRows, layout: PlyLayout | None = None) -> bytes:
         if layout.lists:
             size = table.dtype.itemsize
             rows = zip(layout.lists, range(0, len(body), size), strict=True)
-            body = b"".join(bytes((len(one),)) + one + body[at : at + size] for one, at in rows)
+            body = b"".join(bytes((len(numbers),)) + numbers + body[at : at + size] for numbers, at in rows)
     return head + layout.before[1] + body + layout.after[1]
 
 

@@ -1,4 +1,4 @@
-"""Compare renders of a file with those of its source (L4)."""
+"""Compare renders of a file with renders of its source (L4)."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def check_renders(
     render_score: RenderScore,
     psnr_min: float,
 ) -> Verdict:
-    """Check L4: renders of the file match those of the source. Coarser levels of detail are reported, not judged.
+    """Check L4: renders of the file match renders of the source. Coarser levels of detail are reported, not judged.
 
     Args:
         case: the input.

@@ -10,7 +10,7 @@ import numpy as np
 from csplat.types import F64
 from csplat_conformance.encoders.reference_ply import PlyRows
 
-Surface = tuple[F64, F64, float]  # centres, normals, approximate distance between centres
+Surface = tuple[F64, F64, float]  # centres, [n, 3], normals, [n, 3], approximate distance between centres
 
 SPACING_MIN = 0.04  #: smallest distance between two centres, scene units
 
@@ -55,7 +55,7 @@ def surface_scene(gloss: float, noise: float, seed: int) -> PlyRows:
 
 def _torus(columns: int, rows: int) -> Surface:
     big, small = 1.0, 0.35
-    column, row = (one.ravel() for one in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
+    column, row = (grid.ravel() for grid in np.meshgrid(np.arange(columns), np.arange(rows), indexing="ij"))
     around = 2.0 * np.pi * column / columns
     tube = 2.0 * np.pi * (row + 0.5 * (column % 2)) / rows
     ring = np.stack([np.cos(around), np.zeros(len(around)), np.sin(around)], axis=1)
@@ -74,15 +74,15 @@ def _ball(count: int) -> Surface:
 
 
 def _box(side: int) -> list[Surface]:
-    """Return the faces of a flat box below the others."""
+    """Return the faces of a flat box below the torus and the ball."""
     half = np.array((1.5, 0.12, 1.5))
     spacing = 2.0 * half[0] / side
     positions = [(np.arange(count) + 0.5) / count * 2.0 - 1.0 for count in (side, 2, side)]
     faces = []
     for axis in range(3):
         for sign in (-1.0, 1.0):
-            ends = [np.array((sign,)) if other == axis else positions[other] for other in range(3)]
-            points = np.stack([one.ravel() for one in np.meshgrid(*ends, indexing="ij")], axis=1)
+            ends = [np.array((sign,)) if i == axis else positions[i] for i in range(3)]
+            points = np.stack([grid.ravel() for grid in np.meshgrid(*ends, indexing="ij")], axis=1)
             normals = np.tile(sign * np.eye(3)[axis], (len(points), 1))
             faces.append((points * half + (0.0, 0.6, 0.0), normals, spacing))
     return faces
@@ -141,24 +141,24 @@ def _harmonics(directions: F64) -> F64:
     """Return the basis functions 1 to 15, [N, 15], in the convention of splat renderers."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
-    one, two, three = np.sqrt(np.array((3.0, 15.0, 35.0)) / (4.0 * np.pi))
+    c1, c2, c3 = np.sqrt(np.array((3.0, 15.0, 35.0)) / (4.0 * np.pi))
     return np.stack(
         [
-            -one * y,
-            one * z,
-            -one * x,
-            two * x * y,
-            -two * y * z,
-            two / np.sqrt(12.0) * (3.0 * zz - 1.0),
-            -two * x * z,
-            two / 2.0 * (xx - yy),
-            -three / np.sqrt(8.0) * y * (3.0 * xx - yy),
-            three * np.sqrt(3.0) * x * y * z,
+            -c1 * y,
+            c1 * z,
+            -c1 * x,
+            c2 * x * y,
+            -c2 * y * z,
+            c2 / np.sqrt(12.0) * (3.0 * zz - 1.0),
+            -c2 * x * z,
+            c2 / 2.0 * (xx - yy),
+            -c3 / np.sqrt(8.0) * y * (3.0 * xx - yy),
+            c3 * np.sqrt(3.0) * x * y * z,
             -np.sqrt(21.0 / (32.0 * np.pi)) * y * (5.0 * zz - 1.0),
             np.sqrt(7.0 / (16.0 * np.pi)) * z * (5.0 * zz - 3.0),
             -np.sqrt(21.0 / (32.0 * np.pi)) * x * (5.0 * zz - 1.0),
-            three * np.sqrt(0.75) * z * (xx - yy),
-            -three / np.sqrt(8.0) * x * (xx - 3.0 * yy),
+            c3 * np.sqrt(0.75) * z * (xx - yy),
+            -c3 / np.sqrt(8.0) * x * (xx - 3.0 * yy),
         ],
         axis=1,
     )

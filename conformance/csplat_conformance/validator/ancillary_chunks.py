@@ -232,7 +232,7 @@ def _check_bound(log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord
 def _check_bound_possible(
     log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord], index: Index, source_degree: int
 ) -> None:
-    """Check SER-5 without the source: whether any pair of scenes has errors that permit this bound.
+    """Check SER-5 without the source: some pair of scenes must have errors that permit this bound.
 
     One splat has the true maximum, which the declared maximum hardly exceeds. The true rms is therefore at least that
     maximum over √N, and the declared rms is hardly smaller (SER-7).

@@ -293,7 +293,7 @@ def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], name
 #: Chunks that 4.3.6 recommends at the end of a file with levels.
 _LAST_CHUNKS = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
 _SINGLE_CHUNKS = (_spec.CHUNK_METADATA, *_LAST_CHUNKS, _spec.CHUNK_TREE)
-#: The first layer after those of this version; the order of later layers is not checked (4.3.6).
+#: The first number after the layers of this version; the order of later layers is not checked (4.3.6).
 _LAYER_END = max(_spec.LAYER_NAMES) + 1
 
 
@@ -395,7 +395,7 @@ def _check_type(log: ViolationLog, placed: PlacedRecord[_spec.DirectoryRecord]) 
         return
     if not all(0x20 <= byte <= 0x7E for byte in kind):
         log.add_field("DIR-1", placed, "type", f"{kind!r}, expected bytes 0x20 to 0x7E")
-    flags = record.flags & 0x00FF  # the others are ancillary
+    flags = record.flags & 0x00FF  # the other bits are ancillary
     unlisted = flags & ~sum(_spec.CHUNK_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", placed, "flags", f"bits {unlisted:#06x} are reserved")
@@ -441,7 +441,7 @@ def _check_codebook_chunks(log: ViolationLog, chunks: Sequence[Chunk], index: In
 
 
 def check_coverage(log: ViolationLog, chunks: Sequence[Chunk], start: int, file_size: int, data_size: int) -> None:
-    """Check COV-1, mark the readable chunks, and add a remark if the order is not that of 4.3.6.
+    """Check COV-1, mark the readable chunks, and add a remark if the order differs from 4.3.6.
 
     Args:
         log: receives the violations.
@@ -492,9 +492,9 @@ def check_frame(view: memoryview, chunk: Chunk, clause: str, log: ViolationLog) 
     log.check_reserved(header)
     payload_size = chunk.size - _spec.CHUNK_HEADER_SIZE
     for key, expected in (("type", chunk.kind), ("flags", chunk.flags), ("payload_size", payload_size)):
-        found = getattr(header.record, key)
-        if found != expected:
-            log.add_field("CHK-3", header, key, f"{found!r}, expected {expected!r} by its record")
+        value = getattr(header.record, key)
+        if value != expected:
+            log.add_field("CHK-3", header, key, f"{value!r}, expected {expected!r} by its record")
     # The end of the payload follows from the size in the record, which passed COV-1.
     return Payload(view, at + _spec.CHUNK_HEADER_SIZE, end, chunk.name, clause, log)
 
@@ -530,7 +530,7 @@ class Tile:
 
 
 def read_tiles(view: memoryview, at: int, end: int, index: Index, log: ViolationLog) -> list[Tile]:
-    """Read the tile records; check that they fill the index (IDX-2), and that those of level 0 have N splats (IDX-7).
+    """Read the tile records; check that they fill the index (IDX-2), and that tiles of level 0 have N splats (IDX-7).
 
     Args:
         view: the file.

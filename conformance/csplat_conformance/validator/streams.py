@@ -91,9 +91,9 @@ def read_stream(
 def _check_counts(log: ViolationLog, head: PlacedRecord[_spec.StreamHead], count: int | None, width_max: int) -> bool:
     """Check STR-1 and STR-2."""
     sound = True
-    found, width = head.record.count, head.record.width
-    if found != (max(1, found) if count is None else count):
-        log.add_field("STR-1", head, "count", f"{found}, expected {'1 or more' if count is None else count}")
+    announced, width = head.record.count, head.record.width
+    if announced != (max(1, announced) if count is None else count):
+        log.add_field("STR-1", head, "count", f"{announced}, expected {'1 or more' if count is None else count}")
         sound = False
     if not 1 <= width <= width_max:
         log.add_field("STR-2", head, "width", f"{width}, expected 1 to {width_max}")

@@ -131,9 +131,9 @@ class TileChecker:
             bits = int.from_bytes(bytes(mask.elements.astype(np.uint8)), "little")
             if bits >> count:
                 self.log.add("SPA-3", *where, f"bits of the mask beyond the {count} splats are set")
-            found = (bits & (1 << count) - 1).bit_count()
-            if found != announced:
-                self.log.add("SPA-2", *where, f"{found} bits are set, expected {announced} by present_count")
+            set_count = (bits & (1 << count) - 1).bit_count()
+            if set_count != announced:
+                self.log.add("SPA-2", *where, f"{set_count} bits are set, expected {announced} by present_count")
         if not 1 <= announced <= count:
             raise UnreadableError
         columns = _spec.ATTRIBUTE_COLUMNS[attribute]
@@ -235,7 +235,7 @@ def read_columns(
 
 
 def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: int, *, fixed: bool) -> tuple[int, bool]:
-    """Read lattice parameters; return the exponent, and whether LAT-1, or LAT-2 if it is fixed, holds."""
+    """Read lattice parameters. Return the exponent, and True if LAT-1 holds, or LAT-2 for a fixed exponent."""
     params = payload.structure(_spec.LatticeParams, name)
     exponent = params.record.exponent
     if fixed and exponent:
@@ -245,7 +245,7 @@ def read_exponent(reader: TileChecker, payload: Payload, name: str, attribute: i
 
 
 def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], bool]:
-    """Read the offsets; return them, and whether LAT-3 holds."""
+    """Read the offsets. Return them, and True if LAT-3 holds."""
     at = payload.take(4 * columns, name)
     offsets = [int(value) for value in np.frombuffer(payload.view, "<i4", columns, at)]
     sound = True
@@ -348,7 +348,7 @@ def _read_indices(
 
 
 def _find_indices(reader: TileChecker, book: CodebookAt, params: _CodebookParams) -> CodebookIndices:
-    """Check CBK-4; return the indices of an earlier block, or unknown ones if there are none."""
+    """Check CBK-4; return the indices of an earlier block, or unknown indices if there is none."""
     identity, count = params.record.codebook_id, params.record.escape_count
     first = reader.first.get(identity)
     opener = first_attribute(book)
@@ -393,7 +393,7 @@ def _read_escapes(
         reader.log.add_field("BLK-1", head, "coding", message, _spec.ERROR_UNSUPPORTED)
         raise UnreadableError
     if coding not in legal:
-        names = " or ".join(_spec.CODING_NAMES[one] for one in legal)
+        names = " or ".join(_spec.CODING_NAMES[value] for value in legal)
         reader.log.add_field("CBK-5", head, "coding", f"{_spec.CODING_NAMES[coding]}, expected {names}")
         raise UnreadableError
     rows, _ = read_columns(reader, payload, what, attribute, coding, params.record.escape_count, escape=True)
@@ -429,11 +429,11 @@ def first_attribute(book: CodebookAt) -> int:
 def attribute_columns(book: CodebookAt, attribute: int) -> slice | None:
     """Return the columns of an attribute in the entries of its layer, `None` if the codebook does not contain it."""
     first = 0
-    for one in codebook_attributes(book):
-        columns = _spec.ATTRIBUTE_COLUMNS[one]
+    for member in codebook_attributes(book):
+        columns = _spec.ATTRIBUTE_COLUMNS[member]
         if book.record.kind == _spec.CODEBOOK_KIND_SH:
             first = 0  # each band has a separate chunk
-        if one == attribute:
+        if member == attribute:
             return slice(first, first + columns)
         first += columns
     return None
@@ -456,9 +456,9 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
     layers = () if book is None else range(book.record.band_first, book.record.band_last + 1)
     head = payload.structure(_spec.CodebookHead, "head")
     for key, expected in (("codebook_id", chunk.identity), ("layer", chunk.layer)):
-        found = getattr(head.record, key)
-        if found != expected:
-            log.add_field("CDB-1", head, key, f"{found}, expected {expected} by its record")
+        value = getattr(head.record, key)
+        if value != expected:
+            log.add_field("CDB-1", head, key, f"{value}, expected {expected} by its record")
     if book is None or chunk.layer not in layers:
         log.skip(f"{chunk.name} from byte {payload.at} on", "no valid codebook record requires it")
         return

@@ -36,7 +36,7 @@ class _Node:
 
     @property
     def has_valid_error(self) -> bool:
-        """True if the error is possible at the node's level, whatever those of its children are (TRE-8)."""
+        """True if the error is possible at the node's level, whatever the errors of its children are (TRE-8)."""
         return self.error == 0.0 if self.level == 0 else 0.0 <= self.error < math.inf
 
 
@@ -66,7 +66,7 @@ def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
         message = f"the payload ends within the record, {rest} of {_spec.NODE_RECORD_SIZE} bytes are left"
         log.add("TRE-2", payload.at, f"{payload.name}/node[{count}]", message)
         raise UnreadableError
-    # Each node has a tile, so one of these breaks TRE-3 if there are more nodes.
+    # Each node has a tile, so one of these nodes breaks TRE-3 if there are more nodes than tiles.
     nodes = [_Node(payload.structure(_spec.NodeRecord, f"node[{n}]")) for n in range(min(count, len(tiles) + 1))]
     _assign_tiles(log, nodes, tiles, (start, f"{payload.name}/node"))
     if payload.left:
@@ -78,7 +78,7 @@ def check_tree(payload: Payload, tiles: Sequence[Tile]) -> None:
 
 def _assign_tiles(log: ViolationLog, nodes: Sequence[_Node], tiles: Sequence[Tile], start: tuple[int, str]) -> None:
     """Check TRE-3 and TRE-4, and set levels and numbers of splats if TRE-3 holds."""
-    found: list[tuple[int | None, int]] = []
+    assigned: list[tuple[int | None, int]] = []
     first = 0
     for node in nodes:
         count, left = node.record.record.tile_count, len(tiles) - first
@@ -89,12 +89,12 @@ def _assign_tiles(log: ViolationLog, nodes: Sequence[_Node], tiles: Sequence[Til
         levels = sorted({tile.level for tile in own})
         if len(levels) > 1:
             log.add_field("TRE-4", node.record, "tile_count", f"tiles of levels {levels[0]} to {levels[-1]}")
-        found.append((levels[0] if len(levels) == 1 else None, sum(tile.count for tile in own)))
+        assigned.append((levels[0] if len(levels) == 1 else None, sum(tile.count for tile in own)))
         first += count
     if first < len(tiles):
         log.add("TRE-3", *start, f"{first} tiles of all nodes, expected {len(tiles)}")
         return
-    for node, (level, splat_count) in zip(nodes, found, strict=True):
+    for node, (level, splat_count) in zip(nodes, assigned, strict=True):
         node.level, node.splat_count = level, splat_count
 
 
@@ -121,7 +121,7 @@ def _is_above(nodes: Sequence[_Node], count: int, n: int, parent: int) -> bool:
 
 def _check_node(log: ViolationLog, node: _Node) -> None:
     """Check TRE-6 to TRE-8."""
-    # An error that is invalid by itself is no bound for that of the parent.
+    # An error that is invalid by itself does not bound the parent's error.
     least = max((child.error for child in node.children if child.has_valid_error), default=0.0)
     if not node.has_valid_error:
         expected = "0 at level 0" if node.level == 0 else "finite and not negative"

@@ -75,7 +75,7 @@ def validate(
     with suppress(TooManyViolationsError):  # reported by the last remark
         _check(view, log, counts, json_bytes_max, splats_max, progress or null_progress)
     return Validation(
-        tuple(sorted(log.violations, key=lambda one: one.offset)),
+        tuple(sorted(log.violations, key=lambda violation: violation.offset)),
         tuple(log.remarks),
         tuple(log.unread),
         counts.splats,

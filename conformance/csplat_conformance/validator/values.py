@@ -114,5 +114,5 @@ def check_max_scale(log: ViolationLog, index: Index, largest: int, exponent: int
         return
     expected = value_bits(largest, scale)
     if expected != stored:
-        found, value = (float(np.frombuffer(raw, "<f4")[0]) for raw in (stored, expected))
-        log.add("TIL-11", *where, f"{found!r}, expected the largest scale, {value!r} ({largest} x {scale})")
+        actual, correct = (float(np.frombuffer(raw, "<f4")[0]) for raw in (stored, expected))
+        log.add("TIL-11", *where, f"{actual!r}, expected the largest scale, {correct!r} ({largest} x {scale})")

@@ -168,7 +168,7 @@ class TooManyViolationsError(Exception):
 
 @dataclass
 class ViolationLog:
-    """The violations, remarks and unread parts that were found so far, in any order."""
+    """The violations, remarks and unread parts that were added so far, in any order."""
 
     violations: list[Violation] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
@@ -183,7 +183,7 @@ class ViolationLog:
             offset: offset in the file.
             name: name of the field.
             message: the value found and the value expected.
-            code: error code, if it differs from the usual one of the clause.
+            code: error code, if it differs from the clause's usual code.
 
         Raises:
             TooManyViolationsError: the list is full.
@@ -268,7 +268,7 @@ class Payload:
             self.log.add(self.clause, self.at, f"{self.name}/tail", f"{self.left} bytes follow the last structure")
 
 
-#: The error code of each requirement on a file, the usual one if the clause has two. Clauses about decoders, partial
+#: The error code of each requirement on a file, the usual code if the clause has two. Clauses about decoders, partial
 #: readers and editors are omitted. A test compares this table with the text of the spec.
 CODES: Final[dict[str, str]] = {
     "RES-1": _spec.ERROR_RESERVED,
