@@ -103,17 +103,17 @@ def read_scene(
         with open(file, format, sh_degree=sh_degree) as opened:
             return _loaded(opened, strict=strict, keep_extra=keep_extra)
     with local_file(file) as path:
-        found, findings = detect_format(path, format), list[Finding]()
-        if found.name == _PLY:
+        file_format, findings = detect_format(path, format), list[Finding]()
+        if file_format.name == _PLY:
             model = read_ply(path, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree, report=findings)
-        elif found.name == _CSPLAT:
+        elif file_format.name == _CSPLAT:
             check_sh_degree(sh_degree)
-            model = decode(path, sh_degree=None if sh_degree is None else min(sh_degree, found.degree))
+            model = decode(path, sh_degree=None if sh_degree is None else min(sh_degree, file_format.degree))
         else:
             with open(path, format, sh_degree=sh_degree) as opened:
                 return _loaded(opened, strict=strict, keep_extra=keep_extra)
         scene = Scene.of(model if keep_extra or not model.extra else replace(model, extra={}))
-        return scene.changed(findings=findings, format=found.name, name=path.name, size_bytes=size_on_disk(path))
+        return scene.changed(findings=findings, format=file_format.name, name=path.name, size_bytes=size_on_disk(path))
 
 
 def _loaded(opened: Scene, *, strict: bool, keep_extra: bool) -> Scene:
@@ -184,15 +184,15 @@ def open(
         elif storage:
             raise InputError("storage options require a URL, and the file is not one")
         path = stack.enter_context(local_file(file))
-        found = detect_format(path, format)
+        file_format = detect_format(path, format)
         scene = stack.enter_context(
             SplatFile.open(path, limits=limits)
-            if found.name == _CSPLAT
-            else _opened(found, path, level, max_splats, sh_degree)
+            if file_format.name == _CSPLAT
+            else _opened(file_format, path, level, max_splats, sh_degree)
         )
-        scene = _version_of(found, scene, path.name, level, max_splats, sh_degree)
+        scene = _version_of(file_format, scene, path.name, level, max_splats, sh_degree)
         if not scene.format:
-            scene = scene.changed(format=found.name, name=path.name, size_bytes=size_on_disk(path))
+            scene = scene.changed(format=file_format.name, name=path.name, size_bytes=size_on_disk(path))
         return scene.keep_open(stack.pop_all())  # which closes a `SplatFile` itself a second time, without effect
 
 
@@ -209,13 +209,13 @@ def lint_file(path: Path) -> list[Finding]:
         InputError: csplat cannot read the format, or cannot parse the header.
         OSError: the file cannot be read.
     """
-    found = detect_format(path)
-    if found.name == _PLY:
+    file_format = detect_format(path)
+    if file_format.name == _PLY:
         return lint_ply(path)
-    with _opened(found, path) as scene:
-        if all(one.repairable for one in scene.findings):
+    with _opened(file_format, path) as scene:
+        if all(finding.repairable for finding in scene.findings):
             try:
-                for _ in _along_default_axes(found, scene).blocks():
+                for _ in _along_default_axes(file_format, scene).blocks():
                     pass
             except InputError as error:
                 return [*scene.findings, Finding("malformed", 1, str(error), "error")]
@@ -268,28 +268,28 @@ def write_levels(path: str | os.PathLike[str], levels: Sequence[Scene], format: 
         OSError: the file cannot be written.
     """
     target = Path(path)
-    found = format_by_suffix(target) if format is None else format_by_name(format)
-    if found.write is None:
-        raise InputError(f"{target.name} would be {found.title}, which csplat does not write")
+    file_format = format_by_suffix(target) if format is None else format_by_name(format)
+    if file_format.write is None:
+        raise InputError(f"{target.name} would be {file_format.title}, which csplat does not write")
     statistics = _clamp_statistics()
-    scenes = [statistics.watch(scene.with_sh_degree(found.degree), found.ranges) for scene in levels]
-    if found.write_levels is not None and found.takes_levels(target):
-        findings = found.write_levels(target, scenes)
+    scenes = [statistics.watch(scene.with_sh_degree(file_format.degree), file_format.ranges) for scene in levels]
+    if file_format.write_levels is not None and file_format.takes_levels(target):
+        findings = file_format.write_levels(target, scenes)
     elif len(scenes) != 1:
-        raise InputError(f"{target.name} would be {found.title}, which has one level, found {len(scenes)}")
+        raise InputError(f"{target.name} would be {file_format.title}, which has one level, found {len(scenes)}")
     else:
-        findings = found.write(target, scenes[0])
-    return [*_lost_contents(found, levels), *_clamped_values(found, levels, statistics), *(findings or ())]
+        findings = file_format.write(target, scenes[0])
+    return [*_lost_contents(file_format, levels), *_clamped_values(file_format, levels, statistics), *(findings or ())]
 
 
 def survey_losses(levels: Sequence[Scene], format: str) -> list[Finding]:
     """Return what `write_levels` returns without writing, except findings that depend on how positions are coded."""
-    found = format_by_name(format)
+    file_format = format_by_name(format)
     statistics = _clamp_statistics()
-    for scene in levels if found.ranges else ():
-        for _ in statistics.watch(scene.with_sh_degree(found.degree), found.ranges).blocks():
+    for scene in levels if file_format.ranges else ():
+        for _ in statistics.watch(scene.with_sh_degree(file_format.degree), file_format.ranges).blocks():
             pass
-    return [*_lost_contents(found, levels), *_clamped_values(found, levels, statistics)]
+    return [*_lost_contents(file_format, levels), *_clamped_values(file_format, levels, statistics)]
 
 
 def _clamp_statistics() -> ClampStatistics:
@@ -308,10 +308,10 @@ def _clamped_values(found: Format, levels: Sequence[Scene], statistics: ClampSta
 
     def holders(name: str, least: float, most: float) -> list[str]:
         return [
-            one.name
-            for one in formats()
-            if one.write is not None and (name != "shN" or one.degree >= min(degree, found.degree))
-            if name not in one.ranges or one.ranges[name].holds(least, most)
+            file_format.name
+            for file_format in formats()
+            if file_format.write is not None and (name != "shN" or file_format.degree >= min(degree, found.degree))
+            if name not in file_format.ranges or file_format.ranges[name].holds(least, most)
         ]
 
     return statistics.findings(found.title, holders)
@@ -333,23 +333,23 @@ def detect_format(path: Path, format: str | None = None) -> Format:
         raise InputError(f"the format is {format}, which csplat does not read")
     head = read_head(path)
     kind = detect_content(path, head)
-    found = None if kind is None else _find(kind.name)
-    if found is None and format is not None:
+    file_format = None if kind is None else _find(kind.name)
+    if file_format is None and format is not None:
         return format_by_name(format)
-    if found is not None:
-        if found.open is None:
-            raise InputError(f"{path.name} is {found.title}, which csplat does not read")
-        return found
+    if file_format is not None:
+        if file_format.open is None:
+            raise InputError(f"{path.name} is {file_format.title}, which csplat does not read")
+        return file_format
     kind = kind or (detect_name(path) if head or path.is_dir() else None)
-    found = None if kind is None else _find(kind.name)
-    if kind is None or (found is None and kind.remedy):
+    file_format = None if kind is None else _find(kind.name)
+    if kind is None or (file_format is None and kind.remedy):
         raise refusal(path, head)
-    if found is None:
+    if file_format is None:
         raise InputError(f"{path.name} is {kind.title}, which csplat reads where csplat_trainer is installed")
-    doubt = found.doubt(path)
+    doubt = file_format.doubt(path)
     if doubt:
         raise InputError(f"{path.name} is hardly {kind.title}: {doubt}; if it is one, read it with --from {kind.name}")
-    return found
+    return file_format
 
 
 def format_by_suffix(path: Path) -> Format:
@@ -359,13 +359,13 @@ def format_by_suffix(path: Path) -> Format:
         InputError: no format has its suffix.
     """
     kind = detect_name(path)
-    found = None if kind is None else _find(kind.name)
-    if found is None:
-        endings = ", ".join(one.suffixes[0] for one in formats() if one.write is not None)
+    file_format = None if kind is None else _find(kind.name)
+    if file_format is None:
+        endings = ", ".join(writable.suffixes[0] for writable in formats() if writable.write is not None)
         what = "a folder, not the name of a file" if path.is_dir() else "no format has that ending"
         page = "; `csplat export-html` writes pages" if path.suffix.lower() in {".html", ".htm"} else ""
         raise InputError(f"{path.name or path}: {what}, expected one of {endings}{page}")
-    return found
+    return file_format
 
 
 def format_by_name(name: str) -> Format:
@@ -374,10 +374,10 @@ def format_by_name(name: str) -> Format:
     Raises:
         InputError: there is no such format.
     """
-    found = _find(name)
-    if found is None:
-        raise InputError(f"the format is {name!r}, expected one of {', '.join(one.name for one in formats())}")
-    return found
+    file_format = _find(name)
+    if file_format is None:
+        raise InputError(f"the format is {name!r}, expected one of {', '.join(known.name for known in formats())}")
+    return file_format
 
 
 def _write_csplat(path: Path, scene: Scene) -> None:
@@ -413,9 +413,9 @@ def _own_formats() -> dict[str, Format]:
     # Imported lazily: the libraries of these formats delay the start of programs that do not need them.
     from csplat.formats import compressed_ply, gltf, ksplat, sog, splat, spz
 
-    found = [compressed_ply.FORMAT, _PLY_FORMAT, _CSPLAT_FORMAT, spz.FORMAT, spz.FORMAT_4]
-    found += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT]
-    return {one.name: one for one in found}
+    built_in = [compressed_ply.FORMAT, _PLY_FORMAT, _CSPLAT_FORMAT, spz.FORMAT, spz.FORMAT_4]
+    built_in += [splat.FORMAT, ksplat.FORMAT, sog.FORMAT, gltf.FORMAT]
+    return {file_format.name: file_format for file_format in built_in}
 
 
 def _find(name: str) -> Format | None:

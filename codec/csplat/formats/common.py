@@ -52,17 +52,17 @@ def finite_scene(
     total, kept, blank, scale_range, statistics = 0, 0, 0, RangeStatistics(), RowStatistics()
     for rows, *_ in blocks():
         good = _finite_rows(rows)
-        found = rows if good.all() else rows[good]
-        scales = np.ascontiguousarray(found["scales"])
+        finite = rows if good.all() else rows[good]
+        scales = np.ascontiguousarray(finite["scales"])
         scale_range.add(scales, total)
-        colours = [found["shN"]] if "shN" in (rows.dtype.names or ()) and found["shN"].dtype.kind == "f" else []
+        colours = [finite["shN"]] if "shN" in (rows.dtype.names or ()) and finite["shN"].dtype.kind == "f" else []
         huge = max(scale_range.most, -scale_range.least) > _HUGE
         statistics.huge += count_huge_rows(log_scales(scales.astype(np.float32)) if huge else scales[:0], *colours)
         blank += _count_empty_rows(rows)
-        zero = np.logical_and.reduce([found["quats"][:, part] == zero_quat for part in range(4)])
+        zero = np.logical_and.reduce([finite["quats"][:, part] == zero_quat for part in range(4)])
         statistics.zero_quats += int(np.count_nonzero(zero))
         total += len(rows)
-        kept += len(found)
+        kept += len(finite)
     statistics.nonfinite = total - kept
     are_logs, findings = classify_scales(scale_range, "scale", strict=False)
     findings = list_findings(statistics, total) + findings
@@ -184,13 +184,15 @@ class ClampStatistics:
         self._scenes.append({})
 
         def blocks() -> Iterator[SplatModel]:
-            found = {
-                name: RangeStatistics(one.low - one.step / 2.0, one.high + one.step / 2.0)
-                for name, one in ranges.items()
+            statistics_by_name = {
+                name: RangeStatistics(
+                    value_range.low - value_range.step / 2.0, value_range.high + value_range.step / 2.0
+                )
+                for name, value_range in ranges.items()
             }
-            self._scenes[place] = {name: (ranges[name], statistics) for name, statistics in found.items()}
+            self._scenes[place] = {name: (ranges[name], statistics) for name, statistics in statistics_by_name.items()}
             for rows, model in scene.numbered():
-                for name, statistics in found.items():
+                for name, statistics in statistics_by_name.items():
                     statistics.add(getattr(model, name), rows.start)
                 yield model
 
@@ -205,16 +207,24 @@ class ClampStatistics:
         """
         findings = []
         for name in ARRAYS:
-            found = [scene[name] for scene in self._scenes if name in scene]
-            rows, values = sum(one.rows for _, one in found), sum(one.below + one.above for _, one in found)
+            watched = [scene[name] for scene in self._scenes if name in scene]
+            rows = sum(statistics.rows for _, statistics in watched)
+            values = sum(statistics.below + statistics.above for _, statistics in watched)
             if not rows:
                 continue
             # Of several scenes, the text describes the one with the largest error.
             error, stored, worst = max(
-                ((max(stored.low - one.least, one.most - stored.high), stored, one) for stored, one in found),
-                key=lambda one: one[0],
+                (
+                    (max(stored.low - statistics.least, statistics.most - stored.high), stored, statistics)
+                    for stored, statistics in watched
+                ),
+                key=lambda clamp: clamp[0],
             )
-            others = holders(name, min(one.least for _, one in found), max(one.most for _, one in found))
+            others = holders(
+                name,
+                min(statistics.least for _, statistics in watched),
+                max(statistics.most for _, statistics in watched),
+            )
             text = f"{counted(values, 'value')} of {name} in {counted(rows, 'splat')} outside {stored.low:.4g} to"
             text += f" {stored.high:.4g}, the range of {title}: clamped, by up to {error:.3g}"
             text += _clamped_sizes(name, stored, worst)
@@ -509,11 +519,11 @@ class _ZCurve:
     @classmethod
     def through(cls, scene: Scene) -> _ZCurve:
         stride = -(-scene.count // _CURVE_SAMPLE) or 1
-        taken, at = [np.zeros((0, 3), np.float32)], 0
+        samples, at = [np.zeros((0, 3), np.float32)], 0
         for model in scene.blocks():
-            taken.append(model.means[-at % stride :: stride])
+            samples.append(model.means[-at % stride :: stride])
             at += len(model)
-        sample = np.concatenate(taken)
+        sample = np.concatenate(samples)
         if at != scene.count:
             raise InputError(f"the scene has {at:,} splats, expected {scene.count:,}")
         if not len(sample):

@@ -130,9 +130,9 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
     """Return the elements, the comments and findings, after checking that the file has all rows."""
     findings: list[Finding] = []
     header = read_ply_header(path, findings, "compressed-ply")
-    findings = [one for one in findings if one.repairable]  # row counts are checked below
+    findings = [finding for finding in findings if finding.repairable]  # row counts are checked below
     lines = [line.strip() for line in header.text.decode("ascii").splitlines()[:-1]]
-    found: list[tuple[str, int, list[tuple[str, str]]]] = []
+    declared: list[tuple[str, int, list[tuple[str, str]]]] = []
     comments, form = [], ""
     for line in lines[1:]:
         words = line.split()
@@ -141,16 +141,16 @@ def _parse_header(path: Path) -> tuple[dict[str, _Element], list[str], list[Find
         elif words[:1] == ["format"]:
             form = " ".join(words[1:])
         elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 19:
-            found.append((words[1], int(words[2]), []))
-        elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and found:
-            found[-1][2].append((words[2], _TYPES[words[1]]))
+            declared.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and len(words) == 3 and words[1] in _TYPES and declared:
+            declared[-1][2].append((words[2], _TYPES[words[1]]))
         elif words and words[0] != "obj_info":
             raise InputError(f"{path.name}: the header line {line[:80]!r} is not valid in a compressed PLY")
     if form != "binary_little_endian 1.0":
         raise InputError(f"{path.name}: the format is {form[:40]!r}, expected binary_little_endian 1.0")
     elements: dict[str, _Element] = {}
     offset, size = header.end, path.stat().st_size
-    for name, count, columns in found:
+    for name, count, columns in declared:
         if len({column for column, _ in columns}) != len(columns) or name in elements:
             raise InputError(f"{path.name}: the header declares {name} or one of its columns twice")
         elements[name] = _Element(offset, count, np.dtype(columns))

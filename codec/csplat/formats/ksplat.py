@@ -135,7 +135,7 @@ def _row_type(level: int, degree: int) -> np.dtype[Any]:
 
 def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Section], int]:
     """Return the sections and the offset after the last one."""
-    found: list[_Section] = []
+    sections: list[_Section] = []
     at = _HEADER_SIZE + most * _SECTION_SIZE
     if at > len(data):
         raise InputError(f"{name} declares {most:,} sections, too many for its {len(data):,} bytes")
@@ -154,10 +154,10 @@ def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Sectio
             raise InputError(f"{where}: {head.splats:,} splats, but space for {head.capacity:,}")
         rows = np.frombuffer(data, row, head.splats, start)
         if level and head.splats:
-            found.append(_Section(rows, *_buckets(where, data, head, centres)))
+            sections.append(_Section(rows, *_buckets(where, data, head, centres)))
         else:
-            found.append(_Section(rows, np.array([head.splats]), np.zeros((1, 3)), 1.0))
-    return found, at
+            sections.append(_Section(rows, np.array([head.splats]), np.zeros((1, 3)), 1.0))
+    return sections, at
 
 
 def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:

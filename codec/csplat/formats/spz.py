@@ -185,14 +185,14 @@ def _read_streams(packed: SpzArrays, size: int, stream: BinaryIO) -> None:
     rows = [_STREAM.unpack(_read_exactly(packed.name, stream, _STREAM.size)) for _ in range(packed.streams)]
     if [row[1] for row in rows] != unpacked:
         raise InputError(f"{packed.name} has streams of {[row[1] for row in rows]} bytes, expected {unpacked}")
-    found = table + _STREAM.size * len(rows) + sum(row[0] for row in rows)
-    if found != size:
-        raise InputError(f"{packed.name} has {size:,} bytes, its table declares {found:,}")
-    each = iter(rows)
+    declared_size = table + _STREAM.size * len(rows) + sum(row[0] for row in rows)
+    if declared_size != size:
+        raise InputError(f"{packed.name} has {size:,} bytes, its table declares {declared_size:,}")
+    row_iterator = iter(rows)
     for part_size, width in zip(sizes, packed.widths, strict=True):
         data = np.empty(part_size, np.uint8)
         if part_size:
-            whole = _read_exactly(packed.name, stream, next(each)[0])
+            whole = _read_exactly(packed.name, stream, next(row_iterator)[0])
             with zstandard.ZstdDecompressor().stream_reader(whole, read_across_frames=True) as reader:
                 _fill(packed.name, reader, data)
                 if reader.read(1):

@@ -137,9 +137,9 @@ class GltfDocument:
         """
         values = self.root.get(key)
         if isinstance(values, list) and isinstance(index, int) and 0 <= index < len(values):
-            found = values[index]
-            if isinstance(found, dict):
-                return found
+            value = values[index]
+            if isinstance(value, dict):
+                return value
         raise self.error((key, _shorten(index)), "there is no such object")
 
     def accessor(self, index: object, width: int) -> Accessor:
@@ -283,7 +283,7 @@ class GltfDocument:
         scenes = self.root.get("scenes")
         if not isinstance(scenes, list) or len(scenes) < 2 or "scene" in self.root:
             return ""
-        names = [one.get("name") if isinstance(one, dict) else None for one in scenes]
+        names = [scene.get("name") if isinstance(scene, dict) else None for scene in scenes]
         labels = [f"{index}{f' ({_shorten(name)})' if name else ''}" for index, name in enumerate(names)]
         shown = ", ".join(labels[1:4]) + (", ..." if len(labels) > 4 else "")
         return f"{len(scenes)} scenes and no default: scene {labels[0]} is read, {shown} not"
@@ -297,17 +297,17 @@ class GltfDocument:
         attributes = self.get(extension, json_path, "attributes", dict, {})
         widths = {"TRANSLATION": 3, "ROTATION": 4, "SCALE": 3}
         rows = {name: self.accessor(attributes[name], width) for name, width in widths.items() if name in attributes}
-        counts = {len(one.rows) for one in rows.values()}
+        counts = {len(accessor.rows) for accessor in rows.values()}
         if len(counts) != 1:
             raise self.error(json_path, f"its attributes have {sorted(counts)} rows, expected one number of instances")
-        values = {name: one.values(slice(None)).astype(np.float64) for name, one in rows.items()}
+        values = {name: accessor.values(slice(None)).astype(np.float64) for name, accessor in rows.items()}
         matrices = np.tile(np.eye(4), (counts.pop(), 1, 1))
         for index, quat in enumerate(values.get("ROTATION", ())):
             matrices[index, :3, :3] = self._rotation(quat.tolist(), (*json_path, "attributes", "ROTATION"))
         matrices[:, :3, :3] *= values.get("SCALE", np.ones((len(matrices), 3)))[:, None]
         matrices[:, :3, 3] = values.get("TRANSLATION", 0.0)
-        found: NDArray[np.float64] = placed.matrix @ matrices
-        return found
+        to_world: NDArray[np.float64] = placed.matrix @ matrices
+        return to_world
 
     def _list(self, holder: dict[str, Any], json_path: JsonPath, key: str) -> list[Any]:
         values: list[Any] = self.get(holder, json_path, key, list, [])
@@ -327,7 +327,7 @@ class GltfDocument:
         length = math.hypot(*quat)
         if not 0.0 < length < math.inf:
             raise self.error(json_path, f"found {quat}, expected a unit quaternion")
-        x, y, z, w = (one / length for one in quat)
+        x, y, z, w = (component / length for component in quat)
         return [
             [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
             [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
@@ -372,29 +372,29 @@ def _split_chunks(path: Path, data: memoryview) -> tuple[memoryview, memoryview 
         raise InputError(f"{path.name} is binary glTF {version}, expected {_VERSION}")
     if size > len(data):
         raise InputError(f"{path.name} is truncated: found {len(data)} bytes, expected {size}")
-    found: list[tuple[bytes, memoryview]] = []
+    chunks: list[tuple[bytes, memoryview]] = []
     at = GLB_HEAD.size
-    while at + _CHUNK_HEAD.size <= size and len(found) < 2:  # further chunks are ignored
+    while at + _CHUNK_HEAD.size <= size and len(chunks) < 2:  # further chunks are ignored
         length, kind = _CHUNK_HEAD.unpack_from(data, at)
         at += _CHUNK_HEAD.size
         if length > size - at:
             raise InputError(
                 f"{path.name}, byte {at - _CHUNK_HEAD.size}: a chunk of {length} bytes, {size - at} remain"
             )
-        found.append((kind, data[at : at + length]))
+        chunks.append((kind, data[at : at + length]))
         at += length
-    if not found or found[0][0] != JSON:
+    if not chunks or chunks[0][0] != JSON:
         raise InputError(f"{path.name}: the first chunk is not JSON")
-    binary = found[1][1] if len(found) > 1 and found[1][0] == BIN else None
-    text = bytes(found[0][1]).rstrip(b"\0")  # some exporters pad with zeros instead of spaces
+    binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == BIN else None
+    text = bytes(chunks[0][1]).rstrip(b"\0")  # some exporters pad with zeros instead of spaces
     return memoryview(text), binary, len(data) - size
 
 
 def _extension(holder: dict[str, Any], name: str) -> dict[str, Any]:
     """Return an extension object; {} if it is absent."""
     extensions = holder.get("extensions")
-    found = extensions.get(name) if isinstance(extensions, dict) else None
-    return found if isinstance(found, dict) else {}
+    extension = extensions.get(name) if isinstance(extensions, dict) else None
+    return extension if isinstance(extension, dict) else {}
 
 
 def _as_list(value: object) -> list[Any]:

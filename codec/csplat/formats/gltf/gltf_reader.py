@@ -117,11 +117,11 @@ class _GltfReading:
         extensions = self.file.get(placed.primitive, placed.json_path, "extensions", dict, {})
         extension = self.file.get(extensions, json_path, EXTENSION, dict, {})
         within = self.file.get(extension, (*json_path, EXTENSION), "extensions", dict, {})
-        packed = next((one for one in _SPZ if one in within or one in extensions), "")
+        packed = next((name for name in _SPZ if name in within or name in extensions), "")
         if EXTENSION not in extensions and not packed:
             return
         unknown = [name for name in within if name not in _SPZ]
-        unknown += [one for one in extensions if one in self.required and one not in {EXTENSION, *_SPZ, *_HARMLESS}]
+        unknown += [name for name in extensions if name in self.required and name not in {EXTENSION, *_SPZ, *_HARMLESS}]
         if unknown:
             raise self.file.error(json_path, f"the splats use {', '.join(map(str, unknown))}, which is not supported")
         self._check(placed, extension, (*json_path, EXTENSION), packed=bool(packed))
@@ -141,7 +141,7 @@ class _GltfReading:
             self.statistics.nonfinite += bad
             self.infinite += infinite
             # A small file could reference one mesh very often.
-            if self.count > self.file.size() + sum(one.count for one in self.packed.values()):
+            if self.count > self.file.size() + sum(arrays.count for arrays in self.packed.values()):
                 shown = f"shows at least {counted(self.count, 'splat')}, more than it has bytes"
                 raise InputError(f"{self.file.path.name} {shown}")
             linear, translation = matrix[:3, :3], matrix[:3, 3]
@@ -153,9 +153,9 @@ class _GltfReading:
 
     def _report(self, finding: Finding) -> None:
         """Add a finding; findings with the same text about several primitives are added up."""
-        for index, one in enumerate(self.findings):
-            if one.text == finding.text:
-                self.findings[index] = replace(one, count=one.count + finding.count)
+        for index, known in enumerate(self.findings):
+            if known.text == finding.text:
+                self.findings[index] = replace(known, count=known.count + finding.count)
                 return
         self.findings.append(finding)
 
@@ -168,10 +168,10 @@ class _GltfReading:
             draft = f"an early draft of {EXTENSION} (2025) without kernel and with opacities in COLOR_0"
             raise self.file.error(json_path, f"{draft}: export it again with a newer version of the program")
         for key, values in (*known.items(), ("projection", {"perspective", None})):
-            found = self.file.get(extension, json_path, key, str)
-            if found not in values:
-                expected = " or ".join(sorted(one for one in values if one))
-                raise self.file.error((*json_path, key), f"found {found!r}, expected {expected}")
+            value = self.file.get(extension, json_path, key, str)
+            if value not in values:
+                expected = " or ".join(sorted(allowed for allowed in values if allowed))
+                raise self.file.error((*json_path, key), f"found {value!r}, expected {expected}")
 
     def _plain_block(self, placed: PlacedPrimitive) -> tuple[Callable[[slice], SplatModel], int, tuple[int, int]]:
         file, json_path = self.file, (*placed.json_path, "attributes")
@@ -228,7 +228,7 @@ class _GltfReading:
         kept = slice(None) if good is None else good
         scales = log_scales(arrays["SCALE"].values(rows)[kept])
         return count_huge_rows(
-            scales, *(one.values(rows)[kept] for name, one in arrays.items() if name.startswith("SH_"))
+            scales, *(accessor.values(rows)[kept] for name, accessor in arrays.items() if name.startswith("SH_"))
         )
 
     def _packed_block(
@@ -239,7 +239,7 @@ class _GltfReading:
             data, _ = file.view(view)
             name = f"{file.path.name}, bufferViews/{view}"
             packed = read_spz_file(io.BytesIO(data), name, len(data))
-            self.unpacked_bytes += sum(one.nbytes for one in packed.parts)
+            self.unpacked_bytes += sum(part.nbytes for part in packed.parts)
             if self.unpacked_bytes > _UNPACKED_RATIO * file.size():
                 raise InputError(f"{file.path.name}: its SPZ share their bytes and unpack to too many splats")
             self.packed[view] = packed
@@ -270,16 +270,16 @@ class _GltfReading:
     ) -> tuple[bool, str]:
         """Return True if positions are stored along glTF's axes; and the evidence for messages."""
         bounds = [positions.get(name) for name in ("min", "max")]
-        numbers = [one for each in bounds if isinstance(each, list) for one in each]
-        if len(numbers) == 6 and packed.count and all(type(one) in (int, float) for one in numbers):
-            wanted = np.array(numbers, np.float64).reshape(2, 3)
+        numbers = [number for bound in bounds if isinstance(bound, list) for number in bound]
+        if len(numbers) == 6 and packed.count and all(type(number) in (int, float) for number in numbers):
+            declared = np.array(numbers, np.float64).reshape(2, 3)
             low, high = np.full(3, np.inf), np.full(3, -np.inf)
             for start in range(0, packed.count, BLOCK_SPLATS):
                 means = decode_means(packed, slice(start, start + BLOCK_SPLATS))
                 low, high = np.minimum(low, means.min(axis=0)), np.maximum(high, means.max(axis=0))
-            both = np.stack([low, high])
-            there = np.sort(both @ rotation.T, axis=0)
-            off = [float(np.abs(one - wanted).max()) for one in (both, there)]
+            as_stored = np.stack([low, high])
+            rotated = np.sort(as_stored @ rotation.T, axis=0)
+            off = [float(np.abs(box - declared).max()) for box in (as_stored, rotated)]
             if min(off) <= _ALIKE * float((high - low).max()) and off[0] != off[1]:
                 return off[0] < off[1], "according to the bounds of POSITION"
         return draft, "as CesiumJS reads such drafts"
@@ -290,9 +290,9 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     """Open a file (`Format.open`, `Format.open_bands`)."""
     file = open_document(path)
     reading = _GltfReading(
-        file, [str(one) for one in file.get(file.root, (), "extensionsRequired", list, [])], sh_degree
+        file, [str(name) for name in file.get(file.root, (), "extensionsRequired", list, [])], sh_degree
     )
-    instances = [one for placed in file.placed_primitives() for one in reading.instances(placed)]
+    instances = [instance for placed in file.placed_primitives() for instance in reading.instances(placed)]
     if not instances:
         raise InputError(f"{path.name} shows no splats: no mesh of its scene has {EXTENSION}")
     _conclude(reading)
@@ -302,7 +302,7 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         if comments.origin is None and np.abs(instances[0].translation).max() >= _FAR:
             origin = instances[0].translation
         x, y, z = origin.tolist()
-        degree = max(one.decode(slice(0, 0)).sh_degree for one in instances)
+        degree = max(instance.decode(slice(0, 0)).sh_degree for instance in instances)
         empty = _pad_bands(instances[0].decode(slice(0, 0)), degree)
         antialiased = comments.metadata.antialiased or (bool(reading.antialiased) and all(reading.antialiased))
         metadata = replace(comments.metadata, coordinate_system=AXES, antialiased=antialiased)
@@ -311,13 +311,13 @@ def open_gltf(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
         raise InputError(f"{path.name}: {error}") from None
 
     def blocks() -> Iterator[SplatModel]:
-        for one in instances:
-            for start in range(0, one.count, BLOCK_SPLATS):
-                rows = slice(start, min(start + BLOCK_SPLATS, one.count))
+        for instance in instances:
+            for start in range(0, instance.count, BLOCK_SPLATS):
+                rows = slice(start, min(start + BLOCK_SPLATS, instance.count))
                 try:
-                    block = one.decode(rows)
+                    block = instance.decode(rows)
                     if len(block):
-                        yield _place_block(_pad_bands(block, degree), one, empty)
+                        yield _place_block(_pad_bands(block, degree), instance, empty)
                 except InputError as error:
                     raise InputError(f"{path.name}, splats {rows.start} to {rows.stop - 1}: {error}") from None
 
@@ -328,12 +328,12 @@ def _conclude(reading: _GltfReading) -> None:
     """Classify the values of all primitives and report findings about them."""
     generator = reading.file.root["asset"].get("generator")
     writer = generator[:60] if isinstance(generator, str) else ""
-    reading.are_logs, found = classify_scales(reading.scales, "SCALE", strict=True, writer=writer)
+    reading.are_logs, scale_findings = classify_scales(reading.scales, "SCALE", strict=True, writer=writer)
     written = _WROTE_LOGS.match(writer)
-    if written and not reading.are_logs and not found:
+    if written and not reading.are_logs and not scale_findings:
         text = f"SCALE: {writer} wrote logarithms, but none is negative: read as standard deviations, as glTF specifies"
-        found = [Finding("unclear-scales", reading.count, text, "note")]
-    reading.are_logits, more = classify_opacities(reading.opacities, "OPACITY")
+        scale_findings = [Finding("unclear-scales", reading.count, text, "note")]
+    reading.are_logits, opacity_findings = classify_opacities(reading.opacities, "OPACITY")
     for index, length in reading.file.short.items():
         text = f"buffers/{index}: {length}; the part that splats use is complete"
         reading.findings.append(Finding("short-buffer", 1, text, "note"))
@@ -341,11 +341,11 @@ def _conclude(reading: _GltfReading) -> None:
         reading.statistics.infinite_logits = reading.infinite
     else:
         reading.statistics.nonfinite += reading.infinite
-    reading.findings += [*found, *more, *list_findings(reading.statistics, reading.count)]
+    reading.findings += [*scale_findings, *opacity_findings, *list_findings(reading.statistics, reading.count)]
     reading.findings += trailing_bytes(reading.file.tail)
     if others := reading.file.other_scenes():
         reading.findings.append(Finding("other-scenes", len(reading.file.root["scenes"]) - 1, others, "note"))
-    if reading.linear_samples and all(one.repairable for one in reading.findings):
+    if reading.linear_samples and all(finding.repairable for finding in reading.findings):
         try:
             error = max(
                 (measure_srgb_error(model) for model in (sample() for sample in reading.linear_samples) if len(model)),
@@ -461,9 +461,9 @@ def fit_srgb(model: SplatModel) -> SplatModel:
 def measure_srgb_error(model: SplatModel) -> float:
     """Return the rms error of `fit_srgb` over splats, directions and channels, in steps of 1/255."""
     squares, count = 0.0, 0
-    for _, found, wanted in _fit_blocks(model):
-        squares += float(np.square(np.clip(found, 0, 1) - np.clip(wanted, 0, 1), dtype=np.float64).sum())
-        count += found.size
+    for _, fitted, exact in _fit_blocks(model):
+        squares += float(np.square(np.clip(fitted, 0, 1) - np.clip(exact, 0, 1), dtype=np.float64).sum())
+        count += fitted.size
     return 255.0 * float(np.sqrt(squares / count)) if count else 0.0
 
 
@@ -477,10 +477,10 @@ def _fit_blocks(model: SplatModel) -> Iterator[tuple[F32, F32, F32]]:
         rows = slice(start, start + _ROWS)
         with np.errstate(over="ignore", invalid="ignore"):  # `SplatModel` refuses values beyond float32
             linear = basis @ np.concatenate([model.sh0[rows, None], model.shN[rows]], axis=1) + np.float32(0.5)
-            wanted = _srgb(np.maximum(linear, 0))
-            coefficients = inverse @ (wanted - np.float32(0.5))
+            exact = _srgb(np.maximum(linear, 0))
+            coefficients = inverse @ (exact - np.float32(0.5))
             fitted = basis @ coefficients + np.float32(0.5)
-        yield coefficients, fitted, wanted
+        yield coefficients, fitted, exact
 
 
 def _srgb(linear: F32) -> F32:

@@ -171,12 +171,12 @@ class SogParts:
 
     def _unzip(self, name: str, most: int) -> bytes:
         assert self.zip is not None, "`folder` is only set within a zip"
-        found = self.zip.find(name)
-        if not found:
+        matches = self.zip.find(name)
+        if not matches:
             self.refuse(f"there is no {name[:80]}")
-        if len({info.filename for info in found}) > 1:
-            self.refuse(f"{' and '.join(info.filename[:80] for info in found[:2])} would both be {name[:80]}")
-        info = found[-1]
+        if len({info.filename for info in matches}) > 1:
+            self.refuse(f"{' and '.join(info.filename[:80] for info in matches[:2])} would both be {name[:80]}")
+        info = matches[-1]
         if reason := member_refusal(info, min(most, _FREE + _EXPANSION * info.compress_size)):
             self.refuse(f"{name[:80]} {reason}")
         try:
@@ -219,7 +219,7 @@ class JsonValue:
         """Return the values of a list."""
         if not isinstance(self.value, list):
             self.parts.refuse(f"{self.json_path} is not a list")
-        return [JsonValue(self.parts, self.json_path, one) for one in self.value]
+        return [JsonValue(self.parts, self.json_path, item) for item in self.value]
 
     def text(self) -> str:
         """Return a string."""
@@ -240,9 +240,9 @@ class JsonValue:
             self.parts.refuse(
                 f"{self.json_path} has {len(values)} numbers, expected {least if least == most else most}"
             )
-        for one in values:
-            if type(one) not in (int, float) or not abs(one) <= 1e30 or not math.isfinite(one):
-                self.parts.refuse(f"{self.json_path} contains {str(one)[:40]}, expected finite numbers")
+        for number in values:
+            if type(number) not in (int, float) or not abs(number) <= 1e30 or not math.isfinite(number):
+                self.parts.refuse(f"{self.json_path} contains {str(number)[:40]}, expected finite numbers")
         return np.array(values, np.float64)
 
 
@@ -259,21 +259,21 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
     """
     title = title or path.name
     if path.is_dir():
-        found = [PurePosixPath(name) for name in (_ONE, _LEVELS) if (path / name).is_file()]
-        if not found:
+        manifests = [PurePosixPath(name) for name in (_ONE, _LEVELS) if (path / name).is_file()]
+        if not manifests:
             SogParts(path, title).refuse(f"a folder without {_ONE}, not a SOG")
-        return SogParts(path, title), str(_only_scene(SogParts(path, title), found))
+        return SogParts(path, title), str(_only_scene(SogParts(path, title), manifests))
     with open_binary(path) as stream:
         zipped = stream.read(2) == b"PK"
     if not zipped:
         return SogParts(path.parent, title), path.name
     whole = _ZipDirectory(path, title)
     names = [info.filename for info in whole.members]
-    found = [one for one in map(PurePosixPath, map(use_slashes, names)) if _is_manifest(one)]
-    if not found:
+    manifests = [member for member in map(PurePosixPath, map(use_slashes, names)) if _is_manifest(member)]
+    if not manifests:
         SogParts(path, title).refuse(f"a zip without {_ONE}, not a SOG")
     parts = SogParts(path, title, PurePosixPath(), whole)
-    only = _only_scene(parts, found)
+    only = _only_scene(parts, manifests)
     oddities = ["backslashes in the names of the zip, read as slashes"] if any("\\" in name for name in names) else []
     oddities += [f"{only.name} is read as {only.name.lower()}"] if only.name != only.name.lower() else []
     findings = [Finding("zip-names", 1, "; ".join(oddities), "note")] if oddities else []
@@ -284,10 +284,10 @@ def find_parts(path: Path, title: str | None = None) -> tuple[SogParts, str]:
 def _report_others(parts: SogParts, only: PurePosixPath, names: Sequence[str]) -> list[Finding]:
     """Report scenes of other formats in the folder of the SOG; refuse a zip with scenes in other folders."""
     paths = [path for path in map(PurePosixPath, map(use_slashes, names)) if _OF_MACOS not in path.parts]
-    others = [PurePosixPath(one) for one in scenes_of(map(str, paths))]
+    others = [PurePosixPath(name) for name in scenes_of(map(str, paths))]
     if not others:
         return []
-    if not all(one.is_relative_to(only.parent) for one in others):
+    if not all(other.is_relative_to(only.parent) for other in others):
         _refuse_several(parts, [only, *others])
     text = f"the zip also holds {_list_paths(others)}: not read"
     return [Finding("other-scenes", len(others), text, "note")]
@@ -305,13 +305,13 @@ def _only_scene(parts: SogParts, found: Sequence[PurePosixPath]) -> PurePosixPat
         found: paths of all manifests.
     """
     inside: set[PurePosixPath] = set()
-    for one in found if len(found) > 1 else ():
-        if one.name.lower() == _LEVELS:
-            meta = parts.json(str(one)).value
+    for manifest in found if len(found) > 1 else ():
+        if manifest.name.lower() == _LEVELS:
+            meta = parts.json(str(manifest)).value
             files = meta.get("filenames") if isinstance(meta, dict) else None
             names = [*files, meta.get("environment")] if isinstance(files, list) else []
-            inside |= {one.parent / use_slashes(name) for name in names if isinstance(name, str)}
-    scenes = [one for one in found if one not in inside]
+            inside |= {manifest.parent / use_slashes(name) for name in names if isinstance(name, str)}
+    scenes = [manifest for manifest in found if manifest not in inside]
     if len(scenes) != 1:
         _refuse_several(parts, scenes)
     return scenes[0]
@@ -323,7 +323,7 @@ def _refuse_several(parts: SogParts, scenes: Sequence[PurePosixPath]) -> NoRetur
 
 
 def _list_paths(paths: Sequence[PurePosixPath]) -> str:
-    return ", ".join(str(one)[:80] for one in sorted(paths)[:_NAMED]) + (", ..." if len(paths) > _NAMED else "")
+    return ", ".join(str(path)[:80] for path in sorted(paths)[:_NAMED]) + (", ..." if len(paths) > _NAMED else "")
 
 
 def decode_webp(parts: SogParts, name: str, data: bytes, fits: Any) -> NDArray[np.uint8]:

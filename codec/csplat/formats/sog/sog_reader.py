@@ -66,7 +66,7 @@ def read_leaf_numbers(path: Path, level: int = 0) -> I64:
 
 def _open_scene(path: Path, parts: SogParts, name: str, level: int, max_splats: int | None) -> Scene:
     meta = parts.json(name)
-    if isinstance(meta.value, dict) and not any(one in meta for one in _KEYS):
+    if isinstance(meta.value, dict) and not any(key in meta for key in _KEYS):
         where = folder_refusal(parts.path) if parts.folder is None else zip_refusal(path)
         parts.refuse(f"{name} is not the one of SOG, which has {', '.join(_KEYS[:4])}; {where}")
     if "lodLevels" in meta or "tree" in meta:
@@ -100,28 +100,28 @@ def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int
     With `max_splats`, open the finest level of at most this number of splats, else the coarsest.
     """
     names, leaves = _read_leaves(parts, meta)
-    last = max([max(one) for one in leaves], default=0)
+    last = max([max(leaf) for leaf in leaves], default=0)
     if level > last:
         parts.refuse(f"the level is {level}, expected 0 to {last}")
     environment = use_slashes(meta["environment"].text()) if "environment" in meta else None
     around = 0 if environment is None else read_meta(*parts.inner(environment)).count
     counts = [
-        around + sum(stop - start for _, start, stop in (_range_at(leaf, one) for leaf in leaves))
-        for one in range(last + 1)
+        around + sum(stop - start for _, start, stop in (_range_at(leaf, lod) for leaf in leaves))
+        for lod in range(last + 1)
     ]
     if max_splats is not None:
-        level = next((one for one in range(last) if counts[one] <= max_splats), last)
+        level = next((lod for lod in range(last) if counts[lod] <= max_splats), last)
     findings: list[Finding] = []
     if any("\\" in name for name in names):
         findings.append(Finding("zip-names", 1, "backslashes in filenames, read as slashes", "note"))
         names = [use_slashes(name) for name in names]
-    ranges = _collect_ranges(parts, names, [_range_at(one, level) for one in leaves])
+    ranges = _collect_ranges(parts, names, [_range_at(leaf, level) for leaf in leaves])
     if environment is not None:
         ranges[environment] = None
     metas: list[tuple[SogMeta, list[tuple[int, int]]]] = []
-    for name, wanted in ranges.items():
+    for name, file_ranges in ranges.items():
         sog = read_meta(*parts.inner(name))
-        taken = [(0, sog.count)] if wanted is None else wanted
+        taken = [(0, sog.count)] if file_ranges is None else file_ranges
         if taken[-1][1] > sog.count:
             parts.refuse(f"the level uses splats up to {taken[-1][1]:,} of {name}, which has {sog.count:,}")
         metas.append((sog, taken))
@@ -156,7 +156,7 @@ def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict
     """Return the names of the files; and for each leaf of the tree, the range of splats of each level."""
     if "version" in meta and meta["version"].whole(1 << 30) != 1:
         parts.refuse(f"it is version {meta['version'].value} of streamed SOG, expected 1")
-    names = [one.text() for one in meta["filenames"].list()]
+    names = [item.text() for item in meta["filenames"].list()]
     leaves: list[dict[int, _Range]] = []
     nodes = [meta["tree"]]
     while nodes:
@@ -181,24 +181,24 @@ def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict
 
 def _range_at(leaf: dict[int, _Range], level: int) -> _Range:
     """Return the range of a leaf at a level, else at the next coarser one, else at its coarsest."""
-    return leaf[min((one for one in leaf if one >= level), default=max(leaf))]
+    return leaf[min((lod for lod in leaf if lod >= level), default=max(leaf))]
 
 
 def _collect_ranges(parts: SogParts, names: list[str], wanted: list[_Range]) -> dict[str, list[tuple[int, int]] | None]:
     """Return the ranges of splats to read by file, in order; refuse overlaps."""
-    found: dict[str, list[tuple[int, int]] | None] = {}
+    ranges_by_file: dict[str, list[tuple[int, int]] | None] = {}
     before = (-1, 0, 0)
-    for one in sorted(one for one in wanted if one[2] > one[1]):
-        file, start, stop = one
+    for span in sorted(span for span in wanted if span[2] > span[1]):
+        file, start, stop = span
         if file == before[0] and start < before[2]:
             parts.refuse(f"the level uses splats {start:,} to {before[2]:,} of {names[file][:80]} twice")
-        if file != before[0] and names[file] in found:
+        if file != before[0] and names[file] in ranges_by_file:
             parts.refuse(f"filenames contains {names[file][:80]} twice")
-        ranges = found.setdefault(names[file], [])
+        ranges = ranges_by_file.setdefault(names[file], [])
         assert ranges is not None, "the environment is added later"
         ranges.append((start, stop))
-        before = one
-    return found
+        before = span
+    return ranges_by_file
 
 
 COEFFICIENTS = (0, 3, 8, 15)  #: number of SH coefficients per channel, by degree
@@ -351,7 +351,9 @@ class SogImages:
             OSError: an image cannot be read.
         """
         parts, count = sog.parts, sog.count
-        names = [_list_files(sog.meta[name], wanted) for name, wanted in (("means", 2), ("quats", 1), ("scales", 1))]
+        names = [
+            _list_files(sog.meta[name], file_count) for name, file_count in (("means", 2), ("quats", 1), ("scales", 1))
+        ]
         names += [_list_files(sog.meta["sh0"], 1)] + ([_list_files(sog.meta["shN"], 2)] if sog.shN is not None else [])
         data = {name: parts.read(name) for group in names for name in group}
         size_bytes = sum(map(len, data.values()))
@@ -415,14 +417,14 @@ def read_degree(sog: SogMeta) -> int:
 
 
 def _look_up(tables: F32, codes: NDArray[Any]) -> F32:
-    found = np.empty(codes.shape, np.float32)
+    values = np.empty(codes.shape, np.float32)
     for axis in range(3):
-        found[:, axis] = tables[axis][codes[:, axis]]
-    return found
+        values[:, axis] = tables[axis][codes[:, axis]]
+    return values
 
 
 def _list_files(section: JsonValue, count: int) -> list[str]:
-    names = [one.text() for one in section["files"].list()]
+    names = [item.text() for item in section["files"].list()]
     if len(names) != count or len(set(names)) != count:
         section.parts.refuse(f"{section.json_path} files has {len(set(names))} names, expected {count}")
     return names
@@ -432,12 +434,15 @@ def _read_palette(sog: SogMeta, name: str, data: bytes) -> F32:
     def fits(width: int, height: int) -> bool:
         degrees = [sog.degree] if sog.degree is not None else [1, 2, 3]
         rows = 1 if sog.palette is None else -(-sog.palette // ENTRIES)
-        return width in [ENTRIES * COEFFICIENTS[one] for one in degrees] and rows <= height <= _MAX_PALETTE // ENTRIES
+        return (
+            width in [ENTRIES * COEFFICIENTS[degree] for degree in degrees]
+            and rows <= height <= _MAX_PALETTE // ENTRIES
+        )
 
     codes = decode_webp(sog.parts, name, data, fits)
     entries = codes[:, :, :3].reshape(len(codes) * ENTRIES, -1, 3)[: sog.palette]
     assert sog.shN is not None, "a palette has a codebook"
-    found = sog.shN[entries]
-    if np.isnan(found).any():
+    palette = sog.shN[entries]
+    if np.isnan(palette).any():
         sog.parts.refuse(f"{name} has codes beyond the codebook of shN")
-    return np.ascontiguousarray(found)
+    return np.ascontiguousarray(palette)

@@ -77,8 +77,8 @@ class SogLosses:
         """Return the findings; `metadata` is that of the scene."""
         both = metadata.antialiased and metadata.flat
         lost = [Finding("lost-contents", 1, "SOG cannot hold that splats are discs and antialiased", "loss")] * both
-        found = self.clamped.findings("the 256 codes of SOG", lambda *_: ("ply", "gltf", "csplat"))
-        return [*lost, *found, *self.moved.findings("SOG has 16 bits for the logarithms of positions")]
+        clamped = self.clamped.findings("the 256 codes of SOG", lambda *_: ("ply", "gltf", "csplat"))
+        return [*lost, *clamped, *self.moved.findings("SOG has 16 bits for the logarithms of positions")]
 
 
 def encode_files(scene: Scene, losses: SogLosses) -> Iterator[tuple[str, bytes]]:
@@ -148,14 +148,14 @@ def _sample(scene: Scene) -> tuple[F64, F64, SplatModel]:
     """Return the bounds of the logarithms of all positions, and at most `_SAMPLE` evenly spaced splats."""
     step = -(-scene.count // _SAMPLE) or 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    taken = []
+    samples = []
     for rows, model in scene.numbered():
         logs = _signed_logs(model.means)
         low, high = np.minimum(low, logs.min(0)), np.maximum(high, logs.max(0))
-        taken.append(model.select(np.arange(-rows.start % step, len(model), step)))
-    if not taken:
+        samples.append(model.select(np.arange(-rows.start % step, len(model), step)))
+    if not samples:
         return np.zeros(3), np.zeros(3), scene.empty()
-    return low, high, join_blocks(scene.empty(), taken)
+    return low, high, join_blocks(scene.empty(), samples)
 
 
 def _signed_logs(means: F32) -> F64:
@@ -178,7 +178,7 @@ def _splat_weights(model: SplatModel, median_area: float) -> F32:
 
 def _shortest_decimals(values: F32) -> list[float]:
     """Return the shortest decimals that round to the same float32 values."""
-    return [float(str(one)) for one in values]
+    return [float(str(value)) for value in values]
 
 
 def _build_codebook(columns: F32, weights: F32) -> F32:

@@ -95,16 +95,16 @@ def write_streamed_sog(path: Path, levels: Sequence[Scene]) -> list[Finding]:
     if not levels:
         raise InputError(f"{path}: the scene has no splats, and streamed SOG has no empty leaves")
     tree, leaf_count = _cut_space(levels[0])
-    found = [_survey(level, tree, leaf_count) for level in levels]
+    surveys = [_survey(level, tree, leaf_count) for level in levels]
     filenames, losses = list[str](), SogLosses()
     leaves: list[dict[str, dict[str, int]]] = [{} for _ in range(leaf_count)]
     with atomic_folder(path.parent) as temporary:
-        for number, (level, statistics) in enumerate(zip(levels, found, strict=True)):
+        for number, (level, statistics) in enumerate(zip(levels, surveys, strict=True)):
             _list_runs(leaves, number, statistics, len(filenames))
             names = [f"{number}_{chunk}" for chunk in range(int(statistics.chunks[-1]) + 1)]
             _write_chunks([temporary / name for name in names], level, tree, statistics, losses)
             filenames += [f"{name}/meta.json" for name in names]
-        extents = np.stack([one.extents for one in found])
+        extents = np.stack([survey.extents for survey in surveys])
         bounds = np.stack([extents[:, :, 0].min(0), extents[:, :, 1].max(0)], axis=1)
         counts = [level.count for level in levels]
         meta = {
@@ -120,12 +120,12 @@ def _check_folder(folder: Path) -> None:
     """Refuse a folder that contains anything but streamed SOG, because all of it is replaced."""
     if not folder.exists():
         return
-    names = {one.name for one in folder.iterdir()}
+    names = {entry.name for entry in folder.iterdir()}
     if LEVELS_NAME in names:
         meta = read_json(folder / LEVELS_NAME)
         files = meta.get("filenames") if isinstance(meta, dict) else None
         own = [*files, meta.get("environment")] if isinstance(files, list) else []
-        names -= {LEVELS_NAME, *(one.split("/")[0] for one in own if isinstance(one, str))}
+        names -= {LEVELS_NAME, *(name.split("/")[0] for name in own if isinstance(name, str))}
     if names or folder == Path.cwd():
         reason = f"contains {min(names)}" if names else "is the current one"
         raise InputError(f"{folder} {reason}, and a new folder replaces it: name another, as in scene/{LEVELS_NAME}")
@@ -169,7 +169,9 @@ def _number_leaves(tree: _Cut | int, means: F32) -> I64:
 
 def _survey(scene: Scene, tree: _Cut | int, leaf_count: int) -> _LevelStatistics:
     counts = np.zeros(leaf_count, np.int64)
-    centres, extents = (np.stack([np.full((leaf_count, 3), one) for one in (np.inf, -np.inf)], axis=1) for _ in "ce")
+    centres, extents = (
+        np.stack([np.full((leaf_count, 3), limit) for limit in (np.inf, -np.inf)], axis=1) for _ in "ce"
+    )
     for model in scene.blocks():
         numbers = _number_leaves(tree, model.means)
         counts += np.bincount(numbers, minlength=leaf_count)
@@ -236,7 +238,7 @@ def _describe_node(
         box, rest = bounds[node], dict[str, Any](lods=leaves[node])
     else:
         children = [_describe_node(child, bounds, leaves) for child in (node.low, node.high)]
-        both = np.stack([one for _, one in children])
-        box, rest = np.stack([both[:, 0].min(0), both[:, 1].max(0)]), {"children": [one for one, _ in children]}
+        both = np.stack([child_box for _, child_box in children])
+        box, rest = np.stack([both[:, 0].min(0), both[:, 1].max(0)]), {"children": [child for child, _ in children]}
     least, most = ([float(f"{value:.{_DIGITS}g}") for value in side] for side in box)
     return {"bound": {"min": least, "max": most}, **rest}, box
