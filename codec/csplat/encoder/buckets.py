@@ -148,8 +148,8 @@ def bucket_rows(means: F32, bucket_splats: int) -> Sequence[Rows]:
     bucket = curve.bucket_of(means)
     order = np.argsort(bucket, kind="stable")
     ends = np.searchsorted(bucket[order], np.arange(curve.count + 1))
-    found = [order[start:end] for start, end in pairwise(ends)]
-    return [rows[part] for rows in found for part in bucket_slices(len(rows), bucket_splats) if len(rows)]
+    buckets = [order[start:end] for start, end in pairwise(ends)]
+    return [rows[part] for rows in buckets for part in bucket_slices(len(rows), bucket_splats) if len(rows)]
 
 
 def bucket_slices(count: int, bucket_splats: int) -> list[slice]:

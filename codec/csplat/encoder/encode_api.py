@@ -207,7 +207,7 @@ def _builder_of(levels: Levels, count: int, options: EncodeOptions) -> LevelBuil
 
 
 def _plugin(group: str, name: str, what: str) -> Any:
-    found = load_plugins(group).get(name)
-    if found is None:
+    plugin = load_plugins(group).get(name)
+    if plugin is None:
         raise InputError(f"no {what} is installed (entry points of {group}): pip install 'csplat[render]'")
-    return found
+    return plugin

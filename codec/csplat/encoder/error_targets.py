@@ -85,17 +85,17 @@ def meet_bounds(
             f"no lattice keeps the error of {worst} within {bounds[worst]:g}: the best found is"
             f" {result.largest_error(worst):.3g}; allow a larger error"
         )
-    found, options = best
+    result, options = best
     search = SearchReport(
         goal=target.as_json(),
-        size_bytes=found.size_bytes,
-        splats=found.report.splat_count,
+        size_bytes=result.size_bytes,
+        splats=result.report.splat_count,
         splats_before=len(source),
         encodes=files,
         seconds=round(time.perf_counter() - start, 3),
-        reached={name: found.largest_error(name) for name in bounds},
+        reached={name: result.largest_error(name) for name in bounds},
     )
-    return found.with_search(search), options
+    return result.with_search(search), options
 
 
 def _first_options(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:

@@ -64,7 +64,7 @@ class FreeValues:
 
     def copy(self) -> FreeValues:
         """Return a deep copy."""
-        return FreeValues(*(getattr(self, one.name).copy() for one in fields(self)))
+        return FreeValues(*(getattr(self, field.name).copy() for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

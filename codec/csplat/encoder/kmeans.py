@@ -188,13 +188,13 @@ def search_nearest(
     def work(part: slice) -> None:
         rows = np.ones((part.stop - part.start, table.shape[1]), np.float32)
         rows[:, :-1] = points[part] if shift == 0 else _divide(points[part], shift)
-        found = np.zeros(len(rows), np.int64)
+        nearest = np.zeros(len(rows), np.int64)
         best = np.full(len(rows), -np.inf, np.float32)
         if start is not None:
-            found[:] = start[part]
-            best[:] = np.einsum("nd,nd->n", rows, np.take(table, found, axis=0))
-        find(rows, part.start, found, best)
-        index[part] = found
+            nearest[:] = start[part]
+            best[:] = np.einsum("nd,nd->n", rows, np.take(table, nearest, axis=0))
+        find(rows, part.start, nearest, best)
+        index[part] = nearest
         norm = np.einsum("nd,nd->n", rows, rows, dtype=np.float64) - 1.0
         error[part] = (norm - 2.0 * best) * 4.0**shift
 
@@ -315,13 +315,13 @@ def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I
 
 def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
     if points.ndim != 2 or not points.shape[1] or points.dtype not in (np.int16, np.int32):
-        found = f"{points.dtype} {points.shape}"
-        raise InputError(f"k-means: points are int16 or int32 [N, D], found {found}")
+        actual = f"{points.dtype} {points.shape}"
+        raise InputError(f"k-means: points are int16 or int32 [N, D], found {actual}")
     if weights is None:
         return np.empty(0)
     if weights.shape != points.shape[:1] or not np.all((weights >= 0) & (weights < np.inf)):
-        found = f"{weights.shape} for {len(points)} points"
-        raise InputError(f"k-means: weights are [N], finite and >= 0, found {found}")
+        actual = f"{weights.shape} for {len(points)} points"
+        raise InputError(f"k-means: weights are [N], finite and >= 0, found {actual}")
     return weights.astype(np.float64) if weights.any() else np.ones(len(points))
 
 
@@ -370,8 +370,8 @@ def _first_entries(
         new = sample[_draw_rows(w * error, size * done // rounds - len(entries), rng)]
         entries = np.concatenate([entries, new.astype(np.int32)])
         if len(new) and done < rounds:
-            found = search_nearest(sample, new.astype(np.int32), near, threads)[1]
-            error = np.minimum(error, found) if len(entries) > len(new) else found
+            distance = search_nearest(sample, new.astype(np.int32), near, threads)[1]
+            error = np.minimum(error, distance) if len(entries) > len(new) else distance
     return entries
 
 
@@ -492,7 +492,7 @@ def _near_entries(entries: I64, table: F32, near: int, threads: int | None, othe
     place[order] = np.arange(len(order))
 
     def find(x: F32, start: int, index: I64, best: F32) -> None:
-        found = np.empty_like(index)
+        nearest = np.empty_like(index)
         before = best.copy()
         for chosen, group in _by_group(x @ coarse, near):
             width = matrices[group].shape[1]
@@ -502,9 +502,9 @@ def _near_entries(entries: I64, table: F32, near: int, threads: int | None, othe
                     own = place[rows + start] - ends[group]
                     here = np.flatnonzero((own >= 0) & (own < width))
                     scores[here, own[here]] = -np.inf
-                _keep_better(rows, scores, int(ends[group]), found, best)
+                _keep_better(rows, scores, int(ends[group]), nearest, best)
         better = best > before
-        index[better] = order[found[better]]
+        index[better] = order[nearest[better]]
 
     return find
 

@@ -253,7 +253,7 @@ def encode_tiles(
         plan, codebooks = plan.choose_sh_coding(progress)
     tiles = _encode_all(plan, codebooks.sh_plan, progress)
     errors = errors or ErrorSums.total(part.errors for part in tiles)
-    if plan.shapes is not None and not any(one.id == SHAPE_CODEBOOK_ID for one in codebooks.records):
+    if plan.shapes is not None and not any(book.id == SHAPE_CODEBOOK_ID for book in codebooks.records):
         record, chunk = shape_codebook_chunk(plan.shapes, plan.parameters.deflate)
         codebooks = replace(codebooks, records=[*codebooks.records, record], chunks=[*codebooks.chunks, chunk])
     return EncodedTiles(plan, codebooks, tiles, errors)

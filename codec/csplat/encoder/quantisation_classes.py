@@ -63,7 +63,7 @@ class QuantisationClasses:
     def as_json(self) -> dict[str, list[int]]:
         """Return the number of splats and the step factors of each class."""
         counts = np.bincount(self.index, minlength=len(self.factors))
-        columns = {name: [getattr(one, name) for one in self.factors] for name in CLASSED_ATTRIBUTES}
+        columns = {name: [getattr(factors, name) for factors in self.factors] for name in CLASSED_ATTRIBUTES}
         return {"splats": [int(count) for count in counts], **columns}
 
 

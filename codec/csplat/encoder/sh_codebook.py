@@ -413,10 +413,10 @@ def _train(
     def report_steps(done: int, steps: int) -> None:
         progress("codebook", done / steps)
 
-    found = cluster(points, weights, size, seed=options.seed, threads=threads, progress=report_steps, **effort)
+    clustered = cluster(points, weights, size, seed=options.seed, threads=threads, progress=report_steps, **effort)
     if error_weights.metric is not None:
-        found = _refine(shN, points, error_weights.metric, found, parameters, threads)
-    ranked, entries = rank_by_frequency(found[1], found[0])
+        clustered = _refine(shN, points, error_weights.metric, clustered, parameters, threads)
+    ranked, entries = rank_by_frequency(clustered[1], clustered[0])
     index = ranked.astype(np.int32)
     errors = _errors(shN, index, entries, parameters, error_weights, threads)
     escaped = _choose_escapes(shN, errors, parameters, options, error_weights)

@@ -381,12 +381,14 @@ def _dequantise(entries: I32, parameters: CodingParameters) -> tuple[F64, F64]:
 def _assignment_errors(shapes: _ShapeInput, entries: I32, index: I64, parameters: CodingParameters) -> tuple[F64, I32]:
     """Return the weighted squared error of each splat's assignment, [N], and the summand that minimises it, [N]."""
     decoded, sizes = _dequantise(entries, parameters)
-    found = decoded[:, index]
-    growth = np.zeros(len(index)) if shapes.metric is None else _best_growth(shapes.covariances, found, shapes.metric)
+    assigned = decoded[:, index]
+    growth = (
+        np.zeros(len(index)) if shapes.metric is None else _best_growth(shapes.covariances, assigned, shapes.metric)
+    )
     steps = (shapes.sizes + growth - sizes[index]) / parameters.scale_step
     summand = np.rint(np.where(shapes.fits, steps, 0.0)).astype(np.int32)
     growth = sizes[index] + summand * parameters.scale_step - shapes.sizes
-    return _covariance_errors(shapes.covariances, found, growth, shapes.weights, shapes.metric), summand
+    return _covariance_errors(shapes.covariances, assigned, growth, shapes.weights, shapes.metric), summand
 
 
 def _best_growth(target: F64, found: F64, metric: ErrorMetric) -> F64:

@@ -96,18 +96,18 @@ class GaussNewtonBlocks:
 
     def select(self, rows: Rows) -> GaussNewtonBlocks:
         """Return the blocks of some splats."""
-        return GaussNewtonBlocks(*(getattr(self, one.name)[rows] for one in fields(self)))
+        return GaussNewtonBlocks(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def check(self, count: int) -> None:
         """Raise an `InputError` unless all arrays have `count` rows and are finite and, except `shapes`, >= 0."""
-        for one in fields(self):
-            array = getattr(self, one.name)
-            shape = (count, _TRIANGLE) if one.name == "shapes" else (count,)
+        for field in fields(self):
+            array = getattr(self, field.name)
+            shape = (count, _TRIANGLE) if field.name == "shapes" else (count,)
             if array.shape != shape or array.dtype.kind != "f":
-                found = f"{array.dtype} {list(array.shape)}"
-                raise InputError(f"Gauss-Newton blocks of {one.name} are {found}, expected floats {list(shape)}")
-            if not np.isfinite(array).all() or (one.name != "shapes" and (array < 0.0).any()):
-                raise InputError(f"Gauss-Newton blocks of {one.name} are negative or not finite")
+                actual = f"{array.dtype} {list(array.shape)}"
+                raise InputError(f"Gauss-Newton blocks of {field.name} are {actual}, expected floats {list(shape)}")
+            if not np.isfinite(array).all() or (field.name != "shapes" and (array < 0.0).any()):
+                raise InputError(f"Gauss-Newton blocks of {field.name} are negative or not finite")
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,23 +134,23 @@ class ErrorMetric:
 
     def products(self, a: Floats, b: Floats) -> F64:
         """Return aᵀ M b for every point, [N], without weights; a and b are [N, D, C]."""
-        found = np.empty(len(a))
+        products = np.empty(len(a))
         for at in range(0, len(a), _METRIC_BLOCK):
             part = slice(at, at + _METRIC_BLOCK)
-            found[part] = np.einsum("nic,nic->n", a[part], matrix_products(self.triangles[part], b[part]))
-        return found
+            products[part] = np.einsum("nic,nic->n", a[part], matrix_products(self.triangles[part], b[part]))
+        return products
 
     def errors(self, difference: Floats, rows: Rows | slice) -> F64:
         """Return the weighted squared errors [n] of differences [n, D, C] for the points `rows`."""
         triangles, weights = self.triangles[rows], self.weights[rows]
         upper_i, upper_j = np.triu_indices(self.size)
-        found = np.empty(len(difference))
+        errors = np.empty(len(difference))
         for at in range(0, len(difference), _METRIC_BLOCK):
             part = slice(at, at + _METRIC_BLOCK)
             d = difference[part].astype(np.float64)
             products = np.einsum("npc,npc->np", d[:, upper_i], d[:, upper_j])
-            found[part] = np.einsum("np,np->n", products, doubled_triangles(triangles[part])) * weights[part]
-        return found
+            errors[part] = np.einsum("np,np->n", products, doubled_triangles(triangles[part])) * weights[part]
+        return errors
 
 
 def splat_weights(model: SplatModel, importance: Floats | Importance | None) -> F32:
@@ -301,8 +301,8 @@ def matrix_products(triangles: Floats, points: Floats) -> F64:
     matrices = np.empty((len(points), size, size))
     matrices[:, upper_i, upper_j] = triangles
     matrices[:, upper_j, upper_i] = triangles
-    found: F64 = np.einsum("nij,njc->nic", matrices, points.astype(np.float64))
-    return found
+    products: F64 = np.einsum("nij,njc->nic", matrices, points.astype(np.float64))
+    return products
 
 
 def doubled_triangles(triangles: Floats) -> F64:

@@ -266,11 +266,11 @@ def _may_exceed(values: F32, limit: float) -> bool:
 
 def _exceeds(values: F32, limit: float) -> Mask:
     """Return True for rows with a value that reaches the limit, [N]."""
-    found = np.zeros(len(values), bool)
+    mask = np.zeros(len(values), bool)
     for at in range(0, len(values), _OUTLIER_BLOCK):
         part = values[at : at + _OUTLIER_BLOCK]
-        found[at : at + _OUTLIER_BLOCK] = np.abs(part.reshape(len(part), -1)).max(axis=1, initial=0.0) >= limit
-    return found
+        mask[at : at + _OUTLIER_BLOCK] = np.abs(part.reshape(len(part), -1)).max(axis=1, initial=0.0) >= limit
+    return mask
 
 
 def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
