@@ -115,7 +115,7 @@ def _write_extract(
     copies = TileCopier(window)
     copied = [copies.of(tile) for tile in tiles]
     copies.begin(records)
-    chunks = [FileChunk(one.type, chunk_payload(window, one), one.id, one.layer) for one in records]
+    chunks = [FileChunk(record.type, chunk_payload(window, record), record.id, record.layer) for record in records]
     if tiles[-1].level > 0:
         chunks.append(tree_chunk(copy_nodes([nodes[number] for number in kept], kept, copied)))
     fields = scene_fields(window, header, codebook_ids, chunks)
@@ -184,8 +184,8 @@ class ChunkPrefetcher:
                 stop += 1
             if self._here:
                 self._window.forget()
-            ranges = [(one.offset, one.size) for one in extra]
-            self._window.fetch(ranges + [(one.offset, one.size) for one in self._records[index:stop]])
+            ranges = [(record.offset, record.size) for record in extra]
+            self._window.fetch(ranges + [(record.offset, record.size) for record in self._records[index:stop]])
             self._here = range(index, stop)
         return self._records[index]
 
@@ -228,7 +228,7 @@ class TileCopier:
     def _chunks(self) -> tuple[ChunkPrefetcher, dict[int, int]]:
         """Return all chunks in file order, and the index of the first chunk of each layer."""
         starts = dict(zip(self._records, accumulate(map(len, self._records.values()), initial=0), strict=False))
-        records = [one for records in self._records.values() for one in records]
+        records = [record for records in self._records.values() for record in records]
         return ChunkPrefetcher(self._window, records, self._files), starts
 
     def _read(self, layer: int, index: int) -> bytes:

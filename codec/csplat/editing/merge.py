@@ -122,21 +122,21 @@ def merge(
         for words, field in _SHARED_FIELDS:
             _refuse_contradiction(words, [getattr(scene.header, field) for scene in scenes], names)
         windows = [scene.window() for scene in scenes]
-        fields = [scene_fields(one, scene.header, (), ()) for one, scene in zip(windows, scenes, strict=True)]
+        fields = [scene_fields(window, scene.header, (), ()) for window, scene in zip(windows, scenes, strict=True)]
         why, ids = _difference(fields, names), []
         spool = PayloadSpool(stack.enter_context(temporary_file()))
         books = MergedCodebooks(spool)
         if not why:
-            ids = [books.take(one, scene.header) for one, scene in zip(windows, scenes, strict=True)]
+            ids = [books.take(window, scene.header) for window, scene in zip(windows, scenes, strict=True)]
             if len(books.records) > codebooks_max:
                 why = f"they have {len(books.records):,} codebooks together, a file has at most {codebooks_max:,}"
         if why:
             why += "; levels of detail are left out" * any(scene.header.coarse_tiles for scene in scenes)
-            done = _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
-            return replace(done, notes=_notes(scenes, names))
+            result = _encode_again(scenes, output, options or EncodeOptions(keep_extra=True), why)
+            return replace(result, notes=_notes(scenes, names))
         nodes: list[FileNode] = []
-        for one, scene, new in zip(windows, scenes, ids, strict=True):
-            copied = renumber_tiles(one, scene.header, new, spool, len(scenes))
+        for window, scene, new in zip(windows, scenes, ids, strict=True):
+            copied = renumber_tiles(window, scene.header, new, spool, len(scenes))
             base = len(nodes)
             own = copy_nodes(scene.nodes, range(len(scene.nodes)), copied)
             nodes += [replace(node, parent=None if node.parent is None else base + node.parent) for node in own]
@@ -145,8 +145,8 @@ def merge(
         tree = [tree_chunk(nodes)] if any(tile.level for tile in tiles) else []
         together = replace(
             fields[0],
-            axes=next((one.axes for one in fields if any(one.axes)), fields[0].axes),
-            unit_metres=next((one.unit_metres for one in fields if one.unit_metres), 0.0),
+            axes=next((file_fields.axes for file_fields in fields if any(file_fields.axes)), fields[0].axes),
+            unit_metres=next((file_fields.unit_metres for file_fields in fields if file_fields.unit_metres), 0.0),
             codebooks=books.records,
             chunks=[*tree, *_common_chunks(scenes), *books.chunks],
         )
@@ -157,12 +157,12 @@ def _refuse_other_axes(scenes: Sequence[SplatFile], names: Sequence[str]) -> Non
     """Raise `InputError` if two files have different axes or up directions; RDF is assumed of files without axes."""
     axes = [scene.header.coordinate_system for scene in scenes]
     if not set(axes) <= {UNSPECIFIED}:
-        known = [DEFAULT_AXES if one == UNSPECIFIED else one for one in axes]
-        texts = [f"none, for which {DEFAULT_AXES} is assumed," if one == UNSPECIFIED else one for one in axes]
+        known = [DEFAULT_AXES if system == UNSPECIFIED else system for system in axes]
+        texts = [f"none, for which {DEFAULT_AXES} is assumed," if system == UNSPECIFIED else system for system in axes]
         remedy = "turn one with csplat convert --to-axes, or name the axes of one without with --axes"
         _refuse_contradiction("axes", known, names, texts, remedy)
     ups = [scene.metadata.up for scene in scenes]
-    directions = [(np.array(one), name) for one, name in zip(ups, names, strict=True) if one is not None]
+    directions = [(np.array(up), name) for up, name in zip(ups, names, strict=True) if up is not None]
     for up, name in directions[1:]:
         first, first_name = directions[0]
         if float(up @ first) < CONTRADICTS:
@@ -180,17 +180,17 @@ def _notes(scenes: Sequence[SplatFile], names: Sequence[str]) -> tuple[str, ...]
     """Describe what is assumed of files that leave axes or unit open, and metadata that not all files share."""
     headers = [scene.header for scene in scenes]
     notes = []
-    open_axes = [name for one, name in zip(headers, names, strict=True) if one.coordinate_system == UNSPECIFIED]
+    open_axes = [name for header, name in zip(headers, names, strict=True) if header.coordinate_system == UNSPECIFIED]
     if 0 < len(open_axes) < len(scenes):
         notes.append(f"{', '.join(open_axes)} without axes: {DEFAULT_AXES} is assumed, as the other files have")
-    open_units = [name for one, name in zip(headers, names, strict=True) if one.unit_metres is None]
+    open_units = [name for header, name in zip(headers, names, strict=True) if header.unit_metres is None]
     if 0 < len(open_units) < len(scenes):
-        unit = next(one.unit_metres for one in headers if one.unit_metres is not None)
+        unit = next(header.unit_metres for header in headers if header.unit_metres is not None)
         notes.append(f"{', '.join(open_units)} without a unit: {unit:g} m is assumed, as the other files have")
     entries = [scene.metadata.entries for scene in scenes]
     left_out = sorted(set().union(*entries) - _common_entries(entries).keys())
     cameras = [scene.metadata.cameras for scene in scenes]
-    if left_out := [*left_out, *(["cameras"] if any(one != cameras[0] for one in cameras) else [])]:
+    if left_out := [*left_out, *(["cameras"] if any(camera_list != cameras[0] for camera_list in cameras) else [])]:
         notes.append(f"metadata left out, because not all files have the same: {', '.join(left_out)}")
     return tuple(notes)
 
@@ -229,9 +229,9 @@ def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
             return f"{name} has SH of degree {other.sh_degree}, {first_name} of {first.sh_degree}"
         if other.origin != first.origin:
             return f"{name} and {first_name} have different origins"
-        for one, two in zip(first.attributes, other.attributes, strict=True):
-            if one != two:
-                return f"{name} and {first_name} have different steps of {_spec.ATTRIBUTE_NAMES[one.attribute]}"
+        for attribute, counterpart in zip(first.attributes, other.attributes, strict=True):
+            if attribute != counterpart:
+                return f"{name} and {first_name} have different steps of {_spec.ATTRIBUTE_NAMES[attribute.attribute]}"
         if other.extras != first.extras:
             return f"{name} and {first_name} have different extra columns"
     return ""
@@ -254,7 +254,11 @@ def _common_cameras(scenes: Sequence[SplatFile]) -> Sequence[Mapping[str, Any]] 
 
 def _common_entries(values: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     first, *others = values
-    return {key: value for key, value in first.items() if all(key in one and one[key] == value for one in others)}
+    return {
+        key: value
+        for key, value in first.items()
+        if all(key in entries and entries[key] == value for entries in others)
+    }
 
 
 def _write_merged(
@@ -372,13 +376,15 @@ class MergedCodebooks:
     def take(self, window: FileWindow, header: SceneHeader) -> dict[int, int]:
         """Add the codebooks that the tiles of a file reference; return the new ids by old id."""
         used = {identity for tile in header.all_tiles for identity in tile.codebook_ids}
-        chunks = [one for one in header.directory if one.type == _spec.CHUNK_CODEBOOK and one.id in used]
-        window.fetch((one.offset, one.size) for one in chunks)
+        chunks = [record for record in header.directory if record.type == _spec.CHUNK_CODEBOOK and record.id in used]
+        window.fetch((record.offset, record.size) for record in chunks)
         ids = {}
         for book in header.codebooks:
             if book.codebook_id in used:
-                own = sorted((one for one in chunks if one.id == book.codebook_id), key=lambda one: one.layer)
-                contents = {one.layer: chunk_payload(window, one)[_ID_END:] for one in own}
+                own = sorted(
+                    (record for record in chunks if record.id == book.codebook_id), key=lambda record: record.layer
+                )
+                contents = {record.layer: chunk_payload(window, record)[_ID_END:] for record in own}
                 ids[book.codebook_id] = self._id(book, contents)
         window.forget()
         return ids

@@ -181,10 +181,10 @@ def translate_scene(model: SplatModel, offset: Direction) -> SplatModel:
 def _rotation_to(metadata: SceneMetadata, axes: str) -> F64:
     known = metadata.coordinate_system != UNSPECIFIED
     matrix = axes_rotation(metadata.coordinate_system if known else DEFAULT_AXES, axes)
-    up, wanted = metadata.stated_up, up_of_axes(axes)
-    if known or up is None or wanted is None:
+    up, target_up = metadata.stated_up, up_of_axes(axes)
+    if known or up is None or target_up is None:
         return matrix
-    tilted: F64 = _tilt(_multiply_rows(matrix, np.array(up, np.float64)), np.array(wanted)) @ matrix
+    tilted: F64 = _tilt(_multiply_rows(matrix, np.array(up, np.float64)), np.array(target_up)) @ matrix
     return tilted
 
 
@@ -277,7 +277,7 @@ def sh_rotations(degree: int, matrix: F64) -> list[F64]:
     directions = sphere_lattice(_DIRECTIONS)
     after, before = evaluate_sh(degree, directions), evaluate_sh(degree, directions @ matrix)  # row v is Mᵀ v before
     bands = [slice(band**2, (band + 1) ** 2) for band in range(1, degree + 1)]
-    return [_round_near_integers(np.linalg.lstsq(after[:, one], before[:, one], rcond=None)[0]) for one in bands]
+    return [_round_near_integers(np.linalg.lstsq(after[:, band], before[:, band], rcond=None)[0]) for band in bands]
 
 
 def _round_near_integers(matrix: NDArray[Any]) -> F64:

@@ -218,13 +218,13 @@ def _read_state(folder: Path, key: dict[str, Any], *, resume: bool) -> dict[str,
         raise InputError(f"{folder} is left from an interrupted encoding: continue with `--resume`, or remove it")
     try:
         state = json.loads(read_bytes(path))
-        found = state.pop("key")
+        previous = state.pop("key")
     except (ValueError, TypeError, KeyError):
         raise damaged_file(path) from None
     for name, value in key.items():
-        if found.get(name) != value:
+        if previous.get(name) != value:
             raise InputError(
-                f"{folder} was started with {name} {found.get(name)}, now {value}: continue with the former {name}, "
+                f"{folder} was started with {name} {previous.get(name)}, now {value}: continue with the former {name}, "
                 "or remove the folder to start again"
             )
     if state and tuple(state) != _STATE_FIELDS:  # another version's
@@ -284,8 +284,8 @@ def _spill(scene: Scene, folder: Path, curve: BucketCurve) -> list[int]:
                 pending[section].append(part)
         counts += sizes
     flush()
-    found: list[int] = counts.tolist()
-    return found
+    section_sizes: list[int] = counts.tolist()
+    return section_sizes
 
 
 def _section_path(folder: Path, section: int) -> Path:

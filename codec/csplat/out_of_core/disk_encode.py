@@ -247,11 +247,11 @@ def _encode_buckets(
     count, buckets = sum(store.counts), store.buckets
     origin = Origin(count, np.zeros(0, np.int64))
     plan, codebooks = EncodePlan.of_buckets(store, options, origin, progress).choose_sh_coding(progress)
-    left = [one for one in buckets if not coded_path(store.folder, one).exists()]
-    uncoded = Counter(one.section for one in left)
+    left = [bucket for bucket in buckets if not coded_path(store.folder, bucket).exists()]
+    uncoded = Counter(bucket.section for bucket in left)
     for section in set(range(len(store.counts))) - set(uncoded):
         store.remove_section(section)
-    done = count - sum(one.stop - one.start for one in left)
+    done = count - sum(bucket.stop - bucket.start for bucket in left)
     threads = options.threads if workers == 1 and scheduler is None else 1
     coding = BucketCoding(store.folder, replace(plan, options=replace(options, threads=threads)), codebooks, levels)
     for bucket in code_buckets(coding, left, workers, scheduler):
