@@ -59,12 +59,12 @@ def extract(
     """Write the tiles of a file that touch a box as a file of their own.
 
     Tiles are copied whole, including splats outside the box; values are preserved bit for bit. Nodes of a file with
-    levels of detail are copied whole, those of coarser levels if everything below them is. Declared error bounds
-    and the encoder's options, which refer to the whole file, are omitted, as are chunks of unknown types. Only header,
-    index and the copied data are read, a few megabytes at a time.
+    levels of detail are copied whole, and nodes of coarser levels only if everything below them is. Declared error
+    bounds and the encoder's options, which refer to the whole file, are omitted, as are chunks of unknown types. Only
+    header, index and the copied data are read, a few megabytes at a time.
 
     Args:
-        file: a `.csplat` file as in `csplat.open`, or one that is open.
+        file: a `.csplat` file as in `csplat.open`, or an open file.
         box: two corners, x, y, z each, in any order, possibly infinite, in scene units relative to the origin.
         output: a path, written atomically and replaced if it exists; or an open binary file.
         storage: as in `csplat.open`.
@@ -129,7 +129,7 @@ def _write_extract(
 
 
 def _kept_nodes(nodes: Sequence[Node], tiles: Container[int]) -> list[int]:
-    """Return the leaves with one of some tiles, and the nodes all of whose children are kept."""
+    """Return the leaves that contain any of some tiles, and the nodes all of whose children are kept."""
     kept: list[int] = []
     is_kept = [False] * len(nodes)
     for number, node in enumerate(nodes):  # children come before their parents

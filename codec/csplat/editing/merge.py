@@ -1,6 +1,6 @@
 """Merge several files: copy their tiles if possible, otherwise decode the scenes and encode them together.
 
-Copied tiles are not decoded; only the codebook ids in them are replaced by those of the merged file.
+Copied tiles are not decoded; only their codebook ids are replaced by the ids in the merged file.
 """
 
 from __future__ import annotations
@@ -81,18 +81,18 @@ def merge(
     storage: Mapping[str, Any] | None = None,
     codebooks_max: int = (1 << 16) - 1,
 ) -> MergeResult:
-    """Merge files: the splats of the first, then those of the second, and so on.
+    """Merge files: the splats of the first, then the splats of the second, and so on.
 
     Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH degree,
-    origin and extra columns. That is true for parts of one file (`extract`) and files encoded with the same steps.
+    origin and extra columns. That is true for parts of the same file (`extract`) and files encoded with the same steps.
     Codebooks get new ids. Copying takes memory for the codebooks of one file and a few megabytes. Other files are
     decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more, and levels of
     detail; `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
-    Metadata and cameras are kept if they are the same in all files. Of a file without axes, x right, y down, z forward
-    is assumed, as elsewhere: it can be merged with files of these axes, not of others. Of a file without a unit, that
-    of the others is assumed. `MergeResult.notes` reports all of this. Merged files of copied tiles declare no error
-    bounds and no options, because nothing is measured.
+    Metadata and cameras are kept if they are the same in all files. A file without axes is assumed to have x right, y
+    down, z forward, as elsewhere: it can be merged with files of these axes, not of others. A file without a unit is
+    assumed to have the unit of the others. `MergeResult.notes` reports all of this. Merged files of copied tiles
+    declare no error bounds and no options, because nothing is measured.
 
     Args:
         files: as in `csplat.open`, two or more.
@@ -198,7 +198,7 @@ def _notes(scenes: Sequence[SplatFile], names: Sequence[str]) -> tuple[str, ...]
 def _refuse_contradiction(
     words: str, values: Sequence[Any], names: Sequence[str], texts: Sequence[str] = (), remedy: str = ""
 ) -> None:
-    """Raise `InputError` if two files have different values, of which `None` is unknown.
+    """Raise `InputError` if two files have different values; `None` is an unknown value.
 
     Args:
         words: name of the values, for the message.
@@ -222,7 +222,7 @@ def _text(value: Any) -> str:
 
 
 def _difference(fields: Sequence[SceneFields], names: Sequence[str]) -> str:
-    """Return the reason why tiles of one file are not valid in another; "" if they are."""
+    """Return the reason why tiles of the first file are not valid in another; "" if they are."""
     first, first_name = fields[0], names[0]
     for other, name in zip(fields[1:], names[1:], strict=True):
         if other.sh_degree != first.sh_degree:

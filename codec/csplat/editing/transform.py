@@ -1,6 +1,6 @@
 """Transform scenes: rotate, mirror, scale, translate, stretch, and convert axes.
 
-The mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ is the same for M and -M, one of which is a
+The mirror image of a Gaussian is a Gaussian: its covariance M Σ Mᵀ is the same for M and -M, and either M or -M is a
 rotation. Colours change by the parity of their SH bands. So axes can be converted to axes of either handedness.
 """
 
@@ -24,7 +24,7 @@ from csplat.types import F32, F64
 _Rows = TypeVar("_Rows", F32, F64)
 
 _OPPOSITE = dict(zip("RLUDFB", "LRDUBF", strict=True))
-#: Axes assumed for a scene that does not specify any: those of COLMAP and OpenCV.
+#: Axes assumed for a scene that does not specify any; COLMAP and OpenCV use them.
 DEFAULT_AXES = "RDF"
 _ORTHOGONAL = 1e-6  # tolerance for the entries of M Mᵀ - 1
 _WHOLE = 1e-9  # entries of a computed rotation within this distance of an integer are rounded
@@ -189,7 +189,7 @@ def _rotation_to(metadata: SceneMetadata, axes: str) -> F64:
 
 
 def _tilt(start: F64, end: F64) -> F64:
-    """Return the smallest rotation that takes one unit vector to another."""
+    """Return the smallest rotation that takes a unit vector to another."""
     axis, cosine = np.cross(start, end), float(start @ end)
     if cosine < -1.0 + 1e-12:  # half a turn about any perpendicular axis
         axis = np.eye(3)[int(np.abs(start).argmin())]
@@ -257,7 +257,7 @@ def _left_product(quat: F64) -> F64:
 
 
 def _rotate_sh(shN: F32, matrix: F64) -> F32:
-    """Rotate SH band by band: the colour in direction v becomes the one in direction M v."""
+    """Rotate SH band by band: the colour in direction v becomes the colour in direction M v."""
     out = np.empty_like(shN)
     for band, turn in enumerate(sh_rotations(sh_degree_of(shN.shape[1]), matrix), start=1):
         part = slice(band**2 - 1, (band + 1) ** 2 - 1)
@@ -272,7 +272,7 @@ def sh_rotations(degree: int, matrix: F64) -> list[F64]:
 
     Args:
         degree: 0 to 4.
-        matrix: [3, 3] orthogonal; the colour in direction v becomes the one in direction `matrix` v.
+        matrix: [3, 3] orthogonal; the colour in direction v becomes the colour in direction `matrix` v.
     """
     directions = sphere_lattice(_DIRECTIONS)
     after, before = evaluate_sh(degree, directions), evaluate_sh(degree, directions @ matrix)  # row v is Mᵀ v before

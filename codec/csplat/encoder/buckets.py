@@ -2,7 +2,7 @@
 
 A scene of up to `EncodeOptions.bucket_splats` splats is one bucket. For a larger scene, a sample of that size is
 analysed: all choices are made on it, and a Morton curve through it divides space into buckets. Each bucket is cut into
-tiles by itself, so that only one has to be in memory, and the file does not depend on the available memory.
+tiles by itself, so that only one bucket has to be in memory, and the file does not depend on the available memory.
 """
 
 from __future__ import annotations

@@ -252,8 +252,8 @@ def _steps(statistics: SceneStatistics, quality: float, sh_quality: float, *, ha
     """Choose the steps at which quantising one attribute leaves a PSNR of about `quality`, dB.
 
     The factors are medians over ten scenes of the step that leaves 50 dB, divided by the statistics; they scatter by a
-    quarter to a third (2 to 3 dB). The rate is lowest if every dimension has the same error; the differences between
-    attributes were found by search, with and without SH.
+    quarter to a third (2 to 3 dB). The rate is lowest if every dimension has the same error. The differences between
+    attributes were determined by search, with and without SH.
     """
     contrast = statistics.contrast
     for_quats, for_sh0 = (0.0, -2.0) if has_sh else (-1.5, 2.5)
@@ -354,7 +354,7 @@ def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, floa
 
 
 def _neighbour_runs(means: F32, centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
-    """Return runs of splats in Morton order: all of a small scene, some of a large one."""
+    """Return runs of splats in Morton order: all splats of a small scene, some splats of a large scene."""
     codes = np.empty(len(means), np.int64)
     scale, top = np.float32(min(1.0 / reach, _CELLS_MAX)), (1 << _CODE_BITS) - 1
     shift = np.float32(0.5) - (centre / reach).astype(np.float32)

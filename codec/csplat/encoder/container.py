@@ -87,7 +87,7 @@ class IndexedCodebook:
 
 @dataclass(frozen=True)
 class SceneFields:
-    """The contents of a file except tiles; the chunks may include one of nodes (`tree_chunk`)."""
+    """The contents of a file except tiles; the chunks may include the chunk of the nodes (`tree_chunk`)."""
 
     sh_degree: int
     scene_flags: int

@@ -22,7 +22,7 @@ from csplat.model import SplatModel, check_model
 from csplat.plugins import load_plugins
 from csplat.types import null_progress
 
-#: Levels of detail: their number above the scene; as many as bring it down to 4,096 splats; or what builds them.
+#: Levels of detail: their number above the scene, "auto" for as many as it takes to reach 4,096 splats, or a builder.
 Levels = int | Literal["auto"] | LevelBuilder | None
 _Progress = Callable[[str, float], None]
 

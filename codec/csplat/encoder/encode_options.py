@@ -30,7 +30,7 @@ class EncodeOptions:
             Sets all steps, instead of the preset.
         position_bits: bits per axis of a tile's box, 2 to 16; instead of the step chosen by quality.
         position_step: lattice step of the means, scene units, > 0; overrides `position_bits`. Distant splats may get a
-            coarser one; see the declared errors.
+            coarser step; see the declared errors.
         position_error: maximum displacement of a mean, scene units, > 0; overrides `position_step`. Tiles are split
             until none exceeds it; an `InputError` if float32 or the lattices of the format do not allow it.
         means_coding: "auto", "morton" or "axis".
@@ -43,12 +43,13 @@ class EncodeOptions:
         sh_degree: SH degree to keep, 0 to 4; `None` keeps all bands.
         sh_coding: "auto", "codebook", "scalar" or "none".
         codebook_size: number of entries of the SH codebook.
-        escape_fraction: fraction of the splats, those with the largest weighted errors, to escape from the SH codebook,
-            0 to 1.
+        escape_fraction: fraction of the splats to escape from the SH codebook, 0 to 1; the splats with the largest
+            weighted errors escape.
         shape_codebook_size: maximum number of entries of the codebook of shapes (rotation, and scales up to a common
             factor), which is used only if it makes the file smaller. Default: 0, no codebook.
-        shape_escape_fraction: fraction of the splats, those with the largest weighted errors, to escape from the shape
-            codebook. Default: chosen by rate and distortion if the importance has a metric of shapes, otherwise 0.05.
+        shape_escape_fraction: fraction of the splats to escape from the shape codebook; the splats with the largest
+            weighted errors escape. Default: chosen by rate and distortion if the importance has a metric of shapes,
+            otherwise 0.05.
         adaptive: how much coarser the SH of unimportant splats is, from 0 (not coarser) to 1 (squared error inversely
             proportional to importance). Default: 0 without an importance.
         max_classes: maximum number of quantisation classes, 1 to 5: splats whose errors are equally visible share
@@ -56,8 +57,8 @@ class EncodeOptions:
         tile_splats: maximum number of splats per tile, 1 to 65536. Decoders distribute tiles over cores: with 16384,
             scenes of few tiles decode 1.2 to 3.6 times as fast on four cores and take up to 1.2 % more bytes; 4096
             takes 3 to 6 % more.
-        bucket_splats: maximum number of splats of a bucket. Scenes of more are planned on a sample of that size, and
-            encoded bucket by bucket; a smaller number takes less memory, and finds worse steps and codebooks.
+        bucket_splats: maximum number of splats of a bucket. Larger scenes are planned on a sample of that size, and
+            encoded bucket by bucket. A smaller number takes less memory and leads to worse steps and codebooks.
         deflate_level: level of DEFLATE, 1 to 12 for libdeflate, 1 to 9 for zlib.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: write the model's extra columns.
@@ -73,7 +74,7 @@ class EncodeOptions:
         csplat.errors.InputError: preset is 'tiny', expected one of fast, balanced, small
 
     Raises:
-        InputError: a value is not one of those listed, or out of range.
+        InputError: a value is not in the list above, or out of range.
     """
 
     preset: PresetName = "balanced"

@@ -80,7 +80,7 @@ class EncodePlan:
         parameters: steps and codings; the SH coding may still be "auto".
         tiles: rows of the model and steps of each tile.
         extras: records of the extra columns to write.
-        shapes: the shape codebook, if there is one.
+        shapes: the shape codebook; `None` without a codebook.
         classes: quantisation classes of the splats, if there are several.
         sample: plan of the sample on which choices are made, for a scene of several buckets without importance.
         buckets: `BucketStore.rows` of such a scene.

@@ -42,7 +42,7 @@ _THREADED_MIN = 50_000  # splats; with fewer, starting threads takes longer than
 class FreeValues:
     """Values before quantisation, float32, which fine-tuning changes in place.
 
-    With a codebook, its rows are the entries, followed by the escaped splats; otherwise there is one row per splat.
+    With a codebook, its rows are the entries, followed by the escaped splats; otherwise there is a row per splat.
 
     Attributes:
         means: [N, 3].
@@ -110,12 +110,12 @@ class FixedQuantisation:
 
     @property
     def book(self) -> ShCodebook | None:
-        """The SH codebook, if there is one."""
+        """The SH codebook; `None` without a codebook."""
         return self.sh_plan.book
 
     @property
     def shapes(self) -> ShapeCodebook | None:
-        """The shape codebook, if there is one."""
+        """The shape codebook; `None` without a codebook."""
         return self.encode_plan.shapes
 
     def start(self) -> FreeValues:
@@ -153,7 +153,7 @@ class FixedQuantisation:
             progress: see `EncodePlan.of`.
 
         Returns:
-            Tiles that declare the errors against the source, except those of colours, which are refitted.
+            Tiles that declare the errors against the source, except the errors of colours, which are refitted.
         """
         shapes, quats, scales = self._shape_values(values)
         model, kept = self.encode_plan.model, values.sh.shape[1]

@@ -34,7 +34,7 @@ _Find = Callable[[F32, int, I64, F32], None]  # (rows [x, 1], index of the first
 Floats = NDArray[Any]
 
 _SEED_ROUNDS = (8, 2)  # rounds in which the initial entries are drawn, for few points and for many
-_FEW_POINTS = 1 << 14  # for more, 8 rounds lower the error by 0.3 %; for a few hundred extreme ones, by up to 40 %
+_FEW_POINTS = 1 << 14  # for more, 8 rounds lower the error by 0.3 %; for a few hundred extreme points, by up to 40 %
 _EXACT = 2.0**23  # float32 represents every multiple of 1/2 below this
 _PRODUCT = 1 << 18  # scores per matrix product, 1 MiB, which fits the second-level cache
 _PRODUCT_COLUMNS = 1024  # entries per matrix product
@@ -44,7 +44,7 @@ _REFINED_POINTS = 1 << 16  # minimum number of points of the last iteration, unl
 _REFINED_PER_ENTRY = 64  # the same, per entry
 _NEXT_GROUPS = 2  # groups searched if a near entry is known; 4 take a fifth longer for 0.2 to 0.6 % less RMS error
 _BLAS = threading.RLock()  # a BLAS has one thread count per process: one search at a time
-_CANDIDATES = 96  # candidates for a point: its entry and the nearest neighbours of that
+_CANDIDATES = 96  # candidates for a point: its entry and the nearest neighbours of this entry
 _REFINE_ROUNDS = 2  # iterations under the metric
 _METRIC_BLOCK = 1 << 12  # points per block of temporaries
 _RIDGE = 1e-3  # fraction of the mean diagonal; keeps an entry in place along directions its points do not determine
@@ -69,12 +69,12 @@ def cluster(
     Args:
         points: [N, D], lattice integers. Clip outliers first: if a norm exceeds about 2,300, all points are assigned
             on a coarser lattice.
-        weights: [N], finite and >= 0; only ratios matter; all zeros count as all ones.
+        weights: [N], finite and >= 0. Only ratios matter. If all are zero, all points weigh the same.
         size: maximum number of entries, > 0.
         seed: seed of the sample and of the initial entries, >= 0.
         iterations: k-means iterations on the sample.
         sample_per_entry: points of the sample per entry, > 0.
-        near_groups: see `assign`; once a point has an entry, `_NEXT_GROUPS` groups are searched for a nearer one.
+        near_groups: see `assign`; once a point has an entry, `_NEXT_GROUPS` groups are searched for a nearer entry.
         threads: see `assign`.
         progress: called with the number of iterations done and the total.
 
@@ -258,7 +258,7 @@ def reassign_by_metric(
         entries: [K, D, C].
         index: [N], the present entry of each point.
         threads: number of threads; no effect on the result.
-        candidates: number of entries compared, the present one and its nearest neighbours.
+        candidates: number of entries compared: the present entry and its nearest neighbours.
 
     Returns:
         The new index, [N].
@@ -418,7 +418,7 @@ def _relocate(
         keys = w[rows] * error[rows] / (1.0 - rng.random(len(rows)))
         rows = rows[np.argsort(keys, kind="stable")]
         drawn = np.zeros(len(entries), np.int64)
-        drawn[index[rows]] = rows  # the last one assigned is the point with the largest key
+        drawn[index[rows]] = rows  # the last point assigned has the largest key
         entries[cheap[:count]] = points[drawn[worst[:count]]]
 
 
@@ -553,7 +553,7 @@ def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
 
 @cache
 def _openblas() -> tuple[Callable[[], int], Callable[[int], object]] | None:
-    """Return the functions of NumPy's OpenBLAS that get and set its number of threads, if they are found."""
+    """Return the functions of NumPy's OpenBLAS that get and set its number of threads; `None` if unavailable."""
     core = sys.modules.get("numpy._core._multiarray_umath") or sys.modules.get("numpy.core._multiarray_umath")
     bundled = Path(np.__file__).parent.parent / "numpy.libs"
     paths = [str(getattr(core, "__file__", "")), *map(str, sorted(bundled.glob("*openblas*")))]

@@ -34,8 +34,8 @@ class LevelNode:
         parent: index of the parent; `None` for a root.
         rows: rows of the scene, for a leaf.
         splats: the splats of a coarser node, no more than its children have together.
-        error: pixel size from which on the node may replace the splats below it, scene units; at least that of each
-            child, 0 for a leaf.
+        error: pixel size from which on the node may replace the splats below it, scene units. At least as large as
+            the error of each child; 0 for a leaf.
     """
 
     level: int
@@ -54,7 +54,7 @@ class LevelBuilder(Protocol):
         ...
 
     def settings(self, count: int) -> dict[str, Any]:
-        """Return what the OPTS chunk of a scene of `count` splats states, JSON-compatible."""
+        """Return the entries of the OPTS chunk of a scene of `count` splats, JSON-compatible."""
         ...
 
     def seconds(self, count: int) -> float:
@@ -102,7 +102,7 @@ def encode_levels(
     All choices are made for the scene alone, so that level 0 has the same steps and codebooks as without other levels.
 
     Args:
-        plan: the plan of the scene; its tiles are replaced by those of the leaves.
+        plan: the plan of the scene; its tiles are replaced by the tiles of the leaves.
         nodes: the nodes, whose leaves hold each splat once.
         codebooks: SH codebooks, if the plan's SH coding is chosen; `None`: choose it now.
         progress: see `EncodePlan.of`.

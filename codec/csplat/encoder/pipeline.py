@@ -159,7 +159,7 @@ class EncodedTiles:
         codebooks: codebooks of the file.
         tiles: the tiles of the scene.
         errors: errors to declare.
-        nodes: nodes of the levels of detail with their tiles, by ascending level; none if there is one level.
+        nodes: nodes of the levels of detail with their tiles, by ascending level; empty if there is only one level.
     """
 
     plan: EncodePlan
@@ -176,7 +176,7 @@ class EncodedTiles:
         return index
 
     def against(self, source: SplatModel, decoded: SplatModel) -> EncodedTiles:
-        """Return the same tiles with declared errors that refer to another scene than the one encoded.
+        """Return the same tiles with declared errors that refer to another scene than the encoded scene.
 
         Args:
             source: the scene that the plan's `Origin` refers to.
@@ -212,7 +212,7 @@ class EncodedTiles:
     def write_to(
         self, stream: BinaryIO, metadata: Mapping[str, Any] | None = None, progress: Progress = null_progress
     ) -> EncodeReport:
-        """Write the file to a stream; arguments and errors are those of `write`."""
+        """Write the file to a stream; arguments and errors as in `write`."""
         settings = {**(metadata or {}), **encoding_settings(self.plan, self.codebooks.sh_plan)}
         chunks = file_chunks(self.plan, self.errors, settings)
         tiles = [part.tile for part in self.tiles]
@@ -304,7 +304,7 @@ def encode_tile(
         tile: rows and steps of the tile.
         parameters: lattices and codings of the file.
         sh_plan: SH coding of the file.
-        shapes: shape codebook of the file, if there is one.
+        shapes: shape codebook of the file; `None` without a codebook.
     """
     result = _TileResult(parameters, tile.factors)
     quantised = quantise_and_sort(model, tile, parameters)
@@ -425,7 +425,7 @@ def encoding_settings(plan: EncodePlan, sh_plan: ShCodingPlan) -> dict[str, Any]
 
 
 def declared_errors(errors: ErrorSums, origin: Origin) -> dict[str, tuple[float, float]]:
-    """Return (max, rms) by measure, without those of refitted values, whose errors have no meaning."""
+    """Return (max, rms) by measure, without errors of refitted values, which have no meaning."""
     declared = errors.declared()
     if not origin.refitted:
         return declared

@@ -229,7 +229,7 @@ def _narrowest(largest: float) -> type[np.signedinteger[Any]]:
 def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
     """Bring shapes into canonical axis order: scales descending, w the largest component of the rotation.
 
-    Permuting the axes of an ellipsoid, or turning it by 180° about one of them, changes rotation and scales but not the
+    Permuting the axes of an ellipsoid, or turning it by 180° about an axis, changes rotation and scales but not the
     covariance: 24 pairs, with two signs of the quaternion each, describe the same ellipsoid. In canonical order, the
     coding needs no index of the quaternion's largest component.
 
@@ -265,7 +265,7 @@ def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
 
 
 def _exchange_axes(swap: NDArray[np.bool_], turned: Quaternion, kept: Quaternion) -> Quaternion:
-    """Select the turned rotation, normalised, if axes are exchanged, and the old one otherwise."""
+    """Select the turned rotation, normalised, if axes are exchanged, and the old rotation otherwise."""
     root = np.float32(np.sqrt(0.5))
     w, x, y, z = (np.where(swap, new * root, old) for new, old in zip(turned, kept, strict=True))
     return w, x, y, z

@@ -7,7 +7,7 @@ different classes may overlap. The means then take more bytes, as they are less 
 colours take fewer, as they are similar within a class.
 
 Splats are clustered as in k-means, with the rate at equal distortion in place of squared distances (the Itakura-Saito
-divergence). Let the steps of class k differ from the chosen ones by o_ka octaves for attribute a, which has m_a
+divergence). Let the steps of class k differ from the chosen steps by o_ka octaves for attribute a, which has m_a
 integers. The cost of a splat with relative errors e_a, in bits, is
     Σ_a e_a 4^o_ka / (2 ln 2) - m_a o_ka.
 For the mean error ē_a of the class, it is least for o_ka = ½ log2(m_a / ē_a).
@@ -70,7 +70,7 @@ class QuantisationClasses:
 def choose_classes(
     model: SplatModel, blocks: GaussNewtonBlocks | None, parameters: CodingParameters, options: EncodeOptions
 ) -> tuple[CodingParameters, QuantisationClasses | None]:
-    """Assign the splats to classes, keeping the error of renders at about that of the chosen steps or below.
+    """Assign the splats to classes, keeping the error of renders at about the level of the chosen steps or below.
 
     Args:
         model: the scene.
@@ -88,7 +88,7 @@ def choose_classes(
     errors = rounding_errors(model, blocks, parameters)[:, [list(CLASSED_ATTRIBUTES).index(name) for name in free]]
     if not np.isfinite(errors).all():
         return parameters, None  # squares of the scene's coordinates are out of the range of float64
-    # One splat close to a camera must not determine the precision of all others.
+    # A single splat close to a camera must not determine the precision of all others.
     errors = np.minimum(errors, np.quantile(errors, _COMMON, axis=0))
     # The errors of attributes at their maximum levels exceed the target and are not counted.
     at_most = {"opacities": parameters.opacity_levels >= _LEVELS_MAX, "quats": parameters.quat_levels >= _LEVELS_MAX}
@@ -115,7 +115,7 @@ def _free_attributes(options: EncodeOptions) -> list[str]:
 
 
 def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
-    """Return the octaves [K, A] by which the steps of each class differ from the chosen ones, finest class first.
+    """Return the octaves [K, A] by which the steps of each class differ from the chosen steps, finest class first.
 
     Args:
         errors: [N, A], error of each splat and attribute at the chosen steps, relative to the target per integer.
@@ -163,7 +163,7 @@ def _assign_classes(errors: F64, integers: F64, octaves: F64) -> U8:
 def _as_steps(
     parameters: CodingParameters, index: U8, octaves: F64, free: Sequence[str]
 ) -> tuple[CodingParameters, QuantisationClasses | None]:
-    """Set the file's steps to those of the finest class, and express the others as multiples of them."""
+    """Set the file's steps to the steps of the finest class, and express coarser steps as multiples of them."""
     used = np.unique(index)
     if len(used) < 2:
         return parameters, None

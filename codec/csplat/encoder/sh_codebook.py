@@ -88,7 +88,7 @@ class ShCodingPlan:
     Attributes:
         weights: [N], importance; `None`: all splats have the same.
         reference: weight above which a splat is quantised on the full lattice.
-        book: the codebook, if there is one.
+        book: the codebook; `None` without a codebook.
         extras: names of the extra columns to write.
     """
 
@@ -169,7 +169,7 @@ def choose_sh_coding(
     trial: Rows,
     progress: Progress,
 ) -> tuple[CodingParameters, FileCodebooks]:
-    """Choose the SH coding, and train the codebook if there is one.
+    """Choose the SH coding, and train the codebook if the coding uses a codebook.
 
     Args:
         model: the scene.
@@ -178,8 +178,8 @@ def choose_sh_coding(
         weights: [N] float32, importance of the splats; `None` if no choice depends on it.
         metric: Gauss-Newton matrices of the coefficients; `None`: the identity, times the weights.
         measured: the weights are measured, not guessed from opacity and size.
-        is_sample: the model is a sample of the scene, on a part of which the codebook is trained. The assignment that
-            is returned is that of this part.
+        is_sample: the model is a sample of the scene, and the codebook is trained on part of the sample. The
+            returned assignment covers this part only.
         trial: rows of about a tile, on which scalar coding is tried.
         progress: called with the stage and the fraction done.
 
@@ -486,7 +486,7 @@ def _errors(
 def _choose_escapes(
     shN: F32, errors: F64, parameters: CodingParameters, options: EncodeOptions, error_weights: _ErrorWeights
 ) -> Rows:
-    """Return the splats to escape: those with the largest weighted errors, including all that were clipped.
+    """Return the splats to escape: the splats with the largest weighted errors, and all clipped splats.
 
     If weights are measured, rank by the reduction of the error instead, and escape no splat that gains nothing: an
     important splat may be near its entry, and the lattice of escapes is coarser.

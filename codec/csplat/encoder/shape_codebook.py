@@ -37,14 +37,14 @@ SHAPE_CODEBOOK_ID = 4
 
 _TRACE_STEPS = 2048  # lattice steps per trace; assignments are exact up to norms of about 2,300
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
-_ROUNDS = 2  # trainings; the escapes of one have no weight in the next
+_ROUNDS = 2  # trainings; splats that escape have no weight in the next training
 _METRIC_ROUNDS = 2  # iterations under the metric
 _CANDIDATES = 64  # entries tried for a splat under the metric
 _SUMMAND_MAX = 0.7  # log scale, beyond which the metric is not linear
 _LOG_SIZE_MAX = 30.0  # log scale to which size errors are clipped, to stay within float64
 _ESCAPES = 0.05  # fraction of the splats to escape if the importance has no metric
 _OFF_DIAGONAL_ROOTS = np.sqrt([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])  # each entry off the diagonal occurs twice
-_DIMENSIONS = 6  # dimensions of a shape: one more bit per splat divides the squared error by 2**(2/6)
+_DIMENSIONS = 6  # dimensions of a shape: an additional bit per splat divides the squared error by 2**(2/6)
 _STEPS_MAX = 2.0**20  # steps of the log scales, above which a tile's lattice may be coarser than the file's
 _CODEBOOK_ID_SIZE = 2  # bytes of a codebook id in a tile's record
 _OVERHEAD = 128  # bytes of records, heads and checksums of a codebook
@@ -350,7 +350,7 @@ def _cluster(
 
 
 def _assign(shapes: _ShapeInput, points: I16, entries: I32, parameters: CodingParameters, threads: int) -> I64:
-    """Return the nearest entry of each splat, [N], under the metric if there is one."""
+    """Return the nearest entry of each splat, [N], under the metric if the shapes have a metric."""
     decoded = _dequantise(entries, parameters)[0]
     index = search_nearest(points, _points(decoded).astype(np.int32), 0, threads)[0].astype(np.int64)
     if shapes.metric is None:
@@ -404,7 +404,7 @@ def _best_growth(target: F64, found: F64, metric: ErrorMetric) -> F64:
 
 
 def _worth_assigning(shapes: _ShapeInput, errors: F64, index: I64, summand: I32) -> Mask:
-    """Return True for the splats to assign: those whose assignment lowers D + λ R.
+    """Return True for the splats whose assignment lowers D + λ R.
 
     R is the entropy of the integers of a shape, or of index and summand. A scalar quantiser of 6 dimensions has
     D ∝ 2^(-2R/6), so λ = -dD/dR = 2 ln 2 / 6 · D with the mean distortion D without a codebook.

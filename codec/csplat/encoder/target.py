@@ -27,10 +27,10 @@ class Views(Protocol):
 
 @dataclass(frozen=True)
 class Target:
-    """The target of a file: one of the first four, or largest errors alone or together with a PSNR or a size.
+    """The target of a file: one of the first four fields, or largest errors alone or together with a PSNR or a size.
 
-    A PSNR is that of the squared error pooled over views, pixels and channels, of renders clipped to 0..1, and at most
-    99 dB. A target differs in the views, and in the reference that renders are compared with:
+    A PSNR is computed from the squared error of renders clipped to 0..1, pooled over views, pixels and channels. It is
+    at most 99 dB. Targets differ in the views and in the reference that renders are compared with:
 
     | target | of | views | reference |
     |---|---|---|---|
@@ -110,7 +110,7 @@ class Target:
         """Refuse a target that a command cannot meet.
 
         Args:
-            command: what meets the target, for the message.
+            command: name of the command, for the message.
             names: fields that it can meet.
 
         Raises:

@@ -24,7 +24,7 @@ Rows = NDArray[np.intp]
 Integers = NDArray[Any]
 
 _OWN_TILE_MIN = 48  # splats; a smaller tile takes more bytes than a coarser lattice would lose
-_FINER_MAX = 3  # halvings of a tile's step; after two, errors are those of rounding to float32
+_FINER_MAX = 3  # halvings of a tile's step; after two, only the errors of rounding to float32 remain
 _FINEST = 2.0**45  # maximum number of steps from zero to a tile's far corner; float32 resolves 2**24
 _OUTLIER_BLOCK = 1 << 14  # splats per block of temporaries
 
@@ -69,8 +69,9 @@ def cut_scene(
 ) -> list[TileSplats]:
     """Partition a scene into tiles: by bucket, by class, by outliers, and by space.
 
-    An outlier is a value that does not fit the file's lattice and would coarsen that of up to 65,535 other splats in
-    its tile. Splats with outliers in the same attributes share tiles, after the other tiles of their class or bucket.
+    An outlier is a value that does not fit the file's lattice and would coarsen the lattice of up to 65,535 other
+    splats in its tile. Splats with outliers in the same attributes share tiles, after the other tiles of their class or
+    bucket.
 
     Args:
         model: the scene.

@@ -58,7 +58,7 @@ _PLY, _CSPLAT = "ply", "csplat"  # `read` calls their own readers, which load a 
 
 
 def formats() -> tuple[Format, ...]:
-    """Return all formats: first the built-in ones, then those of plugins (`csplat.plugins`)."""
+    """Return all formats: first the built-in formats, then the formats of plugins (`csplat.plugins`)."""
     return (*_own_formats().values(), *load_plugins("csplat.formats").values())
 
 
@@ -134,9 +134,9 @@ def open(
 ) -> Scene:
     """Open a scene in any format; its splats are read when they are needed.
 
-    Of a `.csplat` file, only header and index are read, and the scene is a `SplatFile`, of which parts can be read. A
-    file of another format is read from disk; one at a URL is downloaded, and an open file or bytes are copied to a
-    temporary file.
+    If the file is a `.csplat` file, only header and index are read, and the scene is a `SplatFile`, which can read
+    parts of the file. A file of another format is read from disk. If it is at a URL, it is downloaded; an open file or
+    bytes are copied to a temporary file.
 
     Args:
         file: path of a file or folder; a URL that fsspec supports (`https://…`, `s3://…`; requires the extra `remote`);
@@ -175,7 +175,7 @@ def open(
             store = open_store(file, storage)
             stack.callback(store.close)
             (head,) = store.read([(0, min(store.size, store.sizes.first))])
-            if MAGIC.startswith(head[: len(MAGIC)]):  # of an empty file, too, whose error is that of `decode`
+            if MAGIC.startswith(head[: len(MAGIC)]):  # an empty file, too: the error is the same as in `decode`
                 opened = SplatFile(store, limits or Limits(), head)
                 return _version_of(_CSPLAT_FORMAT, opened, store.name, level, max_splats, sh_degree).keep_open(
                     stack.pop_all()
@@ -203,7 +203,7 @@ def lint_file(path: Path) -> list[Finding]:
         path: path of the file.
 
     Returns:
-        Findings in the order of reading; the last one is an error if `read` would refuse the file.
+        Findings in the order of reading; the last finding is an error if `read` would refuse the file.
 
     Raises:
         InputError: csplat cannot read the format, or cannot parse the header.
@@ -226,13 +226,13 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
     """Write a scene in any format.
 
     Args:
-        path: path of the file; it appears when complete, replacing an older one.
+        path: path of the file; it appears when complete, replacing an older file.
         model: the scene.
         format: name of the format, if the suffix of the path does not identify it.
 
     Returns:
-        What the format cannot hold, apart from precision: parts of the scene, values beyond its ranges, positions that
-        are rounded visibly. Empty if that is nothing.
+        Findings about everything that the format cannot hold, apart from precision: parts of the scene, values beyond
+        its ranges, positions that are rounded visibly. Empty if the format holds everything.
 
     Examples:
         >>> import csplat
@@ -248,7 +248,7 @@ def write(path: str | os.PathLike[str], model: SplatModel, format: str | None = 
 
 
 def write_scene(path: str | os.PathLike[str], scene: Scene, format: str | None = None) -> list[Finding]:
-    """Write a scene block by block; arguments and result are those of `write`."""
+    """Write a scene block by block; arguments and result are the same as in `write`."""
     return write_levels(path, [scene], format)
 
 
@@ -264,7 +264,7 @@ def write_levels(path: str | os.PathLike[str], levels: Sequence[Scene], format: 
         As in `write`.
 
     Raises:
-        InputError: as in `write`, or the format has one level and there are several.
+        InputError: as in `write`, or the format has only one level and there are several.
         OSError: the file cannot be written.
     """
     target = Path(path)

@@ -203,7 +203,8 @@ class ClampStatistics:
 
         Args:
             title: title of the format.
-            holders: returns the names of other formats that hold values of an attribute from a least to a largest one.
+            holders: called with an attribute and its least and largest value; returns the names of other formats that
+                hold such values.
         """
         findings = []
         for name in ARRAYS:
@@ -212,7 +213,7 @@ class ClampStatistics:
             values = sum(statistics.below + statistics.above for _, statistics in watched)
             if not rows:
                 continue
-            # Of several scenes, the text describes the one with the largest error.
+            # Of several scenes, the text describes the scene with the largest error.
             error, stored, worst = max(
                 (
                     (max(stored.low - statistics.least, statistics.most - stored.high), stored, statistics)
@@ -321,7 +322,7 @@ _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
 
 
 def crossed_bounds(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return a mask of the lower bounds that exceed their upper bound by more than one float32 rounding."""
+    """Return a mask of the lower bounds that exceed their upper bound by more than a float32 rounding."""
     above: NDArray[np.bool_] = low > np.nextafter(high.astype(np.float32), np.float32(np.inf))
     return above
 
@@ -395,7 +396,8 @@ def sorted_shells(scene: Scene, folder: Path) -> Iterator[list[Scene]]:
     """Sort a scene like `sorted_along_curve`, and divide it by the distance from its middle.
 
     Yields:
-        The splats around the middle, then those in shells, each 16 times as wide as the one before, that contain any.
+        The splats around the middle, then the splats of each shell that contains any; a shell is 16 times as wide as
+        the previous shell.
     """
     curve = _ZCurve.through(scene)
     with sorted_parts(scene, folder, curve.codes, curve.splits) as parts:
@@ -412,7 +414,7 @@ class SortedParts:
     """A scene that is sorted by keys and divided.
 
     Attributes:
-        empty: the model of none of the splats, without extra columns.
+        empty: the model without splats or extra columns.
         counts: number of splats of each part.
         rows: returns the parts from one index to another as rows for `scene_of_rows`, one by one.
     """

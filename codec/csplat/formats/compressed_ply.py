@@ -35,7 +35,7 @@ from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, U8, U32
 
 _CHUNK = 256  # splats that share bounds
-_LARGEST_LOG = 20.0  # log scales are clipped to ± this: a larger one would use up the precision of its chunk
+_LARGEST_LOG = 20.0  # log scales are clipped to ± this: a larger scale would use up the precision of its chunk
 _LARGEST_BOUND = 9e37  # largest colour bound: a coefficient is 3.5 times that, and float32 ends at 3.4e38
 _BANDS = (9, 24, 45, 72)  # number of SH columns by degree, 1 to 4
 _TYPES = {

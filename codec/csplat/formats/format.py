@@ -23,8 +23,8 @@ OpenScene = Callable[[Path], AbstractContextManager[Scene]]
 OpenLevel = Callable[[Path, int, int | None], AbstractContextManager[Scene]]
 OpenBands = Callable[[Path, int], AbstractContextManager[Scene]]  # highest SH degree to read
 # Writing raises InputError if the format cannot represent the scene (too many splats, positions out of range), OSError
-# if the file cannot be written. The path appears when the file is complete. Returned are findings about values that the
-# format stores badly, apart from those outside `Format.ranges`; or nothing.
+# if the file cannot be written. The path appears when the file is complete. Returns findings about values that the
+# format stores badly, apart from values outside `Format.ranges`; or nothing.
 WriteScene = Callable[[Path, Scene], Sequence[Finding] | None]
 WriteLevels = Callable[[Path, Sequence[Scene]], Sequence[Finding] | None]  # the levels of a scene, finest first
 
@@ -55,10 +55,10 @@ class Format:
     Attributes:
         name: name for `--from` and `--to`, a key of `csplat.detect.KINDS`, for example `spz`.
         open: opens a file; `None`: csplat does not read the format.
-        open_level: opens a level of detail; `None`: scenes have one level.
+        open_level: opens a level of detail; `None`: scenes have only one level.
         open_bands: opens a file without the SH bands above a degree; `None`: `open` reads all bands.
         write: writes a file; `None`: csplat does not write the format.
-        write_levels: writes all levels of detail to a file of the name `levels_name`; `None`: files have one level.
+        write_levels: writes all levels of detail to a file of the name `levels_name`; `None`: one level only.
         levels_name: name of files with levels, in lower case; "" if there are none.
         doubt: for formats identified by the file name alone: returns the reason why the content is unlikely to be of
             this format, "" if it may be.
@@ -94,7 +94,7 @@ class Format:
 
     @property
     def suffixes(self) -> tuple[str, ...]:
-        """File name suffixes with their dots, in lower case, the usual one first."""
+        """File name suffixes with their dots, in lower case, the usual suffix first."""
         return KINDS[self.name].suffixes
 
     def takes_levels(self, path: Path) -> bool:

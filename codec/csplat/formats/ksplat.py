@@ -41,7 +41,7 @@ _LARGEST = 1e38  # larger values exceed float32
 
 @dataclass(frozen=True, eq=False)
 class _Section:
-    """A section: splats whose rows have one type.
+    """A section: splats whose rows have the same type.
 
     Attributes:
         rows: [N], structured.
@@ -134,7 +134,7 @@ def _row_type(level: int, degree: int) -> np.dtype[Any]:
 
 
 def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Section], int]:
-    """Return the sections and the offset after the last one."""
+    """Return the sections and the offset after the last section."""
     sections: list[_Section] = []
     at = _HEADER_SIZE + most * _SECTION_SIZE
     if at > len(data):

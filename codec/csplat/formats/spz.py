@@ -1,4 +1,4 @@
-"""SPZ of Niantic and Adobe, versions 1 to 4: fixed-point positions, bytes for the rest, one attribute after the other.
+"""SPZ of Niantic and Adobe, versions 1 to 4: fixed-point positions, bytes for the rest, attribute by attribute.
 
 Versions 1 to 3 are a single gzip stream, version 4 has a Zstandard stream per attribute. The axes are right, up, back
 (https://github.com/nianticlabs/spz) unless an extension specifies others. Some converters store scenes along other axes
@@ -163,7 +163,7 @@ def _parse_header(name: str, size: int, stream: BinaryIO) -> SpzArrays:
 
 
 def _read_arrays(packed: SpzArrays, _size: int, stream: BinaryIO) -> None:
-    """Read versions 1 to 3: one attribute after the other, then extensions."""
+    """Read versions 1 to 3: all attributes in turn, then extensions."""
     _fill(packed.name, stream, packed.allocate()[_HEADER.size :])
     tail = stream.read(_EXTENSION_BYTES + 1)  # up to the end, where gzip verifies its checksum
     if len(tail) > _EXTENSION_BYTES:
@@ -315,7 +315,7 @@ def _decode_first_three(rotations: U8) -> F32:
 
 
 def _decode_rotations(rotations: U8) -> F32:
-    """Decode the three smallest of x y z w: ten bits each, sign and magnitude, the first one in the highest bits."""
+    """Decode the three smallest of x y z w: ten bits each, sign and magnitude, the first in the highest bits."""
     words = rotations.view("<u4")[:, 0]
     fields = (words[:, None] >> np.array([20, 10, 0], np.uint32)).astype(np.int32)
     sizes = fields & 511

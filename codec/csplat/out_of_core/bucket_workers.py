@@ -72,7 +72,7 @@ def code_buckets(
     Args:
         coding: parameters of all buckets.
         buckets: the buckets to code.
-        workers: number of processes; 1: only this one.
+        workers: number of processes; 1: only this process.
         scheduler: address of a Dask scheduler, whose workers code instead, and access the working folder under the
             same path; Dask repeats the work of a lost worker.
 

@@ -2,7 +2,7 @@
 
 Each section of the bucket curve has a spill file; a large section is split into several buckets, which are ranges of
 its splats. A spill file is a sequence of frames: number of splats, CRC, and a record of all values of each splat. Files
-use the byte order of the machine, which is also the one that reads them.
+use the byte order of the machine, because the same machine reads them.
 """
 
 from __future__ import annotations

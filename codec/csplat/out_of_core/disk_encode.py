@@ -40,12 +40,12 @@ _CODED = 0.3  # maximum size of a file, as a multiple of the size of its arrays
 #: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
 #: 30 M of degree 3. Degree 4 takes 1.13 times the CPU time of degree 3 (300,000 splats in memory).
 _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0), (0.65, 9.0, 22.5))
-# Levels of detail: memory of building those of a bucket, for each process: renders, a multiple of the size of its
-# arrays, and bytes per splat; size of the file relative to one without.
+# Levels of detail. Memory of each process for building the levels of a bucket: renders, a multiple of the size of its
+# arrays, and bytes per splat. Size of the file relative to a file without levels.
 _LEVEL_RENDERS, _LEVEL_ROWS, _LEVEL_SPLAT = 200 * _MB, 2.0, 600
 _LEVEL_SIZE = 1.35
 _NAME_BYTES_MAX = 250  # bytes of a file's name with which `.work` fits into the 255 of file systems
-_NAME_PART = 60  # characters of a longer one that are kept: at most 240 bytes
+_NAME_PART = 60  # characters of a longer name that are kept: at most 240 bytes
 #: Bytes per splat of a file, by preset and SH degree 0 to 4.
 _FILE_BYTES = {
     "fast": (9.0, 9.5, 10.0, 11.0, 11.3),
@@ -159,7 +159,7 @@ def estimate_cost(
 
 
 def _building_bytes(count: int, row: int) -> int:
-    """Return the memory for the levels of splats that are built together, in addition to that of their encoding."""
+    """Return the memory for building the levels of some splats together, in addition to encoding them."""
     return _LEVEL_RENDERS + int(count * (row * _LEVEL_ROWS + _LEVEL_SPLAT))
 
 
@@ -173,7 +173,7 @@ def encode_scene(
     source: Mapping[str, Any] | None = None,
     progress: Progress | None = None,
 ) -> EncodeReport:
-    """Encode a scene that is read block by block; the bytes are those of `encode`.
+    """Encode a scene that is read block by block; the bytes are the same as with `encode`.
 
     A scene that does not fit in memory is sorted into buckets of neighbours in a working folder on disk. The buckets
     are coded one by one, by `options.threads` processes. If the encoding is interrupted, finished work stays in the

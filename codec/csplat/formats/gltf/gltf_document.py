@@ -35,7 +35,7 @@ _VERSION = 2
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _TRANSFORM = {"matrix", "rotation", "scale", "translation"}  # properties of a node
-_MAX_PRIMITIVES = 1 << 14  # primitives shown by all nodes: a small file could reference one mesh very often
+_MAX_PRIMITIVES = 1 << 14  # primitives shown by all nodes: a small file could reference a mesh very often
 _NO_TRANSLATION = (0.0, 0.0, 0.0)
 _INSTANCING = "EXT_mesh_gpu_instancing"
 
@@ -130,7 +130,7 @@ class GltfDocument:
         return number
 
     def item(self, key: str, index: object) -> dict[str, Any]:
-        """Return an object from one of the top-level lists.
+        """Return an object from a top-level list.
 
         Raises:
             InputError: there is no object with that index.
@@ -289,7 +289,7 @@ class GltfDocument:
         return f"{len(scenes)} scenes and no default: scene {labels[0]} is read, {shown} not"
 
     def instances(self, placed: PlacedPrimitive) -> NDArray[np.float64]:
-        """Return the matrices [I, 4, 4] from a primitive to the world: one per instance of EXT_mesh_gpu_instancing."""
+        """Return the matrices [I, 4, 4] from a primitive to the world, for each instance of EXT_mesh_gpu_instancing."""
         extension = _extension(placed.node, _INSTANCING)
         if not extension:
             return placed.matrix[None]

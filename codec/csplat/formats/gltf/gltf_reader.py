@@ -6,7 +6,7 @@ The SPZ extension specifies that positions are unpacked along LUF; CesiumJS and 
 bounds of POSITION, which glTF requires, tell the two cases apart.
 
 Colours in linear light are fitted to sRGB. The transfer function of sRGB (IEC 61966-2-1) turns SH into functions that
-are no longer SH of finite degree, so the nearest SH of the same degree are found by least squares. At degree 0 the
+are no longer SH of finite degree, so the nearest SH of the same degree are fitted by least squares. At degree 0 the
 result is exact except for negative light. Splats blended in linear light look different from splats blended in sRGB;
 colours cannot correct that.
 """
@@ -112,7 +112,7 @@ class _GltfReading:
     unpacked_bytes: int = 0
 
     def instances(self, placed: PlacedPrimitive) -> Iterator[_Instance]:
-        """Yield each instance of a primitive; none if the primitive has no splats."""
+        """Yield each instance of a primitive; nothing if the primitive has no splats."""
         json_path = (*placed.json_path, "extensions")
         extensions = self.file.get(placed.primitive, placed.json_path, "extensions", dict, {})
         extension = self.file.get(extensions, json_path, EXTENSION, dict, {})
@@ -140,7 +140,7 @@ class _GltfReading:
             self.count += count
             self.statistics.nonfinite += bad
             self.infinite += infinite
-            # A small file could reference one mesh very often.
+            # A small file could reference a mesh very often.
             if self.count > self.file.size() + sum(arrays.count for arrays in self.packed.values()):
                 shown = f"shows at least {counted(self.count, 'splat')}, more than it has bytes"
                 raise InputError(f"{self.file.path.name} {shown}")

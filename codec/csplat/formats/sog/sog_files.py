@@ -23,7 +23,7 @@ from csplat.lint import Finding
 _LARGEST_JSON = 1 << 25  # bytes
 _LARGEST_PART = 1 << 30  # bytes
 _LONGEST_NAME = 200  # characters
-_ONE, _LEVELS = "meta.json", "lod-meta.json"  # manifests of one scene, and of a scene in levels
+_ONE, _LEVELS = "meta.json", "lod-meta.json"  # manifests of a single scene, and of a scene in levels
 _OF_MACOS = "__MACOSX"  # folder with file attributes that macOS adds to zips
 _NAMED = 5  # maximum number of scenes that a message lists
 _EXPANSION = 4  # maximum expansion of a zip member: images and short texts do not compress further
@@ -68,7 +68,7 @@ class _ZipDirectory:
         return []
 
     def read(self, info: zipfile.ZipInfo) -> bytes:
-        """Unpack a member; raises one of `DAMAGED` if that fails."""
+        """Unpack a member; raises an error in `DAMAGED` if that fails."""
         if self._archive is not None:
             return self._archive.read(info)
         with zipfile.ZipFile(self._path) as archive:
@@ -79,7 +79,7 @@ class _ZipDirectory:
             return zipfile.ZipFile(self._path)
         except DAMAGED as error:
             reason = " ".join(str(error).split())[:120] or type(error).__name__
-            if "not a zip file" in reason:  # it begins like one
+            if "not a zip file" in reason:  # it begins like a zip
                 reason = "its end is missing, where its list of files is"
             raise InputError(f"{self._title}: a damaged zip: {reason}: copy or download it again") from None
 
@@ -95,7 +95,7 @@ _NAME_KEYS: tuple[Callable[[str], str], ...] = (str, use_slashes, lambda name: u
 
 @dataclass(frozen=True)
 class SogParts:
-    """The files of one SOG, called parts, by name.
+    """The files of a SOG, called parts, by name.
 
     Attributes:
         path: path of the folder or zip.

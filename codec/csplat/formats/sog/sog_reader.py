@@ -1,7 +1,8 @@
 """Read SOG, versions 1 and 2, and levels of streamed SOG.
 
 A byte of an image interpolates between two bounds in version 1, and indexes a codebook in version 2. Follows
-`read-sog.ts` and `read-sog-v1.ts` of splat-transform (MIT). The axes are those of the PLY that was converted to SOG.
+`read-sog.ts` and `read-sog-v1.ts` of splat-transform (MIT). The axes are the same as in the PLY that was converted to
+SOG.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def read_leaf_numbers(path: Path, level: int = 0) -> I64:
     """Return the leaf of each splat of a level of streamed SOG, in the order of `open_sog`.
 
     Leaves are numbered in the order of the tree; splats of the environment have the number after the last. A leaf
-    without a level has that of the next coarser one, else of its coarsest.
+    without the level is represented by its next coarser level, else by its coarsest.
 
     Raises:
         InputError: the file is no streamed SOG, or damaged.
@@ -95,7 +96,7 @@ def _list_findings(images: SogImages) -> list[Finding]:
 
 
 def _open_streamed(parts: SogParts, meta: JsonValue, level: int, max_splats: int | None) -> Scene:
-    """Open a level of streamed SOG with its environment; blocks are read one file at a time.
+    """Open a level of streamed SOG with its environment; blocks are read file by file.
 
     With `max_splats`, open the finest level of at most this number of splats, else the coarsest.
     """
@@ -180,7 +181,7 @@ def _read_leaves(parts: SogParts, meta: JsonValue) -> tuple[list[str], list[dict
 
 
 def _range_at(leaf: dict[int, _Range], level: int) -> _Range:
-    """Return the range of a leaf at a level, else at the next coarser one, else at its coarsest."""
+    """Return the range of a leaf at a level, else at the next coarser level, else at its coarsest."""
     return leaf[min((lod for lod in leaf if lod >= level), default=max(leaf))]
 
 
@@ -214,7 +215,7 @@ _SPARE = 1 << 16  # pixels that an image may have in addition to four per splat
 
 @dataclass(frozen=True)
 class SogMeta:
-    """The checked JSON of one SOG.
+    """The checked JSON of a SOG.
 
     Attributes:
         count: N.

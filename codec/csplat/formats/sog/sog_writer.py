@@ -74,7 +74,7 @@ class SogLosses:
     moved: MovedSplats = field(default_factory=MovedSplats)
 
     def findings(self, metadata: SceneMetadata) -> list[Finding]:
-        """Return the findings; `metadata` is that of the scene."""
+        """Return the findings; `metadata` is the metadata of the scene."""
         both = metadata.antialiased and metadata.flat
         lost = [Finding("lost-contents", 1, "SOG cannot hold that splats are discs and antialiased", "loss")] * both
         clamped = self.clamped.findings("the 256 codes of SOG", lambda *_: ("ply", "gltf", "csplat"))

@@ -1,7 +1,7 @@
 """Write streamed SOG, version 1: a scene in levels of detail, which viewers load part by part.
 
 Follows https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/streamed-sog. A binary tree cuts space
-into leaves. Each has, for each level, a run of splats in Morton order in a SOG, a *chunk*; a viewer draws one level of
+into leaves. Each has, for each level, a run of splats in Morton order in a SOG, a *chunk*. A viewer draws one level of
 each leaf. Here, a splat of any level belongs to the leaf in which its centre lies, as in the files of splat-transform.
 
 `errors` are not written, as by default in splat-transform. They are relative squared errors of renders of a leaf, while
@@ -48,7 +48,7 @@ class _Cut:
 
     Attributes:
         axis, place: positions with a coordinate below `place` are in `low`, the others in `high`.
-        low, high: the children; a number is that of a leaf.
+        low, high: the children: further cuts, or numbers of leaves.
     """
 
     axis: int
@@ -82,8 +82,8 @@ def write_streamed_sog(path: Path, levels: Sequence[Scene]) -> list[Finding]:
 
     Args:
         path: path of the lod-meta.json. Its folder is new, empty, or a streamed SOG, which is replaced.
-        levels: the levels, finest first; their blocks are read twice, those of the finest three times. Levels from
-            the first without splats on are left out.
+        levels: the levels, finest first; their blocks are read twice, the blocks of the finest level three times. The
+            first level without splats and all after it are left out.
 
     Raises:
         InputError: there are no splats, the folder contains other files, or Pillow is not installed.
