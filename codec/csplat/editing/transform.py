@@ -189,7 +189,7 @@ def _rotation_to(metadata: SceneMetadata, axes: str) -> F64:
 
 
 def _tilt(start: F64, end: F64) -> F64:
-    """Return the smallest rotation that takes a unit vector to another."""
+    """Return the smallest rotation, [3, 3], that takes a unit vector [3] to another."""
     axis, cosine = np.cross(start, end), float(start @ end)
     if cosine < -1.0 + 1e-12:  # half a turn about any perpendicular axis
         axis = np.eye(3)[int(np.abs(start).argmin())]
@@ -201,7 +201,7 @@ def _tilt(start: F64, end: F64) -> F64:
 
 
 def _multiply_rows(matrix: F64, rows: _Rows) -> _Rows:
-    """Multiply each row by a square matrix; exact if it only permutes and flips axes."""
+    """Multiply rows [..., D] by a matrix [D, D]; exact if it only permutes and flips axes."""
     order = np.abs(matrix).argmax(axis=1)
     signs: F64 = matrix[np.arange(len(matrix)), order]
     out = np.empty_like(rows)
@@ -217,7 +217,7 @@ def _multiply_rows(matrix: F64, rows: _Rows) -> _Rows:
 
 
 def _rotate_shapes(model: SplatModel, matrix: F64) -> tuple[F32, F32]:
-    """Return rotations and scales; a permutation of axes permutes the scales, which is exact."""
+    """Return quats [N, 4] and scales [N, 3]; a permutation of axes permutes the scales, which is exact."""
     proper = matrix * np.sign(np.linalg.det(matrix))
     order = np.abs(matrix).argmax(axis=1)
     whole = np.count_nonzero(matrix) == 3
@@ -241,6 +241,7 @@ def _quats_of(matrix: F64) -> F64:
 
 
 def _matrices(quats: F32) -> F64:
+    """Return the rotation matrices [N, 3, 3] of quaternions [N, 4]."""
     w, x, y, z = normalise_quats(quats).astype(np.float64).T
     rows = [
         [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
@@ -251,7 +252,7 @@ def _matrices(quats: F32) -> F64:
 
 
 def _left_product(quat: F64) -> F64:
-    """Return the matrix of the left multiplication by a quaternion."""
+    """Return the matrix, [4, 4], of the left multiplication by a quaternion [4]."""
     w, x, y, z = quat
     return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
 

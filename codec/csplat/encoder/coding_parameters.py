@@ -328,7 +328,7 @@ def _sample_rows(count: int) -> NDArray[np.intp]:
 
 
 def _reach(means: F32) -> tuple[F64, float]:
-    """Return a sample of the means, and the radius around their median that contains 80 % of them."""
+    """Return a sample [n, 3] of the means, and the radius around their median that contains 80 % of it."""
     points = np.take(means, _sample_rows(len(means)), axis=0).astype(np.float64)
     distance = points - np.median(points, axis=0)
     top = float(np.abs(distance).max())

@@ -326,7 +326,7 @@ def _check_points(points: I16 | I32, weights: F32 | None) -> F64:
 
 
 def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64, F64]:
-    """Draw a weighted sample of rows; return the rows, and weights whose sums are unbiased.
+    """Draw a sample of rows by weights w [N]; return the rows, and weights whose sums are unbiased.
 
     With uniform u, the rows with the largest priorities w / u are kept, and each counts max(w, τ), where τ is the
     largest priority left out (Duffield, Lund, Thorup, "Priority sampling for estimation of arbitrary subset sums").
@@ -341,7 +341,7 @@ def _priority_sample(w: F64, count: int, rng: np.random.Generator) -> tuple[I64,
 
 
 def _largest(keys: F64, count: int) -> I64:
-    """Return the rows of the `count` largest keys, ascending."""
+    """Return the rows of the `count` largest keys [N], ascending."""
     limit = np.partition(keys, len(keys) - count)[len(keys) - count]
     rows = np.flatnonzero(keys >= limit)
     same = np.flatnonzero(keys[rows] == limit)  # `argpartition` would choose others of these on other processors
@@ -349,7 +349,7 @@ def _largest(keys: F64, count: int) -> I64:
 
 
 def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
-    """Draw up to `count` distinct rows, with a probability that grows with their importance."""
+    """Draw up to `count` distinct rows, with a probability that grows with their importance, [N]."""
     count = min(count, int(np.count_nonzero(importance)))
     if count == 0:
         return np.empty(0, np.int64)
@@ -376,7 +376,7 @@ def _first_entries(
 
 
 def _move_to_means(points: I16 | I32, w: F64, index: U32, entries: I32) -> I32:
-    """Move each entry to the centroid of its points, rounded; entries without weight stay."""
+    """Move each entry [K, D] to the centroid of its points [N, D], rounded; entries without weight stay."""
     where = index.astype(np.int64)
     total = np.bincount(where, w, len(entries))
     moved = entries.copy()
@@ -423,6 +423,7 @@ def _relocate(
 
 
 def _distinct(rows: I16 | I32) -> tuple[I32, U32]:
+    """Return the distinct rows [K, D] of rows [N, D], and the index of each row among them, [N]."""
     distinct, index = np.unique(rows, axis=0, return_inverse=True)
     return distinct.astype(np.int32), index.reshape(-1).astype(np.uint32)
 
@@ -443,6 +444,7 @@ def _shift(points: I16 | I32, entries: I32) -> int:
 
 
 def _largest_norm(rows: I16 | I32) -> float:
+    """Return the largest Euclidean norm of rows [N, D]."""
     largest = 0.0
     for a in range(0, len(rows), _BLOCK):
         part = rows[a : a + _BLOCK].astype(np.float64)
@@ -537,7 +539,7 @@ def _keep_better(rows: I64, scores: F32, first: int, index: I64, best: F32) -> N
 
 
 def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
-    """Cluster the entries into about sqrt(K) groups by plain k-means; return centroids and labels."""
+    """Cluster entries [K, D] into about sqrt(K) groups by plain k-means; return centroids and labels [K]."""
     count = math.isqrt(len(entries))
     rows = entries.astype(np.int32)
     centres = rows[np.arange(count) * len(rows) // count]

@@ -54,7 +54,7 @@ class LevelBuilder(Protocol):
         ...
 
     def settings(self, count: int) -> dict[str, Any]:
-        """Return the entries of the OPTS chunk of a scene of `count` splats, JSON-compatible."""
+        """Return the value of `levels` in the OPTS chunk of a scene of `count` splats, JSON-compatible."""
         ...
 
     def seconds(self, count: int) -> float:
@@ -122,12 +122,12 @@ def encode_levels(
     plan = replace(plan, tiles=[tile for tiles in of_leaves for tile in tiles])
     encoded = encode_tiles(plan, codebooks, progress=progress)
     parts = iter(encoded.tiles)
-    made = {number: [next(parts).tile for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
+    tiles_by_node = {number: [next(parts).tile for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
     coarse = [number for number, node in enumerate(nodes) if node.level]
     for done, number in enumerate(coarse):
-        made[number] = encode_coarse(nodes[number], plan, codebooks)
+        tiles_by_node[number] = encode_coarse(nodes[number], plan, codebooks)
         progress("levels", (done + 1) / len(coarse))
-    tree = [FileNode(node.parent, made[number], node.error) for number, node in enumerate(nodes)]
+    tree = [FileNode(node.parent, tiles_by_node[number], node.error) for number, node in enumerate(nodes)]
     return replace(encoded, nodes=order_nodes(tree))
 
 

@@ -138,7 +138,7 @@ def _cluster_octaves(errors: F64, integers: F64, count: int) -> F64:
 
 
 def _octaves(errors: F64, classes: U8, integers: F64) -> F64:
-    """Return the octaves of each used class at which an integer adds an error of 1 on average."""
+    """Return the octaves [K, A] of each used class at which an integer adds an error of 1 on average."""
     counts = np.bincount(classes)
     sums = np.stack([np.bincount(classes, column) for column in errors.T], axis=1)
     means = sums[counts > 0] / counts[counts > 0, None]

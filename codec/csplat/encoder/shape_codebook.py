@@ -331,7 +331,7 @@ def _vectors(covariances: F64) -> F64:
 
 
 def _points(covariances: F64) -> I16:
-    """Return `_vectors` rounded to the lattice of k-means."""
+    """Return `_vectors`, [N, 6], rounded to the lattice of k-means."""
     return np.rint(_vectors(covariances) * _TRACE_STEPS).astype(np.int16)
 
 

@@ -190,8 +190,10 @@ def _unpack(words: NDArray[Any], bounds: NDArray[Any], sh: NDArray[Any] | None, 
     if sh is not None and kept:
         names = sh.dtype.names or ()
         codes = sh.view(np.uint8).reshape(count, len(names))  # all columns are bytes, without gaps
-        each = len(names) // 3
-        columns = [names.index(f"f_rest_{channel * each + index}") for channel in range(3) for index in range(kept)]
+        channel_size = len(names) // 3
+        columns = [
+            names.index(f"f_rest_{channel * channel_size + index}") for channel in range(3) for index in range(kept)
+        ]
         shN = _sh_values()[codes[:, columns].reshape(count, 3, -1).transpose(0, 2, 1)]
     return {
         "means": _unpack_means(words["packed_position"], bounds[:, 0]).astype(np.float32),

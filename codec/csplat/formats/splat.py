@@ -103,7 +103,7 @@ def _write(path: Path, scene: Scene) -> None:
 
 
 def _with_negative_largest(quats: F32) -> F32:
-    """Make the largest component negative: a byte represents -1 but not 1, and some viewers do not normalise."""
+    """Make the largest component of quats [N, 4] negative: bytes represent -1, not 1; some viewers do not normalise."""
     largest = np.take_along_axis(quats, np.abs(quats).argmax(axis=1)[:, None], axis=1)
     return np.where(largest > 0, -quats, quats)
 

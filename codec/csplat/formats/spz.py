@@ -225,10 +225,10 @@ def _read_exactly(name: str, stream: BinaryIO, size: int) -> bytes:
 def _fill(name: str, stream: Any, data: U8) -> None:
     at = 0
     while at < len(data):
-        got = stream.readinto(data[at : at + _PIECE])  # in pieces, because gzip copies each read
-        if not got:
+        byte_count = stream.readinto(data[at : at + _PIECE])  # in pieces, because gzip copies each read
+        if not byte_count:
             raise InputError(f"{name} is truncated: {at:,} of {len(data):,} bytes are present")
-        at += got
+        at += byte_count
 
 
 _COLOUR = np.float32(0.15)  # colour per unit of an SH coefficient of degree 0
@@ -307,7 +307,7 @@ def decode_means(packed: SpzArrays, rows: slice) -> F32:
 
 
 def _decode_first_three(rotations: U8) -> F32:
-    """Decode rotations of versions 1 and 2: x, y and z are bytes, w >= 0 follows from them."""
+    """Decode rotations [N, 3] of versions 1 and 2 to wxyz: x, y and z are bytes, w >= 0 follows from them."""
     quats = np.empty((len(rotations), 4), np.float32)
     quats[:, 1:] = np.divide(rotations, 127.5, dtype=np.float32) - np.float32(1)
     quats[:, 0] = np.sqrt(np.maximum(0, 1 - np.square(quats[:, 1:]).sum(axis=1)))
@@ -358,7 +358,7 @@ def _scale_codes(scales: F32) -> U8:
 
 
 def _encode_rotations(quats: F32) -> U8:
-    """Invert `_decode_rotations`."""
+    """Invert `_decode_rotations`: quats [N, 4] to bytes [N, 4]."""
     largest, three = encode_smallest_three(quats[:, [1, 2, 3, 0]])
     steps = np.rint(three / _PART)
     fields = np.minimum(np.abs(steps), 511).astype(np.uint32) | np.where(steps < 0, np.uint32(512), np.uint32(0))

@@ -353,10 +353,10 @@ def _read(path: Path, model: SplatModel, start: int, stop: int) -> SplatModel:
         name: np.empty((stop - start, *array.shape[1:]), array.dtype) for name, array in _arrays(model).items()
     }
     for frame in _frames(path, dtype):
-        wanted = frame[max(0, start - at) : max(0, stop - at)]
+        records = frame[max(0, start - at) : max(0, stop - at)]
         for name, array in arrays.items():
-            array[read : read + len(wanted)] = wanted[name]
-        at, read = at + len(frame), read + len(wanted)
+            array[read : read + len(records)] = records[name]
+        at, read = at + len(frame), read + len(records)
         if at >= stop:
             break
     if read < stop - start:

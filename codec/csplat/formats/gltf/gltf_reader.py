@@ -454,8 +454,8 @@ _ROWS = 4096  # splats whose colours are fitted at a time
 def fit_srgb(model: SplatModel) -> SplatModel:
     """Convert SH of linear light to the SH of sRGB that fit best."""
     fitted = [coefficients for coefficients, _, _ in _fit_blocks(model)]
-    both = np.concatenate([np.zeros((0, model.shN.shape[1] + 1, 3), np.float32), *fitted])
-    return replace(model, sh0=np.ascontiguousarray(both[:, 0]), shN=np.ascontiguousarray(both[:, 1:]))
+    sh = np.concatenate([np.zeros((0, model.shN.shape[1] + 1, 3), np.float32), *fitted])
+    return replace(model, sh0=np.ascontiguousarray(sh[:, 0]), shN=np.ascontiguousarray(sh[:, 1:]))
 
 
 def measure_srgb_error(model: SplatModel) -> float:

@@ -418,6 +418,7 @@ def read_degree(sog: SogMeta) -> int:
 
 
 def _look_up(tables: F32, codes: NDArray[Any]) -> F32:
+    """Return the values [N, 3] of codes [N, 3] by the table of each column, [3, 256]."""
     values = np.empty(codes.shape, np.float32)
     for axis in range(3):
         values[:, axis] = tables[axis][codes[:, axis]]

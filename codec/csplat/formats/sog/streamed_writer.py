@@ -238,7 +238,8 @@ def _describe_node(
         box, rest = bounds[node], dict[str, Any](lods=leaves[node])
     else:
         children = [_describe_node(child, bounds, leaves) for child in (node.low, node.high)]
-        both = np.stack([child_box for _, child_box in children])
-        box, rest = np.stack([both[:, 0].min(0), both[:, 1].max(0)]), {"children": [child for child, _ in children]}
+        child_boxes = np.stack([child_box for _, child_box in children])
+        box = np.stack([child_boxes[:, 0].min(0), child_boxes[:, 1].max(0)])
+        rest = {"children": [child for child, _ in children]}
     least, most = ([float(f"{value:.{_DIGITS}g}") for value in side] for side in box)
     return {"bound": {"min": least, "max": most}, **rest}, box
