@@ -152,7 +152,7 @@ class Candidate:
 
     Attributes:
         subset, coding: its splats, and the coding of their colours.
-        quality: its precision, PSNR of each attribute alone, dB; `None`: that of the options.
+        quality: its precision, PSNR of each attribute alone, dB; `None`: the precision of the options.
         is_draft: the refit through the quantisers was skipped.
         options: options of the encoder.
         coded, result: the encoder's tiles, and its result.
@@ -177,11 +177,11 @@ class Candidate:
     def with_levels(self, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
         """Return the same splats in a file with levels of detail, which is not measured in the test views yet."""
         coded, entries = self.coded, self.subset.metadata(self.validation_psnr) or {}
-        found = levels.encode_plan(coded.plan, coded.codebooks, progress or null_progress)
+        encoded = levels.encode_plan(coded.plan, coded.codebooks, progress or null_progress)
         if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
-            found = replace(found, errors=coded.errors)
-        result = found.write({**entries, "levels": levels.settings(len(coded.plan.model))})
-        return replace(self, coded=found, result=result, test_errors=None, test_psnr=None)
+            encoded = replace(encoded, errors=coded.errors)
+        result = encoded.write({**entries, "levels": levels.settings(len(coded.plan.model))})
+        return replace(self, coded=encoded, result=result, test_errors=None, test_psnr=None)
 
     @property
     def size_bytes(self) -> int:
@@ -240,19 +240,19 @@ class CandidatePool:
     decode: Callable[[bytes], SplatModel] = decode
 
     def make(self, subset: Subset, coding: Coding, quality: float | None, *, draft: bool) -> Candidate:
-        """Make a candidate, or return the one that was made with the same arguments.
+        """Make a candidate, or return the candidate that was already made with the same arguments.
 
         Args:
             subset: its splats.
             coding: the coding of their colours.
-            quality: PSNR of each attribute alone, dB; `None`: that of the options.
-            draft: skip the refit through the quantisers, if the subset has one.
+            quality: PSNR of each attribute alone, dB; `None`: the precision of the options.
+            draft: skip the refit through the quantisers, if the subset has such a refit.
         """
         options, draft = coding.options(self.encoding, len(subset.model), quality), draft and subset.refits
-        for one in self.made:
-            is_alike = one.subset is subset and one.coding.use_classes == coding.use_classes
-            if is_alike and one.options == options and one.is_draft == draft:
-                return one
+        for candidate in self.made:
+            is_alike = candidate.subset is subset and candidate.coding.use_classes == coding.use_classes
+            if is_alike and candidate.options == options and candidate.is_draft == draft:
+                return candidate
         report, stage = self.progress or null_progress, f"file {len(self.made) + 1}"
         report(stage, 0.0)
         coded = subset.encode(options, use_classes=coding.use_classes, draft=draft)
@@ -270,9 +270,10 @@ class CandidatePool:
 
     def of(self, subset: Subset, coding: Coding, *, draft: bool) -> list[Candidate]:
         """Return the candidates of a subset and coding at any precision, either drafts or the others."""
-
-        def options(one: Coding) -> EncodeOptions:
-            return one.options(self.encoding, len(subset.model), None)
-
-        made = [one for one in self.made if one.subset is subset and one.quality is not None and one.is_draft == draft]
-        return [one for one in made if one.coding == coding or options(one.coding) == options(coding)]
+        splats, options = len(subset.model), coding.options(self.encoding, len(subset.model), None)
+        made = [
+            candidate
+            for candidate in self.made
+            if candidate.subset is subset and candidate.quality is not None and candidate.is_draft == draft
+        ]
+        return [candidate for candidate in made if candidate.coding.options(self.encoding, splats, None) == options]

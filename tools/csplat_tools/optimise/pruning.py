@@ -74,24 +74,24 @@ class Pruner:
 
     @cached_property
     def sufficient(self) -> SufficientViews:
-        """Training views whose pruning errors agree with those of held-out views, and the held-out views."""
+        """Training views whose pruning errors agree with the errors of held-out views, and the held-out views."""
         return find_sufficient_views(
             self.source, self.views, size=self.size, threads=self.threads, progress=self.progress
         )
 
     @cached_property
     def measured(self) -> list[MeasuredViews]:
-        """Groups of views of the source; if views are virtual, twice the sufficient ones, against overfitting."""
+        """Groups of views of the source; if views are virtual, twice as many as suffice, against overfitting."""
         batches = self.sufficient.batches
         groups = [functools.reduce(operator.add, batches[start::2]) for start in range(min(2, len(batches)))]
         if self.views.virtual:
             cameras = camera_sequence(self.source, len(self.sufficient.used), self.size, seed=self.seed + 1)
             for part in (cameras[::2], cameras[1::2]):
-                found = MeasuredViews.of(
+                group = MeasuredViews.of(
                     self.source, part, self.views.background, keep_renders=True, threads=self.threads,
                     progress=self.progress,
                 )  # fmt: skip
-                groups.append(found)
+                groups.append(group)
         return groups
 
     @cached_property
@@ -103,7 +103,7 @@ class Pruner:
 
     @cached_property
     def cameras(self) -> Sequence[Camera]:
-        """The views that splats are fitted to, those of the pruning order."""
+        """The views that splats are fitted to; the pruning order uses the same."""
         return [camera for group in self.measured for camera in group.cameras]
 
     @cached_property
@@ -232,7 +232,7 @@ class PrunedSubset:
             progress=pruner.progress,
         )  # fmt: skip
         start = fixed.start()
-        before, after = (pruner.check_scorer.psnr(self._decoded(fixed, one)) for one in (start, values))
+        before, after = (pruner.check_scorer.psnr(self._decoded(fixed, tried)) for tried in (start, values))
         values = values if after >= before else start  # a refit of few splats may overfit
         # Longer chains overfit, and in surroundings the rate term moves what few views show (fox120k: 1 to 3 dB less).
         if tuned is None and pruner.use_classes:
@@ -240,7 +240,7 @@ class PrunedSubset:
         return fixed.encode(values, pruner.progress)
 
     def _with_values(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
-        """Return the splats with tuned values before rounding, or decoded ones if splats share them."""
+        """Return the splats with tuned values before rounding, or decoded values if splats share them."""
         decoded, here = fixed.dequantise(values), np.argsort(fixed.source_index)
         shape = decoded if fixed.shapes is not None else values
         shN = np.zeros_like(self.model.shN)
@@ -280,7 +280,7 @@ class PrunedSubset:
 
 
 def _with_values_of(before: SplatModel, its_rows: I64, start: SplatModel, rows: I64) -> SplatModel:
-    """Return splats of the source with the values of another refit if it has them; `rows` ascend."""
+    """Return splats of the source, [N] `rows`, with the values of another refit of [M] `its_rows`; both ascend."""
     _, there, here = np.intersect1d(its_rows, rows, assume_unique=True, return_indices=True)
 
     def carry(own: F32, its: F32) -> F32:

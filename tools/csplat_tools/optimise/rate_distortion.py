@@ -17,7 +17,7 @@ import numpy as np
 from csplat.types import F64
 
 #: Usual change of log bytes per dB of quantisation error, without and with SH. Files of neighbouring numbers of splats
-#: show 0.02 (donut, no SH) and 0.07 (garden), those of neighbouring precisions 0.035 and 0.05.
+#: show 0.02 (donut, no SH) and 0.07 (garden). Files of neighbouring precisions show 0.035 and 0.05.
 BYTES_PER_DB = (0.03, 0.07)
 
 #: Least fraction of a file's error that is attributed to quantisation, since a smaller rest is noise.
@@ -32,11 +32,11 @@ LOG_ERROR_PER_DB = math.log(10.0) / 10.0
 #: dB above a PSNR that is aimed at, since PSNR varies by chance; `simplify` does not improve a result this close.
 AIM = 0.1
 
-#: Distance of two precisions in dB. Nearer ones do not determine a slope; files of half this distance differ by 1 %, as
-#: much as by chance.
+#: Distance of two precisions in dB. Nearer precisions do not determine a slope; files of half this distance differ by
+#: 1 %, as much as by chance.
 APART = 0.3
 
-_SLOPES = (0.2, 2.0)  # range of a measured slope, as a multiple of the assumed one
+_SLOPES = (0.2, 2.0)  # range of a measured slope, as a multiple of the assumed slope
 
 #: Largest fraction of a file's error that pruning and left-out SH bands may take, without and with SH; with more,
 #: quantisation would have to be too fine. With SH, codebooks need more of the error: at 38 dB, mic (SH of degree 3)
@@ -82,15 +82,15 @@ class RateLine:
         """Return the line through files, the first of which is nearest to the goal.
 
         Args:
-            points: the files. Another one that is far enough from the first determines the slopes.
-            error_slope, bytes_slope: the slopes to assume without one, and to limit measured ones by.
+            points: the files. The first other file that is far enough from the nearest determines the slopes.
+            error_slope, bytes_slope: the slopes to assume without such a file, and to limit measured slopes by.
         """
         first = points[0]
-        for other in points[1:]:
-            apart = other.quality - first.quality
+        for point in points[1:]:
+            apart = point.quality - first.quality
             if abs(apart) >= APART:
-                by_error = math.log(other.error / first.error) / apart / error_slope
-                by_size = math.log(other.size_bytes / first.size_bytes) / apart / bytes_slope
+                by_error = math.log(point.error / first.error) / apart / error_slope
+                by_size = math.log(point.size_bytes / first.size_bytes) / apart / bytes_slope
                 error_slope *= min(max(by_error, _SLOPES[0]), _SLOPES[1])
                 bytes_slope *= min(max(by_size, _SLOPES[0]), _SLOPES[1])
                 break

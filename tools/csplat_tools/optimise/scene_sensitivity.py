@@ -22,7 +22,7 @@ from csplat_trainer.sensitivity import Sensitivity, measure_sensitivity
 from csplat_trainer.sensitivity_file import GROUPS, StoredSensitivity, write_sensitivity
 
 _NOTHING = "a scene without splats has no sensitivities"
-_VIEWS = (40, 80)  # number of views that suffice, if cameras are given and of small virtual ones
+_VIEWS = (40, 80)  # number of views that suffice: of given cameras, and of small virtual views
 MANY_SPLATS = 150_000  #: of more splats, half of the views show enough, and take long enough
 
 
@@ -73,7 +73,7 @@ def measure_scene(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> SceneSensitivity:
-    """Measure the sensitivities of a scene in all training views, or in sufficiently many virtual ones.
+    """Measure the sensitivities of a scene in all training views, or in sufficiently many virtual views.
 
     Args:
         model: the scene.
@@ -92,8 +92,8 @@ def measure_scene(
     )
     if views.virtual and views.training:
         size = (views.training[0].W, views.training[0].H)
-        found = find_sufficient_views(model, views, size=size, threads=threads, progress=progress)
-        cameras, check, source = found.used, [*found.check.cameras], "virtual"
+        sufficient = find_sufficient_views(model, views, size=size, threads=threads, progress=progress)
+        cameras, check, source = sufficient.used, [*sufficient.check.cameras], "virtual"
     measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
     missed = float("nan")
     if check:
@@ -132,13 +132,13 @@ def measure_views(
         progress("compiling", 0.0)  # takes some seconds unless cached
         measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
         progress("compiling", 1.0)
-    found = measure_sensitivity(
+    sensitivity = measure_sensitivity(
         model, cameras, background=background, metric=matrices, magnitudes=magnitudes, threads=threads,
         progress=progress,
     )  # fmt: skip
-    if not found.seen.any():
+    if not sensitivity.seen.any():
         raise InputError("no view shows any splat: check that the cameras belong to the scene")
-    return found
+    return sensitivity
 
 
 def measure_importance(
@@ -157,18 +157,18 @@ def measure_importance(
     Raises:
         InputError: as for `measure_views`.
     """
-    found = measure_views(
+    sensitivity = measure_views(
         model, cameras, background, matrices=False, magnitudes=False, threads=threads, progress=progress
     )
-    weights = StoredSensitivity.of(model, found).importance()
+    weights = StoredSensitivity.of(model, sensitivity).importance()
     return replace(weights, sh=apply_weight_floor(weights.sh, model))
 
 
 def importance_views(views: ViewSet, splats: int) -> Sequence[Camera]:
     """Return the training views in which the importance of N splats is measured.
 
-    Virtual training views have various distances and directions. Cameras like the test views generalise less: plane3
-    with quantisation classes from 40 of them has 42 dB on them and 39 on others; from these views, 41 and 40.
+    Virtual training views have various distances and directions. Cameras like the test views generalise less. With
+    quantisation classes from 40 of them, plane3 has 42 dB on them and 39 on others. From these views, it has 41 and 40.
     """
     return evenly_spaced(views.training, _VIEWS[views.virtual] // (1 + (splats > MANY_SPLATS)))
 
@@ -189,7 +189,7 @@ def complete_importance(
         views: the views; importance is measured in training views.
         encoding: the caller's options; some exclude quantisation classes.
         importance: the caller's importance. If it has Gauss–Newton blocks, nothing is measured; else it is kept for SH.
-        inside: the views are virtual ones in a surrounding scene, in which nothing is measured.
+        inside: the views are virtual, in a surrounding scene; nothing is measured in such views.
         progress: progress callback.
 
     Returns:
@@ -204,13 +204,13 @@ def complete_importance(
         return None, 0
     seen_from = importance_views(views, len(source))
     try:
-        found = measure_importance(source, seen_from, views.background, threads=encoding.threads, progress=progress)
+        measured = measure_importance(source, seen_from, views.background, threads=encoding.threads, progress=progress)
     except InputError:
         return None, 0  # no splat is visible
     if isinstance(importance, Importance):
-        found = replace(importance, blocks=found.blocks)
+        measured = replace(importance, blocks=measured.blocks)
     elif importance is not None:
-        found = replace(found, sh=np.asarray(importance))
+        measured = replace(measured, sh=np.asarray(importance))
     if not encoding.shape_codebook_size:
-        found = replace(found, shape_metric=None)  # frees half of the memory
-    return found, len(seen_from)
+        measured = replace(measured, shape_metric=None)  # frees half of the memory
+    return measured, len(seen_from)

@@ -21,7 +21,7 @@ _NOTABLE = 0.5  # dB; more above the target is explained, and less on other view
 
 
 def format_search(report: SearchReport) -> tuple[str, ...]:
-    """Format the report of a search for users, a sentence each."""
+    """Format the report of a search as sentences for users."""
     goal = report.goal
     asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
     if "size_bytes" in goal:
@@ -55,7 +55,7 @@ def _format_elsewhere(psnr: float, elsewhere: Mapping[str, float]) -> list[str]:
     if not elsewhere:
         return []
     kinds = {"beside": "at other positions"}
-    scores = ", ".join(f"{found:.2f} {kinds.get(kind, kind)}" for kind, found in elsewhere.items())
+    scores = ", ".join(f"{score:.2f} {kinds.get(kind, kind)}" for kind, score in elsewhere.items())
     less = psnr - min(elsewhere.values())
     worse = f": up to {less:.1f} dB less than on the test views" if less > _NOTABLE else ""
     return [f"PSNR on virtual views that were not used in the search: {scores}{worse}"]
@@ -107,8 +107,8 @@ def make_report(
         views=len(errors),
         views_of=views_of,
         renders=sum(
-            len(candidates.validation_scorer.cameras) + len(errors) * (one.goal_error is not None)
-            for one in candidates.made
+            len(candidates.validation_scorer.cameras) + len(errors) * (candidate.goal_error is not None)
+            for candidate in candidates.made
         ),
         chosen=found.as_json(),
         tried=tuple(candidate.as_json() for candidate in candidates.made),
@@ -120,7 +120,9 @@ def make_report(
 
 def _why(target: Target, found: Candidate, psnr: float, candidates: CandidatePool, splats_before: int) -> list[str]:
     """Return sentences on the coding of SH, the alternatives, and the number of pruned splats."""
-    codings = list(dict.fromkeys(_coding(one) for one in candidates.made if one.subset is found.subset))
+    codings = list(
+        dict.fromkeys(_coding(candidate) for candidate in candidates.made if candidate.subset is found.subset)
+    )
     if found.quality is None:
         lines = [f"{_coding(found)}, at the precision of the preset {found.options.preset}"]
     else:

@@ -178,21 +178,21 @@ def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, flo
     assert goal is not None
     if psnr_of_mse(source_error) < goal:
         raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
-    allowed, known, found = error_of_psnr(goal), dict[int, float](), dict[int, tuple[float, PrunedSubset]]()
+    allowed, known, refits = error_of_psnr(goal), dict[int, float](), dict[int, tuple[float, PrunedSubset]]()
     for _ in range(_TRIES):
         counts, errors = pruner.errors(allowed - source_error, known)
         fits = counts[errors <= (allowed - source_error) * error_of_psnr(0.5 * AIM)]
         kept_count = int(fits.min(initial=len(source)))
-        if kept_count in found or kept_count == len(source):
+        if kept_count in refits or kept_count == len(source):
             break
         subset = pruner.refit(kept_count)
         error = scorer.pooled(scorer.errors(subset.model))
-        found[kept_count], known[kept_count] = (psnr_of_mse(error), subset), max(error - source_error, 0.0)
+        refits[kept_count], known[kept_count] = (psnr_of_mse(error), subset), max(error - source_error, 0.0)
         if goal <= psnr_of_mse(error) <= goal + AIM:
             break
-    reached = [one for one in found.values() if one[0] >= goal]
+    reached = [refit for refit in refits.values() if refit[0] >= goal]
     psnr, subset = min(
-        reached, key=lambda one: len(one[1].rows), default=(psnr_of_mse(source_error), pruner.refit(len(source)))
+        reached, key=lambda refit: len(refit[1].rows), default=(psnr_of_mse(source_error), pruner.refit(len(source)))
     )
     return subset, {"validation_psnr": psnr}
 

@@ -36,13 +36,13 @@ def meet_target(
     Args:
         source: the scene.
         options, target, importance, progress: as for `csplat.encode_with_report`.
-        views: training, validation and test views; `None`: virtual ones around the scene.
-        simplifying: options of pruning and refitting, instead of the target's effort; the background is that of the
-            views.
+        views: training, validation and test views; `None`: virtual views around the scene.
+        simplifying: options of pruning and refitting, instead of the target's effort; the views determine the
+            background.
         levels: builds levels of detail, whose bytes count; `None`: the file has none.
 
     Returns:
-        The file. Its source index refers to the source, and its report contains that of the search.
+        The file. Its source index refers to the source, and its report contains the search's report.
 
     Raises:
         InputError: the extra `render` is missing, there are no splats, an option is set that the target determines, or
@@ -63,12 +63,12 @@ def meet_target(
         bounded, options = meet_bounds(source, options, target, importance=importance, progress=progress)
         assert bounded.report.search is not None
         encodes = bounded.report.search.encodes
-    found, report = search_target(
+    chosen, report = search_target(
         source, target, views or find_view_set(source), options, importance=importance,
         options=simplifying or SimplifyOptions(effort=target.effort), levels=levels, progress=progress,
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 3)
-    return found.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
+    return chosen.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
 
 
 def expected_search_seconds(source: SplatModel, options: EncodeOptions, target: Target, views: ViewSet) -> float:

@@ -1,4 +1,4 @@
-"""Search for the smallest file of a PSNR or a drop of PSNR, or for the best one of a size.
+"""Search for the smallest file that meets a PSNR or a drop of PSNR, or for the best file of a size.
 
 How a target is met:
 
@@ -14,9 +14,9 @@ How a target is met:
    pruning takes too much of the error get no drafts, unless they are the last. For the final number, and for a size,
    drafts of one coding after another are made: each neighbour of the best, up to `_TRIES` codings (`_choose_coding`).
 5. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
-   goal, which corrects the prediction of the precision, until another is not expected to save enough (`_finish`). If
-   none meets the goal, more splats are taken: those of step 4, or others; for a size, fewer. Of all that meet it,
-   drafts included, the smallest is written, or the best one of a size.
+   goal. This corrects the prediction of the precision, and ends when another file is not expected to save enough
+   (`_finish`). If no file meets the goal, larger subsets of step 4 are taken, then other numbers of splats (fewer for a
+   size). Of all files that meet it, drafts included, the smallest is written, or the best file of a size.
 
 Drafts are compared by their error on validation views. The views of the goal, which are the test views for a PSNR,
 only tell how much error is left there (`_allowed`): they settle precision and number of splats. With all splats kept,
@@ -66,14 +66,14 @@ from csplat_tools.views import VIRTUAL, ViewSet, extra_test_cameras, with_valida
 
 _RENDERS = (520.0, 2480.0)  # cost of a target in renders of a test view: a fixed part, and one of pruning by effort
 
-# What is typical; pairs are without and with SH.
-_USUAL = PRESETS["small"]  # whose precision and codebook the first drafts have
+# Typical values; pairs are without and with SH.
+_USUAL = PRESETS["small"]  # the first drafts have its precision and codebook
 _USUAL_BYTES = (8.0, 11.0)  # bytes per kept splat of a file of a size
 _PSNR_PER_PRECISION = {"codebook": 0.6}  # dB of PSNR per dB of precision; 1 for other codings
 _MISSED_GAIN = 0.03  # log bytes that the refit of a file gains less without quantisation classes (horse, plane3: 4 %)
 _TUNING_GAIN = 2.0  # dB of the error of quantisation by the refit through the quantisers; 1.5 to 2.6 in five scenes
 
-# What is tried.
+# Range and number of the candidates.
 _QUALITIES = (24.0, 110.0)  # range of the precision, PSNR of each attribute alone, dB
 _FINEST = 80.0  # dB of precision; from 70 dB on, opacities and quats have all their levels, and finer means cut tiles
 _AMPLE = 16  # bytes per splat; files of the finest precision have 20 or more
@@ -84,7 +84,7 @@ _TRIES = 8  # most codings of some splats at the default effort, and most files 
 _BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squared and inverse for a size
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
 
-# What is near, and what is worth another candidate.
+# Distances, and the worth of another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
 _TOLERANCE = 1.1  # factor by which pruning may take more of the error than it should, before it takes too much
@@ -106,8 +106,8 @@ class Goal:
         scorer: scorer on the goal's views: the test views for a PSNR, validation images for a drop.
         size_bytes: largest size of the file; `None` without a target size.
         error: largest mean squared error on the goal's views.
-        source_error: that of the source.
-        max_error: largest errors of splats by measure; files that exceed one are rejected.
+        source_error: mean squared error of the source on these views; 0 unless the goal is a drop.
+        max_error: largest errors of splats by measure; files that exceed any are rejected.
     """
 
     scorer: Scorer
@@ -160,7 +160,7 @@ class TargetSearch:
     _errors: dict[tuple[Subset, int, bool], float] = field(default_factory=dict, init=False)
 
     def best(self) -> Candidate:
-        """Return the smallest file that meets the goal, or the best one of a size.
+        """Return the smallest file that meets the goal, or the best file of a size.
 
         Raises:
             InputError: no file meets the goal.
@@ -181,10 +181,10 @@ class TargetSearch:
                     break
                 subset = another
                 self._try(subset, coding, {})
-        met = [one for one in self.pool.made if self._is_met(one)]
+        met = [candidate for candidate in self.pool.made if self._is_met(candidate)]
         if not met:
             raise InputError(self._out_of_reach())
-        return min(met, key=lambda one: one.size_bytes if self.goal.size_bytes is None else one.error)
+        return min(met, key=lambda candidate: candidate.size_bytes if self.goal.size_bytes is None else candidate.error)
 
     def finest(self) -> Candidate | None:
         """Return the file of all splats at the finest precision if it meets the target size, otherwise `None`.
@@ -199,13 +199,13 @@ class TargetSearch:
             return None
         if size_bytes is not None and size_bytes < _AMPLE * len(self.whole.model):
             return None
-        found = self.pool.make(self.whole, self._first_codings(self.whole)[0], _FINEST, draft=False)
-        self._score(found)
+        candidate = self.pool.make(self.whole, self._first_codings(self.whole)[0], _FINEST, draft=False)
+        self._score(candidate)
         if size_bytes is None:
-            if (found.goal_error or 0.0) > self.goal.error * error_of_psnr(-_BEYOND_REACH):
+            if (candidate.goal_error or 0.0) > self.goal.error * error_of_psnr(-_BEYOND_REACH):
                 raise InputError(self._out_of_reach())
             return None
-        return found if self._is_met(found) else None
+        return candidate if self._is_met(candidate) else None
 
     def best_draft(self) -> tuple[Candidate, float]:
         """Return the draft of the best splats, coding and precision, and its expected error after another refit."""
@@ -217,7 +217,7 @@ class TargetSearch:
     # The number of splats
 
     def _choose_splats(self, pruner: Pruner) -> tuple[Subset, Coding, list[tuple[Subset, Coding]]]:
-        """Return the best refitted splats and coding, and those of more splats, most first.
+        """Return the best refitted splats and coding, and the pairs of more splats, most splats first.
 
         The best have the least expected cost, but fewer splats must promise `_WORTH` over more, since their cost is
         less certain.
@@ -235,9 +235,9 @@ class TargetSearch:
             kept_count, saved = self._next_count(pruner, subset, coding)
             if self.work < 1.0 or saved < _WORTH or not self._is_worth(0.5 * saved, subset):
                 break
-            if any(abs(len(one.model) - kept_count) <= _WORTH * kept_count for _, one, _ in tried):
+            if any(abs(len(earlier.model) - kept_count) <= _WORTH * kept_count for _, earlier, _ in tried):
                 break
-        tried.sort(key=lambda one: -len(one[1].model))
+        tried.sort(key=lambda trial: -len(trial[1].model))
         best = 0
         for number, (cost, _, _) in enumerate(tried):
             if cost < tried[best][0] - _WORTH:
@@ -260,7 +260,7 @@ class TargetSearch:
             usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
             return self._rounded(min(self.goal.size_bytes / usual, splats))
         allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
-        for left in reversed(range(_ROUNDS)):  # pruning errors in validation views differ from those in training views
+        for left in reversed(range(_ROUNDS)):  # validation views show other pruning errors than training views
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
             before, kept_count = kept_count, self._rounded(counts[np.argmin(costs)])
@@ -323,7 +323,7 @@ class TargetSearch:
         return not subset.refits and len(subset.model) > MANY_SPLATS
 
     def _choose_coding(self, subset: Subset, most: int) -> Coding:
-        """Return the coding with the least expected cost of `most` ones.
+        """Return the coding with the least expected cost, of at most `most`.
 
         A coding of each kind is tried; then codebooks of other sizes, and neighbours of the best coding.
         """
@@ -334,16 +334,16 @@ class TargetSearch:
             costs[coding] = self._try(subset, coding, costs)
             if not waiting:
                 ordered = sorted(costs, key=costs.__getitem__)
-                best, books = ordered[0], [one for one in ordered if one.sh == "codebook"]
-                found = self._fewer_bands(subset, best)
+                best, books = ordered[0], [book for book in ordered if book.sh == "codebook"]
+                neighbours = self._fewer_bands(subset, best)
                 if books:
-                    found += self._resized(books[0], 2.0)
-                    if costs[books[0]] <= costs[best] + _WORTH:  # a smaller one hardly gains more
-                        found += self._resized(books[0], 0.5)
-                    largest = max(books, key=lambda one: one.entries_per_splat or 0.0)
+                    neighbours += self._resized(books[0], 2.0)
+                    if costs[books[0]] <= costs[best] + _WORTH:  # a smaller codebook hardly gains more
+                        neighbours += self._resized(books[0], 0.5)
+                    largest = max(books, key=lambda book: book.entries_per_splat or 0.0)
                     if self._needs_entries(subset, largest, costs[best]):
-                        found += self._resized(largest, 2.0)
-                waiting = [one for one in [*found, *self._alike(subset, best)] if one not in costs][:1]
+                        neighbours += self._resized(largest, 2.0)
+                waiting = [coding for coding in [*neighbours, *self._alike(subset, best)] if coding not in costs][:1]
         return min(costs, key=costs.__getitem__)
 
     def _try(self, subset: Subset, coding: Coding, costs: Mapping[Coding, float]) -> float:
@@ -353,7 +353,7 @@ class TargetSearch:
             quality = min(self._predict(subset, best)[0], quality + _FAR)
         missed = _MISSED_GAIN if subset.refits and subset.classifiable and not coding.use_classes else 0.0
         made = self.pool.of(subset, coding, draft=subset.refits)  # when the number of splats was chosen
-        if any(abs(quality - (one.quality or 0.0)) < _NEAR for one in made):
+        if any(abs(quality - (draft.quality or 0.0)) < _NEAR for draft in made):
             return self._predict(subset, coding)[1] + missed
         cost = math.inf
         for _ in range(_ROUNDS):
@@ -369,12 +369,12 @@ class TargetSearch:
     def _start(self, subset: Subset, coding: Coding) -> float:
         """Return the precision of the first draft of a subset with a coding, dB."""
         size_bytes = self.goal.size_bytes
-        for other in reversed(self.pool.made):
-            if other.coding == coding and other.quality is not None:
-                line = self._line(other.subset, coding)
+        for candidate in reversed(self.pool.made):
+            if candidate.coding == coding and candidate.quality is not None:
+                line = self._line(candidate.subset, coding)
                 if size_bytes is None:
                     return _clipped(line.quality_at_error(self._rest(subset, coding)))
-                return _clipped(line.quality_at_size(size_bytes / len(subset.model) * len(other.subset.model)))
+                return _clipped(line.quality_at_size(size_bytes / len(subset.model) * len(candidate.subset.model)))
         return _USUAL.quality[coding.sh == "none"]
 
     def _first_codings(self, subset: Subset) -> list[Coding]:
@@ -406,46 +406,46 @@ class TargetSearch:
         the file expected of the best coding, whose cost in log bytes is given.
         """
         drafts = self.pool.of(subset, book, draft=subset.refits)
-        return self.goal.size_bytes is None and math.log(min(one.size_bytes for one in drafts)) < cost - _WORTH
+        return self.goal.size_bytes is None and math.log(min(draft.size_bytes for draft in drafts)) < cost - _WORTH
 
     def _fewer_bands(self, subset: Subset, coding: Coding) -> list[Coding]:
         """Return codings with fewer SH bands, the fewest first, if dropping these takes little of the error."""
-        encoding, found, lower = self.pool.encoding, list[Coding](), self._degree(coding) - 1
+        encoding, codings, lower = self.pool.encoding, list[Coding](), self._degree(coding) - 1
         fixed = encoding.sh_degree is not None or encoding.sh_coding != "auto"
         if coding.sh == "none" or fixed or self.goal.size_bytes is not None:
-            return found
+            return codings
         while lower >= 0:
             fewer = replace(coding, degree=lower) if lower else Coding("none", degree=0, use_classes=coding.use_classes)
             if self._unquantised(subset, fewer) > self._most_left_out * self._allowed(subset, coding):
                 break
-            found, lower = [fewer, *found], lower - 1
-        return found
+            codings, lower = [fewer, *codings], lower - 1
+        return codings
 
     def _alike(self, subset: Subset, coding: Coding) -> list[Coding]:
         """Return codings with equal steps for all splats in one respect."""
-        found = [replace(coding, adaptive=None)] if coding.adaptive is not None else []
+        codings = [replace(coding, adaptive=None)] if coding.adaptive is not None else []
         if subset.classifiable and coding.use_classes:
-            found.append(replace(coding, use_classes=False))
-        return found
+            codings.append(replace(coding, use_classes=False))
+        return codings
 
     # The precision
 
     def _finish(self, subset: Subset, coding: Coding) -> bool:
-        """Make files until one meets the goal and another one would hardly be smaller; return True if one meets it."""
+        """Make files until the goal is met and another file would hardly be smaller. Return True if it is met."""
         best: Candidate | None = None
         if subset.refits:
             self._score(self._by_distance(subset, coding, draft=True)[0])
         made, is_pruned = list[float](), len(subset.model) < len(self.whole.model)
-        safer = 1.0 if self.goal.size_bytes is None else -1.0  # finer files have less error, coarser ones fewer bytes
+        safer = 1.0 if self.goal.size_bytes is None else -1.0  # finer files have less error, coarser files fewer bytes
         for _ in range(_TRIES):
             quality = self._predict(subset, coding)[0]
-            while any(abs(quality - other) < 0.5 * APART for other in made):
+            while any(abs(quality - earlier) < 0.5 * APART for earlier in made):
                 quality += 0.5 * safer * APART  # files of neighbouring precisions may differ by chance
             if best is not None:
                 met = best.quality or 0.0
-                beyond = [other for other in made if safer * other < safer * met]
+                beyond = [earlier for earlier in made if safer * earlier < safer * met]
                 if len(beyond) > 1:  # the last missed the goal, although the model expected it to meet it
-                    quality = 0.5 * (met + max(beyond, key=lambda other: safer * other))
+                    quality = 0.5 * (met + max(beyond, key=lambda earlier: safer * earlier))
                 saved = self._cost(best) - self._cost_at(subset, coding, quality)
                 if safer * (met - quality) < 0.5 * APART or not self._is_worth(saved, subset):
                     break
@@ -500,23 +500,23 @@ class TargetSearch:
         for draft in (True, False):
             made = self._by_distance(subset, coding, draft=draft)
             if made:
-                line = RateLine.through([self._point(one) for one in made], *slopes)
+                line = RateLine.through([self._point(candidate) for candidate in made], *slopes)
                 slopes = line.error_slope, line.bytes_slope
         assert line is not None
         return line
 
     def _excess(self, one: Candidate) -> float:
-        """Return the log of a candidate's size, or of its quantisation error, divided by that of the goal."""
+        """Return the log of a candidate's size, or of its quantisation error, divided by the goal's."""
         if self.goal.size_bytes is not None:
             return math.log(one.size_bytes / self.goal.size_bytes)
         return math.log(self._point(one).error / self._rest(one.subset, one.coding))
 
     def _by_distance(self, subset: Subset, coding: Coding, *, draft: bool) -> list[Candidate]:
-        """Return candidates: the nearest to the goal first, then those on the other side of the goal."""
-        made = [(self._excess(one), one) for one in self.pool.of(subset, coding, draft=draft)]
-        made.sort(key=lambda found: (abs(found[0]), -(found[1].quality or 0.0)))  # the finest of equal ones first
-        made[1:] = sorted(made[1:], key=lambda found: (found[0] > 0.0) == (made[0][0] > 0.0))
-        return [one for _, one in made]
+        """Return candidates: the nearest to the goal first, then the others on the other side of the goal."""
+        made = [(self._excess(candidate), candidate) for candidate in self.pool.of(subset, coding, draft=draft)]
+        made.sort(key=lambda entry: (abs(entry[0]), -(entry[1].quality or 0.0)))  # of equal distances, the finest first
+        made[1:] = sorted(made[1:], key=lambda entry: (entry[0] > 0.0) == (made[0][0] > 0.0))
+        return [candidate for _, candidate in made]
 
     def _point(self, one: Candidate) -> RatePoint:
         """Return precision, bytes and the expected quantisation error of a candidate, after the refit if a draft."""
@@ -530,22 +530,27 @@ class TargetSearch:
     def _allowed(self, subset: Subset, coding: Coding) -> float:
         """Return the mean squared error on the validation views at which a file meets the goal.
 
-        Errors differ between the validation views and the views of the goal. Those before quantisation are measured in
-        both. Those of quantisation are in a ratio that candidates measured in both show, 1 until there are any.
+        Errors differ between the validation views and the views of the goal. Errors before quantisation are
+        measured in both. Errors of quantisation are in a ratio that candidates measured in both show. It is 1 until
+        there are any.
         """
         before, on_goal = (self._unquantised(subset, coding, on_goal=on_goal) for on_goal in (False, True))
         rest = max(self._allowed_in_renders - on_goal, LEAST_QUANTISED * self._allowed_in_renders)
-        measured = [one for one in self.pool.made if one.subset is subset and one.goal_error is not None]
+        measured = [
+            candidate for candidate in self.pool.made if candidate.subset is subset and candidate.goal_error is not None
+        ]
         if not measured:
             return before + rest
-        nearest = min(measured, key=lambda one: (one.is_draft, one.coding != coding, self._off_goal(one)))
+        nearest = min(
+            measured, key=lambda candidate: (candidate.is_draft, candidate.coding != coding, self._off_goal(candidate))
+        )
         return before + rest * self._quantised(nearest) / self._quantised(nearest, on_goal=True)
 
     def _quantised(self, one: Candidate, *, on_goal: bool = False) -> float:
-        """Return the error of quantisation of a candidate, of a draft that of its file after another refit."""
+        """Return the quantisation error of a candidate; for a draft, the error of its file after another refit."""
         error = self._goal_error(one) if on_goal else one.error
         least = LEAST_QUANTISED * error
-        if on_goal and self.goal.is_drop:  # against images, the error of a file may be that of the source by chance
+        if on_goal and self.goal.is_drop:  # against images, the error of a file may equal the source's by chance
             least = LEAST_QUANTISED * self._allowed_in_renders
         rest = max(error - self._unquantised(one.subset, one.coding, on_goal=on_goal), least, NOTHING)
         return rest * (error_of_psnr(_TUNING_GAIN) if one.is_draft else 1.0)
@@ -560,7 +565,7 @@ class TargetSearch:
 
     @property
     def _allowed_in_renders(self) -> float:
-        """The mean squared error that a file may have against renders of the source, if these had no other error."""
+        """The mean squared error that a file may have against renders of the source, if renders had no other error."""
         return self.goal.error - self.goal.source_error
 
     def _unquantised(self, subset: Subset, coding: Coding, *, on_goal: bool = False) -> float:
@@ -571,14 +576,14 @@ class TargetSearch:
         key = subset, degree, on_goal
         if key not in self._errors:
             scorer = self.goal.scorer if on_goal else self.pool.validation_scorer
-            found = self._error_in(scorer, drop_bands(subset.model, degree))
-            self._errors[key] = max(found - (self.goal.source_error if on_goal else 0.0), 0.0)
+            error = self._error_in(scorer, drop_bands(subset.model, degree))
+            self._errors[key] = max(error - (self.goal.source_error if on_goal else 0.0), 0.0)
         return self._errors[key]
 
     def _degree(self, coding: Coding) -> int:
         """Return the SH degree of a coding's files."""
         chosen = [self.pool.encoding.sh_degree, coding.degree, 0 if coding.sh == "none" else None]
-        return min([self.whole.model.sh_degree, *(one for one in chosen if one is not None)])
+        return min([self.whole.model.sh_degree, *(degree for degree in chosen if degree is not None)])
 
     @staticmethod
     def _error_in(scorer: Scorer, model: SplatModel) -> float:
@@ -615,9 +620,9 @@ class TargetSearch:
         goal, made = self.goal, self.pool.made
         if goal.size_bytes is not None:
             kept = " with all splats" if self.pruner is None else ""
-            smallest = min(one.size_bytes for one in made)
+            smallest = min(candidate.size_bytes for candidate in made)
             return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
-        best = psnr_of_mse(min(one.goal_error for one in made if one.goal_error is not None))
+        best = psnr_of_mse(min(candidate.goal_error for candidate in made if candidate.goal_error is not None))
         if goal.is_drop:
             return (
                 f"no file reaches {psnr_of_mse(goal.error):.2f} dB on the validation images; the best has {best:.2f} dB"
@@ -672,10 +677,10 @@ def search_target(
     if finest is None and not _keeps_all(target, encoding):
         pruner = options.pruner(source, views, use_classes=not inside, progress=progress)
     if finest is not None:
-        found = finest
+        chosen = finest
     elif pruner is not None and target.keep is not None:
-        found = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
-        found = found if levels is None else found.with_levels(levels, progress)
+        chosen = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
+        chosen = chosen if levels is None else chosen.with_levels(levels, progress)
     else:
         if pruner is None:
             measured, sensitivity_views = complete_importance(
@@ -683,26 +688,26 @@ def search_target(
             )
             whole = replace(whole, measured=measured)
         search = TargetSearch(goal, pool, whole, pruner, options.work)
-        found = search.best() if levels is None else _best_with_levels(search, levels, progress)
-    remarks = [_INSIDE_REMARK] * (inside and found.splats < len(source))
+        chosen = search.best() if levels is None else _best_with_levels(search, levels, progress)
+    remarks = [_INSIDE_REMARK] * (inside and chosen.splats < len(source))
     if finest is not None:
         remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
     report = make_report(
-        target, found, pool, test_scorer, splats_before=len(source), views_of=views.name, remarks=remarks,
+        target, chosen, pool, test_scorer, splats_before=len(source), views_of=views.name, remarks=remarks,
         encodes=len(pool.made), seconds=0.0,
-        photographs=_image_psnr(source, found, views, encoding.threads) if views.images else {},
+        photographs=_image_psnr(source, chosen, views, encoding.threads) if views.images else {},
         sensitivity_views=sensitivity_views, pruning_views=0 if pruner is None else pruner.view_count,
-        elsewhere=_psnr_elsewhere(source, found, views, encoding.threads),
-        reached={name: found.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
+        elsewhere=_psnr_elsewhere(source, chosen, views, encoding.threads),
+        reached={name: chosen.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
-    return found, report
+    return chosen, report
 
 
 def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
     """Return the best file with levels of detail, whose bytes count for a size.
 
     Their bytes are only known once they are built for the splats of a file. So the size that is left for level 0 is
-    predicted, and corrected by that of the file.
+    predicted, and corrected by the size of the file.
 
     Raises:
         InputError: no file meets the goal.
@@ -713,13 +718,13 @@ def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder, progress
     left, best, smallest = size_bytes * _LEVEL_0, None, math.inf
     for _ in range(_ROUNDS):
         goal = replace(search.goal, size_bytes=max(1, int(left)))
-        found = replace(search, goal=goal).best().with_levels(levels, progress)
-        smallest = min(smallest, found.size_bytes)
-        if found.size_bytes <= size_bytes and (best is None or found.error < best.error):
-            best = found
-        if (1.0 - _WORTH) * size_bytes <= found.size_bytes <= size_bytes:
+        candidate = replace(search, goal=goal).best().with_levels(levels, progress)
+        smallest = min(smallest, candidate.size_bytes)
+        if candidate.size_bytes <= size_bytes and (best is None or candidate.error < best.error):
+            best = candidate
+        if (1.0 - _WORTH) * size_bytes <= candidate.size_bytes <= size_bytes:
             break
-        left *= (1.0 - 0.5 * _WORTH) * size_bytes / found.size_bytes
+        left *= (1.0 - 0.5 * _WORTH) * size_bytes / candidate.size_bytes
     if best is None:
         raise InputError(f"no file with levels of detail has at most {size_bytes} bytes; the smallest has {smallest}")
     return best
