@@ -56,7 +56,7 @@ class AttributeErrors:
         pairing: origin of the pairs. `index`: a source index. `order`: both scenes have the same number of splats, in
             the same order by their centres. `search`: some source splat is within the declared error bounds.
         matched: number of splats with a partner; only these are measured.
-        unmatched: number of splats without one.
+        unmatched: number of splats without a partner.
         errors: largest and rms error by measure, in the order of the registry.
     """
 
@@ -113,7 +113,7 @@ class Comparison:
 
     @property
     def ratio(self) -> float:
-        """Size of A divided by that of B."""
+        """Size of A divided by the size of B."""
         return self.a.size_bytes / self.b.size_bytes
 
     def as_json(self) -> dict[str, Any]:
@@ -130,8 +130,8 @@ class Comparison:
             **self.quality.as_json(),
             "ignored": {"a": self.ignored, "b": self.quality.ignored},
             "views": [
-                {name: getattr(one, name) for name in ("image", "psnr", "ssim", "lpips", "cover")}
-                for one in self.quality.each
+                {name: getattr(score, name) for name in ("image", "psnr", "ssim", "lpips", "cover")}
+                for score in self.quality.each
             ],
             "seconds": round(self.seconds, 3),
         }
@@ -165,7 +165,7 @@ def compare(
         lpips: a file of LPIPS weights, or `auto` for the usual places; `None`: LPIPS is not computed.
         pictures: a folder for one PNG per view: the image, if any, A, B, and their amplified difference.
         amplification: factor of the difference.
-        background: red, green, blue, 0..1; `None`: that of the views.
+        background: red, green, blue, 0..1; `None`: the background of the views.
         mode: mode of the renderer.
         backend: what renders, as in `csplat_render.render`. A GPU computes PSNR alone, unless images are needed for
             something else: `pictures`, `lpips`, or the images of a data set. Both scenes have to fit in memory.
@@ -177,8 +177,8 @@ def compare(
 
     Examples:
         >>> import csplat_tools
-        >>> found = csplat_tools.compare("scene.ply", "scene.csplat")  # doctest: +SKIP
-        >>> found.ratio, found.quality.psnr, found.attributes.errors["means"]  # doctest: +SKIP
+        >>> comparison = csplat_tools.compare("scene.ply", "scene.csplat")  # doctest: +SKIP
+        >>> comparison.ratio, comparison.quality.psnr, comparison.attributes.errors["means"]  # doctest: +SKIP
         (12.3, 41.2, (0.00021, 0.00009))
 
     Raises:
@@ -210,7 +210,7 @@ def compare(
         viewers += [] if image_scores is None else [image_scores]
         device, _ = find_device(backend)
         if device is not None:
-            first, second = (_on_gpu(one, device) for one in (first, second))
+            first, second = (_on_gpu(scene, device) for scene in (first, second))
         if isinstance(first, GpuScene) and isinstance(second, GpuScene) and not viewers and distance is None:
             colour = background or views.test_background
             quality = compare_scenes(first, second, views.test, colour, progress=progress)
@@ -233,7 +233,7 @@ def attribute_errors(
     *,
     progress: Progress | None = None,
 ) -> AttributeErrors | None:
-    """Measure the errors of a scene's splats against those of its source.
+    """Measure the errors of a scene's splats against the splats of its source.
 
     Args:
         source: the source, in memory.
@@ -259,11 +259,11 @@ def attribute_errors(
     bounds = {record.measure: record.max for record in declared.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:
         return None
-    found = find_partners(ours, theirs, bounds, lattice_radii(theirs, other.header), progress=progress)
-    matched = np.flatnonzero(found >= 0)
+    partners = find_partners(ours, theirs, bounds, lattice_radii(theirs, other.header), progress=progress)
+    matched = np.flatnonzero(partners >= 0)
     if not len(matched):
         return None
-    errors = _errors(ours, theirs.select(matched), found[matched])
+    errors = _errors(ours, theirs.select(matched), partners[matched])
     return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
 
 
@@ -281,18 +281,18 @@ def attribute_errors_out_of_core(
             return None
         most = splats_in_memory(other, memory_bytes)
         pairs = measure_pairs_by_tile(source, other, source_index, most, progress=progress)
-        found = {name: (one.max, one.rms) for name, one in pairs.measured.items()}
-        return AttributeErrors("index", other.count, 0, found)
+        errors = {name: (measured.max, measured.rms) for name, measured in pairs.measured.items()}
+        return AttributeErrors("index", other.count, 0, errors)
     if source.count != other.count or not _same_order(
-        *(sample_scene(one, progress=progress)[0] for one in (source, other))
+        *(sample_scene(scene, progress=progress)[0] for scene in (source, other))
     ):
         return None
     parts = [
         (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
         for start, ours, theirs in _paired_blocks(source, other, progress)
     ]
-    found = {name: (one.max, one.rms) for name, one in merge_errors(parts).items()}
-    return AttributeErrors("order", other.count, 0, found)
+    errors = {name: (measured.max, measured.rms) for name, measured in merge_errors(parts).items()}
+    return AttributeErrors("order", other.count, 0, errors)
 
 
 def _paired_blocks(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
@@ -309,7 +309,7 @@ def _paired_blocks(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tu
 
 
 def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str, tuple[float, float]]:
-    return {name: (found.max, found.rms) for name, found in measure_pairs(source, other, index).items()}
+    return {name: (measured.max, measured.rms) for name, measured in measure_pairs(source, other, index).items()}
 
 
 def _same_order(source: SplatModel, other: SplatModel) -> bool:
@@ -341,12 +341,12 @@ def _measure(
         return source.in_memory, other.in_memory, attribute_errors(source, other, source_index, progress=progress)
     kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
     first, second = (
-        SlicedScene(one, *sample_scene(one, progress=progress), memory_bytes - kept, progress)
-        for one in (source, other)
+        SlicedScene(scene, *sample_scene(scene, progress=progress), memory_bytes - kept, progress)
+        for scene in (source, other)
     )
-    for one in (first, second):
-        if one.memory_bytes < one.least_bytes:
-            bound, least = (one.memory_bytes + kept) / 1e6, (one.least_bytes + kept) / 1e6
+    for scene in (first, second):
+        if scene.memory_bytes < scene.least_bytes:
+            bound, least = (scene.memory_bytes + kept) / 1e6, (scene.least_bytes + kept) / 1e6
             raise InputError(f"the memory is {bound:,.0f} MB, expected at least {least:,.0f} MB to draw these scenes")
     check_free_space(
         temporary_root(),
@@ -370,11 +370,11 @@ class _ImageScores:
         self._each: dict[str, list[ViewScore]] = {"a": [], "b": []}
 
     def __call__(self, number: int, a: F32, b: F32) -> None:
-        for each, render in zip(self._each.values(), (a, b), strict=True):
-            each.append(self._scorer.score(number, render, lpips=self._distance))
+        for scores, render in zip(self._each.values(), (a, b), strict=True):
+            scores.append(self._scorer.score(number, render, lpips=self._distance))
 
     def as_json(self) -> dict[str, Any]:
-        return {name: Scores.of(each).as_json() for name, each in self._each.items()}
+        return {name: Scores.of(scores).as_json() for name, scores in self._each.items()}
 
 
 class _ImageWriter:

@@ -1,7 +1,7 @@
 """Describe a file without decoding it, for `csplat info`.
 
-Of a .csplat file only the heads of blocks are read. Nothing is inflated and no CRC is computed, so that a memory-mapped
-file of any size is described at once. Every length is checked against the remaining bytes.
+Only the heads of the blocks of a .csplat file are read. Nothing is inflated and no CRC is computed, so that a
+memory-mapped file of any size is described at once. Every length is checked against the remaining bytes.
 """
 
 from __future__ import annotations
@@ -133,7 +133,7 @@ class FileDescription:
     Attributes:
         header: header and index.
         attributes, layers: attributes and layers by name, in the order of the registry; of all levels of detail.
-        levels: levels of detail, finest first; none if level 0 is the only one.
+        levels: levels of detail, finest first; empty if level 0 is the only level.
         codebooks: codebooks in the order of the index.
         overhead: bytes outside attributes, by name: header, index, chunks of the whole file, frames of the tiles'
             chunks.
@@ -163,9 +163,9 @@ class FileDescription:
         """Ranges of splat counts, lattice exponents and bits per axis over the tiles; empty without tiles."""
         tiles = self.header.tiles
         columns = {
-            "splats": [one.splat_count for one in tiles],
-            "exponents": [one.exponent for one in tiles],
-            "bits_per_axis": [max(extent.bit_length() for extent in one.extent) for one in tiles],
+            "splats": [tile.splat_count for tile in tiles],
+            "exponents": [tile.exponent for tile in tiles],
+            "bits_per_axis": [max(extent.bit_length() for extent in tile.extent) for tile in tiles],
         }
         return {name: Span(min(values), max(values)) for name, values in columns.items() if values}
 
@@ -188,15 +188,15 @@ class FileDescription:
             "antialiased": header.antialiased,
             "flat": header.flat,
             "attributes": {
-                name: {key: value for key, value in asdict(one).items() if value is not None or key in _NULLABLE}
-                for name, one in self.attributes.items()
+                name: {key: value for key, value in asdict(summary).items() if value is not None or key in _NULLABLE}
+                for name, summary in self.attributes.items()
             },
-            "layers": {name: asdict(one) for name, one in self.layers.items()},
-            "levels": [asdict(one) for one in self.levels],
+            "layers": {name: asdict(layer) for name, layer in self.layers.items()},
+            "levels": [asdict(level) for level in self.levels],
             "overhead": dict(self.overhead),
-            "codebooks": [asdict(one) for one in self.codebooks],
+            "codebooks": [asdict(codebook) for codebook in self.codebooks],
             "extra_columns": [{"name": extra.name, "dtype": extra.dtype} for extra in header.extras],
-            "tiles": {"count": len(tiles), **{name: asdict(one) for name, one in self.spans.items()}, **largest},
+            "tiles": {"count": len(tiles), **{name: asdict(span) for name, span in self.spans.items()}, **largest},
             "chunks": [
                 {"type": chunk.type.decode("ascii"), "size_bytes": chunk.size, "offset_bytes": chunk.offset}
                 for chunk in header.directory
@@ -215,12 +215,12 @@ def describe_file(data: bytes | mmap) -> FileDescription:
         data: the whole file; only a small part is read.
 
     Raises:
-        FormatError: header, index, block heads or one of the small chunks are not valid.
+        FormatError: header, index, a block head or a small chunk is not valid.
         LimitError: metadata, cameras or options are larger than the decoder's budget.
     """
     header = read_header(data)
     use = attribute_usage(data, header)
-    attributes = {name: _attribute(header, name, one) for name, one in use.items()}
+    attributes = {name: _attribute(header, name, usage) for name, usage in use.items()}
     return FileDescription(
         header,
         attributes,
@@ -269,14 +269,14 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
         if scene.file_axes:
             words["axes"] = f"{scene.file_axes}, read as {metadata.coordinate_system}"
         if scene.levels:
-            words["levels"] = f"{' / '.join(f'{one:,}' for one in scene.levels)} splats (csplat convert --level)"
+            words["levels"] = f"{' / '.join(f'{splats:,}' for splats in scene.levels)} splats (csplat convert --level)"
         if scene.extra:
             words["extra"] = ", ".join(f"{name} ({dtype})" for name, dtype in scene.extra.items())
         if metadata.entries:
             words["metadata"] = json.dumps(metadata.entries, sort_keys=True)
         lines = [f"{format_by_name(scene.format).title}, {format_bytes(size)}{average}"]
         lines += [f"{name:12} {value}" for name, value in words.items()]
-        lines += [str(one) for one in scene.findings if not one.usual]
+        lines += [str(finding) for finding in scene.findings if not finding.usual]
     return report, "\n".join(lines)
 
 
@@ -287,7 +287,7 @@ def bytes_by_attribute(data: bytes | mmap, header: SceneHeader) -> dict[str, int
         FormatError: heads contradict each other.
     """
     use = attribute_usage(data, header)
-    return {**{name: one.size_bytes for name, one in use.items()}, "overhead": sum(_overhead(header, use).values())}
+    return {**{name: usage.size_bytes for name, usage in use.items()}, "overhead": sum(_overhead(header, use).values())}
 
 
 def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, AttributeUsage]:
@@ -311,7 +311,7 @@ def attribute_usage(data: bytes | mmap, header: SceneHeader) -> dict[str, Attrib
     codebooks = {record.codebook_id: record for record in header.codebooks}
     use: dict[int, AttributeUsage] = {}
     for tile in header.all_tiles:
-        for layer in (one for id_, one in tile.layers.items() if id_ in _spec.LAYER_NAMES):
+        for layer in (tile.layers[id_] for id_ in tile.layers if id_ in _spec.LAYER_NAMES):
             _walk_tile(_Cursor(data, layer.offset, layer.size), codebooks, use)
     for chunk in header.directory:
         if chunk.type == _spec.CHUNK_CODEBOOK:
@@ -333,7 +333,7 @@ def describe_scene(file: FileDescription) -> dict[str, str]:
     header = file.header
     words = describe_placement(header, header.splat_count, file.metadata)
     words["tiles"] = _tiles(file)
-    extras = ", ".join(f"{one.name} ({one.dtype or 'unknown type'})" for one in header.extras)
+    extras = ", ".join(f"{extra.name} ({extra.dtype or 'unknown type'})" for extra in header.extras)
     if extras:
         words["extra"] = extras
     if file.metadata.cameras is not None:
@@ -396,7 +396,7 @@ def _bits(size_bytes: int, count: int) -> float | None:
 
 
 def _attribute(header: SceneHeader, name: str, use: AttributeUsage) -> AttributeSummary:
-    record = next((one for one in header.attributes if _spec.ATTRIBUTE_NAMES[one.attribute] == name), None)
+    record = next((entry for entry in header.attributes if _spec.ATTRIBUTE_NAMES[entry.attribute] == name), None)
     known: dict[str, Any] = {}
     if record is not None:
         known["mapping"] = _spec.MAPPING_NAMES[record.mapping]
@@ -437,21 +437,21 @@ def _levels(data: bytes | mmap, header: SceneHeader) -> list[LevelSummary]:
     if not header.coarse_tiles:
         return []
     nodes = read_nodes(memoryview(data), header)
-    found = []
+    levels = []
     for level in sorted({node.level for node in nodes}):
         own = [node for node in nodes if node.level == level]
         tiles = [tile for node in own for tile in node.tiles]
         size = sum(layer.size for tile in tiles for layer in tile.layers.values())
         errors = [node.error for node in own]
         splats = sum(node.splat_count for node in own)
-        found.append(LevelSummary(level, len(own), len(tiles), splats, size, (min(errors), max(errors))))
-    return found
+        levels.append(LevelSummary(level, len(own), len(tiles), splats, size, (min(errors), max(errors))))
+    return levels
 
 
 def _overhead(header: SceneHeader, use: Mapping[str, AttributeUsage]) -> dict[str, int]:
     whole = {chunk.type.decode("ascii"): chunk.size for chunk in header.directory if chunk.type != _spec.CHUNK_CODEBOOK}
     parts = {"header": _spec.HEADER_SIZE, "index": header.index_size, **whole}
-    rest = header.file_size - sum(parts.values()) - sum(one.size_bytes for one in use.values())
+    rest = header.file_size - sum(parts.values()) - sum(usage.size_bytes for usage in use.values())
     return {**parts, "tile_frames": rest}
 
 
@@ -503,10 +503,10 @@ def _walk_tile(cursor: _Cursor, codebooks: Mapping[int, _spec.CodebookRecord], u
         start = cursor.at
         block = _spec.unpack_block_head(cursor.take(_spec.BLOCK_HEAD_SIZE))
         _name(_spec.ATTRIBUTE_NAMES, block.attribute, "attribute", start)
-        one = use.setdefault(block.attribute, AttributeUsage())
-        one.codings[_name(_spec.CODING_NAMES, block.coding, "coding", start)] += 1
-        _walk_coding(cursor, block.attribute, block.coding, codebooks, one)
-        one.block_bytes += cursor.at - start
+        usage = use.setdefault(block.attribute, AttributeUsage())
+        usage.codings[_name(_spec.CODING_NAMES, block.coding, "coding", start)] += 1
+        _walk_coding(cursor, block.attribute, block.coding, codebooks, usage)
+        usage.block_bytes += cursor.at - start
 
 
 def _walk_coding(
@@ -559,12 +559,12 @@ def _walk_stream(cursor: _Cursor, use: AttributeUsage) -> None:
 
 
 def _first_attribute(record: _spec.CodebookRecord, band: int) -> int:
-    """Return the id of the first attribute of a codebook chunk; for SH that of the band."""
+    """Return the id of the first attribute of a codebook chunk; for SH, of the band's attribute."""
     if record.kind == _spec.CODEBOOK_KIND_SH:
         name = f"sh{band}"
     else:
         name = _spec.CODEBOOK_KIND_ATTRIBUTES[record.kind][0]
-    return next(id_ for id_, one in _spec.ATTRIBUTE_NAMES.items() if one == name)
+    return next(id_ for id_, attribute in _spec.ATTRIBUTE_NAMES.items() if attribute == name)
 
 
 def _name(names: Mapping[int, str], id_: int, what: str, offset: int) -> str:
@@ -575,7 +575,8 @@ def _name(names: Mapping[int, str], id_: int, what: str, offset: int) -> str:
 
 def _tiles(file: FileDescription) -> str:
     words = {
-        name: str(one.min) if one.min == one.max else f"{one.min} to {one.max}" for name, one in file.spans.items()
+        name: str(span.min) if span.min == span.max else f"{span.min} to {span.max}"
+        for name, span in file.spans.items()
     }
     if not words:
         return "0"

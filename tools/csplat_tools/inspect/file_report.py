@@ -135,11 +135,17 @@ def _compare(data: bytes | mmap, source: str, progress: Progress | None) -> _Sou
 
 
 def _bytes(description: FileDescription) -> str:
-    sizes = {name: one.size_bytes for name, one in description.attributes.items()}
+    sizes = {name: attribute.size_bytes for name, attribute in description.attributes.items()}
     sizes["overhead"] = sum(description.overhead.values())
     rows = [
-        (name, _ATTRIBUTES.get(name, ""), f"{one.size_bytes:,}", _bits(one.bits_per_splat), describe_coding(one))
-        for name, one in description.attributes.items()
+        (
+            name,
+            _ATTRIBUTES.get(name, ""),
+            f"{attribute.size_bytes:,}",
+            _bits(attribute.bits_per_splat),
+            describe_coding(attribute),
+        )
+        for name, attribute in description.attributes.items()
     ]
     overhead = ", ".join(f"{name} {number}" for name, number in description.overhead.items())
     rows.append(("overhead", _ATTRIBUTES["overhead"], f"{sizes['overhead']:,}", "", overhead))
@@ -150,8 +156,8 @@ def _bytes(description: FileDescription) -> str:
 def _layers(description: FileDescription) -> str:
     size = description.header.file_size
     rows = [
-        (name, _LAYERS.get(name, ""), f"{one.size_bytes:,}", f"{100.0 * one.size_bytes / size:.1f} %")
-        for name, one in description.layers.items()
+        (name, _LAYERS.get(name, ""), f"{layer.size_bytes:,}", f"{100.0 * layer.size_bytes / size:.1f} %")
+        for name, layer in description.layers.items()
     ]
     head = ("layer", "content", "bytes", "share of the file")
     return html.section("Layers, in order of arrival", html.table(head, rows, words=(1,)) if rows else "")
@@ -167,7 +173,10 @@ def _bounds(bounds: DeclaredBounds | None) -> str:
     )
     if bounds.refitted:
         text += " Some attributes were refitted to renders of the source: they have no bounds."
-    rows = [(one.measure, _MEASURES.get(one.measure, ""), f"{one.max:.4g}", f"{one.rms:.4g}") for one in bounds.records]
+    rows = [
+        (record.measure, _MEASURES.get(record.measure, ""), f"{record.max:.4g}", f"{record.rms:.4g}")
+        for record in bounds.records
+    ]
     errors = html.table(("error of", "meaning", "largest", "rms"), rows, words=(1,)) if rows else ""
     return html.section("Declared error bounds", f"<p>{escape(text)} {_CHECK}</p>", errors)
 

@@ -65,10 +65,10 @@ def format_comparison(compared: Comparison, a: str, b: str) -> str:
 
 def _scene_sizes(compared: Comparison, a: str, b: str) -> str:
     rows = []
-    for name, one in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
-        count = one.count
-        per_splat = f"{one.size_bytes / count:.2f}" if count else "-"
-        rows.append((name, one.size_bytes, count, one.sh_degree, per_splat))
+    for name, scene in ((f"A  {a}", compared.a), (f"B  {b}", compared.b)):
+        count = scene.count
+        per_splat = f"{scene.size_bytes / count:.2f}" if count else "-"
+        rows.append((name, scene.size_bytes, count, scene.sh_degree, per_splat))
     table = format_table(("", "bytes", "splats", "SH", "bytes/splat"), rows)
     ratio = compared.ratio
     return f"{table}\nB is {ratio:.2f} times smaller than A" if ratio >= 1.0 else f"{table}\nB is larger than A"
@@ -127,16 +127,19 @@ def format_description(description: FileDescription) -> str:
     parts = [
         _scene(description),
         _entry_sizes(
-            "attribute", description.attributes, size, [describe_coding(one) for one in description.attributes.values()]
+            "attribute",
+            description.attributes,
+            size,
+            [describe_coding(attribute) for attribute in description.attributes.values()],
         ),
         _entry_sizes(
-            "layer", description.layers, size, [counted(one.tiles, "tile") for one in description.layers.values()]
+            "layer", description.layers, size, [counted(layer.tiles, "tile") for layer in description.layers.values()]
         ),
         *([_level_table(description.levels)] if description.levels else []),
         "other bytes: " + ", ".join(f"{name} {number}" for name, number in description.overhead.items()),
     ]
     if description.codebooks:
-        parts.append("\n".join(_codebook(one) for one in description.codebooks))
+        parts.append("\n".join(_codebook(codebook) for codebook in description.codebooks))
     if description.declared_bounds is not None:
         parts.append(_declared_errors(description.declared_bounds))
     parts += [
@@ -150,10 +153,10 @@ def format_description(description: FileDescription) -> str:
 def _level_table(levels: Sequence[LevelSummary]) -> str:
     rows = [
         (
-            str(one.level), one.size_bytes, one.splats, one.nodes, one.tiles,
-            " to ".join(f"{error:.3g}" for error in sorted({*one.errors})),
+            str(level.level), level.size_bytes, level.splats, level.nodes, level.tiles,
+            " to ".join(f"{error:.3g}" for error in sorted({*level.errors})),
         )
-        for one in levels
+        for level in levels
     ]  # fmt: skip
     return format_table(("level", "bytes", "splats", "nodes", "tiles", "errors, scene units"), rows)
 
@@ -170,11 +173,11 @@ def _entry_sizes(
     rows = [
         (
             name,
-            one.size_bytes,
-            "-" if one.bits_per_splat is None else f"{one.bits_per_splat:.2f}",
-            f"{100.0 * one.size_bytes / file_size:.1f}",
+            entry.size_bytes,
+            "-" if entry.bits_per_splat is None else f"{entry.bits_per_splat:.2f}",
+            f"{100.0 * entry.size_bytes / file_size:.1f}",
         )
-        for name, one in entries.items()
+        for name, entry in entries.items()
     ]
     lines = format_table((title, "bytes", "bits/splat", "% of file"), rows).splitlines()
     return "\n".join(f"{line}  {text}".rstrip() for line, text in zip(lines, ["", *remarks], strict=True))
@@ -192,7 +195,7 @@ def _declared_errors(declared: DeclaredBounds) -> str:
     if declared.refitted:
         lines.append("attributes were refitted: those without an error here are checked by renders only")
     if declared.records:
-        rows = [(one.measure, f"{one.max:.6g}", f"{one.rms:.6g}") for one in declared.records]
+        rows = [(record.measure, f"{record.max:.6g}", f"{record.rms:.6g}") for record in declared.records]
         lines.append(format_table(("declared error", "max", "rms"), rows))
     return "\n".join(lines)
 
@@ -200,7 +203,10 @@ def _declared_errors(declared: DeclaredBounds) -> str:
 def format_verification(verified: Verification) -> str:
     """Format the result of a verification: violations, and the verified errors."""
     validation, proof = verified.validation, verified.proof
-    lines = [*map(str, (*validation.violations, *validation.unread)), *(f"remark: {one}" for one in validation.remarks)]
+    lines = [
+        *map(str, (*validation.violations, *validation.unread)),
+        *(f"remark: {remark}" for remark in validation.remarks),
+    ]
     if validation.conforms:
         lines.append(f"intact: {counted(validation.splat_count, 'splat')}; checked: {', '.join(validation.checks)}")
     if proof is not None:
@@ -213,7 +219,7 @@ def format_verification(verified: Verification) -> str:
 
 
 def _verdict(proof: BoundsVerification) -> str:
-    if not any(one.holds for one in proof.measures):
+    if not any(measure.holds for measure in proof.measures):
         return "the file declares no errors that could be verified"
     return "the declared errors hold" if proof.rms_verified else "the declared maxima hold"
 
@@ -223,14 +229,14 @@ def _measures(proof: BoundsVerification) -> str:
         header = ("error", "declared max", "found max", "declared rms", "found rms", "")
         rows = [
             (
-                one.name,
-                *map(_number, (one.declared_max, one.measured_max, one.declared_rms, one.measured_rms)),
-                _word(one),
+                measure.name,
+                *map(_number, (measure.declared_max, measure.measured_max, measure.declared_rms, measure.measured_rms)),
+                _word(measure),
             )
-            for one in proof.measures
+            for measure in proof.measures
         ]
         return format_table(header, rows)
-    rows = [(one.name, _number(one.declared_max), _word(one)) for one in proof.measures]
+    rows = [(measure.name, _number(measure.declared_max), _word(measure)) for measure in proof.measures]
     return format_table(("error", "declared max", ""), rows)
 
 

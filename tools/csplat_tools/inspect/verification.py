@@ -49,19 +49,19 @@ class Verification:
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
-        found, proof = self.validation, self.proof
+        validation, proof = self.validation, self.proof
         return {
             "holds": self.holds,
-            "conforms": found.conforms,
+            "conforms": validation.conforms,
             "violations": [
-                {name: getattr(one, name) for name in ("clause", "code", "offset", "field", "message")}
-                for one in found.violations
+                {name: getattr(violation, name) for name in ("clause", "code", "offset", "field", "message")}
+                for violation in validation.violations
             ],
-            "remarks": list(found.remarks),
-            "not_looked_at": [{"field": one.field, "reason": one.reason} for one in found.unread],
-            "splats": found.splat_count,
-            "tiles": found.tile_count,
-            "checks": list(found.checks),
+            "remarks": list(validation.remarks),
+            "not_looked_at": [{"field": unread.field, "reason": unread.reason} for unread in validation.unread],
+            "splats": validation.splat_count,
+            "tiles": validation.tile_count,
+            "checks": list(validation.checks),
             "proof": None if proof is None else proof.as_json(),
         }
 

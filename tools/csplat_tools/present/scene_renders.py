@@ -54,9 +54,9 @@ def find_cameras(
     Args:
         model: the scene; cameras are relative to its origin.
         path: path of a camera file.
-        orbit_count: number of cameras on a closed path, along those of a file or a data set if one is given.
+        orbit_count: number of cameras on a closed path; it follows the cameras of a file or a data set, if given.
         data: a data set; its own size is used instead of `size`, unless there is an orbit.
-        size: width and height of the renders; `None`: those of the file, or 640×480.
+        size: width and height of the renders; `None`: the size in the file, or 640×480.
         split: the part of the data set.
         report: receives remarks on camera files of other programs.
 
@@ -72,10 +72,10 @@ def find_cameras(
     if path is not None:
         cameras = load_cameras(path, report, model.origin)
     elif data is not None:
-        # An orbit uses the positions of the cameras, but not the size of their images: `size` is that of the orbit.
+        # An orbit uses the positions of the cameras, but not the size of their images: `size` is the orbit's.
         data_set = data if orbit_count is None else replace(data, size=None)
-        found = find_view_set(model, data=data_set, count=0, split=split)
-        cameras = [*found.test, *(() if orbit_count is None else (*found.training, *found.validation))]
+        views = find_view_set(model, data=data_set, count=0, split=split)
+        cameras = [*views.test, *(() if orbit_count is None else (*views.training, *views.validation))]
         if not cameras:
             raise InputError(f"{data.path} has no {split} views")
     if orbit_count is not None:
@@ -103,7 +103,7 @@ def render_folder(
         model: the scene.
         cameras: the views. Renders are named after their images, or by numbers.
         folder: the folder for the files; it is made if missing.
-        background: red, green, blue, 0..1; `None`: that of the scene's training if known, else black.
+        background: red, green, blue, 0..1; `None`: the colour of the scene's training if known, else black.
         mode, backend: see `csplat_render.render`.
         depth: write NAME.depth.npy, too, [H, W] float32: mean depth along the camera's axis, scene units; 0 in pixels
             without splats. Requires the backend cpu.
@@ -180,7 +180,7 @@ def render_film(
 
 
 def on_backend(model: SplatModel, backend: Backend) -> SplatModel | Renderable:
-    """Return a scene to render, in the memory of the GPU if the backend is one.
+    """Return a scene to render, in the memory of the GPU if the backend is a GPU.
 
     Raises:
         InputError: there is no GPU, or it has too little memory.
@@ -229,6 +229,6 @@ def _remove_if_empty(folder: Path | None) -> Iterator[None]:
 
 
 def _mean_depth(depth: F32, alpha: F32) -> F32:
-    """Return the mean depth; the renderer's depth is a weighted sum, and alpha is the sum of the weights."""
+    """Return the mean depth, [H, W]. The renderer's depth is a weighted sum, and alpha is the sum of the weights."""
     mean = np.divide(depth, alpha, out=np.zeros_like(depth), where=alpha > 0.0)
     return mean.astype(np.float32)

@@ -1,10 +1,10 @@
-"""Export the viewer, the JavaScript decoder and a scene as one HTML page; or the viewer as one script.
+"""Export the viewer, the JavaScript decoder and a scene as one HTML page, or the viewer as one script.
 
 A page opened as `file:` cannot import modules from neighbouring files, and its worker cannot import at all: the origin
-of such a page equals no other, not even that of its own blobs. So the modules become functions of one classic script.
-The page runs it, and so does the worker, which is made from a blob of the same text: a function can read its own
-source. A policy in the page forbids the network. The page is ASCII, so that the text matches the digests in the policy
-even if a server declares another charset.
+of such a page equals no other, not even the origin of its own blobs. So the modules become functions of one classic
+script. The page runs it, and so does the worker, which is made from a blob of the same text: a function can read its
+own source. A policy in the page forbids the network. The page is ASCII, so that the text matches the digests in the
+policy even if a server declares another charset.
 """
 
 from __future__ import annotations
@@ -152,8 +152,8 @@ def export_page(scene: bytes, name: str, wishes: Mapping[str, str] | None = None
     page = _replace_once(page, _SCRIPT, "")
     page = _replace_once(page, "<title>csplat viewer</title>", f"<title>{html.escape(name)} – csplat viewer</title>")
     page = _replace_once(page, "</body>", f"{body}</body>")
-    page, found = _POLICY.subn(lambda match: match[1] + _policy(style, script) + match[2], page)
-    assert found == 1, "the page has one policy"
+    page, policy_count = _POLICY.subn(lambda match: match[1] + _policy(style, script) + match[2], page)
+    assert policy_count == 1, "the page has one policy"
     data = page.encode("ascii", "xmlcharrefreplace")
     return ExportedPage(data, len(data) - len(coded), len(coded))
 
@@ -175,11 +175,11 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
         entries: paths of the modules to begin with.
 
     Returns:
-        Functions by path, each after those of its imports, with a trailing comma. A function is called with one that
-        returns the exports of another module by its number in this order, and returns its own exports. (Imports are
-        not live bindings then; no module exports a value that changes.)
+        Functions by path, each after the functions of its imports, with a trailing comma. A function is called with a
+        function that returns the exports of another module by its number in this order. It returns its own exports.
+        (Imports are not live bindings then; no module exports a value that changes.)
     """
-    found: dict[str, str] = {}
+    functions: dict[str, str] = {}
     numbers: dict[str, int] = {}
     open_paths: list[str] = []
 
@@ -190,8 +190,8 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
             open_paths.append(path)
             text = _IMPORT.sub(lambda match: taken(path, match), texts[path])
             open_paths.pop()
-            numbers[path] = len(found)
-            found[path] = _as_function(path, text)
+            numbers[path] = len(functions)
+            functions[path] = _as_function(path, text)
         return numbers[path]
 
     def taken(path: str, match: re.Match[str]) -> str:
@@ -201,7 +201,7 @@ def link_modules(texts: Mapping[str, str], entries: list[str]) -> dict[str, str]
 
     for entry in entries:
         visit(entry)
-    return found
+    return functions
 
 
 def _texts() -> dict[str, str]:

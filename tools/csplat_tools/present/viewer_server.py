@@ -112,8 +112,8 @@ class SceneServer(ThreadingHTTPServer):
     def __init__(self, host: str, port: int, resources: Mapping[str, _Resource], start: str) -> None:
         self.resources = resources
         self.start = start
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
-        family, _, _, _, address = min(found, key=lambda one: one[0] != socket.AF_INET)
+        addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, _, _, _, address = min(addresses, key=lambda entry: entry[0] != socket.AF_INET)
         self.address_family = family
         super().__init__(cast("tuple[str, int]", address), _Handler)
         shown = f"[{host}]" if ":" in host else host
@@ -196,7 +196,7 @@ def open_server(
         server = SceneServer(host, port, resources, start)
     except OverflowError:
         raise InputError(f"the port is {port}, expected 1 to 65535, or 0 for any free port") from None
-    except ValueError:  # a name that is none, such as one of 300 letters
+    except ValueError:  # not a valid host name: 300 letters, for example
         raise InputError(_NOT_HERE.format(host)) from None
     except OSError as error:
         raise InputError(_refusal(error, host, port)) from None
@@ -223,7 +223,7 @@ def page_parameters(
     """
     wishes = {}
     if camera is not None:
-        entries = [one.to_json() for one in load_cameras(camera, report, origin)]
+        entries = [view.to_json() for view in load_cameras(camera, report, origin)]
         wishes["camera"] = json.dumps(entries, separators=(",", ":"))
     if overrides.coordinate_system is not None:
         wishes["axes"] = overrides.coordinate_system
@@ -245,7 +245,7 @@ def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
         size: number of bytes of the resource.
 
     Returns:
-        First byte and number of bytes; `None` to send everything: there is no range, an unsupported one, or several.
+        First byte and number of bytes; `None` to send everything: there is no range, an unsupported range, or several.
 
     Raises:
         ValueError: no byte of the range exists (status 416).
@@ -269,7 +269,7 @@ def byte_range(header: str | None, size: int) -> tuple[int, int] | None:
 
 
 def _position(digits: str) -> int:
-    """Return a number of any length, limited; Python refuses to convert one of 5,000 digits."""
+    """Return a number of any length, limited; Python refuses to convert 5,000 digits."""
     digits = digits.lstrip("0")
     return int(digits or "0") if len(digits) <= _DIGITS_MAX else 10**_DIGITS_MAX
 
@@ -284,8 +284,8 @@ def _is_address(host: str) -> bool:
 
 def _is_loopback(address: str) -> bool:
     """Return True for an address that only programs on this machine reach, also for IPv4 addresses in IPv6."""
-    found = ip_address(address.partition("%")[0])
-    return (getattr(found, "ipv4_mapped", None) or found).is_loopback
+    parsed = ip_address(address.partition("%")[0])
+    return (getattr(parsed, "ipv4_mapped", None) or parsed).is_loopback
 
 
 def _join(up: Direction) -> str:
@@ -336,7 +336,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(send=False)
 
     def parse_request(self) -> bool:
-        """Parse a request; refuse one of HTTP/0.9, which has no version and no headers."""
+        """Parse a request; refuse HTTP/0.9, which has no version and no headers."""
         if len(self.raw_requestline.split()) == 2:
             self.requestline, self.request_version, self.command = "", self.default_request_version, ""
             self.send_error(HTTPStatus.BAD_REQUEST)
@@ -406,16 +406,16 @@ class _Handler(BaseHTTPRequestHandler):
         headers = {"Content-Type": resource.media_type, "Accept-Ranges": "bytes", "ETag": tag}
         condition = self.headers.get("If-Range")
         try:
-            found = byte_range(self.headers.get("Range"), size) if condition in (None, tag) else None
+            requested = byte_range(self.headers.get("Range"), size) if condition in (None, tag) else None
         except ValueError:
             headers |= {"Content-Range": f"bytes */{size}", "Content-Length": "0"}
             self._start(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, headers)
             return
-        first, length = found or (0, size)
+        first, length = requested or (0, size)
         headers["Content-Length"] = str(length)
-        if found is not None:
+        if requested is not None:
             headers["Content-Range"] = f"bytes {first}-{first + length - 1}/{size}"
-        self._start(HTTPStatus.OK if found is None else HTTPStatus.PARTIAL_CONTENT, headers)
+        self._start(HTTPStatus.OK if requested is None else HTTPStatus.PARTIAL_CONTENT, headers)
         if send:
             self._copy(stream, first, length)
 
