@@ -96,11 +96,11 @@ def run_training_to_file(
         data, overrides, plot, page, quiet: as for `run_training`.
         options: options of the training; `plan_training` derives them from the target.
         output: the `.csplat` file to write, or `-`.
-        files: as for `run_training`. Checkpoints of the tuning are next to those of the training
+        files: as for `run_training`. Checkpoints of the tuning are next to the training's
             (`tuning_checkpoint`); a run resumes from them if the training had ended.
         encoding: options of the encoder; its number of threads applies to everything.
         tuning: options of the tuning.
-        target: as for `run_finetuning`; but a fraction to keep is that of the training, which has pruned to it.
+        target: as for `run_finetuning`; but the training has already pruned to a fraction to keep.
 
     Returns:
         `training`, the log of `run_training`, and `file`, the report of `run_finetuning`.
@@ -111,8 +111,8 @@ def run_training_to_file(
     """
     tuning_files = _tuning_outputs(files, options)
     data_set = _load(data, options, files)
-    for one in data_set.val:  # training does not read these; finds damaged ones before it
-        _ = one.pixels, one.mask
+    for image in data_set.val:  # training does not read these images: this finds damaged files before it
+        _ = image.pixels, image.mask
     result = _train(data_set, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     views = find_view_set(model, data=data_set, validation_count=0)  # the tuning splits the training views
@@ -138,10 +138,10 @@ def plan_training(
 
     Args:
         options: the other options.
-        target: the target of the file. A kept fraction is that of the trained splats. A size leaves one splat per
+        target: the target of the file. A fraction to keep refers to the trained splats. A size leaves one splat per
             `SPLAT_BYTES`. A PSNR leaves all, since the tuning prunes. `None`: 0.8 are kept.
-        max_splats: number of splats to train; `None`: for a size a quarter more than are kept, otherwise the default;
-            for a size or a PSNR that of the checkpoint.
+        max_splats: number of splats to train; `None`: for a size a quarter more than are kept, otherwise the default.
+            With `resume`, for a size or a PSNR, the number in the checkpoint.
         resume: the checkpoint that the training resumes from, if any.
 
     Raises:

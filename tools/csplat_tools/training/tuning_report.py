@@ -84,8 +84,8 @@ def score_models(
         if known is not None and name in known:
             scores[name] = {score: known[name][score] for score in SCORES}
         elif has_images or model is not source:
-            found = scorer.scores(model, lpips=lpips)
-            scores[name] = {score: getattr(found, score) for score in SCORES}
+            measured = scorer.scores(model, lpips=lpips)
+            scores[name] = {score: getattr(measured, score) for score in SCORES}
     reference = _TEST_IMAGES if has_images else "renders of the source"
     return ModelScores(reference, len(views.test), scores)
 
@@ -126,7 +126,7 @@ def make_tuning_report(
         "overhead_bytes": overhead,
         "test_reference": None if test is None else test.reference,
         "test_view_count": 0 if test is None else test.view_count,
-        "scores": {} if test is None else {name: dict(one) for name, one in test.scores.items()},
+        "scores": {} if test is None else {name: dict(values) for name, values in test.scores.items()},
         "decoded_is_what_was_tuned": True,  # `finetune` raises an error otherwise
         "validation": {
             "views": log["validation_views"],
@@ -185,7 +185,9 @@ def score_rows(scores: Mapping[str, Mapping[str, float | None]]) -> list[tuple[s
     def cell(value: float | None, digits: int) -> str:
         return "-" if value is None else f"{value:.{digits}f}"
 
-    return [(name, *(cell(one[score], digits) for score, digits in SCORES.items())) for name, one in scores.items()]
+    return [
+        (name, *(cell(values[score], digits) for score, digits in SCORES.items())) for name, values in scores.items()
+    ]
 
 
 _SHOWN_VIEWS = 3  # number of test views on the page
@@ -255,8 +257,8 @@ def make_training_page(
 
     Args:
         title: name of the scene or file.
-        training: log of the training; `None` without one.
-        file: report on the tuned file, with its log; `None` without one.
+        training: log of the training; `None` without a training.
+        file: report on the tuned file, with its log; `None` without a tuning.
         shown: images of test views.
     """
     sizes = {} if file is None else {**file["bytes_by_attribute"], "overhead": file["overhead_bytes"]}
@@ -304,7 +306,7 @@ def _reference_text(reference: str) -> str:
 
 
 def _images(shown: Sequence[ShownView]) -> str:
-    blocks = [f"<h3>{escape(one.name)}</h3>\n{html.image_row(one.images, one.name)}" for one in shown]
+    blocks = [f"<h3>{escape(view.name)}</h3>\n{html.image_row(view.images, view.name)}" for view in shown]
     text = "Test views, evenly spread. Images are compressed for this page."
     return html.section("Renders", html.paragraph(text), *blocks) if blocks else ""
 
@@ -316,15 +318,15 @@ def _training_plot(training: Mapping[str, Any] | None) -> str:
 
     def draw(canvas: Figure) -> None:
         axes = canvas.add_subplot()
-        steps = [one["iteration"] for one in entries]
-        axes.plot(steps, [one["psnr"] for one in entries], color=_LINE, label="training images")
+        steps = [entry["iteration"] for entry in entries]
+        axes.plot(steps, [entry["psnr"] for entry in entries], color=_LINE, label="training images")
         if tests:
-            at, found = [one["iteration"] for one in tests], [one["psnr"] for one in tests]
-            axes.plot(at, found, "o", color=_OTHER, label="test images")
+            at, psnrs = [evaluation["iteration"] for evaluation in tests], [evaluation["psnr"] for evaluation in tests]
+            axes.plot(at, psnrs, "o", color=_OTHER, label="test images")
         axes.set(xlabel="step", ylabel="PSNR, dB")
         axes.legend(loc="lower right")
         right = axes.twinx()
-        right.plot(steps, [one["splat_count"] for one in entries], ":", color=INK)
+        right.plot(steps, [entry["splat_count"] for entry in entries], ":", color=INK)
         right.set_ylabel("splats (dotted)")
         right.set_ylim(bottom=0)
         right.grid(visible=False)
@@ -341,11 +343,11 @@ def _tuning_plot(file: Mapping[str, Any] | None) -> str:
 
     def draw(canvas: Figure) -> None:
         axes = canvas.add_subplot()
-        steps = [one["iteration"] for one in validations]
-        axes.plot(steps, [one["psnr"] for one in validations], "o-", color=_LINE, markersize=3)
+        steps = [validation["iteration"] for validation in validations]
+        axes.plot(steps, [validation["psnr"] for validation in validations], "o-", color=_LINE, markersize=3)
         axes.set(xlabel="step", ylabel="PSNR on validation views, dB")
         right = axes.twinx()
-        right.plot(steps, [one["size_bytes"] / 1e6 for one in validations], ":", color=INK)
+        right.plot(steps, [validation["size_bytes"] / 1e6 for validation in validations], ":", color=INK)
         right.set_ylabel("MB of the file (dotted)")
         right.grid(visible=False)
 

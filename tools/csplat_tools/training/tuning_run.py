@@ -55,8 +55,8 @@ from csplat_trainer.tuning import (
     split_views,
 )
 
-#: Factor of the learning rates, by whether the reference are the scene's own renders. Those can be matched almost
-#: exactly, and large steps lose quality that small ones are slow to regain.
+#: Factor of the learning rates, by whether the reference are the scene's own renders. Its own renders can be matched
+#: almost exactly, and large steps lose quality that small steps are slow to regain.
 LEARNING_FACTOR = {False: 1.0, True: 0.03}
 #: Default of lambda, loss per bit and splat, by whether the reference are the scene's own renders. Their loss is
 #: smaller.
@@ -69,15 +69,15 @@ SPLAT_BYTES = 10
 #: Number and size of virtual training views, used without images: more and larger than for other commands.
 VIEWS, VIEW_SIZE = 480, (320, 240)
 
-#: Factor of the steps of refits before a tuning to images, which continues them. Before one to renders, whose steps are
-#: small, plane3 would lose 0.45 dB in 150 kB.
+#: Factor of the steps of refits before a tuning to images, which continues them. Before a tuning to renders, whose
+#: steps are small, plane3 would lose 0.45 dB in 150 kB.
 _DRAFT_STEPS = 0.5
 _AIM = 0.05  # dB above a PSNR that tuned files aim at
 _WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
 _FINER = 0.1  # least factor of the error of the goal from one tuning to the next
 _TUNINGS = 4  # largest number of tunings for a target
-_PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.375  # dB: range and accuracy of the precision that is found for a size
-_SAMPLE = 1 << 15  # splats of the sample in which it is found
+_PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.375  # dB: range and accuracy of the precision searched for a size
+_SAMPLE = 1 << 15  # splats of the sample in which that precision is searched
 _SH_CODINGS: tuple[ShCoding, ...] = ("codebook", "scalar")
 _VALIDATIONS = 8  # validations of a tuning on a GPU
 
@@ -207,8 +207,8 @@ class Tuner:
         outputs: checkpoints; the first file resumes from them.
         prune_unseen: splats that no training or validation view shows are pruned.
         effort: amount of work of pruning and refitting, 1 to 9.
-        importance: importance of the source's splats; `None`: that of each file's splats is measured in the training
-            views, as `csplat sensitivity` does.
+        importance: importance of the source's splats; `None`: the importance of each file's splats is measured in the
+            training views, as `csplat sensitivity` does.
         progress, on_step: as for `csplat_trainer.finetune`.
     """
 
@@ -234,7 +234,7 @@ class Tuner:
 
         def as_views(cameras: Sequence[Camera]) -> list[TuningView]:
             if views.images:
-                return [TuningView(one.camera, one) for one in views.images_of(cameras)]
+                return [TuningView(image.camera, image) for image in views.images_of(cameras)]
             return renders_of(self.source, cameras, background, self.encoding.threads)
 
         training = as_views(views.training)
@@ -251,16 +251,16 @@ class Tuner:
         """
         if not self.prune_unseen:
             return np.arange(len(self.source))
-        found = measure_pruning(
+        errors = measure_pruning(
             self.source, [*self.views.training, *self.views.validation], self._background, self.options.device,
             threads=self.encoding.threads, progress=self.progress,
         )  # fmt: skip
-        if not found.seen.any():
+        if not errors.seen.any():
             raise InputError("no view shows any splat: check that the cameras belong to the scene")
-        return np.flatnonzero(found.seen)
+        return np.flatnonzero(errors.seen)
 
     def _pruner(self, options: SimplifyOptions) -> Pruner:
-        """Return a pruner of the splats to choose from; without validation views, some training views become such."""
+        """Return a pruner of the splats to choose from. Without validation views, some training views serve as such."""
         views = with_validation_views(replace(self.views, training=self._measuring, test=()))
         return options.pruner(self.source.select(self.rows), views, use_classes=False, progress=self.progress)
 
@@ -274,7 +274,7 @@ class Tuner:
         return self.views.training[:VIEW_COUNT] if self.views.virtual else self.views.training
 
     def tune_kept(self, kept_count: int | None) -> TunedSubset:
-        """Tune a file of this number of splats at most; `None`: of all that are not pruned as unseen."""
+        """Tune a file of this number of splats at most; `None`: all splats that are not pruned as unseen."""
         with self._timer.stage("choosing"):
             rows = self.rows
             if kept_count is not None and kept_count < len(rows):
@@ -300,7 +300,7 @@ class Tuner:
             model: its splats.
             rows: [N] int64, their indices in the source, ascending.
             encoding: options of the encoder.
-            size_bytes: largest size, to which the tuning adjusts lambda; `None`: none.
+            size_bytes: largest size, to which the tuning adjusts lambda; `None`: no limit.
             is_pruned: splats may have been pruned that a view shows.
             weights: importance of the splats, if it is known.
         """
@@ -321,7 +321,7 @@ class Tuner:
         return TunedSubset(made, pruning, self._timer.seconds)
 
     def _importance_of(self, model: SplatModel, rows: I64) -> NDArray[Any] | Importance:
-        """Return the importance of some splats, `rows` of the source."""
+        """Return the importance of some splats; `rows`, [N] int64, are their indices in the source."""
         given = self.importance
         if given is not None:
             return given.select(rows) if isinstance(given, Importance) else given[rows]
@@ -337,7 +337,7 @@ class Tuner:
     def _precise(self, model: SplatModel, weights: NDArray[Any] | Importance, size_bytes: int) -> EncodeOptions:
         """Return the options with the precision at which the untuned file has about the size.
 
-        It is found in a sample, whose splats take more bytes for centres, and fewer for indices of its smaller
+        The search uses a sample, whose splats take more bytes for centres, and fewer for indices of its smaller
         codebooks. How much all splats take is learnt without importance and shapes, which cost most of the time: of
         130,000 splats of Lego, 0.94 of the sample's bytes per splat instead of 0.92.
         """
@@ -364,10 +364,10 @@ class Tuner:
                 low, high = (low, middle) if is_larger else (middle, high)
             return replace(options, attribute_psnr=low)
 
-        found = [replace(self.encoding, attribute_psnr=sum(_PRECISIONS) / 2.0)]
+        candidates = [replace(self.encoding, attribute_psnr=sum(_PRECISIONS) / 2.0)]
         if model.sh_degree and self.encoding.sh_coding == "auto":  # its choice differs between precisions
-            found = [replace(found[0], sh_coding=coding) for coding in _SH_CODINGS]
-        options = search(size_bytes * count / len(model), min(found, key=sample_bytes))
+            candidates = [replace(candidates[0], sh_coding=coding) for coding in _SH_CODINGS]
+        options = search(size_bytes * count / len(model), min(candidates, key=sample_bytes))
         if count == len(model):
             return options
         plain = replace(options, shape_codebook_size=0)
@@ -404,14 +404,14 @@ class Tuner:
                 break
             # Too large; or the tuning has outgrown the size, and only values of its first steps fit.
             untuned_bytes = int(untuned_bytes * (size_bytes / last_bytes) * (1.0 - _WORTH))
-        found = [one for one in made if one.size_bytes <= size_bytes]
-        if not found:
-            smallest = min(one.size_bytes for one in made)
+        fitting = [subset for subset in made if subset.size_bytes <= size_bytes]
+        if not fitting:
+            smallest = min(subset.size_bytes for subset in made)
             raise InputError(f"the smallest file has {smallest:,} bytes, more than {size_bytes:,}")
-        return max(found, key=lambda one: one.psnr)
+        return max(fitting, key=lambda subset: subset.psnr)
 
     def tune_to(self, target: Target) -> TunedSubset:
-        """Tune the best file of a size, or the smallest one of a PSNR on the validation views.
+        """Tune the best file of a size, or the smallest file of a PSNR on the validation views.
 
         The search of `csplat encode` chooses splats, coding and precision by drafts, which are compared with renders of
         the source. The best draft is tuned without becoming larger. The difference between the errors of the tuned file
@@ -425,7 +425,7 @@ class Tuner:
             pruner = self._pruner(options)
             if self.views.images:
                 pruner.steps_factor *= _DRAFT_STEPS
-            cameras = shrink_cameras(pruner.views.validation, pruner.size)  # none that splats are refitted to
+            cameras = shrink_cameras(pruner.views.validation, pruner.size)  # not the views of refits
             scorer = Scorer.of_source(pruner.source, cameras, self.views.background, threads=pruner.threads)
             pool = CandidatePool(self.encoding, scorer, self.progress)
             whole = WholeScene(pruner.source, None, None, None)
@@ -438,7 +438,7 @@ class Tuner:
             goal = Goal(scorer, size_bytes, error)
             with self._timer.stage("choosing"):
                 draft, expected = TargetSearch(goal, pool, whole, pruner, options.work).best_draft()
-            met = [one.size_bytes for one in made if one.psnr >= (target.psnr or 0.0)]
+            met = [subset.size_bytes for subset in made if subset.psnr >= (target.psnr or 0.0)]
             if draft in tuned or (met and draft.size_bytes > (1.0 - _WORTH) * min(met)):
                 break
             tuned.append(draft)
@@ -452,18 +452,18 @@ class Tuner:
                 return made[-1]
             else:
                 size_bytes = max(1, int(size_bytes * (most / made[-1].size_bytes) ** 2 * (1.0 - _WORTH)))
-        found = [one for one in made if target.psnr is not None and one.psnr >= target.psnr]
-        if found:
-            return min(found, key=lambda one: one.size_bytes)
+        reached = [subset for subset in made if target.psnr is not None and subset.psnr >= target.psnr]
+        if reached:
+            return min(reached, key=lambda subset: subset.size_bytes)
         if target.psnr is None:
-            smallest = min(one.size_bytes for one in made)
+            smallest = min(subset.size_bytes for subset in made)
             raise InputError(f"the smallest file has {smallest:,} bytes, more than {target.size_bytes:,}")
-        best = max(made, key=lambda one: one.psnr)
+        best = max(made, key=lambda subset: subset.psnr)
         raise InputError(f"{target.psnr:g} dB cannot be reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
 
     def _image_error(self, model: SplatModel) -> float:
         """Return the mean squared error of a scene against the validation images; 0 without images."""
-        images = [one.reference for one in self.tuning_views.validation if isinstance(one.reference, PosedImage)]
+        images = [view.reference for view in self.tuning_views.validation if isinstance(view.reference, PosedImage)]
         if not images:
             return 0.0
         scorer = image_scorer(images, self.tuning_views.background, threads=self.encoding.threads)

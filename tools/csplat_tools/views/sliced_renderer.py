@@ -1,7 +1,8 @@
 """Render a scene that does not fit in memory, in slices of depth, using a file on the disk.
 
-For each render all splats are read once, and the visible ones are sorted into slices. Slices are drawn from front to
-back, each with the transmittance left by the previous one. So the render is that of the whole scene, bit for bit.
+For each render all splats are read once, and the visible splats are sorted into slices. Slices are drawn from front to
+back, each with the transmittance left by the previous slice. So the render equals a render of the whole scene, bit for
+bit.
 """
 
 from __future__ import annotations
@@ -138,7 +139,7 @@ class _SlicedRender:
             self._scene.progress(STAGE, share)
 
     def _visible_splats(self, splats: HasSplats) -> tuple[F32, F64, int]:
-        """Return depths and memory for drawing in bytes, both 0 if invisible; and the number of ignored splats."""
+        """Return [n] depths and [n] bytes for drawing, both 0 if invisible, and the number of ignored splats."""
         seen = self._rasteriser.find_visible(splats, self._camera, antialiased=self._scene.scene.metadata.antialiased)
         return seen.near, np.where(seen.near > 0, self._splat_bytes + _PAIR_BYTES * seen.tiles, 0.0), seen.ignored
 
@@ -188,19 +189,19 @@ class _SlicedRender:
 
     def _limits(self, blocks: Iterator[Source], every: int, share: int, *, least: int = 1) -> F32:
         """Return limits as `slice_limits` does, from every Nth splat of blocks, each of which represents `share`."""
-        found = [[column[::every].copy() for column in self._visible_splats(block)[:2]] for block in blocks]
-        if not found:
+        sampled = [[column[::every].copy() for column in self._visible_splats(block)[:2]] for block in blocks]
+        if not sampled:
             return np.empty(0, np.float32)
-        near, taken = (np.concatenate(columns) for columns in zip(*found, strict=True))
+        near, taken = (np.concatenate(columns) for columns in zip(*sampled, strict=True))
         return slice_limits(near, taken, max(least, math.ceil(taken.sum() * share / self._full)))
 
     def _draw(self, splats: HasSplats) -> None:
-        found = self._rasteriser.forward(
+        render = self._rasteriser.forward(
             splats, self._camera, background=self._background, state=self._state,
             antialiased=self._scene.scene.metadata.antialiased,
         )  # fmt: skip
-        self._last = replace(found, radii=np.empty(0, np.float32))
-        self._done, self._pairs = self._done + found.drawn, self._pairs + found.intersections
+        self._last = replace(render, radii=np.empty(0, np.float32))
+        self._done, self._pairs = self._done + render.drawn, self._pairs + render.intersections
         self._report(_READING + (1.0 - _READING) * self._done / max(1, self._visible))
 
 
@@ -213,7 +214,7 @@ def slice_limits(near: F32, taken: F64, pieces: int) -> F32:
         pieces: least number of slices.
 
     Returns:
-        Limits in ascending order; a slice includes its lower limit, but not its upper one. A depth with more splats
+        Limits in ascending order; a slice includes its lower limit, but not its upper limit. A depth with more splats
         than fit into a slice is a slice of its own, up to the next float.
     """
     rows = np.flatnonzero(near)

@@ -1,4 +1,4 @@
-"""Find how many views are needed to choose splats: views are added until they agree with held-out ones.
+"""Find how many views are needed to choose splats: views are added until they agree with held-out views.
 
 A choice of splats to prune overfits its views. This can be measured without rendering the result: the predicted error
 of the pruned splats should be about the same in the views that chose them and in held-out views.
@@ -61,7 +61,7 @@ def find_sufficient_views(
     Args:
         model: the source.
         views: the views. Virtual training views are added batch by batch until they show all splats and agree with some
-            that are held out. Other training views are all used, with validation views as the held-out ones.
+            held-out views. Other training views are all used, with the validation views as held-out views.
         size: width and height of the renders, pixels; the user's cameras keep their aspect ratio and are never
             enlarged.
         threads: number of threads; `None` for all.
@@ -75,8 +75,8 @@ def find_sufficient_views(
         return MeasuredViews.of(model, cameras, views.background, keep_renders=True, threads=threads, progress=progress)
 
     if not views.training or not views.validation:
-        found = len(views.training) + len(views.validation)
-        raise InputError(f"{found} cameras, expected at least 2: one for training, one for validation")
+        count = len(views.training) + len(views.validation)
+        raise InputError(f"{count} cameras, expected at least 2: one for training, one for validation")
     every, check = shrink_cameras(views.training, size), shrink_cameras(views.validation, size)
     if views.virtual:
         every, check = _hold_out(every)  # views of the same kind
@@ -95,10 +95,10 @@ def find_sufficient_views(
 
 
 def _hold_out(cameras: Sequence[Camera]) -> tuple[list[Camera], list[Camera]]:
-    """Split cameras into used and held-out ones, which are evenly spaced: only the whole sequence is even."""
+    """Split cameras into used and held-out cameras. These are evenly spaced, since only the whole sequence is even."""
     count = min(HELD_OUT_COUNT, len(cameras) - 1)
     held_out = set(np.linspace(0, len(cameras) - 1, count + 2).astype(int)[1:-1].tolist())
-    return [one for i, one in enumerate(cameras) if i not in held_out], [cameras[i] for i in sorted(held_out)]
+    return [camera for i, camera in enumerate(cameras) if i not in held_out], [cameras[i] for i in sorted(held_out)]
 
 
 def _gap(model: SplatModel, used: PruningError, check: PruningError) -> float:

@@ -5,10 +5,10 @@ search ends. Reports contain scores on test views. No view has two roles.
 
 | views | training | validation | test |
 |---|---|---|---|
-| virtual | `count` + 16 small ones, all around | twelve like those of `psnr` | the eight of `psnr` |
+| virtual | `count` + 16 small views, all around | twelve like the test views | the eight of `psnr` |
 | camera file, 40 or more | the others | every 8th of the others | every 4th, 24 at most |
-| camera file, fewer | virtual ones | virtual ones | all |
-| data set | training images | 16 for validation at most, else every 8th training one | held-out ones |
+| camera file, fewer | virtual views | virtual views | all |
+| data set | training images | 16 for validation at most, else every 8th training image | held-out images |
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Colour = tuple[float, float, float]
 BLACK: Colour = (0.0, 0.0, 0.0)
 WHITE: Colour = (1.0, 1.0, 1.0)
 
-#: Name of a set whose test views are virtual: those of `psnr`.
+#: Name of a set whose test views are virtual: the views of `psnr`.
 VIRTUAL = "virtual"
 
 #: Parts of a data set: its test images, and the others.
@@ -64,7 +64,7 @@ _TIMED_DIVISOR = 8  # divisor of width and height for timing mode `exact`, whose
 
 _DISPLAY_MAX, _DISPLAY_SIZE = 6, (640, 480)  # views to display, at most; width and height, pixels
 _DISPLAY_CANDIDATES, _DISPLAY_POINTS, _DISPLAY_SEED = 64, 40_000, 0  # candidate views; points of the scene; seed
-_DISPLAY_DETAIL = 0.8  # least detail of a view to display, as a fraction of the best one's
+_DISPLAY_DETAIL = 0.8  # least detail of a view to display, as a fraction of the largest detail
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ class ViewSet:
         training: training views, to which values are fitted, and in which importance is measured.
         validation: validation views, which choose the number of splats, the best step and the end of a search.
         test: test views, to which the scores in reports refer.
-        images: images of a data set, in its order; each has its camera, one of those above.
+        images: images of a data set, in its order; each has its camera, which is in a role above.
         virtual: csplat placed training and validation views around the scene.
         origin: the scene's origin, to which all cameras are relative.
         notes: remarks for the user on the choice of views, a line each.
@@ -103,9 +103,9 @@ class ViewSet:
         seen: dict[bytes, str] = {}
         for role in ("training", "validation", "test"):
             for camera in getattr(self, role):
-                other = seen.setdefault(pose_key(camera), role)
-                if other != role:
-                    raise InputError(f"{self.name}: a view is both a {other} and a {role} view")
+                known_role = seen.setdefault(pose_key(camera), role)
+                if known_role != role:
+                    raise InputError(f"{self.name}: a view is both a {known_role} and a {role} view")
 
     @property
     def test_background(self) -> Colour:
@@ -161,11 +161,11 @@ class ViewSet:
 
     def images_of(self, cameras: Sequence[Camera]) -> list[PosedImage]:
         """Return the images of the given cameras, in their order."""
-        taken = {id(one.camera): one for one in self.images}
+        taken = {id(image.camera): image for image in self.images}
         return [taken[id(camera)] for camera in cameras]
 
     def read_images(self) -> None:
-        """Read all images, to find damaged ones early.
+        """Read all images, to find damaged images early.
 
         Raises:
             InputError: a file is not an image, or is truncated.
@@ -238,7 +238,7 @@ def find_view_set(
         source: the scene.
         cameras: a camera file, see `csplat_render.camera_files.load_cameras`.
         data: a data set, to be opened or opened already, instead of a camera file.
-        background: background colour; `None`: that of the scene's training if known, else black.
+        background: background colour; `None`: the colour of the scene's training if known, else black.
         count: number of virtual training views, in addition to 16 that pruning holds out; 0: no virtual training or
             validation views. `None`: by the number of splats (`default_views`).
         size: width and height of virtual training views, pixels; `None`: by the number of splats.
@@ -248,7 +248,7 @@ def find_view_set(
         every: the source is every Nth splat of the scene; used to place virtual test views.
 
     Raises:
-        InputError: both `cameras` and `data` are given, or one is not valid, or has too few views.
+        InputError: both `cameras` and `data` are given, or the given views are not valid, or too few.
         OSError: a file cannot be read.
     """
     if cameras is not None and data is not None:
@@ -272,7 +272,7 @@ def find_view_set(
 
 
 def with_validation_views(views: ViewSet) -> ViewSet:
-    """Return the views; if there are no validation views, every eighth training view becomes one."""
+    """Return the views; if there are no validation views, every eighth training view becomes a validation view."""
     if views.validation:
         return views
     validation, training = _split_validation(views.training, None)
@@ -290,8 +290,8 @@ def display_cameras(source: SplatModel, views: ViewSet) -> Sequence[Camera]:
         views: its test views are shown; if they are virtual, other views are searched.
 
     Returns:
-        Cameras relative to the scene's origin: the test views, or virtual ones far from each other that show much
-        detail with nothing in front of it.
+        Cameras relative to the scene's origin: the test views, or virtual cameras far from each other that show
+        much detail with nothing in front of it.
     """
     if views.name != VIRTUAL or not len(source):
         return views.test
@@ -332,7 +332,10 @@ def render_seconds(
     tried, times = cameras[:: max(1, len(cameras) // _TIMED_MAX)][:_TIMED_MAX], 1
     if mode == "exact":
         times = _TIMED_DIVISOR**2
-        tried = [resized(one, max(1, one.W // _TIMED_DIVISOR), max(1, one.H // _TIMED_DIVISOR)) for one in tried[:1]]
+        tried = [
+            resized(camera, max(1, camera.W // _TIMED_DIVISOR), max(1, camera.H // _TIMED_DIVISOR))
+            for camera in tried[:1]
+        ]
     else:
         draw(tried[0])  # not timed: allocates buffers and loads kernels
     start = clock()
@@ -377,26 +380,26 @@ def _views_of_data(
     split: Split,
 ) -> ViewSet:
     record = source.metadata.training
-    name, found, notes = (
+    name, data_set, notes = (
         _open_data_set(data, record) if isinstance(data, DataOptions) else (data.name, data, list[str]())
     )
-    shift = np.subtract(source.origin, found.origin)
-    parts = (found.train, found.test, evenly_spaced(found.val, _VALIDATION_MAX))
+    shift = np.subtract(source.origin, data_set.origin)
+    parts = (data_set.train, data_set.test, evenly_spaced(data_set.val, _VALIDATION_MAX))
     train, test, val = (_shift(part, shift) for part in parts)
     colour, more = _choose_background(background, record, images=True)
     if split == "train":
         train, test, val = [], train, []
-    test_poses = {pose_key(one.camera) for one in test}
-    training = _without(test_poses, [one.camera for one in train])
+    test_poses = {pose_key(image.camera) for image in test}
+    training = _without(test_poses, [image.camera for image in train])
     if len(training) < len(train):
         more.append(f"{len(train) - len(training)} training images are dropped: they have the pose of a test view")
     taken = test_poses | {pose_key(camera) for camera in training}
-    validation = _without(taken, [one.camera for one in val])
+    validation = _without(taken, [image.camera for image in val])
     if validation_count or not validation:
         validation, training = _split_validation(training, validation_count)
     return ViewSet(
-        name, colour, training, validation, [one.camera for one in test], [*train, *val, *test],
-        origin=source.origin, notes=(*found.report, *notes, *more), split=split,
+        name, colour, training, validation, [image.camera for image in test], [*train, *val, *test],
+        origin=source.origin, notes=(*data_set.report, *notes, *more), split=split,
     )  # fmt: skip
 
 
@@ -413,11 +416,11 @@ def _open_data_set(data: DataOptions, record: TrainingRecord | None) -> tuple[st
     every = _HOLD_OUT_EVERY if options.test_every is None else options.test_every
     if images is not None:  # the user named the folder of images, which may therefore be a link to anywhere
         options = replace(options, path=named, images=None)
-    found = load(
+    data_set = load(
         options.path, options.size, images=options.images, test_every=every, near=options.near,
         trust_paths=options.trust_paths,
     )  # fmt: skip
-    return _set_name(data.path), found, notes
+    return _set_name(data.path), data_set, notes
 
 
 def _complete_options(data: DataOptions, record: TrainingRecord | None) -> tuple[DataOptions, list[str]]:
@@ -439,7 +442,7 @@ def _choose_background(
     if background is not None:
         if record is None or record.background == background:
             return background, []
-        names = [_colour_name(one) for one in (background, record.background)]
+        names = [_colour_name(colour) for colour in (background, record.background)]
         return background, [f"background is {names[0]}, but the scene was trained on {names[1]}"]
     if record is not None:
         return record.background, []
@@ -447,7 +450,7 @@ def _choose_background(
 
 
 def _set_name(path: str) -> str:
-    """Return the name of a file or folder, changed if it equals that of virtual views."""
+    """Return the name of a file or folder, changed if it equals the name of virtual views."""
     name = resolve_links(path).name
     return f"./{name}" if name == VIRTUAL else name
 
@@ -457,13 +460,13 @@ def _colour_name(colour: Colour) -> str:
 
 
 def _shift(images: Sequence[PosedImage], shift: NDArray[np.float64]) -> list[PosedImage]:
-    return [replace(one, camera=relative_to(shift, one.camera)) for one in images]
+    return [replace(image, camera=relative_to(shift, image.camera)) for image in images]
 
 
 def _place_virtual(
     source: SplatModel, count: int, size: tuple[int, int], seed: int, validation_count: int | None
 ) -> tuple[list[Camera], list[Camera]]:
-    """Return virtual training views, and validation views like those of `psnr` at other positions."""
+    """Return virtual training views, and validation views like the views of `psnr` at other positions."""
     if count < 1:
         return [], []
     usual, width, height = virtual_views.VIRTUAL_SIZES.validation
@@ -473,7 +476,7 @@ def _place_virtual(
 
 
 def _split_validation(cameras: Sequence[Camera], validation_count: int | None) -> tuple[list[Camera], list[Camera]]:
-    """Split cameras into validation views, evenly spread, and training views without those of the same pose."""
+    """Split cameras into validation views, evenly spread, and training views of other poses."""
     count = len(cameras)
     if validation_count is None:
         every = min(_VALIDATION_EVERY, count)
@@ -488,9 +491,9 @@ def _split_validation(cameras: Sequence[Camera], validation_count: int | None) -
 
 def _split(cameras: Sequence[Camera], places: Collection[int]) -> tuple[list[Camera], list[Camera]]:
     chosen = set(places)
-    return [cameras[i] for i in sorted(chosen)], [one for i, one in enumerate(cameras) if i not in chosen]
+    return [cameras[i] for i in sorted(chosen)], [camera for i, camera in enumerate(cameras) if i not in chosen]
 
 
 def _without(poses: Collection[bytes], cameras: Sequence[Camera]) -> list[Camera]:
     """Return the cameras whose pose is not among `poses`."""
-    return [one for one in cameras if pose_key(one) not in poses]
+    return [camera for camera in cameras if pose_key(camera) not in poses]

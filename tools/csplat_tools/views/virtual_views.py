@@ -1,7 +1,7 @@
 """Place virtual cameras around a scene, for training and for extra tests.
 
-Training views are many and small, since many small renders overfit less than a few large ones with the same number of
-pixels.
+Training views are many and small, since many small renders overfit less than a few large renders with the same number
+of pixels.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class VirtualViewSizes:
     """Counts, widths and heights in pixels of virtual views to which nothing is fitted.
 
     Attributes:
-        test: test views, those of `psnr`.
+        test: test views, which are the views of `psnr`.
         validation: validation views.
         extra: views of each kind of `extra_test_cameras`.
     """
@@ -51,7 +51,7 @@ class VirtualViewSizes:
 VIRTUAL_SIZES = VirtualViewSizes()
 
 _PIXELS = 50  # pixels of all views together per splat
-_LARGEST = 2.0  # largest factor of width and height; all renders are in memory, and larger ones would be too few
+_LARGEST = 2.0  # largest factor of width and height; all renders are in memory, and larger renders would be too few
 _POINTS = 20_000  # points to sample from the scene
 _OBJECT_DISTANCE = (0.95, 1.6)  # distance from the centre of an object, extents
 _OBJECT_HEIGHT = (-0.95, 0.98)  # sines of elevations; objects are seen from below, too
@@ -182,9 +182,9 @@ _NEARER, _FARTHER = (0.6, 0.7, 0.8, 0.9), 2.0  # factors of the distance from th
 
 
 def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
-    """Place virtual cameras like those of `psnr` at other positions, and nearer to and farther from the middle.
+    """Place virtual cameras like the cameras of `psnr` at other positions, and nearer to and farther from the middle.
 
-    They are used for reports only. Nearer ones stay outside of the objects that they look at.
+    They are used for reports only. Nearer cameras stay outside of the objects that they look at.
 
     Args:
         source: the scene; its own cameras are not used.
@@ -194,13 +194,16 @@ def extra_test_cameras(source: SplatModel) -> dict[str, list[Camera]]:
     """
     frame = scene_frame(source)
     others = virtual_cameras(source, *VIRTUAL_SIZES.extra, seed=_SEED)
-    found = {"beside": others, "farther": [_at(camera, frame.centre, _FARTHER) for camera in others]}
+    groups = {"beside": others, "farther": [_at(camera, frame.centre, _FARTHER) for camera in others]}
     if not len(source):
-        return {**found, "nearer": others}
+        return {**groups, "nearer": others}
     cloud = sample_cloud(source, _POINTS, np.random.default_rng(_SEED))
     candidates = [[_at(camera, frame.centre, times) for times in _NEARER] + [camera] for camera in others]
-    nearer = [next((one for one in each if is_clear(frame, cloud, one)), each[-1]) for each in candidates]
-    return {**found, "nearer": nearer}
+    nearer = [
+        next((camera for camera in distances if is_clear(frame, cloud, camera)), distances[-1])
+        for distances in candidates
+    ]
+    return {**groups, "nearer": nearer}
 
 
 def _at(camera: Camera, centre: NDArray[np.float64], times: float) -> Camera:
