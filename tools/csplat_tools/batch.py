@@ -54,9 +54,9 @@ PAGE = "index.html"
 _MARK = "<!-- csplat batch -->"  # in our pages; a page without it is somebody else's, and is kept
 _MANIFESTS, _COLUMNS = (".jsonl", ".csv", ".txt"), ("path", "output", "options")
 _ONE_LEVEL, _LEVELS = FOLDER_NAMES
-_OTHER_GPU = re.compile(r"_rank[1-9]\d*\.pt$")  # gsplat's checkpoints, which are read with that of rank 0
-#: Commands that take IN and OUT: the ending of OUT, "" if there are several; and if they take only the .csplat files of
-#: a folder (True), all other scenes (False), or both (`None`).
+_OTHER_GPU = re.compile(r"_rank[1-9]\d*\.pt$")  # gsplat's checkpoints, which are read with rank 0
+#: Commands that take IN and OUT: the ending of OUT, "" if there are several; and whether they take only the .csplat
+#: files of a folder (True), all other scenes (False), or both (`None`).
 _COMMANDS: dict[str, tuple[str, bool | None]] = {
     "encode": (".csplat", False), "decode": (".ply", True), "convert": ("", None), "extract": (".csplat", True),
     "simplify": (".ply", None), "finetune": (".csplat", None), "train": ("", None), "render": ("", None),
@@ -107,12 +107,12 @@ class Batch:
 
     def select(self, *states: str) -> list[SceneResult]:
         """Return the scenes in these states."""
-        return [one for one in self.results if one.state in states]
+        return [result for result in self.results if result.state in states]
 
     def as_json(self) -> dict[str, Any]:
         """Return totals and results as JSON-compatible values."""
         counts = {state: len(self.select(state)) for state in ("done", "done_before", "failed")}
-        return {"scenes": len(self.results), **counts, "results": [asdict(one) for one in self.results]}
+        return {"scenes": len(self.results), **counts, "results": [asdict(result) for result in self.results]}
 
 
 def run_batch(
@@ -136,7 +136,7 @@ def run_batch(
             of JSON (.jsonl), or of path, output and options (.csv, .txt) with commas, semicolons or tabs between them.
         folder: the folder for outputs and the page of results; it is made if missing.
         command: the command with its options: `encode` skips .csplat files, `decode` and `extract` skip all others.
-        ending: file name ending of outputs without a name; `None`: that of the command.
+        ending: file name ending of outputs without a name; `None`: by the command.
         match: shell pattern of names within a folder, such as `*.ply`.
         workers: number of processes, which share the cores; `None`: one per core.
         scheduler: address of a Dask scheduler, whose workers see the same files and run the scenes instead.
@@ -178,7 +178,7 @@ def run_batch(
             _end_processes(processes - others, [target / task.output for task in lost])
             for executor in {*idle, *(executor for executor, _ in running.values())}:
                 executor.shutdown(wait=client is None)
-    done = Batch(Path(folder), words, tuple(ended[one.output] for one in tasks))
+    done = Batch(Path(folder), words, tuple(ended[task.output] for task in tasks))
     page = target / PAGE
     if page.exists() and not force and _MARK.encode() not in read_bytes(page):
         return replace(done, has_page=False)
@@ -188,14 +188,14 @@ def run_batch(
 
 
 def _result(future: Future[SceneResult], task: Task) -> SceneResult:
-    """Return the result of a task; if its process was killed or its cluster gave up, its failure."""
+    """Return the result of a task, or its failure if its process was killed or its cluster gave up."""
     try:
         return future.result()
     except CommandLineError:
         raise
     except BrokenExecutor:
         error = "its process was killed, perhaps for lack of memory: try fewer --workers"
-    except Exception as unexpected:  # noqa: BLE001  # a defect, or of a cluster or a store
+    except Exception as unexpected:  # noqa: BLE001  # a defect, or an error of a cluster or a store
         error = repr(unexpected)
     return SceneResult(task.source, task.output, error=error)
 
@@ -244,7 +244,10 @@ def _begin_worker(threads: int) -> None:
 
 
 def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: str, without: Path) -> list[Task]:
-    """Return the scenes of a folder but one within it, sorted, or those of a manifest; the rest as for `run_batch`."""
+    """Return the sorted scenes of a folder, except in the folder `without`, or the scenes of a manifest.
+
+    The other arguments are as for `run_batch`.
+    """
     if not command or command[0] not in _COMMANDS:
         raise CommandLineError(f"expected a command that can run in batch: {', '.join(_COMMANDS)}")
     ending = _COMMANDS[command[0]][0] or None if ending is None else ending
@@ -252,19 +255,19 @@ def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: st
         raise CommandLineError(f"csplat {command[0]} writes several formats: choose one with --ending, such as .spz")
     path.stat()  # raises an OSError that names it
     if path.is_dir():
-        found = [(Task(str(path / name), ""), name) for name in _names(path, command[0], match, without)]
+        scenes = [(Task(str(path / name), ""), name) for name in _names(path, command[0], match, without)]
     elif path.suffix.lower() in _MANIFESTS:
-        found = list(_listed(path))
+        scenes = list(_listed(path))
     else:
         raise InputError(f"{path} is not a folder, expected a folder or a manifest: {', '.join(_MANIFESTS)}")
-    if not found:
+    if not scenes:
         raise InputError(f"{path} has no scenes for `csplat {command[0]}`")
     root = resolve_links(path).name if path.is_dir() else path.stem
-    short = [task.output or _output_name(within, root, ending) for task, within in found]
+    short = [task.output or _output_name(within, root, ending) for task, within in scenes]
     uses = Counter(short)  # outputs that would have one name keep the endings of their sources
     tasks = [
         replace(task, output=name if task.output or uses[name] == 1 else _output_name(within, root, ending, whole=True))
-        for (task, within), name in zip(found, short, strict=True)
+        for (task, within), name in zip(scenes, short, strict=True)
     ]
     output, count = Counter(task.output for task in tasks).most_common(1)[0]
     if count > 1:
@@ -274,15 +277,17 @@ def find_tasks(path: Path, command: Sequence[str], ending: str | None, match: st
 
 def _names(folder: Path, command: str, match: str, without: Path) -> list[str]:
     """Return the relative paths of the scenes within a folder, with slashes."""
-    endings = tuple(end for one in formats() if one.open for end in one.suffixes if end.startswith("."))
-    own, found, away = _COMMANDS[command][1], set[Path](), resolve_links(without)
-    for one in folder.rglob("*"):
-        name, relative = one.name.lower(), one.relative_to(folder)
+    endings = tuple(
+        end for scene_format in formats() if scene_format.open for end in scene_format.suffixes if end.startswith(".")
+    )
+    own, scenes, away = _COMMANDS[command][1], set[Path](), resolve_links(without)
+    for path in folder.rglob("*"):
+        name, relative = path.name.lower(), path.relative_to(folder)
         is_scene = (name in FOLDER_NAMES or name.endswith(endings)) and own in (None, name.endswith(".csplat"))
         is_hidden = any(part.startswith(".") for part in relative.parts)
-        if is_scene and not (is_hidden or one.is_dir() or Path(os.path.realpath(one)).is_relative_to(away)):
-            found.add(relative)
-    names = [one.as_posix() for one in sorted(found) if not _is_part(folder, one, found)]
+        if is_scene and not (is_hidden or path.is_dir() or Path(os.path.realpath(path)).is_relative_to(away)):
+            scenes.add(relative)
+    names = [scene.as_posix() for scene in sorted(scenes) if not _is_part(folder, scene, scenes)]
     return [name for name in names if fnmatch(name, match) or fnmatch(PurePosixPath(name).name, match)]
 
 
@@ -299,7 +304,7 @@ def _listed(manifest: Path) -> Iterator[tuple[Task, str]]:
     """Yield the scenes of a manifest, with paths relative to its folder, and the paths that name their outputs."""
     lines, is_json = read_text(manifest).splitlines(), manifest.suffix.lower() == ".jsonl"
     first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    separator = next((one for one in ";\t" if one in first and "," not in first), ",")  # as some spreadsheets write
+    separator = next((mark for mark in ";\t" if mark in first and "," not in first), ",")  # as some spreadsheets write
     columns = list(_COLUMNS)
     for number, line in enumerate(lines, 1):
         try:
@@ -322,16 +327,16 @@ def _listed(manifest: Path) -> Iterator[tuple[Task, str]]:
 
 
 def leads_out(name: str, flavour: type[PurePath] = PurePath) -> bool:
-    """Return True if a relative path leads out of its folder, read as a POSIX path or as one of this system."""
+    """Return True if a relative path leads out of its folder, read as a POSIX path or as a path of this system."""
     return any(path.anchor or ".." in path.parts for path in (PurePosixPath(name), flavour(name)))
 
 
 def _output_name(within: str, root: str, ending: str, *, whole: bool = False) -> str:
-    """Return the source's name with another ending; if `whole`, with one appended."""
+    """Return the source's name with another ending; if `whole`, the ending is appended."""
     path = PurePosixPath(within)
     if path.name in FOLDER_NAMES:
         return f"{path.parent if path.parent.name else root}{ending}"
-    known = [end for one in formats() for end in one.suffixes if path.name.lower().endswith(end)]
+    known = [end for scene_format in formats() for end in scene_format.suffixes if path.name.lower().endswith(end)]
     stem = path.name if whole or not known else path.name[: -len(max(known, key=len))]
     return str(path.with_name(stem + ending))
 
@@ -417,20 +422,22 @@ def _check_existing(output: Path, source: Path | None) -> int | None:
     try:
         if output.is_file() and is_csplat(output):
             splats = check_chunks(output).splat_count
-        elif output.is_dir() or output.name.lower().endswith(tuple(end for one in formats() for end in one.suffixes)):
+        elif output.is_dir() or output.name.lower().endswith(
+            tuple(end for scene_format in formats() for end in scene_format.suffixes)
+        ):
             with csplat.open(output) as scene:
                 splats = scene.count
     except (CsplatError, OSError) as error:
         raise InputError(f"the output exists, and is invalid: {error}; --force replaces it") from None
     made = output.stat().st_mtime
-    if source is not None and max(one.stat().st_mtime for one in (source, *source.rglob("*"))) > made:
+    if source is not None and max(path.stat().st_mtime for path in (source, *source.rglob("*"))) > made:
         raise InputError("the output exists, and is older than the scene: --force replaces it")
     return splats
 
 
 @contextmanager
 def _local(place: str, folder: Path) -> Iterator[Path]:
-    """Yield the path of a file; one at a URL is downloaded if it exists, and uploaded if it was replaced."""
+    """Yield the path of a file. A file at a URL is downloaded if it exists, and uploaded if it was replaced."""
     if not is_url(place):
         yield folder / place
         return
@@ -452,7 +459,7 @@ def _local(place: str, folder: Path) -> Iterator[Path]:
 def make_page(batch: Batch) -> str:
     """Return the HTML report: totals, failed scenes, and a table of the others."""
     done, failed = batch.select("done", "done_before"), batch.select("failed")
-    source, output = (sum(getattr(one, name) or 0 for one in done) for name in ("source_bytes", "output_bytes"))
+    source, output = (sum(getattr(result, name) or 0 for result in done) for name in ("source_bytes", "output_bytes"))
     totals = {
         "command": " ".join(("csplat", *batch.command)),
         "done": f"{len(done):,} of {len(batch.results):,}",
@@ -460,11 +467,13 @@ def make_page(batch: Batch) -> str:
     }
     heads = [html.Head("scene", kind="name"), *map(html.Head, ("splats", "source, kB", "output, kB", "seconds"))]
     rows = []
-    for one in done:
-        values = one.splats, (one.source_bytes or 0) / 1e3, (one.output_bytes or 0) / 1e3, one.seconds
+    for result in done:
+        values = result.splats, (result.source_bytes or 0) / 1e3, (result.output_bytes or 0) / 1e3, result.seconds
         texts = ("" if value is None else f"{value:,.1f}".removesuffix(".0") for value in values)
-        rows.append([(one.output, one.path), *zip(texts, values, strict=True)])
-    errors = html.table(("scene", "error"), [(one.path, one.error) for one in failed], words=(1,)) if failed else ""
+        rows.append([(result.output, result.path), *zip(texts, values, strict=True)])
+    errors = (
+        html.table(("scene", "error"), [(result.path, result.error) for result in failed], words=(1,)) if failed else ""
+    )
     table = html.sortable_table(heads, rows) if rows else ""
     parts = [_MARK, html.definitions(totals), html.section("Failed", errors), html.section("Done", table)]
     return html.document(f"{batch.folder.resolve().name}: {len(batch.results):,} scenes", parts)

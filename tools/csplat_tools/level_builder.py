@@ -1,10 +1,10 @@
 """Build the levels of detail of a scene of any size.
 
-Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent; above the last common one,
-a chain of nodes goes on to a few thousand splats. Each level has a quarter of the splats of the finer one, those that
-matter most, fitted to renders (`level_fitting.py`). Larger scenes are built bucket by bucket, of merged neighbours,
-until each is one node; these nodes together are the scene whose levels are built next. Levels that a scene has already,
-in streamed SOG, are taken instead.
+Space is cut by medians into leaves of equal numbers of splats. Four nodes have one parent. Above the node that all
+leaves have in common, a chain of nodes goes on to a few thousand splats. Each level has a quarter of the splats of the
+next finer level: the splats that matter most, fitted to renders (`level_fitting.py`). Larger scenes are built bucket by
+bucket from merged neighbours, until each bucket is one node. These nodes together are the scene whose levels are built
+next. If a scene has levels already, in streamed SOG, these are taken instead.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ from csplat_tools.optional_packages import require_renderer
 
 # Modules that render are imported where they are used: the cost of levels can be estimated without them.
 
-_KEPT = 4  # splats of a level, divided by those of the coarser one
+_KEPT = 4  # splats of a level, divided by the splats of the next coarser level
 _CHILDREN = 4  # maximum number of children of a node, so that nodes of all levels have about as many splats
-# Seconds per splat for levels, with the measurement of errors: of scenes in one piece, and of buckets.
+# Seconds per splat to build levels and measure their errors: scenes in one piece, and buckets.
 _SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 4e-5
 
 #: Makes the splats of a level, and the node of each; arguments as for `LevelFitter.fit`.
@@ -59,14 +59,14 @@ class FittedLevelBuilder:
 
     Attributes:
         count: number of levels above 0; `None`: until one node has `root_splats`.
-        leaf_splats: maximum number of splats of a leaf; smaller leaves take more bytes, larger ones load later when
-            they are seen.
+        leaf_splats: maximum number of splats of a leaf; smaller leaves take more bytes, larger leaves load later
+            when they are seen.
         root_splats: maximum number of splats of the root, the first picture of a scene; 4,096 are about 50 kB.
         whole_splats: number of splats up to which a scene is built in one piece, with more work. Built like a bucket,
             level 1 of garden500k has 27.5 instead of 32.0 dB.
-        fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger ones,
-            neighbours are merged alone: 411,296 splats of SH degree 0 take 14 CPU s instead of 35. On two cores, 100
-            million would take 75 to 90 minutes with the fit, and 40 million take 30 to 35.
+        fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger
+            scenes, neighbours are only merged: 411,296 splats of SH degree 0 take 14 CPU s instead of 35. On two cores,
+            100 million would take 75 to 90 minutes with the fit, and 40 million take 30 to 35.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
     """
@@ -184,7 +184,7 @@ class FittedLevelBuilder:
 
     @property
     def _part_levels(self) -> int:
-        """Number of levels above 0 of a bucket, with which the largest one becomes one node."""
+        """Number of levels above 0 with which the largest bucket becomes one node."""
         leaves = max(1, math.ceil(self.bucket_splats / self.leaf_splats))
         levels = math.ceil(math.log(leaves, _CHILDREN) - 1e-9) or 1
         return levels if self.count is None else min(levels, self.count)
@@ -200,14 +200,14 @@ class FittedLevelBuilder:
     def _add_levels(
         self, nodes: list[LevelNode], splats: SplatModel, places: I64, fit: _Fit, last: int | None
     ) -> list[LevelNode]:
-        """Return nodes of one level with those of coarser levels.
+        """Return the nodes of a level, followed by the nodes of coarser levels.
 
         Args:
             nodes: the nodes.
             splats: their splats.
             places: [N], the node of each splat.
-            fit: makes the splats of a level of those of the finer one, as `LevelFitter.fit`.
-            last: the coarsest level; `None`: that of a root of `root_splats`.
+            fit: makes the splats of a level from the next finer level, as `LevelFitter.fit`.
+            last: the coarsest level; `None`: the first level with a single node of at most `root_splats`.
         """
         nodes, first, node_count = list(nodes), nodes[0].level, len(nodes)
         level = first
@@ -284,7 +284,7 @@ def _plain(model: SplatModel) -> SplatModel:
 
 
 def _moved(node: LevelNode, first: int, rows: NDArray[np.intp] | None = None) -> LevelNode:
-    """Return a node of a list that begins at `first`, and of splats that are rows of a scene."""
+    """Raise the number of a node's parent by `first`, and look its rows up in `rows` [N], the rows of its part."""
     parent = None if node.parent is None else node.parent + first
     return replace(node, parent=parent, rows=None if node.rows is None or rows is None else rows[node.rows])
 
@@ -310,7 +310,7 @@ def read_streamed_levels(path: Path, last: int | None = None) -> list[LevelNode]
 
 
 def chain_leaves(levels: Sequence[tuple[SplatModel, I64]]) -> list[LevelNode]:
-    """Return a chain of nodes for each leaf, without levels that have no fewer splats than the finer one.
+    """Return a chain of nodes for each leaf, without levels that have no fewer splats than the next finer level.
 
     Args:
         levels: the splats of each level, finest first, and the number of the leaf of each splat.
@@ -330,7 +330,7 @@ def chain_leaves(levels: Sequence[tuple[SplatModel, I64]]) -> list[LevelNode]:
 
 
 def _with_bands(splats: SplatModel, scene: SplatModel) -> SplatModel:
-    """Return splats with as many SH coefficients as those of a scene, and without extra columns."""
+    """Return splats with as many SH coefficients as a scene has, and without extra columns."""
     shN = np.zeros((len(splats), *scene.shN.shape[1:]), np.float32)
     kept = min(shN.shape[1], splats.shN.shape[1])
     shN[:, :kept] = splats.shN[:, :kept]

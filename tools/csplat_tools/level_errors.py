@@ -21,8 +21,8 @@ from csplat.types import F32, F64, Progress, null_progress
 from csplat_render.camera import Camera, look_at
 from csplat_render.rasteriser import Rasteriser
 
-#: Maximum number of splats that a node is compared with: those of a bucket, so that each node of a bucket is compared
-#: with level 0. Six renders of them take 1 s.
+#: Maximum number of splats that a node is compared with: as many as a bucket has, so that each node of a bucket is
+#: compared with level 0. Six renders of them take 1 s.
 REFERENCE_SPLATS = 1 << 19
 
 # Spec E.5.
@@ -65,13 +65,13 @@ def measure_errors(
         if node.level == 0 or node.squares:
             continue
         cut = _reference(nodes, children, number, reference_splats)
-        coarse, fine = decode(encoded.part([node])), decode(encoded.part([nodes[one] for one in cut]))
+        coarse, fine = decode(encoded.part([node])), decode(encoded.part([nodes[index] for index in cut]))
         radius = _radius(regions[number], fine)
         try:
             squares = _squared_errors(rasteriser, coarse, fine, regions[number].mean(axis=0), radius)
         except LimitError:  # too many splats at one place to be rendered: as different as can be
             squares = np.ones(_SIZES)
-        below = _errors_below([(nodes[one], _radius(regions[one])) for one in cut], radius)
+        below = _errors_below([(nodes[index], _radius(regions[index])) for index in cut], radius)
         squares = (np.sqrt(squares) + np.sqrt(below)) ** 2
         error = max(_first_alike(squares, radius), *(nodes[child].error for child in children[number]))
         nodes[number] = replace(node, error=error, squares=tuple(squares.tolist()))
@@ -82,17 +82,17 @@ def measure_errors(
 def _reference(
     nodes: Sequence[FileNode], children: Sequence[Sequence[int]], number: int, splat_count: int
 ) -> list[int]:
-    """Return the finest level of the subtree of a node with at most as many splats, or the coarsest one."""
+    """Return the finest level of a node's subtree with at most `splat_count` splats, else its coarsest level."""
     cut: list[int] = []
     for level in range(nodes[number].level):
         pending, cut = list(reversed(children[number])), []
         while pending:
-            one = pending.pop()
-            if nodes[one].level > level:
-                pending += reversed(children[one])
+            index = pending.pop()
+            if nodes[index].level > level:
+                pending += reversed(children[index])
             else:
-                cut.append(one)
-        if sum(nodes[one].splat_count for one in cut) <= splat_count:
+                cut.append(index)
+        if sum(nodes[index].splat_count for index in cut) <= splat_count:
             break
     return cut
 
@@ -106,7 +106,8 @@ def _radius(region: F64, splats: SplatModel | None = None) -> float:
 def _errors_below(cut: Sequence[tuple[FileNode, float]], radius: float) -> F64:
     """Return the squared errors of a level of a subtree at the pixel sizes of a node of this radius.
 
-    They are averages over the nodes, by the areas of their regions; for each, that of the next finer size measured.
+    They are averages over the nodes, weighted by the areas of their regions. The error of a node is its error at the
+    next finer size that was measured.
     """
     total, area = np.zeros(_SIZES), 0.0
     for node, own in cut:
@@ -118,17 +119,17 @@ def _errors_below(cut: Sequence[tuple[FileNode, float]], radius: float) -> F64:
 
 
 def _first_alike(squares: F64, radius: float) -> float:
-    """Return the smallest pixel size from which on all have a small squared error, scene units, as float32."""
+    """Return the smallest pixel size from which on all squared errors are small, in scene units, as float32."""
     first = _SIZES - int(np.argmin([*(squares <= _SQUARED_ERROR_MAX)[::-1], False]))
     return float(np.float32(radius * 2.0**first / _RADIUS_PIXELS))
 
 
 def _squared_errors(rasteriser: Rasteriser, coarse: SplatModel, fine: SplatModel, centre: F64, radius: float) -> F64:
-    """Return the mean squared error at each pixel size, finest first."""
+    """Return the mean squared error at each pixel size, finest first, [_SIZES]."""
     squares, pixels = np.zeros(_SIZES), np.zeros(_SIZES, np.int64)
     for camera in _cameras(centre, radius):
         a, b = (_image(rasteriser, splats, camera) for splats in (coarse, fine))
-        # Averages are linear: those of the difference and of both alphas are all that is needed.
+        # Averages are linear, so that the difference and both alphas are all that has to be averaged.
         images = np.concatenate([a - b, a[3:], b[3:]])
         for size in range(_SIZES):
             covered = np.maximum(images[4], images[5]) >= np.float32(_COVERED)

@@ -24,7 +24,7 @@ from csplat_trainer.splat_refit import refit_splats
 
 _PIXELS_PER_SPLAT = 8.0  # pixels of a view per splat of level 1; views of each coarser level are half as wide
 #: Pixels, the smallest and largest views of level 1. With 640 instead of 400, level 1 of garden500k loses 1.2 dB at its
-#: pixel size, gains 0.5 at half of it, and takes 1.7 times as long; that of fox120k gains 0.0 and 0.2 dB.
+#: pixel size, gains 0.5 at half of it, and takes 1.7 times as long; level 1 of fox120k gains 0.0 and 0.2 dB.
 _WIDTHS = (128, 448)
 _LEAST_WIDTH = 64  # pixels, of the views of the coarsest levels
 _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
@@ -32,7 +32,7 @@ _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
 
 @dataclass(frozen=True)
 class Work:
-    """Bounds the work on each level.
+    """Bounds of the work on each level.
 
     Attributes:
         splats_to_measure: number of views times splats of the finer level, within the bounds of views.
@@ -60,7 +60,7 @@ class LevelFitter:
     """Fits levels of a scene.
 
     Attributes:
-        scene: a scene or a part of one, in whose renders levels are measured.
+        scene: a scene or a part of a scene, in whose renders levels are measured.
         is_part: it is a part or a coarse version of a larger scene: views are from outside, and neighbours are merged
             instead of chosen, which would leave holes where no view sees anything. In four buckets of an aerial scene,
             views as of whole scenes cost 1.1 dB at level 2, and 1.4 at level 3. With every second view as of whole
@@ -83,8 +83,8 @@ class LevelFitter:
         Args:
             finer: the next finer level.
             nodes: [N], the node to which each splat of `finer` goes.
-            count: number of splats to keep, about a quarter; each node keeps one at least.
-            level: the level, from 1; its views are 2^level times smaller than those of the scene.
+            count: number of splats to keep, about a quarter; each node keeps at least one.
+            level: the level, from 1; its views are 2^level times smaller than views of the scene.
 
         Returns:
             The node of each splat of the level, and the splats.
@@ -111,7 +111,7 @@ class LevelFitter:
         return nodes, fitted if scorer.psnr(fitted) >= scorer.psnr(chosen) else chosen
 
     def _cameras(self, finer_count: int, level: int) -> tuple[list[Camera], list[Camera]]:
-        """Return views for a level, and held-out ones."""
+        """Return views for a level, and held-out views."""
         widest = _between(math.sqrt(_PIXELS_PER_SPLAT * len(self.scene) / 3.0), _WIDTHS)
         width = max(_LEAST_WIDTH, widest >> (level - 1))
         views = _between(self.work.splats_to_measure / finer_count, self.work.views)
@@ -125,7 +125,7 @@ class LevelFitter:
             MeasuredViews.of(finer, part, (0.0, 0.0, 0.0), threads=self.threads, progress=self.progress)
             for part in (cameras[::2], cameras[1::2])
         ]
-        # No view tells unseen splats apart: as many of them go, those of the least opacity times area.
+        # No view tells unseen splats apart: the same fraction is kept, with the largest opacity times area.
         light = light_of(finer)
         unseen = np.flatnonzero(~total_error(groups).seen)
         unseen = unseen[np.argsort(-light[unseen], kind="stable")]

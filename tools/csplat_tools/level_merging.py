@@ -1,7 +1,7 @@
-"""Merge neighbouring splats in pairs, those first that change images least.
+"""Merge neighbouring splats in pairs, starting with the pairs that change images least.
 
-A pair costs the squared difference between images of both splats and of the one that replaces them, over views along
-the three axes. This has a closed form, since it leaves out what splats hide.
+The cost of a pair is the squared difference between images of both splats and of the splat that replaces them, over
+views along the three axes. This has a closed form, since it leaves out what splats hide.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _NEIGHBOURS = 8  # with which a splat may be merged; 16 gain 0.1 dB at level 1, 
 # 1 of lego60k: 32.0, 32.3 and 28.2 dB.
 _KEPT = 0.629
 # A cost is divided by this power of the squared sum of both images. With 0, all small splats are merged before any
-# large one, and with 1, size does not count. Level 1 of fox120k: 34.3 dB (0), 35.4 (0.5), 35.8 (1); of lego60k: 31.9,
+# large splat, and with 1, size does not count. Level 1 of fox120k: 34.3 dB (0), 35.4 (0.5), 35.8 (1); of lego60k: 31.9,
 # 32.2, 31.3.
 _ENERGY_EXPONENT = 0.6
 # Merged splats keep opacity × area. What an opacity above 0.99 would have to carry goes into the area with this power:
@@ -44,7 +44,7 @@ _TINY = np.finfo(np.float64).tiny
 
 
 def merge_neighbours(splats: SplatModel, nodes: I64, count: int) -> tuple[I64, SplatModel]:
-    """Merge splats of the same node until `count` are left, or one in each node.
+    """Merge splats of the same node until `count` splats are left, or one in each node.
 
     Args:
         splats: the splats.
@@ -69,7 +69,7 @@ def merge_neighbours(splats: SplatModel, nodes: I64, count: int) -> tuple[I64, S
 
 
 def _pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
-    """Return the rows of disjoint pairs of neighbours in the same node, at `most` as many, those of small costs."""
+    """Return the rows of disjoint pairs of neighbours in the same node, the cheapest, at most `most`, [2, M]."""
     edges = _neighbours(splats.means, nodes)
     cheapest = np.argsort(_costs(splats, edges), kind="stable")
     partners = np.full(len(splats), -1)
@@ -80,7 +80,7 @@ def _pairs(splats: SplatModel, nodes: I64, most: int) -> I64:
 
 @kernel
 def _pair_up(edges: Any, order: Any, most: int, partners: Any) -> None:
-    """Set the partners of splats, in this order of edges, if both have none; at `most` as many pairs."""
+    """Pair the splats of each edge [2, M], in this order, if neither has a partner; stop after `most` pairs."""
     count = 0
     for edge in order:
         if count == most:
@@ -92,9 +92,9 @@ def _pair_up(edges: Any, order: Any, most: int, partners: Any) -> None:
 
 
 def _neighbours(means: F32, nodes: I64) -> I64:
-    """Return the rows of each splat and its nearest ones in the same node, in ascending order, [2, M]."""
+    """Return the rows of each splat and its nearest neighbours in the same node, in ascending order, [2, M]."""
     by_node = np.argsort(nodes, kind="stable")
-    found = [np.zeros(0, np.int64)]
+    edge_keys = [np.zeros(0, np.int64)]
     for rows in np.split(by_node, np.flatnonzero(np.diff(nodes[by_node])) + 1):
         count = min(len(rows), _NEIGHBOURS + 1)
         # The last coordinate tells splats at one place apart; with thousands of them, the search would take minutes.
@@ -102,15 +102,15 @@ def _neighbours(means: F32, nodes: I64) -> I64:
         apart = _TIE * (float(np.ptp(places, axis=0).max()) or 1.0) * np.linspace(0.0, 1.0, len(rows))
         places = np.column_stack([places, apart])
         near = KDTree(places).query(places, k=count)[1].reshape(len(rows), count)
-        one = np.repeat(rows, count)
-        other = rows[near.reshape(-1)]
-        found.append((np.minimum(one, other) * len(means) + np.maximum(one, other))[one != other])
-    keys = np.sort(np.concatenate(found))
+        starts = np.repeat(rows, count)
+        ends = rows[near.reshape(-1)]
+        edge_keys.append((np.minimum(starts, ends) * len(means) + np.maximum(starts, ends))[starts != ends])
+    keys = np.sort(np.concatenate(edge_keys))
     return np.stack(np.divmod(keys[np.diff(keys, prepend=-1) > 0], len(means)))
 
 
 def _costs(splats: SplatModel, edges: I64) -> F64:
-    """Return the cost of each edge, divided by a power of its energy."""
+    """Return the cost of each edge, divided by a power of its energy, [M]."""
     scales = splats.scales.astype(np.float64)
     scales = np.maximum(scales, scales.max(axis=1, keepdims=True) + math.log(_THINNEST))
     covariances = covariance_entries(splats.quats.T, np.exp(2.0 * scales).T)
@@ -124,22 +124,22 @@ def _costs(splats: SplatModel, edges: I64) -> F64:
 
 
 def _block_costs(means: F32, covariances: F64, amplitudes: F64, light: F64, edges: I64) -> F64:
-    """Return the cost of each edge; amplitudes are red, green, blue and alpha of each splat, [N, 4]."""
-    one, other = edges
-    a, b = amplitudes[one], amplitudes[other]
+    """Return the cost of each edge, [M]; amplitudes are red, green, blue and alpha of each splat, [N, 4]."""
+    i, j = edges
+    a, b = amplitudes[i], amplitudes[j]
     aa, bb, ab = (np.einsum("nc,nc->n", left, right) for left, right in ((a, a), (b, b), (a, b)))
-    share = light[one] / (light[one] + light[other])
-    costs, energies = np.zeros(len(one)), np.zeros(len(one))
+    share = light[i] / (light[i] + light[j])
+    costs, energies = np.zeros(len(i)), np.zeros(len(i))
     for axes, entries in _VIEWS:
-        x, y = ((means[other, axis] - means[one, axis]).astype(np.float64) for axis in axes)
+        x, y = ((means[j, axis] - means[i, axis]).astype(np.float64) for axis in axes)
         first, second = (tuple(covariances[entry, rows] for entry in entries) for rows in edges)
         apart = share * (1.0 - share)
         both = tuple(
-            share * one_entry + (1.0 - share) * other_entry + apart * offset
-            for one_entry, other_entry, offset in zip(first, second, (x * x, x * y, y * y), strict=True)
+            share * first_entry + (1.0 - share) * second_entry + apart * offset
+            for first_entry, second_entry, offset in zip(first, second, (x * x, x * y, y * y), strict=True)
         )
         sizes = [np.sqrt(_determinant(shape)) for shape in (first, second, both)]
-        # The image of the merged splat has the sum of both volumes: of these amplitudes, as multiples of a and b.
+        # The volume of the merged splat's image is the sum of both volumes: its amplitude is s a + t b.
         s, t = sizes[0] / sizes[2], sizes[1] / sizes[2]
         with_first = _overlap(first, both, (1.0 - share) * x, (1.0 - share) * y)
         with_second = _overlap(second, both, share * x, share * y)
@@ -174,14 +174,14 @@ def _determinant(entries: tuple[F64, ...]) -> F64:
 
 
 def _merged(splats: SplatModel, pairs: I64) -> SplatModel:
-    """Return all splats, of which the first ones of the pairs stand for both."""
+    """Return all splats, with the first splat of each pair replaced by the merged splat."""
     two = [splats.select(rows) for rows in pairs]
     light = [light_of(part) for part in two]
     share = light[0] / (light[0] + light[1])
 
-    def averaged(one: NDArray[np.floating], other: NDArray[np.floating]) -> F64:
-        weights = share.reshape(-1, *[1] * (one.ndim - 1))
-        return np.asarray(weights * one + (1.0 - weights) * other)
+    def averaged(first: NDArray[np.floating], second: NDArray[np.floating]) -> F64:
+        weights = share.reshape(-1, *[1] * (first.ndim - 1))
+        return np.asarray(weights * first + (1.0 - weights) * second)
 
     offsets = (two[1].means.astype(np.float64) - two[0].means).T
     inside = [covariance_entries(part.quats.T, np.exp(2.0 * part.scales.astype(np.float64)).T) for part in two]
