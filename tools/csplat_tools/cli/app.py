@@ -37,7 +37,7 @@ _PANEL_OF = {name: panel for panel, commands in _PANELS.items() for name in comm
 
 
 class _Commands(TyperGroup):
-    """The group of all commands, looked up in `_PANELS`. Owns those that were imported."""
+    """The group of all commands, looked up in `_PANELS`. Owns the commands that were imported."""
 
     def list_commands(self, ctx: Any) -> list[str]:  # noqa: ARG002  # typer's
         return list(_PANEL_OF)
@@ -59,7 +59,7 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
 
     def main(self, *args: Any, **how: Any) -> Any:
-        """Run a command line, and exit; typer would draw a box around the message of a wrong one."""
+        """Run a command line, and exit; typer would draw a box around its error message."""
         if not how.get("standalone_mode", True):
             return super().main(*args, **how)
         try:
@@ -86,12 +86,12 @@ def _split_program_options(words: Sequence[str]) -> tuple[list[str], list[str]]:
 def _imported(name: str) -> Any:
     """Import the command of a name, or a group of commands."""
     panel = _PANEL_OF[name]
-    found = getattr(import_module(f"csplat_tools.cli.{_PANELS[panel][name]}"), name.replace("-", "_"))
+    definition = getattr(import_module(f"csplat_tools.cli.{_PANELS[panel][name]}"), name.replace("-", "_"))
     alone = typer.Typer(rich_markup_mode="rich")
-    if isinstance(found, typer.Typer):
-        alone.add_typer(found, name=name, rich_help_panel=panel)
+    if isinstance(definition, typer.Typer):
+        alone.add_typer(definition, name=name, rich_help_panel=panel)
     else:
-        alone.command(name, rich_help_panel=panel)(found)
+        alone.command(name, rich_help_panel=panel)(definition)
     command = get_group(alone).commands[name]
     _hide_flag_types(command)
     return command
@@ -99,8 +99,8 @@ def _imported(name: str) -> Any:
 
 def _hide_flag_types(command: Any) -> None:
     """Show no type next to flags in help: `<bool>` reads like a value that they take."""
-    for one in getattr(command, "commands", {}).values():
-        _hide_flag_types(one)
+    for subcommand in getattr(command, "commands", {}).values():
+        _hide_flag_types(subcommand)
     for option in (*command.params, command.get_help_option(typer.Context(command))):
         if getattr(option, "is_flag", False):
             option.metavar = ""

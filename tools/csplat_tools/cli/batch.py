@@ -64,8 +64,8 @@ def batch(
     counts = (f"{len(done.select(state))} {state.replace('_', ' ')}" for state in ("done", "done_before", "failed"))
     out.publish(done.as_json(), f"{counted(len(done.results), 'scene')}: {', '.join(counts)}; {done.folder / PAGE}")
     failed = done.select("failed")
-    for one in failed[:_SHOWN_MAX]:
-        note(f"failed: {one.path}: {one.error}")
+    for result in failed[:_SHOWN_MAX]:
+        note(f"failed: {result.path}: {result.error}")
     if not done.has_page:
         note(f"{done.folder / PAGE} is not from csplat batch, and was kept: no page was written")
     if failed:

@@ -62,15 +62,15 @@ class Output:
         """Refuse unusable files before any work is done for them.
 
         Args:
-            outputs: files that the command writes, or `-`; `None` for one that is not requested.
+            outputs: files that the command writes, or `-`; `None` for a file that is not requested.
             inputs: files that it reads; none of them may be written.
             named: other files that it writes, by option; not `-`, nor files with the ending of another kind.
             force: existing files may be replaced, even without --force.
 
         Raises:
-            InputError: a file exists, two are the same, or one has the ending of another kind of file.
+            InputError: a file exists, two are the same, or a file has the ending of another kind.
             OSError: an input does not exist, or the folder of an output.
-            typer.BadParameter: two outputs would go to standard output, or one that cannot.
+            typer.BadParameter: two outputs would go to standard output, or an output that cannot.
         """
         files = {"--report": self.report, **(named or {})}
         for name, path in files.items():
@@ -120,9 +120,9 @@ class Output:
             findings: findings in the file.
             name: name of the file, if a command reads several.
         """
-        for one in findings:
-            if one.kind in ("repair", "loss") or not (self.quiet or one.usual):
-                note(f"{name}: {one}" if name else str(one))
+        for finding in findings:
+            if finding.kind in ("repair", "loss") or not (self.quiet or finding.usual):
+                note(f"{name}: {finding}" if name else str(finding))
 
     def bar(self) -> AbstractContextManager[Progress | None]:
         """Return the progress bar, see `progress_bar`."""

@@ -90,8 +90,8 @@ def compare(
                 raise InputError("--backend exact requires both scenes in memory, and they do not fit: use cpu")
             bound = format_bytes(default_memory_bytes())
             out.remark(f"A and B do not fit in {bound} of memory: they are rendered from the disk")
-        for name, one in ((a, source), (b, other)):
-            out.print_findings(findings_of(one), Path(name).name)
+        for name, scene in ((a, source), (b, other)):
+            out.print_findings(findings_of(scene), Path(name).name)
         model, every = sample_scene(source, progress=progress)
         around = views.find(model, out, count=0, split=split, every=every)
         if mode == "exact":

@@ -103,9 +103,9 @@ def decoder(
     """
     out = Output(force, report, as_json, quiet)
     _check_reports(out, junit)
-    patterns = [one.strip() for text in filters or () for one in text.split(",")]
-    clauses = [one for one in patterns if _CLAUSE.fullmatch(one)]
-    names = [one for one in patterns if one not in clauses]
+    patterns = [pattern.strip() for text in filters or () for pattern in text.split(",")]
+    clauses = [pattern for pattern in patterns if _CLAUSE.fullmatch(pattern)]
+    names = [pattern for pattern in patterns if pattern not in clauses]
     program, render_program, cut_program = _commands(programs or [])
     # The commands that are given select the default: a renderer alone is tested at L4 alone.
     more = [str(number) for number, given in ((RENDERS, render_program), (CUTS, cut_program)) if given is not None]
@@ -124,13 +124,13 @@ def decoder(
 
 def _commands(programs: Sequence[str]) -> tuple[str | None, str | None, str | None]:
     """Return the commands of a decoder, a renderer and cuts by their names in braces; `None` if there is none."""
-    found: dict[str, str] = {}
+    by_kind: dict[str, str] = {}
     for program in programs:
         kind = next((kind for kind in ("cuts", "camera") if f"{{{kind}}}" in program), "decoder")
-        if kind in found:
-            raise typer.BadParameter(f"--cmd has two commands of one kind: {found[kind]!r} and {program!r}")
-        found[kind] = program
-    return found.get("decoder"), found.get("camera"), found.get("cuts")
+        if kind in by_kind:
+            raise typer.BadParameter(f"--cmd has two commands of one kind: {by_kind[kind]!r} and {program!r}")
+        by_kind[kind] = program
+    return by_kind.get("decoder"), by_kind.get("camera"), by_kind.get("cuts")
 
 
 @conformance.command()
@@ -254,8 +254,8 @@ def _render_scorer(levels: Sequence[str], *, quiet: bool) -> tuple[RenderScore |
     """Return a function that measures the PSNR of renders, or `None` and the reason.
 
     Args:
-        levels: levels to be checked. At L4 every file is rendered, and the renderer is prepared at once; at L3 alone
-            hardly any is, and it is prepared at the first.
+        levels: levels to be checked. At L4 every file is rendered, and the renderer is prepared at once. At L3 alone
+            hardly any file is, and the renderer is prepared at the first.
         quiet: print nothing while the renderer is compiled.
     """
     if not {"L3", "L4"} & {*levels}:

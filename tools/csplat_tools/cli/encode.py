@@ -184,9 +184,9 @@ def _publish_estimate(
 ) -> None:
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local, csplat.open(local, read_as, sh_degree=read_degree(options)) as scene:
-        found = estimate_cost(scene, options, limits, choose_levels(scene.count, options, levels))
+        cost = estimate_cost(scene, options, limits, choose_levels(scene.count, options, levels))
         lines = describe_levels(scene, options, limits) if levels is None else []
-    out.publish(found.as_json(), format_cost(found))
+    out.publish(cost.as_json(), format_cost(cost))
     out.remark(*lines)
 
 
@@ -197,11 +197,11 @@ def _find_views(
     prepare_renderer(quiet=out.quiet, simplify=True)
     from csplat_tools.optimise.target_encoding import expected_search_seconds
 
-    found = views.find(model, out)
-    if len(model) and found.test:
+    view_set = views.find(model, out)
+    if len(model) and view_set.test:
         may_prune = target.prune and target.keep is None
         out.announce_time(
-            lambda: expected_search_seconds(model, options, target, found),
+            lambda: expected_search_seconds(model, options, target, view_set),
             "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
         )
-    return found
+    return view_set

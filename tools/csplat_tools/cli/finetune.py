@@ -77,7 +77,7 @@ def finetune(
         tuning.LEARNING_FACTOR[itself]
     )
     encoding = EncodeOptions(preset, shape_codebook_size=tuning.SHAPE_ENTRIES)
-    replaces = shared.is_same_file(checkpoint, resume)  # a checkpoint may replace the one that the run goes on from
+    replaces = shared.is_same_file(checkpoint, resume)  # a run may replace the checkpoint that it goes on from
     named = {"--source-index": source_index, "--page": page}
     if replaces:
         out.check(inputs=(source, *views.inputs), named={"--checkpoint": checkpoint}, force=True)

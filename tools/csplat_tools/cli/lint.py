@@ -46,12 +46,12 @@ def lint(
     with source_path(source) as path:
         findings = formats.lint_file(path)
         if keep_extra:
-            findings = [one for one in findings if one.id != "extra-columns"]
-        errors = any(one.kind == "error" for one in findings)
+            findings = [finding for finding in findings if finding.id != "extra-columns"]
+        errors = any(finding.kind == "error" for finding in findings)
         if fix is not None and not errors:
             with csplat.open(path) as scene:
                 write_model(fix, scene if keep_extra else scene.without_extra(), absolute=False)
-    clean = all(one.kind == "note" for one in findings)
+    clean = all(finding.kind == "note" for finding in findings)
     table = _table(findings)
     if fix == STANDARD_STREAM:
         out.remark(table)
@@ -66,6 +66,8 @@ def lint(
 def _table(findings: list[Finding]) -> str:
     if not findings:
         return "nothing found"
-    rows = [(f"{one.kind:<6}  {one.id}", one.count) for one in findings]
+    rows = [(f"{finding.kind:<6}  {finding.id}", finding.count) for finding in findings]
     lines = format_table(("kind    id", "count"), rows).splitlines()
-    return "\n".join([lines[0], *(f"{line}  {one.text}" for line, one in zip(lines[1:], findings, strict=True))])
+    return "\n".join(
+        [lines[0], *(f"{line}  {finding.text}" for line, finding in zip(lines[1:], findings, strict=True))]
+    )

@@ -48,9 +48,9 @@ def _print_full_help(context: typer.Context, requested: bool) -> None:
 
 def hidden(option: Any) -> Any:
     """Return an option that only --help-all shows."""
-    other = copy(option)
-    other.hidden = True
-    return other
+    hidden_option = copy(option)
+    hidden_option.hidden = True
+    return hidden_option
 
 
 # The options of every command
@@ -88,7 +88,7 @@ SourceIndexInput = Annotated[
     str | None, typer.Option("--source-index", metavar="FILE.npy", help="File of `encode --source-index`.")
 ]
 
-# Views; the hidden ones are for commands that rarely need them
+# Views; hidden options are for commands that rarely need them
 _cameras = typer.Option("--cameras", metavar="FILE.json", help="Test views. Default: virtual ones.")
 _background = typer.Option("--background", metavar="R,G,B", help="Background. Default: the training's.")
 Cameras = Annotated[str | None, _cameras]
@@ -144,11 +144,11 @@ def parse_level(text: str | None) -> tuple[int, int | None]:
     Args:
         text: a level, 0 to 255; or a number of splats above, or with k or M for thousands or millions.
     """
-    found = _LEVEL.fullmatch("0" if text is None else text)
-    factor = {None: 1, "k": 1_000, "M": 1_000_000}[found[2]] if found else 0
-    if found is None or (factor == 1 and "." in found[1]):
+    match = _LEVEL.fullmatch("0" if text is None else text)
+    factor = {None: 1, "k": 1_000, "M": 1_000_000}[match[2]] if match else 0
+    if match is None or (factor == 1 and "." in match[1]):
         raise typer.BadParameter(f"--level is {text}, expected a level, as in 1, or a number of splats, as in 500k")
-    number = round(float(found[1]) * factor)
+    number = round(float(match[1]) * factor)
     return (number, None) if factor == 1 and number <= _LEVEL_MAX else (0, number)
 
 
@@ -156,7 +156,7 @@ def parse_backend(name: RendererName, out: Output) -> tuple[Mode, Backend]:
     """Return the mode and the backend of a renderer; for `auto`, remark if there is no GPU.
 
     Args:
-        name: `cpu`; its slow and its fast mode, `exact` and `fast`; `gpu`; `auto`, a GPU if there is one; or
+        name: `cpu`; its slow and fast modes, `exact` and `fast`; `gpu`; `auto`, a GPU if there is one; or
             `software`, the GPU's shaders on the CPU.
         out: the command's output.
 
@@ -173,7 +173,7 @@ def parse_backend(name: RendererName, out: Output) -> tuple[Mode, Backend]:
 
 
 def refuse_together(*groups: Mapping[str, object]) -> None:
-    """Refuse options that exclude each other: several of one group, or of two groups one each.
+    """Refuse options that exclude each other: several of a single group, or options of different groups.
 
     Args:
         groups: option values by spelling; `None` and False: not given.
@@ -188,10 +188,10 @@ def refuse_together(*groups: Mapping[str, object]) -> None:
 
 
 def require_one(options: Mapping[str, object], required: Mapping[str, object]) -> None:
-    """Refuse options that have no effect unless one of the required ones is given.
+    """Refuse options that have no effect unless a required option is given.
 
     Raises:
-        typer.BadParameter: such an option is given, and none of the required ones.
+        typer.BadParameter: such an option is given, and no required option.
     """
     given = _given(options)
     if given and not _given(required):
@@ -236,18 +236,18 @@ def take_estimated_up(
 
 
 def open_data(path: str, **options: Any) -> DataOptions:
-    """Return the options of a data set, with those of the program."""
+    """Return the options of a data set, including the program's."""
     return DataOptions(path, trust_paths=TRUSTS_PATHS.get(), **options)
 
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Views of a camera file or a data set; without either, virtual ones.
+    """Views of a camera file or a data set; virtual views without either.
 
     Attributes:
         cameras: a camera file.
-        data: a data set, or the folder of images in one.
-        background: background colour, see `parse_colour`; `None`: that of training.
+        data: a data set, or its folder of images.
+        background: background colour, see `parse_colour`; `None`: as in training.
         test_every: every Nth image was held out; `None`: as in training.
 
     Raises:
@@ -296,19 +296,19 @@ class ViewOptions:
             output: prints remarks.
             count, size, validation_count, split, every: as for `find_view_set`.
         """
-        found = find_view_set(
+        view_set = find_view_set(
             model, cameras=self.cameras, data=self.data_options, background=self.colour, count=count, size=size,
             validation_count=validation_count, split=split, every=every,
         )  # fmt: skip
-        output.remark(*found.notes)
-        axis = None if output.quiet or found.name != VIRTUAL else estimate_up(model, every)
+        output.remark(*view_set.notes)
+        axis = None if output.quiet or view_set.name != VIRTUAL else estimate_up(model, every)
         if axis is not None:
             word = up_word(axis)
             output.remark(
                 f"views are placed for -y up, since the scene does not specify its up direction; {word} is estimated:"
                 f" `csplat convert IN.ply OUT.ply --up {word}` writes it, and changes views and PSNR"
             )
-        return found
+        return view_set
 
 
 def parse_overrides(up: str | None, axes: str | None = None, **others: Any) -> MetadataOverrides:
@@ -326,10 +326,10 @@ def parse_overrides(up: str | None, axes: str | None = None, **others: Any) -> M
 
 def parse_size(text: str) -> tuple[int, int]:
     """Parse width and height from `640x480`."""
-    found = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text.strip())
-    if found is None:
+    match = re.fullmatch(r"([1-9][0-9]{0,4})[xX]([1-9][0-9]{0,4})", text.strip())
+    if match is None:
         raise typer.BadParameter(f"a size is {text!r}, expected width and height in pixels, as 640x480")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def parse_bytes(text: str | None) -> int | None:
@@ -377,9 +377,9 @@ def parse_colour(text: str) -> tuple[float, float, float]:
 
 def parse_up(text: str) -> Direction:
     """Parse a direction from `y`, `-y`, or `0,-1,0.1`, and return it at unit length."""
-    found = re.fullmatch(r"([+-]?)([xyz])", text.strip().lower())
-    if found is not None:
-        x, y, z = ((-1.0 if found[1] == "-" else 1.0) * (found[2] == axis) + 0.0 for axis in "xyz")
+    match = re.fullmatch(r"([+-]?)([xyz])", text.strip().lower())
+    if match is not None:
+        x, y, z = ((-1.0 if match[1] == "-" else 1.0) * (match[2] == axis) + 0.0 for axis in "xyz")
         return x, y, z
     try:
         return unit_up([float(part) for part in text.split(",")])
@@ -482,12 +482,12 @@ def parse_max_error(text: str, unit_metres: float | None) -> dict[str, float]:
     for part in text.split(","):
         name, _, value = part.partition("=")
         name = name.strip()
-        found = re.fullmatch(NUMBER + r"\s*([a-zµ]*)", value.strip().lower())
-        if found is None:
+        match = re.fullmatch(NUMBER + r"\s*([a-zµ]*)", value.strip().lower())
+        if match is None:
             raise InputError(f"{part.strip()!r} is not an error bound, expected a measure and a number: means=0.001")
         if name in bounds:
             raise InputError(f"the largest error of {name} is given twice")
-        bounds[name] = float(found[1]) * _factor(part.strip(), name, found[2], unit_metres)
+        bounds[name] = float(match[1]) * _factor(part.strip(), name, match[2], unit_metres)
     return bounds
 
 

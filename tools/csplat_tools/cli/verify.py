@@ -58,7 +58,9 @@ def verify(
 def _print_reasons(verified: Verification, path: str, *, unverified: bool) -> None:
     violations = verified.validation.violations
     if violations:
-        clauses, codes = (", ".join(sorted({getattr(one, name) for one in violations})) for name in ("clause", "code"))
+        clauses, codes = (
+            ", ".join(sorted({getattr(violation, name) for violation in violations})) for name in ("clause", "code")
+        )
         note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; copy or make it again ({codes})")
     if unverified:
         note("error: the declared errors were not checked")
