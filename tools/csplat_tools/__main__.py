@@ -69,7 +69,7 @@ def _silence_libraries() -> None:
     def show(message: Warning | str, *_: object) -> None:
         note(f"warning: {message}")
 
-    logging.getLogger().addHandler(logging.NullHandler())  # without one, what nobody handles would be printed
+    logging.getLogger().addHandler(logging.NullHandler())  # without it, unhandled messages would be printed
     warnings.filterwarnings("ignore", module=r"(?!csplat)")
     warnings.showwarning = show  # type: ignore[assignment]  # the category and the place are not printed
 

@@ -189,7 +189,7 @@ class Display:
             self._bars, self._tasks = None, {}
 
     def _update_bars(self, unfinished: Sequence[tuple[str, _Stage]], now: float) -> None:
-        """Update the bars, and remove those of stages that ended."""
+        """Update the bars, and remove the bars of stages that ended."""
         if self._bars is None:
             self._bars = _new_bars()
             self._bars.start()
@@ -231,9 +231,9 @@ def parse_size_bytes(text: str) -> int:
     Raises:
         InputError: the text is not a size, or is smaller than any file.
     """
-    found = re.fullmatch(NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
-    unit = None if found is None else _UNITS.get(found[2].lower())
-    size = None if found is None or unit is None else float(found[1]) * unit
+    match = re.fullmatch(NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
+    unit = None if match is None else _UNITS.get(match[2].lower())
+    size = None if match is None or unit is None else float(match[1]) * unit
     if size is None or not 1.0 <= size < 2.0**63:
         raise InputError(f"a size is {text!r}, expected bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
     if size < _FILE_BYTES_MIN:

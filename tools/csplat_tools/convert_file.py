@@ -39,7 +39,7 @@ class Filters:
     Attributes:
         to_axes: convert the scene to these axes, as in `SplatModel`; a scene without axes is assumed to have x right,
             y down, z forward.
-        axes: axes along which `rotate`, `translate` and the crops are given; `None`: those of the scene.
+        axes: axes along which `rotate`, `translate` and the crops are given; `None`: the axes of the scene.
         rotate: rotate about x, y, z in this order, degrees, counter-clockwise as seen from the tip of the axis. The
             scene keeps the names of its axes, so that converting it to axes of a format does not rotate it back.
         scale: scale the scene about the origin of its coordinates by this factor.
@@ -119,7 +119,7 @@ def find_floaters(points: F64, sizes: F64) -> Mask:
     with np.errstate(divide="ignore", over="ignore"):
         octaves = np.ceil(np.log2(np.maximum(_SPREAD * sizes / (_CELL * extent), 1.0)))
     octaves = np.minimum(octaves, 40.0).astype(np.int64)
-    found = np.zeros(len(points), np.bool_)
+    floaters = np.zeros(len(points), np.bool_)
     for octave in np.unique(octaves):
         cells = np.floor(np.clip((points - low) / (_CELL * extent * 2.0**octave), -(2.0**19), 2.0**19)).astype(np.int64)
         keys, counts = np.unique(_key(cells), return_counts=True)
@@ -129,8 +129,8 @@ def find_floaters(points: F64, sizes: F64) -> Mask:
             expected = _key(cells[own] + (np.array(step) - 1))
             at = np.minimum(np.searchsorted(keys, expected), len(keys) - 1)
             neighbours += np.where(keys[at] == expected, counts[at], 0)
-        found[own] = neighbours < _NEIGHBOURS_MIN
-    return found
+        floaters[own] = neighbours < _NEIGHBOURS_MIN
+    return floaters
 
 
 def _key(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -151,7 +151,7 @@ def _select(scene: Scene, keep: Callable[[SplatModel], Mask]) -> Scene:
 
 
 def _without_floaters(scene: Scene) -> Scene:
-    """Drop isolated splats; keeps centres and sizes of all splats in memory, 16 bytes each."""
+    """Drop isolated splats. Centres and sizes of all splats are kept in memory, 16 bytes each."""
     points, sizes = np.empty((scene.count, 3), np.float32), np.empty(scene.count, np.float32)
     at = 0
     for model in scene.blocks():
@@ -172,6 +172,7 @@ def _without_floaters(scene: Scene) -> Scene:
 
 
 def _inside_box(model: SplatModel, corners: F64) -> Mask:
+    """Return which centres lie between two corners, [2, 3], the lower corner first."""
     places = model.means + np.array(model.origin)
     inside: Mask = ((places >= corners[0]) & (places <= corners[1])).all(axis=1)
     return inside
@@ -186,11 +187,11 @@ def _inside_sphere(model: SplatModel, sphere: F64) -> Mask:
 def _rotation(degrees: tuple[float, float, float]) -> F64:
     matrix = np.eye(3)
     for axis, angle in enumerate(np.radians(degrees)):
-        one = np.eye(3)
+        turn = np.eye(3)
         i, j = (axis + 1) % 3, (axis + 2) % 3
         c, s = np.cos(angle), np.sin(angle)
-        one[i, i], one[i, j], one[j, i], one[j, j] = c, -s, s, c
-        matrix = one @ matrix
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
+        matrix = turn @ matrix
     return matrix
 
 
@@ -252,7 +253,7 @@ class Conversion:
 
         Attributes with a finding in `losses` are left out: more than their precision is lost.
         """
-        rounded = [name for name in self.rounded if name not in {one.attribute for one in self.losses}]
+        rounded = [name for name in self.rounded if name not in {finding.attribute for finding in self.losses}]
         return "; ".join([*self.lost, *([f"precision of {', '.join(rounded)}"] if rounded else [])])
 
 
@@ -278,7 +279,7 @@ def convert_file(
         read_as: name of the source's format, if its content does not identify it.
         write_as: name of the target's format; `None`: by the file name ending.
         level: level of detail to read if the source has several; 0 is the finest. Streamed SOG (a target
-            lod-meta.json) gets it and all coarser ones.
+            lod-meta.json) gets it and all coarser levels.
         max_splats: as in `csplat.open`; streamed SOG gets one level then.
         overrides: overrides of the source's metadata.
         filters: changes of the scene. By default, they are along `to_axes`, otherwise along the axes of the source's
@@ -317,7 +318,7 @@ def convert_file(
         filter_axes = changes.axes or changes.to_axes or own or before
         changes = replace(changes, axes=None if filter_axes == UNSPECIFIED else filter_axes)
         levels = [changes.apply((overrides or MetadataOverrides()).apply_to_scene(scene)) for scene in (reader, *more)]
-        scene, counts = levels[0], tuple(one.count for one in levels if one.count)
+        scene, counts = levels[0], tuple(changed.count for changed in levels if changed.count)
         lost = writes.losses(scene)
         rounded = tuple(name for name in ARRAYS if name not in writes.exact and (name != "shN" or scene.sh_degree))
         result = Conversion(
@@ -328,16 +329,17 @@ def convert_file(
         if no_loss and (lost or rounded):
             raise InputError(f"{writes.title} does not keep all of {source}: {result.lost_words()}")
         reporting = [
-            with_progress(one, f"reading level {level + at}" if more else "reading", progress)
-            for at, one in enumerate(levels)
+            with_progress(changed, f"reading level {level + at}" if more else "reading", progress)
+            for at, changed in enumerate(levels)
         ]
         if dry_run:
             losses = survey_losses(reporting, writes.name)
         else:
             losses = write_levels(path, reporting, writes.name)
             result = replace(result, size_bytes=size_on_disk(path))
-        result = replace(result, losses=tuple(one for one in losses if one.id != "lost-contents"))
-        return replace(result, findings=tuple(one for one in reader.findings if not (more and one.id == "levels")))
+        result = replace(result, losses=tuple(finding for finding in losses if finding.id != "lost-contents"))
+        findings = tuple(finding for finding in reader.findings if not (more and finding.id == "levels"))
+        return replace(result, findings=findings)
 
 
 def decode_file(

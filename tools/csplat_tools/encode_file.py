@@ -28,10 +28,10 @@ from csplat_tools.level_builder import FittedLevelBuilder, LevelCount, choose_le
 from csplat_tools.scene_files import CHEAP_TO_REOPEN, MetadataOverrides, findings_as_json, read_source
 
 _MEMORY_FACTOR = 4  # memory of a scene divided by the size of its PLY; unknown for other formats
-_LEVELS_FACTOR = 4  # memory with levels of detail divided by that without: renders, and splats in several forms
+_LEVELS_FACTOR = 4  # memory with levels of detail / memory without: renders, and splats in several forms
 _SMALL = 4 << 20  # bytes; smaller files of any format always fit in memory
 
-_MANY_SPLATS = 1_000_000  # a file of these has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
+_MANY_SPLATS = 1_000_000  # a file of this many has 8 MB: ten seconds at 6 Mbit/s; a coarsest level has about 70 kB
 
 
 def read_degree(options: EncodeOptions) -> int | None:
@@ -127,7 +127,7 @@ def encode_file(
     A `target`, `importance` and `source_index` require the scene in memory, and exclude `out_of_core`.
 
     Args:
-        source: a scene in any format, or `-`; or one that `read_source` has read.
+        source: a scene in any format, or `-`; or a scene that `read_source` has read.
         output: the file to write, or `-`; it is replaced without a check.
         options: options of the encoder; `keep_extra` applies to reading, too.
         target, views: as for `csplat.encode`.
@@ -137,7 +137,7 @@ def encode_file(
         prune_unseen: prune the splats that no view of the sensitivities saw; requires `importance`.
         source_index: a .npy file to write: the index in the source of each splat of the file.
         levels: number of levels of detail above the scene, 1 to 16; "auto": until the coarsest has 4,096 splats;
-            `None`: none. Those of streamed SOG are taken instead.
+            `None`: none. Levels of streamed SOG are taken instead.
         out_of_core: memory, disk and workers.
         format: as for `csplat.open`.
         progress: progress callback.
@@ -303,9 +303,9 @@ def format_encoding(encoded: EncodedFile, source: str, output: str) -> str:
     ratio = encoded.source_bytes / report.size_bytes
     splats = f"{counted(report.splat_count, 'splat')} in {counted(report.tile_count, 'tile')}, {encoded.seconds:.2f} s"
     sizes = f"{format_bytes(encoded.source_bytes)} -> {format_bytes(report.size_bytes)}{per_splat}"
-    quality, found = "", None if encoded.result is None else encoded.result.psnr
-    if found is not None:
-        quality = f", PSNR {found:.2f} dB"
+    quality, psnr = "", None if encoded.result is None else encoded.result.psnr
+    if psnr is not None:
+        quality = f", PSNR {psnr:.2f} dB"
     elif encoded.result is not None and len(encoded.source) and "-" not in (source, output):
         quality = f"; `csplat compare {source} {output}` shows how it looks"
     return f"{splats}: {sizes}, {ratio:.1f} times smaller{quality}"

@@ -101,8 +101,8 @@ def check_output(path: str, *, force: bool, inputs: tuple[str, ...] = ()) -> Non
         if not force:
             _free.add(resolved)
         return
-    for other in inputs:
-        if other != STANDARD_STREAM and Path(other).exists() and target.samefile(other):
+    for source in inputs:
+        if source != STANDARD_STREAM and Path(source).exists() and target.samefile(source):
             raise InputError(f"{path} is the input: name another output")
     if target.is_file() and not force:
         raise InputError(f"{path} exists: --force replaces it")
@@ -148,8 +148,12 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
     target, suffix = Path(path), Path(path).suffix.lower()
     if suffix == wanted:
         return
-    others = [one for one in formats() if one.write is not None and one.name not in _OWN_FORMATS]
-    converts = any(target.name.lower().endswith(one.suffixes) for one in others)
+    others = [
+        scene_format
+        for scene_format in formats()
+        if scene_format.write is not None and scene_format.name not in _OWN_FORMATS
+    ]
+    converts = any(target.name.lower().endswith(scene_format.suffixes) for scene_format in others)
     kind = None if converts else detect_name(target)
     known = None if kind is None or kind.name in _OWN_FORMATS or not kind.is_scene else kind.title
     maker = _MAKERS.get((Path(source).suffix.lower(), suffix)) or _MAKERS.get(("*", suffix)) or converts * "convert"
@@ -214,7 +218,7 @@ def source_path(file: File) -> Iterator[Path]:
 def is_csplat(path: Path) -> bool:
     """Return True for a .csplat file, by its first bytes, or by its name if they are damaged.
 
-    A PLY with such a name is not one, nor is a folder (an unbundled SOG).
+    A PLY with such a name is not a .csplat file, nor is a folder (an unbundled SOG).
 
     Raises:
         OSError: the file cannot be read.
@@ -231,7 +235,7 @@ def mapped_csplat(path: str, shown: str | None = None) -> Iterator[bytes | mmap]
     """Yield the bytes of a .csplat file, memory-mapped if possible; they are not validated.
 
     Args:
-        path: a path, which may be that of a pipe, or `-`.
+        path: the path of a file or a pipe, or `-`.
         shown: name for messages; `None`: `path`.
 
     Raises:

@@ -138,7 +138,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]], words: Collectio
     """
     kinds = ["words" if place in words else "" if place else "name" for place in range(len(header))]
     marks = [f' class="{kind}"' if kind else "" for kind in kinds]
-    heads = "".join(f'<th scope="col"{mark}>{escape(one)}</th>' for mark, one in zip(marks, header, strict=True))
+    heads = "".join(f'<th scope="col"{mark}>{escape(title)}</th>' for mark, title in zip(marks, header, strict=True))
     cells = [
         "<tr>" + "".join(f"<td{mark}>{escape(cell)}</td>" for mark, cell in zip(marks, row, strict=True)) + "</tr>"
         for row in rows
@@ -192,7 +192,7 @@ def sortable_table(heads: Sequence[Head], rows: Sequence[Sequence[Any]], marked:
         + "</tr>"
         for place, row in enumerate(rows)
     ]
-    return _table("".join(one.html() for one in heads), lines, ' class="sortable"')
+    return _table("".join(head.html() for head in heads), lines, ' class="sortable"')
 
 
 def _table(heads: str, rows: Sequence[str], kind: str = "") -> str:
@@ -341,16 +341,16 @@ def _own_id(key: str, value: str, name: str) -> str:
 
 def _as_attributes(style: str) -> dict[str, str]:
     """Parse `fill: none; stroke: red` into attributes, without the font family, which the page sets."""
-    found: dict[str, str] = {}
+    attributes: dict[str, str] = {}
     for part in style.split(";"):
         key, _, value = (piece.strip() for piece in part.partition(":"))
         if key == "font":
             match = _FONT.match(value + " ")
             if match is not None:
-                found["font-size"] = match["size"]
+                attributes["font-size"] = match["size"]
         elif key and key != "font-family":
-            found[key] = value
-    return found
+            attributes[key] = value
+    return attributes
 
 
 _AMPLIFICATION = 10.0  # factor of the differences that are shown
@@ -361,8 +361,8 @@ IMAGES_NOTE = (
     f" {_AMPLIFICATION:g}. Images are compressed for this page; scores are not measured on them."
 )
 
-_SHARE = 4  # width and height of a view divided by those of the piece
-_SIDE = 480  # largest side of an image, pixels; larger ones would make pages of tens of megabytes
+_SHARE = 4  # width and height of a view, divided by the piece's
+_SIDE = 480  # largest side of an image, pixels; larger images would make pages of tens of megabytes
 _WEBP = {"quality": 94, "method": 4}
 
 
@@ -409,7 +409,7 @@ class HardestPlaceSearch:
             return None
         number, rows, columns, source, decoded = self._place
         a, b = source[rows, columns], decoded[rows, columns]
-        pieces = [_reduced(one) for one in np.split(side_by_side(a, b, _AMPLIFICATION), 3, axis=1)]
+        pieces = [_reduced(image) for image in np.split(side_by_side(a, b, _AMPLIFICATION), 3, axis=1)]
         return ImagePiece(number, float(psnr(a, b)), _framed(source, rows, columns), *pieces)
 
 

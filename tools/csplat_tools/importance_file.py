@@ -80,11 +80,11 @@ def encode_by_importance(
             splat, or the file has weights only.
         OSError: the file cannot be read.
     """
-    found = read_importance(path, model)
-    stored = found if isinstance(found, StoredSensitivity) else None
+    importance = read_importance(path, model)
+    stored = importance if isinstance(importance, StoredSensitivity) else None
     if prune_unseen and stored is None:
         raise InputError("pruning unseen splats requires a file of `csplat sensitivity` as importance")
-    weights = encoder_importance(found, model)
+    weights = encoder_importance(importance, model)
     if target is not None:
         return encode_with_report(
             model, options, levels=levels, target=target, views=views, importance=weights, progress=progress

@@ -84,7 +84,7 @@ def side_by_side(a: F32, b: F32, amplification: float, image: F32 | None = None)
     """
     difference = np.abs(b.astype(np.float32) - a) * np.float32(amplification)
     shown = [a, b, difference] if image is None else [image, a, b, difference]
-    return np.concatenate([to_uint8(one) for one in shown], axis=1)
+    return np.concatenate([to_uint8(panel) for panel in shown], axis=1)
 
 
 def write_png(path: Path, pixels: NDArray[Any]) -> None:

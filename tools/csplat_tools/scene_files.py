@@ -46,7 +46,7 @@ def load_scene(
 
     Args:
         scene: a path, an open binary file, or bytes; the path `-` is standard input. A model or a scene in memory is
-            not read again. The size of a model is that of its plain PLY.
+            not read again. A model counts with the size of its plain PLY.
         level, max_splats, sh_degree: as in `csplat.open`.
 
     Returns:
@@ -143,7 +143,7 @@ def open_scenes(given: Sequence[SceneLike], memory_bytes: int | None = None) -> 
     """Read scenes for a comparison into memory, or open all of them if they do not fit together.
 
     Args:
-        given: scenes as for `load_scene`. If one is in memory already, all are read into memory; scenes that are open
+        given: scenes as for `load_scene`. If any is in memory already, all are read into memory; scenes that are open
             remain so.
         memory_bytes: approximate limit of the memory; `None`: half of the free memory.
 
@@ -247,9 +247,9 @@ def findings_of(scene: Scene) -> Sequence[Finding]:
 def findings_as_json(findings: tuple[Finding, ...] | list[Finding]) -> list[dict[str, Any]]:
     """Return findings as JSON-compatible values."""
     return [
-        {"id": one.id, "kind": one.kind, "count": one.count, "text": one.text}
-        | ({"attribute": one.attribute, "largest_error": one.largest_error} if one.attribute else {})
-        for one in findings
+        {"id": finding.id, "kind": finding.kind, "count": finding.count, "text": finding.text}
+        | ({"attribute": finding.attribute, "largest_error": finding.largest_error} if finding.attribute else {})
+        for finding in findings
     ]
 
 
@@ -273,7 +273,7 @@ def with_progress(scene: Scene, stage: str, progress: Progress | None) -> Scene:
 
 @dataclass(frozen=True)
 class MetadataOverrides:
-    """Overrides of a scene's metadata; `None` keeps that of the file.
+    """Overrides of a scene's metadata; `None` keeps the file's.
 
     Attributes:
         coordinate_system, unit_metres, antialiased: as in `SceneMetadata`.

@@ -34,14 +34,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-#: Groups of a grid, and their values if none are given; quick ones first.
+#: Groups of a grid, quick groups first, and their values if none are given.
 GROUPS = {
     "presets": ":".join(PRESETS),
     "precision": "32:36:40:44:48:56",  # `--attribute-psnr`, dB
     "targets": "36:40:44",  # `--target-psnr`, dB, or `--target-size`
     "simplify": "0.7:0.5:0.3",  # `--keep`, fractions of the splats
 }
-_SEARCH = 50.0  # time of a target, in encodings without: 70 to 140 s and 0.8 s for the sample scene, on two busy cores
+_SEARCH = 50.0  # time with a target / time without: 70 to 140 s and 0.8 s for the sample scene, on two busy cores
 _DECODE_RUNS = 3  # timed runs, of which the median is reported
 
 
@@ -85,7 +85,7 @@ def parse_grid(text: str = ",".join(GROUPS), preset: PresetName = "balanced") ->
     """
     settings = dict[str, GridSetting]()
     for part in text.split(","):
-        group, _, values = (one.strip() for one in part.partition("="))
+        group, _, values = (piece.strip() for piece in part.partition("="))
         if group not in GROUPS:
             raise InputError(f"{group!r} is not a group of settings, expected some of {', '.join(GROUPS)}")
         for value in (values or GROUPS[group]).split(":"):
@@ -120,7 +120,7 @@ class TradeoffRow:
         setting: how it was encoded.
         command: the command that makes the same file.
         size_bytes: its size.
-        ratio: size of the source divided by that of the file.
+        ratio: size of the source divided by the size of the file.
         splats: number of splats in the file.
         psnr, ssim: against the source's renders: PSNR pooled over all test views, dB; and mean SSIM.
         image_scores: scores of the source (`a`) and of the file (`b`) against the images of a data set, as in
@@ -213,7 +213,7 @@ def tradeoff(
     Args:
         scene: a model, or a file in any format but .csplat.
         grid: the settings, see `parse_grid`; `None`: all groups.
-        views: the views that targets use, and test views for the scores; `None`: virtual ones.
+        views: the views that targets use, and test views for the scores; `None`: virtual views.
         path: path of the scene in commands.
         view_words: options of `csplat encode` that give the same views, for commands.
         say: called with a line for each setting.
@@ -221,8 +221,8 @@ def tradeoff(
 
     Examples:
         >>> import csplat_tools
-        >>> found = csplat_tools.tradeoff("scene.ply", csplat_tools.parse_grid("presets"))  # doctest: +SKIP
-        >>> [(row.setting.name, row.size_bytes, row.psnr) for row in found.front]  # doctest: +SKIP
+        >>> measured = csplat_tools.tradeoff("scene.ply", csplat_tools.parse_grid("presets"))  # doctest: +SKIP
+        >>> [(row.setting.name, row.size_bytes, row.psnr) for row in measured.front]  # doctest: +SKIP
 
     Raises:
         InputError: the scene has no splats, or no file could be made and measured.
@@ -259,7 +259,7 @@ def measure_grid(
     say: Callable[[str], None] | None = None,
     progress: Progress | None = None,
 ) -> tuple[list[TradeoffRow], dict[str, str]]:
-    """Measure each setting; one that fails does not stop the others.
+    """Measure each setting; a setting that fails does not stop the others.
 
     Returns:
         The rows, the smallest file first, and errors by the name of the setting.
@@ -281,7 +281,9 @@ def measure_grid(
         if say is not None:
             say(f"{number + 1}/{len(grid)} {setting.name}: {line}")
     if not rows:
-        raise InputError("; ".join(["nothing could be measured", *(f"{one}: {why}" for one, why in failures.items())]))
+        raise InputError(
+            "; ".join(["nothing could be measured", *(f"{name}: {reason}" for name, reason in failures.items())])
+        )
     return sorted(rows, key=lambda row: row.size_bytes), failures
 
 
@@ -396,7 +398,7 @@ _STYLES = {  # markers, in colours that colour-blind readers can tell apart, on 
     "targets": ("D", "#e69f00"),
     "simplify": ("v", "#009e73"),
 }
-# Places of a label: the offset from its mark in points, and its alignment; the first free one is taken.
+# Places of a label: the offset from its mark in points, and its alignment; the first free place is taken.
 _PLACES = tuple(
     (distance * x, distance * y, {-1: "right", 0: "center", 1: "left"}[x], {-1: "top", 0: "center", 1: "bottom"}[y])
     for distance in (5, 10, 20)
@@ -405,7 +407,7 @@ _PLACES = tuple(
 
 
 def _plot(tradeoff: Tradeoff, key: str, label: str, level: float | None = None) -> str:
-    """Draw an attribute of the rows against their size, and a dotted line at a level, that of the source."""
+    """Draw an attribute of the rows against their size, and a dotted line at the source's level, if given."""
     unit, divisor = ("MB", 1e6) if tradeoff.rows[-1].size_bytes >= 1e6 else ("kB", 1e3)
 
     def marks(rows: Sequence[TradeoffRow]) -> list[tuple[float, float]]:
