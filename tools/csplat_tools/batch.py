@@ -342,7 +342,7 @@ def _output_name(within: str, root: str, ending: str, *, whole: bool = False) ->
 
 
 def run_scene(folder: Path, command: Sequence[str], threads: int, task: Task, apart: bool, force: bool) -> SceneResult:
-    """Run a command on a scene, unless an earlier run has made the output; if `apart`, in a process of its own.
+    """Run a command on a scene, unless an earlier run has made the output. If `apart`, it runs in its own process.
 
     Raises:
         CommandLineError: options of all scenes are invalid.

@@ -31,7 +31,7 @@ _ESTIMATE_FROM = (0.03, 1.0)  # fraction done and seconds of a stage from which 
 _TIMED_REPORTS = 2  # number of reports of a long run after which its time is estimated
 _RUN_RANGE = (0.8, 2.0)  # range of that estimate, as factors: steps get slower as a scene grows
 _RENDER_RANGE = (0.6, 1.7)  # the same for estimates from the time of renders
-_STAGES = 2  # stages shown at a time: those reported last
+_STAGES = 2  # stages shown at a time: the last that were reported
 _WORKING = "working"  # shown if no stage is known
 _MINUTES_FROM = 100.0  # seconds; longer durations are given in minutes
 
@@ -43,7 +43,7 @@ _FILE_BYTES_MIN = 64  # size of a file's header: no file is smaller
 
 STANDARD_OUTPUT = "standard output"  # its name in messages
 
-#: Seconds; the expected time of longer work is announced.
+#: Seconds. The expected time of longer work is announced.
 LONG_WORK_SECONDS = 10.0
 
 
@@ -58,7 +58,7 @@ def print_data(text: str) -> None:
 
 
 def print_json(value: Any) -> None:
-    """Print a value as JSON; NaN and infinities are refused, since JSON has none."""
+    """Print a value as JSON. NaN and infinities are refused, since JSON has none."""
     print_data(json.dumps(value, indent=2, allow_nan=False))
 
 
@@ -85,7 +85,7 @@ S = TypeVar("S", bound=RunProgress)
 
 @contextmanager
 def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
-    """Show progress; if a display is shown already, use it.
+    """Show progress, on the display that is shown already if there is one.
 
     Yields:
         The progress callback; `None` if nothing is shown.
@@ -182,7 +182,7 @@ class Display:
                 note(f"{text}; {minutes}:{seconds:02d} so far")
 
     def close(self) -> None:
-        """Remove the bars; the next tick shows them again."""
+        """Remove the bars. The next tick shows them again."""
         with self._lock:
             if self._bars is not None:
                 self._bars.stop()
@@ -204,7 +204,7 @@ class Display:
 
 
 def format_table(header: Sequence[str], rows: Sequence[Sequence[object]], *, left: int = 1) -> str:
-    """Format a table: the first `left` columns flush left, the others flush right; the same in a pipe."""
+    """Format a table, the first `left` columns flush left, the others flush right, also in a pipe."""
     cells = [list(header), *([str(cell) for cell in row] for row in rows)]
     widths = [max(len(row[column]) for row in cells) for column in range(len(header))]
     lines = []
@@ -263,7 +263,7 @@ _displays: list[Display] = []  # the display that is shown; at most one
 
 @contextmanager
 def displayed(display: Display) -> Iterator[Display]:
-    """Show progress on a display within the context; `print_data` and `note` remove its bars first."""
+    """Show progress on a display within the context. `print_data` and `note` remove its bars first."""
     _displays.append(display)
     try:
         yield display

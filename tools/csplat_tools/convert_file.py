@@ -90,7 +90,7 @@ class Filters:
 
 
 def _rotate_in_axes(model: SplatModel, matrix: F64) -> SplatModel:
-    """Rotate a scene whose axes keep their names; an up direction in its metadata rotates with it."""
+    """Rotate a scene whose axes keep their names. An up direction in its metadata rotates with it."""
     turned, letters = rotate_scene(model, matrix), model.metadata.coordinate_system
     if letters == UNSPECIFIED:
         return turned
@@ -249,7 +249,7 @@ class Conversion:
         }
 
     def lost_words(self) -> str:
-        """Describe in one line the contents and precision that are lost; empty if there are none.
+        """Describe in one line the contents and precision that are lost. The line is empty if nothing is lost.
 
         Attributes with a finding in `losses` are left out: more than their precision is lost.
         """

@@ -35,7 +35,7 @@ _MANY_SPLATS = 1_000_000  # a file of this many has 8 MB: ten seconds at 6 Mbit/
 
 
 def read_degree(options: EncodeOptions) -> int | None:
-    """Return the SH degree at which to read a scene to be encoded; `None` keeps all bands.
+    """Return the SH degree at which to read a scene to be encoded. `None` keeps all bands.
 
     Bands that the encoder drops are read as well, since declared errors include them. A file of a higher degree than
     models support can be read only if bands are dropped.
@@ -209,7 +209,7 @@ def encode_file(
 def _levels_of_source(
     local: Path, options: EncodeOptions, levels: int | Literal["auto"], limits: OutOfCoreOptions
 ) -> FittedLevelBuilder | None:
-    """Return the builder that takes the levels of streamed SOG; `None` if it has one level, or none are to be written.
+    """Return the builder that takes the levels of streamed SOG, or `None` for a single level or a file without levels.
 
     Raises:
         InputError: the scene does not fit in memory; or as in `choose_levels`.
@@ -283,7 +283,7 @@ def format_cost(cost: EncodingCost) -> str:
 
 
 def format_declared_errors(errors: Mapping[str, tuple[float, float]]) -> list[str]:
-    """Format declared errors, maximum and RMS by measure, as a table; return nothing if there are none."""
+    """Format declared errors, maximum and RMS by measure, as a table, or return an empty list if there are none."""
     if not errors:
         return []
     names = sorted(errors, key=list(MEASURE_NAMES.values()).index)

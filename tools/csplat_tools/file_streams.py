@@ -1,7 +1,7 @@
 """Open the files, standard input and standard output of commands.
 
-`-` is standard input or output. A file appears under its name only when it is complete, and an existing one is
-replaced only with `force`.
+`-` is standard input or output. A file appears under its name only when it is complete, and an existing file
+is replaced only with `force`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _MAKERS = {
     ("*", ".npz"): "sensitivity",
 }
 
-#: File name endings of other files than scenes.
+#: File name endings of files that are not scenes.
 _NO_SCENES = {".csv", ".gif", ".jpg", ".json", ".mp4", ".npy", ".pdf", ".png", ".svg", ".txt", ".webp", ".xml"}
 
 
@@ -169,7 +169,7 @@ def check_name(path: str, wanted: str, writer: str, source: str = "") -> None:
 
 @contextmanager
 def local_path(file: File) -> Iterator[Path]:
-    """Yield the path of a file that can be read twice; `-`, named pipes, open files and bytes are copied.
+    """Yield the path of a file that can be read twice. `-`, named pipes, open files and bytes are copied.
 
     Raises:
         InputError: `file` is not a file.
@@ -199,7 +199,7 @@ def naming(file: object) -> Iterator[None]:
 
 @contextmanager
 def source_path(file: File) -> Iterator[Path]:
-    """Yield the path of a scene to be encoded; streams and bytes are copied to a temporary file first.
+    """Yield the path of a scene to be encoded. Streams and bytes are copied to a temporary file first.
 
     Raises:
         InputError: the scene is a .csplat file.
@@ -232,7 +232,7 @@ def is_csplat(path: Path) -> bool:
 
 @contextmanager
 def mapped_csplat(path: str, shown: str | None = None) -> Iterator[bytes | mmap]:
-    """Yield the bytes of a .csplat file, memory-mapped if possible; they are not validated.
+    """Yield the bytes of a .csplat file, memory-mapped if possible. They are not validated.
 
     Args:
         path: the path of a file or a pipe, or `-`.
@@ -276,7 +276,7 @@ def write_array(path: str, array: NDArray[Any]) -> None:
 
 
 def write_bytes(path: str, data: bytes) -> None:
-    """Write a file or to standard output; devices and named pipes are written directly."""
+    """Write to a file or to standard output. Devices and named pipes are written directly."""
     with _output_stream(path) as stream:
         stream.write(data)
 
@@ -295,7 +295,7 @@ def _output_stream(path: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def whole_output(path: str) -> Iterator[BinaryIO]:
-    """Yield a stream like `_output_stream`; data reaches standard output only when it is complete."""
+    """Yield a stream like `_output_stream`. Data reaches standard output only when it is complete."""
     if path != STANDARD_STREAM:
         with open_output(path) as stream:
             yield stream
@@ -326,7 +326,7 @@ def open_output(path: str) -> Iterator[BinaryIO]:
 
 
 def write_json(path: str, value: Any) -> None:
-    """Write a value as JSON; NaN and infinities are refused, since JSON has none."""
+    """Write a value as JSON. NaN and infinities are refused, since JSON has none."""
     write_bytes(path, (json.dumps(value, indent=2, allow_nan=False) + "\n").encode())
 
 

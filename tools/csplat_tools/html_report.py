@@ -113,7 +113,7 @@ def document(title: str, parts: Sequence[str], summary: str = "") -> str:
 
 
 def section(title: str, *parts: str) -> str:
-    """Return a heading and the parts below it; an empty string if all parts are empty."""
+    """Return a heading and the parts below it, or an empty string if all parts are empty."""
     body = "\n".join(part for part in parts if part)
     return f"<h2>{escape(title)}</h2>\n{body}" if body else ""
 
@@ -239,7 +239,7 @@ _GAP = 10  # pixels between text and bar
 
 
 def attribute_figure(sizes: Mapping[str, int]) -> str:
-    """Return a figure with the bytes of each attribute as bars to one scale; their sum is the size of the file."""
+    """Return a figure with the bytes of each attribute as bars to one scale. Their sum is the size of the file."""
     whole = sum(sizes.values())
     texts = {name: f"{format_bytes(size)}, {100.0 * size / whole:.1f} %" for name, size in sizes.items()}
     left = _GAP + _LETTER * max(map(len, sizes))
@@ -393,7 +393,7 @@ class HardestPlaceSearch:
         self._place: tuple[int, slice, slice, F32, F32] | None = None
 
     def examine(self, number: int, source: F32, decoded: F32) -> None:
-        """Examine the view of this number; both renders are [H, W, 3] in 0..1."""
+        """Examine the view of this number. Both renders are [H, W, 3] in 0..1."""
         errors: F64 = np.asarray(squared_error(source, decoded).sum(axis=2), np.float64)
         height, width = (max(1, side // _SHARE) for side in errors.shape)
         sums = _window_sums(errors, height, width) / (height * width)
@@ -404,7 +404,7 @@ class HardestPlaceSearch:
             self._place = (number, rows, columns, source, decoded)
 
     def found(self) -> ImagePiece | None:
-        """Return the piece, with images reduced to a size for a page; `None` if no view was examined."""
+        """Return the piece, with images reduced to a size for a page, or `None` if no view was examined."""
         if self._place is None:
             return None
         number, rows, columns, source, decoded = self._place

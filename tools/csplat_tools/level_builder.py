@@ -43,7 +43,7 @@ _CHILDREN = 4  # maximum number of children of a node, so that nodes of all leve
 # Seconds per splat to build levels and measure their errors: scenes in one piece, and buckets.
 _SECONDS_WHOLE, _SECONDS_FITTED, _SECONDS_MERGED = 3.2e-4, 8e-5, 4e-5
 
-#: Makes the splats of a level, and the node of each; arguments as for `LevelFitter.fit`.
+#: A function that makes the splats of a level, and the node of each. Its arguments are as for `LevelFitter.fit`.
 _Fit = Callable[[SplatModel, I64, int, int], tuple[I64, SplatModel]]
 
 
@@ -96,7 +96,7 @@ class FittedLevelBuilder:
     def encode_plan(
         self, plan: EncodePlan, codebooks: FileCodebooks | None = None, progress: Progress = null_progress
     ) -> EncodedTiles:
-        """Encode a planned scene with its levels, in memory; arguments as for `csplat.encoder.encode_levels`."""
+        """Encode a planned scene with its levels, in memory. Arguments are as for `csplat.encoder.encode_levels`."""
         threads = plan.options.threads
         nodes = self.build(plan.model, threads, progress) if self.nodes is None else self.nodes
         return self.measure(encode_levels(plan, nodes, codebooks, progress), threads, progress)
@@ -104,7 +104,7 @@ class FittedLevelBuilder:
     def build(
         self, model: SplatModel, threads: int | None = None, progress: Progress = null_progress
     ) -> list[LevelNode]:
-        """Build the nodes of a scene; errors are 0.
+        """Build the nodes of a scene. Their errors are 0 until `measure` is called.
 
         Args:
             model: the scene.
@@ -225,7 +225,7 @@ class FittedLevelBuilder:
 
 
 def choose_levels(count: int, options: EncodeOptions, levels: LevelCount) -> FittedLevelBuilder | None:
-    """Return the builder of the levels of detail of a scene of `count` splats; `None`: the file has none.
+    """Return the builder of levels of detail for a scene of `count` splats, or `None` if the file gets none.
 
     Raises:
         InputError: the number of levels is out of range, or the extra `render` is not installed.

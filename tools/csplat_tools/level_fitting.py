@@ -1,4 +1,4 @@
-"""Fit the splats of a level of detail: keep those that matter in renders, and adjust them to renders of the scene.
+"""Fit the splats of a level of detail: keep splats that matter in renders, and refit them to renders of the scene.
 
 Views around the scene become smaller from level to level, so that a level is as good as it can be at the pixel size at
 which it is shown. Parts of a larger scene are seen from outside, as their coarse versions will be, and their splats are
@@ -51,7 +51,7 @@ class Work:
 #: most cost level 1 of fox120k 1.1 dB, and level 2 of lego60k 0.5.
 SCENE_WORK = Work(6e7, (40, 120), 7.5e7, (100, 1600))
 #: A million splats of a bucket take 70 CPU s. In four buckets of an aerial scene, the fit gains 2.5, 3.5 and 3.7 dB at
-#: levels 1 to 3. Twice as many views gain 0.1 dB; steps as few as at level 1 cost levels 2 and 3 half a dB.
+#: levels 1 to 3. Twice as many views gain 0.1 dB. As few steps as at level 1 cost levels 2 and 3 half a dB.
 PART_WORK = Work(0.0, (16, 16), 6e6, (60, 240))
 
 
@@ -78,7 +78,7 @@ class LevelFitter:
     progress: Progress = null_progress
 
     def fit(self, finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
-        """Choose or merge splats, and adjust them; merge them alone if there are too many in a view to be rendered.
+        """Choose or merge splats, and refit them. Only merge them if a view has too many to be rendered.
 
         Args:
             finer: the next finer level.

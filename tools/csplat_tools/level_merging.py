@@ -97,7 +97,7 @@ def _neighbours(means: F32, nodes: I64) -> I64:
     edge_keys = [np.zeros(0, np.int64)]
     for rows in np.split(by_node, np.flatnonzero(np.diff(nodes[by_node])) + 1):
         count = min(len(rows), _NEIGHBOURS + 1)
-        # The last coordinate tells splats at one place apart; with thousands of them, the search would take minutes.
+        # The last coordinate tells splats at the same place apart. Otherwise, thousands of them would take minutes.
         places = means[rows].astype(np.float64)
         apart = _TIE * (float(np.ptp(places, axis=0).max()) or 1.0) * np.linspace(0.0, 1.0, len(rows))
         places = np.column_stack([places, apart])

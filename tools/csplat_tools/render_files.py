@@ -65,7 +65,7 @@ def make_output_folder(folder: str, names: Sequence[str], *, force: bool) -> Pat
 
 
 def to_uint8(values: F32) -> U8:
-    """Round 0..1 to 0..255; values outside are clipped, NaN becomes 0."""
+    """Round 0..1 to 0..255. Values outside are clipped, and NaN becomes 0."""
     clipped = np.clip(np.nan_to_num(values, nan=0.0), 0.0, 1.0)
     result: U8 = np.rint(clipped * 255.0).astype(np.uint8)
     return result
@@ -88,7 +88,7 @@ def side_by_side(a: F32, b: F32, amplification: float, image: F32 | None = None)
 
 
 def write_png(path: Path, pixels: NDArray[Any]) -> None:
-    """Write [H, W] or [H, W, 3] uint8 as a PNG; the file appears when it is complete.
+    """Write [H, W] or [H, W, 3] uint8 as a PNG. The file appears when it is complete.
 
     Raises:
         InputError: pillow is not installed.
@@ -113,7 +113,7 @@ def _stem(image: str | None) -> str:
 
 _MP4 = "MP4"
 
-#: File name endings of videos, with pillow's names of the formats; pillow does not write MP4.
+#: File name endings of videos, with pillow's names of the formats. Pillow does not write MP4.
 FILM_ENDINGS = {".webp": "WEBP", ".gif": "GIF", ".png": "PNG", ".apng": "PNG", ".mp4": _MP4}
 
 #: Frames per second.
@@ -172,7 +172,7 @@ def check_film(path: str, sizes: Sequence[tuple[int, int]], fps: float) -> None:
 
 
 def write_film(path: str, frames: Sequence[U8], fps: float) -> None:
-    """Write a video; the file appears when it is complete. An animation repeats for ever.
+    """Write a video. The file appears when it is complete. An animation repeats for ever.
 
     Args:
         path: its ending determines the format. WebP loses a little, GIF has 256 colours a frame, PNG loses nothing.

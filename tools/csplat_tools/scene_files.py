@@ -32,7 +32,7 @@ _SMALL = 1 << 20  # bytes; smaller files of any format always fit in memory
 _BASE_BYTES, _SPLAT_BYTES = 200_000_000, 320
 #: Largest number of splats, about, by which cameras are placed in a .csplat file with levels.
 FRAMED_SPLATS = 2_000_000
-SAMPLE_SPLATS = 1 << 19  # splats of a scene that stand for those that do not fit in memory
+SAMPLE_SPLATS = 1 << 19  # splats of a sample of a scene that does not fit in memory
 
 
 #: A scene as an argument: a model, an open scene, or a file in any format.
@@ -148,7 +148,7 @@ def open_scenes(given: Sequence[SceneLike], memory_bytes: int | None = None) -> 
         memory_bytes: approximate limit of the memory; `None`: half of the free memory.
 
     Yields:
-        The scenes, which can be read within the context; those in memory as of `load_scene`.
+        The scenes, which can be read within the context. Scenes in memory are as from `load_scene`.
 
     Raises:
         CsplatError: as for `load_scene`.
@@ -203,7 +203,7 @@ def _together_bytes(scenes: Sequence[Scene]) -> float:
 def sample_scene(
     scene: Scene, *, splats_max: int = SAMPLE_SPLATS, progress: Progress | None = None
 ) -> tuple[SplatModel, int]:
-    """Return every Nth splat, without SH bands, and N; all of a scene in memory, and 1.
+    """Return every Nth splat without SH bands, and N; for a scene in memory, all splats and 1.
 
     Args:
         scene: the scene; its blocks are read once.

@@ -72,7 +72,7 @@ def parse_grid(text: str = ",".join(GROUPS), preset: PresetName = "balanced") ->
     """Parse a grid: groups separated by commas, their values after `=`, separated by colons.
 
     Args:
-        text: the grid. A group without values has those of `GROUPS`.
+        text: the grid. A group without values has the values of `GROUPS`.
         preset: preset of all settings outside the group `presets`.
 
     Examples:
@@ -259,7 +259,7 @@ def measure_grid(
     say: Callable[[str], None] | None = None,
     progress: Progress | None = None,
 ) -> tuple[list[TradeoffRow], dict[str, str]]:
-    """Measure each setting; a setting that fails does not stop the others.
+    """Measure each setting. A setting that fails does not stop the others.
 
     Returns:
         The rows, the smallest file first, and errors by the name of the setting.

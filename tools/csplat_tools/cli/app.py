@@ -59,7 +59,7 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
 
     def main(self, *args: Any, **how: Any) -> Any:
-        """Run a command line, and exit; typer would draw a box around its error message."""
+        """Run a command line, and exit. Typer alone would draw a box around an error message."""
         if not how.get("standalone_mode", True):
             return super().main(*args, **how)
         try:

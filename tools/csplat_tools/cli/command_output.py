@@ -16,7 +16,7 @@ from csplat.types import Progress
 from csplat_tools.console import LONG_WORK_SECONDS, format_estimate, note, print_data, print_json, progress_bar
 from csplat_tools.file_streams import STANDARD_STREAM, check_name, check_outputs, write_json
 
-#: True if data sets may read files outside of their folders; set by the program for each command line.
+#: True if data sets may read files outside of their folders. The program sets it for each command line.
 TRUSTS_PATHS = ContextVar("TRUSTS_PATHS", default=False)
 
 #: File name endings of the outputs of options.
@@ -26,7 +26,7 @@ _ENDINGS = {
 
 
 def default_output(output: str | None, source: str, ending: str) -> str:
-    """Return the output; if none is given, the source's name with another ending.
+    """Return the output, or the source's name with another ending if no output is given.
 
     Raises:
         typer.BadParameter: no output is given, and the source is standard input.
@@ -114,7 +114,7 @@ class Output:
             note(f"this takes about {format_estimate(seconds)} here; {faster}")
 
     def print_findings(self, findings: Sequence[Finding], name: str = "") -> None:
-        """Print unusual findings in a file, unless `--quiet` is given; repairs and losses are printed in any case.
+        """Print unusual findings in a file, unless `--quiet` is given. Repairs and losses are printed in any case.
 
         Args:
             findings: findings in the file.

@@ -123,7 +123,7 @@ def decoder(
 
 
 def _commands(programs: Sequence[str]) -> tuple[str | None, str | None, str | None]:
-    """Return the commands of a decoder, a renderer and cuts by their names in braces; `None` if there is none."""
+    """Return the commands of a decoder, a renderer and cuts by their names in braces, each `None` if not given."""
     by_kind: dict[str, str] = {}
     for program in programs:
         kind = next((kind for kind in ("cuts", "camera") if f"{{{kind}}}" in program), "decoder")
@@ -203,7 +203,7 @@ def encoder(
 
 
 def _check_reports(out: Output, junit: str | None) -> None:
-    """Refuse unusable paths of reports before anything is run; XML may go to a terminal."""
+    """Refuse unusable paths of reports before anything is run. XML may go to a terminal."""
     to_stdout = junit == STANDARD_STREAM
     if to_stdout and out.as_json:
         raise typer.BadParameter("--json and --junit - both use standard output")

@@ -22,7 +22,7 @@ EXIT_FAILED = 1
 EXIT_USAGE = 2
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as in shells
 
-#: Base class of the errors that typer raises for a command line; typer exports only one of its subclasses.
+#: Base class of the errors that typer raises for a command line. Typer exports only one of its subclasses.
 UsageError: type[Exception] = typer.BadParameter.__bases__[0]
 
 _AGAIN = "copy or download it again"

@@ -153,7 +153,7 @@ def parse_level(text: str | None) -> tuple[int, int | None]:
 
 
 def parse_backend(name: RendererName, out: Output) -> tuple[Mode, Backend]:
-    """Return the mode and the backend of a renderer; for `auto`, remark if there is no GPU.
+    """Return the mode and the backend of a renderer. For `auto`, remark if there is no GPU.
 
     Args:
         name: `cpu`; its slow and fast modes, `exact` and `fast`; `gpu`; `auto`, a GPU if there is one; or
@@ -242,7 +242,7 @@ def open_data(path: str, **options: Any) -> DataOptions:
 
 @dataclass(frozen=True)
 class ViewOptions:
-    """Views of a camera file or a data set; virtual views without either.
+    """Views of a camera file or a data set, or virtual views without either.
 
     Attributes:
         cameras: a camera file.

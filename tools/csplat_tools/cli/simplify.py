@@ -14,7 +14,7 @@ from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import load_scene
 
 #: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
-#: for the fraction to keep (20 and 45); half of the cost is fitting.
+#: for the fraction to keep (20 and 45). Half of the cost is fitting.
 _PASSES = (20.0, 45.0)
 
 
