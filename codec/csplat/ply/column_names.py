@@ -1,4 +1,4 @@
-"""Find the columns of a splat PLY by their usual names or those of other programs."""
+"""Find the columns of a splat PLY by their usual names or by the names that other programs give them."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _OPACITY = "opacity"
 _FILTER = "filter_3D"
 _REST = re.compile(r"f_rest_(0|[1-9][0-9]*)")
-_REST_DIGITS = 9  # digits of its number that are compared; a longer one is in no valid file
+_REST_DIGITS = 9  # digits of its number that are compared; no valid file has a longer number
 _ZEROS = re.compile(r"\Af_rest_0+(?=[0-9])")
 
-#: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the additional one of 3dgsconverter, which prepares files
-#: for CloudCompare.
+#: Prefix of CloudCompare's scalar fields (PlyFilter.cpp), and the second prefix that 3dgsconverter adds to files for
+#: CloudCompare.
 _PREFIXES = re.compile(r"(?:scal(?:ar)?_)+")
-#: Colours in place of f_dc: the names of nerfstudio's ns-export, and those that three.js' PLYLoader and Brush accept.
+#: Colours in place of f_dc, under the names that nerfstudio's ns-export writes, and three.js' PLYLoader and Brush read.
 _COLOURS = (("red", "green", "blue"), ("diffuse_red", "diffuse_green", "diffuse_blue"), ("r", "g", "b"))
 #: The value of white, by type of the column.
 _COLOUR_RANGES = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
@@ -50,8 +50,8 @@ class ColumnMap:
     """The columns of a PLY by meaning, in the order of the model's last axis.
 
     Attributes:
-        means, scales, quats, sh0: names of the columns; `scales` has two names for discs, one for spheres, of which
-            `quats` may have none.
+        means, scales, quats, sh0: names of the columns; `scales` has two names for discs and a single name for spheres,
+            whose `quats` may be empty.
         rest: 3 K names, channel by channel: red, green, blue.
         opacity: name of the column of logits.
         normals: three names, or none.
@@ -77,7 +77,7 @@ class ColumnMap:
 def find_columns(
     dtype: np.dtype[Any], *, keep_extra: bool = False, sh_degree: int | None = None, elements: Sequence[str] = ()
 ) -> tuple[ColumnMap | None, list[Finding]]:
-    """Find the columns of a PLY, in any order, by their usual names or those of other programs.
+    """Find the columns of a PLY, in any order, by their usual names or by the names that other programs give them.
 
     Args:
         dtype: structured, one field per scalar property, in the order of the file.
@@ -92,7 +92,7 @@ def find_columns(
     findings: list[Finding] = []
     means, quats = names.find(_MEANS), names.find(_QUATS)
     scales, sh0, opacity = names.find(_SCALES), names.find(_SH0), names.find((_OPACITY,))
-    flat = [name for name, found in zip(_SCALES, scales, strict=True) if not found] == [_SCALES[2]]
+    flat = [name for name, column in zip(_SCALES, scales, strict=True) if not column] == [_SCALES[2]]
     if flat:
         scales = scales[:2]
         findings.append(Finding("flat-scales", 1, "scale_2 is absent: the splats are discs (2DGS)", "note"))
@@ -105,7 +105,7 @@ def find_columns(
         findings.append(Finding("one-scale", 1, text, "note"))
     colour_range, coefficients = 0.0, sh0
     if not any(sh0):
-        colours = next((one for one in _COLOURS if names.has(one)), None)
+        colours = next((channels for channels in _COLOURS if names.has(channels)), None)
         if colours is not None:
             sh0 = names.find(colours)
             colour_range, finding = _colour_range(dtype, sh0)
@@ -113,7 +113,7 @@ def find_columns(
             coefficients = ()
     required = (*_MEANS, *_SH0, _OPACITY, *_SCALES[: len(scales)], *_QUATS[: len(quats)])
     missing = [
-        name for name, found in zip(required, (*means, *sh0, *opacity, *scales, *quats), strict=True) if not found
+        name for name, column in zip(required, (*means, *sh0, *opacity, *scales, *quats), strict=True) if not column
     ]
     if missing:
         findings.append(Finding("missing-columns", len(missing), _describe_absence(names, missing, elements), "error"))
@@ -150,7 +150,7 @@ def find_columns(
 
 
 def _sphere_column(names: _NameIndex, scales: Sequence[str]) -> str:
-    """Return the only column of scales: `scale_0`, or `scale`; "" if there are more or none."""
+    """Return the only column of scales, `scale_0` or `scale`; "" if there are several or none."""
     if not any(scales):
         return names.find((_SCALE,))[0]
     return scales[0] if not any(scales[1:]) else ""
@@ -199,34 +199,34 @@ class _NameIndex:
         return all(name in self.plain for name in wanted)
 
     def find(self, wanted: Sequence[str]) -> tuple[str, ...]:
-        """Return the column for each usual name; "" if there is none, or several under other names."""
+        """Return the column for each usual name; "" if it is absent or several columns have aliases of the name."""
         return tuple(self._find(name) for name in wanted)
 
     def _find(self, name: str) -> str:
-        found = self.plain.get(name.lower(), [])
-        if name in found:
-            self._second += [other for other in found if other != name]
+        columns = self.plain.get(name.lower(), [])
+        if name in columns:
+            self._second += [column for column in columns if column != name]
             return name
-        if len(found) > 1:
-            self._ambiguous.append(f"{' and '.join(found)} would both be {name}")
-        elif found:
-            self._renamed[found[0]] = name
-        return found[0] if found else ""
+        if len(columns) > 1:
+            self._ambiguous.append(f"{' and '.join(columns)} would both be {name}")
+        elif columns:
+            self._renamed[columns[0]] = name
+        return columns[0] if columns else ""
 
     def findings(self) -> list[Finding]:
         """Report columns under other names."""
-        found = []
+        findings = []
         if self._ambiguous:
             text = f"{'; '.join(self._ambiguous[:_NAMED])}: rename one of them"
-            found.append(Finding("ambiguous-columns", len(self._ambiguous), text, "error"))
+            findings.append(Finding("ambiguous-columns", len(self._ambiguous), text, "error"))
         if self._renamed:
             pairs = _list_some([f"{name} as {self._renamed[name]}" for name in self.all if name in self._renamed])
             text = f"{counted(len(self._renamed), 'column')} named by another program: {pairs}"
-            found.append(Finding("alias-columns", len(self._renamed), text, "note"))
+            findings.append(Finding("alias-columns", len(self._renamed), text, "note"))
         if self._second:
             text = f"{_list_some(self._second)}: duplicated under the usual name, which is read"
-            found.append(Finding("second-columns", len(self._second), text, "note"))
-        return found
+            findings.append(Finding("second-columns", len(self._second), text, "note"))
+        return findings
 
 
 def _list_some(words: Sequence[str]) -> str:
@@ -253,14 +253,14 @@ def _list_colours(colours: Sequence[str]) -> str:
 
 def _integers(dtype: np.dtype[Any], groups: Sequence[Sequence[str]]) -> Finding | None:
     """Report columns of integers, whose scale is unknown."""
-    found = [name for group in groups for name in group if name and dtype[name].kind != "f"]
-    if not found:
+    integers = [name for group in groups for name in group if name and dtype[name].kind != "f"]
+    if not integers:
         return None
-    types = " and ".join(sorted({dtype[name].name for name in found}))
-    colours = groups[0] and set(groups[0]) == set(found)
+    types = " and ".join(sorted({dtype[name].name for name in integers}))
+    colours = groups[0] and set(groups[0]) == set(integers)
     remedy = "rename colours of 0 to 255 to red, green and blue" if colours else "export the values before quantisation"
-    text = f"{_list_some(found)} {'is' if len(found) == 1 else 'are'} of type {types}, expected float: {remedy}"
-    return Finding("integer-columns", len(found), text, "error")
+    text = f"{_list_some(integers)} {'is' if len(integers) == 1 else 'are'} of type {types}, expected float: {remedy}"
+    return Finding("integer-columns", len(integers), text, "error")
 
 
 def _describe_absence(names: _NameIndex, missing: Sequence[str], elements: Sequence[str]) -> str:
@@ -278,8 +278,7 @@ def _describe_absence(names: _NameIndex, missing: Sequence[str], elements: Seque
 
 def _meaning(names: Sequence[str]) -> str | None:
     plain = [plain_name(name) for name in names]
-    found = (meaning for known, meaning in _MEANINGS.items() if any(map(known.fullmatch, plain)))
-    return next(found, None)
+    return next((meaning for known, meaning in _MEANINGS.items() if any(map(known.fullmatch, plain))), None)
 
 
 def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...], tuple[str, ...], Finding | None]:
@@ -292,17 +291,17 @@ def _find_rest(names: _NameIndex, sh_degree: int | None) -> tuple[tuple[str, ...
     bands = count // 3
     degree = math.isqrt(bands + 1) - 1
     if count % 3 or (degree + 1) ** 2 - 1 != bands:
-        *others, last = (3 * (one * one - 1) for one in range(1, MAX_SH_DEGREE + 2))
+        *others, last = (3 * (n * n - 1) for n in range(1, MAX_SH_DEGREE + 2))
         text = f"{count} f_rest columns match no SH degree, expected {', '.join(map(str, others))} or {last}"
         return (), (), Finding("sh-columns", count, text, "error")
-    found = names.find([f"f_rest_{number}" for number in numbers])
+    every = names.find([f"f_rest_{number}" for number in numbers])
     kept = degree if sh_degree is None else min(degree, sh_degree)
     if kept > MAX_SH_DEGREE:
-        return found, (), Finding("sh-columns", count, f"{count} f_rest columns are {too_many_bands(degree)}", "error")
+        return every, (), Finding("sh-columns", count, f"{count} f_rest columns are {too_many_bands(degree)}", "error")
     if kept == degree:
-        return found, found, None
-    rest = tuple(found[channel * bands + band] for channel in range(3) for band in range((kept + 1) ** 2 - 1))
+        return every, every, None
+    rest = tuple(every[channel * bands + band] for channel in range(3) for band in range((kept + 1) ** 2 - 1))
     if degree <= MAX_SH_DEGREE:
-        return found, rest, None
+        return every, rest, None
     text = f"SH degree {degree}: {'all bands' if kept == 0 else f'bands above {kept}'} are dropped, as requested"
-    return found, rest, Finding("sh-bands", count - len(rest), text, "note")
+    return every, rest, Finding("sh-bands", count - len(rest), text, "note")

@@ -22,19 +22,19 @@ from csplat.portable_math import exp, log
 from csplat.spherical_harmonics import SH_C0
 from csplat.types import F32, F64
 
-Rows = NDArray[Any]  # one block of the file: 1-D, structured, contiguous
+Rows = NDArray[Any]  # a block of the file: 1-D, structured, contiguous
 
 #: Logits whose float32 sigmoids are exactly 0 and 1, also after a round trip through decimal text.
 LOGIT_OF_0 = -110.0
 LOGIT_OF_1 = 20.0
 
-#: Natural logarithm that replaces that of a standard deviation of 0; errors count smaller ones as this one (SER-5).
+#: Replaces the natural logarithm of a standard deviation of 0. Errors count smaller logarithms as this value (SER-5).
 LOG_OF_0 = -88.0
 
 #: Natural logarithm of the largest float32, scene units.
 LOG_OF_LARGEST = math.log(np.finfo(np.float32).max)
 
-#: Log scale beyond which the exponential or its inverse leaves float32; decoders treat larger ones alike (CNF-6).
+#: Log scale beyond which the exponential or its inverse leaves float32; decoders treat larger values alike (CNF-6).
 HUGE_LOG = 88.0
 
 #: Natural logarithm of 100: the third scale of a disc is a hundredth of the smallest scale in the file.
@@ -49,7 +49,7 @@ _POSITIONS = ("x", "y", "z")
 _BAD_SHARE = 0.01  # maximum fraction of NaN and infinity among half floats
 _SANE_LENGTHS = (0.01, 100.0)  # lengths of quaternions in half floats; integers read as half floats are outside
 _MAX_SPREAD = 256.0  # maximum ratio of the 90th to the 50th percentile of positions in half floats
-_FEW = 16  # splats; what fewer have in common may be coincidence
+_FEW = 16  # splats; a property that fewer have in common may be coincidence
 _TINY = 1e-30  # smallest divisor
 _ROUNDING = 1e-3  # tolerance by which alphas may exceed 0 and 1
 _SAMPLE_OF_BLOCK = 256  # splats per block whose scales are compared with the scene's extent
@@ -90,7 +90,7 @@ class RowStatistics:
     scales: tuple[float, float] = _NO_RANGE
     colours: tuple[float, float] = _NO_RANGE
     colour_range: float = 0.0  # as in `ColumnMap`
-    has_columns: bool = True  # the rows are those of a PLY, whose columns can be renamed
+    has_columns: bool = True  # the rows come from a PLY, whose columns can be renamed
     sample: list[tuple[NDArray[Any], F32]] = field(default_factory=list)  # means and scales of some splats
 
 
@@ -200,8 +200,8 @@ def _are_sane(rows: Rows, halves: set[str], *, alone: bool) -> bool:
         alone: only positions are half floats, so other columns give no evidence.
     """
     columns = {name: rows[name].astype(np.float32) for name in halves}
-    bad = sum(int((np.isnan(one) if plain_name(name) == "opacity" else ~np.isfinite(one)).sum())
-              for name, one in columns.items())  # fmt: skip
+    bad = sum(int((np.isnan(values) if plain_name(name) == "opacity" else ~np.isfinite(values)).sum())
+              for name, values in columns.items())  # fmt: skip
     if bad > _BAD_SHARE * len(rows) * len(columns):
         return False
     named = {plain_name(name): rows[name].astype(np.float64) for name in rows.dtype.names or ()}
@@ -237,7 +237,7 @@ def with_colour_range(blocks: Iterable[Rows], columns: ColumnMap, findings: list
     largest = max((int(rows[name].max(initial=0)) for rows in blocks for name in columns.sh0), default=0)
     if not 0 < largest <= _BYTE:
         return columns
-    at = next(index for index, one in enumerate(findings) if one.id == "rgb-colours")
+    at = next(index for index, finding in enumerate(findings) if finding.id == "rgb-colours")
     findings[at] = colour_finding(columns.sh0, _BYTE, f": they have 16 bits, but are at most {largest}")
     return replace(columns, colour_range=_BYTE)
 
@@ -346,7 +346,7 @@ def _count_nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
 
 
 def _repair(part: AttributeArrays, columns: ColumnMap, statistics: RowStatistics, widths: F64 | None) -> int:
-    """Repair a block in place, moving the remaining rows to the front; return their number.
+    """Repair a block in place, moving the remaining rows to the front, and return their number.
 
     Args:
         part: the block with the values of the file.
@@ -405,7 +405,8 @@ def flatten_scales(scales: F32) -> NDArray[np.bool_]:
 def _extend_range(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
     """Extend a range by some values.
 
-    Once a value is negative beyond rounding, the values are not activated; the range is irrelevant and stays unchanged.
+    A value that is negative beyond rounding shows that the values are not activated. The range is then irrelevant and
+    stays unchanged.
     """
     if bounds[0] < -_ROUNDING:
         return bounds
@@ -441,21 +442,22 @@ def count_huge_rows(scales: NDArray[Any], *colours: NDArray[Any]) -> int:
         colours: [n, ...], coefficients.
     """
     huge = None
-    for array, limit in ((scales, HUGE_LOG), *((one, _HUGE_COLOUR) for one in colours)):
+    for array, limit in ((scales, HUGE_LOG), *((array, _HUGE_COLOUR) for array in colours)):
         if max(float(array.max(initial=0.0)), -float(array.min(initial=0.0))) > limit:
-            found = np.abs(array).reshape(len(array), -1).max(axis=1) > limit
-            huge = found if huge is None else huge | found
+            beyond = np.abs(array).reshape(len(array), -1).max(axis=1) > limit
+            huge = beyond if huge is None else huge | beyond
     return 0 if huge is None else int(np.count_nonzero(huge))
 
 
 def _repair_quats(quats: F32, statistics: RowStatistics) -> None:
+    """Normalise quaternions [n, 4] in place, and count the rows that had another length."""
     wide = quats.astype(np.float64)
     squared = squared_lengths(wide)
     zero = int(np.count_nonzero(squared == 0.0))
-    other = int(np.count_nonzero(np.abs(squared - 1.0) > 2.0 * QUAT_LENGTH_TOLERANCE))
+    not_unit = int(np.count_nonzero(np.abs(squared - 1.0) > 2.0 * QUAT_LENGTH_TOLERANCE))
     statistics.zero_quats += zero
-    statistics.unnormalised += other - zero
-    if other > zero:
+    statistics.unnormalised += not_unit - zero
+    if not_unit > zero:
         low, high = statistics.quat_lengths
         least = float(squared.min(where=squared > 0.0, initial=math.inf))
         statistics.quat_lengths = (min(low, math.sqrt(least)), max(high, math.sqrt(float(squared.max()))))
@@ -491,29 +493,29 @@ def list_findings(statistics: RowStatistics, count: int) -> list[Finding]:
 
 def _suspicions(statistics: RowStatistics, kept: int) -> list[Finding]:
     """Report ranges that indicate values after their activation, which trained scenes do not have."""
-    found = []
+    findings = []
     colours = statistics.colours
     if statistics.colour_range == 1.0 and kept and colours[1] > _LARGEST_COLOUR:
         text = f"red, green and blue are floats up to {colours[1]:g}, expected 0 to 1: store them as uchar"
-        found.append(Finding("colour-columns", kept, text, "error"))
+        findings.append(Finding("colour-columns", kept, text, "error"))
     if kept < _FEW:
-        return found
+        return findings
     alphas = _lie_in(statistics.opacities, -_ROUNDING, 1.0 + _ROUNDING)
     if alphas or (_lie_in(statistics.opacities, 0.0, _BYTE) and statistics.opacities[1] > HUGE_LOG):
         top = 1 if alphas else 255
         text = f"all {kept} opacities are in 0..{top}, like alphas: read as logits; export them before the sigmoid"
-        found.append(Finding("opacities-are-alphas", kept, text, "note"))
+        findings.append(Finding("opacities-are-alphas", kept, text, "note"))
     if _lie_in(statistics.scales, 0.0, HUGE_LOG) and _are_lengths(statistics):
         text = f"no scale of {kept} splats is negative, like lengths: read as logarithms; export them before exp"
-        found.append(Finding("scales-are-linear", kept, text, "note"))
+        findings.append(Finding("scales-are-linear", kept, text, "note"))
     if not statistics.colour_range and (
         _lie_in(colours, 0.0, 1.0) or (_lie_in(colours, 0.0, 255.0) and colours[1] > _BYTE_COLOUR)
     ):
         top = 1 if colours[1] <= 1.0 else 255
         text = f"all f_dc of {kept} splats are in 0..{top}, like colours: read as SH coefficients"
         text += "; name the columns red, green and blue if they are colours" if statistics.has_columns else ""
-        found.append(Finding("colours-are-rgb", kept, text, "note"))
-    return found
+        findings.append(Finding("colours-are-rgb", kept, text, "note"))
+    return findings
 
 
 def _are_lengths(statistics: RowStatistics) -> bool:
@@ -521,7 +523,7 @@ def _are_lengths(statistics: RowStatistics) -> bool:
     means, scales = (np.concatenate(arrays) for arrays in zip(*statistics.sample, strict=True))
     extent = float(np.subtract(*np.quantile(means, (0.95, 0.05), axis=0)).max())
     low, middle, high = np.quantile(scales, (0.05, 0.5, 0.95)).tolist()
-    # Lengths vary by factors; read as logarithms they would give all splats a size of about one unit.
+    # Lengths vary by factors. Read as logarithms, they would give all splats a size of about one unit.
     alike = middle < 1.0 and high > _LENGTHS_RATIO * low
     return middle <= extent / 2.0 and (alike or math.exp(middle) > extent / 2.0)
 

@@ -105,7 +105,7 @@ def format_comments(metadata: SceneMetadata, origin: Sequence[float], *, absolut
         absolute: positions are written with the origin added.
 
     Returns:
-        ASCII lines, without lines for defaults; other characters become question marks.
+        ASCII lines, in which other characters become question marks. Defaults get no line.
     """
     lines = [line for comment in metadata.comments for line in comment.splitlines()]
     if absolute or any(origin):

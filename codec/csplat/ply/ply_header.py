@@ -1,7 +1,7 @@
 """Rewrite headers and text rows that plyfile does not accept although their meaning is clear.
 
 Headers may have byte order marks, blank lines, keywords in capitals and spaces after `end_header`. Text rows may share
-a line or span several lines, and may have decimal commas and NaN or infinity as other languages write them. Ambiguous
+a line or span several lines. They may have decimal commas, and NaN or infinity as other languages write them. Ambiguous
 text is an error that names the number or row.
 """
 
@@ -25,7 +25,7 @@ SPLAT_ELEMENT = "vertex"
 _END_OF_HEADER = re.compile(rb"[\r\n]end_header[ \t]*(\r\n|\n|\r)", re.IGNORECASE)
 _MAX_SIZE = 1 << 20  # bytes of a header; programs write up to a few kilobytes
 _MAX_DECLARED = 4096  # elements and properties; SH of degree 4 takes 87, and each takes memory in every block of rows
-_MAX_DIGITS = 18  # digits of a count; longer ones exceed every file, and Python converts no more than 4300
+_MAX_DIGITS = 18  # digits of a count; longer counts exceed every file, and Python converts no more than 4300
 _SHOWN = 80  # maximum number of characters of a word in a message
 _MARK = b"\xef\xbb\xbf"  # byte order mark of UTF-8
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")  # byte order marks of UTF-16
@@ -73,7 +73,7 @@ class PlyHeader:
         return self.start + len(self.text)
 
     def without_rows(self) -> bytes:
-        """Return the header with counts of 0, for a parser that shall read no rows."""
+        """Return the header with counts of 0, for a parser that must not read rows."""
         lines = (b"element %s 0" % line.split()[1] if _is_element(line.split()) else line for line in _split(self.text))
         return b"\n".join([*lines, b""])
 
@@ -88,7 +88,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
 
     Raises:
         InputError: the file is not a PLY of this kind, or its header has no end, declares too much, or has a count
-            that is no whole number.
+            that is not a whole number.
         OSError: the file cannot be read.
     """
     head = read_head(path)
@@ -130,7 +130,7 @@ def read_ply_header(path: Path, findings: list[Finding], kind: str = "ply") -> P
 
 
 def _split(text: bytes) -> list[bytes]:
-    """Return the lines of a rewritten header, which end as its first one does."""
+    """Return the lines of a rewritten header, which end as its first line does."""
     end = _LINE_END.search(text)
     assert end is not None, "the line end_header has an end"
     return text.split(end[0])[:-1]
@@ -154,7 +154,7 @@ def _rewrite_header(raw: bytes) -> tuple[bytes, list[str]]:
     changed = [old for old, new in zip(lines, normalised, strict=True) if old.split() != new.split()]
     words = dict.fromkeys(word for line in changed for word in line.split() if word != word.lower())
     blank = sum(not line.strip() for line in lines)
-    kinds = {one[0] for one in _LINE_END.finditer(raw)}
+    kinds = {match[0] for match in _LINE_END.finditer(raw)}
     oddities = [f"{blank} blank lines" if blank > 1 else "a blank line"] if blank else []
     oddities += [f"capitals in {' '.join(word.decode('ascii', 'replace') for word in [*words][:3])}"] if words else []
     oddities += ["spaces next to end_header"] if lines[-1].lower() != b"end_header" else []
@@ -188,14 +188,14 @@ def _normalise_line(line: bytes) -> bytes:
 
 
 def _parse_elements(lines: list[list[bytes]]) -> list[PlyElement]:
-    found: list[PlyElement] = []
+    elements: list[PlyElement] = []
     for words in lines:
         if _is_element(words):
-            found.append(PlyElement(words[1].decode(), _parse_count(words[2])))
-        elif words[:1] == [b"property"] and len(words) > 2 and found:
-            found[-1].properties.append(words[-1].decode())
-            found[-1].has_lists |= words[1] == b"list"
-    return found
+            elements.append(PlyElement(words[1].decode(), _parse_count(words[2])))
+        elif words[:1] == [b"property"] and len(words) > 2 and elements:
+            elements[-1].properties.append(words[-1].decode())
+            elements[-1].has_lists |= words[1] == b"list"
+    return elements
 
 
 def _parse_count(word: bytes) -> int:
@@ -251,7 +251,7 @@ def parse_text_rows(
         wanted: names of the elements whose rows are returned.
 
     Returns:
-        The rows of each wanted element, as lines of words; and findings.
+        The rows of each wanted element, as lines of words, and the findings.
 
     Raises:
         RowError: rows are missing, or a row has another number of values than declared.
@@ -293,8 +293,8 @@ def _split_rows(
     """Return the rows of the wanted elements, the oddities of the lines, and the number of bytes after the last row.
 
     Rows may share a line or continue on the next one, provided that every line end is a row end or every row end is a
-    line end. So a missing value never shifts the values after it. No object is made per word, except of a wanted
-    element whose rows are not on lines of their own.
+    line end. So a missing value never shifts the values after it. An object per word is made only for a wanted element
+    whose rows are not on lines of their own.
     """
     counts = np.fromiter((len(line.split()) for line in lines), np.int64, len(lines))
     filled = np.flatnonzero(counts)

@@ -123,7 +123,7 @@ def lint_ply(file: File, *, sh_degree: int | None = None) -> list[Finding]:
         sh_degree: as in `read_ply`.
 
     Returns:
-        Findings in the order of reading; the last one is an error if `read_ply` would refuse the file.
+        Findings in the order of reading; the last finding is an error if `read_ply` would refuse the file.
 
     Raises:
         InputError: the file is not a PLY, or its header cannot be parsed.
@@ -176,8 +176,8 @@ class PlyContent(NamedTuple):
 def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False) -> PlyContent | None:
     """Parse a file with plyfile.
 
-    It is shown the header without counts, and then the elements that are needed one by one, without their lists: it
-    makes an object for each list.
+    plyfile first parses the header without counts, and then the needed elements separately. Lists are left out because
+    plyfile makes an object for each list.
 
     Args:
         path: path of the file.
@@ -192,7 +192,7 @@ def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False)
         OSError: the file cannot be read.
     """
     header = read_ply_header(path, findings)
-    if any(not one.repairable for one in findings):
+    if any(not finding.repairable for finding in findings):
         return None
     try:
         declared = plyfile.PlyData.read(io.BytesIO(header.without_rows()))
@@ -204,10 +204,10 @@ def parse_ply(path: Path, findings: list[Finding], *, only_splats: bool = False)
         raise InputError(f"{path.name} has no element {SPLAT_ELEMENT!r}: not a PLY of splats")
     others = [element.name for element in declared if element.name != SPLAT_ELEMENT]
     properties = declared[SPLAT_ELEMENT].properties
-    list_findings = _list_findings([one.name for one in properties if is_list(one)])
+    list_findings = _list_findings([prop.name for prop in properties if is_list(prop)])
     if only_splats:
         _, more = find_columns(row_type(properties), elements=others)
-        if any(one.id == "missing-columns" for one in more):
+        if any(finding.id == "missing-columns" for finding in more):
             findings += [*_other_findings(others), *list_findings, *more]
             return None
     try:
@@ -236,9 +236,9 @@ def _packed_colours(path: Path, header: PlyHeader, declared: Any, findings: list
     if header.is_text or [element.name for element in declared] != [SPLAT_ELEMENT]:
         return b""
     properties, count = declared[SPLAT_ELEMENT].properties, header.elements[0].count
-    names = {one.name for one in properties}
-    single = [one for one in properties if not is_list(one)]
-    packed = next((one for one in single if one.name in _PACKED_COLOURS and one.val_dtype == "u1"), None)
+    names = {prop.name for prop in properties}
+    single = [prop for prop in properties if not is_list(prop)]
+    packed = next((prop for prop in single if prop.name in _PACKED_COLOURS and prop.val_dtype == "u1"), None)
     surplus = path.stat().st_size - header.end - count * row_type(properties).itemsize
     if packed is None or len(single) < len(properties) or count == 0 or surplus != 2 * count:
         return b""
@@ -273,7 +273,7 @@ def _open(
     if content is None:
         return None
     rows = with_half_floats(content.rows, findings)
-    if any(not one.repairable for one in findings):
+    if any(not finding.repairable for finding in findings):
         return None
     columns, more = find_columns(
         rows.dtype, keep_extra=keep_extra, sh_degree=sh_degree, elements=content.elements
@@ -416,14 +416,14 @@ def _read_rows(path: Path, header: PlyHeader, declared: Any, findings: list[Find
 
 def _is_needed(element: Any) -> bool:
     if element.name == _COLOUR_SPACE:
-        return [one.name for one in element.properties if not is_list(one)][:1] == [_COLOUR_SPACE]
+        return [prop.name for prop in element.properties if not is_list(prop)][:1] == [_COLOUR_SPACE]
     return element.name == SPLAT_ELEMENT and not all(map(is_list, element.properties))
 
 
 def _read_binary(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
     rows: dict[str, Rows] = {}
     at, size, order = header.end, path.stat().st_size, declared.byte_order
-    for element, count in zip(declared, (one.count for one in header.elements), strict=True):
+    for element, count in zip(declared, (header_element.count for header_element in header.elements), strict=True):
         name, properties = element.name, element.properties
         if any(map(is_list, properties)):
             data = memoryview(map_file(path))
@@ -448,19 +448,20 @@ def _read_binary(path: Path, header: PlyHeader, declared: Any, findings: list[Fi
 
 
 def _read_lines(path: Path, header: PlyHeader, declared: Any, findings: list[Finding]) -> dict[str, Rows]:
-    """Read text with a row in each line; raise an error if it has another layout."""
+    """Read text with a row in each line; raise an error for any other layout."""
     rows: dict[str, Rows] = {}
     with open_binary(path) as file:
         left = file.seek(0, io.SEEK_END) - header.end
         file.seek(header.end)
         stream = io.TextIOWrapper(file, encoding="ascii", errors="replace", newline="")
-        for element, one in zip(declared, header.elements, strict=True):
-            absent = RowError(truncated_finding(one.name, one.count, 0))
-            if one.count * 2 * len(one.properties) > left + 1:  # before memory for the rows is allocated
+        for element, header_element in zip(declared, header.elements, strict=True):
+            absent = RowError(truncated_finding(header_element.name, header_element.count, 0))
+            # Refuse before memory for the rows is allocated.
+            if header_element.count * 2 * len(header_element.properties) > left + 1:
                 raise absent
             if _is_needed(element):
-                rows[one.name] = _parse_lines(declared, element, one.count, stream)
-            elif one.count != sum(1 for _ in islice(_scalar_lines(element, stream), one.count)):
+                rows[header_element.name] = _parse_lines(declared, element, header_element.count, stream)
+            elif header_element.count != sum(1 for _ in islice(_scalar_lines(element, stream), header_element.count)):
                 raise absent
         rest = len(stream.read().strip())
     findings += _rest_findings(rest)
@@ -475,11 +476,11 @@ def _read_layout(path: Path, header: PlyHeader, declared: Any, findings: list[Fi
         lines, more = parse_text_rows(stream.read(), header.elements, needed)
     findings += more
     rows: dict[str, Rows] = {}
-    for name, found in lines.items():
+    for name, row_lines in lines.items():
         try:
-            rows[name] = _parse_lines(declared, declared[name], len(found), found)
+            rows[name] = _parse_lines(declared, declared[name], len(row_lines), row_lines)
         except plyfile.PlyElementParseError as error:
-            row = next(islice(_scalar_lines(declared[name], found), error.row or 0, None)).split()
+            row = next(islice(_scalar_lines(declared[name], row_lines), error.row or 0, None)).split()
             raise RowError(_row_finding(error, row)) from None
     return rows
 
@@ -489,7 +490,7 @@ def _scalar_lines(element: Any, lines: Iterable[str]) -> Iterator[str]:
 
 
 def _parse_lines(declared: Any, element: Any, count: int, lines: Iterable[str]) -> Rows:
-    """Parse rows of text, one in each line."""
+    """Parse text with a row in each line."""
     if any(map(is_list, element.properties)):
         lines = _scalar_lines(element, lines)
     header = io.StringIO(_element_header(declared, element, count).decode())
@@ -500,7 +501,7 @@ def _parse_lines(declared: Any, element: Any, count: int, lines: Iterable[str]) 
 
 def _element_header(declared: Any, element: Any, count: int) -> bytes:
     """Return the header of a file that has only this element, without its lists."""
-    single = (one for one in element.properties if not is_list(one))
+    single = (prop for prop in element.properties if not is_list(prop))
     lines = [f"format {_FORMATS[declared.byte_order]} 1.0", f"element {element.name} {count}", *map(str, single)]
     return "\n".join(["ply", *lines, "end_header", ""]).encode("ascii")
 
@@ -509,7 +510,7 @@ def _row_finding(error: Any, words: list[str]) -> Finding:
     """Report the invalid value of a text row."""
     name, row, text = error.element.name, error.row or 0, error.message
     if error.prop is not None:
-        word = words[[one.name for one in error.element.properties].index(error.prop.name)]
+        word = words[[prop.name for prop in error.element.properties].index(error.prop.name)]
         kind = np.dtype(error.prop.val_dtype)
         expected = "a number" if kind.kind == "f" else f"an integer of type {kind.name}"
         text = f"{error.prop.name} is {word[:_SHOWN]!r}, expected {expected}"
@@ -577,9 +578,9 @@ def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
     with open_binary(path) as stream:
         stream.seek(header.end)
         while block := stream.read(_BLOCK_SIZE):
-            found = block.count(b"\n")
-            feeds += found
-            if found != (last[-1:] + block).count(b"\r\n"):
+            block_feeds = block.count(b"\n")
+            feeds += block_feeds
+            if block_feeds != (last[-1:] + block).count(b"\r\n"):
                 return False
             last = block
     return surplus <= feeds

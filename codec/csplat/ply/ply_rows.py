@@ -1,6 +1,6 @@
 """Skip rows of PLY files, and the lists in rows, without keeping an object per row.
 
-Properties are those of plyfile: `name` and `val_dtype`, and `len_dtype` of lists.
+Properties are plyfile's objects, which have a `name` and a `val_dtype`. Lists also have a `len_dtype`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ def is_list(one: Any) -> bool:
 
 def row_type(properties: Sequence[Any], order: str = "=") -> np.dtype[Any]:
     """Return the type of a row without its lists, in this byte order."""
-    return np.dtype([(one.name, order + one.val_dtype) for one in properties if not is_list(one)])
+    return np.dtype([(prop.name, order + prop.val_dtype) for prop in properties if not is_list(prop)])
 
 
 def skip_lists(
@@ -39,27 +39,27 @@ def skip_lists(
         count: number of rows.
         properties: properties of the element.
         order: byte order, `<` or `>`.
-        copy: the rows without their lists are written to this file; `None`: to none.
+        copy: file that receives the rows without their lists; `None`: the rows are only skipped.
 
     Returns:
         Offset of the end of the last row.
 
     Raises:
-        RowError: rows are missing, or the length of a list is no count.
+        RowError: rows are missing, or the length of a list is not a count.
     """
     byteorder: Literal["little", "big"] = "big" if order == ">" else "little"
-    end, gap = len(data), 0  # gap: bytes of single values before a list, or after the last one
+    end, gap = len(data), 0  # gap: bytes of single values before a list, or after the last list
     lists = []
-    for one in properties:
-        if not is_list(one):
-            gap += np.dtype(one.val_dtype).itemsize
+    for prop in properties:
+        if not is_list(prop):
+            gap += np.dtype(prop.val_dtype).itemsize
             continue
-        kind = np.dtype(one.len_dtype)
+        kind = np.dtype(prop.len_dtype)
         if kind.kind == "f":
-            text = f"the list {one.name[:_SHOWN]} of {name} has lengths of type {kind.name}, expected integers"
+            text = f"the list {prop.name[:_SHOWN]} of {name} has lengths of type {kind.name}, expected integers"
             raise RowError(Finding("malformed", 1, text, "error"))
-        width = np.dtype(one.val_dtype).itemsize
-        lists.append((gap, kind.itemsize, kind == np.uint8, kind.kind == "i", width, one.name))
+        width = np.dtype(prop.val_dtype).itemsize
+        lists.append((gap, kind.itemsize, kind == np.uint8, kind.kind == "i", width, prop.name))
         gap = 0
     for row in range(count):
         for before, size, is_byte, is_signed, width, listed in lists:
@@ -89,14 +89,14 @@ def lines_without_lists(lines: Iterable[str], name: str, properties: Sequence[An
     """Yield rows of text without their lists.
 
     Args:
-        lines: one row each.
+        lines: a row each.
         name: name of the element.
         properties: properties of the element.
 
     Raises:
-        RowError: a row has another number of values than declared, or the length of a list is no count.
+        RowError: a row has another number of values than declared, or the length of a list is not a count.
     """
-    are_lists = [is_list(one) for one in properties]
+    are_lists = [is_list(prop) for prop in properties]
     for row, line in enumerate(lines):
         words = line.split()
         kept, at = words, len(are_lists)

@@ -36,7 +36,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
     metadata comments, licence, training, up and view is written; cameras are not.
 
     Args:
-        file: path of the file, which appears when complete, replacing an older one; or an open binary file.
+        file: path of the file, which appears when complete and replaces an older file; or an open binary file.
         model: the scene.
         absolute: write x, y and z as doubles with the origin added, for programs that read doubles. By default they
             are floats relative to the origin, which is stored in a comment.
@@ -55,7 +55,7 @@ def write_ply(file: str | os.PathLike[str] | BinaryWriter, model: SplatModel, *,
 
 
 def write_scene_ply(file: str | os.PathLike[str] | BinaryWriter, scene: Scene, *, absolute: bool = False) -> None:
-    """Write a scene block by block; arguments are those of `write_ply`."""
+    """Write a scene block by block; arguments as in `write_ply`."""
     dtype = _row_dtype(scene, absolute=absolute)
     step = max(1, _BLOCK_SIZE // dtype.itemsize)
     with open_writer(file) as stream:
