@@ -115,7 +115,7 @@ class CodebookBlock:
         indices: the entry of each splat.
         entries: [size, C], the columns of the block's attribute.
         escapes: integers of the escaped splats.
-        summand: for scales, one column that is added to all three.
+        summand: for scales, a column that is added to all three columns.
         at: offset of the block in the file.
         exponent: 0: the block is on the file's lattice.
         bound: largest magnitude of an integer, or of a part of a sum.
@@ -150,7 +150,7 @@ class CodebookBlock:
 
 @dataclass(frozen=True)
 class SparseBlock:
-    """A block coded SPARSE: the integers of the masked splats; those of the others are 0 (spec 6.4.7).
+    """A block coded SPARSE: the integers of the masked splats; all other integers are 0 (spec 6.4.7).
 
     Attributes:
         values: integers of the masked splats.
@@ -229,10 +229,10 @@ def read_block_head(cursor: Cursor, attribute: int, legal: tuple[int, ...] | Non
     if legal is not None and head.coding not in legal:
         detail = "coding of an escape block"
         raise FormatError(_spec.ERROR_STREAM, coding_at, "CBK-5", detail, found=head.coding, wanted=legal)
-    found, allowed = _spec.CODING_NAMES[head.coding], _spec.ATTRIBUTE_CODINGS[attribute]
-    if found not in allowed:
+    coding, allowed = _spec.CODING_NAMES[head.coding], _spec.ATTRIBUTE_CODINGS[attribute]
+    if coding not in allowed:
         detail = f"coding of {_spec.ATTRIBUTE_NAMES[attribute]}"
-        raise FormatError(_spec.ERROR_VALUE, coding_at, "BLK-1", detail, found=found, wanted=" or ".join(allowed))
+        raise FormatError(_spec.ERROR_VALUE, coding_at, "BLK-1", detail, found=coding, wanted=" or ".join(allowed))
     return head.coding
 
 
@@ -313,8 +313,8 @@ def check_integers(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.
     if record.attribute == _spec.ATTRIBUTE_OPACITIES:
         _check_level(highs[0], 0, record.levels, at, "LEV-1")
     elif record.attribute == _spec.ATTRIBUTE_QUATS:
-        for found in (min(lows), max(highs)):
-            _check_level(found, -record.levels, record.levels, at, "QUA-1")
+        for level in (min(lows), max(highs)):
+            _check_level(level, -record.levels, record.levels, at, "QUA-1")
     else:
         _check_columns(lows, highs, record, at)
 
@@ -328,10 +328,10 @@ def _check_columns(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.
     """Check LAT-4: each integer, after its chroma shift, is at most COLUMN_MAX in magnitude."""
     for column, (low, high) in enumerate(zip(lows, highs, strict=True)):
         shift = record.chroma_shift if 3 * column >= len(lows) else 0
-        found = max(-low, high) << shift
-        if found > _spec.COLUMN_MAX:
+        largest = max(-low, high) << shift
+        if largest > _spec.COLUMN_MAX:
             detail, wanted = f"integer of column {column}", f"at most {_spec.COLUMN_MAX} in magnitude"
-            raise FormatError(_spec.ERROR_RANGE, at, "LAT-4", detail, found=found, wanted=wanted)
+            raise FormatError(_spec.ERROR_RANGE, at, "LAT-4", detail, found=largest, wanted=wanted)
 
 
 def morton_axes(codes: Ints) -> Ints:

@@ -17,7 +17,7 @@ _ATTRIBUTE_OF = {name: attribute for attribute, name in _spec.ATTRIBUTE_NAMES.it
 
 
 def layer_columns(record: _spec.CodebookRecord, layer: int) -> int:
-    """Return the number of columns of a CODB chunk: those of the band, or of all attributes of the kind."""
+    """Return the number of columns of a CODB chunk: of its band, or of all attributes of its kind."""
     if record.kind == _spec.CODEBOOK_KIND_SH:
         return _spec.ATTRIBUTE_COLUMNS[_spec.ATTRIBUTE_SH0 + layer]
     names = _spec.CODEBOOK_KIND_ATTRIBUTES[record.kind]

@@ -46,7 +46,7 @@ class Tile:
     Attributes:
         index: position of the record in the index.
         offset: offset of the record in the file.
-        start: index of the tile's first splat among those of all tiles.
+        start: index of the tile's first splat among the splats of all tiles.
         level: level of detail; 0 is the scene.
         splat_count: number of splats.
         exponent: the step of the means is step × 2^exponent.
@@ -72,7 +72,7 @@ class Tile:
     def corners(self, step: float) -> tuple[list[float], list[float]]:
         """Return the corners of the box around the centres (spec 4.3.5), scene units; `step` is the file's.
 
-        The numbers are those of binary32, as the centres are, so that no centre is outside.
+        The numbers are rounded to binary32, as the centres are, so that no centre is outside.
         """
         scaled = math.ldexp(step, self.exponent)
         far = [corner + extent for corner, extent in zip(self.corner, self.extent, strict=True)]
@@ -156,8 +156,9 @@ class Cursor:
         at, left = self.at, self.end - self.at
         if size > left:
             detail = "the payload ends within a structure"
-            found, wanted = f"{left} bytes", f"{size} bytes"
-            raise FormatError(_spec.ERROR_STREAM, at, self.clause, detail, found=found, wanted=wanted)
+            raise FormatError(
+                _spec.ERROR_STREAM, at, self.clause, detail, found=f"{left} bytes", wanted=f"{size} bytes"
+            )
         self.at = at + size
         return at
 
@@ -253,8 +254,8 @@ def check_length(view: memoryview, file_size: int) -> None:
 
 def refuse_length(code: str, clause: str, detail: str, view: memoryview, size: int) -> NoReturn:
     """Raise the `FormatError` for data of the wrong length, expected to be `size` bytes."""
-    at, found = min(len(view), size), f"{len(view)} bytes"
-    raise FormatError(code, at, clause, detail, found=found, wanted=f"{size} bytes")
+    at = min(len(view), size)
+    raise FormatError(code, at, clause, detail, found=f"{len(view)} bytes", wanted=f"{size} bytes")
 
 
 def check_index_crc(view: memoryview, start: int, size: int) -> None:

@@ -129,7 +129,7 @@ def decode(
         data: the whole file: a path, which is mapped into memory; an open binary file; or bytes.
         limits: limits on size and memory; default: the registry's.
         tiles: indices of the tiles to decode, in the order requested, of any level; default: all of level 0.
-            `csplat.open(data).cut(...)` selects those of a coarser version of the scene.
+            `csplat.open(data).cut(...)` selects the tiles of a coarser version of the scene.
         sh_degree: highest SH band to decode; default: all.
         threads: number of threads; default: one per processor, up to 8.
 
@@ -197,7 +197,7 @@ def decode_integers(
     sh_degree: int | None = None,
     threads: int | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Decode the integer arrays of spec 9.2, by default those of all levels; arguments and errors as in `decode`."""
+    """Decode the integer arrays of spec 9.2, by default of all levels; arguments and errors as in `decode`."""
     request = _request_of(data, limits, tiles, sh_degree, every_level=True)
     header, degree = request.header, request.degree
     check_budget(header, request.tiles, degree, integer_bytes(degree), request.limits, whole=request.whole)
@@ -225,7 +225,7 @@ def iter_tiles(
 ) -> Iterator[DecodedTile]:
     """Decode tile by tile; memory holds the codebooks and one tile per thread.
 
-    An iteration over all tiles checks every other chunk before the first tile; a damaged tile raises at its turn.
+    An iteration over all tiles checks every other chunk before the first tile. A damaged tile raises at its turn.
 
     Args:
         data: as in `decode`; a path or an `mmap` may be larger than memory.
@@ -261,7 +261,7 @@ def iter_packed(
 ) -> Iterator[PackedTile]:
     """Decode to integers and tables tile by tile, see `csplat.packed`; extra columns are left out.
 
-    Arguments and errors are those of `iter_tiles`.
+    Arguments and errors as in `iter_tiles`.
     """
     return request_packed(_request_of(data, limits, tiles, sh_degree), threads)
 
@@ -404,7 +404,7 @@ def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile
         write_tile(source, header, request.degree, table, arrays)
         return source.tile, arrays
 
-    # With one more tile than threads, no thread waits for the caller.
+    # With one tile more than threads, no thread waits for the caller.
     for done in _each_tile(request, convert, threads, ahead=1):
         pages.after(sum(layer.size for layer in done[0].layers.values()))
         yield done
@@ -426,7 +426,7 @@ def _each_tile(
         request: the tiles.
         convert: returns the result for a tile's position in `request.tiles` and its blocks.
         threads: as in `decode`.
-        ahead: number of tiles, finished or waiting, in addition to those being decoded.
+        ahead: number of tiles, finished or waiting, in addition to the tiles being decoded.
         books: the codebooks of these tiles; `None`: they are read here.
     """
     view, header, degree, tiles = request.view, request.header, request.degree, request.tiles

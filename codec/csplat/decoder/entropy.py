@@ -103,14 +103,14 @@ def _undo_coder(head: _spec.StreamHead, coded: memoryview, at: int) -> bytes | m
 def _inflate(coded: memoryview, size: int, at: int) -> bytes:
     inflater = zlib.decompressobj(-zlib.MAX_WBITS)
     try:
-        # COD-4: asking for one more byte detects a stream that is too long, and lets inflate reach the stream's end.
+        # COD-4: asking for another byte detects a stream that is too long, and lets inflate reach the stream's end.
         packed = inflater.decompress(coded, size + 1)
     except zlib.error as error:
         clause = _ZLIB_CLAUSES.get(str(error).split()[-1], "COD-2")
         raise FormatError(_spec.ERROR_CODER, at, clause, str(error)) from None
     if len(packed) != size:
-        found = f"more than {size} bytes" if len(packed) > size else f"{len(packed)} bytes"
-        raise FormatError(_spec.ERROR_CODER, at, "COD-2", found=found, wanted=f"{size} bytes")
+        actual = f"more than {size} bytes" if len(packed) > size else f"{len(packed)} bytes"
+        raise FormatError(_spec.ERROR_CODER, at, "COD-2", found=actual, wanted=f"{size} bytes")
     if not inflater.eof:
         raise FormatError(_spec.ERROR_CODER, at, "COD-2", "the DEFLATE stream has no end")
     if inflater.unused_data:
@@ -182,7 +182,7 @@ def _undo_zigzag(elements: Ints, width: int) -> Ints:
 def _undo_delta(elements: Ints, width: int) -> Ints:
     dtype = elements.dtype
     if dtype.itemsize < 4:
-        # Sums of four bytes are several times faster than of one, and equal modulo 2^(8 width).
+        # Summing four-byte integers is several times faster than summing bytes, and equal modulo 2^(8 width).
         narrow: Ints = np.cumsum(elements, dtype="<u4").astype(dtype)
         return narrow
     return _wrap(np.cumsum(elements, dtype=dtype), width)

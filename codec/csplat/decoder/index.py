@@ -295,8 +295,8 @@ def read_directory(view: memoryview, at: range) -> tuple[_spec.DirectoryRecord, 
         if record.type in _SINGLE_CHUNKS:
             if record.type in seen or record.id or record.layer:
                 detail = f"chunk {record.type.decode()} occurs twice, or has an id or a layer"
-                found = f"id {record.id}, layer {record.layer}"
-                raise FormatError(_spec.ERROR_INDEX, record_at, "DIR-4", detail, found=found)
+                present = f"id {record.id}, layer {record.layer}"
+                raise FormatError(_spec.ERROR_INDEX, record_at, "DIR-4", detail, found=present)
             seen.add(record.type)
         records.append(record)
     return tuple(records)
@@ -330,7 +330,7 @@ def _check_chunk_type(record: _spec.DirectoryRecord, at: int) -> None:
 def check_codebook_chunks(
     directory: tuple[_spec.DirectoryRecord, ...], at: range, codebooks: tuple[_spec.CodebookRecord, ...]
 ) -> None:
-    """Check DIR-5 for the directory records at `at`: one CODB chunk per codebook or, for the kind SH, per band."""
+    """Check DIR-5 for the directory records at `at`: a CODB chunk per codebook or, for the kind SH, per band."""
     wanted = {(book.codebook_id, layer) for book in codebooks for layer in range(book.band_first, book.band_last + 1)}
     for record_at, record in zip(at, directory, strict=True):
         if record.type != _spec.CHUNK_CODEBOOK:
@@ -376,8 +376,8 @@ def read_tiles(
         start += tile.splat_count
         at += size
     if at != end:
-        found = f"{end - at} bytes"
-        raise FormatError(_spec.ERROR_INDEX, at, "IDX-2", "bytes follow the last tile", found=found, wanted="the CRC")
+        rest = f"{end - at} bytes"
+        raise FormatError(_spec.ERROR_INDEX, at, "IDX-2", "bytes follow the last tile", found=rest, wanted="the CRC")
     count = sum(tile.splat_count for tile in tiles if tile.level == 0)
     if count != head.splat_count:
         offsets = _spec.INDEX_HEAD_OFFSETS
@@ -393,7 +393,9 @@ def _check_levels(tiles: Sequence[Tile], directory: Sequence[_spec.DirectoryReco
             wanted = f"at least {before.level}"
             refuse_field(_spec.ERROR_INDEX, "TIL-12", tile, tile.offset, offsets, "level", wanted)
     coarse = next((tile for tile in tiles if tile.level > 0), None)
-    tree_at = next((at for at, one in zip(directory_at, directory, strict=True) if one.type == _spec.CHUNK_TREE), None)
+    tree_at = next(
+        (at for at, record in zip(directory_at, directory, strict=True) if record.type == _spec.CHUNK_TREE), None
+    )
     if coarse is not None and tree_at is None:
         at, detail = coarse.offset + offsets["level"], f"a tile of level {coarse.level}, and no TREE chunk"
         raise FormatError(_spec.ERROR_INDEX, at, "TRE-1", detail)
@@ -496,8 +498,8 @@ def _check_tile(tile: Tile, means_step: float) -> None:
     for axis, (corner, extent) in enumerate(zip(tile.corner, tile.extent, strict=True)):
         if abs(corner) > _spec.INTEGER_MAX or abs(corner + extent) > _spec.INTEGER_MAX:
             at, detail = tile.offset + offsets["corner"] + 8 * axis, "corner and corner + extent"
-            found, wanted = (corner, corner + extent), f"at most {_spec.INTEGER_MAX} in magnitude"
-            raise FormatError(_spec.ERROR_VALUE, at, "TIL-7", detail, found=found, wanted=wanted)
+            corners, wanted = (corner, corner + extent), f"at most {_spec.INTEGER_MAX} in magnitude"
+            raise FormatError(_spec.ERROR_VALUE, at, "TIL-7", detail, found=corners, wanted=wanted)
         if extent >> _spec.AXIS_BITS_MAX:
             at, wanted = tile.offset + offsets["extent"] + 4 * axis, f"below 2^{_spec.AXIS_BITS_MAX}"
             raise FormatError(_spec.ERROR_VALUE, at, "TIL-8", "extent", found=extent, wanted=wanted)

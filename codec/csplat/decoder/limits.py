@@ -16,7 +16,7 @@ from csplat.errors import InputError, LimitError
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of one decode, by default those of the registry.
+    """Limits of a decode, by default the registry's.
 
     Attributes:
         splats: maximum number of splats decoded; default: no limit.

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 _BOM = b"\xef\xbb\xbf"
-_VALUE_MARKS = (b",", b":", b"[", b"{")  # STR-8: one of them precedes or follows every value
+_VALUE_MARKS = (b",", b":", b"[", b"{")  # STR-8: a mark precedes or follows every value
 _INT_DIGITS = 300  # digits; longer integers are read as binary64
 
 #: Components of each measure, for SER-2.
@@ -165,8 +165,10 @@ def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None
     if head.error_flags & ~sum(_spec.ERROR_FLAG_NAMES):
         refuse_field(_spec.ERROR_RESERVED, "RES-1", head, at, _spec.STATED_ERRORS_HEAD_OFFSETS, "error_flags")
     if head.source_count - head.pruned_count != header.splat_count:
-        found, wanted = head.source_count - head.pruned_count, header.splat_count
-        raise FormatError(_spec.ERROR_VALUE, at, "SER-4", "source_count - pruned_count", found=found, wanted=wanted)
+        kept_count, wanted = head.source_count - head.pruned_count, header.splat_count
+        raise FormatError(
+            _spec.ERROR_VALUE, at, "SER-4", "source_count - pruned_count", found=kept_count, wanted=wanted
+        )
     records: list[DeclaredBound] = []
     last = 0
     for _ in range(head.record_count):

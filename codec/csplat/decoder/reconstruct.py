@@ -1,7 +1,7 @@
 """Reconstruct float32 values from integers (spec 7): one product in binary64, rounded once.
 
 Each `write_…` fills the output of one tile. `lattice_rows` and `quat_rows` yield checked integers, colours as red,
-green and blue; `write_integers` copies the same integers (spec 9.2).
+green and blue. `write_integers` copies the same integers (spec 9.2).
 """
 
 from __future__ import annotations
@@ -179,15 +179,15 @@ def tile_boxes(header: SceneHeader, tiles: Sequence[Tile]) -> F64:
     """Return the boxes around the centres of the splats of some tiles (spec 4.3.5).
 
     Returns:
-        [T, 2, 3] float64: smallest and largest corner in scene units, relative to the origin. The numbers are those
-        of binary32, as the centres are; in float64 they are compared exactly with any query.
+        [T, 2, 3] float64: smallest and largest corner in scene units, relative to the origin. The numbers are
+        rounded to binary32, as the centres are. In float64 they are compared exactly with any query.
     """
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     return np.array([tile.corners(step) for tile in tiles], np.float64).reshape(len(tiles), 2, 3)
 
 
 def boxes_touching(boxes: F64, box: F64) -> NDArray[np.bool_]:
-    """Return which of some boxes, [T, 2, 3], share a point with one box, [2, 3], smallest corner first (spec 5.7)."""
+    """Return a mask of the boxes [T, 2, 3] that share a point with `box`, [2, 3], smallest corner first (spec 5.7)."""
     touch: NDArray[np.bool_] = np.all((boxes[:, 0] <= box[1]) & (boxes[:, 1] >= box[0]), axis=1)
     return touch
 

@@ -131,7 +131,7 @@ def _read_tile_head(view: memoryview, at: int, layer: int, block_count: int) -> 
     check_reserved(head, at, offsets)
     if head.layer != layer:
         refuse_field(_spec.ERROR_INDEX, "TLE-1", head, at, offsets, "layer", layer)
-    if head.block_count != block_count:  # always the case for more than 255 extra columns: the count is one byte
+    if head.block_count != block_count:  # always the case for more than 255 extra columns: the count is a single byte
         refuse_field(_spec.ERROR_STREAM, "TLE-2", head, at, offsets, "block_count", block_count)
 
 
@@ -164,8 +164,8 @@ def read_sparse(cursor: Cursor, context: TileContext, attribute: int) -> SparseB
         raise FormatError(_spec.ERROR_RANGE, mask_at, "SPA-3", "bits of the mask beyond the last splat", wanted=0)
     present = np.flatnonzero(bits)
     if len(present) != params.present_count:
-        found, wanted = len(present), params.present_count
-        raise FormatError(_spec.ERROR_RANGE, mask_at, "SPA-2", "bits of the mask", found=found, wanted=wanted)
+        bit_count, wanted = len(present), params.present_count
+        raise FormatError(_spec.ERROR_RANGE, mask_at, "SPA-2", "bits of the mask", found=bit_count, wanted=wanted)
     return SparseBlock(read_signed(cursor, record, params.exponent, len(present)), present)
 
 
@@ -207,9 +207,9 @@ def read_means(cursor: Cursor, context: TileContext, coding: int) -> ColumnBlock
     block = ColumnBlock(q, tile.corner, tile.exponent, at)
     far = tuple(corner + extent for corner, extent in zip(tile.corner, tile.extent, strict=True))
     if block.lows != tile.corner or block.highs != far:
-        at, found = tile.offset + _spec.TILE_RECORD_OFFSETS["corner"], f"{tile.corner} to {far}"
+        at, box = tile.offset + _spec.TILE_RECORD_OFFSETS["corner"], f"{tile.corner} to {far}"
         wanted = f"{block.lows} to {block.highs}, the box of its splats"
-        raise FormatError(_spec.ERROR_BOX, at, "TIL-10", "the tile's box", found=found, wanted=wanted)
+        raise FormatError(_spec.ERROR_BOX, at, "TIL-10", "the tile's box", found=box, wanted=wanted)
     return block
 
 
@@ -255,7 +255,7 @@ def holds_indices(book: _spec.CodebookRecord, attribute: int) -> bool:
 def _indices(
     cursor: Cursor, context: TileContext, attribute: int, book: Codebook, params: _spec.CodebookParams, at: int
 ) -> Indices:
-    """Read the indices, or return those of the codebook's first block in the tile (CBK-4)."""
+    """Read the indices, or return the indices of the codebook's first block in the tile (CBK-4)."""
     if holds_indices(book.record, attribute):
         indices = _read_indices(cursor, context, attribute, book, params.escape_count, at)
         context.first[params.codebook_id] = indices
@@ -263,8 +263,8 @@ def _indices(
     known = context.first.get(params.codebook_id)
     if known is None or len(known.escaped) != params.escape_count:
         detail = f"{_spec.ATTRIBUTE_NAMES[attribute]} disagrees with the codebook's first block in the escape count"
-        found, wanted = params.escape_count, "a first block" if known is None else len(known.escaped)
-        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-4", detail, found=found, wanted=wanted)
+        wanted = "a first block" if known is None else len(known.escaped)
+        raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-4", detail, found=params.escape_count, wanted=wanted)
     return known
 
 
@@ -310,12 +310,12 @@ def _check_sums(block: CodebookBlock, context: TileContext) -> None:
 def _step_over_coded(cursor: Cursor, header: SceneHeader, attribute: int) -> tuple[int, int]:
     at = cursor.take(_spec.CODEBOOK_PARAMS_SIZE)
     params = _spec.unpack_codebook_params(cursor.view, at)
-    book = next((one for one in header.codebooks if one.codebook_id == params.codebook_id), None)
+    book = next((record for record in header.codebooks if record.codebook_id == params.codebook_id), None)
     if book is None:
         raise FormatError(_spec.ERROR_CODEBOOK, at, "CBK-1", f"there is no codebook {params.codebook_id}")
     if holds_indices(book, attribute):
         _step_over_stream(cursor)
-    if attribute == _spec.ATTRIBUTE_SCALES:  # the summand: lattice parameters, one offset
+    if attribute == _spec.ATTRIBUTE_SCALES:  # the summand: lattice parameters and an offset
         cursor.take(_spec.LATTICE_PARAMS_SIZE + 4)
         _step_over_stream(cursor)
     if params.escape_count:

@@ -45,7 +45,7 @@ def read_nodes(view: memoryview, header: SceneHeader) -> tuple[Node, ...]:
         header: header and index.
 
     Returns:
-        The nodes; without a TREE chunk, one node of all tiles, or none if there are no tiles.
+        The nodes. Without a TREE chunk, a single node of all tiles, or no node if there are no tiles.
     """
     chunk = header.chunk(_spec.CHUNK_TREE)
     if chunk is None:
@@ -87,8 +87,10 @@ def _share_tiles(
         record = _spec.unpack_node_record(view, at)
         left = len(tiles) - first
         if not 1 <= record.tile_count <= left:
-            found, wanted = record.tile_count, f"1 to {left}, the tiles that are left"
-            raise FormatError(_spec.ERROR_INDEX, at + count_at, "TRE-3", "tile_count", found=found, wanted=wanted)
+            wanted = f"1 to {left}, the tiles that are left"
+            raise FormatError(
+                _spec.ERROR_INDEX, at + count_at, "TRE-3", "tile_count", found=record.tile_count, wanted=wanted
+            )
         own = tiles[first : first + record.tile_count]
         if own[0].level != own[-1].level:  # TIL-12: the levels of tiles do not descend
             detail = f"a node has tiles of the levels {own[0].level} and {own[-1].level}"
@@ -154,13 +156,13 @@ def select_tiles(
         header: header and index.
         nodes: the result of `read_nodes`.
         level: the highest level to use, 0 to 255.
-        pixel_size: size of a pixel at each node, scene units, one number or one per node, at least 0.
+        pixel_size: size of a pixel at each node, scene units, a number for all nodes or a number per node, at least 0.
         max_splats: maximum number of splats. At most one of these three is given; default: level 0.
-        box: [2, 3] corners of a box, smallest first, relative to the origin; of level 0, only tiles whose box touches
-            it are selected, and of coarser nodes only those whose region does.
+        box: [2, 3] corners of a box, smallest first, relative to the origin. A tile of level 0 is selected only if its
+            box touches this box, and a coarser node only if its region does.
 
     Raises:
-        InputError: several of the three are given, or one is out of its range.
+        InputError: several of the three are given, or a value is out of its range.
         LimitError: the coarsest cut has more than `max_splats` splats.
     """
     given = [
@@ -225,7 +227,7 @@ def _at_pixel_size(nodes: Sequence[Node], pixel_size: float | Sequence[float]) -
 
 
 def _within(nodes: Sequence[Node], max_splats: int) -> list[int]:
-    """Replace the node with the largest error, of equals the last, until the budget would be exceeded."""
+    """Replace the node with the largest error until the budget would be exceeded; the last node wins a tie."""
     if max_splats < 0:
         raise InputError(f"max_splats is {max_splats}, expected 0 or more")
     cut = {number for number, node in enumerate(nodes) if node.parent is None}
