@@ -23,7 +23,7 @@ from csplat.file_source import describe_substitute, open_binary
 DAMAGED = (ValueError, EOFError, KeyError, TypeError, AttributeError, RuntimeError, OverflowError, MemoryError,
             SyntaxError, OSError, struct.error, zlib.error, zipfile.BadZipFile)  # fmt: skip
 
-_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # the others expand further, LZMA with 4 GiB of memory
+_COMPRESSIONS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # other methods expand further, LZMA with 4 GiB of memory
 _FREE = 1 << 28  # bytes that compressed data may unpack to regardless of its size
 _EXPANSION = 64  # largest expansion of larger data; trained values compress to a tenth at best
 _MAX_ARRAYS = 4096  # an array of an archive takes 60 bytes of the file if they overlap, and 60 microseconds
@@ -62,8 +62,8 @@ def zip_refusal(path: Path) -> str:
 
 def folder_refusal(path: Path) -> str:
     """Return the error message for a folder that is not a scene, naming the newest scene that a trainer left in it."""
-    found = {one for pattern in _PATTERNS for one in path.glob(pattern) if one.name.lower().endswith(_SCENES)}
-    scenes = sorted(one.relative_to(path).as_posix() for one in found if one.name != _POINTS)
+    files = {file for pattern in _PATTERNS for file in path.glob(pattern) if file.name.lower().endswith(_SCENES)}
+    scenes = sorted(file.relative_to(path).as_posix() for file in files if file.name != _POINTS)
     if not scenes:
         return f"{path} is a folder, not a scene"
     newest = max(scenes, key=lambda name: [int(number) for number in re.findall(r"\d+", name)])
@@ -99,12 +99,12 @@ class Archive(dict[str, NDArray[Any]]):
             InputError: the array is missing, or is not a JSON object.
         """
         try:
-            found = parse_json(self["facts"].tobytes())
+            facts = parse_json(self["facts"].tobytes())
         except InputError as error:
             self.refuse(error)
-        if not isinstance(found, dict):
-            self.refuse(f"its facts are a {type(found).__name__}, expected an object")
-        return found
+        if not isinstance(facts, dict):
+            self.refuse(f"its facts are a {type(facts).__name__}, expected an object")
+        return facts
 
     def check(self, facts: Mapping[str, Any], kinds: Mapping[str, type]) -> None:
         """Raise an `InputError` unless each name has a value of its type."""
@@ -155,7 +155,7 @@ def read_archive(path: str | Path, kind: str) -> Archive:
 
 
 def _read_arrays(stream: BinaryIO) -> dict[str, NDArray[Any]]:
-    """Read the members of a .npz; raises one of `DAMAGED` or an `InputError` with the reason alone."""
+    """Read the members of a .npz; raises an exception of `DAMAGED`, or an `InputError` with the reason alone."""
     if not zipfile.is_zipfile(stream):
         raise InputError("it is not a .npz file")
     arrays: dict[str, NDArray[Any]] = {}

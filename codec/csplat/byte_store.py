@@ -24,10 +24,10 @@ class RequestSizes:
     Attributes:
         first: size of the first request, bytes: holds the index of a scene of about twenty million splats.
         batch: total size of the tiles fetched together during a sequential read, bytes.
-        gap: largest gap between two ranges that one request reads through, bytes; a second request takes longer.
-        request: maximum size of one request, bytes.
+        gap: largest gap between two ranges that a request reads through, bytes; a second request takes longer.
+        request: maximum size of a request, bytes.
         at_once: maximum number of concurrent requests.
-        waits: breaks before a failed request to a web server is repeated, seconds: one for each repetition.
+        waits: break before each repetition of a failed request to a web server, seconds.
     """
 
     first: int = 1 << 16
@@ -44,7 +44,7 @@ class Store:
     Attributes:
         name: name for messages, without the passwords and signatures of a URL; "" if the file has no name.
         size: size of the file, bytes.
-        requests: number of requests so far, including those for the size.
+        requests: number of requests so far, including requests for the size.
         bytes_read: number of bytes read so far.
         sizes: sizes of requests; may be replaced before the first request.
     """

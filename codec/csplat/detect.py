@@ -28,7 +28,7 @@ _NO_SPLATS = "not a scene of splats"
 _PROJECT = "not a scene: export the splats as PLY in that program"
 _PLY_HEADER_SIZE = 1 << 16  # bytes within which a compressed PLY declares its packed columns
 _KSPLAT_HEAD = 44  # used bytes of .ksplat's header; the rest are 0
-_SPLAT_ROW_SIZE = 32  # bytes of one splat in a .splat file
+_SPLAT_ROW_SIZE = 32  # bytes per splat of a .splat file
 _SAFETENSORS_HEAD = 100_000_000  # maximum size of the JSON header of safetensors, bytes
 _LCC_PARTS = {"data.bin", "index.bin", "shcoef.bin", "environment.bin", "attrs.lcp"}  # files next to an LCC's index
 _MANIFESTS = {"meta.json", "lod-meta.json"}  # manifests in a SOG file
@@ -42,7 +42,7 @@ class FileKind:
     Attributes:
         name: id of the kind; for a format that csplat reads, the name of its `csplat.formats.format.Format`.
         title: name in prose: `SPZ 4`.
-        suffixes: file name suffixes in lower case with their dots, the usual one first.
+        suffixes: file name suffixes in lower case with their dots, the usual suffix first.
         matches: returns True if the path and the first bytes (empty for a folder) are of this kind.
         remedy: advice to the user that follows "<file> is <title>, "; "" if csplat has a reader.
     """
@@ -78,8 +78,8 @@ def detect_content(path: Path, head: bytes) -> FileKind | None:
 def detect_name(path: Path) -> FileKind | None:
     """Identify a file by its name; return `None` if the suffix is unknown."""
     name = path.name.lower()
-    found = [(len(suffix), kind) for kind in KINDS.values() for suffix in kind.suffixes if name.endswith(suffix)]
-    return max(found, key=lambda pair: pair[0])[1] if found else None
+    matches = [(len(suffix), kind) for kind in KINDS.values() for suffix in kind.suffixes if name.endswith(suffix)]
+    return max(matches, key=lambda match: match[0])[1] if matches else None
 
 
 def read_head(path: Path) -> bytes:
@@ -232,7 +232,7 @@ def _is_lcc2(path: Path, head: bytes) -> bool:
 
 def _holds(folder: Path, suffix: str) -> bool:
     try:
-        return any(one.suffix.lower() == suffix for one in folder.iterdir())
+        return any(entry.suffix.lower() == suffix for entry in folder.iterdir())
     except OSError:
         return False
 
@@ -245,7 +245,7 @@ def _is_usd(path: Path, head: bytes) -> bool:
     return head.startswith((b"PXR-USDC", b"#usda")) or _zip_with(".usdc")(path, head) or _zip_with(".usda")(path, head)
 
 
-#: All kinds by name. If several match, the first one counts.
+#: All kinds by name. If several match, the first counts.
 KINDS: dict[str, FileKind] = {
     kind.name: kind
     for kind in (

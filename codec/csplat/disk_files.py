@@ -32,7 +32,7 @@ from csplat.system import take_permissions
 _DECIMAL_COMMA = re.compile(r'":\s*([+-]?\d+,\d+(?:[eE][+-]?\d+)?)\s*[,}\n]|[\[,]\s*(-?\d+,0\d+)')
 _TRAILING_BYTE = re.compile(r"([\udc81-\udcfe])\\(?!\\)")  # a backslash that ends a character of Shift-JIS, GBK or Big5
 _PART_SIZE = 1 << 20  # bytes copied at a time
-_NAME_PART = 20  # characters of a file's name in that of its temporary file, which must not be longer than 255 bytes
+_NAME_PART = 20  # characters of a file's name in its temporary file's name, whose maximum is 255 bytes
 _TEMPORARY = "csplat-"  # beginning of the names of files in the system's folder for temporary files
 _numbers = itertools.count()  # tells the temporary files of this process apart
 _MB = 1e6  # bytes
@@ -89,8 +89,8 @@ def read_text(path: str | os.PathLike[str], *, any_bytes: bool = False) -> str:
     try:
         text = data.decode(encoding, "surrogateescape" if any_bytes and encoding.startswith("utf-8") else "strict")
     except UnicodeDecodeError as error:
-        found = f"byte {error.start} is 0x{data[error.start]:02x}, which is not {encoding.removesuffix('-sig').upper()}"
-        raise InputError(f"{os.fspath(path)} is not a text file in UTF-8 ({found}): save it as UTF-8") from None
+        fault = f"byte {error.start} is 0x{data[error.start]:02x}, which is not {encoding.removesuffix('-sig').upper()}"
+        raise InputError(f"{os.fspath(path)} is not a text file in UTF-8 ({fault}): save it as UTF-8") from None
     if "\0" in text:
         raise InputError(
             f"{os.fspath(path)} is not a text file in UTF-8 (byte {text.index(chr(0))} is 0): save it as UTF-8"
@@ -127,7 +127,7 @@ def parse_json(text: str | bytes) -> Any:
         The value.
 
     Raises:
-        InputError: it is not JSON, nested too deep, or has an integer of more than 300 digits, or a string that is no
+        InputError: it is not JSON, nested too deep, or has an integer of more than 300 digits, or a string that is not
             text (half of a surrogate pair).
     """
     try:
@@ -183,7 +183,7 @@ def size_on_disk(path: Path) -> int:
     manifest = manifest or next((name for name in reversed(FOLDER_NAMES) if (folder / name).is_file()), "")
     inside = folder.iterdir() if manifest == "meta.json" else folder.rglob("*")
     parts = (".webp", *FOLDER_NAMES) if manifest else ("",)
-    return sum(one.stat().st_size for one in inside if one.name.lower().endswith(parts) and one.is_file())
+    return sum(entry.stat().st_size for entry in inside if entry.name.lower().endswith(parts) and entry.is_file())
 
 
 @contextmanager
@@ -311,7 +311,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekabl
 
     Args:
         path: path of the file to write.
-        seekable: the caller seeks; what a pipe gets is complete before.
+        seekable: the caller seeks; a pipe receives the bytes when they are complete.
         replace: replace an existing file; False also keeps a file that another process creates in the meantime.
 
     Yields:
@@ -335,7 +335,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekabl
     old = target.stat() if target.exists() else None
     temporary = _temporary_name(target)
     try:
-        permissions = 0o666 if old is None else 0o600  # until it has those of the old file
+        permissions = 0o666 if old is None else 0o600  # until it has the permissions of the old file
         with open_binary(temporary, "x", name=path, permissions=permissions) as stream:
             if old is not None:
                 take_permissions(stream.fileno(), old)
@@ -391,14 +391,14 @@ def _report_as(path: str | os.PathLike[str], temporary: Path, error: BaseExcepti
 
 
 def work_folder(path: str | os.PathLike[str]) -> Path:
-    """Return the folder for temporary files of an output: its own, or for a device or pipe that of the system."""
+    """Return the folder for temporary files of an output: its own folder, or the system's for a device or pipe."""
     target = Path(path)
     return Path(temporary_root()) if target.exists() and not target.is_file() else target.parent
 
 
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Write a folder that appears under its name only when complete, in the place of an older one.
+    """Write a folder that appears under its name only when complete, in the place of an older folder.
 
     Args:
         path: path of the folder. All of an older folder is deleted: the caller checks what it contains.
@@ -489,7 +489,7 @@ def read_array(path: str | os.PathLike[str], *, most_bytes: int | None = None) -
 
 
 def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
-    """Read an array in NumPy's format; its size is compared with that of the file before memory is allocated.
+    """Read an array in NumPy's format; its size is compared with the file's before memory is allocated.
 
     Args:
         stream: the file from its beginning.

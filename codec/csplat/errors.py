@@ -1,4 +1,4 @@
-"""Define the exceptions, one class per party at fault.
+"""Define the exceptions, with a class per party at fault.
 
 | class | fault | remedy |
 |---|---|---|
@@ -68,7 +68,7 @@ class UnsupportedError(CsplatError):
         feature: name of the feature that the file requires, `version 0.7`.
         code: error code of the registry.
         offset: offset of the field in the file, if known.
-        clause: id of the clause, if there is one.
+        clause: id of the clause, if any.
     """
 
     def __init__(self, feature: str, code: str = "E_UNSUPPORTED", offset: int | None = None, clause: str = "") -> None:
@@ -91,7 +91,7 @@ class LimitError(CsplatError):
         allowed: amount that the caller allows.
         code: error code of the registry.
         offset: offset of the field in the file, if known.
-        clause: id of the clause, if there is one.
+        clause: id of the clause, if any.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class InputError(CsplatError):
     """The caller's data is invalid: a PLY, an array, an option.
 
     Args:
-        message: one line with the problem and, if there is one, the remedy.
+        message: a line with the problem and the remedy, if there is any.
     """
 
     code = "E_INPUT"
@@ -133,7 +133,7 @@ class StoreError(CsplatError):
     """The store of a file did not return its bytes: no support for ranges, a lost connection, a changed file.
 
     Args:
-        message: one line with the name of the file and the problem.
+        message: a line with the name of the file and the problem.
     """
 
     code = "E_STORE"

@@ -53,7 +53,7 @@ def map_file(path: str | os.PathLike[str]) -> bytes | mmap:
 
 @contextmanager
 def named_errors(name: str | os.PathLike[str]) -> Iterator[None]:
-    """Add the name of a file to errors of the operating system that lack one: those of reading, writing and closing."""
+    """Add the name of a file to errors of the operating system that lack it, in reading, writing and closing."""
     try:
         yield
     except OSError as error:
@@ -63,7 +63,7 @@ def named_errors(name: str | os.PathLike[str]) -> Iterator[None]:
 
 
 class _NamedFile(io.FileIO):
-    """An unbuffered file whose errors all have its name, not only that of opening it."""
+    """An unbuffered file whose errors all have its name, not only the errors of opening it."""
 
     def __init__(self, path: str, mode: str, name: str, opener: Callable[[str, int], int]) -> None:
         self._label = name
@@ -117,7 +117,7 @@ def open_binary(
     permissions: int = 0o666,
     flags: int = 0,
 ) -> io.BufferedReader | BinaryIO:
-    """Open a file on disk; errors of reading, writing and closing have its name, not only that of opening.
+    """Open a file on disk; errors of reading, writing and closing also have its name.
 
     Args:
         path: path of the file.
@@ -129,7 +129,7 @@ def open_binary(
     Raises:
         OSError: the file cannot be opened.
     """
-    opener = lambda path, own: os.open(path, own | flags, permissions)  # noqa: E731  # one line, used once
+    opener = lambda path, own: os.open(path, own | flags, permissions)  # noqa: E731  # short, used once
     file = _NamedFile(os.fspath(path), mode, os.fspath(path if name is None else name), opener)
     kind: Any = io.BufferedRandom if "+" in mode else io.BufferedReader if mode == "r" else io.BufferedWriter
     opened: BinaryIO = kind(file)

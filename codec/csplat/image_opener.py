@@ -190,13 +190,13 @@ def _identify(head: bytes, name: str, formats: Sequence[ImageFormat]) -> ImageFo
         raise InputError(f"{name} is a {kind}, expected {expected}")
     if not head:
         raise InputError(f"{name} is empty")
-    other = next((other for at, magic, other in _OTHERS if head[at:].startswith(magic)), "")
-    if not other and b"<svg" in head.lower():
-        other = "an SVG"
-    if other == _RAW:
+    refused = next((description for at, magic, description in _OTHERS if head[at:].startswith(magic)), "")
+    if not refused and b"<svg" in head.lower():
+        refused = "an SVG"
+    if refused == _RAW:
         raise _raw_refusal(name)
-    if other:
-        raise InputError(f"{name} is {other}, which is not read, expected {expected}: convert it to PNG or JPEG")
+    if refused:
+        raise InputError(f"{name} is {refused}, which is not read, expected {expected}: convert it to PNG or JPEG")
     if instead := describe_substitute(head):
         raise InputError(f"{name} is {instead}")
     raise InputError(f"{name} is not an image: it begins with {head[:8]!r}, expected {expected}")
@@ -222,7 +222,7 @@ def _raw_refusal(name: str) -> InputError:
 
 @contextmanager
 def _converted_errors(kind: ImageFormat, name: str) -> Iterator[None]:
-    """Turn the errors of Pillow into one line; its plugins raise almost any error on damaged files."""
+    """Turn the errors of Pillow into a single line; its plugins raise almost any error on damaged files."""
     try:
         yield
     except CsplatError:

@@ -1,7 +1,7 @@
 """Describe findings about splat files: unusual or invalid content and its repair.
 
 A *note* is ordinary variation; nothing is lost or looks different. A *repair* changes or drops data safely; `strict`
-refuses it. An *error* cannot be repaired without guessing. A *loss* is found while writing: the target cannot hold
+refuses it. An *error* cannot be repaired without guessing. A *loss* is detected while writing: the target cannot hold
 part of the scene.
 
 | id | meaning | kind |
@@ -83,10 +83,10 @@ class Finding:
     Attributes:
         id: id in the table above, stable across versions.
         count: number of splats, columns, elements or bytes affected.
-        text: one line that describes the finding and its treatment.
+        text: a line that describes the finding and its treatment.
         kind: `note`, `repair`, `error` or `loss`.
         usual: True if most trained scenes have the finding; it is shown only if all findings are requested.
-        attribute: name of the array concerned; "" if the finding is not about one.
+        attribute: name of the array concerned; "" if none.
         largest_error: largest difference from the source among the values of the attribute; `None`: unknown.
     """
 
@@ -128,6 +128,6 @@ def refuse(findings: Sequence[Finding], *, strict: bool) -> None:
     Raises:
         InputError: the message lists all errors and refused repairs.
     """
-    refused = [one for one in findings if one.kind == "error" or (strict and one.kind == "repair")]
+    refused = [finding for finding in findings if finding.kind == "error" or (strict and finding.kind == "repair")]
     if refused:
-        raise InputError("; ".join(f"{one.id}: {one.text}" for one in refused))
+        raise InputError("; ".join(f"{finding.id}: {finding.text}" for finding in refused))

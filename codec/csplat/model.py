@@ -106,7 +106,7 @@ class SplatModel:
         return sh_degree_of(self.shN.shape[1])
 
     def with_metadata(self, metadata: SceneMetadata) -> SplatModel:
-        """Return the splats with other metadata; the model itself if they are its own."""
+        """Return the splats with other metadata, or the model itself if the metadata is its own."""
         return self if metadata is self.metadata else trusted_model(**{**vars(self), "metadata": metadata})
 
     def select(self, index: NDArray[Any] | slice) -> SplatModel:
@@ -121,7 +121,7 @@ class SplatModel:
                 return array[index]
             return np.take(array, index, axis=0)  # takes half the time of indexing
 
-        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        values = {attribute.name: getattr(self, attribute.name) for attribute in fields(self)}
         values |= {name: rows(values[name]) for name in ("means", "quats", "scales", "opacities", "sh0", "shN")}
         values["extra"] = {name: rows(column) for name, column in self.extra.items()}
         values["means_double"] = None if self.means_double is None else rows(self.means_double)
@@ -136,8 +136,8 @@ def trusted_model(**values: Any) -> SplatModel:
     Args:
         values: fields by name; fields with a default may be omitted.
     """
-    required = {one.name for one in fields(SplatModel) if one.default is MISSING}
-    assert required <= values.keys() <= {one.name for one in fields(SplatModel)}
+    required = {attribute.name for attribute in fields(SplatModel) if attribute.default is MISSING}
+    assert required <= values.keys() <= {attribute.name for attribute in fields(SplatModel)}
     model: SplatModel = object.__new__(SplatModel)
     for name, value in values.items():
         object.__setattr__(model, name, value)
@@ -145,7 +145,7 @@ def trusted_model(**values: Any) -> SplatModel:
 
 
 def check_model(caller: str, model: object) -> None:
-    """Raise an `InputError` unless `model` is a `SplatModel`; it explains how to make one."""
+    """Raise an `InputError`, which explains how to make a `SplatModel`, if `model` has another type."""
     if not isinstance(model, SplatModel):
         raise InputError(
             f"{caller} expects a SplatModel, not a {type(model).__name__}: read a file with csplat.read(file)"

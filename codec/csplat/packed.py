@@ -1,6 +1,6 @@
 """Integers of tiles, with codebooks as tables, as a renderer on a GPU keeps them (`SplatFile.packed_tiles`).
 
-A value is an integer times a step (spec 7). An SH band of a tile has one row of integers per splat, or an index per
+A value is an integer times a step (spec 7). An SH band of a tile has a row of integers per splat, or an index per
 splat into a table that tiles share, plus the rows of the escaped splats. Colours are red, green and blue.
 """
 
@@ -32,7 +32,7 @@ class PackedBand:
     """An SH band of a tile.
 
     Attributes:
-        rows: the rows of all splats, or with a table those of the escaped splats.
+        rows: the rows of all splats or, with a table, of the escaped splats.
         table: the codebook's rows, the same object for every tile of a file; `None` if there is none.
         index: [n] integers, row of the table; its length plus k is row k of `rows`. Bands that share a codebook have
             the same array. `None` without a table.

@@ -21,18 +21,18 @@ if TYPE_CHECKING:
 def load_plugins(group: str) -> dict[str, Any]:
     """Load the entry points of a group by name.
 
-    Entry points with missing dependencies are omitted; those that fail otherwise are omitted with a `RuntimeWarning`.
+    Entry points with missing dependencies are omitted. Other failing entry points are omitted with a `RuntimeWarning`.
     """
-    found = {}
+    plugins = {}
     for point in _entry_points(group):
         try:
-            found[point.name] = point.load()
+            plugins[point.name] = point.load()
         except ModuleNotFoundError:
             continue  # its extra is not installed
         except Exception as error:  # noqa: BLE001  # someone else's broken package must not keep us from reading a PLY
             text = f"{point.value}, installed as {point.name!r} of {group}, cannot be loaded: {error}"
             warnings.warn(text, RuntimeWarning, stacklevel=2)
-    return found
+    return plugins
 
 
 @cache

@@ -1,11 +1,11 @@
 """Compute exponentials and logarithms with the same bits on every processor.
 
-NumPy and the C library choose other code for other processors, whose results differ in the last bit. The functions here
-consist of operations that IEEE 754 rounds correctly: sums, products, quotients, and scaling by powers of two. Each is a
-ufunc call of its own, which leaves a compiler nothing to fuse. Reductions and coefficients are those of FDLIBM
-(e_exp.c, e_log.c), whose errors are below 1 ulp for exp, and below 2 ulp for the logarithms.
+NumPy and the C library choose different code for different processors, with results that differ in the last bit. The
+functions here consist of operations that IEEE 754 rounds correctly: sums, products, quotients, and scaling by powers of
+two. Each is a ufunc call of its own, which leaves a compiler nothing to fuse. Reductions and coefficients are from
+FDLIBM (e_exp.c, e_log.c), whose errors are below 1 ulp for exp, and below 2 ulp for the logarithms.
 
-What reaches the bytes of a file is computed by these functions instead of NumPy's, and by sums in a fixed order:
+Values that reach the bytes of a file are computed by these functions instead of NumPy's, and by sums in a fixed order:
 `np.sum` and `np.bincount`, but not `np.einsum` and matrix products, unless their partial sums are exact.
 """
 

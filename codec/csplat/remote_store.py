@@ -86,7 +86,7 @@ class RemoteStore(Store):
     """A file at a URL.
 
     fsspec manages connections, which it keeps for the next file. Requests to web servers are repeated after the breaks
-    of `RequestSizes.waits`, and short answers are continued; the libraries of other stores repeat theirs.
+    of `RequestSizes.waits`, and short answers are continued. The libraries of other stores repeat their own requests.
     """
 
     def __init__(self, url: str, options: Mapping[str, Any]) -> None:
@@ -109,7 +109,7 @@ class RemoteStore(Store):
             missing = [at for at, (start, stop) in enumerate(ranges) if len(parts[at]) < stop - start]
             if not missing:
                 break
-            self.requests += len(missing) if round_ else 0  # `read` has counted the first ones
+            self.requests += len(missing) if round_ else 0  # `read` has counted the first requests
             lost: BaseException | None = None
             answers = self._answers([(ranges[at][0] + len(parts[at]), ranges[at][1]) for at in missing])
             for at, answer in zip(missing, answers, strict=True):
@@ -125,16 +125,16 @@ class RemoteStore(Store):
         return parts
 
     def _answers(self, ranges: Sequence[tuple[int, int]]) -> list[Any]:
-        """Request ranges; return bytes, which may be too few, or an exception for each."""
+        """Request ranges, and return the bytes of each, which may be too few, or an exception."""
         starts, stops = zip(*ranges, strict=True)
         # File systems without coroutines open files, which would read ahead.
         cache = {} if self._fs.async_impl else {"cache_type": "none"}
         paths = [self._path] * len(ranges)
         try:
-            found: list[Any] = self._fs.cat_ranges(paths, list(starts), list(stops), on_error="return", **cache)
+            answers: list[Any] = self._fs.cat_ranges(paths, list(starts), list(stops), on_error="return", **cache)
         except Exception as error:  # noqa: BLE001  # stores raise the exceptions of their libraries
             return [error] * len(ranges)
-        return found
+        return answers
 
     def _read_info(self, waits: Sequence[float]) -> dict[str, Any]:
         repeats = 0
@@ -156,7 +156,7 @@ class RemoteStore(Store):
             waits: break before each repetition, seconds, unless the server specifies it.
 
         Raises:
-            StoreError, OSError, InputError: the error, if it is permanent, or was the last one.
+            StoreError, OSError, InputError: the error, if it is permanent or no repetition is left.
         """
         cause = self._cause(error)
         if not (self._web and repeats < len(waits) and _is_transient(cause)):
@@ -197,7 +197,7 @@ class RemoteStore(Store):
             return OSError(number, text, self._shown)  # creates the subclass for the number
         if isinstance(error, TimeoutError):
             text = "the server sends nothing"
-        elif "content-encoding" in getattr(error, "message", ""):  # one that aiohttp cannot unpack
+        elif "content-encoding" in getattr(error, "message", ""):  # aiohttp cannot unpack it
             text = _COMPRESSED.format("")
         else:
             text = f"HTTP status {status}" if status else _message(error) or type(error).__name__
@@ -208,7 +208,7 @@ class RemoteStore(Store):
 
 
 def _strong(value: Any) -> Any:
-    """Return an ETag without the mark of a weak one, which proxies add; other values as they are."""
+    """Return an ETag without the mark of weak tags, which proxies add, and other values unchanged."""
     return value.removeprefix("W/") if isinstance(value, str) else value
 
 
@@ -293,7 +293,7 @@ def _web_options(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _message(error: BaseException) -> str:
-    """Return the text of a library's exception as one line; it may contain the URL."""
+    """Return the text of a library's exception as a single line; it may contain the URL."""
     return _redact(" ".join(str(error).split()))
 
 

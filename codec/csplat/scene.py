@@ -36,7 +36,7 @@ class Scene:
         sh_degree: spherical-harmonics degree, 0 to 4.
         reader: returns an iterator over all splats in order, in models of at most `BLOCK_SPLATS` splats with the
             metadata of the scene.
-        metadata: what else is known about the scene.
+        metadata: metadata of the scene.
         origin: as in `SplatModel`.
         extra: dtypes of the extra columns, by name.
         has_doubles: models have `means_double`.
@@ -44,7 +44,7 @@ class Scene:
         format: name of the format that the scene is read from; "" if it is in memory.
         levels: number of splats of each level of detail, finest first, if the file has several; this scene is one.
         file_axes: axes of the coordinates in the file, if the scene was converted from them while it was opened.
-        in_memory: the splats, if the scene is that of a model.
+        in_memory: the splats, if the scene was made from a model.
         name: name of the file, for messages.
         size_bytes: size of the file; of the tiles, for a coarser version in a .csplat file.
     """
@@ -86,8 +86,8 @@ class Scene:
         """
         extra = {name: column.dtype for name, column in model.extra.items()}
         doubles = model.means_double is not None
-        found = findings if isinstance(findings, list) else list(findings)
-        return cls(count, model.sh_degree, reader, model.metadata, model.origin, extra, doubles, found)
+        listed = findings if isinstance(findings, list) else list(findings)
+        return cls(count, model.sh_degree, reader, model.metadata, model.origin, extra, doubles, listed)
 
     def __enter__(self) -> Self:
         return self
@@ -103,8 +103,8 @@ class Scene:
         self._resources.close()
 
     def changed(self, **fields: Any) -> Scene:
-        """Return the scene with other values of some attributes; this one is still to be closed."""
-        kept = {one.name: getattr(self, one.name) for one in dataclasses.fields(Scene)}
+        """Return the scene with other values of some attributes; the caller still has to close this scene."""
+        kept = {attribute.name: getattr(self, attribute.name) for attribute in dataclasses.fields(Scene)}
         if not fields.keys() <= _ABOUT_THE_FILE:
             kept["in_memory"] = None
         return Scene(**{**kept, **fields})
@@ -121,7 +121,7 @@ class Scene:
             start += len(block)
 
     def model(self) -> SplatModel:
-        """Read all blocks into one model; a model in memory is returned itself."""
+        """Read all blocks into one model, or return the model that is in memory."""
         return join_blocks(self.empty(), list(self.blocks())) if self.in_memory is None else self.in_memory
 
     def loaded(self) -> Scene:
@@ -142,7 +142,7 @@ class Scene:
         return self
 
     def empty(self) -> SplatModel:
-        """Return the model of none of the splats."""
+        """Return a model without splats that has everything else of the scene."""
         three = np.zeros((0, 3), np.float32)
         return SplatModel(
             means=three,
@@ -158,7 +158,7 @@ class Scene:
         )
 
     def map(self, change: Callable[[SplatModel], SplatModel]) -> Scene:
-        """Return the scene with each block changed, to as many splats.
+        """Return the scene with each block changed, but not its number of splats.
 
         Args:
             change: returns the changed block; also called with no splats, for everything else.
@@ -198,19 +198,19 @@ class Scene:
 
 
 def join_blocks(empty: SplatModel, blocks: Sequence[SplatModel]) -> SplatModel:
-    """Concatenate blocks of a scene, of which `empty` has none of the splats."""
+    """Concatenate blocks of a scene; `empty` is the scene without splats."""
     if len(blocks) < 2:
         return blocks[0] if blocks else empty
     arrays: dict[str, Any] = {
-        name: np.concatenate([getattr(one, name) for one in blocks])
+        name: np.concatenate([getattr(block, name) for block in blocks])
         for name in ("means", "quats", "scales", "opacities", "sh0", "shN")
     }
-    doubles = [one.means_double for one in blocks]
+    doubles = [block.means_double for block in blocks]
     return replace(
         empty,
         **arrays,
-        extra={name: np.concatenate([one.extra[name] for one in blocks]) for name in empty.extra},
-        means_double=None if doubles[0] is None else np.concatenate([one for one in doubles if one is not None]),
+        extra={name: np.concatenate([block.extra[name] for block in blocks]) for name in empty.extra},
+        means_double=None if doubles[0] is None else np.concatenate([means for means in doubles if means is not None]),
     )
 
 

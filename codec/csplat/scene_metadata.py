@@ -34,12 +34,12 @@ _COLOURS = {(0.0, 0.0, 0.0): "black", (1.0, 1.0, 1.0): "white"}
 
 @dataclass(frozen=True)
 class SceneMetadata:
-    """What is known about a scene besides its splats.
+    """Properties of a scene other than its splats.
 
     Attributes:
         coordinate_system: directions of +x, +y and +z from the viewer's perspective, one letter each of R/L, U/D and
             F/B: `"RDF"`; or `"unspecified"`.
-        unit_metres: length of one scene unit in metres; `None` if unknown.
+        unit_metres: length of a scene unit in metres; `None` if unknown.
         antialiased: trained with the mip-splatting low-pass filter; renders must apply it.
         flat: splats are discs (2DGS); the smallest scale has no meaning.
         cameras: training cameras, each {K, viewmat, W, H, near, image}; viewmat maps world to camera with OpenCV axes,
@@ -68,7 +68,7 @@ class SceneMetadata:
 
     @property
     def stated_up(self) -> Direction | None:
-        """Unit vector of the entry `up`; `None` if there is no valid one."""
+        """Unit vector of the entry `up`; `None` if absent or invalid."""
         try:
             return unit_up(self.entries[UP]) if UP in self.entries else None
         except InputError:
@@ -76,12 +76,12 @@ class SceneMetadata:
 
     @property
     def up(self) -> Direction | None:
-        """Up direction of the scene, a unit vector: the entry `up`, else that of the axes; `None` if unknown."""
+        """Up direction of the scene, a unit vector, from the entry `up` or else from the axes; `None` if unknown."""
         return self.stated_up or up_of_axes(self.coordinate_system)
 
     @property
     def training(self) -> TrainingRecord | None:
-        """Training record; `None` if there is no valid one."""
+        """Training record; `None` if absent or invalid."""
         try:
             return TrainingRecord.from_json(self.entries[TRAINING]) if TRAINING in self.entries else None
         except InputError:
@@ -105,7 +105,7 @@ class SceneMetadata:
         return replace(self, entries={key: value for key, value in merged.items() if entries.get(key, key) is not None})
 
     def with_up(self, up: Direction | None = None, coordinate_system: str | None = None) -> SceneMetadata:
-        """Return the metadata with another up direction or other axes; what contradicts them is removed.
+        """Return the metadata with another up direction or other axes; entries that contradict them are removed.
 
         Args:
             up: three finite numbers, not all 0; `None`: unchanged. Without `coordinate_system`, existing axes with a

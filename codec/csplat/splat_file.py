@@ -65,7 +65,7 @@ class SplatFile(Scene):
             self._head = _read_head(store, window)
             self.header = header = read_header(window.view)
         self.count, self.sh_degree, self.origin = header.splat_count, header.sh_degree, header.origin
-        self.extra = {one.name: np.dtype(one.dtype) for one in header.extras if one.dtype is not None}
+        self.extra = {column.name: np.dtype(column.dtype) for column in header.extras if column.dtype is not None}
         self.reader, self.has_doubles, self.file_axes = self.models, False, ""
         self.format, self.name, self.size_bytes = "csplat", store.name, store.size
         self.findings, self.in_memory = [], None
@@ -74,7 +74,7 @@ class SplatFile(Scene):
 
     @classmethod
     def open(cls, file: File, *, limits: Limits | None = None, storage: Mapping[str, Any] | None = None) -> SplatFile:
-        """Open a `.csplat` file; arguments and errors are those of `csplat.open`, which opens other formats, too."""
+        """Open a `.csplat` file; arguments and errors as in `csplat.open`, which also opens other formats."""
         store = open_store(file, storage)
         try:
             return cls(store, limits or Limits())
@@ -87,7 +87,7 @@ class SplatFile(Scene):
 
     @property
     def requests(self) -> int:
-        """Number of requests to the store so far, including one for the size of a file at a URL."""
+        """Number of requests to the store so far, including the request for the size of a file at a URL."""
         return self._store.requests
 
     @property
@@ -97,7 +97,7 @@ class SplatFile(Scene):
 
     @cached_property
     def levels(self) -> tuple[int, ...]:  # type: ignore[override]  # requires the TREE chunk
-        """Number of splats of each level of detail, finest first; empty if there is one."""
+        """Number of splats of each level of detail, finest first; empty if there is only level 0."""
         last = max((tile.level for tile in self.header.coarse_tiles), default=0)
         cuts = [select_tiles(self.header, self.nodes, level=level) for level in range(last + 1)] if last else []
         return tuple(sum(tile.splat_count for tile in tiles) for tiles in cuts)
@@ -112,7 +112,9 @@ class SplatFile(Scene):
 
     @cached_property
     def nodes(self) -> tuple[Node, ...]:
-        """Nodes of the levels of detail, read on first access; a file without levels has one, or none without tiles.
+        """Nodes of the levels of detail, read on first access.
+
+        A file without levels has a single node, or no node if it has no tiles.
 
         Raises:
             FormatError: the TREE chunk breaks a clause.
@@ -132,7 +134,7 @@ class SplatFile(Scene):
 
     @cached_property
     def options(self) -> dict[str, Any] | None:
-        """The encoder's record of its options, if there is one; read on first access."""
+        """The encoder's record of its options, if any; read on first access."""
         with self._store.named_errors():
             window = self.window()
             window.fetch(self._chunks(_spec.CHUNK_OPTIONS))
@@ -150,7 +152,7 @@ class SplatFile(Scene):
             return bounds_chunk(window.view, self.header)
 
     def loaded(self) -> SplatFile:
-        """Return this file, after decoding all splats and reading what is known about them; it may be closed then."""
+        """Return this file after decoding all splats and reading their metadata and bounds; it may then be closed."""
         if self.in_memory is None:
             self.in_memory = self.read()
         _ = self.metadata, self.declared_bounds
@@ -172,14 +174,15 @@ class SplatFile(Scene):
     ) -> list[int]:
         """Select the tiles of a version of the scene, coarser where less detail is needed, for `read`.
 
+        Only one of `level`, `pixel_size` and `max_splats` can be given. Default: `level=0`.
+
         Args:
             level: highest level of detail to use; 0 is the scene.
-            pixel_size: size of a pixel in scene units, for all nodes or for each of `nodes`: the coarsest version that
-                looks like the scene at this size.
-            max_splats: maximum number of splats: the version with the smallest errors. Only one of `level`,
-                `pixel_size` and `max_splats` can be given; default: `level=0`.
-            box: as in `tiles`. Tiles of level 0 are selected if their splats touch it, tiles of other levels if the
-                splats of level 0 that they stand for do.
+            pixel_size: size of a pixel in scene units, for all nodes or for each of `nodes`. Selects the coarsest
+                version that looks like the scene at this size.
+            max_splats: maximum number of splats. Selects the version with the smallest errors.
+            box: as in `tiles`. Tiles of level 0 are selected if their splats touch it. Tiles of other levels are
+                selected if the splats of level 0 that they replace touch it.
 
         Returns:
             Indices of tiles, ascending.
@@ -205,12 +208,12 @@ class SplatFile(Scene):
         return [tile.index for tile in chosen]
 
     def version(self, *, level: int = 0, max_splats: int | None = None) -> Scene:
-        """Return a version of the scene, of which coarser ones have no extra columns.
+        """Return a version of the scene; coarser versions have no extra columns.
 
         Args:
             level: level of detail; 0 is the finest.
-            max_splats: the version of at most this number of splats with the smallest errors instead of a level, or the
-                coarsest.
+            max_splats: instead of a level, the version with the smallest errors among the versions of at most this
+                number of splats, or the coarsest version if all have more.
 
         Raises:
             InputError: there is no such level.
@@ -237,7 +240,7 @@ class SplatFile(Scene):
         )
 
     def models(self, tiles: Sequence[int] | None = None) -> Iterator[SplatModel]:
-        """Decode tile by tile, each to a model with the metadata of the scene.
+        """Decode each tile to a model with the metadata of the scene.
 
         A file on disk is mapped, and its tiles are decoded in threads.
 
@@ -263,7 +266,7 @@ class SplatFile(Scene):
                 yield trusted_model(**arrays, origin=origin, metadata=metadata)
 
     def tiles(self, box: Sequence[float] | None = None, *, sh_degree: int | None = None) -> Iterator[DecodedTile]:
-        """Decode tile by tile; memory holds the codebooks, one tile and a few megabytes of the file.
+        """Decode tile by tile; memory holds the codebooks, a single tile and a few megabytes of the file.
 
         Args:
             box: region whose tiles are read; tiles that touch it, or share a point with it, are returned whole. Two
@@ -303,7 +306,7 @@ class SplatFile(Scene):
 
         Args:
             box: as in `tiles`.
-            tiles: indices of the tiles to decode, in the order requested, such as those of `cut`; excludes `box`.
+            tiles: indices of the tiles to decode, in the order requested, such as the result of `cut`; excludes `box`.
             sh_degree: as in `tiles`.
 
         Examples:
@@ -367,7 +370,7 @@ class SplatFile(Scene):
         return range(len(self.header.tiles)) if self.header.coarse_tiles else None
 
     def _chunks(self, *kinds: bytes) -> list[tuple[int, int]]:
-        return [(one.offset, one.size) for one in self.header.directory if one.type in kinds]
+        return [(record.offset, record.size) for record in self.header.directory if record.type in kinds]
 
 
 def _levels_finding(header: SceneHeader, which: str) -> Finding:
@@ -400,7 +403,7 @@ def _layers(tiles: Sequence[Tile], degree: int) -> list[tuple[int, int]]:
 
 
 def _batches(tiles: Sequence[Tile], degree: int, size_bytes: int) -> Iterator[list[Tile]]:
-    """Yield batches of tiles to fetch together, at least one, which may be empty."""
+    """Yield batches of tiles to fetch together; without tiles, a single empty batch."""
     batch: list[Tile] = []
     size = 0
     for tile in tiles:
@@ -424,17 +427,17 @@ def tiles_touching(header: SceneHeader, box: Sequence[float]) -> list[Tile]:
         InputError: the box is not six numbers, or no tile touches it.
     """
     corners = box_corners(box)
-    found = boxes_touching(tile_boxes(header, header.tiles), corners)
-    if not found.any():
+    touching = boxes_touching(tile_boxes(header, header.tiles), corners)
+    if not touching.any():
         raise _nothing_touches(header, corners)
-    return [header.tiles[index] for index in np.flatnonzero(found)]
+    return [header.tiles[index] for index in np.flatnonzero(touching)]
 
 
 def box_corners(box: Sequence[float]) -> F64:
     """Return the corners of a box, [2, 3], smallest first.
 
     Raises:
-        InputError: the box is not six numbers, or one is NaN.
+        InputError: the box is not six numbers, or a number is NaN.
     """
     try:
         numbers = [float(value) for value in box]

@@ -67,7 +67,7 @@ def open_regular(path: str | os.PathLike[str]) -> BinaryIO:
 def take_permissions(descriptor: int, old: os.stat_result) -> None:
     """Give a file the permissions, and if possible owner and group, of the file that it replaces.
 
-    In another group it gives the group the rights of all others: the group may be one that had no more.
+    A file in another group gives that group only the rights of all others, because the group may have had no more.
     """
     if sys.platform == "win32" or not hasattr(os, "fchown"):
         return
@@ -173,11 +173,11 @@ def interrupts_held() -> Iterator[None]:
 
 def available_memory_bytes() -> int:
     """Return the free memory of the machine or of the process's control group, whichever is less."""
-    found = [_free_machine_bytes()]
+    free = [_free_machine_bytes()]
     for limit, current in _LIMITS:
         with suppress(OSError, ValueError):
-            found.append(int(Path(limit).read_text("ascii")) - int(Path(current).read_text("ascii")))
-    return max(0, min(found))
+            free.append(int(Path(limit).read_text("ascii")) - int(Path(current).read_text("ascii")))
+    return max(0, min(free))
 
 
 def default_memory_bytes() -> int:

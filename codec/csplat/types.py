@@ -24,7 +24,7 @@ Progress = Callable[[str, float], None]
 """Progress callback: (name of the stage, fraction done from 0 to 1)."""
 
 PSNR_CAP = 99.0
-"""Largest PSNR, dB, also that of equal images."""
+"""Largest PSNR, dB, also the PSNR of equal images."""
 
 
 def null_progress(stage: str, done: float) -> None:
