@@ -88,7 +88,7 @@ class Archive(dict[str, NDArray[Any]]):
         self.refuse(f"it has no {name}")
 
     def refuse(self, reason: object) -> NoReturn:
-        """Raise an `InputError` that the file is not of the expected kind."""
+        """Raise an `InputError`, which says that the file is not of the expected kind."""
         text = textwrap.shorten(str(reason), 120)
         raise InputError(f"{self._path} is not {self._kind}: {text}")
 
@@ -119,7 +119,7 @@ def unpacked_limit(size: int) -> int:
 
 
 def member_refusal(info: zipfile.ZipInfo, max_bytes: int) -> str:
-    """Return why a member of a zip is refused before it is unpacked; "" if it is not.
+    """Return the reason to refuse a member of a zip before it is unpacked; "" if it is accepted.
 
     Unpacking stops at the declared size, so a member with more data is refused by its checksum.
 

@@ -83,7 +83,7 @@ class Store:
         return f"{self.name} has changed while it was read: open it again" if self._is_other() else ""
 
     def _fault(self, message: str) -> StoreError:
-        """Return the error for unexpected data: that the file has changed, if it has."""
+        """Return the error for unexpected data, which says that the file has changed if it has."""
         try:
             return StoreError(self.changed() or message)
         except (StoreError, OSError):

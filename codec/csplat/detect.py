@@ -83,7 +83,7 @@ def detect_name(path: Path) -> FileKind | None:
 
 
 def read_head(path: Path) -> bytes:
-    """Return the first bytes of a file for `detect_content`; none for a folder.
+    """Return the first bytes of a file for `detect_content`; b"" for a folder.
 
     Raises:
         OSError: the file cannot be read.

@@ -41,7 +41,7 @@ FOLDER_NAMES = ("meta.json", "lod-meta.json")
 
 #: Exceptions that NumPy raises for damaged headers of arrays.
 _NOT_AN_ARRAY = (ValueError, EOFError, SyntaxError, TokenError, TypeError, OverflowError, MemoryError, RecursionError)
-_INTEGER_DIGITS = 300  # digits of the longest integer in JSON; longer ones exceed float64
+_INTEGER_DIGITS = 300  # digits of the longest integer in JSON; longer integers exceed float64
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")  # an escape in JSON
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -175,7 +175,7 @@ def check_free_space(folder: str | os.PathLike[str], wanted_bytes: int, what: st
 
 
 def size_on_disk(path: Path) -> int:
-    """Return the size in bytes of a file, or of all files of a folder; for SOG, without other files of its folder."""
+    """Return the size in bytes of a file, or of all files of a folder; a SOG folder counts without its other files."""
     manifest = path.name.lower() if path.name.lower() in FOLDER_NAMES else ""
     if not (path.is_dir() or manifest):
         return path.stat().st_size
@@ -188,7 +188,7 @@ def size_on_disk(path: Path) -> int:
 
 @contextmanager
 def local_file(file: File, name: str = "") -> Iterator[Path]:
-    """Yield the path of a file that can be read twice; other inputs than paths are copied to a temporary file.
+    """Yield the path of a file that can be read twice; inputs other than paths are copied to a temporary file.
 
     Args:
         file: a path; a binary file, read from its current position; or bytes. Named pipes are copied, too.
@@ -238,7 +238,7 @@ def temporary_root() -> str:
     """Return the folder for temporary files, which the environment variable TMPDIR sets.
 
     Raises:
-        InputError: there is none that can be written.
+        InputError: no such folder can be written.
     """
     try:
         return tempfile.gettempdir()
@@ -307,7 +307,7 @@ def atomic_writer(path: str | os.PathLike[str], *, replace: bool = True, seekabl
 
     Bytes go to a temporary file in the same folder, which is renamed on success and removed on any error. The target
     of a symbolic link is replaced, not the link. A file that is replaced keeps its permissions, and if possible its
-    owner and group; other hard links keep the older content. Devices and pipes are written directly, if possible.
+    owner and group. Other hard links keep the older content. Devices and pipes are written directly, if possible.
 
     Args:
         path: path of the file to write.
@@ -401,7 +401,7 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a folder that appears under its name only when complete, in the place of an older folder.
 
     Args:
-        path: path of the folder. All of an older folder is deleted: the caller checks what it contains.
+        path: path of the folder. An older folder is deleted with all its files, so the caller checks what it contains.
 
     Yields:
         An empty folder next to it, which is renamed on success and removed on any error.
@@ -499,7 +499,7 @@ def parse_array(stream: io.BufferedIOBase, size: int) -> NDArray[Any]:
         InputError: it is not an array, contains Python objects, or has more or fewer bytes than its shape requires.
     """
     try:
-        with warnings.catch_warnings(action="ignore"):  # Python 2 wrote headers that NumPy warns of
+        with warnings.catch_warnings(action="ignore"):  # NumPy warns about headers that Python 2 wrote
             version = np.lib.format.read_magic(stream)
             if version not in _HEADER_READERS:
                 raise InputError(f"it is an array file of version {version[0]}.{version[1]}, expected 1.0 or 2.0")

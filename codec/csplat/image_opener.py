@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 ImageFormat = Literal["PNG", "JPEG", "TIFF", "WebP", "BMP"]
 
-#: Plugin and class of Pillow by format. A JPEG with further images of a phone (MPO) is opened as a JPEG: its first.
+#: Plugin and class of Pillow by format. The first image of a phone's JPEG with several images (MPO) is opened.
 _PLUGINS: dict[ImageFormat, tuple[str, str]] = {
     "PNG": ("PIL.PngImagePlugin", "PngImageFile"),
     "JPEG": ("PIL.JpegImagePlugin", "JpegImageFile"),
@@ -97,7 +97,7 @@ _REASON_MAX = 120  # characters of Pillow's reason in a message
 
 #: Images of at most this many pixels are read whatever the size of their files.
 FREE_PIXELS = 1 << 26
-#: Larger images have at most this many pixels per byte of their files; photographs have less than 20.
+#: Larger images have at most this many pixels per byte of their files; photographs have fewer than 20.
 PIXELS_PER_BYTE = 64
 
 _pillow = threading.RLock()  # filters of warnings belong to the process
@@ -158,7 +158,7 @@ _SILENT = logging.NullHandler()  # Pillow's log is the application's business; w
 
 @contextmanager
 def _silent_libtiff(kind: ImageFormat) -> Iterator[None]:
-    """Discard what libtiff writes to standard error, past Python; Pillow reports the same error."""
+    """Discard the output of libtiff to standard error, which bypasses Python; Pillow reports the same error."""
     try:
         saved = os.dup(_STDERR) if kind == "TIFF" else -1
     except OSError:  # it is closed
@@ -176,7 +176,7 @@ def _silent_libtiff(kind: ImageFormat) -> Iterator[None]:
 
 
 def _identify(head: bytes, name: str, formats: Sequence[ImageFormat]) -> ImageFormat:
-    """Return the format of a file by its first bytes; refuse others by name."""
+    """Return the format of a file by its first bytes; refuse other formats by name."""
     expected = ", ".join(formats[:-1]) + " or " * (len(formats) > 1) + formats[-1]
     kind: ImageFormat | None = next((kind for magic, kind in _MAGICS if head.startswith(magic)), None)
     if head[:4] == b"RIFF" and head[8:12] == b"WEBP":

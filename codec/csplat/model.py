@@ -1,6 +1,6 @@
 """Represent a scene of 3D Gaussian splats in memory: `SplatModel`.
 
-All readers, writers, renderers and the codec use it. The constructor checks its data and never repairs them.
+All readers, writers, renderers and the codec use it. The constructor checks its data and never repairs it.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class SplatModel:
             coordinates keep the precision of float32 this way.
         means_double: [N, 3] float64, centres in the source's coordinates; `means` are these minus `origin`, rounded.
             `None` if `origin` and `means` are exact.
-        metadata: what else is known about the scene.
+        metadata: metadata of the scene.
         extra: additional columns by name, each [N], integer or floating.
 
     Raises:
@@ -131,7 +131,7 @@ class SplatModel:
 def trusted_model(**values: Any) -> SplatModel:
     """Make a model without the constructor's checks, which take an eighth of the time of a decode.
 
-    For the decoder, whose clauses are stricter.
+    The decoder uses it, because its clauses are stricter.
 
     Args:
         values: fields by name; fields with a default may be omitted.
@@ -218,7 +218,7 @@ def _check_array(name: str, array: F32, shape: tuple[int | str, ...]) -> None:
 
 
 def _non_finite_count(array: F32) -> int:
-    """Count NaN and infinities; one pass over memory if there are none."""
+    """Count NaN and infinities of an array of any shape; a single pass over memory if there are none."""
     with np.errstate(over="ignore", invalid="ignore"):
         if np.isfinite(array.sum(dtype=np.float32)):
             return 0
@@ -228,6 +228,7 @@ def _non_finite_count(array: F32) -> int:
 
 
 def _check_opacities(opacities: F32) -> None:
+    """Raise an `InputError` unless opacities [N] are in [0, 1]."""
     if len(opacities) == 0:
         return
     low, high = float(opacities.min()), float(opacities.max())
@@ -236,6 +237,7 @@ def _check_opacities(opacities: F32) -> None:
 
 
 def _check_quats(quats: F32) -> None:
+    """Raise an `InputError` unless quaternions [N, 4] have unit length within the tolerance."""
     with np.errstate(over="ignore"):
         squared = squared_lengths(quats)
     low, high = (1.0 - QUAT_LENGTH_TOLERANCE) ** 2, (1.0 + QUAT_LENGTH_TOLERANCE) ** 2
@@ -263,7 +265,7 @@ def _parse_origin(origin: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _check_doubles(means: F32, doubles: F64, origin: tuple[float, float, float]) -> None:
-    """Raise an `InputError` unless `means` are `doubles` minus `origin`, rounded."""
+    """Raise an `InputError` unless `means`, [N, 3], are `doubles`, [N, 3] float64, minus `origin`, rounded."""
     fits = isinstance(doubles, np.ndarray) and doubles.dtype == np.float64 and doubles.shape == means.shape
     if not fits or not np.array_equal((doubles - np.array(origin)).astype(np.float32), means):
         raise InputError("means_double and means disagree: means are float32(means_double - origin)")

@@ -77,13 +77,16 @@ def ceil_log2(x: float) -> int:
 
 
 def _flat(x: NDArray[Any] | float) -> tuple[F64, F64]:
-    """Return the values in one dimension, and space for as many results."""
+    """Return the values as float64 [n], and an uninitialised array of the same shape for the results."""
     wide = np.asarray(x, np.float64).reshape(-1)
     return wide, np.empty_like(wide)
 
 
 def _exp_block(x: F64, out: F64) -> None:
-    """With x = k ln 2 + r, |r| <= ln 2 / 2, and c = r - r² P(r²): e**x = 2**k (1 + r + r c / (2 - c))."""
+    """Write e**x of x [n] to `out` [n].
+
+    With x = k ln 2 + r, |r| <= ln 2 / 2, and c = r - r² P(r²): e**x = 2**k (1 + r + r c / (2 - c)).
+    """
     small = bool(np.abs(x).max() <= _ONE_SCALE)  # False if a value is NaN
     if not small:
         x = np.clip(x, -_OVERFLOW, _OVERFLOW)
@@ -115,7 +118,7 @@ def _exp_block(x: F64, out: F64) -> None:
 
 
 def _log_block(x: F64) -> tuple[F64, F64]:
-    """Return k and log(m) of x = 2**k m with √½ <= m < √2.
+    """Return k and log(m), both [n], of x = 2**k m, [n], with √½ <= m < √2.
 
     With f = m - 1 and s = f / (2 + f): log(m) = f - f²/2 + s (f²/2 + R(s²)).
     """

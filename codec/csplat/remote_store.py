@@ -32,7 +32,7 @@ _COMPRESSED = (
 )
 _SILENCE = 30.0  # seconds without a byte after which a connection counts as lost; proxies wait up to 60 s for others
 _LONGEST_WAIT = 60.0  # seconds; a server that asks for a longer break has an error reported instead
-_MAX_ROUNDS = 1000  # answers from which a range is put together: 8 MiB in pieces of 8 KiB
+_MAX_ROUNDS = 1000  # maximum number of answers that a range is joined from: 8 MiB in pieces of 8 KiB
 #: Fields that identify a version of a file, under the names of fsspec's file systems.
 _VERSION = (
     "size", "ETag", "etag", "Last-Modified", "LastModified", "last_modified", "mtime", "created", "VersionId",
@@ -73,7 +73,7 @@ class _BusyError(Exception):
 
     Attributes:
         status: HTTP status.
-        wait: seconds after which the server asks to try again; `None` if it does not say.
+        wait: seconds after which the server asks to try again; `None` if unspecified.
     """
 
     def __init__(self, status: int, wait: float | None) -> None:

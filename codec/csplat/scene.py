@@ -1,7 +1,7 @@
 """Read a scene in blocks of bounded size: `Scene`.
 
-A block is a `SplatModel` with the metadata of the whole scene. Blocks may be read several times, one in memory at a
-time.
+A block is a `SplatModel` with the metadata of the whole scene. Blocks may be read several times, with a single block
+in memory at a time.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from csplat.errors import InputError
 
 Direction = tuple[float, float, float]
 
-#: Coordinate system of a scene whose source did not specify one.
+#: Coordinate system of a scene whose source did not specify its axes.
 UNSPECIFIED = "unspecified"
 
 #: Keys of entries.
@@ -89,7 +89,7 @@ class SceneMetadata:
 
     @property
     def licence(self) -> str | None:
-        """Licence; `None` if there is none."""
+        """Licence; `None` if absent."""
         licence = self.entries.get(LICENCE)
         return licence if isinstance(licence, str) else None
 

@@ -216,7 +216,7 @@ class SplatFile(Scene):
                 number of splats, or the coarsest version if all have more.
 
         Raises:
-            InputError: there is no such level.
+            InputError: the scene does not have this level.
             FormatError: the TREE chunk breaks a clause.
         """
         last = len(self.levels or (0,)) - 1
@@ -459,7 +459,7 @@ def _corner_text(corner: F64) -> str:
 
 
 def _extent_text(boxes: F64) -> str:
-    """Return the extent of the splats, for messages."""
+    """Describe the extent of boxes [T, 2, 3] for messages."""
     if not len(boxes):
         return "the scene has no splats"
     return f"centres lie within {_corner_text(boxes[:, 0].min(axis=0))} to {_corner_text(boxes[:, 1].max(axis=0))}"

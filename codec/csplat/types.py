@@ -1,4 +1,4 @@
-"""Define what all layers share: arrays by dtype, the progress callback, and the largest PSNR."""
+"""Define types and a constant that all layers share: arrays by dtype, the progress callback, and the largest PSNR."""
 
 from __future__ import annotations
 

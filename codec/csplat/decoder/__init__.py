@@ -1,7 +1,7 @@
 """Decode `.csplat` files into arrays, checking every clause of the specification.
 
-Written from `spec/format.md` alone: it shares only the registry's constants, the errors and `SplatModel` with the
-encoder, and the classes of `csplat.packed` with the renderer.
+The package was written from `spec/format.md` alone. It shares only the registry's constants, the errors and
+`SplatModel` with the encoder, and the classes of `csplat.packed` with the renderer.
 
 | function | returns |
 |---|---|
@@ -16,7 +16,7 @@ encoder, and the classes of `csplat.packed` with the renderer.
 | `read_options`, `read_declared_bounds` | one chunk |
 
 Modules, each of which builds on the previous ones: `container` (file header, frames of chunks), `index`, `entropy`
-(streams), `blocks` (integers of one attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `packed`,
+(streams), `blocks` (integers of an attribute), `reconstruct` (integers to values), `codebooks`, `tiles`, `packed`,
 `tree`, `limits`, `metadata`, `decode_api`.
 """
 

@@ -32,7 +32,7 @@ class ExtraColumn:
 
     Attributes:
         name: key in `SplatModel.extra`.
-        dtype: NumPy dtype, `<u2`; `None` if this version does not know the type, in which case the column is skipped.
+        dtype: NumPy dtype, `<u2`; `None` for a type unknown to this version, whose column is skipped.
     """
 
     name: str
@@ -191,7 +191,7 @@ def view_of(data: File) -> memoryview:
 
 
 def check_reserved(record: Any, at: int, offsets: Mapping[str, int]) -> None:
-    """RES-1: "A reserved field or bit MUST be 0"; arguments as in `refuse_field`."""
+    """Check RES-1, "A reserved field or bit MUST be 0"; arguments as in `refuse_field`."""
     for name in offsets:
         if name.startswith("reserved_") and getattr(record, name) != 0:
             refuse_field(_spec.ERROR_RESERVED, "RES-1", record, at, offsets, name, 0)

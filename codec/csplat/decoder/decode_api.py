@@ -52,7 +52,7 @@ class DecodedScene:
     Attributes:
         header: header and index.
         model: the splats of the file or of the chosen tiles.
-        options: the encoder's record of its options; `None` if there is none, or only a part was decoded.
+        options: the encoder's record of its options; `None` if it is absent, or only a part was decoded.
         declared_bounds: declared error bounds; `None` likewise.
         checks: checks made: `header_crc`, `index_crc`, `chunk_crc` (of every chunk read), `all_chunk_crcs`.
     """

@@ -123,6 +123,7 @@ def _inflate(coded: memoryview, size: int, at: int) -> bytes:
 
 
 def _undo_run_length(packed: bytes | memoryview | Ints, size: int, at: int) -> Ints:
+    """Expand runs, stored as planes of values, low bytes and high bytes of lengths, to uint8 [size]."""
     data = np.frombuffer(packed, np.uint8)
     values, low, high = data.reshape(3, -1)
     lengths = high.astype(np.int64)
@@ -172,6 +173,7 @@ def _join_planes(planes: Ints) -> Ints:
 
 
 def _undo_zigzag(elements: Ints, width: int) -> Ints:
+    """Return integers [count] in two's complement of `width` bytes."""
     one = elements.dtype.type(1)
     out = elements & one
     np.negative(out, out=out)  # all ones if the sign bit is set, modulo 2^bits
@@ -180,6 +182,7 @@ def _undo_zigzag(elements: Ints, width: int) -> Ints:
 
 
 def _undo_delta(elements: Ints, width: int) -> Ints:
+    """Return the cumulative sums of integers [count], modulo 2^(8 width)."""
     dtype = elements.dtype
     if dtype.itemsize < 4:
         # Summing four-byte integers is several times faster than summing bytes, and equal modulo 2^(8 width).
@@ -196,6 +199,7 @@ def _wrap(elements: Ints, width: int) -> Ints:
 
 
 def _as_signed(elements: Ints, width: int) -> Ints:
+    """Read integers [count] in two's complement of `width` bytes as signed integers of the same item size."""
     spare = elements.dtype.itemsize - width
     if spare:
         elements = elements << elements.dtype.type(8 * spare)

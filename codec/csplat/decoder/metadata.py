@@ -58,7 +58,7 @@ class DeclaredBounds:
 
     Attributes:
         source_count: number of splats of the source.
-        pruned_count: number of these that are not in the file.
+        pruned_count: number of source splats that are not in the file.
         source_sh_degree: SH degree of the source.
         refitted: attributes were refitted; measures without a record can only be verified by renders.
         records: bound of each measure.

@@ -68,6 +68,7 @@ def _pack_indices(
     tables: Mapping[tuple[int, int], PackedColumns],
     indices: dict[int, Ints],
 ) -> PackedBand:
+    """Return a band coded by a codebook; its index [n] is added to `indices`, which the tile's bands share."""
     codebook, escaped = block.indices.book.record.codebook_id, block.indices.escaped
     table = tables[codebook, band]
     if codebook not in indices:

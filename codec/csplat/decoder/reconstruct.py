@@ -100,7 +100,7 @@ def write_tile(source: TileBlocks, header: SceneHeader, degree: int, opacities: 
         {band: header.attribute(attribute) for band, attribute in bands.items()},
         out.shN,
     )
-    if out.extra:  # a cut of coarser levels has none
+    if out.extra:  # a cut of coarser levels has no extra columns
         for bits, column in zip(source.extra, out.extra.values(), strict=True):
             column.view(bits.dtype)[:] = bits
 
@@ -303,7 +303,7 @@ def write_bands(blocks: dict[int, Block], records: dict[int, _spec.AttributeReco
 
 
 def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRecord], out: F32) -> bool:
-    """Copy float32 rows if all bands use the same codebook and indices; return False otherwise."""
+    """Copy float32 rows to `out` [n, K, 3] if all bands use the same codebook and indices; return False otherwise."""
     first = blocks.get(1)
     if not isinstance(first, CodebookBlock) or len(blocks) != len(records):
         return False
@@ -318,6 +318,7 @@ def _copy_entries(blocks: dict[int, Block], records: dict[int, _spec.AttributeRe
 
 
 def _write_some(splat_indices: NDArray[np.intp], columns: ColumnBlock, record: _spec.AttributeRecord, out: F32) -> None:
+    """Write the coefficients of k splats, of indices [k], to `out` [n, 2 l + 1, 3]."""
     values = np.empty((len(splat_indices), *out.shape[1:]), np.float32)
     write_colour(columns, record, values)
     out[splat_indices] = values

@@ -214,6 +214,7 @@ def read_means(cursor: Cursor, context: TileContext, coding: int) -> ColumnBlock
 
 
 def _check_bits(elements: Ints, bits: int, at: int, clause: str) -> None:
+    """Check that unsigned integers, in an array of any shape, are below 2^bits."""
     largest = int(elements.max())
     if largest >> bits:
         raise FormatError(_spec.ERROR_RANGE, at, clause, "integer", found=largest, wanted=f"below 2^{bits}")

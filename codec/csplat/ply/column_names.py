@@ -80,7 +80,7 @@ def find_columns(
     """Find the columns of a PLY, in any order, by their usual names or by the names that other programs give them.
 
     Args:
-        dtype: structured, one field per scalar property, in the order of the file.
+        dtype: structured, a field per scalar property, in the order of the file.
         keep_extra: extra columns are kept, so they are not reported.
         sh_degree: highest SH degree to read; `None`: all, up to 4.
         elements: names of the other elements of the file, for messages.
@@ -183,7 +183,7 @@ def plain_name(name: str) -> str:
 
 
 class _NameIndex:
-    """The columns of a file, found by their usual names."""
+    """The columns of a file by their usual names."""
 
     def __init__(self, names: Sequence[str]) -> None:
         self.all = tuple(names)

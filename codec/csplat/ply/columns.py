@@ -258,6 +258,7 @@ def alpha_of_logits(logits: NDArray[Any]) -> F32:
 
 
 def _alphas(logits: NDArray[Any]) -> F64:
+    """Compute the sigmoid of logits [N] in float64."""
     alphas: F64 = 1.0 / (1.0 + exp(-logits.astype(np.float64)))
     return alphas
 
@@ -325,7 +326,7 @@ def _copy_group(rows: Rows, names: Sequence[str], target: NDArray[Any]) -> None:
 
 
 def _adjacent(rows: Rows, names: Sequence[str]) -> NDArray[Any] | None:
-    """View columns as one array [n, len(names)] if they are adjacent and have one type; otherwise return `None`."""
+    """View columns as an array [n, len(names)] if they are adjacent and of the same type; otherwise return `None`."""
     fields: dict[str, Any] = dict((rows.dtype.fields or {}).items())
     if not names:
         return None
@@ -339,6 +340,7 @@ def _adjacent(rows: Rows, names: Sequence[str]) -> NDArray[Any] | None:
 
 
 def _count_nonzero_rows(rows: Rows, names: Sequence[str]) -> int:
+    """Count rows in which a named column is not 0."""
     nonzero = np.zeros(len(rows), bool)
     for name in names:
         nonzero |= rows[name] != 0
@@ -403,7 +405,7 @@ def flatten_scales(scales: F32) -> NDArray[np.bool_]:
 
 
 def _extend_range(bounds: tuple[float, float], values: F32) -> tuple[float, float]:
-    """Extend a range by some values.
+    """Extend a range by values, an array of any shape.
 
     A value that is negative beyond rounding shows that the values are not activated. The range is then irrelevant and
     stays unchanged.
@@ -523,7 +525,7 @@ def _are_lengths(statistics: RowStatistics) -> bool:
     means, scales = (np.concatenate(arrays) for arrays in zip(*statistics.sample, strict=True))
     extent = float(np.subtract(*np.quantile(means, (0.95, 0.05), axis=0)).max())
     low, middle, high = np.quantile(scales, (0.05, 0.5, 0.95)).tolist()
-    # Lengths vary by factors. Read as logarithms, they would give all splats a size of about one unit.
+    # Lengths vary by factors. Read as logarithms, they would give all splats a size of about a scene unit.
     alike = middle < 1.0 and high > _LENGTHS_RATIO * low
     return middle <= extent / 2.0 and (alike or math.exp(middle) > extent / 2.0)
 

@@ -52,7 +52,7 @@ class CommentMetadata:
     """Scene metadata from header comments, with defaults.
 
     Attributes:
-        origin: origin of the scene; `None` if no comment specifies one.
+        origin: origin of the scene; `None` if no comment specifies it.
         origin_is_added: True if x, y and z in the file are absolute, that is, include the origin.
         metadata: the scene's metadata; comments that csplat does not interpret are its `comments`.
         findings: findings about the comments of other programs.
@@ -254,7 +254,7 @@ def _numbers(key: str, values: Sequence[str], count: int) -> list[float]:
 
 
 def _choose_origin(positions: F64) -> tuple[float, float, float]:
-    """Choose an origin for float64 positions so that float32 loses nothing visible.
+    """Choose an origin for positions [N, 3] so that float32 loses nothing visible.
 
     The origin is zero if float32 is exact or the scene is around zero. Otherwise it is the scene's centre (the median,
     which is robust to outliers), rounded to a multiple of a power of two near the scene's spread.

@@ -292,7 +292,7 @@ def _split_rows(
 ) -> tuple[dict[str, list[str]], list[str], int]:
     """Return the rows of the wanted elements, the oddities of the lines, and the number of bytes after the last row.
 
-    Rows may share a line or continue on the next one, provided that every line end is a row end or every row end is a
+    Rows may share a line or continue on the next line, provided that every line end is a row end or every row end is a
     line end. So a missing value never shifts the values after it. An object per word is made only for a wanted element
     whose rows are not on lines of their own.
     """

@@ -587,7 +587,7 @@ def _is_changed_as_text(path: Path, header: PlyHeader, surplus: int) -> bool:
 
 
 def _row_blocks(path: Path, rows: Rows, max_rows: int | None = None) -> Iterator[Rows]:
-    """Yield rows in blocks; memory-mapped rows are read from the file, which aligns them and saves memory.
+    """Yield rows in blocks. Memory-mapped rows are read from the file, which aligns them and saves memory.
 
     Args:
         path: path of the file.
