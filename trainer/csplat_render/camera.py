@@ -112,10 +112,10 @@ def check_last_row(pose: F64, name: str) -> None:
     expected = (0.0, 0.0, 0.0, 1.0)
     if np.abs(pose[3] - expected).max() <= _ROW_TOLERANCE:
         return
-    found = " ".join(f"{value:.9g}" for value in pose[3])
+    row = " ".join(f"{value:.9g}" for value in pose[3])
     by_columns = (pose[:, 3] == expected).all()
     hint = ": the last column is 0 0 0 1, so it is transposed" if by_columns else ""
-    raise InputError(f"{name} has the last row {found}, expected 0 0 0 1{hint}")
+    raise InputError(f"{name} has the last row {row}, expected 0 0 0 1{hint}")
 
 
 def _checked_matrix(name: str, value: ArrayLike, size: int) -> F64:

@@ -148,7 +148,7 @@ def parse_foreign_cameras(document: object, where: str, report: list[str]) -> li
         cameras = _parse_each(document["frames"], where, "frame", lambda e, at: _parse_frame(document, e, at))
         report.append(f"{where} is a transforms.json: {counted(len(cameras), 'camera')}")
         report += describe_scales([frame["transform_matrix"] for frame in document["frames"]], where)
-        if any(one.get(key) for key in _DISTORTION for one in (document, *document["frames"])):
+        if any(values.get(key) for key in _DISTORTION for values in (document, *document["frames"])):
             report.append(f"{where}: lens distortion is ignored, renders are rectilinear")
         return cameras
     return None
@@ -292,9 +292,9 @@ def viewmat_of_opengl(matrix: Any, name: str, where: str) -> F64:
     scale = float(lengths.mean())  # some exporters include the scale of the world in the axes
     determinant = float(np.linalg.det(axes))
     if not (scale > 0.0 and determinant > 0.0 and np.abs(lengths / scale - 1.0).max() <= _SCALE_TOLERANCE):
-        found = ", ".join(f"{length:.4g}" for length in lengths)
+        lengths_text = ", ".join(f"{length:.4g}" for length in lengths)
         raise InputError(
-            f"{where}: {name} begins with axes of lengths {found} and determinant {determinant:.4g}, expected a "
+            f"{where}: {name} begins with axes of lengths {lengths_text} and determinant {determinant:.4g}, expected a "
             "rotation: it is mirrored, sheared or zero"
         )
     u, _, vt = np.linalg.svd(axes / scale)  # u vᵀ is the nearest rotation: files have few digits

@@ -75,7 +75,7 @@ def orbit_cameras(
         raise InputError(f"an orbit of {count} cameras, expected at least 1")
     frame, K = scene_frame(with_estimated_up(model)), intrinsics(width, height, FIELD_OF_VIEW)
     if not along and frame.kind == "surrounding":
-        along = [Camera.from_json(one) for one in model.metadata.cameras or ()]
+        along = [Camera.from_json(entry) for entry in model.metadata.cameras or ()]
     if along:
         eyes, ahead, up = _path_along(along, count, model.metadata.up)
         near = min(frame.near, *(camera.near for camera in along))
@@ -119,16 +119,16 @@ def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
 
 def _touching(first: int, filled: Mask) -> Mask:
     """Return the filled cells connected with the cell `first`."""
-    found: Mask = np.zeros_like(filled)
-    found.flat[first] = True
+    connected: Mask = np.zeros_like(filled)
+    connected.flat[first] = True
     while True:
-        wider = found
+        wider = connected
         for axis in range(3):  # wrapping around is harmless: border cells are empty or contain distant points
             wider = wider | np.roll(wider, 1, axis) | np.roll(wider, -1, axis)
         wider = wider & filled
-        if (wider == found).all():
-            return found
-        found = wider
+        if (wider == connected).all():
+            return connected
+        connected = wider
 
 
 def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:

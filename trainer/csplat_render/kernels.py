@@ -102,8 +102,8 @@ class _CacheFiles(caching.FunctionCache._impl_class):  # type: ignore[misc]  # n
     """The files of a kernel's cache. Knows the folders that are tried for them."""
 
     _locator_classes = [  # noqa: RUF012  # numba's
-        _UserCacheLocator if one is caching.UserWideCacheLocator else one
-        for one in caching.FunctionCache._impl_class._locator_classes  # noqa: SLF001
+        _UserCacheLocator if locator is caching.UserWideCacheLocator else locator
+        for locator in caching.FunctionCache._impl_class._locator_classes  # noqa: SLF001
     ]
 
 
@@ -369,7 +369,7 @@ class _ThreadPool:
 
 def _bytes_of(arguments: tuple[Any, ...]) -> int:
     """Return the size of all arrays together."""
-    return sum(one.nbytes for one in arguments if isinstance(one, np.ndarray))
+    return sum(argument.nbytes for argument in arguments if isinstance(argument, np.ndarray))
 
 
 def _after_fork() -> None:

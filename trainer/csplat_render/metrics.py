@@ -94,20 +94,20 @@ class Scores:
         """
         if not each:
             raise InputError("found no images to compare")
-        pixels = [one.pixels for one in each]
-        covers = [one.cover for one in each if one.cover is not None]
+        pixels = [view.pixels for view in each]
+        covers = [view.cover for view in each if view.cover is not None]
         known = len(covers) == len(each)
         covered = [share * count for share, count in zip(covers, pixels, strict=True)] if known else []
-        missed = math.fsum(count * (one.covered_mse or 0.0) for count, one in zip(covered, each, strict=known))
+        missed = math.fsum(count * (view.covered_mse or 0.0) for count, view in zip(covered, each, strict=known))
         worst = min(range(len(each)), key=lambda number: each[number].psnr)
         return cls(
             each=tuple(each),
-            psnr=psnr_of_mse(pooled([one.mse for one in each], pixels)),
-            psnr_mean=math.fsum(one.psnr for one in each) / len(each),
+            psnr=psnr_of_mse(pooled([view.mse for view in each], pixels)),
+            psnr_mean=math.fsum(view.psnr for view in each) / len(each),
             psnr_worst=each[worst].psnr,
             worst_view=worst,
-            ssim=_mean([one.ssim for one in each]),
-            lpips=_mean([one.lpips for one in each]),
+            ssim=_mean([view.ssim for view in each]),
+            lpips=_mean([view.lpips for view in each]),
             psnr_covered=psnr_of_mse(missed / math.fsum(covered)) if any(covered) else None,
             cover=math.fsum(covered) / sum(pixels) if known else None,
             ignored=ignored,

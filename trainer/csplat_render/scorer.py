@@ -173,13 +173,13 @@ class Scorer:
             on_view: called with the images of each view.
             progress: called with the stage and the completed fraction.
         """
-        render, each, ignored = self._renderer(model), [], 0
+        render, scores, ignored = self._renderer(model), [], 0
         for number, camera in enumerate(self.cameras):
             if progress is not None:
                 progress("comparing", number / len(self.cameras))
             reference, result = self.reference(number), render(camera)
             ignored = max(ignored, result.ignored)
-            each.append(
+            scores.append(
                 metrics.score_view(
                     reference.rgb, result.rgb, reference.covered, reference.mask, image=camera.image, with_ssim=ssim,
                     lpips=lpips,
@@ -189,7 +189,7 @@ class Scorer:
                 on_view(number, np.clip(reference.rgb, 0.0, 1.0), np.clip(result.rgb, 0.0, 1.0))
         if progress is not None:
             progress("comparing", 1.0)
-        return metrics.Scores.of(each, ignored)
+        return metrics.Scores.of(scores, ignored)
 
     def _renderer(self, model: SplatModel | Renderable) -> Callable[[Camera], Render]:
         render = renderer(model, self.background, mode=self.mode, threads=self.threads)

@@ -42,17 +42,17 @@ def measure_importance(
         InputError: no view shows any splat, or the device is not usable.
     """
     if device == "cpu":
-        found = measure_sensitivity(
+        sensitivity = measure_sensitivity(
             model, cameras, background=background, metric=True, magnitudes=False, threads=threads, progress=progress
         )
     else:
         rasteriser = _rasteriser(model)
         from csplat_trainer.gsplat_derivatives import estimate_sensitivity
 
-        found = estimate_sensitivity(rasteriser, model, cameras, background, progress)
-    if not found.seen.any():
+        sensitivity = estimate_sensitivity(rasteriser, model, cameras, background, progress)
+    if not sensitivity.seen.any():
         raise InputError("no view shows any splat: check that the cameras belong to the scene")
-    return StoredSensitivity.of(model, found).importance()
+    return StoredSensitivity.of(model, sensitivity).importance()
 
 
 def measure_pruning(

@@ -175,7 +175,9 @@ class Fitter:
         """Return the progress since the last report; arguments as in `FitStep`, `None`: estimate the time left."""
         self._read_losses()
         window, self._window = self._window, []
-        loss, mse = (sum(values) / len(window) for values in zip(*((one.loss, one.mse) for one in window), strict=True))
+        loss, mse = (
+            sum(values) / len(window) for values in zip(*((value.loss, value.mse) for value in window), strict=True)
+        )
         return FitStep(
             self.iteration, self.iterations, loss, psnr_of_mse(mse), splat_count, sh_degree, self.seconds,
             self.seconds_left if seconds_left is None else seconds_left, size_bytes,

@@ -53,7 +53,7 @@ def estimate_pruning(
         derivatives.add(camera)
     error = derivatives.opacity * splats.opacities.detach().double().square()
     return PruningError(
-        error.cpu().numpy(), (derivatives.views > 0).cpu().numpy(), sum(3 * one.W * one.H for one in cameras)
+        error.cpu().numpy(), (derivatives.views > 0).cpu().numpy(), sum(3 * camera.W * camera.H for camera in cameras)
     )
 
 
@@ -78,7 +78,7 @@ def estimate_sensitivity(
         derivatives.add(camera)
         if progress is not None:
             progress("measuring sensitivity", (number + 1) / len(cameras))
-    pixels = max(1, sum(one.W * one.H for one in cameras))
+    pixels = max(1, sum(camera.W * camera.H for camera in cameras))
 
     def mean(sums: Tensor) -> Any:
         return np.minimum((sums.double() / pixels).cpu().numpy(), np.finfo(np.float32).max)
@@ -141,15 +141,19 @@ class _Derivatives:
             basis = self._basis_functions(camera)
             colours = (torch.einsum("nk,nkc->nc", basis, splats.colours) + 0.5).clamp(min=0.0)
         alphas = splats.opacities.clamp(max=_LARGEST_ALPHA)
-        inputs = [one.detach().clone().requires_grad_() for one in (splats.means, self._covariances, alphas, colours)]
+        inputs = [
+            tensor.detach().clone().requires_grad_() for tensor in (splats.means, self._covariances, alphas, colours)
+        ]
         rendered = self._rasteriser.render_covariances(
             inputs[0], inputs[1], inputs[2], inputs[3], camera, self._background
         )
         seen = torch.zeros(len(colours), dtype=torch.bool, device=colours.device)
         for draw in range(_DRAWS):
             signs = torch.randint(0, 2, rendered.shape, generator=self._generator, device=rendered.device)
-            found = torch.autograd.grad(rendered, inputs, 2.0 * signs - 1.0, retain_graph=draw + 1 < _DRAWS)
-            means, covariances, opacities, slopes = (torch.nan_to_num(one, 0.0, 0.0, 0.0) for one in found)
+            gradients = torch.autograd.grad(rendered, inputs, 2.0 * signs - 1.0, retain_graph=draw + 1 < _DRAWS)
+            means, covariances, opacities, slopes = (
+                torch.nan_to_num(gradient, 0.0, 0.0, 0.0) for gradient in gradients
+            )
             seen |= self._add(means, covariances, opacities, slopes, basis)
         self.views += seen
 
@@ -177,7 +181,7 @@ class _Derivatives:
         x, y, z = (offsets / offsets.norm(dim=1, keepdim=True).clamp(min=1e-12)).unbind(dim=1)
         values: list[Any] = [None] * (self._degree + 1) ** 2
         sh_basis(self._degree, x, y, z, values)
-        return torch.stack([one * torch.ones_like(x) for one in values], dim=1)
+        return torch.stack([value * torch.ones_like(x) for value in values], dim=1)
 
 
 def _covariances(quats: Tensor, scales: Tensor) -> Tensor:

@@ -138,5 +138,5 @@ class _DeviceScreenGradients(ScreenGradients):
     @property
     def mean(self) -> F64:
         """The mean, 0 for splats that no render shows."""
-        found: F64 = (self._sums[0] / self._sums[1].clamp(min=1.0)).double().cpu().numpy()
-        return found
+        mean: F64 = (self._sums[0] / self._sums[1].clamp(min=1.0)).double().cpu().numpy()
+        return mean

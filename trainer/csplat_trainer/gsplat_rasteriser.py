@@ -44,8 +44,8 @@ def gsplat_rasterization() -> Callable[..., Any]:
         raise InputError(f"device cuda: gsplat cannot be compiled: {_last_line(error)}") from None
     if _C is None:
         raise InputError("device cuda: gsplat finds no CUDA compiler: install nvcc of the CUDA version of torch")
-    found: Callable[..., Any] = rasterization
-    return found
+    function: Callable[..., Any] = rasterization
+    return function
 
 
 def _last_line(error: Exception) -> str:
@@ -93,8 +93,8 @@ class SplatTensors:
     def gradients(self) -> dict[str, Tensor]:
         """Return the gradients by means, quats, log scales, opacities, sh0 and shN, 0 where there is none."""
         means, quats, scales, opacities, colours = (
-            torch.zeros_like(one) if one.grad is None else one.grad
-            for one in (self.means, self.quats, self.scales, self.opacities, self.colours)
+            torch.zeros_like(tensor) if tensor.grad is None else tensor.grad
+            for tensor in (self.means, self.quats, self.scales, self.opacities, self.colours)
         )
         return {
             "means": means,
@@ -200,8 +200,8 @@ class DeviceParameters(Parameters):
     @property
     def alphas(self) -> F32:
         """Opacities, [N], in an array of NumPy."""
-        found: F32 = self.device_alphas.cpu().numpy()
-        return found
+        alphas: F32 = self.device_alphas.cpu().numpy()
+        return alphas
 
     @property
     def device_alphas(self) -> Tensor:
@@ -223,8 +223,8 @@ class DeviceParameters(Parameters):
 
     def read(self, name: str, rows: NDArray[np.int64]) -> F32:
         """Return a group's values of some splats, in an array of NumPy."""
-        found: F32 = self.tensors[name][self._upload(rows)].cpu().numpy()
-        return found
+        values: F32 = self.tensors[name][self._upload(rows)].cpu().numpy()
+        return values
 
     def write(self, name: str, rows: NDArray[np.int64], values: F32) -> None:
         """Replace a group's values of some splats."""

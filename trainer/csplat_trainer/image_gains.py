@@ -37,10 +37,10 @@ class ImageGains:
     def __init__(self, count: int, stored: Sequence[Sequence[float]] = ()) -> None:
         state = np.zeros((count, *_STATE))
         if len(stored):
-            found = np.array(stored, np.float64)
-            if found.size != state.size or not np.isfinite(found).all():
-                raise InputError(f"the checkpoint has exposures of {len(found)} images, expected {count}")
-            state = found.reshape(state.shape)
+            restored = np.array(stored, np.float64)
+            if restored.size != state.size or not np.isfinite(restored).all():
+                raise InputError(f"the checkpoint has exposures of {len(restored)} images, expected {count}")
+            state = restored.reshape(state.shape)
         self.values, self._first, self._second, self._steps = (state[:, part] for part in range(_STATE[0]))
 
     def as_json(self) -> list[list[float]]:

@@ -139,7 +139,7 @@ def _in_box(
     images: Sequence[PosedImage], scene: SceneExtent, count: int, rng: Generator, *, masked: bool
 ) -> tuple[F64, F64]:
     """Draw points that cameras see, inside the hull if `masked`, with the mean of their pixels."""
-    found: list[F64] = []
+    kept: list[F64] = []
     colours: list[F64] = []
     total = 0
     for _ in range(_BATCHES):
@@ -149,14 +149,14 @@ def _in_box(
         if masked:
             keep &= hits >= (1.0 - _MISSES) * seen - 1e-9
             keep &= 2 * seen >= len(images)
-        found.append(points[keep])
+        kept.append(points[keep])
         colours.append(colour[keep])
         total += int(keep.sum())
         if total >= count:
             break
     if total == 0:  # inconsistent masks, or cameras without a common subject
         return scene.focus + scene.half * rng.uniform(-1.0, 1.0, (count, 3)), np.full((count, 3), 0.5)
-    means, colour = np.concatenate(found), np.concatenate(colours)
+    means, colour = np.concatenate(kept), np.concatenate(colours)
     chosen = np.concatenate([np.arange(total), rng.integers(0, total, max(0, count - total))])[:count]
     return means[chosen], colour[chosen]
 

@@ -268,10 +268,14 @@ class PerceptualLoss:
 
     def __init__(self, weights: Lpips) -> None:
         torch = _import_torch()
-        self._kernels = [torch.from_numpy(np.ascontiguousarray(one.transpose(3, 2, 0, 1))) for one in weights.kernels]
-        self._biases = [torch.from_numpy(np.array(one)) for one in weights.biases]
-        self._heads = [torch.from_numpy(np.array(one)).reshape(1, -1, 1, 1) for one in weights.heads]
-        self._shift, self._scale = (torch.from_numpy(one.copy()).reshape(1, 3, 1, 1) for one in (SHIFT, SCALE))
+        self._kernels = [
+            torch.from_numpy(np.ascontiguousarray(kernel.transpose(3, 2, 0, 1))) for kernel in weights.kernels
+        ]
+        self._biases = [torch.from_numpy(np.array(bias)) for bias in weights.biases]
+        self._heads = [torch.from_numpy(np.array(head)).reshape(1, -1, 1, 1) for head in weights.heads]
+        self._shift, self._scale = (
+            torch.from_numpy(constants.copy()).reshape(1, 3, 1, 1) for constants in (SHIFT, SCALE)
+        )
 
     def distance(self, first: F32, second: F32) -> float:
         """Return LPIPS of two images, [H, W, 3] in 0..1."""
@@ -293,8 +297,8 @@ class PerceptualLoss:
 
     def _distance(self, x: Any, y: Any) -> Any:
         total: Any = 0.0
-        for one, other, head in zip(self._features(x), self._features(y), self._heads, strict=True):
-            total = total + (head * (_unit(one) - _unit(other)).square()).sum(dim=1).mean()
+        for first, second, head in zip(self._features(x), self._features(y), self._heads, strict=True):
+            total = total + (head * (_unit(first) - _unit(second)).square()).sum(dim=1).mean()
         return total
 
     def _features(self, image: Any) -> list[Any]:

@@ -185,11 +185,10 @@ def image_scorer(
     """
     colour = np.asarray(background, np.float32)
     cameras = [image.camera for image in images]
-    references = [partial(_reference_image, one, colour) for one in images]
-    masked = any(one.masked is not None for one in images)
-    return Scorer(
-        cameras, references, colour, mode, threads, origin, [_pixel_count(one) for one in images] if masked else None
-    )
+    references = [partial(_reference_image, image, colour) for image in images]
+    masked = any(image.masked is not None for image in images)
+    pixel_counts = [_pixel_count(image) for image in images] if masked else None
+    return Scorer(cameras, references, colour, mode, threads, origin, pixel_counts)
 
 
 def evaluate(
@@ -210,8 +209,8 @@ def evaluate(
         The JSON of `csplat_render.metrics.Scores` over all images.
     """
     scorer = image_scorer(images, background)
-    each = [scorer.score(number, render(camera), lpips=lpips) for number, camera in enumerate(scorer.cameras)]
-    return Scores.of(each).as_json()
+    scores = [scorer.score(number, render(camera), lpips=lpips) for number, camera in enumerate(scorer.cameras)]
+    return Scores.of(scores).as_json()
 
 
 def _reference_image(image: PosedImage, background: F32) -> ReferenceImage:

@@ -52,11 +52,11 @@ class MeasuredViews:
     ) -> MeasuredViews:
         """Measure the pruning errors of a scene; other arguments as for `measure_pruning_error`."""
         renders = list[F32]()
-        found = measure_pruning_error(
+        pruning_error = measure_pruning_error(
             model, cameras, background=background, threads=threads, progress=progress,
             on_render=renders.append if keep_renders else None,
         )  # fmt: skip
-        return cls(cameras, found, renders)
+        return cls(cameras, pruning_error, renders)
 
     def __add__(self, other: MeasuredViews) -> MeasuredViews:
         return MeasuredViews(

@@ -145,7 +145,7 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
     if any(arrays[name].shape for name in ("scene", "source", "view_count", "missed_share")):
         arrays.refuse("it has lists, expected single values")
     try:
-        found = StoredSensitivity(
+        stored = StoredSensitivity(
             {name: arrays[name] for name in GROUPS},
             arrays["views"],
             str(arrays["source"]),
@@ -156,20 +156,20 @@ def read_sensitivity(path: str | Path, model: SplatModel) -> StoredSensitivity:
         )
     except (ValueError, TypeError, OverflowError) as error:
         arrays.refuse(error)
-    matrices: list[NDArray[Any]] = [found.shape_matrices, *([] if found.matrices is None else [found.matrices])]
-    kinds = {array.dtype.kind for array in (*found.groups.values(), *matrices)}
-    if (kinds, found.views.dtype.kind, found.views.ndim) != ({"f"}, "i", 1):
+    matrices: list[NDArray[Any]] = [stored.shape_matrices, *([] if stored.matrices is None else [stored.matrices])]
+    kinds = {array.dtype.kind for array in (*stored.groups.values(), *matrices)}
+    if (kinds, stored.views.dtype.kind, stored.views.ndim) != ({"f"}, "i", 1):
         arrays.refuse("its arrays have unexpected types or shapes")
-    if any(array.ndim != 2 or len(array) != len(found.views) for array in matrices):
+    if any(array.ndim != 2 or len(array) != len(stored.views) for array in matrices):
         arrays.refuse("its matrices and views are of different splats")
     shape = (len(model),)
-    if any(array.shape != shape for array in (*found.groups.values(), found.views)):
-        raise InputError(f"{path} is of {len(found.views)} splats, but the scene has {len(model)}")
+    if any(array.shape != shape for array in (*stored.groups.values(), stored.views)):
+        raise InputError(f"{path} is of {len(stored.views)} splats, but the scene has {len(model)}")
     if str(arrays["scene"]) != scene_digest(model):
         raise InputError(f"{path} belongs to another scene: its splats differ")
-    if not all(np.isfinite(array).all() for array in (*found.groups.values(), *matrices)):
+    if not all(np.isfinite(array).all() for array in (*stored.groups.values(), *matrices)):
         arrays.refuse("it holds values that are not finite")
-    return found
+    return stored
 
 
 def _pack(metric: NDArray[np.float32]) -> NDArray[np.float16]:

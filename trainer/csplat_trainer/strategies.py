@@ -267,7 +267,7 @@ def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
     )
     deviations = np.exp(np.minimum(scales.astype(np.float64), _MAX_LOG_SCALE))
     drawn = rng.standard_normal((2, len(quats), 3)) * deviations
-    first, second = (np.einsum("nij,nj->ni", rotation, one).astype(np.float32) for one in drawn)
+    first, second = (np.einsum("nij,nj->ni", rotation, offsets).astype(np.float32) for offsets in drawn)
     return first, second
 
 

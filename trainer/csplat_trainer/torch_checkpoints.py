@@ -74,9 +74,9 @@ _NAMES = {
 @contextmanager
 def _open(path: Path, sh_degree: int | None = None) -> Iterator[Scene]:
     paths, findings = _rank_files(path)
-    parts = [_read(one, sh_degree) for one in paths]
-    models = [one.model for one in parts]
-    degrees = sorted({one.sh_degree for one in models})
+    parts = [_read(file, sh_degree) for file in paths]
+    models = [part.model for part in parts]
+    degrees = sorted({model.sh_degree for model in models})
     if len(degrees) > 1:
         raise InputError(f"{path.name}: the files of its GPUs have SH degrees {degrees[0]} and {degrees[1]}")
     model, counts = join_blocks(models[0], models), RowStatistics()
@@ -117,22 +117,22 @@ def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
     named = _RANK.fullmatch(path.name)
     if named is None:
         return [path], []
-    found = {}
-    for one in path.parent.iterdir():
-        match = _RANK.fullmatch(one.name)
+    by_rank = {}
+    for file in path.parent.iterdir():
+        match = _RANK.fullmatch(file.name)
         if match and (match["run"], match["ending"]) == (named["run"], named["ending"]):
-            found[int(match["rank"])] = one
-    absent = sorted(set(range(max(found))) - set(found))
+            by_rank[int(match["rank"])] = file
+    absent = sorted(set(range(max(by_rank))) - set(by_rank))
     if absent:
         missing = ", ".join(f"{named['run']}{rank}{named['ending']}" for rank in absent[:_NAMED])
         raise InputError(
             f"{path.name} has the splats of one of several GPUs, expected the others' files next to it: no {missing}"
         )
-    paths = [found[rank] for rank in sorted(found)]
+    paths = [by_rank[rank] for rank in sorted(by_rank)]
     if len(paths) == 1:
         text = "the splats of GPU 0; complete if no other GPU was used"
         return paths, [Finding("ranks", 1, text, "note", usual=True)]
-    text = f"the splats of {len(paths)} GPUs, from {', '.join(one.name for one in paths)}"
+    text = f"the splats of {len(paths)} GPUs, from {', '.join(file.name for file in paths)}"
     return paths, [Finding("ranks", len(paths), text, "note")]
 
 
@@ -223,9 +223,9 @@ def _model_of(content: object, size: int, sh_degree: int | None) -> _CheckpointP
         names = ", ".join(map(str, list(content)[:_NAMED]))
         raise InputError(f"it holds {names or 'nothing'}: neither splats of gsplat nor a pipeline of splatfacto")
     (prefix,) = models
-    found = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
-    part = _checked_part({_NAMES.get(name, name): value for name, value in found.items()}, size, sh_degree)
-    if part.model.sh_degree or "features_rest" not in found:
+    tensors = {name.removeprefix(prefix): value for name, value in named.items() if name.startswith(prefix)}
+    part = _checked_part({_NAMES.get(name, name): value for name, value in tensors.items()}, size, sh_degree)
+    if part.model.sh_degree or "features_rest" not in tensors:
         return part
     # Without SH splatfacto trains logits of colours.
     colours = 1.0 / (1.0 + np.exp(-part.model.sh0.astype(np.float64)))
@@ -246,12 +246,16 @@ def _models_in(named: Mapping[str, Any]) -> dict[str, Any]:
     It is `_model.gauss_params.` in splatfacto, `_model.` before nerfstudio 1.1, `gaussian_model.gaussians.` in Gaussian
     Splatting Lightning, and empty in a bare state_dict.
     """
-    found: dict[str, dict[str, Any]] = {}
+    models: dict[str, dict[str, Any]] = {}
     for name, value in named.items():
         prefix, dot, last = name.rpartition(".")
         if last in _NAMES:
-            found.setdefault(prefix + dot, {})[_NAMES[last]] = value
-    return {prefix: one["means"] for prefix, one in found.items() if "means" in one and {"scales", "quats"} & set(one)}
+            models.setdefault(prefix + dot, {})[_NAMES[last]] = value
+    return {
+        prefix: tensors["means"]
+        for prefix, tensors in models.items()
+        if "means" in tensors and {"scales", "quats"} & set(tensors)
+    }
 
 
 def _count(means: Any) -> str:

@@ -113,9 +113,9 @@ class DeviceImages:
         return None if mask is None else self._stored(mask, mask)
 
     def _stored(self, key: Any, array: NDArray[Any]) -> Tensor:
-        found = self._kept.get(id(key))
-        if found is not None:
-            return found[1]
+        kept = self._kept.get(id(key))
+        if kept is not None:
+            return kept[1]
         tensor = torch.from_numpy(np.require(array, requirements=["C", "W"])).to(self._device)
         if array.nbytes <= self._left:
             self._left -= array.nbytes

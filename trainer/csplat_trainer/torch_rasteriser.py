@@ -80,8 +80,8 @@ class _Render(Function):
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         gradients = ctx.rasteriser.backward(np.ascontiguousarray(slopes[0].numpy()))
-        found = [
+        tensors = [
             torch.from_numpy(getattr(gradients, name).copy()).reshape(shape)
             for name, shape in zip(_GROUPS, ctx.shapes, strict=True)
         ]
-        return (*found, None, None, None, None)
+        return (*tensors, None, None, None, None)

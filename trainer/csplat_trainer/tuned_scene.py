@@ -293,11 +293,11 @@ def _class_steps(fixed: FixedQuantisation) -> list[_ClassSteps]:
     begins = [0] if fixed.encode_plan.classes is None else [
         number for number, tile in enumerate(tiles) if not number or tile.factors != tiles[number - 1].factors
     ]  # fmt: skip
-    found = []
+    steps = []
     for begin, end in pairwise([*begins, len(tiles)]):
         factors = tiles[begin].factors
         rows = slice(None) if len(begins) == 1 else slice(tiles[begin].rows[0], tiles[end - 1].rows[-1] + 1)
-        found.append(
+        steps.append(
             _ClassSteps(
                 rows,
                 plan.scale_step * 2.0**factors.scales,
@@ -306,7 +306,7 @@ def _class_steps(fixed: FixedQuantisation) -> list[_ClassSteps]:
                 plan.sh0_step * 2.0**factors.sh0,
             )
         )
-    return found
+    return steps
 
 
 def _table_name(name: str, number: int) -> str:
@@ -324,8 +324,8 @@ def count_integers(parts: Iterable[NDArray[Any]]) -> I64:
     for columns in parts:
         width = columns.shape[1]
         places = np.clip(columns, -MAX_INTEGER, MAX_INTEGER) + (MAX_INTEGER + size * np.arange(width))
-        found = np.bincount(places.reshape(-1), minlength=width * size).reshape(width, size)
-        counts = counts + found if len(counts) else found
+        column_counts = np.bincount(places.reshape(-1), minlength=width * size).reshape(width, size)
+        counts = counts + column_counts if len(counts) else column_counts
     return counts
 
 

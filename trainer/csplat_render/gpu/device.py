@@ -222,12 +222,14 @@ class Device:
             raise InputError(f"{self.adapter} failed: {last or type(error).__name__}") from None
 
     def _pipeline(self, name: str, entry: str) -> Any:
-        found = self._pipelines.get((name, entry))
-        if found is None:
+        pipeline = self._pipelines.get((name, entry))
+        if pipeline is None:
             module = self._device.create_shader_module(label=name, code=shader_source(name))
             compute = {"module": module, "entry_point": entry}
-            found = self._pipelines[name, entry] = self._device.create_compute_pipeline(layout="auto", compute=compute)
-        return found
+            pipeline = self._pipelines[name, entry] = self._device.create_compute_pipeline(
+                layout="auto", compute=compute
+            )
+        return pipeline
 
 
 def _encode(compute: Any, calls: Sequence[Call]) -> None:
@@ -289,12 +291,12 @@ def open_device(*, software: bool = False, binding_max: int | None = None) -> De
         raise missing_package(error, extra="gpu") from None
     except (ImportError, OSError) as error:
         raise InputError(f"wgpu cannot be loaded: {error}") from None
-    adapters = [found for found in wgpu.gpu.enumerate_adapters_sync() if found.info["backend_type"] != "OpenGL"]
-    adapters.sort(key=lambda found: _KINDS.index(_describe(found).kind))
-    usable = [found for found in adapters if _describe(found).is_hardware is not software]
+    adapters = [adapter for adapter in wgpu.gpu.enumerate_adapters_sync() if adapter.info["backend_type"] != "OpenGL"]
+    adapters.sort(key=lambda adapter: _KINDS.index(_describe(adapter).kind))
+    usable = [adapter for adapter in adapters if _describe(adapter).is_hardware is not software]
     if not usable:
-        found = ", ".join(str(_describe(adapter)) for adapter in adapters) or "no adapter"
-        raise InputError(f"no {'software adapter' if software else 'GPU'} was found, only {found}")
+        names = ", ".join(str(_describe(adapter)) for adapter in adapters) or "no adapter"
+        raise InputError(f"no {'software adapter' if software else 'GPU'} was found, only {names}")
     return Device(wgpu, usable[0], binding_max)
 
 

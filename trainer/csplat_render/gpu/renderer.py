@@ -324,15 +324,15 @@ class GpuRenderer:
             while True:
                 self._run(stages, times)
                 counters = device.read(self._counters, _COUNTERS.itemsize).view(_COUNTERS)[0]
-                found = int(counters["visible"])
-                if found > self._records:
-                    raise InputError(f"{device.adapter} failed: {found} splats in a slice of {self._records}")
+                slice_count = int(counters["visible"])
+                if slice_count > self._records:
+                    raise InputError(f"{device.adapter} failed: {slice_count} splats in a slice of {self._records}")
                 pairs, steps = pairs + int(counters["pairs"]), steps + 1
-                if int(counters["first_block"]) * BLOCK >= found:
+                if int(counters["first_block"]) * BLOCK >= slice_count:
                     break
                 self._pairs_wanted = min(2 * self._pairs, self._pairs_max)  # the next image gets larger buffers
                 stages = self._step
-            visible += found
+            visible += slice_count
         return visible, pairs, steps
 
     def time(self, camera: Camera) -> dict[str, float]:
@@ -398,17 +398,17 @@ class GpuRenderer:
         self.device.run(self._count_depths, clear=[self._depths])
         counts = self.device.read(self._depths, 4 << _DEPTH_BITS).view(np.uint32)
         for place in np.flatnonzero(counts):
-            key, found = keys[0] + (int(place) << shift), int(counts[place])
-            if count + found <= self._records:
-                count += found
+            key, key_count = keys[0] + (int(place) << shift), int(counts[place])
+            if count + key_count <= self._records:
+                count += key_count
             elif shift:
                 last = min(keys[1], key + (1 << shift) - 1)
                 count = self._find_starts(view, starts, count, (key, last), max(0, shift - _DEPTH_BITS))
-            elif found > self._records:
-                raise LimitError("splats of equal depth on the GPU", found, self._records)
+            elif key_count > self._records:
+                raise LimitError("splats of equal depth on the GPU", key_count, self._records)
             else:
                 starts.append(key)
-                count = found
+                count = key_count
         return count
 
     def _page(self, page: Page) -> tuple[Any, ...]:

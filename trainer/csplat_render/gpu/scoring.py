@@ -38,14 +38,14 @@ def compare_scenes(
     colour = checked_background(background, np.float32)
     first, second = GpuRenderer(source), GpuRenderer(other)
     shift = np.subtract(other.origin, source.origin)
-    each = []
+    scores = []
     for number, camera in enumerate(cameras):
         if progress is not None:
             progress("comparing", number / len(cameras))
-        each.append(_compare_view(first, second, camera, relative_to(shift, camera), colour))
+        scores.append(_compare_view(first, second, camera, relative_to(shift, camera), colour))
     if progress is not None:
         progress("comparing", 1.0)
-    return Scores.of(each, other.ignored)
+    return Scores.of(scores, other.ignored)
 
 
 def _compare_view(
@@ -54,17 +54,17 @@ def _compare_view(
     device, sums = first.device, np.zeros(4)
     second.bands(moved)  # makes room; the bands are the same
     for rows in first.bands(camera):
-        for one, view in ((first, camera), (second, moved)):
-            one.draw(view, rows)
+        for renderer, view in ((first, camera), (second, moved)):
+            renderer.draw(view, rows)
         pixels = len(rows) * camera.W
         runs = -(-pixels // _RUN)
         backdrop = np.zeros(8, np.float32)
         backdrop[:3] = background
         backdrop.view(np.uint32)[4] = pixels
-        found = device.buffer(16 * runs)
+        differences = device.buffer(16 * runs)
         uniform = device.uploaded(backdrop, uniform=True)
-        device.run([device.bind("difference", "difference", runs, uniform, first.pixels, second.pixels, found)])
-        sums += device.read(found, 16 * runs).view(np.float32).reshape(runs, 4).sum(axis=0, dtype=np.float64)
+        device.run([device.bind("difference", "difference", runs, uniform, first.pixels, second.pixels, differences)])
+        sums += device.read(differences, 16 * runs).view(np.float32).reshape(runs, 4).sum(axis=0, dtype=np.float64)
     count = camera.W * camera.H
     mse, covered = sums[0] / (3 * count), sums[2]
     return ViewScore(

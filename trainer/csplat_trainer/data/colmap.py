@@ -58,7 +58,9 @@ def find_model(folder: Path) -> tuple[Path, list[str]] | None:
     """
     for names in _MODEL_FOLDERS:
         inside = [folder / name for name in names if (folder / name).is_dir()]
-        models = [path for one in inside for path in (*sorted(one.iterdir(), key=_number), one) if _is_model(path)]
+        models = [
+            path for parent in inside for path in (*sorted(parent.iterdir(), key=_number), parent) if _is_model(path)
+        ]
         if models:
             return _largest(models, folder)
     return (folder, []) if _is_model(folder) else None
@@ -83,17 +85,21 @@ def read_colmap(
     cameras_path, images_path = _file(model, "cameras"), _file(model, "images")
     assert cameras_path is not None
     assert images_path is not None
-    same, other = images_path.with_suffix(".txt"), cameras_path.with_suffix(".txt")
-    for path in (cameras_path, images_path, same, other):
+    images_text, cameras_text = images_path.with_suffix(".txt"), cameras_path.with_suffix(".txt")
+    for path in (cameras_path, images_path, images_text, cameras_text):
         place.checked(path)
     registered, report = read_images(images_path)
     used = {image.camera for image in registered}
     cameras = read_cameras(cameras_path, used, report)
-    if same != images_path and same.is_file() and (there := count_images(same)) != len(registered):
-        what = f"{same.name} has {counted(there, 'image')}, {images_path.name} {len(registered)}"
+    if images_text != images_path and images_text.is_file() and (there := count_images(images_text)) != len(registered):
+        what = f"{images_text.name} has {counted(there, 'image')}, {images_path.name} {len(registered)}"
         report.append(f"{what}: {images_path.name} is read")
-    if other != cameras_path and other.is_file() and not _agree(cameras, read_cameras(other, used)):
-        report.append(f"{other.name} has other cameras than {cameras_path.name}, which is read")
+    if (
+        cameras_text != cameras_path
+        and cameras_text.is_file()
+        and not _agree(cameras, read_cameras(cameras_text, used))
+    ):
+        report.append(f"{cameras_text.name} has other cameras than {cameras_path.name}, which is read")
     if not registered:
         raise InputError(f"{images_path} has no images")
     for image in registered:
@@ -101,21 +107,22 @@ def read_colmap(
             raise InputError(f"{images_path}: {image.name} has camera {image.camera}, which {cameras_path} lacks")
     registered = _each_once(registered, images_path, report)
     names = [image.name for image in registered]
-    found = find_images(place, names, images_path.name, _folders(place, model, images), size)
-    report.append("images from " + ("the folder itself" if found.folder == folder else _relative(found.folder, folder)))
-    report += found.notes
-    report += describe_missing([name for name in names if name not in found.files], len(names), images_path.name)
-    masks = _masks(place, found.files, report)
+    image_files = find_images(place, names, images_path.name, _folders(place, model, images), size)
+    shown = "the folder itself" if image_files.folder == folder else _relative(image_files.folder, folder)
+    report.append(f"images from {shown}")
+    report += image_files.notes
+    report += describe_missing([name for name in names if name not in image_files.files], len(names), images_path.name)
+    masks = _masks(place, image_files.files, report)
     shots = [
         Shot(
-            _shown_name(image.name, found),
-            found.files[image.name],
+            _shown_name(image.name, image_files),
+            image_files.files[image.name],
             cameras[image.camera],
             image.viewmat,
             masks.get(image.name),
         )
         for image in registered
-        if image.name in found.files
+        if image.name in image_files.files
     ]
     points, colours = _points(place, model, report)
     lists, files = read_split_lists(place, (model, model.parent, folder))
@@ -139,8 +146,8 @@ def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> 
     """
     first: dict[str, ColmapImage] = {}
     for image in registered:
-        other = first.setdefault(PurePosixPath(image.name).as_posix(), image)
-        if other.camera != image.camera or (other.viewmat != image.viewmat).any():
+        earlier = first.setdefault(PurePosixPath(image.name).as_posix(), image)
+        if earlier.camera != image.camera or (earlier.viewmat != image.viewmat).any():
             raise InputError(f"{path}: {image.name} occurs twice, with different poses or cameras; expected each once")
     if len(first) < len(registered):
         report.append(f"{path.name}: {counted(len(registered) - len(first), 'image')} twice: read once")
@@ -345,7 +352,7 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
     Raises:
         InputError: the file is damaged.
     """
-    found: list[tuple[str, int, Sequence[float], str]] = []  # name, camera, pose, place in the file
+    entries: list[tuple[str, int, Sequence[float], str]] = []  # name, camera, pose, place in the file
     notes: list[str] = []
     if path.suffix == ".txt":
         lines, notes = _image_lines(path)
@@ -354,7 +361,7 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
             words = line.split(None, 9)
             if len(words) < 10:
                 raise InputError(f"{where}: expected id, rotation, translation, camera and name")
-            found.append((words[9].rstrip(), _integer(words[8], where), _numbers(words[1:8], where), where))
+            entries.append((words[9].rstrip(), _integer(words[8], where), _numbers(words[1:8], where), where))
     else:
         data = _BinaryFile(path)
         for _ in range(data.count(73)):
@@ -362,17 +369,19 @@ def read_images(path: Path) -> tuple[list[ColmapImage], list[str]]:
             name = data.string()
             (matches,) = data.unpack("<Q")
             data.skip(24 * matches)
-            found.append((name, camera, pose, f"{path}, image {number}"))
+            entries.append((name, camera, pose, f"{path}, image {number}"))
         data.end()
-    finite = [one for one in found if np.isfinite(one[2]).all()]
-    lost = [name for name, _, pose, _ in found if not np.isfinite(pose).all()]
+    finite = [entry for entry in entries if np.isfinite(entry[2]).all()]
+    lost = [name for name, _, pose, _ in entries if not np.isfinite(pose).all()]
     if lost:
         notes.append(f"{path.name}: {counted(len(lost), 'image')} without a finite pose, dropped: {abbreviate(lost)}")
     lengths = [(float(np.linalg.norm(pose[:4])), name) for name, _, pose, _ in finite]
-    other = [f"{name} has length {length:.4g}" for length, name in lengths if abs(length - 1.0) > _UNIT_TOLERANCE]
-    if other:
-        what = f"{counted(len(other), 'rotation')} QW QX QY QZ not of unit length, normalised"
-        notes.append(f"{path.name}: {what}: {abbreviate(other)}")
+    unnormalised = [
+        f"{name} has length {length:.4g}" for length, name in lengths if abs(length - 1.0) > _UNIT_TOLERANCE
+    ]
+    if unnormalised:
+        what = f"{counted(len(unnormalised), 'rotation')} QW QX QY QZ not of unit length, normalised"
+        notes.append(f"{path.name}: {what}: {abbreviate(unnormalised)}")
     return [ColmapImage(name, camera, _viewmat(pose, where)) for name, camera, pose, where in finite], notes
 
 
@@ -484,10 +493,10 @@ def _image_lines(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     def pair(number: int) -> tuple[str, str]:
         return lines[number], f"{path}, line {number + 1}"
 
-    if all(_is_pose(lines[one]) for one in numbers[::2] if lines[one].strip()) and all(
-        _is_keypoints(lines[one].split()) for one in numbers[1::2]
+    if all(_is_pose(lines[number]) for number in numbers[::2] if lines[number].strip()) and all(
+        _is_keypoints(lines[number].split()) for number in numbers[1::2]
     ):
-        return [pair(one) for one in numbers[::2] if lines[one].strip()], []
+        return [pair(number) for number in numbers[::2] if lines[number].strip()], []
     poses: list[tuple[str, str]] = []
     single = 0
     expected = False  # a line of keypoints may follow

@@ -193,10 +193,10 @@ def read_split_lists(place: SetFolder, folders: Sequence[Path]) -> tuple[dict[st
 def _read_scannet_lists(path: Path) -> dict[str, list[str]]:
     document = read_json(path, any_bytes=True)
     lists = {role: document.get(role) for role in ROLES} if isinstance(document, dict) else {}
-    found = {role: names for role, names in lists.items() if isinstance(names, list)}
-    if not found or not all(isinstance(name, str) for names in found.values() for name in names):
+    name_lists = {role: names for role, names in lists.items() if isinstance(names, list)}
+    if not name_lists or not all(isinstance(name, str) for names in name_lists.values() for name in names):
         raise InputError(f"{path} has no lists of names, expected train, val or test")
-    return found
+    return name_lists
 
 
 def _list_files(folder: Path, role: str) -> list[Path]:
@@ -266,9 +266,9 @@ def split_listed(
             continue
         cells = [name for line in lists[role] for name in _names_in(line, by_name)]
         names = list({PurePosixPath(name).as_posix(): name for name in cells}.values())
-        found, notes = match_names(names, by_name, where)
+        matched, notes = match_names(names, by_name, where)
         report += notes
-        missing = [name for name in names if name not in found]
+        missing = [name for name in names if name not in matched]
         unread = next((name for name in missing if name != printable(name)), None)
         if unread is not None:
             raise InputError(
@@ -276,15 +276,15 @@ def split_listed(
                 "UTF-8"
             )
         line = f"{where} names {counted(len(names), f'{word} image')}"
-        report.append(f"{line}, found {len(found)}; missing: {abbreviate(missing)}" if missing else line)
-        heeded += [role] if found else []
-        twice = [name for name in found.values() if name in roles]
+        report.append(f"{line}, found {len(matched)}; missing: {abbreviate(missing)}" if missing else line)
+        heeded += [role] if matched else []
+        twice = [name for name in matched.values() if name in roles]
         if twice:
             report.append(
                 f"{where}: {counted(len(twice), 'image')} on several lists, not used as {word} images:"
                 f" {abbreviate(twice)}"
             )
-        roles = {**dict.fromkeys(found.values(), role), **roles}
+        roles = {**dict.fromkeys(matched.values(), role), **roles}
     unlisted = [shot.name for shot in shots if shot.name not in roles]
     if "train" not in heeded:
         roles |= dict.fromkeys(unlisted, "train")
@@ -446,7 +446,7 @@ def read_point_cloud(path: Path) -> tuple[F64, F32]:
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from error
     if content is None:
-        raise InputError(f"{path}: {next(one.text for one in findings if not one.repairable)}")
+        raise InputError(f"{path}: {next(finding.text for finding in findings if not finding.repairable)}")
     rows = content[0]
     names = rows.dtype.names or ()
     if not {"x", "y", "z"} <= set(names):

@@ -118,7 +118,7 @@ def describe_lenses(shots: Sequence[Shot]) -> list[str]:
         notes.append(f"lens distortion is undone, the images are enlarged by up to {100 * (zoom - 1):.1f} %")
     wide = [straight for lens, straight in bent if lens.projection == "equidistant"]
     if wide:
-        angle = min(2.0 * math.degrees(math.atan(0.5 * one.width / one.fx)) for one in wide)
+        angle = min(2.0 * math.degrees(math.atan(0.5 * straight.width / straight.fx)) for straight in wide)
         notes.append(f"fisheye images are cropped to the view of a pinhole: {angle:.0f} degrees across")
     off = [lens for lens in lenses if not _is_in_the_middle(lens)]
     if off:
@@ -196,15 +196,15 @@ def _check_size(path: Path, size: tuple[int, int], expected: tuple[float, float]
 def _aspect_error(
     path: Path, size: tuple[int, int], expected: tuple[float, float], source: str, remedy: str
 ) -> InputError:
-    found, shape = f"{size[0]}×{size[1]}", f"{expected[0]:g}×{expected[1]:g}"
-    return InputError(f"{path} has {found} pixels, expected the aspect ratio of {shape}, {source}: {remedy}")
+    actual, shape = f"{size[0]}×{size[1]}", f"{expected[0]:g}×{expected[1]:g}"
+    return InputError(f"{path} has {actual} pixels, expected the aspect ratio of {shape}, {source}: {remedy}")
 
 
 def _aspect_mismatch(size: tuple[int, int], expected: tuple[float, float]) -> float:
     """Return the relative difference of an image's scales along both sides; 0 if rounding explains it."""
     (low_x, high_x), (low_y, high_y) = (
-        ((side - _ROUNDING) / (other + _ROUNDING), (side + _ROUNDING) / max(other - _ROUNDING, 0.5))
-        for side, other in zip(size, expected, strict=True)
+        ((side - _ROUNDING) / (expected_side + _ROUNDING), (side + _ROUNDING) / max(expected_side - _ROUNDING, 0.5))
+        for side, expected_side in zip(size, expected, strict=True)
     )
     if max(low_x, low_y) <= min(high_x, high_y):
         return 0.0

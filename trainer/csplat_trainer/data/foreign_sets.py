@@ -109,16 +109,16 @@ def describe_foreign(path: Path) -> str:
     Args:
         path: a folder that is not a data set, or a file.
     """
-    for one in FOREIGN_SETS:
+    for foreign_set in FOREIGN_SETS:
         if path.is_dir():
-            found = [file for pattern in one.patterns for file in path.glob(_any_case(pattern))]
+            files = [file for pattern in foreign_set.patterns for file in path.glob(_any_case(pattern))]
         else:
-            names = {pattern.rpartition("/")[2] for pattern in one.patterns}
-            found = [path] if any(path.match(_any_case(name)) for name in names) else []
-        file = next((file for file in found if _has_mark(file, one.mark)), None)
+            names = {pattern.rpartition("/")[2] for pattern in foreign_set.patterns}
+            files = [path] if any(path.match(_any_case(name)) for name in names) else []
+        file = next((file for file in files if _has_mark(file, foreign_set.mark)), None)
         if file is not None:
             subject = f"{path} holds {file.relative_to(path).as_posix()}," if path.is_dir() else f"{path} is"
-            return f"{subject} {one.title}, which is not read: {one.remedy}"
+            return f"{subject} {foreign_set.title}, which is not read: {foreign_set.remedy}"
     return ""
 
 

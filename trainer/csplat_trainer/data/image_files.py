@@ -109,11 +109,13 @@ def find_images(
     root = place.path
     groups = {folder: _size_folders(place, folder) for folder in dict.fromkeys(folders)}
     for loose in (False, True):
-        for folder in sorted(groups, key=lambda one: loose and one == "."):
-            found = [one for path in groups[folder] if (one := _find_in(place, path, names, where, loose=loose)).files]
-            if found:
-                large = [one for one in found[1:] if size is not None and _is_large(one, size)]
-                chosen = large[-1] if large else found[0]
+        for folder in sorted(groups, key=lambda name: loose and name == "."):
+            matches = [
+                match for path in groups[folder] if (match := _find_in(place, path, names, where, loose=loose)).files
+            ]
+            if matches:
+                large = [match for match in matches[1:] if size is not None and _is_large(match, size)]
+                chosen = large[-1] if large else matches[0]
                 _refuse_outside(place, [chosen.folder], [name for name in names if name not in chosen.files], where)
                 return chosen
     _refuse_outside(place, [path for paths in groups.values() for path in paths], names, where)
@@ -168,7 +170,7 @@ def find_masks(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | No
 
 def _masks_next_to(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | None:
     """Find masks whose names are those of images, followed by `.mask` and a suffix, in any case."""
-    folders = {path.parent: {one.name.casefold(): one for one in path.parent.iterdir()} for path in images.values()}
+    folders = {path.parent: {file.name.casefold(): file for file in path.parent.iterdir()} for path in images.values()}
     files = {}
     for name, path in images.items():
         masks = (folders[path.parent].get(f"{path.name}.mask{ending}".casefold()) for ending in IMAGE_ENDINGS)
@@ -238,11 +240,11 @@ def _match_by_rules(
             break
         loose: dict[str, str] = {}
         for listed_key, known_key in rules:
-            found = _match(left, free, listed_key, known_key, where)
-            for name, to in found.items():
+            pairs = _match(left, free, listed_key, known_key, where)
+            for name, to in pairs.items():
                 del left[name], free[to]
-            matched |= found
-            loose |= {name: to for name, to in found.items() if words and not _only_lacks_ending(name, to)}
+            matched |= pairs
+            loose |= {name: to for name, to in pairs.items() if words and not _only_lacks_ending(name, to)}
         if loose:
             name, to = next(iter(loose.items()))
             more = ", …" if len(loose) > 1 else ""
@@ -255,37 +257,37 @@ def _match_code_pages(
     names: Iterable[str], known: Sequence[str], where: str, *, folders: bool
 ) -> tuple[dict[str, str], list[str]]:
     """Match names by rule 8; arguments and result are those of `match_names`."""
-    listed, other = ([name for name in some if not name.isascii()] for some in (names, known))
+    listed, existing = ([name for name in some if not name.isascii()] for some in (names, known))
     best: dict[str, tuple[dict[str, str], str]] = {}  # by the mapping, which several code pages may give
     most = max(1.0, _MOST * len(listed))
     stems = {_stem(name) for name in known}, {_stem(name) for name in listed}
     for translate, title in _translations() if listed else ():
         for forwards in (True, False):
-            ours, theirs = ({name: name for name in some} for some in (listed, known if forwards else other))
+            ours, theirs = ({name: name for name in some} for some in (listed, known if forwards else existing))
             given = ours if forwards else theirs
             given = {read: name for name in given if (read := translate(name)) is not None and read != name}
             if sum(_stem(name) in stems[not forwards] for name in given) < most:
                 continue
             ours, theirs = (given, theirs) if forwards else (ours, given)
             try:
-                found, _ = _match_by_rules(ours, theirs, where, folders=folders)
+                pairs, _ = _match_by_rules(ours, theirs, where, folders=folders)
             except InputError:
                 continue
-            found = {ours[name]: theirs[to] for name, to in found.items()}
-            if len(found) >= most:
-                if len(found) > most:
-                    best = {key: value for key, value in best.items() if len(value[0]) >= len(found)}
-                most = max(most, float(len(found)))
-                best.setdefault(repr(sorted(found.items())), (found, title))
+            pairs = {ours[name]: theirs[to] for name, to in pairs.items()}
+            if len(pairs) >= most:
+                if len(pairs) > most:
+                    best = {key: value for key, value in best.items() if len(value[0]) >= len(pairs)}
+                most = max(most, float(len(pairs)))
+                best.setdefault(repr(sorted(pairs.items())), (pairs, title))
     if not best:
         return {}, []
     if len(best) > 1:
         titles = " and ".join(title for _, title in list(best.values())[:2])
         raise InputError(f"{where}: names match different files in {titles}: rename the files, or write UTF-8")
-    ((found, title),) = best.values()
-    name, to = next(iter(found.items()))
-    text = f"{counted(len(found), 'name')} of {where} found in the code page {title}: {printable(name)} is"
-    return found, [f"{text} {printable(to)}" + (", …" if len(found) > 1 else "")]
+    ((pairs, title),) = best.values()
+    name, to = next(iter(pairs.items()))
+    text = f"{counted(len(pairs), 'name')} of {where} found in the code page {title}: {printable(name)} is"
+    return pairs, [f"{text} {printable(to)}" + (", …" if len(pairs) > 1 else "")]
 
 
 def _stem(name: str) -> str:
@@ -379,18 +381,18 @@ def _match(
     index: dict[str, list[str]] = {}
     for name in known:
         index.setdefault(known_key(name), []).append(name)
-    found: dict[str, str] = {}
+    matches: dict[str, str] = {}
     taken: dict[str, str] = {}
     for name in names:
         fitting = index.get(listed_key(name), [])
         if len(fitting) > 1:
             raise InputError(f"{where}: {name} matches {len(fitting)} files: {abbreviate(sorted(fitting))}")
         if fitting:
-            other = taken.setdefault(fitting[0], name)
-            if other != name:
-                raise InputError(f"{where}: {other} and {name} both match {fitting[0]}")
-            found[name] = fitting[0]
-    return found
+            earlier = taken.setdefault(fitting[0], name)
+            if earlier != name:
+                raise InputError(f"{where}: {earlier} and {name} both match {fitting[0]}")
+            matches[name] = fitting[0]
+    return matches
 
 
 def _only_lacks_ending(name: str, known: str) -> bool:
@@ -409,7 +411,7 @@ def _size_folders(place: SetFolder, folder: str) -> list[Path]:
         return []
     if folder == "." or not path.parent.is_dir():
         return [path] if path.is_dir() else []
-    names = sorted(one.name for one in path.parent.iterdir() if one.is_dir())
+    names = sorted(sibling.name for sibling in path.parent.iterdir() if sibling.is_dir())
     for flags in (0, re.IGNORECASE):
         matches = [
             match for name in names if (match := re.fullmatch(f"{re.escape(path.name)}(?:_([0-9]+))?", name, flags))

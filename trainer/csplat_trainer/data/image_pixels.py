@@ -161,13 +161,13 @@ def mask_values(image: Image.Image, path: Path) -> MaskValues:
                 values, taken_as = alpha, "all colours are equal: alpha is the mask"
     top = int(values.max())
     if 0 < top < MASK_THRESHOLD:
-        found = np.unique(values)
-        if len(found) > 2 or (len(found) == 2 and found[0] > 0):
+        levels = np.unique(values)
+        if len(levels) > 2 or (len(levels) == 2 and levels[0] > 0):
             raise InputError(
-                f"{path} is a mask of values from {found[0]} to {top}, expected at least {MASK_THRESHOLD} for pixels"
+                f"{path} is a mask of values from {levels[0]} to {top}, expected at least {MASK_THRESHOLD} for pixels"
                 " that count"
             )
-        taken_as = f"values are {' and '.join(str(value) for value in found)}: {top} counts as white"
+        taken_as = f"values are {' and '.join(str(value) for value in levels)}: {top} counts as white"
         values = np.where(values > 0, 255, 0).astype(np.uint8)
     return MaskValues(values, taken_as)
 

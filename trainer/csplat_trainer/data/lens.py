@@ -101,9 +101,9 @@ def undistorted_lens(lens: Lens) -> Lens:
         zoom += _ZOOM_STEP
     where = f"{lens.source}: " if lens.source else ""
     names = ("radial", "tangential", "divisor", "prism", "omega")
-    found = ", ".join(f"{name} {getattr(lens, name)}" for name in names if np.any(getattr(lens, name)))
+    distortion = ", ".join(f"{name} {getattr(lens, name)}" for name in names if np.any(getattr(lens, name)))
     raise InputError(
-        f"{where}the distortion ({found}) cannot be undone over the whole image: it folds, or requires a zoom of more"
+        f"{where}the distortion ({distortion}) cannot be undone over the whole image: it folds, or requires a zoom of more"
         f" than {_MAX_ZOOM:g} to hide the border; check its parameters, or use {UNDISTORTER}"
     )
 

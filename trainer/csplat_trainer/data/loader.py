@@ -71,29 +71,29 @@ def load(
     place = SetFolder(path if path.is_dir() else path.parent, trust_paths, None if images is None else named)
     if size is not None and not all(1 <= side <= MAX_IMAGE_SIZE for side in size):
         raise InputError(f"size is {size[0]}×{size[1]}, expected 1 to {MAX_IMAGE_SIZE} pixels per side")
-    found = _read(place, path, size, images, test_every)
-    if not found.train:
+    unread = _read(place, path, size, images, test_every)
+    if not unread.train:
         raise InputError(f"{path} has no training images")
-    doubts = describe_poses([*found.train, *found.test], found.points)
-    found, origin = choose_origin(found)
-    found = _settle(found, place)
-    shots = [*found.train, *found.test]
-    heads = {shot.path: read_image_header(shot.path) for shot in (*shots, *found.val)}
-    check_shots([*shots, *found.val], heads)
+    doubts = describe_poses([*unread.train, *unread.test], unread.points)
+    unread, origin = choose_origin(unread)
+    unread = _settle(unread, place)
+    shots = [*unread.train, *unread.test]
+    heads = {shot.path: read_image_header(shot.path) for shot in (*shots, *unread.val)}
+    check_shots([*shots, *unread.val], heads)
     opaque = opaque_images(heads.values())
     heads |= {head.path: replace(head, has_alpha=False) for head in opaque}
-    near = near_plane(shots, found.points) if near is None else near
+    near = near_plane(shots, unread.points) if near is None else near
     train, test, val = (
         [open_shot(shot, heads[shot.path], size, near) for shot in part]
-        for part in (found.train, found.test, found.val)
+        for part in (unread.train, unread.test, unread.val)
     )
-    name = f"{found.kind} {path}"
+    name = f"{unread.kind} {path}"
     sizes = sorted({(image.camera.W, image.camera.H) for image in (*train, *test)})
     shown = ", ".join(f"{width}×{height}" for width, height in sizes[:3]) + (", …" if len(sizes) > 3 else "")
-    points = "" if found.points is None else f", {counted(len(found.points), 'point')}"
-    counts = f"{len(found.train)} training and {counted(len(found.test), 'test image')}"
-    counts += f", {len(found.val)} for validation," if found.val else ""
-    report = [f"{name}: {counts} of {shown} pixels{points}", *found.report]
+    points = "" if unread.points is None else f", {counted(len(unread.points), 'point')}"
+    counts = f"{len(unread.train)} training and {counted(len(unread.test), 'test image')}"
+    counts += f", {len(unread.val)} for validation," if unread.val else ""
+    report = [f"{name}: {counts} of {shown} pixels{points}", *unread.report]
     masked = sum(shot.mask is not None for shot in shots)
     if masked:
         report.append(f"masks hide parts of {counted(masked, 'image')}, which do not count")
@@ -104,30 +104,30 @@ def load(
     if 0 < with_alpha < len(shots):
         background = "white" if 2 * with_alpha >= len(shots) else "black"
         report.append(f"{with_alpha} of {len(shots)} images have transparency: the background of all is {background}")
-    training_paths = {shot.path for shot in found.train}
-    both = sum(shot.path in training_paths for shot in found.test)
+    training_paths = {shot.path for shot in unread.train}
+    both = sum(shot.path in training_paths for shot in unread.test)
     if both:
         report.append(
             f"{counted(both, 'test image')} used for training, too: scores do not show the quality of new views"
         )
-    if (found.points is None or not len(found.points)) and not any(image.has_alpha for image in train):
+    if (unread.points is None or not len(unread.points)) and not any(image.has_alpha for image in train):
         report.append("there are no points: splats start anywhere in view")
-    colours = found.points_rgb
+    colours = unread.points_rgb
     if colours is not None and len(colours) and (colours == colours[0]).all():
         shade = " ".join(f"{value:.3g}" for value in colours[0].tolist())
         report.append(f"all points have the colour {shade}: initial colours are taken from the images instead")
         colours = None
-    axes, up, axes_note = _choose_axes(found.coordinate_system, shots)
+    axes, up, axes_note = _choose_axes(unread.coordinate_system, shots)
     data = DataSet(
         name,
         train,
         test,
-        None if found.points is None else found.points.astype(np.float32),
+        None if unread.points is None else unread.points.astype(np.float32),
         colours,
         tuple(line for line in (*report, axes_note) if line),
         axes,
         up,
-        found.test_every,
+        unread.test_every,
         size,
         images,
         val,
@@ -147,8 +147,8 @@ def find_image_folder(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
         `garden` and `images_4` for `garden/images_4`; otherwise `path` and `None`.
     """
     path = Path(path)
-    files = (one for pattern in ("*", "*/*") for one in path.glob(pattern))
-    if path.is_dir() and not _is_set(path) and any(one.suffix.lower() in IMAGE_ENDINGS for one in files):
+    files = (file for pattern in ("*", "*/*") for file in path.glob(pattern))
+    if path.is_dir() and not _is_set(path) and any(file.suffix.lower() in IMAGE_ENDINGS for file in files):
         for folder in path.parents[:_SET_LEVELS]:
             if _is_set(folder):
                 return folder, path.relative_to(folder).as_posix()
@@ -203,12 +203,12 @@ def _read(
         raise InputError(f"{path} is neither a folder nor a transforms.json{remedy or _suggest_images(path)}")
     model = find_model(path)
     if (path / "transforms_train.json").is_file():
-        found = read_blender(place, images)
+        unread = read_blender(place, images)
     elif (path / "transforms.json").is_file():
-        found = read_transforms(place, path / "transforms.json", test_every, images)
+        unread = read_transforms(place, path / "transforms.json", test_every, images)
     elif model is not None:
-        found = read_colmap(place, model[0], size, images, test_every)
-        return replace(found, report=[*model[1], *found.report])
+        unread = read_colmap(place, model[0], size, images, test_every)
+        return replace(unread, report=[*model[1], *unread.report])
     elif not (place_hint := _suggest_place(path)) and (foreign := describe_foreign(path)):
         raise InputError(foreign)
     else:
@@ -217,16 +217,17 @@ def _read(
             f"or sparse/0/cameras.bin (COLMAP), or a folder of images of such a set{place_hint or _missing_poses(path)}"
         )
     if model is not None:
-        found = replace(found, report=[*found.report, "there is also a COLMAP model, which is ignored"])
-    if found.kind == "Blender set" and (path / "transforms.json").is_file():
-        found = replace(found, report=[*found.report, "there is also a transforms.json, which is ignored"])
-    return found
+        unread = replace(unread, report=[*unread.report, "there is also a COLMAP model, which is ignored"])
+    if unread.kind == "Blender set" and (path / "transforms.json").is_file():
+        unread = replace(unread, report=[*unread.report, "there is also a transforms.json, which is ignored"])
+    return unread
 
 
 def _suggest_images(path: Path) -> str:
     """Return the folders of images next to a path that does not exist, or ""."""
-    found = [one for one in sorted(path.parent.glob("*/")) if find_image_folder(one)[1]] if path.parent.is_dir() else []
-    return f"; {path.parent} has {', '.join(one.name for one in found)}" if found else ""
+    siblings = sorted(path.parent.glob("*/")) if path.parent.is_dir() else []
+    folders = [folder for folder in siblings if find_image_folder(folder)[1]]
+    return f"; {path.parent} has {', '.join(folder.name for folder in folders)}" if folders else ""
 
 
 def _missing_poses(path: Path) -> str:
@@ -240,9 +241,10 @@ def _missing_poses(path: Path) -> str:
 def _suggest_place(path: Path) -> str:
     """Return a hint on the path of the data set, or ""."""
     folders = [*sorted(path.glob("*/")), *sorted(path.glob("*/*/"))]
-    sets = [one for one in folders if _is_set(one)]
+    sets = [folder for folder in folders if _is_set(folder)]
     if sets:
-        return "; did you mean " + ", ".join(one.relative_to(path).as_posix() for one in sets[:_MAX_NAMED]) + " in it?"
+        names = ", ".join(folder.relative_to(path).as_posix() for folder in sets[:_MAX_NAMED])
+        return f"; did you mean {names} in it?"
     if (path / "database.db").is_file():
         return "; it has a database of COLMAP, but no model yet: run `colmap mapper`"
     return ""
@@ -356,19 +358,19 @@ def estimate_up_of_cameras(viewmats: Sequence[F64]) -> UpEstimate | None:
     right, own_up, forward = rotations[:, 0], -rotations[:, 1], rotations[:, 2]
     values, directions = np.linalg.eigh(np.mean(right[:, :, None] * right[:, None, :], axis=0))
     mean_up = np.mean(own_up, axis=0)
-    found: list[UpEstimate] = []
+    estimates: list[UpEstimate] = []
     if values[1] > _TURNED:
         up = directions[:, 0]
         towards = float(np.sum(up * mean_up))
         if abs(towards) < _UNDECIDED:
             towards = -float(np.sum(up * np.mean(forward, axis=0)))
         up = up if towards >= 0.0 else -up
-        found.append(_measure_up(up, np.arcsin(np.clip(np.sum(right * up, axis=1), -1.0, 1.0)), by_horizons=True))
+        estimates.append(_measure_up(up, np.arcsin(np.clip(np.sum(right * up, axis=1), -1.0, 1.0)), by_horizons=True))
     length = float(np.sqrt(np.sum(mean_up**2)))
     if length > _UNDECIDED:
         up = mean_up / length
-        found.append(_measure_up(up, np.arccos(np.clip(np.sum(own_up * up, axis=1), -1.0, 1.0)), by_horizons=False))
-    return next((one for one in found if one.tilt_degrees <= _TILT_MAX), None)
+        estimates.append(_measure_up(up, np.arccos(np.clip(np.sum(own_up * up, axis=1), -1.0, 1.0)), by_horizons=False))
+    return next((estimate for estimate in estimates if estimate.tilt_degrees <= _TILT_MAX), None)
 
 
 def _measure_up(up: F64, angles: F64, *, by_horizons: bool) -> UpEstimate:

@@ -113,9 +113,9 @@ def _check_distinct(shots: Sequence[Shot], folder: Path) -> None:
     """Refuse files that match several names, such as test/r_0 and train/r_0 if only r_0.png exists."""
     names: dict[Path, str] = {}
     for shot in shots:
-        other = names.setdefault(shot.path, shot.name)
-        if other != shot.name:
-            raise InputError(f"{folder}: {other} and {shot.name} are both found as {shot.path.relative_to(folder)}")
+        earlier = names.setdefault(shot.path, shot.name)
+        if earlier != shot.name:
+            raise InputError(f"{folder}: {earlier} and {shot.name} are both found as {shot.path.relative_to(folder)}")
 
 
 @dataclass(frozen=True)
@@ -150,25 +150,27 @@ def _shots(
     try:
         if images is not None and not place.holds(folder / images):
             raise place.refusal(Path(images))
-        found = find_images(place, names, path.name, _folders(names, images)) if names else FoundImages(folder, {})
+        image_files = (
+            find_images(place, names, path.name, _folders(names, images)) if names else FoundImages(folder, {})
+        )
     except NoImagesError:
         if needed:
             raise
-        found = FoundImages(folder, {})
-    if found.folder != folder:
-        report.append(f"images from {found.folder.relative_to(folder).as_posix()}")
-    report += found.notes
-    report += describe_missing([name for name in names if name not in found.files], len(names), path.name)
+        image_files = FoundImages(folder, {})
+    if image_files.folder != folder:
+        report.append(f"images from {image_files.folder.relative_to(folder).as_posix()}")
+    report += image_files.notes
+    report += describe_missing([name for name in names if name not in image_files.files], len(names), path.name)
     masks = _masks(place, frames, path, report)
     shots = []
     for frame in frames:
-        if frame.name in found.files:
-            image, where = found.files[frame.name], f"{path}, frame {frame.number}"
+        if frame.name in image_files.files:
+            image, where = image_files.files[frame.name], f"{path}, frame {frame.number}"
             lens = _lens(frame_values(document, frame.values), image, where)
             viewmat = viewmat_of_opengl(frame.values.get("transform_matrix"), "transform_matrix", where)
             shots.append(Shot(_plain(frame.name, image, place.path), image, lens, viewmat, masks.get(frame.name)))
     report += describe_scales(
-        [frame.values["transform_matrix"] for frame in frames if frame.name in found.files], path.name
+        [frame.values["transform_matrix"] for frame in frames if frame.name in image_files.files], path.name
     )
     return shots
 
@@ -246,14 +248,14 @@ def _masks(place: SetFolder, frames: Sequence[_Frame], path: Path, report: list[
         return {}
     try:
         masks = list(dict.fromkeys(named.values()))
-        found = find_images(place, masks, path.name, _folders(masks, None))
+        mask_files = find_images(place, masks, path.name, _folders(masks, None))
     except NoImagesError:
-        found = FoundImages(path.parent, {})
-    report += found.notes
-    missing = next(((name, mask) for name, mask in named.items() if mask not in found.files), None)
+        mask_files = FoundImages(path.parent, {})
+    report += mask_files.notes
+    missing = next(((name, mask) for name, mask in named.items() if mask not in mask_files.files), None)
     if missing is not None:
         raise InputError(f"{path}: the mask {missing[1][:200]!r} of {abbreviate([missing[0]])} does not exist")
-    return {name: found.files[mask] for name, mask in named.items()}
+    return {name: mask_files.files[mask] for name, mask in named.items()}
 
 
 def _points(
@@ -270,7 +272,7 @@ def _points(
         path.parent / normalise_name(name),
         path.parent / PurePosixPath(normalise_name(name)).name,
     )
-    cloud = next((one for one in candidates if place.finds(one)), None)
+    cloud = next((candidate for candidate in candidates if place.finds(candidate)), None)
     if cloud is None and place.finds_outside(candidates[0]):
         raise place.refusal(Path(name), f"{path.name}, ply_file_path")
     if cloud is None:

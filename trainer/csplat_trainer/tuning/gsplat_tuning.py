@@ -66,14 +66,14 @@ class GsplatTuning:
 
     def count(self, weight: float) -> RateTerm:
         """Count the bits of the file's integers; `weight` is lambda, loss per bit and splat."""
-        found, costs = self._quantised(), RateTerm(self._fixed, weight, {})
+        quantised, costs = self._quantised(), RateTerm(self._fixed, weight, {})
         columns = {
-            "scales": found.scales,
-            "quats": found.quats,
-            "opacities": found.opacities[:, None],
-            "sh0": found.sh0,
-            "sizes": found.sizes[:, None],
-            "shN": found.sh.flatten(1),
+            "scales": quantised.scales,
+            "quats": quantised.quats,
+            "opacities": quantised.opacities[:, None],
+            "sh0": quantised.sh0,
+            "sizes": quantised.sizes[:, None],
+            "shN": quantised.sh.flatten(1),
         }
         for name, integers in columns.items():
             if integers.shape[1]:
@@ -88,9 +88,9 @@ class GsplatTuning:
     ) -> PendingLoss:
         """Make a step on a view, see `CpuTuning.step`."""
         v, alphas = self.parameters.tensors, self.parameters.device_alphas
-        found = self._quantisers.quantise(v, alphas)
-        splats = SplatTensors.of(found.decoded, found.alphas)
-        rendered, _ = self._rasteriser.render(splats, view.camera, self._background, _degree(found))
+        quantised = self._quantisers.quantise(v, alphas)
+        splats = SplatTensors.of(quantised.decoded, quantised.alphas)
+        rendered, _ = self._rasteriser.render(splats, view.camera, self._background, _degree(quantised))
         shown = rendered.detach()
         reference = self._images.reference(view.reference, self._background)
         value, slope = self._loss(corrected(gain, shown), reference, self._images.mask(view.mask))
@@ -108,7 +108,7 @@ class GsplatTuning:
             if rows is not None:
                 gradients[name] = torch.zeros_like(v[name]).index_add_(0, rows, gradients[name])
         if costs is not None:
-            self._add_costs(gradients, found, costs)
+            self._add_costs(gradients, quantised, costs)
         self.parameters.adam_step(gradients, rates)
         self._quantisers.constrain(v)
         return value
@@ -116,9 +116,9 @@ class GsplatTuning:
     @torch.no_grad()
     def score(self, view: TuningView, gain: ImageGain | None) -> tuple[LossValue, float]:
         """Return the loss of a view, and the squared error summed over the values that count, clipped to 0..1."""
-        found = self._quantised()
-        splats = SplatTensors.of(found.decoded, found.alphas)
-        rendered = self._rasteriser.render(splats, view.camera, self._background, _degree(found))[0]
+        quantised = self._quantised()
+        splats = SplatTensors.of(quantised.decoded, quantised.alphas)
+        rendered = self._rasteriser.render(splats, view.camera, self._background, _degree(quantised))[0]
         rendered, reference = corrected(gain, rendered), self._images.reference(view.reference, self._background)
         mask = self._images.mask(view.mask)
         error = (rendered.clamp(0, 1) - reference.clamp(0, 1)).double().square()
@@ -134,16 +134,16 @@ class GsplatTuning:
         """
         v, alphas = self.parameters.on_cpu().values, self.parameters.alphas
         values = FreeValues(v["means"], v["quats"], v["scales"], alphas, v["sh0"], v["shN"], v["sizes"])
-        expected, found = self._fixed.dequantise(values), self._quantised()
+        expected, quantised = self._fixed.dequantise(values), self._quantised()
         for name, array in vars(expected).items():
-            seen = found.alphas if name == "opacities" else found.decoded[name]
+            seen = quantised.alphas if name == "opacities" else quantised.decoded[name]
             if not np.array_equal(array, seen.cpu().numpy()):
                 raise InputError(f"{name} are too large to be tuned on a GPU: use --device cpu")
         return values
 
     def _quantised(self) -> QuantisedValues:
-        found: QuantisedValues = self._quantisers.quantise(self.parameters.tensors, self.parameters.device_alphas)
-        return found
+        quantised: QuantisedValues = self._quantisers.quantise(self.parameters.tensors, self.parameters.device_alphas)
+        return quantised
 
     @torch.no_grad()
     def _add_costs(self, gradients: dict[str, Tensor], found: QuantisedValues, costs: RateTerm) -> None:

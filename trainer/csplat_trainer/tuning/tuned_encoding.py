@@ -119,7 +119,7 @@ def finetune(
         views = _views_of(views, model)
     if importance is None:
         importance = measure_importance(
-            model, [one.camera for one in views.train], views.background, options.device, threads=encoding.threads,
+            model, [view.camera for view in views.train], views.background, options.device, threads=encoding.threads,
             progress=progress,
         )  # fmt: skip
     with timer.stage("encoding"):
@@ -161,7 +161,7 @@ def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
     record = model.metadata.training
     background = data.background if record is None else record.background
     shift = np.subtract(model.origin, data.origin)
-    training = [TuningView(relative_to(shift, one.camera), one) for one in data.train]
+    training = [TuningView(relative_to(shift, image.camera), image) for image in data.train]
     return split_views(training, np.array(background, np.float32))
 
 

@@ -120,23 +120,23 @@ class _Tuning:
             InputError: the file is damaged, or of a run with another scene, views or options.
         """
         fixed, start = self._fixed, self._fixed.start()
-        found = load_checkpoint(path, "finetune")
-        own, arrays = found.own, found.arrays
+        checkpoint = load_checkpoint(path, "finetune")
+        own, arrays = checkpoint.own, checkpoint.arrays
         if own.get("fixed") != fingerprint(fixed):
             raise InputError(f"{path} belongs to another scene, or to other options of the encoder")
-        if found.log.get("views") != self._views.digest:
+        if checkpoint.log.get("views") != self._views.digest:
             raise InputError("the checkpoint is of a run with other views")
         controller = RateController.of(own.get("controller"))
         if (controller and controller.size_bytes) != (self._controller and self._controller.size_bytes):
             raise InputError("the checkpoint is of a run with another target")
         for name, value in asdict(self._options).items():
-            if name not in ("iterations", "device") and found.options.get(name) != value:
-                raise InputError(f"the checkpoint is of a run with another {name}: {found.options.get(name)}")
+            if name not in ("iterations", "device") and checkpoint.options.get(name) != value:
+                raise InputError(f"the checkpoint is of a run with another {name}: {checkpoint.options.get(name)}")
         values = self._engine.parameters.values
-        check_arrays(path, found.parameters.values, {name: tuple(array.shape) for name, array in values.items()})
+        check_arrays(path, checkpoint.parameters.values, {name: tuple(array.shape) for name, array in values.items()})
         check_arrays(path, arrays, {f"best_{name}": getattr(start, name).shape for name in _FREE_VALUES})
-        self._fitter.resume(found)
-        self._engine = self._make_engine(found.parameters)
+        self._fitter.resume(checkpoint)
+        self._engine = self._make_engine(checkpoint.parameters)
         tables = {name.removeprefix("rate_"): array for name, array in arrays.items() if name.startswith("rate_")}
         try:
             self._best = _BestValues(FreeValues(*(arrays[f"best_{name}"] for name in _FREE_VALUES)), **own["best"])
@@ -313,10 +313,10 @@ class RateController:
     @classmethod
     def of(cls, stored: Any) -> RateController | None:
         """Return the controller of a checkpoint; `None` if its state is absent or incomplete."""
-        names = {one.name for one in fields(cls)}
+        names = {field.name for field in fields(cls)}
         if not isinstance(stored, dict) or stored.keys() != names:
             return None
-        numbers = all(isinstance(one, (int, float)) and math.isfinite(one) for one in stored.values())
+        numbers = all(isinstance(value, (int, float)) and math.isfinite(value) for value in stored.values())
         return cls(**stored) if numbers else None
 
     def excess(self, size_bytes: int, bits: float) -> float:
@@ -345,7 +345,7 @@ class RateController:
         self.byte_cost = min(max(self.byte_cost * math.exp(by), least), _WEIGHT_RANGE[1])
 
 
-_FREE_VALUES = tuple(one.name for one in fields(FreeValues))
+_FREE_VALUES = tuple(field.name for field in fields(FreeValues))
 
 
 def fingerprint(fixed: FixedQuantisation) -> str:

@@ -78,14 +78,14 @@ class TuningViews:
     @property
     def digest(self) -> str:
         """Hash of the training cameras, the split and the background."""
-        cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (one.camera for one in self.train)]
+        cameras = [(c.W, c.H, c.K.tolist(), c.viewmat.tolist()) for c in (view.camera for view in self.train)]
         identity = repr((cameras, len(self.validation), self.is_held_out, self.background.tolist()))
         return hashlib.sha256(identity.encode()).hexdigest()
 
     @property
     def is_held_out(self) -> bool:
         """True if no validation view is a training view."""
-        return not any(one is other for one in self.validation for other in self.train)
+        return not any(view is trained for view in self.validation for trained in self.train)
 
 
 def split_views(views: Sequence[TuningView], background: F32, validation_count: int = 0) -> TuningViews:
