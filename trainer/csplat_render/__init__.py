@@ -64,8 +64,8 @@ def render(
     """Render one image.
 
     For many images of one scene, or for gradients, use a `csplat_render.rasteriser.Rasteriser`; on a GPU, a
-    `csplat_render.gpu.renderer.GpuRenderer`. The backends agree to 75 dB or better; published PSNRs are those of the
-    CPU, which are the same on every machine.
+    `csplat_render.gpu.renderer.GpuRenderer`. The backends agree to 75 dB or better. Published PSNRs are measured on
+    the CPU, which gives the same values on every machine.
 
     Args:
         model: a `SplatModel`, an object with its six arrays, or a file opened by `csplat.open`. Cameras, like `means`,

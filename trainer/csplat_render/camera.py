@@ -100,7 +100,7 @@ _ROW_TOLERANCE = 1e-5  # for values of the last row; files have few digits, or p
 
 
 def check_last_row(pose: F64, name: str) -> None:
-    """Check that a pose is affine; a transposed one is recognised.
+    """Check that a pose is affine, and recognise a transposed pose.
 
     Args:
         pose: [4, 4].

@@ -1,4 +1,4 @@
-"""Read and write camera files of csplat, and read those of other programs.
+"""Read and write csplat's camera files, and read other programs' camera files.
 
 * csplat: a JSON list of {K, viewmat, W, H, near, image}: world to camera, OpenCV axes, pixel centres at +0.5; `near`
   and `image` are optional.
@@ -155,7 +155,7 @@ def parse_foreign_cameras(document: object, where: str, report: list[str]) -> li
 
 
 def frame_values(document: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a frame of a transforms.json, which override those of all frames."""
+    """Return the values of a frame of a transforms.json; they override the values that apply to all frames."""
     own = {**frame, **_intrinsics_of_matrix(frame)}
     values = {**document, **own}
     listed = values.get("distortion_params")  # nerfstudio
@@ -212,7 +212,7 @@ def check_intrinsics(
             f"{where}the focal lengths are {fx:g} across and {fy:g} down, expected about the same: one of them is wrong"
         )
     point = f"{where}the principal point is {cx:g} {cy:g} in {width:g}×{height:g} pixels"
-    far = _OFF_CENTRE  # outside the image if that is a tile of a larger one
+    far = _OFF_CENTRE  # the point is outside the image if the image is a tile of a larger image
     if not (-far * width <= cx <= far * width and -far * height <= cy <= far * height):
         raise InputError(f"{point}, expected about the middle")
     away = max(abs(2.0 * cx / width - 1.0), abs(2.0 * cy / height - 1.0))
@@ -249,13 +249,13 @@ def focal_lengths(
         values: at least one of fl_x, fl_y, camera_angle_x, camera_angle_y.
         width, height: size of the images, pixels.
         where: file and place, for messages.
-        fisheye: do not compare angles of view with focal lengths, because they are not those of a pinhole.
+        fisheye: do not compare angles of view with focal lengths, because a fisheye is not a pinhole.
 
     Returns:
         The horizontal and vertical focal length, pixels; equal if only one is specified.
 
     Raises:
-        InputError: there is none, one is out of range, or two contradict each other.
+        InputError: no value is specified, a value is out of range, or two values contradict each other.
     """
     fx = _focal(values, "x", width, where, fisheye=fisheye)
     fy = _focal(values, "y", height, where, fisheye=fisheye)

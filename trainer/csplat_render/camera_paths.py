@@ -167,7 +167,7 @@ def _first_view(model: SplatModel) -> Camera | None:
 
 
 def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, width: int, height: int) -> list[Camera]:
-    """Return cameras on an ellipse around a known one, looking at a fixed point.
+    """Return cameras on an ellipse around a known camera, looking at a fixed point.
 
     The ellipse is the widest on which the cameras show enough detail.
     """

@@ -1,6 +1,6 @@
 """Shared definitions of the rasteriser and its exact reference: constants, modes, splats and results.
 
-The conventions are those of INRIA's implementation (Kerbl et al., 3D Gaussian Splatting, 2023):
+The conventions follow INRIA's implementation (Kerbl et al., 3D Gaussian Splatting, 2023):
 
     alpha = min(opacity · exp(−½ dᵀ Σ⁻¹ d), ALPHA_CAP), and 0 below ALPHA_MIN
     Σ = projected covariance + DILATION · I
@@ -46,7 +46,7 @@ COMPENSATION_MIN = 0.000025
 Mode = Literal["exact", "standard", "fast"]
 MODES: tuple[Mode, ...] = ("exact", "standard", "fast")
 
-#: What renders: the CPU; a GPU; a GPU if there is one, otherwise the CPU; or the GPU's shaders on the CPU, for tests.
+#: The CPU; a GPU; a GPU if there is one, otherwise the CPU; or the GPU's shaders on the CPU, for tests.
 Backend = Literal["cpu", "gpu", "auto", "software"]
 
 
@@ -90,7 +90,7 @@ Array = NDArray[Any]
 
 
 class HasSplats(Protocol):
-    """An object with the arrays of splats: a `SplatModel`, `UncheckedSplats`, or another one."""
+    """An object with the arrays of splats, such as a `SplatModel` or `UncheckedSplats`."""
 
     @property
     def means(self) -> Array: ...  # noqa: D102 - as in `UncheckedSplats`
@@ -128,7 +128,7 @@ class UncheckedSplats:
 
 
 def checked_splats(splats: HasSplats, dtype: Any) -> UncheckedSplats:
-    """Convert the arrays to contiguous ones of a dtype, and check their shapes."""
+    """Convert the arrays to contiguous arrays of a dtype, and check their shapes."""
     means = np.ascontiguousarray(splats.means, dtype)
     n = len(means) if means.ndim else 0
     shapes: dict[str, tuple[int, ...]] = {
@@ -146,7 +146,7 @@ def checked_splats(splats: HasSplats, dtype: Any) -> UncheckedSplats:
 
 
 def checked_degree(sh_degree: int | None, coefficient_count: int) -> int:
-    """Return the SH degree to render, at most that of the coefficients."""
+    """Return the SH degree to render, at most the degree of the coefficients."""
     available = sh_degree_of(coefficient_count)
     if sh_degree is None:
         return available

@@ -130,7 +130,7 @@ class _KernelCache(caching.FunctionCache):  # type: ignore[misc]  # numba's type
             self._give_up(error)
 
     def _repair(self) -> None:
-        """Replace a damaged index by an empty one, so that compiled versions can be saved again."""
+        """Replace a damaged index by an empty index, so that compiled versions can be saved again."""
         try:
             self.flush()
         except OSError as error:
@@ -151,7 +151,7 @@ class ParallelKernel(Generic[P]):
     as two wrappers, and as part of its caller. A call takes 10 µs longer, compilation takes half the time.
 
     Attributes:
-        compiled: the compiled function; its arguments are lane, number of lanes, and those of the call.
+        compiled: the compiled function; its arguments are lane, number of lanes, and the arguments of the call.
     """
 
     compiled: Any
@@ -163,7 +163,7 @@ class ParallelKernel(Generic[P]):
         return signatures
 
     def __call__(self, *arguments: P.args, **named: P.kwargs) -> None:
-        """Run the kernel on the threads set by `thread_count`, by default on one if arrays are small, and wait."""
+        """Run the kernel on the threads set by `thread_count`, by default a single thread if arrays are small; wait."""
         assert not named
         with LOCK:
             _threads.run(self.compiled, arguments)
@@ -268,7 +268,7 @@ def thread_count(threads: int | None) -> Iterator[int]:
 
     Args:
         threads: number of threads, at least 1, limited to `available_threads`; `None`: unchanged. Initially kernels use
-            all threads, or one if arrays are small.
+            all threads, or a single thread if arrays are small.
 
     Yields:
         The maximum number of threads in use.

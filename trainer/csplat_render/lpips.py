@@ -154,11 +154,11 @@ def _read(path: Path) -> Lpips:
 
 
 def load_torch_lpips(cache: Path | None = None, heads_path: Path | None = None) -> Lpips | None:
-    """Read the weights from PyTorch's files; return `None` if one of them, or torch, is not installed.
+    """Read the weights from PyTorch's files; return `None` if a file, or torch, is not installed.
 
     Args:
         cache: torch's cache folder; `None`: its default.
-        heads_path: file of the linear heads; `None`: that of an installed `lpips` or `torchmetrics` package.
+        heads_path: file of the linear heads; `None`: the file of an installed `lpips` or `torchmetrics` package.
 
     Raises:
         InputError: a file lacks some of the weights.

@@ -117,7 +117,7 @@ class Rasteriser:
             camera: the camera to render from.
             background: red, green, blue of the background.
             antialiased: compensate for the dilation by scaling opacities (mip-splatting).
-            sh_degree: highest SH degree; `None`: that of the splats.
+            sh_degree: highest SH degree; `None`: the splats' own degree.
             state: [H, W, 5], in the rasteriser's dtype, from `initial_state`, updated: the pixels after all slices so
                 far. `None`: there are no slices.
 
@@ -163,7 +163,7 @@ class Rasteriser:
         return state
 
     def find_visible(self, splats: HasSplats, camera: Camera, *, antialiased: bool = False) -> VisibleSplats:
-        """Find the splats that a render would show, and their depths; the arguments are those of `forward`."""
+        """Find the splats that a render would show, and their depths. Takes the arguments of `forward`."""
         arrays = checked_splats(splats, self.dtype)
         degree = checked_degree(None, arrays.shN.shape[1])
         with thread_count(self.threads):

@@ -42,7 +42,7 @@ class Decisions:
     _next: int = -1
 
     def ask(self, mask: Array) -> Array:
-        """Record the outcome of a comparison, or return its recorded one."""
+        """Record the outcome of a comparison, or return its recorded outcome."""
         if self._next < 0:
             self.masks.append(mask)
             return mask
@@ -71,9 +71,9 @@ def render_exact(
         camera: the camera to render from.
         background: red, green, blue of the background.
         antialiased: compensate for the dilation by scaling opacities.
-        sh_degree: highest SH degree; `None`: that of the splats.
+        sh_degree: highest SH degree; `None`: the splats' own degree.
         transmittance_min: transmittance at which a pixel is finished; 0: never.
-        decisions: records the outcomes of all comparisons, or replays recorded ones.
+        decisions: records the outcomes of all comparisons, or replays recorded outcomes.
 
     Returns:
         The image, float64; `intersections` is 0.
@@ -187,7 +187,7 @@ def _blend(
         weight = np.where(seen, alpha * through, 0.0)
         rgb += np.einsum("sp,sc->pc", weight, part["colour"][:, 0])
         depth += (weight * part["depth"]).sum(0)
-        count = seen.sum(0)  # a finished pixel stays finished, so the first `count` splats are the blended ones
+        count = seen.sum(0)  # a finished pixel stays finished, so the first `count` splats are blended
         before = np.where(count > 0, np.take_along_axis(after, np.maximum(count - 1, 0)[None], 0)[0], before)
         going = seen[-1]
     return rgb.reshape(camera.H, camera.W, 3), before.reshape(camera.H, camera.W), depth.reshape(camera.H, camera.W)

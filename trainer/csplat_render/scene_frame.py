@@ -2,7 +2,7 @@
 
 There are two kinds of scene: an *object* is viewed from outside; *surroundings* extend far beyond their dense middle.
 
-Choosing cameras needs hundreds of rough images, not exact ones. A `Cloud` replaces splats by points drawn from their
+Choosing cameras needs hundreds of rough images, not exact images. A `Cloud` replaces splats by points drawn from their
 Gaussians. Each point represents a fraction of the splat's optical depth times its mean projected area. Binned into the
 cells of a coarse image, the points determine coverage and occlusion within a few per cent. Sums have a fixed order and
 do not use BLAS, so no result depends on the number of threads.

@@ -25,7 +25,7 @@ OnView = Callable[[int, F32, F32], None]
 
 
 class Renderable(Protocol):
-    """A scene that renders itself because it is not in memory, or in that of a GPU."""
+    """A scene that renders itself because it is not in memory, or is in the memory of a GPU."""
 
     @property
     def origin(self) -> tuple[float, float, float]:
@@ -167,7 +167,7 @@ class Scorer:
         """Score a scene by all metrics.
 
         Args:
-            model: the scene. Its origin may differ from that of the cameras.
+            model: the scene. Its origin may differ from the origin of the cameras.
             ssim: compute SSIM, which takes about as long as rendering.
             lpips: the LPIPS distance; `None`: it is not computed.
             on_view: called with the images of each view.

@@ -126,7 +126,7 @@ def _object_view(
     highest, highest_at = 1.0, OBJECT_DISTANCES[0]
     for distance in OBJECT_DISTANCES:
         if highest * (highest_at / distance) ** 2 < 0.8 * needed:
-            continue  # the cover at the last distance implies that this one is not sufficient either
+            continue  # the cover at the last distance implies that this distance is not sufficient either
         covers = []
         for angle in angles:
             camera = camera_at(*angle, distance, offset=offset)
@@ -137,7 +137,7 @@ def _object_view(
             if (enough, covers[-1]) > best_rank:
                 best, best_rank = camera, (enough, covers[-1])
         highest, highest_at = max(covers), distance
-        ranked = np.argsort(-np.array(covers), kind="stable")  # only the most promising ones are tried nearer
+        ranked = np.argsort(-np.array(covers), kind="stable")  # only the most promising angles are tried nearer
         angles = [angles[i] for i in ranked[:_PROMISING]]
     return best
 
@@ -151,7 +151,7 @@ def _in_surroundings(frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, coun
     good = details >= _GOOD_DETAIL * details.max()
     enough = len(angles)
     while enough < len(cameras) and np.count_nonzero(good[:enough]) < count:
-        enough += len(angles)  # nearer views are used only if there are too few farther ones
+        enough += len(angles)  # nearer views are used only if there are too few farther views
     pool = np.flatnonzero(good[:enough])
     if len(pool) < count:
         pool = np.argsort(-details, kind="stable")[: max(count, len(pool))]

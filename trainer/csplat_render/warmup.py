@@ -33,7 +33,7 @@ def warm_up(
     """Compile kernels, or load them from numba's cache, by running them on a single splat.
 
     Args:
-        announce: called with a message if something has to be compiled, and with another one at the end.
+        announce: called with a message if something has to be compiled, and with another message at the end.
         gradients: also compile the renderer's backward pass.
         simplify: compile the kernels of `measure_pruning_error`.
         ssim: compile the kernels of `metrics.ssim`.

@@ -1,7 +1,7 @@
 """Training of Gaussian splats on a CPU or a GPU: data sets, losses, optimisation, and a torch wrapper of the renderer.
 
     >>> import csplat_trainer
-    >>> found = csplat_trainer.train("capture")  # doctest: +SKIP
+    >>> trained = csplat_trainer.train("capture")  # doctest: +SKIP
 
 The names load their modules on first use. `train` and `finetune` require numba, and gsplat on a GPU.
 `torch_rasteriser`, the perceptual loss, and `torch_checkpoints`, with which `csplat.read` reads checkpoints of gsplat

@@ -103,7 +103,7 @@ def check_arrays(path: str | Path, arrays: Mapping[str, NDArray[Any]], shapes: M
     """Check the arrays of a checkpoint.
 
     Raises:
-        InputError: one is missing, has another shape, or is not finite float32.
+        InputError: an array is missing, has another shape, or is not finite float32.
     """
     for name, shape in shapes.items():
         array = arrays.get(name, np.empty(0))

@@ -20,7 +20,7 @@ from csplat_trainer.parameters import Parameters
 from csplat_trainer.tuned_scene import RateTerm
 
 COUNT_EVERY = 50  # steps between counts of the file's integers for the rate term
-_MOST_PENDING = 20  # losses to be read at once; reading one lets a GPU wait for the next step
+_MOST_PENDING = 20  # losses to be read at once; reading a loss lets a GPU wait for the next step
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Fitter:
 
     Attributes:
         iterations: as given.
-        iteration: number of steps so far, including the current one.
+        iteration: number of steps so far, including the current step.
         has_ended: set to end the run after the current step.
         rng: the random generator.
         queue: indices of the images that remain in this epoch; the last is the next.
@@ -146,7 +146,7 @@ class Fitter:
             self._read_losses()
 
     def _read_losses(self) -> None:
-        """Read the losses of the last steps, and raise an `InputError` if one is not finite."""
+        """Read the losses of the last steps, and raise an `InputError` if a loss is not finite."""
         first = self.iteration - len(self._pending) + 1
         for step, pending in enumerate(self._pending, first):
             value = pending.read()

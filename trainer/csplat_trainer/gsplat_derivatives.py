@@ -111,7 +111,7 @@ class _Derivatives:
     Attributes:
         opacity, colour, means: [N], squared derivatives by alpha, a channel of the colour, and the centre.
         shape: [N, 21], Gauss–Newton matrices of the covariance over its trace; see `Sensitivity.shape_metric`.
-        basis: [N, B (B + 1) / 2], those of the SH coefficients of a channel.
+        basis: [N, B (B + 1) / 2], Gauss–Newton matrices of the SH coefficients of a channel.
         views: [N], number of views that show the splat. The last four are not computed without `matrices`.
     """
 

@@ -1,6 +1,6 @@
 # torch and gsplat may be absent:
 # pyright: reportMissingImports=false
-"""Training steps on a GPU with the gsplat package as rasteriser; the interface is that of `CpuEngine`."""
+"""Training steps on a GPU with the gsplat package as rasteriser, with the interface of `CpuEngine`."""
 
 from __future__ import annotations
 

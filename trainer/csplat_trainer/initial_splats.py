@@ -204,9 +204,9 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Ge
 
 
 def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
-    """Return the root mean square distance to the nearest three others, never 0.
+    """Return the root mean square distance to the three nearest other points, never 0.
 
-    If most points coincide with others, distances are those of points that fill the box evenly.
+    If most points coincide with other points, return the distance between points that fill the box evenly.
     """
     evenly = 2.0 * scene.half / max(1, len(points)) ** (1.0 / 3.0)
     if len(points) < 2:

@@ -4,8 +4,9 @@
 
     loss = l1_weight · mean |x − y| + ssim_weight · (1 − mean SSIM(x, y))
 
-SSIM is that of the INRIA trainer: an 11×11 Gaussian window of σ 1.5, zeros beyond the border, C1 = 0.01², C2 = 0.03²,
-the mean over all pixels and channels. With m1, m2 the blurred images, s11, s22, s12 their blurred (co)variances and
+SSIM is defined as in the INRIA trainer: an 11×11 Gaussian window of σ 1.5, zeros beyond the border, C1 = 0.01²,
+C2 = 0.03², the mean over all pixels and channels. With m1, m2 the blurred images, s11, s22, s12 their blurred
+(co)variances and
 
     a = 2 m1 m2 + C1,  b = 2 s12 + C2,  c = m1² + m2² + C1,  d = s11 + s22 + C2,  ssim = a b / (c d)
 
@@ -101,7 +102,7 @@ class PhotometricLoss:
         Args:
             rendered: [H, W, 3], C-contiguous.
             target: [H, W, 3], C-contiguous.
-            mask: [H, W], pixels that count; the others of `target` are set to those of `rendered`. `None`: all
+            mask: [H, W], pixels that count; all other pixels of `target` are copied from `rendered`. `None`: all
                 count.
 
         Returns:

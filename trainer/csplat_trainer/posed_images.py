@@ -58,7 +58,7 @@ class PosedImage:
     """An image of a data set with its camera.
 
     Attributes:
-        camera: its camera; W and H are those of the image.
+        camera: its camera; W and H are the size of the image.
         source: [H, W, 3] or [H, W, 4] uint8, C-contiguous, RGB or RGBA with straight (not premultiplied) alpha; or
             unread pixels.
         masked: [H, W], True for pixels that count in training and scores; or an unread mask. `None`: all count.

@@ -66,12 +66,12 @@ class MeasuredViews:
 
 @dataclass(eq=False)
 class PruningOrder:
-    """The splats of a scene in the order of pruning, without those that no view shows; longer on demand.
+    """The splats of a scene in the order of pruning, without splats that no view shows. The order grows on demand.
 
     Attributes:
         model: the scene.
         groups: views with the pruning errors of the scene. Each round measures the next group, and adds the last
-            measurements of the others: two groups give twice the views at the cost of one.
+            measurements of the others: two groups give twice the views at the cost of a single group.
         background: background colour of the views.
         threads: number of threads; `None` for all. The order does not depend on it.
         progress: progress callback.
@@ -165,7 +165,7 @@ def pruning_keys(opacities: NDArray[np.float32], pruning_error: PruningError, *,
 
 
 def kept_in_round(opacities: NDArray[np.float32], pruning_error: PruningError, count: int) -> I64:
-    """Return the ascending indices of the splats that a round keeps, at least `count`; unseen ones are pruned first.
+    """Return the ascending indices of the splats that a round keeps, at least `count`. Unseen splats are pruned first.
 
     Args:
         opacities, pruning_error: as for `pruning_keys`.

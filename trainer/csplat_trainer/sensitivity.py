@@ -1,10 +1,10 @@
-"""Sensitivity of renders to each splat, attribute by attribute, measured from training cameras or virtual ones.
+"""Sensitivity of renders to each splat, attribute by attribute, measured from training or virtual cameras.
 
 The sensitivity of a parameter p is S(p) = Σ_i |∂E_i/∂p| / Σ_i P_i over the views i, with E_i the sum of the red, green
-and blue of view i, and P_i its number of pixels; that of a group of parameters is its maximum (Niedermayr, Stumpfegger,
-Westermann, "Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024). This suits colours. For
-opacity and shape the pixels of one view cancel in E_i: a growing splat brightens some pixels and darkens others. So
-magnitudes are taken here before pixels and channels are summed; the published quantity is computed as well.
+and blue of view i, and P_i its number of pixels. The sensitivity of a group of parameters is its maximum (Niedermayr,
+Stumpfegger, Westermann, "Compressed 3D Gaussian Splatting for Accelerated Novel View Synthesis", CVPR 2024). This suits
+colours. For opacity and shape the pixels of one view cancel in E_i: a growing splat brightens some pixels and darkens
+others. So magnitudes are taken here before pixels and channels are summed; the published quantity is computed as well.
 
 Sums of squares instead of magnitudes are the diagonal of the Gauss–Newton matrix: the squared error that a small error
 of the parameter adds to the renders. They are the weights of k-means, which minimises squared errors.

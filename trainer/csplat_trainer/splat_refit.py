@@ -2,9 +2,9 @@
 
 Colours, opacities, scales and rotations are fitted together, one small view per step, so that neighbours of pruned
 splats cover for them, and other values compensate for quantisation. The step length is proportional to the error. Least
-squares over all views at once (linear for colours alone) overfit the training views; descent does not, and after three
-passes over the views gains the same on held-out views. Centres are fixed unless asked for, since scenes with few views
-get worse if they move.
+squares over all views at once (linear for colours alone) overfit the training views. Descent does not, and gains the
+same on held-out views after three passes over the views. Centres are fixed unless the caller frees them, since scenes
+with few views get worse if they move.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def quantisation_aware_refit(
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> FreeValues:
-    """Refit splats through the quantisers of a file, so that renders are those of the decoded file; weigh its bytes.
+    """Refit splats through the quantisers of a file, as the decoded file would render them; weigh its bytes.
 
     Args:
         fixed: the encoder's quantisation.

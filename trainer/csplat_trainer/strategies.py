@@ -1,13 +1,13 @@
 """Changes of the number and positions of splats during training: MCMC, gradient-based densification, pruning.
 
 * "3DGS as Markov chain Monte Carlo", Kheradmand et al. 2024, https://arxiv.org/abs/2404.09591. A dead splat moves onto
-  a live one. All n splats there get the opacity and the scales that change the render least; noise then separates
+  a live splat. All n splats there get the opacity and the scales that change the render least. Noise then separates
   them.
 * Densification of the first publication, Kerbl et al. 2023, section 5, https://arxiv.org/abs/2308.04079. A splat whose
   position on screen has a large gradient is cloned if it is small and split in two if it is large. Transparent splats
   are pruned, and opacities are reset from time to time so that floaters die.
 * Pruning of the splats with the least pruning error, the exact squared change of the renders if only this splat is
-  removed. Overlapping splats have small errors each, but a large one together, so few are pruned at once, and the
+  removed. Overlapping splats have small errors each, but a large error together. So few are pruned at once, and the
   others are trained before they are measured again.
 """
 
@@ -36,7 +36,7 @@ _GATE_OFF = 0.1  # opacity above which the gate is below 1e-4
 
 
 def relocate(parameters: Parameters, dead_opacity: float, rng: Generator) -> int:
-    """Move splats that are nearly transparent to live ones, chosen by opacity.
+    """Move splats that are nearly transparent to live splats, chosen by opacity.
 
     Args:
         parameters: changed in place.
@@ -83,10 +83,10 @@ def grow(parameters: Parameters, factor: float, cap: int, dead_opacity: float, r
 
 
 def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
-    """Return opacity and scale of n equal splats that look like one (equation 9 of the MCMC paper).
+    """Return opacity and scale of n equal splats that look like a single splat (equation 9 of the MCMC paper).
 
     Args:
-        alphas: opacity of the one splat.
+        alphas: opacity of the single splat.
         counts: n, at most 51.
 
     Returns:
@@ -123,7 +123,7 @@ def _add(parameters: Parameters, name: str, rows: I64, summand: F32 | np.float32
 
 
 def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
-    """Move splats at random inside their own shapes, transparent ones more.
+    """Move splats at random inside their own shapes, transparent splats more.
 
     This is the paper's noise, covariance · normal · gate · strength, limited to the splat's size along each axis.
 
@@ -210,7 +210,7 @@ def densify(
     dead_opacity: float,
     rng: Generator,
 ) -> int:
-    """Clone and split splats whose gradient is above a threshold, largest first up to the cap; prune dead ones.
+    """Clone and split splats whose gradient is above a threshold, largest first up to the cap; prune dead splats.
 
     Args:
         parameters: changed in place.
@@ -277,11 +277,11 @@ _PRUNING_VIEWS = 32  # largest number of views in which the pruning error is mea
 def prune_least_needed(
     parameters: Parameters, cameras: Sequence[Camera], measure: Callable[[Sequence[Camera]], PruningError], count: int
 ) -> None:
-    """Prune the splats with the least pruning error in rounds; unseen ones are the first.
+    """Prune the splats with the least pruning error in rounds, unseen splats first.
 
     Args:
         parameters: changed in place.
-        cameras: those of the training images.
+        cameras: the cameras of the training images.
         measure: measures the pruning errors of the splats in some views.
         count: number of splats to keep.
     """

@@ -50,8 +50,8 @@ _HOLDERS = ("pipeline", "state_dict", "model")  # keys that may hold splatfacto'
 #: gsplat writes a file per GPU with a part of the splats (simple_trainer.py).
 _RANK = re.compile(r"(?P<run>.*_rank)(?P<rank>\d{1,4})(?P<ending>\.pt)")
 _FILTER = "filter_3D"
-#: gsplat's names of tensors, by those of gsplat and splatfacto, of Gaussian Splatting Lightning, and of attributes in
-#: INRIA's `GaussianModel`, which trainers derived from it save as a state.
+#: gsplat's names of tensors, by the names in gsplat and splatfacto, in Gaussian Splatting Lightning, and of attributes
+#: in INRIA's `GaussianModel`, which trainers derived from it save as a state.
 _NAMES = {
     "means": "means",
     "quats": "quats",
@@ -109,7 +109,7 @@ class _CheckpointPart(NamedTuple):
 
 
 def _rank_files(path: Path) -> tuple[list[Path], list[Finding]]:
-    """Return the files of all GPUs of a run of gsplat, given one of them.
+    """Return the files of all GPUs of a run of gsplat, given the file of a GPU.
 
     Raises:
         InputError: a file is missing.

@@ -19,7 +19,7 @@ from csplat_trainer.image_gains import ImageGain
 from csplat_trainer.losses import LOSS_WEIGHTS, LossValue
 from csplat_trainer.posed_images import PosedImage
 
-_IMAGE_SHARE = 0.3  # fraction of a GPU's memory for images; further ones are copied to it in each step
+_IMAGE_SHARE = 0.3  # fraction of a GPU's memory for images; further images are copied to it in each step
 
 
 class TorchLoss:

@@ -28,7 +28,7 @@ class QuantisedValues:
     """Integers of a file's streams, and decoded values of its splats, on a device.
 
     Attributes:
-        scales: [S, 3] integers, those of the S rows of shapes.
+        scales: [S, 3] integers of the S rows of shapes.
         quats: [S, 3].
         sizes: [N], or [0] without a shape codebook.
         opacities: [N].

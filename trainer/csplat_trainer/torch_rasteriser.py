@@ -44,7 +44,7 @@ def render(
         camera: the camera to render from.
         background: background colour.
         antialiased: apply the mip-splatting low-pass filter.
-        sh_degree: highest degree of the SH bands; `None`: that of `shN`.
+        sh_degree: highest degree of the SH bands; `None`: the degree of `shN`.
 
     Returns:
         [H, W, 3], not clipped.

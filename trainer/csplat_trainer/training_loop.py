@@ -66,8 +66,8 @@ def train(
 
     Examples:
         >>> import csplat, csplat_trainer
-        >>> found = csplat_trainer.train("capture", csplat_trainer.TrainOptions(max_splats=5000))  # doctest: +SKIP
-        >>> csplat.write_ply("scene.ply", found.model)  # doctest: +SKIP
+        >>> trained = csplat_trainer.train("capture", csplat_trainer.TrainOptions(max_splats=5000))  # doctest: +SKIP
+        >>> csplat.write_ply("scene.ply", trained.model)  # doctest: +SKIP
 
     Raises:
         InputError: there are no images, an option does not fit the data, or a file is damaged or of another kind.

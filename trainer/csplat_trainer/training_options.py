@@ -32,7 +32,7 @@ MISSING_TORCH = "device cuda: torch is not installed (pip install 'csplat[cuda]'
 class TrainOptions:
     """Options of training. The defaults suit thousands to a hundred thousand splats on a CPU.
 
-    They differ from the usual ones in the learning rates of means and higher SH bands (twice those of the first
+    They differ from the usual options in the learning rates of means and higher SH bands (twice the rates of the first
     publication), the noise (the same in scene units) and the weight of the mean opacity (0.003 instead of 0.01): Lego
     with 10,000 splats gained 1.1 dB in 7,000 steps.
 
@@ -163,7 +163,7 @@ class TrainOptions:
     def prunings_left(self, iteration: int) -> int:
         """Return the number of prunings left, including the one after this step; 0 if there is none after this step.
 
-        The last one is followed by 40 % of the steps after the end of the strategy.
+        The last pruning is followed by 40 % of the steps after the end of the strategy.
         """
         begin = min(self.refine_end, self.iterations - 1)
         steps = max(1, int(_PRUNING_FRACTION * (self.iterations - begin)))

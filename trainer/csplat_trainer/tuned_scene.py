@@ -101,7 +101,7 @@ class TunedScene:
         self.fixed.constrain(self._free_values(alphas))
 
     def _by_row(self, by_splat: F32) -> F32:
-        """Return the gradients of the file's rows of SH, given those of all splats [N, K, 3]."""
+        """Return the gradients of the file's rows of SH, given the gradients of all splats [N, K, 3]."""
         book = self.fixed.book
         if book is None or self._users is None:
             return by_splat
@@ -140,7 +140,7 @@ def initial_parameters(fixed: FixedQuantisation) -> Parameters:
 
 
 def _users(index: NDArray[np.int32], size: int) -> tuple[I64, I64]:
-    """Return splats sorted by entry, escaped ones last, and the start of each entry, [size + 1]."""
+    """Return splats sorted by entry, escaped splats last, and the start of each entry, [size + 1]."""
     order = np.argsort(index, kind="stable")
     starts = np.searchsorted(index[order], np.arange(size + 1))
     return order.astype(np.int64), starts.astype(np.int64)
@@ -314,7 +314,7 @@ def _table_name(name: str, number: int) -> str:
 
 
 def count_integers(parts: Iterable[NDArray[Any]]) -> I64:
-    """Count the integers −128 to 128 of each column, [C, 257]; those beyond count as these.
+    """Count the integers −128 to 128 of each column, [C, 257]. Integers beyond count as −128 or 128.
 
     Args:
         parts: at least one part of [n, C] integers: rows of the same C columns.

@@ -35,7 +35,7 @@ _PASSES = {
 }
 
 _HARDWARE = ("DiscreteGPU", "IntegratedGPU", "VirtualGPU")
-_KINDS = (*_HARDWARE, "CPU", "Unknown")  # the preferred ones first
+_KINDS = (*_HARDWARE, "CPU", "Unknown")  # preferred kinds first
 
 
 @dataclass(frozen=True)
@@ -142,7 +142,7 @@ class Device:
             return np.frombuffer(self._device.queue.read_buffer(buffer, 0, size_bytes), np.uint8)
 
     def run(self, calls: Sequence[Call], *, clear: Sequence[Any] = ()) -> None:
-        """Run passes one after the other, after those of earlier calls; some buffers are filled with zeros before.
+        """Run passes one after the other, after the passes of earlier calls. Fill the buffers in `clear` with 0 first.
 
         Raises:
             InputError: the GPU failed or was lost.
@@ -194,11 +194,11 @@ class Device:
         Args:
             name: the pass, see `shader_source`.
             entry: its entry point.
-            count: number of workgroups: of one or two dimensions, or a buffer and the offset of three numbers in it.
+            count: number of workgroups, in one or two dimensions; or a buffer and the offset of three numbers in it.
             buffers: the buffers of the bindings from 0 on; `None` for those that the entry point does not use.
 
         Raises:
-            InputError: the GPU failed or was lost, or a buffer is that of another GPU.
+            InputError: the GPU failed or was lost, or a buffer belongs to another GPU.
         """
         entries = [
             {"binding": slot, "resource": {"buffer": buffer, "offset": 0, "size": buffer.size}}

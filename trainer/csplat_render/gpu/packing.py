@@ -98,7 +98,7 @@ class TileWords:
 
     @property
     def blocks(self) -> int:
-        """Number of blocks of `BLOCK` splats, the last one filled up."""
+        """Number of blocks of `BLOCK` splats; the last block is filled up."""
         return -(-self.splats // BLOCK)
 
     def placed(self, first_word: int, first_block: int) -> Words:
@@ -116,7 +116,7 @@ def pack_tile(tile: PackedTile, tables: SharedTables, shift: F64, *, antialiased
 
     Args:
         tile: the tile's integers.
-        tables: the codebooks so far; those of the tile are added.
+        tables: the codebooks so far; the tile's codebooks are added.
         shift: [3], added to the means, scene units.
         antialiased: True if the scene needs the mip-splatting filter.
     """

@@ -1,8 +1,8 @@
 """`GpuRenderer`: render scenes on a GPU, by screen tiles, from the integers of their files.
 
-An image is made in bands of rows that fit the buffers; a band, in slices of depth, nearest first, that fit the buffers
-of records; and a slice, in steps that fit the buffer of pairs of splat and screen tile. Most images are one band, one
-slice and one step. Pixels pass from one step to the next, so that slices and steps do not change the image.
+An image is rendered in bands of rows that fit the buffers. A band is rendered in slices of depth, nearest first, that
+fit the buffers of records; a slice, in steps that fit the buffer of pairs of splat and screen tile. Most images are one
+band, one slice and one step. Pixels pass from one step to the next, so slices and steps do not change the image.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class GpuScene:
         device: the GPU.
         scenes: models, or files opened by `csplat.open`, at least one.
         antialiased: apply the mip-splatting filter; `None`: each scene's own setting.
-        sh_degree: highest SH degree; `None`: that of each scene.
+        sh_degree: highest SH degree; `None`: each scene's own degree.
 
     Attributes:
         device: the GPU.
@@ -290,7 +290,7 @@ class GpuRenderer:
         return GpuRender(rgb, alpha, self.scene.ignored, visible, pairs, steps)
 
     def bands(self, camera: Camera) -> list[range]:
-        """Return the rows of an image in bands that fit the buffers, after making room for the pixels of one."""
+        """Return the rows of an image in bands that fit the buffers, after making room for the pixels of a band."""
         columns = -(-camera.W // _SCREEN_TILE)
         widest = min(self.device.binding_max // (16 * _SCREEN_TILE), self._pairs_max // BLOCK * _SCREEN_TILE)
         if columns * _SCREEN_TILE > widest:
@@ -305,7 +305,7 @@ class GpuRenderer:
 
         Args:
             camera: the camera.
-            rows: the band, one of those that `bands` returned last.
+            rows: a band from the last call of `bands`.
             times: the milliseconds of each stage are added to it; this needs timestamps. `None`: none are measured.
 
         Returns:

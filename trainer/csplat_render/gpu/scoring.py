@@ -24,7 +24,7 @@ def compare_scenes(
     *,
     progress: Progress | None = None,
 ) -> Scores:
-    """Measure the PSNR of a scene's renders against those of its source; other metrics are `None`.
+    """Measure the PSNR of a scene's renders against renders of its source; other metrics are `None`.
 
     Args:
         source, other: the scenes, on one device.

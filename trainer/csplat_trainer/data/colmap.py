@@ -44,14 +44,14 @@ from csplat_trainer.data.image_files import (
 from csplat_trainer.data.lens import SPLIT_PANORAMAS, UNDISTORTER, Lens, is_panorama
 from csplat_trainer.data.set_folder import SetFolder
 
-#: Folders with models in numbered subfolders, or with a model; the last one only if there is no other.
+#: Folders with models in numbered subfolders, or with a model; the last folder is used only if there is no other.
 _MODEL_FOLDERS = (("sparse", "colmap/sparse"), ("distorted/sparse",))
 _IMAGE_FOLDERS = ("images", "input", ".")
 _UNDISTORTED_FIRST = "distorted"  # by convert.py of 3DGS: images/ belongs to sparse/0, input/ to this folder's model
 
 
 def find_model(folder: Path) -> tuple[Path, list[str]] | None:
-    """Find the sparse model in the folder of a set; of several the one with most images.
+    """Find the sparse model in the folder of a set; of several models, choose the model with the most images.
 
     Returns:
         The model's folder, and a line that names other models, if any; `None` if there is no model.
@@ -134,7 +134,7 @@ def read_colmap(
 
 
 def _shown_name(name: str, found: FoundImages) -> str:
-    """Return the name of an image, or that of its file if the name is not UTF-8."""
+    """Return the name of an image, or the name of its file if the former is not UTF-8."""
     return name if name == printable(name) else printable(_relative(found.files[name], found.folder))
 
 
@@ -159,7 +159,7 @@ def _is_model(folder: Path) -> bool:
 
 
 def _file(model: Path, name: str) -> Path | None:
-    """Find a file of the model, binary before text, and empty ones last."""
+    """Find a file of the model, binary before text, and empty files last."""
     there = [path for path in (model / f"{name}.bin", model / f"{name}.txt") if path.is_file()]
     return next((path for path in there if path.stat().st_size), there[0] if there else None)
 
@@ -173,7 +173,7 @@ def _largest(models: list[Path], folder: Path) -> tuple[Path, list[str]]:
     if len(models) == 1:
         return models[0], []
     counts = [_count(model) for model in models]
-    best = max(range(len(models)), key=counts.__getitem__)  # the first of equal ones
+    best = max(range(len(models)), key=counts.__getitem__)  # the first of equal models
     words = [f"{counts[i]}" if counts[i] >= 0 else "a damaged list of images" for i in range(len(models))]
     others = ", ".join(f"{_relative(models[i], folder)} has {words[i]}" for i in range(len(models)) if i != best)
     chosen = _relative(models[best], folder)
@@ -213,7 +213,7 @@ def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
 
 
 def _masks(place: SetFolder, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
-    """Find the masks of images, and report images without one."""
+    """Find the masks of images, and report images without a mask."""
     names = list(images)
     masks = find_masks(place, images)
     if masks is None:

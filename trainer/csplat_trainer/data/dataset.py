@@ -88,7 +88,7 @@ class DataSet:
         return [image for image in self.train if id(image) not in outliers] or self.train
 
     def read(self) -> None:
-        """Read all training and test images, to find damaged ones early.
+        """Read all training and test images, to detect damaged files early.
 
         Raises:
             InputError: a file is not an image, or is truncated.
@@ -304,7 +304,7 @@ def open_shot(shot: Shot, head: ImageHeader, size: tuple[int, int] | None, near:
     Args:
         shot: the shot to convert.
         head: header of its file.
-        size: width and height of the image; `None`: those of the file.
+        size: width and height of the image; `None`: the file's own size.
         near: near plane of the camera, scene units.
 
     Raises:

@@ -19,8 +19,8 @@ class ForeignSet:
 
     Attributes:
         title: the program and its files, in prose.
-        patterns: paths in the folder of the set, one of which exists; the last part is also the name of a file that
-            users pass as the set. Case does not matter.
+        patterns: paths in the folder of the set, at least one of which exists. The last part is also the name of a file
+            that users pass as the set. Case does not matter.
         remedy: advice that follows "<path> is <title>, which is not read: "; for folders "<path> holds <file>, …".
         mark: bytes near the beginning of such a file, in lower case; b"": the name suffices.
     """

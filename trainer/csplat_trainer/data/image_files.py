@@ -7,14 +7,14 @@ matched by these rules in order, and every rule but the first is reported when i
 2. `\` as `/`, without a drive letter and surrounding spaces;
 3. as a URL: without `file:`, `%20` as a space;
 4. in another Unicode form, or in another case;
-5. with another image suffix, or with one if there is none (Blender's names), in any case;
+5. with another image suffix, or with a suffix if the name has none (Blender's names), in any case;
 6. without its leading folders, if rules 1 to 5 match no name at all;
 7. in a folder below, if rule 6 matches none either;
 8. under another code page, by all the rules above: bytes that are not UTF-8, or letters that result from reading a name
    in a wrong code page; if one code page explains most of the names that are left.
 
-Rules 4 to 7 also apply rules 2 and 3. A name that matches two files is an error, and so are two names that match one
-file. Names that lead out of the folder of the set are matched by rules 6 and 7 alone, unless the set is trusted
+Rules 4 to 7 also apply rules 2 and 3. A name that matches two files is an error. Two names that match one file are an
+error, too. Names that lead out of the folder of the set are matched by rules 6 and 7 alone, unless the set is trusted
 (`SetFolder`).
 """
 
@@ -33,7 +33,7 @@ from csplat.errors import InputError, counted
 from csplat_trainer.data.image_pixels import image_size
 from csplat_trainer.data.set_folder import SetFolder
 
-#: Suffixes of images; files of the last ones are found, and refused by name.
+#: Suffixes of images; files with the last suffixes are matched, and refused by name.
 IMAGE_ENDINGS = (
     *(".png", ".jpg", ".jpeg", ".jpe", ".jfif", ".webp", ".tif", ".tiff", ".bmp"),
     *(".avif", ".heic", ".heif", ".jp2", ".jxl", ".gif", ".exr"),
@@ -45,7 +45,7 @@ _FOLDER_WORDS = ("without leading folders", "in folders below")  # rules 6 and 7
 _MASK_FOLDERS = ("masks", "mask", "_masks", "_mask")
 _MASK_AFFIX = re.compile(r"^masks?[_.-]|[_. -]masks?$", re.IGNORECASE)
 
-#: Code pages of file names, by Python's names: Chinese, Japanese, Korean, European, Cyrillic, and those of zips.
+#: Code pages of file names, by Python's names: Chinese, Japanese, Korean, European, Cyrillic, and code pages of zips.
 _CODE_PAGES = {
     "gb18030": "GBK", "cp932": "Shift-JIS", "cp950": "Big5", "cp949": "EUC-KR", "euc_jp": "EUC-JP",
     "cp1252": "Windows-1252", "cp1250": "Windows-1250", "cp1251": "Windows-1251", "cp437": "CP437", "cp850": "CP850",
@@ -97,9 +97,9 @@ def find_images(
         place: the folder of the set.
         names: names in the set, at least one.
         where: the file that names them, for messages.
-        folders: folders to try in this order, relative to that of the set. `.` is that folder itself; it comes last
-            when leading folders of names are ignored. Each includes folders of smaller images next to it: `images`
-            includes `images_2`, `images_4`, …
+        folders: folders to try in this order, relative to the folder of the set. `.` is the folder of the set itself.
+            It comes last when leading folders of names are ignored. Each includes folders of smaller images next to it:
+            `images` includes `images_2`, `images_4`, …
         size: requested width and height, for which the smallest sufficient of such folders is used; `None`: the first.
 
     Raises:
@@ -137,7 +137,7 @@ def _refuse_outside(place: SetFolder, folders: Sequence[Path], names: Iterable[s
 
 
 def find_masks(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | None:
-    """Find the masks of images in a folder `masks` or `mask`, or those of RealityScan next to the images.
+    """Find the masks of images in a folder `masks` or `mask`, or RealityScan's masks next to the images.
 
     In a folder, the masks of `1.jpg` are called `1.png`, `1.jpg.png`, `1_mask.png`, `mask_1.png` or `1.jpg.mask.png`.
     Next to the images, `1.jpg.mask.png` is accepted, which cannot be an image.
@@ -169,7 +169,7 @@ def find_masks(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | No
 
 
 def _masks_next_to(place: SetFolder, images: Mapping[str, Path]) -> FoundImages | None:
-    """Find masks whose names are those of images, followed by `.mask` and a suffix, in any case."""
+    """Find masks that are named like an image, followed by `.mask` and a suffix, in any case."""
     folders = {path.parent: {file.name.casefold(): file for file in path.parent.iterdir()} for path in images.values()}
     files = {}
     for name, path in images.items():
@@ -206,7 +206,7 @@ def _without_affix(name: str) -> str:
 def match_names(
     names: Iterable[str], known: Iterable[str], where: str, *, folders: bool = True
 ) -> tuple[dict[str, str], list[str]]:
-    """Match listed names with existing ones, by the rules of this module.
+    """Match listed names with existing names, by the rules of this module.
 
     Args:
         names: listed names.
@@ -215,10 +215,11 @@ def match_names(
         folders: use rules 6 and 7.
 
     Returns:
-        Existing names by listed ones, without missing ones; and a line for each rule that was used.
+        Existing names by listed names, without missing names; and a line for each rule that was used.
 
     Raises:
-        InputError: a name matches two existing ones, or two names match one; or code pages contradict each other.
+        InputError: a name matches two existing names, two names match the same name, or code pages contradict each
+            other.
     """
     left, free = dict.fromkeys(names), dict.fromkeys(known)
     matched, notes = _match_by_rules(left, free, where, folders=folders)
@@ -231,7 +232,7 @@ def match_names(
 def _match_by_rules(
     names: Iterable[str], known: Iterable[str], where: str, *, folders: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Match names by rules 1 to 7; arguments and result are those of `match_names`."""
+    """Match names by rules 1 to 7; arguments and result are as in `match_names`."""
     left, free = dict.fromkeys(names), dict.fromkeys(known)
     matched: dict[str, str] = {}
     notes: list[str] = []
@@ -256,7 +257,7 @@ def _match_by_rules(
 def _match_code_pages(
     names: Iterable[str], known: Sequence[str], where: str, *, folders: bool
 ) -> tuple[dict[str, str], list[str]]:
-    """Match names by rule 8; arguments and result are those of `match_names`."""
+    """Match names by rule 8; arguments and result are as in `match_names`."""
     listed, existing = ([name for name in some if not name.isascii()] for some in (names, known))
     best: dict[str, tuple[dict[str, str], str]] = {}  # by the mapping, which several code pages may give
     most = max(1.0, _MOST * len(listed))
@@ -405,7 +406,7 @@ def abbreviate(names: Sequence[str]) -> str:
 
 
 def _size_folders(place: SetFolder, folder: str) -> list[Path]:
-    """Find a folder, in any case, and those of smaller images next to it, the largest images first."""
+    """Find a folder, in any case, and folders of smaller images next to it, the largest images first."""
     path = place.path / folder
     if not place.holds(path):
         return []
@@ -439,7 +440,7 @@ def _is_large(found: FoundImages, size: tuple[int, int]) -> bool:
 
 
 def _images_below(folder: Path) -> Iterator[str]:
-    """Yield the sorted relative paths of images below a folder, without hidden ones and those of macOS' archives."""
+    """Yield the sorted relative paths of images below a folder, without hidden files and files of macOS' archives."""
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(name for name in folders if not name.startswith((".", "__MACOSX")))
         for name in sorted(files):

@@ -92,7 +92,7 @@ def read_image_header(path: Path) -> ImageHeader:
 def opaque_images(heads: Iterable[ImageHeader]) -> list[ImageHeader]:
     """Find images with a redundant alpha channel, as written by some exporters.
 
-    Images are decoded until one has some transparency.
+    Images are decoded until an image has some transparency.
 
     Args:
         heads: headers of the files of a set.
@@ -136,7 +136,7 @@ def rgb_pixels(image: Image.Image, path: Path) -> U8:
     stored = np.asarray(image)
     grey = np.rint(255.0 * _unit_grey(image, path)).astype(np.uint8)
     channels = [grey, grey, grey]
-    if "transparency" in image.info:  # one grey value that is transparent
+    if "transparency" in image.info:  # a grey value that is transparent
         channels.append(np.where(stored == image.info["transparency"], 0, 255).astype(np.uint8))
     return np.stack(channels, axis=2)
 

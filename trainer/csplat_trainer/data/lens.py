@@ -87,8 +87,8 @@ def is_panorama(model: str) -> bool:
 def undistorted_lens(lens: Lens) -> Lens:
     """Return the pinhole camera of a lens's undistorted images.
 
-    The focal lengths grow in steps of 0.5 % until every pixel of the undistorted image maps into the distorted one, and
-    no two to the same place, so that no pixel is undefined. The border of a fisheye image is cut off.
+    The focal lengths grow in steps of 0.5 % until every pixel of the undistorted image maps into the distorted image,
+    and no two to the same place, so that no pixel is undefined. The border of a fisheye image is cut off.
 
     Raises:
         InputError: no reasonable zoom achieves this, so the parameters are implausible.
@@ -103,13 +103,13 @@ def undistorted_lens(lens: Lens) -> Lens:
     names = ("radial", "tangential", "divisor", "prism", "omega")
     distortion = ", ".join(f"{name} {getattr(lens, name)}" for name in names if np.any(getattr(lens, name)))
     raise InputError(
-        f"{where}the distortion ({distortion}) cannot be undone over the whole image: it folds, or requires a zoom of more"
-        f" than {_MAX_ZOOM:g} to hide the border; check its parameters, or use {UNDISTORTER}"
+        f"{where}the distortion ({distortion}) cannot be undone over the whole image: it folds, or requires a zoom of "
+        f"more than {_MAX_ZOOM:g} to hide the border; check its parameters, or use {UNDISTORTER}"
     )
 
 
 def distorted(u: F64, v: F64, lens: Lens, straight: Lens) -> tuple[F64, F64]:
-    """Return the positions of pixels of the undistorted image in the distorted one.
+    """Return the positions of pixels of the undistorted image in the distorted image.
 
     Args:
         u, v: horizontal and vertical pixel coordinates, of any shape.

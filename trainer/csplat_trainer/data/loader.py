@@ -26,7 +26,7 @@ from csplat_trainer.data.transforms import read_blender, read_transforms
 _SET_LEVELS = 2  # how far the data set may be above its folder of images
 _SETS = ("transforms_train.json", "transforms.json")
 _MAX_NAMED = 3  # folders in a message, at most
-_AGREES = math.cos(math.radians(30.0))  # least cosine between the conventional up direction and that of the cameras
+_AGREES = math.cos(math.radians(30.0))  # least cosine between the conventional and the cameras' up direction
 
 
 def load(
@@ -52,8 +52,8 @@ def load(
     Args:
         path: its folder, its `transforms.json`, or a folder of images in it, such as `garden/images_4`.
         size: width and height to which all images are scaled, each axis separately; `None`: unchanged.
-        images: the folder of images, such as `images_4`; `None`: that of the set; for COLMAP sets with `size` the
-            smallest that is large enough.
+        images: the folder of images, such as `images_4`. `None`: the set's own folder; for COLMAP sets with `size`, the
+            folder with the smallest images that are large enough.
         test_every: every Nth image is a test image if the set specifies none; 0: no test images.
         near: near plane of the cameras, scene units; `None`: derived from the set.
         trust_paths: read files outside of the folder, too.
@@ -141,7 +141,7 @@ def find_image_folder(path: str | os.PathLike[str]) -> tuple[Path, str | None]:
     """Split the path of a folder of images in a data set.
 
     Args:
-        path: a data set, or a folder of images in one that is not itself a data set.
+        path: a data set; or a folder of images in a data set, if the folder is not itself a data set.
 
     Returns:
         `garden` and `images_4` for `garden/images_4`; otherwise `path` and `None`.
@@ -177,7 +177,7 @@ def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | N
 
 
 def _settle(found: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
-    """Resolve the links of images and masks: what is read later is what was checked."""
+    """Resolve the links of images and masks, so that the files read later are the files that were checked."""
     train, test, val = (
         [
             replace(shot, path=place.settled(shot.path), mask=None if shot.mask is None else place.settled(shot.mask))
@@ -327,8 +327,8 @@ class UpEstimate:
 
     Attributes:
         up: unit length, in the scene's coordinates.
-        tilt_degrees: median angle between the images' horizons and level ones or, if `by_horizons` is False, between
-            the cameras' own up and this one. It is robust to some images in portrait orientation.
+        tilt_degrees: median angle between the images' horizons and level horizons or, if `by_horizons` is False,
+            between the cameras' own up and `up`. It is robust to some images in portrait orientation.
         by_horizons: True if up is the direction in which the cameras' right axes point least, since cameras are mostly
             held level. This requires cameras that look in various directions; otherwise up is the mean of the
             cameras' own.

@@ -17,7 +17,7 @@ class SetFolder:
     """The folder of a data set, which others may have written.
 
     Attributes:
-        path: the folder that the user named, or that of the named file.
+        path: the folder that the user named, or the folder of the named file.
         trusted: True if the set may read any path.
         images: a folder of images that the user named; it may be a link to anywhere.
     """

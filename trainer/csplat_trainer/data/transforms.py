@@ -1,4 +1,4 @@
-"""Readers of `transforms*.json`: NeRF-synthetic (Blender) sets, and those of instant-ngp and nerfstudio.
+"""Readers of `transforms*.json`: sets of NeRF-synthetic (Blender), instant-ngp and nerfstudio.
 
 Both hold camera-to-world matrices with OpenGL axes: x to the right, y up, z backwards.
 """
@@ -226,7 +226,7 @@ def _is_lost(frame: Mapping[str, Any]) -> bool:
 
 
 def _folders(names: Sequence[str], images: str | None) -> list[str]:
-    """Return the folders to search for images: that of the names, then its last part, then the usual ones."""
+    """Return the folders to search for images: the names' folder, then its last part, then the usual folders."""
     if images is not None:
         return [images]
     own = PurePosixPath(normalise_name(names[0])).parent
@@ -321,7 +321,7 @@ def _load(place: SetFolder, path: Path) -> dict[str, Any]:
 
 
 def _lens(values: Mapping[str, Any], image: Path, where: str) -> Lens:
-    """Return the lens: focal lengths or angles of view, for the given size or that of the file; and the distortion."""
+    """Return the lens: focal lengths or angles of view, for the given or the file's size; and the distortion."""
     model = str(values.get("camera_model") or "").strip()
     fisheye = model.upper() in _FISHEYES or bool(values.get("is_fisheye"))
     if not fisheye and model.upper() not in PERSPECTIVES:

@@ -1,4 +1,4 @@
-"""Quantisation-aware fine-tuning: renders during the tuning are those of the decoded file."""
+"""Quantisation-aware fine-tuning: renders during the tuning show the decoded file."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # torch and gsplat may be absent:
 # pyright: reportMissingImports=false
-"""Fine-tuning on a GPU with the gsplat package as rasteriser; the interface is that of `CpuTuning`.
+"""Fine-tuning on a GPU with the gsplat package as rasteriser, with the interface of `CpuTuning`.
 
 Images are rendered from the values that a decoder of the file returns, bit for bit, by quantisers in torch; the encoder
 decides and writes.

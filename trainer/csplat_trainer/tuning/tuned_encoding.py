@@ -32,7 +32,7 @@ class TunedFile:
 
     Attributes:
         result: result of the encoder.
-        decoded: the decoded values, which are the tuned ones, bit for bit.
+        decoded: the decoded values, which are the tuned values, bit for bit.
         plain: the file with the same decisions before tuning.
         log: JSON-compatible: options, losses, evaluations on the validation views (`validations`), times.
         seconds: time of `encoding` and `tuning`.
@@ -104,8 +104,8 @@ def finetune(
     Examples:
         >>> import csplat, csplat_trainer
         >>> data = csplat_trainer.load("capture")  # doctest: +SKIP
-        >>> found = csplat_trainer.finetune(csplat.read("scene.ply"), data)  # doctest: +SKIP
-        >>> len(found.data) < len(found.plain.data)  # doctest: +SKIP
+        >>> tuned = csplat_trainer.finetune(csplat.read("scene.ply"), data)  # doctest: +SKIP
+        >>> len(tuned.data) < len(tuned.plain.data)  # doctest: +SKIP
         True
 
     Raises:

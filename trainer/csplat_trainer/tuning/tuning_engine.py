@@ -104,7 +104,7 @@ class CpuTuning:
         if gain is not None:
             rendered = gain.apply(rendered)
         reference = view.image(self._background, buffer)
-        value = loss(rendered, reference, view.mask)[0]  # sets pixels that do not count to those of the render
+        value = loss(rendered, reference, view.mask)[0]  # copies pixels that do not count from the render
         error = np.square(np.clip(rendered, 0, 1) - np.clip(reference, 0, 1)).sum(dtype=np.float64)
         return value, float(error)
 

@@ -37,7 +37,7 @@ class TuningResult:
     """Result of a run.
 
     Attributes:
-        best_values: the values with the best score on the validation views; perhaps the initial ones.
+        best_values: the values with the best score on the validation views; perhaps the initial values.
         log: JSON-compatible: options, losses, evaluations (`validations`), times.
     """
 
@@ -65,7 +65,7 @@ def tune(
         options: options of the tuning.
         size_bytes: largest size of the file; lambda is adjusted to meet it, starting at `byte_cost`.
         progress: called every `log_every` steps.
-        outputs: checkpoints; a run resumes from one of the same fixed quantisation.
+        outputs: checkpoints; a run resumes from a checkpoint of the same fixed quantisation.
         threads: number of threads; `None` for all.
 
     Raises:
@@ -163,7 +163,7 @@ class _Tuning:
                 self._controller.update(fitter.rate.bits, (fitter.iteration - 1) / fitter.iterations, options.byte_cost)
         gain = fitter.gain(view, options.lr_exposure * options.learning_rate_factor(fitter.iteration))
         value = self._engine.step(self._views.train[view], gain, self._rates(), fitter.rate)
-        if fitter.iteration == 1 and not math.isfinite(value.read().loss):  # that of the initial values
+        if fitter.iteration == 1 and not math.isfinite(value.read().loss):  # the loss of the initial values
             raise InputError("renders of the scene overflow float32: its colours are too large for tuning")
         return value
 
