@@ -368,7 +368,7 @@ def direction_at(up: ArrayLike, azimuth: float, elevation: float) -> F64:
 
 
 def _cross(a: F64, b: F64) -> F64:
-    """Return `np.cross` of two vectors, bit for bit, without its overhead, which matters for hundreds of cameras."""
+    """Return `np.cross` of two vectors [3], bit for bit. Its overhead would matter for hundreds of cameras."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 

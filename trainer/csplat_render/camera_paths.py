@@ -118,7 +118,7 @@ def _main_parts(cloud: Cloud, frame: SceneFrame) -> F64:
 
 
 def _touching(first: int, filled: Mask) -> Mask:
-    """Return the filled cells connected with the cell `first`."""
+    """Return the filled cells, [n, n, n] bool, connected with the cell of flat index `first`."""
     connected: Mask = np.zeros_like(filled)
     connected.flat[first] = True
     while True:
@@ -132,7 +132,7 @@ def _touching(first: int, filled: Mask) -> Mask:
 
 
 def _framing(body: F64, frame: SceneFrame, elevation: float, K: F64, width: int, height: int) -> tuple[F64, float]:
-    """Return a look-at point and a distance at which an object is inside all images of an orbit."""
+    """Return a look-at point [3] and a distance at which an object, points [M, 3], is inside all images of an orbit."""
     up = frame.up
     first, second = direction_at(up, 0.0, 0.0), direction_at(up, 90.0, 0.0)
     sides = np.stack([_along(body - frame.centre, axis) for axis in (first, second, up)])

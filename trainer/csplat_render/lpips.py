@@ -212,13 +212,13 @@ def _features(image: NDArray[Any], weights: Lpips) -> list[F32]:
 
 
 def _unit(x: F32) -> NDArray[np.float64]:
-    """Scale the channels of each pixel to length 1."""
+    """Scale the channels of each pixel to length 1, [h, w, channels]."""
     wide = x.astype(np.float64)
     result: NDArray[np.float64] = wide / (np.sqrt(np.sum(wide * wide, axis=2, keepdims=True)) + _EPSILON)
     return result
 
 
 def _pool(x: F32) -> F32:
-    """Return the maximum over 3×3 pixels, with a stride of 2."""
+    """Return the maximum over 3×3 pixels of [h, w, channels], with a stride of 2."""
     result: F32 = sliding_window_view(x, (3, 3), axis=(0, 1))[::2, ::2].max(axis=(3, 4))
     return result

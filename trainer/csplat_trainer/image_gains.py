@@ -62,7 +62,7 @@ class ImageGains:
 
 @dataclass(frozen=True, eq=False)
 class ImageGain:
-    """The correction of one image.
+    """The correction of an image.
 
     Attributes:
         gains: the corrections of all images.

@@ -123,7 +123,7 @@ def place_splats(
 
 
 def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: Generator) -> tuple[F64, F64]:
-    """Choose some of the points; if more splats are needed than there are points, repeat some with noise."""
+    """Choose some of the points [M, 3], and their colours. If there are fewer than `count`, repeat some with noise."""
     order = rng.permutation(len(points))
     chosen = np.concatenate([order, rng.integers(0, len(points), max(0, count - len(points)))])[:count]
     means = points[chosen].astype(np.float64)
@@ -138,7 +138,7 @@ def _at_points(points: F32, colours: F32, count: int, scene: SceneExtent, rng: G
 def _in_box(
     images: Sequence[PosedImage], scene: SceneExtent, count: int, rng: Generator, *, masked: bool
 ) -> tuple[F64, F64]:
-    """Draw points that cameras see, inside the hull if `masked`, with the mean of their pixels."""
+    """Draw points that cameras see, inside the hull if `masked`, with the mean of their pixels, [count, 3] each."""
     kept: list[F64] = []
     colours: list[F64] = []
     total = 0
@@ -162,7 +162,11 @@ def _in_box(
 
 
 def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], F64]:
-    """Return for each point the number of images that see it, and that see the object there, and the mean colour."""
+    """Count the images that see each of the points [M, 3], and that see the object there; and average its colour.
+
+    Returns:
+        [M] and [M], the counts; [M, 3], the mean colour, 0.5 if no image sees the object.
+    """
     seen, hits = np.zeros(len(points), np.int64), np.zeros(len(points), np.int64)
     colour = np.zeros((len(points), 3))
     for image in images:
@@ -175,7 +179,7 @@ def _sample_images(images: Sequence[PosedImage], points: F64) -> tuple[NDArray[n
 
 
 def _pixels_at(image: PosedImage, points: F64) -> tuple[NDArray[np.int64], F64]:
-    """Return the indices of points inside an image, and its pixels there, RGBA in 0..1."""
+    """Return the indices [n] of the points inside an image, and its pixels there, [n, 4], RGBA in 0..1."""
     camera: Camera = image.camera
     V, K = camera.viewmat, camera.K
     x, y, z = (points @ V[axis, :3] + V[axis, 3] for axis in range(3))
@@ -204,7 +208,7 @@ def _splats(means: F64, colour: F64, sh_degree: int, scene: SceneExtent, rng: Ge
 
 
 def _neighbour_distances(points: F64, scene: SceneExtent) -> F64:
-    """Return the root mean square distance to the three nearest other points, never 0.
+    """Return the root mean square distance of points [M, 3] to the three nearest other points, [M], never 0.
 
     If most points coincide with other points, return the distance between points that fill the box evenly.
     """

@@ -180,7 +180,10 @@ def _pack(metric: NDArray[np.float32]) -> NDArray[np.float16]:
 
 
 def _over_mean(triangles: NDArray[Any], mean: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return triangles divided by the mean of their diagonals; the unit matrix for splats that no view shows."""
+    """Return triangles [N, D (D + 1) / 2] divided by the mean of their diagonals [N].
+
+    Splats that no view shows get the unit matrix.
+    """
     seen = mean > 0.0
     scaled = np.empty(triangles.shape, np.float32)
     np.divide(triangles, np.where(seen, mean, 1.0)[:, None], out=scaled, casting="same_kind")

@@ -101,7 +101,7 @@ def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
 
 
 def _draw_by_opacity(alphas: F32, among: I64, count: int, rng: Generator) -> I64:
-    """Draw splats with replacement, in proportion to their opacity."""
+    """Draw `count` of the indices `among` with replacement, in proportion to the splats' opacity."""
     edges = np.cumsum(alphas[among].astype(np.float64))
     drawn = np.searchsorted(edges, rng.random(count) * edges[-1], side="right")
     chosen: I64 = among[np.minimum(drawn, len(among) - 1)]
@@ -255,7 +255,7 @@ def reset_opacities(parameters: Parameters) -> None:
 
 
 def _split_offsets(quats: F32, scales: F32, rng: Generator) -> tuple[F32, F32]:
-    """Draw two offsets for each splat from its own shape."""
+    """Draw two offsets, [N, 3] each, for each splat from its own shape."""
     w, x, y, z = quats.astype(np.float64).T
     rotation = np.stack(
         [

@@ -174,7 +174,7 @@ def _multiples(values: Tensor, coarse: Tensor | None) -> Tensor:
 
 
 def _rows(index: NDArray[np.int32], size: int) -> NDArray[np.int64]:
-    """Return the row of each splat: its entry, or, after all entries, its place among the escaped splats."""
+    """Return the row of each splat, [N]: its entry, or, after all entries, its place among the escaped splats."""
     rows = index.astype(np.int64)
     escaped = rows == size
     rows[escaped] += np.arange(np.count_nonzero(escaped))

@@ -163,7 +163,7 @@ def describe_poses(shots: Sequence[Shot], points: NDArray[np.floating[Any]] | No
 
 
 def _is_panorama(viewmats: NDArray[np.float64]) -> bool:
-    """Return True if the lines of sight meet in a point behind the cameras."""
+    """Return True if the lines of sight of cameras [V, 4, 4] meet in a point behind the cameras."""
     axes = viewmats[:, 2, :3]
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     positions = positions - positions.mean(axis=0)
@@ -177,7 +177,7 @@ def _is_panorama(viewmats: NDArray[np.float64]) -> bool:
 
 
 def _sees_any(shot: Shot, points: NDArray[np.floating[Any]]) -> bool:
-    """Return True if a point is in front of a camera, and within twice the width and height of its image."""
+    """Return True if any point of [M, 3] is in front of a camera, and within twice the size of its image."""
     x, y, z = (points @ shot.viewmat[:3, :3].T + shot.viewmat[:3, 3]).T
     lens = shot.lens
     across, down = np.abs(x) * lens.fx <= lens.width * z, np.abs(y) * lens.fy <= lens.height * z
