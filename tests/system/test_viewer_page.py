@@ -260,7 +260,7 @@ def test_the_file_gives_the_first_view(viewer, make_model):
 def test_the_address_has_precedence_over_the_file(tab, site, make_model):
     views = [look_at([0.0, 0.0, -4.0]), look_at([3.0, 0.0, -4.0])]
     site.add("/cameras.json", json.dumps(views).encode())
-    in_file = {"cameras": [look_at([1.0, 1.0, 5.0])], "metadata": {"training": {"background": [1, 1, 0.4]}}}
+    in_file = {"cameras": [look_at([1.0, 1.0, 5.0])], "entries": {"training": {"background": [1, 1, 0.4]}}}
     site.add("/a%20scene.csplat", encode(make_model(1, 0, opacities=np.zeros(1, np.float32), **in_file)))
     viewer = ViewerPage(tab, site)
     query = "?scene=/a%2520scene.csplat&camera=/cameras.json&view=1&axes=RUB&size=80x60&background=ff8000&ui=0"

@@ -241,10 +241,13 @@ def test_poses_of_other_conventions_are_reported_and_their_scale_removed(transfo
     poses = [np.array(frame["transform_matrix"]) for frame in sets.frames_of(transforms_set)]
     away = np.zeros((4, 4))
     away[0, 3] = 5000.0
+    sine, cosine = np.sin(np.radians(8.0)), np.cos(np.radians(8.0))
+    aside = np.array([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
     words = ("scaled", "cameras look", "one place")
     for changed, message in (
         (poses, None), (map(np.linalg.inv, poses), "all 10 cameras are at one place"),
         ((pose @ np.diag([1, -1, -1, 1]) for pose in poses), "all cameras look outwards"),
+        ((pose @ np.diag([1, -1, -1, 1]) @ aside for pose in poses), None),  # lines of sight do not meet
         ((pose + away * (i == 2) for i, pose in enumerate(poses)), None),  # an outlier
         ((pose @ np.diag([2, 2, 2, 1]) for pose in poses), "10 poses scaled (the first by 2): removed, positions stay"),
     ):  # fmt: skip
