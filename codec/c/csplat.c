@@ -128,7 +128,7 @@
 #define SPEC_CHUNK_METADATA "META"
 #define SPEC_CHUNK_CAMERAS "CAMS"
 #define SPEC_CHUNK_OPTIONS "OPTS"
-#define SPEC_CHUNK_STATED_ERRORS "SERR"
+#define SPEC_CHUNK_DECLARED_ERRORS "SERR"
 #define SPEC_CHUNK_TREE "TREE"
 #define SPEC_HEADER_SIZE 32
 #define SPEC_HEADER_AT_MAGIC 0
@@ -253,19 +253,19 @@
 #define SPEC_STREAM_HEAD_AT_COUNT 8
 #define SPEC_STREAM_HEAD_AT_PACKED_SIZE 12
 #define SPEC_STREAM_HEAD_AT_CODED_SIZE 16
-#define SPEC_STATED_ERRORS_HEAD_SIZE 20
-#define SPEC_STATED_ERRORS_HEAD_AT_SOURCE_COUNT 0
-#define SPEC_STATED_ERRORS_HEAD_AT_PRUNED_COUNT 8
-#define SPEC_STATED_ERRORS_HEAD_AT_SOURCE_SH_DEGREE 16
-#define SPEC_STATED_ERRORS_HEAD_AT_ERROR_FLAGS 17
-#define SPEC_STATED_ERRORS_HEAD_AT_RECORD_COUNT 18
-#define SPEC_STATED_ERROR_RECORD_SIZE 24
-#define SPEC_STATED_ERROR_RECORD_AT_MEASURE 0
-#define SPEC_STATED_ERROR_RECORD_AT_RESERVED_0 1
-#define SPEC_STATED_ERROR_RECORD_AT_RESERVED_1 2
-#define SPEC_STATED_ERROR_RECORD_AT_RESERVED_2 4
-#define SPEC_STATED_ERROR_RECORD_AT_MAX 8
-#define SPEC_STATED_ERROR_RECORD_AT_RMS 16
+#define SPEC_DECLARED_ERRORS_HEAD_SIZE 20
+#define SPEC_DECLARED_ERRORS_HEAD_AT_SOURCE_COUNT 0
+#define SPEC_DECLARED_ERRORS_HEAD_AT_PRUNED_COUNT 8
+#define SPEC_DECLARED_ERRORS_HEAD_AT_SOURCE_SH_DEGREE 16
+#define SPEC_DECLARED_ERRORS_HEAD_AT_ERROR_FLAGS 17
+#define SPEC_DECLARED_ERRORS_HEAD_AT_RECORD_COUNT 18
+#define SPEC_DECLARED_ERROR_RECORD_SIZE 24
+#define SPEC_DECLARED_ERROR_RECORD_AT_MEASURE 0
+#define SPEC_DECLARED_ERROR_RECORD_AT_RESERVED_0 1
+#define SPEC_DECLARED_ERROR_RECORD_AT_RESERVED_1 2
+#define SPEC_DECLARED_ERROR_RECORD_AT_RESERVED_2 4
+#define SPEC_DECLARED_ERROR_RECORD_AT_MAX 8
+#define SPEC_DECLARED_ERROR_RECORD_AT_RMS 16
 /* end generated */
 
 #define TRY(call)     \
@@ -379,7 +379,7 @@ struct csplat {
     size_t chunk_count;
     tile *tiles;
     uint32_t tile_count; /* of all levels */
-    const chunk *texts[3], *stated, *tree;
+    const chunk *texts[3], *declared, *tree;
     const csplat_node *nodes;       /* in node_memory; NULL until read */
     const uint32_t *replaced_first; /* in order_memory, the nodes above level 0; NULL until a budget is given */
     uint32_t node_count;
@@ -1221,8 +1221,8 @@ static unsigned chunks_of_book(const book *b)
 /* Register the chunk of a directory record of a known type; each must occur once. */
 static int claim(csplat *d, const chunk *k, const uint8_t *p)
 {
-    static const char *const types[] = {SPEC_CHUNK_METADATA,      SPEC_CHUNK_CAMERAS, SPEC_CHUNK_OPTIONS,
-                                        SPEC_CHUNK_STATED_ERRORS, SPEC_CHUNK_TREE,    SPEC_CHUNK_CODEBOOK};
+    static const char *const types[] = {SPEC_CHUNK_METADATA,        SPEC_CHUNK_CAMERAS, SPEC_CHUNK_OPTIONS,
+                                        SPEC_CHUNK_DECLARED_ERRORS, SPEC_CHUNK_TREE,    SPEC_CHUNK_CODEBOOK};
     static const unsigned flags[] = {SPEC_CHUNK_FLAG_SAFE_TO_COPY, SPEC_CHUNK_FLAG_SAFE_TO_COPY, 0, 0,
                                      SPEC_CHUNK_FLAG_CRITICAL,     SPEC_CHUNK_FLAG_CRITICAL};
     const chunk **slot = NULL;
@@ -1233,7 +1233,7 @@ static int claim(csplat *d, const chunk *k, const uint8_t *p)
         return fail(d, CSPLAT_E_VALUE, "CHK-4", k->record + SPEC_DIRECTORY_RECORD_AT_FLAGS, "flags %u of %s, expected %u",
                     k->flags, types[type], flags[type]);
     if (type < 5) {
-        slot = type < 3 ? &d->texts[type] : type == 3 ? &d->stated : &d->tree;
+        slot = type < 3 ? &d->texts[type] : type == 3 ? &d->declared : &d->tree;
         if (id || layer || *slot)
             return fail(d, CSPLAT_E_INDEX, "DIR-4", k->record, "%s with an id or a layer, or twice", types[type]);
     } else {
@@ -1253,7 +1253,7 @@ static int claim(csplat *d, const chunk *k, const uint8_t *p)
 static int is_known(const uint8_t *type)
 {
     return !memcmp(type, SPEC_CHUNK_METADATA, 4) || !memcmp(type, SPEC_CHUNK_CAMERAS, 4) ||
-           !memcmp(type, SPEC_CHUNK_OPTIONS, 4) || !memcmp(type, SPEC_CHUNK_STATED_ERRORS, 4) ||
+           !memcmp(type, SPEC_CHUNK_OPTIONS, 4) || !memcmp(type, SPEC_CHUNK_DECLARED_ERRORS, 4) ||
            !memcmp(type, SPEC_CHUNK_TREE, 4) || !memcmp(type, SPEC_CHUNK_CODEBOOK, 4);
 }
 
@@ -2766,47 +2766,49 @@ static int read_text(csplat *d, csplat_text which)
     return json_value(&j, which == CSPLAT_CAMERAS);
 }
 
-/* Stated errors (5.5) --------------------------------------------------------------------------------------------------- */
+/* Declared errors (5.5) ----------------------------------------------------------------------------------------------- */
 
-static int read_stated_errors(csplat *d, csplat_stated_errors *out)
+static int read_declared_errors(csplat *d, csplat_declared_errors *out)
 {
-    const csplat_stated_error none = {-1, -1};
+    const csplat_declared_error none = {-1, -1};
     const uint8_t *p;
     unsigned count, last = 0;
     cursor c;
     out->means = out->covariance = out->opacities = none;
     for (unsigned band = 0; band <= SPEC_SH_DEGREE_MAX; band++)
         out->sh[band] = none;
-    TRY(load(d, d->stated, &d->chunk_bytes, CSPLAT_E_STREAM, "SER-3", &c));
-    TRY(take(d, &c, SPEC_STATED_ERRORS_HEAD_SIZE, &p));
+    TRY(load(d, d->declared, &d->chunk_bytes, CSPLAT_E_STREAM, "SER-3", &c));
+    TRY(take(d, &c, SPEC_DECLARED_ERRORS_HEAD_SIZE, &p));
     out->source_count = get_u64(p);
-    out->pruned_count = get_u64(p + SPEC_STATED_ERRORS_HEAD_AT_PRUNED_COUNT);
-    out->source_sh_degree = p[SPEC_STATED_ERRORS_HEAD_AT_SOURCE_SH_DEGREE];
-    out->refitted = p[SPEC_STATED_ERRORS_HEAD_AT_ERROR_FLAGS];
-    count = get_u16(p + SPEC_STATED_ERRORS_HEAD_AT_RECORD_COUNT);
+    out->pruned_count = get_u64(p + SPEC_DECLARED_ERRORS_HEAD_AT_PRUNED_COUNT);
+    out->source_sh_degree = p[SPEC_DECLARED_ERRORS_HEAD_AT_SOURCE_SH_DEGREE];
+    out->refitted = p[SPEC_DECLARED_ERRORS_HEAD_AT_ERROR_FLAGS];
+    count = get_u16(p + SPEC_DECLARED_ERRORS_HEAD_AT_RECORD_COUNT);
     if (out->refitted > SPEC_ERROR_FLAG_REFITTED)
-        return fail(d, CSPLAT_E_RESERVED, "RES-1", c.offset + SPEC_STATED_ERRORS_HEAD_AT_ERROR_FLAGS, "error_flags 0x%02x",
-                    out->refitted);
+        return fail(d, CSPLAT_E_RESERVED, "RES-1", c.offset + SPEC_DECLARED_ERRORS_HEAD_AT_ERROR_FLAGS,
+                    "error_flags 0x%02x", out->refitted);
     if (out->pruned_count > out->source_count || out->source_count - out->pruned_count != d->info.splat_count)
         return fail(d, CSPLAT_E_VALUE, "SER-4", c.offset, "%llu splats of which %llu were pruned",
                     (unsigned long long)out->source_count, (unsigned long long)out->pruned_count);
     for (unsigned i = 0; i < count; i++) {
         uint64_t at = place(&c);
-        csplat_stated_error e;
+        csplat_declared_error e;
         double most;
         unsigned measure;
-        TRY(take(d, &c, SPEC_STATED_ERROR_RECORD_SIZE, &p));
+        TRY(take(d, &c, SPEC_DECLARED_ERROR_RECORD_SIZE, &p));
         measure = p[0];
-        TRY(reserved(d, p + SPEC_STATED_ERROR_RECORD_AT_RESERVED_0, 7, at + SPEC_STATED_ERROR_RECORD_AT_RESERVED_0));
+        TRY(reserved(d, p + SPEC_DECLARED_ERROR_RECORD_AT_RESERVED_0, 7,
+                     at + SPEC_DECLARED_ERROR_RECORD_AT_RESERVED_0));
         if (measure <= last || measure > SPEC_MEASURE_SH4)
             return fail(d, CSPLAT_E_VALUE, "SER-1", at, "the measure %u is unknown or does not ascend", measure);
         last = measure;
-        e.max = get_f64(p + SPEC_STATED_ERROR_RECORD_AT_MAX);
-        e.rms = get_f64(p + SPEC_STATED_ERROR_RECORD_AT_RMS);
+        e.max = get_f64(p + SPEC_DECLARED_ERROR_RECORD_AT_MAX);
+        e.rms = get_f64(p + SPEC_DECLARED_ERROR_RECORD_AT_RMS);
         most = e.max * sqrt(measure < SPEC_MEASURE_SH0 ? 1 : columns_of(SH0 + measure - SPEC_MEASURE_SH0));
         most = most * (1 + 0x1p-20);
         if (!(e.max >= 0) || !is_finite(e.max) || !(e.rms >= 0) || !is_finite(e.rms) || !(e.rms <= most))
-            return fail(d, CSPLAT_E_VALUE, "SER-2", at + SPEC_STATED_ERROR_RECORD_AT_MAX, "max and rms contradict each other");
+            return fail(d, CSPLAT_E_VALUE, "SER-2", at + SPEC_DECLARED_ERROR_RECORD_AT_MAX,
+                        "max and rms contradict each other");
         *(measure == SPEC_MEASURE_MEANS        ? &out->means
           : measure == SPEC_MEASURE_COVARIANCE ? &out->covariance
           : measure == SPEC_MEASURE_OPACITIES  ? &out->opacities
@@ -3335,16 +3337,16 @@ csplat_code csplat_read_text(csplat *d, csplat_text which, const char **text, si
     return CSPLAT_OK;
 }
 
-csplat_code csplat_read_stated_errors(csplat *d, csplat_stated_errors *out, int *found)
+csplat_code csplat_read_declared_errors(csplat *d, csplat_declared_errors *out, int *found)
 {
     memset(out, 0, sizeof *out);
-    *found = d->stated != NULL;
-    return done(d, !d->stated || read_stated_errors(d, out));
+    *found = d->declared != NULL;
+    return done(d, !d->declared || read_declared_errors(d, out));
 }
 
 static int check(csplat *d)
 {
-    csplat_stated_errors errors;
+    csplat_declared_errors errors;
     cursor c;
     for (size_t i = 0; i < d->chunk_count; i++)
         if (d->chunks[i].skipped)
@@ -3357,7 +3359,7 @@ static int check(csplat *d)
             TRY(read_text(d, (csplat_text)which));
     if (d->tree)
         TRY(read_nodes(d));
-    return !d->stated || read_stated_errors(d, &errors);
+    return !d->declared || read_declared_errors(d, &errors);
 }
 
 csplat_code csplat_check(csplat *d)

@@ -208,16 +208,16 @@ typedef struct csplat_packed_geometry {
 } csplat_packed_geometry;
 
 /* Bounds of an error; negative if not declared. */
-typedef struct csplat_stated_error {
+typedef struct csplat_declared_error {
     double max, rms;
-} csplat_stated_error;
+} csplat_declared_error;
 
 /* Error bounds declared in the file. */
-typedef struct csplat_stated_errors {
+typedef struct csplat_declared_errors {
     uint64_t source_count, pruned_count;
     uint8_t source_sh_degree, refitted;
-    csplat_stated_error means, covariance, opacities, sh[CSPLAT_SH_DEGREE_MAX + 1];
-} csplat_stated_errors;
+    csplat_declared_error means, covariance, opacities, sh[CSPLAT_SH_DEGREE_MAX + 1];
+} csplat_declared_errors;
 
 typedef enum csplat_text { CSPLAT_METADATA, CSPLAT_CAMERAS, CSPLAT_ENCODER_OPTIONS } csplat_text;
 
@@ -263,7 +263,7 @@ csplat_code csplat_select(csplat *file, const csplat_cut *cut, uint32_t *tiles, 
 /* Read a JSON text, checked by section 5.4. It is valid until the next text is read. NULL if the file has none. */
 csplat_code csplat_read_text(csplat *file, csplat_text which, const char **text, size_t *size);
 /* *found is 0 if the file declares none. */
-csplat_code csplat_read_stated_errors(csplat *file, csplat_stated_errors *out, int *found);
+csplat_code csplat_read_declared_errors(csplat *file, csplat_declared_errors *out, int *found);
 
 /* Check everything outside the tiles of level 0: CRCs of skipped chunks and layers and of coarser tiles, nodes, codebooks, texts,
  * declared errors. */

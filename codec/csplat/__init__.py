@@ -9,7 +9,7 @@
     ...     model = file.read(box=(-1, -1, -1, 1, 1, 1))
 
 Functions that read a *file* (`read`, `open`, `decode`) accept a path, an open binary file or bytes.
-Functions that take a *scene* (`encode`, `write_ply`, `to_gsplat`) accept a `SplatModel`.
+`encode` takes a *scene*: a `SplatModel`, or a `Scene` of any size from `open`.
 
 All errors are `CsplatError`s: `FormatError`, `UnsupportedError` and `LimitError` concern the file, `InputError` the
 caller's data, `StoreError` a server. Errors of the operating system stay `OSError`s.
@@ -26,10 +26,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from csplat.context import Context
     from csplat.decoder import decode, decode_integers, decode_scene, read_header
     from csplat.editing.extract import extract
     from csplat.editing.merge import merge
-    from csplat.encoder import EncodeOptions, EncodeResult, Target, encode, encode_with_report
+    from csplat.encode_api import encode, encode_with_report
+    from csplat.encoder import EncodeOptions, EncodeResult, Target
     from csplat.errors import CsplatError, FormatError, InputError, LimitError, StoreError, UnsupportedError
     from csplat.formats import open, read, write
     from csplat.interop import from_gsplat, to_gsplat
@@ -42,6 +44,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Context",
     "CsplatError",
     "EncodeOptions",
     "EncodeResult",
@@ -103,6 +106,7 @@ def lazy_exports(package: str, module_of: Mapping[str, str]) -> tuple[Callable[[
 
 
 _MODULE_OF = {
+    "Context": "csplat.context",
     "CsplatError": "csplat.errors",
     "EncodeOptions": "csplat.encoder",
     "EncodeResult": "csplat.encoder",
@@ -119,8 +123,8 @@ _MODULE_OF = {
     "decode": "csplat.decoder",
     "decode_integers": "csplat.decoder",
     "decode_scene": "csplat.decoder",
-    "encode": "csplat.encoder",
-    "encode_with_report": "csplat.encoder",
+    "encode": "csplat.encode_api",
+    "encode_with_report": "csplat.encode_api",
     "extract": "csplat.editing.extract",
     "from_gsplat": "csplat.interop",
     "lint_ply": "csplat.ply",

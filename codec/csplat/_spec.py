@@ -142,7 +142,7 @@ EXTRA_DTYPE_F64: Final = 8
 EXTRA_DTYPE_NAMES: Final[dict[int, str]] = {1: "u8", 2: "i8", 3: "u16", 4: "i16", 5: "u32", 6: "i32", 7: "f32", 8: "f64"}
 EXTRA_DTYPE_BYTES: Final[dict[int, int]] = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8}
 
-# Stated errors
+# Declared errors
 MEASURE_MEANS: Final = 1
 MEASURE_COVARIANCE: Final = 2
 MEASURE_OPACITIES: Final = 3
@@ -153,7 +153,7 @@ MEASURE_SH3: Final = 7
 MEASURE_SH4: Final = 8
 MEASURE_NAMES: Final[dict[int, str]] = {1: "means", 2: "covariance", 3: "opacities", 4: "sh0", 5: "sh1", 6: "sh2", 7: "sh3", 8: "sh4"}
 
-# Flags of the stated errors (bit masks)
+# Flags of the declared errors (bit masks)
 ERROR_FLAG_REFITTED: Final = 1
 ERROR_FLAG_NAMES: Final[dict[int, str]] = {1: "refitted"}
 
@@ -163,9 +163,9 @@ CHUNK_CODEBOOK: Final = b"CODB"
 CHUNK_METADATA: Final = b"META"
 CHUNK_CAMERAS: Final = b"CAMS"
 CHUNK_OPTIONS: Final = b"OPTS"
-CHUNK_STATED_ERRORS: Final = b"SERR"
+CHUNK_DECLARED_ERRORS: Final = b"SERR"
 CHUNK_TREE: Final = b"TREE"
-CHUNK_NAMES: Final[dict[bytes, str]] = {b"TILE": "tile", b"CODB": "codebook", b"META": "metadata", b"CAMS": "cameras", b"OPTS": "options", b"SERR": "stated_errors", b"TREE": "tree"}
+CHUNK_NAMES: Final[dict[bytes, str]] = {b"TILE": "tile", b"CODB": "codebook", b"META": "metadata", b"CAMS": "cameras", b"OPTS": "options", b"SERR": "declared_errors", b"TREE": "tree"}
 CHUNK_FLAGS: Final[dict[bytes, tuple[str, ...]]] = {b"TILE": ("critical",), b"CODB": ("critical",), b"META": ("safe_to_copy",), b"CAMS": ("safe_to_copy",), b"OPTS": (), b"SERR": (), b"TREE": ("critical",)}
 
 # Error codes
@@ -692,7 +692,7 @@ def pack_stream_head(r: StreamHead) -> bytes:
     return STREAM_HEAD_STRUCT.pack(r.width, r.coder, r.transforms, r.reserved_0, r.count, r.packed_size, r.coded_size)
 
 
-class StatedErrorsHead(NamedTuple):
+class DeclaredErrorsHead(NamedTuple):
     """Head of a SERR payload."""
 
     source_count: int
@@ -702,24 +702,24 @@ class StatedErrorsHead(NamedTuple):
     record_count: int
 
 
-STATED_ERRORS_HEAD_STRUCT: Final = struct.Struct("<QQBBH")
-STATED_ERRORS_HEAD_SIZE: Final = 20
-STATED_ERRORS_HEAD_OFFSETS: Final[dict[str, int]] = {"source_count": 0, "pruned_count": 8, "source_sh_degree": 16, "error_flags": 17, "record_count": 18}
+DECLARED_ERRORS_HEAD_STRUCT: Final = struct.Struct("<QQBBH")
+DECLARED_ERRORS_HEAD_SIZE: Final = 20
+DECLARED_ERRORS_HEAD_OFFSETS: Final[dict[str, int]] = {"source_count": 0, "pruned_count": 8, "source_sh_degree": 16, "error_flags": 17, "record_count": 18}
 
 
-def unpack_stated_errors_head(data: bytes | bytearray | memoryview, offset: int = 0) -> StatedErrorsHead:
-    """Read a StatedErrorsHead at a byte offset; raise struct.error if the data is too short."""
-    v = STATED_ERRORS_HEAD_STRUCT.unpack_from(data, offset)
-    return StatedErrorsHead(v[0], v[1], v[2], v[3], v[4])
+def unpack_declared_errors_head(data: bytes | bytearray | memoryview, offset: int = 0) -> DeclaredErrorsHead:
+    """Read a DeclaredErrorsHead at a byte offset; raise struct.error if the data is too short."""
+    v = DECLARED_ERRORS_HEAD_STRUCT.unpack_from(data, offset)
+    return DeclaredErrorsHead(v[0], v[1], v[2], v[3], v[4])
 
 
-def pack_stated_errors_head(r: StatedErrorsHead) -> bytes:
-    """Return the 20 bytes of a StatedErrorsHead."""
-    return STATED_ERRORS_HEAD_STRUCT.pack(r.source_count, r.pruned_count, r.source_sh_degree, r.error_flags, r.record_count)
+def pack_declared_errors_head(r: DeclaredErrorsHead) -> bytes:
+    """Return the 20 bytes of a DeclaredErrorsHead."""
+    return DECLARED_ERRORS_HEAD_STRUCT.pack(r.source_count, r.pruned_count, r.source_sh_degree, r.error_flags, r.record_count)
 
 
-class StatedErrorRecord(NamedTuple):
-    """Stated error record."""
+class DeclaredErrorRecord(NamedTuple):
+    """Declared error record."""
 
     measure: int
     reserved_0: int
@@ -729,17 +729,17 @@ class StatedErrorRecord(NamedTuple):
     rms: float
 
 
-STATED_ERROR_RECORD_STRUCT: Final = struct.Struct("<BBHIdd")
-STATED_ERROR_RECORD_SIZE: Final = 24
-STATED_ERROR_RECORD_OFFSETS: Final[dict[str, int]] = {"measure": 0, "reserved_0": 1, "reserved_1": 2, "reserved_2": 4, "max": 8, "rms": 16}
+DECLARED_ERROR_RECORD_STRUCT: Final = struct.Struct("<BBHIdd")
+DECLARED_ERROR_RECORD_SIZE: Final = 24
+DECLARED_ERROR_RECORD_OFFSETS: Final[dict[str, int]] = {"measure": 0, "reserved_0": 1, "reserved_1": 2, "reserved_2": 4, "max": 8, "rms": 16}
 
 
-def unpack_stated_error_record(data: bytes | bytearray | memoryview, offset: int = 0) -> StatedErrorRecord:
-    """Read a StatedErrorRecord at a byte offset; raise struct.error if the data is too short."""
-    v = STATED_ERROR_RECORD_STRUCT.unpack_from(data, offset)
-    return StatedErrorRecord(v[0], v[1], v[2], v[3], v[4], v[5])
+def unpack_declared_error_record(data: bytes | bytearray | memoryview, offset: int = 0) -> DeclaredErrorRecord:
+    """Read a DeclaredErrorRecord at a byte offset; raise struct.error if the data is too short."""
+    v = DECLARED_ERROR_RECORD_STRUCT.unpack_from(data, offset)
+    return DeclaredErrorRecord(v[0], v[1], v[2], v[3], v[4], v[5])
 
 
-def pack_stated_error_record(r: StatedErrorRecord) -> bytes:
-    """Return the 24 bytes of a StatedErrorRecord."""
-    return STATED_ERROR_RECORD_STRUCT.pack(r.measure, r.reserved_0, r.reserved_1, r.reserved_2, r.max, r.rms)
+def pack_declared_error_record(r: DeclaredErrorRecord) -> bytes:
+    """Return the 24 bytes of a DeclaredErrorRecord."""
+    return DECLARED_ERROR_RECORD_STRUCT.pack(r.measure, r.reserved_0, r.reserved_1, r.reserved_2, r.max, r.rms)

@@ -4,7 +4,7 @@
 |---|---|
 | `csplat.formats` | a `csplat.formats.format.Format` under the name of each format |
 | `csplat.display` | `html`: a function that converts a `SplatModel` to HTML for notebooks |
-| `csplat.search` | `target`: a `csplat.encoder.encode_api.Search`, which meets a `Target` by rendering |
+| `csplat.search` | `target`: a `csplat.encode_api.Search`, which meets a `Target` by rendering |
 | `csplat.levels` | `builder`: a function of splat count, options and levels that returns a `LevelBuilder` or `None` |
 """
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from csplat import _spec
 from csplat.byte_store import FileWindow, Store
+from csplat.context import DEFAULT_CONTEXT
 from csplat.decoder import (
     DecodedTile,
     Limits,
@@ -68,7 +69,7 @@ class SplatFile(Scene):
         self.extra = {column.name: np.dtype(column.dtype) for column in header.extras if column.dtype is not None}
         self.reader, self.has_doubles, self.file_axes = self.models, False, ""
         self.format, self.name, self.size_bytes = "csplat", store.name, store.size
-        self.findings, self.in_memory = [], None
+        self.findings, self.in_memory, self.identity = [], None, {}
         if header.coarse_tiles:
             self.findings.append(_levels_finding(header, "level 0 alone is read"))
 
@@ -148,7 +149,7 @@ class SplatFile(Scene):
         """Declared error bounds, if there are any; read on first access."""
         with self._store.named_errors():
             window = self.window()
-            window.fetch(self._chunks(_spec.CHUNK_STATED_ERRORS))
+            window.fetch(self._chunks(_spec.CHUNK_DECLARED_ERRORS))
             return bounds_chunk(window.view, self.header)
 
     def loaded(self) -> SplatFile:
@@ -259,7 +260,7 @@ class SplatFile(Scene):
             decoded = self._decode(self._default_tiles() if tiles is None else tiles, None)
         else:
             request = prepare_decode(memoryview(data), self.header, self._limits, tiles, None)
-            decoded = request_tiles(request, threads=None)
+            decoded = request_tiles(request, DEFAULT_CONTEXT)
         with self._store.named_errors():
             for tile in decoded:
                 arrays = {name: value for name, value in vars(tile).items() if name != "tile"}

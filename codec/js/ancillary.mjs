@@ -6,18 +6,18 @@ import { nameOf } from './registry.mjs';
 import * as spec from './spec.mjs';
 import { readJson } from './streams.mjs';
 
-const { ERROR_JSON, ERROR_RESERVED, ERROR_VALUE, STATED_ERRORS_HEAD_OFFSETS: AT_HEAD } = spec;
-const AT = spec.STATED_ERROR_RECORD_OFFSETS;
+const { ERROR_JSON, ERROR_RESERVED, ERROR_VALUE, DECLARED_ERRORS_HEAD_OFFSETS: AT_HEAD } = spec;
+const AT = spec.DECLARED_ERROR_RECORD_OFFSETS;
 
 /**
  * @typedef {import('./decoder.d.ts').DirectoryRecord} DirectoryRecord
  * @typedef {import('./decoder.d.ts').Description} Description
- * @typedef {import('./decoder.d.ts').StatedErrors} StatedErrors
+ * @typedef {import('./decoder.d.ts').DeclaredErrors} DeclaredErrors
  * @typedef {import('./inflate.mjs').Inflate} Inflate
  */
 
 /** @type {() => Description} */
-export const emptyDescription = () => ({ metadata: null, cameras: null, options: null, statedErrors: null });
+export const emptyDescription = () => ({ metadata: null, cameras: null, options: null, declaredErrors: null });
 
 /**
  * Read an ancillary chunk of a known type and store its value in `into`.
@@ -30,8 +30,8 @@ export const emptyDescription = () => ({ metadata: null, cameras: null, options:
 export async function describe(into, record, bytes, { splatCount, jsonBytes, inflate }) {
   const { type } = record;
   const base = record.offset + spec.CHUNK_HEADER_SIZE;
-  if (type === spec.CHUNK_STATED_ERRORS) {
-    into.statedErrors = readStatedErrors(new Payload(bytes, base, 'SER-3'), splatCount);
+  if (type === spec.CHUNK_DECLARED_ERRORS) {
+    into.declaredErrors = readDeclaredErrors(new Payload(bytes, base, 'SER-3'), splatCount);
     return;
   }
   const { value, offset } = await readJson(new Payload(bytes, base, 'JSN-2'), jsonBytes, inflate);
@@ -54,12 +54,12 @@ const isObject = (value) => typeof value === 'object' && value !== null && !Arra
 /**
  * @param {Payload} payload
  * @param {number} splatCount
- * @returns {StatedErrors}
+ * @returns {DeclaredErrors}
  */
-function readStatedErrors(payload, splatCount) {
+function readDeclaredErrors(payload, splatCount) {
   const { fields: head, offset } = payload.read(
-    spec.unpackStatedErrorsHead,
-    spec.STATED_ERRORS_HEAD_SIZE,
+    spec.unpackDeclaredErrorsHead,
+    spec.DECLARED_ERRORS_HEAD_SIZE,
     {},
     'the head of SERR',
   );
@@ -73,11 +73,11 @@ function readStatedErrors(payload, splatCount) {
       ERROR_RESERVED,
       offset + AT_HEAD.error_flags,
       'RES-1',
-      `flags ${head.error_flags} of the stated errors`,
+      `flags ${head.error_flags} of the declared errors`,
     );
   }
-  /** @type {StatedErrors} */
-  const stated = {
+  /** @type {DeclaredErrors} */
+  const declared = {
     sourceCount: Number(source),
     prunedCount: Number(pruned),
     sourceShDegree: head.source_sh_degree,
@@ -85,23 +85,23 @@ function readStatedErrors(payload, splatCount) {
     errors: {},
   };
   let last = 0;
-  for (let i = 0; i < head.record_count; i++) last = readStatedError(payload, last, stated);
+  for (let i = 0; i < head.record_count; i++) last = readDeclaredError(payload, last, declared);
   payload.finish();
-  return stated;
+  return declared;
 }
 
 /**
  * @param {Payload} payload
  * @param {number} last measure of the previous record
- * @param {StatedErrors} stated
+ * @param {DeclaredErrors} declared
  * @returns {number} measure of this record
  */
-function readStatedError(payload, last, stated) {
+function readDeclaredError(payload, last, declared) {
   const { fields, offset } = payload.read(
-    spec.unpackStatedErrorRecord,
-    spec.STATED_ERROR_RECORD_SIZE,
-    spec.STATED_ERROR_RECORD_RESERVED,
-    'a stated error',
+    spec.unpackDeclaredErrorRecord,
+    spec.DECLARED_ERROR_RECORD_SIZE,
+    spec.DECLARED_ERROR_RECORD_RESERVED,
+    'a declared error',
   );
   const { measure, max, rms } = fields;
   const name = nameOf(spec.MEASURE_NAMES, measure);
@@ -113,7 +113,7 @@ function readStatedError(payload, last, stated) {
   if (!(isBound(max) && isBound(rms) && rms <= max * components * room)) {
     throw fault(ERROR_VALUE, offset + AT.max, 'SER-2', `${name}: maximum ${max}, rms ${rms}`);
   }
-  stated.errors[name] = { max, rms };
+  declared.errors[name] = { max, rms };
   return measure;
 }
 

@@ -179,7 +179,7 @@ export interface CutOptions {
   box?: ArrayLike<number>;
 }
 
-export interface StatedErrors {
+export interface DeclaredErrors {
   sourceCount: number;
   prunedCount: number;
   sourceShDegree: number;
@@ -193,7 +193,7 @@ export interface Description {
   cameras: Record<string, unknown>[] | null;
   /** Options that the encoder was called with. */
   options: Record<string, unknown> | null;
-  statedErrors: StatedErrors | null;
+  declaredErrors: DeclaredErrors | null;
 }
 
 /** The checked CRCs: header, index, and the number of chunks. */

@@ -375,7 +375,7 @@ export class Reader {
   }
 
   /**
-   * Read metadata, cameras, encoder options and stated errors; null for what the file does not have.
+   * Read metadata, cameras, encoder options and declared errors; null for what the file does not have.
    *
    * @param {{signal?: AbortSignal}} [options]
    */

@@ -134,7 +134,7 @@ export const EXTRA_DTYPE_F64 = 8;
 export const EXTRA_DTYPE_NAMES = Object.freeze({ 1: 'u8', 2: 'i8', 3: 'u16', 4: 'i16', 5: 'u32', 6: 'i32', 7: 'f32', 8: 'f64' });
 export const EXTRA_DTYPE_BYTES = Object.freeze({ 1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 8: 8 });
 
-// Stated errors
+// Declared errors
 export const MEASURE_MEANS = 1;
 export const MEASURE_COVARIANCE = 2;
 export const MEASURE_OPACITIES = 3;
@@ -145,7 +145,7 @@ export const MEASURE_SH3 = 7;
 export const MEASURE_SH4 = 8;
 export const MEASURE_NAMES = Object.freeze({ 1: 'means', 2: 'covariance', 3: 'opacities', 4: 'sh0', 5: 'sh1', 6: 'sh2', 7: 'sh3', 8: 'sh4' });
 
-// Flags of the stated errors (bit masks)
+// Flags of the declared errors (bit masks)
 export const ERROR_FLAG_REFITTED = 1;
 export const ERROR_FLAG_NAMES = Object.freeze({ 1: 'refitted' });
 
@@ -155,9 +155,9 @@ export const CHUNK_CODEBOOK = 'CODB';
 export const CHUNK_METADATA = 'META';
 export const CHUNK_CAMERAS = 'CAMS';
 export const CHUNK_OPTIONS = 'OPTS';
-export const CHUNK_STATED_ERRORS = 'SERR';
+export const CHUNK_DECLARED_ERRORS = 'SERR';
 export const CHUNK_TREE = 'TREE';
-export const CHUNK_NAMES = Object.freeze({ 'TILE': 'tile', 'CODB': 'codebook', 'META': 'metadata', 'CAMS': 'cameras', 'OPTS': 'options', 'SERR': 'stated_errors', 'TREE': 'tree' });
+export const CHUNK_NAMES = Object.freeze({ 'TILE': 'tile', 'CODB': 'codebook', 'META': 'metadata', 'CAMS': 'cameras', 'OPTS': 'options', 'SERR': 'declared_errors', 'TREE': 'tree' });
 export const CHUNK_FLAGS = Object.freeze({ 'TILE': Object.freeze(['critical']), 'CODB': Object.freeze(['critical']), 'META': Object.freeze(['safe_to_copy']), 'CAMS': Object.freeze(['safe_to_copy']), 'OPTS': Object.freeze([]), 'SERR': Object.freeze([]), 'TREE': Object.freeze(['critical']) });
 
 // Error codes
@@ -531,14 +531,14 @@ export function unpackStreamHead(view, at) {
   };
 }
 
-export const STATED_ERRORS_HEAD_SIZE = 20;
-export const STATED_ERRORS_HEAD_OFFSETS = Object.freeze({ source_count: 0, pruned_count: 8, source_sh_degree: 16, error_flags: 17, record_count: 18 });
+export const DECLARED_ERRORS_HEAD_SIZE = 20;
+export const DECLARED_ERRORS_HEAD_OFFSETS = Object.freeze({ source_count: 0, pruned_count: 8, source_sh_degree: 16, error_flags: 17, record_count: 18 });
 /**
  * Head of a SERR payload. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
  * @param {number} at
  */
-export function unpackStatedErrorsHead(view, at) {
+export function unpackDeclaredErrorsHead(view, at) {
   return {
     source_count: view.getBigUint64(at + 0, true),
     pruned_count: view.getBigUint64(at + 8, true),
@@ -548,15 +548,15 @@ export function unpackStatedErrorsHead(view, at) {
   };
 }
 
-export const STATED_ERROR_RECORD_SIZE = 24;
-export const STATED_ERROR_RECORD_OFFSETS = Object.freeze({ measure: 0, reserved_0: 1, reserved_1: 2, reserved_2: 4, max: 8, rms: 16 });
-export const STATED_ERROR_RECORD_RESERVED = Object.freeze({ reserved_0: 1, reserved_1: 2, reserved_2: 4 });
+export const DECLARED_ERROR_RECORD_SIZE = 24;
+export const DECLARED_ERROR_RECORD_OFFSETS = Object.freeze({ measure: 0, reserved_0: 1, reserved_1: 2, reserved_2: 4, max: 8, rms: 16 });
+export const DECLARED_ERROR_RECORD_RESERVED = Object.freeze({ reserved_0: 1, reserved_1: 2, reserved_2: 4 });
 /**
- * Stated error record. 64-bit integers are BigInt, u8[n] is a view.
+ * Declared error record. 64-bit integers are BigInt, u8[n] is a view.
  * @param {DataView} view
  * @param {number} at
  */
-export function unpackStatedErrorRecord(view, at) {
+export function unpackDeclaredErrorRecord(view, at) {
   return {
     measure: view.getUint8(at + 0),
     reserved_0: view.getUint8(at + 1),

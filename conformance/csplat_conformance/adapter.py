@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import CsplatError, LimitError
 from csplat_conformance.answers import Answer
 from csplat_conformance.conformance_report import Status
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 _FLOATS = ("means", "quats", "scales", "opacities", "sh0", "shN")
 
 
-def answer(data: bytes, limits: Limits | None = None, threads: int | None = None) -> Answer:
+def answer(data: bytes, limits: Limits | None = None, *, context: Context = DEFAULT_CONTEXT) -> Answer:
     """Decode a file to floats and to integers; both must accept it, or refuse it with the same error.
 
     Only integers are decoded at all levels, so they alone may reveal damage in a coarser level.
@@ -41,11 +42,11 @@ def answer(data: bytes, limits: Limits | None = None, threads: int | None = None
     Args:
         data: the file.
         limits: budgets; default: the registry's budgets.
-        threads: see `csplat.decode`.
+        context: threads.
     """
     began = time.monotonic()
     try:
-        header, arrays = _decode(data, limits, threads)
+        header, arrays = _decode(data, limits, context)
     except CsplatError as error:
         code, clause, offset = _place(error)
         seconds = time.monotonic() - began
@@ -112,14 +113,14 @@ class _DifferError(Exception):
     """Raised if the two ways of decoding disagree, which is a defect of the decoder."""
 
 
-def _decode(data: bytes, limits: Limits | None, threads: int | None) -> tuple[dict[str, Any], dict[str, bytes]]:
+def _decode(data: bytes, limits: Limits | None, context: Context) -> tuple[dict[str, Any], dict[str, bytes]]:
     """Return header fields, and raw values by `part.name`."""
     from csplat import decoder  # not needed to read the manifest
 
     results: list[Any] = []
     for decode in (decoder.decode, decoder.decode_integers):
         try:
-            results.append(decode(data, limits=limits, threads=threads))
+            results.append(decode(data, limits=limits, context=context))
         except CsplatError as error:
             results.append(error)
     model, integers = results
@@ -187,7 +188,7 @@ def main(words: Sequence[str] | None = None) -> int:
             for tiles in cuts_of(args.input.read_bytes(), lines):
                 sys.stdout.write((tiles if isinstance(tiles, str) else " ".join(map(str, tiles))) + "\n")
             return 0
-        header, arrays = _decode(args.input.read_bytes(), None, None)
+        header, arrays = _decode(args.input.read_bytes(), None, DEFAULT_CONTEXT)
     except CsplatError as error:
         code, clause, offset = _place(error)
         sys.stdout.write(json.dumps({"code": code, "offset": offset, "clause": clause}) + "\n")

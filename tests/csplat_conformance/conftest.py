@@ -8,7 +8,7 @@ from encoder_runs_cases import INPUTS, L3, PLAIN, model_of
 
 import csplat
 from csplat.decoder import decode_scene
-from csplat.encoder import encode_with_report
+from csplat.encode_api import encode_with_report
 from csplat_conformance.encoders import EncoderSuiteOptions, run_encoder
 from csplat_conformance.protocol import ProcessEnd
 

@@ -284,7 +284,7 @@ def test_a_decoder_reads_all_payloads_of_a_chunk_type_or_none(faulty, fault, fai
 
 @pytest.mark.slow
 def test_a_broken_frame_must_be_refused_and_in_an_exact_run_a_broken_payload_too(faulty):
-    frames = {"invalid/metadata_crc", "invalid/stated_errors_crc", "invalid/chunk_flags_differ"}
+    frames = {"invalid/metadata_crc", "invalid/declared_errors_crc", "invalid/chunk_flags_differ"}
     assert frames == {outcome.name for outcome in faulty("silent", ",".join(frames)).failures}
     assert {*PAYLOADS} == {outcome.name for outcome in faulty("silent", ",".join(PAYLOADS), exact=True).failures}
 

@@ -16,6 +16,7 @@ from tables import differing, failures
 
 import csplat
 from csplat import _spec
+from csplat.context import Context
 from csplat.decoder import Limits, iter_tiles
 from csplat_authoring._rules import CHOICES, RANGES
 from csplat_authoring.annexes import UNCOVERED, annex, clause_ids, clause_map, replace_generated
@@ -93,12 +94,12 @@ def test_a_file_beyond_a_budget_is_refused_before_its_tiles_are_read():
 
 def test_every_decoding_function_checks_the_whole_file():
     ways = (
-        lambda data: csplat.decode(data, threads=1),
-        lambda data: csplat.decode(data, threads=2),
-        lambda data: csplat.decode_integers(data, threads=1),
+        lambda data: csplat.decode(data, context=Context(threads=1)),
+        lambda data: csplat.decode(data, context=Context(threads=2)),
+        lambda data: csplat.decode_integers(data, context=Context(threads=1)),
         lambda data: list(iter_tiles(data)),
     )
-    names = ("index_crc", "chunk_crc", "metadata_crc", "stated_errors_crc", "unknown_chunk_crc")
+    names = ("index_crc", "chunk_crc", "metadata_crc", "declared_errors_crc", "unknown_chunk_crc")
 
     def check(vector):
         assert [vector.error["code"]] * len(ways) == [refusal(decode, vector)[0] for decode in ways]
@@ -168,7 +169,7 @@ def error_of(request):
 
     def python(data):
         with pytest.raises(csplat.CsplatError) as caught:
-            csplat.decode(data, threads=1)
+            csplat.decode(data, context=Context(threads=1))
         return caught.value
 
     if request.param == "Python":
@@ -352,7 +353,7 @@ LEVELS, ALPHAS, MEAN_STEP, SCALE_STEP, SH0_STEP = 127, 63, 0.01, 1 / 16, 1 / 64
 @pytest.fixture(scope="module")
 def row():
     """Return a function for the numbers in the row of the example with a given beginning, a list for each splat."""
-    part = GUIDE.split("### Stating errors")[1].split("So SERR states")[0]
+    part = GUIDE.split("### Declaring errors")[1].split("So SERR declares")[0]
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in part.splitlines() if line[:1] == "|"]
     table = {cells[0]: [re.findall(r"-?\d+(?:\.\d+)?", cell) for cell in cells[1:]] for cells in rows}
 
@@ -397,21 +398,21 @@ def near(expected, found):
     np.testing.assert_allclose(np.array(found, np.float64), np.array(expected), rtol=0, atol=6e-8)
 
 
-def test_the_values_and_the_code_of_the_guide_give_the_stated_errors(row, source, file):
+def test_the_values_and_the_code_of_the_guide_give_the_declared_errors(row, source, file):
     near(row("quaternion of the source"), source.quats)
     near(row("alpha of the source"), source.opacities[:, None])
     near(row("decoded quaternion"), file.quats)
     near(row("decoded alpha"), [[alpha] for alpha in file.opacities])
     near(row("decoded sh0"), file.sh0)
-    code = re.search(r"### Stating errors.*?```python\n(.*?)```", GUIDE, re.DOTALL)[1]
+    code = re.search(r"### Declaring errors.*?```python\n(.*?)```", GUIDE, re.DOTALL)[1]
     names = {"source": source, "file": file}
     exec(code, names)  # noqa: S102 - the text is the project's own
     for j in range(2):
         for name, values in names["errors"](j, j):
             near(row(f"error of {name}")[j], values)
-    part = GUIDE.split("So SERR states")[1].split("## ")[0]
+    part = GUIDE.split("So SERR declares")[1].split("## ")[0]
     table = dict(re.findall(r"^\| (\w+) \| ([\d.]+ \| [\d.]+) \|", part, re.MULTILINE))
-    for name, pair in names["stated"]([0, 1]).items():
+    for name, pair in names["declared"]([0, 1]).items():
         near([float(number) for number in table[name].split(" | ")], pair)
 
 

@@ -10,6 +10,7 @@ from oracle import GROUPS, adversarial, extreme_splats, facing
 from sensitivity_cases import scene, small_scene, views
 from tables import failures
 
+from csplat.context import Context
 from csplat.errors import InputError
 from csplat.model import sh_degree_of
 from csplat.ply import read_ply
@@ -79,7 +80,7 @@ def test_a_splat_out_of_view_is_unseen():
 
 def test_errors_of_groups_of_views_add_up_in_any_number_of_threads():
     model, cameras = scene(count=50), views(3)
-    whole, same = (measure_pruning_error(model, cameras, threads=threads) for threads in (1, 2))
+    whole, same = (measure_pruning_error(model, cameras, context=Context(threads=threads)) for threads in (1, 2))
     parts = measure_pruning_error(model, cameras[:1]) + measure_pruning_error(model, cameras[1:])
     np.testing.assert_array_equal(whole.error, same.error)
     np.testing.assert_allclose(whole.error, parts.error, rtol=1e-12)

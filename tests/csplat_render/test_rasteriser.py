@@ -14,6 +14,7 @@ from models import with_facts
 from oracle import VIEW, extreme_splats, facing, random_gradients, random_splats
 from rasteriser_cases import camera
 
+from csplat.context import Context
 from csplat.errors import InputError
 from csplat.model import SplatModel, normalise_quats
 from csplat.ply import read_ply
@@ -94,8 +95,8 @@ def test_neither_threads_nor_earlier_renders_change_a_bit():
 
     used = Rasteriser()
     first = used.forward(scene(count=4000, degree=1, seed=5), camera(200, 150)).rgb
-    kept, wanted = first.copy(), outcome(Rasteriser(threads=1))
-    for rasteriser in (Rasteriser(threads=2), used):
+    kept, wanted = first.copy(), outcome(Rasteriser(context=Context(threads=1)))
+    for rasteriser in (Rasteriser(context=Context(threads=2)), used):
         assert all(map(np.array_equal, wanted, outcome(rasteriser)))
     np.testing.assert_array_equal(kept, first)  # results belong to the caller
 
@@ -130,7 +131,6 @@ def test_invalid_arrays_and_options_are_refused():
         "dtype": lambda: Rasteriser(dtype=np.float16),
         "forward": lambda: Rasteriser().backward(np.zeros((2, 2, 3))),
         "background": lambda: render(model, view, background=(0.0, float("nan"), 0.0)),
-        "threads": lambda: render(model, view, threads=0),
         "slice": lambda: plain.forward(model, view, state=plain.initial_state(view)),  # it would have no gradients
         "state": lambda: still.forward(model, view, state=still.initial_state(other)),
     }.items():

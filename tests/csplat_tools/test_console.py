@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from csplat.types import null_progress
 from csplat_tools import console
 from csplat_tools.console import Display, displayed, progress_bar, step_progress
 
@@ -92,11 +93,11 @@ def test_a_terminal_shows_bars_after_two_seconds_and_removes_them_before_other_o
 
 def test_quiet_and_nested_displays_show_nothing_and_durations_are_short():
     with progress_bar(quiet=True) as progress:
-        assert progress is None
+        assert null_progress is progress
     with progress_bar() as outer, progress_bar() as inner, progress_bar(quiet=True) as silent:
-        assert (outer, None) == (inner, silent)
+        assert (outer, null_progress) == (inner, silent)
     with progress_bar() as later:
-        assert later not in (None, outer)  # the first display went with its work
+        assert later not in (null_progress, outer)  # the first display went with its work
     assert ["0 s", "99 s", "2 minutes"] == [console.format_seconds(seconds) for seconds in (0.2, 99.4, 110.0)]
     ranges = {(20.0, 50.0): "20 to 50 s", (30.0, 110.0): "1 to 2 minutes", (120.0, 290.0): "2 to 5 minutes"}
     assert ranges == {between: console.format_range(*between) for between in ranges}

@@ -24,11 +24,10 @@ from tables import failures
 from typer.testing import CliRunner
 
 import csplat
-from csplat import CsplatError, EncodeOptions, InputError, LimitError, decode, formats, write_ply
+from csplat import Context, CsplatError, EncodeOptions, InputError, LimitError, decode, formats, write_ply
 from csplat.editing.transform import convert_axes
 from csplat.formats import spz
 from csplat.formats.format import ARRAYS
-from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import read_ply
 from csplat.scene import Scene
 from csplat_conformance.manifest import load
@@ -438,7 +437,7 @@ def test_tile_wise_scenes_and_plys_equal_those_of_one_decode(tmp_path):
 
     def check(vector):
         path.write_bytes(vector.data)
-        expected = decode(vector.data, threads=1)
+        expected = decode(vector.data, context=Context(threads=1))
         with csplat.open(path) as scene:
             assert len(expected) == scene.count
             np.testing.assert_equal(asdict(scene.model()), asdict(expected))
@@ -457,7 +456,7 @@ def test_invalid_files_give_the_same_error_and_leave_no_ply(tmp_path):
     def check(vector):
         path.write_bytes(vector.data)
         errors = []
-        for read in (lambda: decode(vector.data, threads=1), lambda: decode_file(str(path), str(ply))):
+        for read in (lambda: decode(vector.data, context=Context(threads=1)), lambda: decode_file(str(path), str(ply))):
             with pytest.raises(CsplatError) as error:
                 read()
             errors.append(str(error.value))
@@ -471,9 +470,9 @@ def test_a_packed_scene_is_unpacked_once_and_one_that_exceeds_the_memory_refused
     packed, encoded, unpacked, read = tmp_path / "a.spz", tmp_path / "a.csplat", [], spz.read_spz_file
     csplat.write(packed, read_ply(ply))
     monkeypatch.setattr(spz, "read_spz_file", lambda *words: unpacked.append(words) or read(*words))
-    encode_file(str(packed), str(encoded), EncodeOptions(), out_of_core=OutOfCoreOptions(always=True))
+    encode_file(str(packed), str(encoded), EncodeOptions(), context=Context(workers=1))
     assert 1 == len(unpacked)
-    with open_scenes((packed, packed), 1 << 30) as (one, _):
+    with open_scenes((packed, packed), Context(memory=1 << 30)) as (one, _):
         assert 200 == one.count
     assert 3 == len(unpacked)
     assert csplat.decode(encoded).sh_degree == 2

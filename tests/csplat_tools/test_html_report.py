@@ -150,7 +150,7 @@ def test_a_page_of_a_training_without_a_file_agrees_with_compare(file_runs, tmp_
     assert expected == parts(path.read_text())
     both = (file_runs.folder / name for name in ("a.ply", "a.csplat"))
     call("compare", *both, "--data", file_runs.data, "--report", compared)
-    judged = json.loads(compared.read_text())["photographs"]
+    judged = json.loads(compared.read_text())["images"]
     for name, one in (("source", "a"), ("file", "b")):
         scores = {score: file_runs.report["file"]["scores"][name][score] for score in ("psnr", "psnr_mean", "ssim")}
         assert scores == pytest.approx({score: judged[one][score] for score in scores}, abs=1e-3)

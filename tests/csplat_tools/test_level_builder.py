@@ -20,13 +20,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import csplat
-from csplat import InputError, LimitError, _spec, decode, decode_scene, read_header
+from csplat import Context, InputError, LimitError, _spec, decode, decode_scene, read_header
 from csplat.decoder.container import SceneHeader
 from csplat.decoder.tree import Node, select_tiles
 from csplat.encoder import EncodeOptions, EncodePlan
 from csplat.encoder.levels import LevelNode, encode_levels
-from csplat.out_of_core import OutOfCoreOptions, encode_scene
-from csplat.scene import Scene
 from csplat_conformance.declared_bounds import Source
 from csplat_conformance.encoders import all_inputs
 from csplat_conformance.encoders.file_checks import SplatPairs
@@ -359,7 +357,8 @@ def test_groups_hold_each_point_once_and_are_of_equal_size():
 
 @pytest.mark.slow
 def test_each_level_has_a_quarter_of_the_splats_of_the_finer_one_at_any_number_of_threads(model):
-    nodes, others = (FittedLevelBuilder(leaf_splats=100, root_splats=30).build(model, threads) for threads in (1, 2))
+    builder, contexts = FittedLevelBuilder(leaf_splats=100, root_splats=30), (Context(threads=n) for n in (1, 2))
+    nodes, others = (builder.build(model, context) for context in contexts)
     counts = [0] * (nodes[-1].level + 1)
     for node, other in zip(nodes, others, strict=True):
         counts[node.level] += len(node.rows) if node.level == 0 else len(node.splats)
@@ -381,7 +380,7 @@ def test_the_number_of_levels_is_the_one_asked_for_and_very_large_parts_are_merg
     header = read_header(csplat.encode(model.select(slice(0, 0)), levels=FittedLevelBuilder()))
     assert (0, ()) == (header.splat_count, header.all_tiles)
     builder = FittedLevelBuilder(1, leaf_splats=SPLATS, whole_splats=SPLATS, fitted_splats=5000)
-    fitted, merged = (builder.build_part(model, count, 1)[1].splats for count in (5000, 5001))
+    fitted, merged = (builder.build_part(model, count, Context(threads=1))[1].splats for count in (5000, 5001))
     assert (True, False) == tuple(same(quarter(model), splats) for splats in (merged, fitted))
     assert builder.seconds(5001) < builder.seconds(5000)
 
@@ -419,31 +418,30 @@ def test_scenes_have_levels_on_request_only(tmp_path, model, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("fitted_splats", [400, 399])
 def test_buckets_on_disk_give_the_bytes_of_memory_and_of_two_processes(model, tmp_path, fitted_splats):
-    options = EncodeOptions(bucket_splats=300, threads=1)
+    options = EncodeOptions(bucket_splats=300)
     builder = FittedLevelBuilder(2, leaf_splats=300, whole_splats=300, fitted_splats=fitted_splats, bucket_splats=300)
     assert ("fitted" if fitted_splats == 400 else "merged") == builder.settings(len(model))["splats"]
-    data = csplat.encode(model, options, levels=builder)
+    data = csplat.encode(model, options, levels=builder, context=Context(threads=1))
     with csplat.open(data) as file:
         assert [0, 0, 1, 1, 2] == [node.level for node in file.nodes]
         errors = [node.error for node in file.nodes]
         assert 0.0 == min(errors) < errors[2] <= errors[4]
     assert_valid(data)
     # Other processes would fit with all steps.
-    threads, memory_bytes = (1, 2_000_000_000) if fitted_splats == 400 else (2, None)
-    options, limits = replace(options, threads=threads), OutOfCoreOptions(memory_bytes=memory_bytes)
-    encode_scene(Scene.of(model), tmp_path / "out.csplat", options, limits, levels=builder)
+    context = Context(1, 1, 2_000_000_000) if fitted_splats == 400 else Context(2, 2)
+    csplat.encode(model, options, out=tmp_path / "out.csplat", levels=builder, context=context)
     assert bool(data == (tmp_path / "out.csplat").read_bytes())
 
 
 @pytest.mark.long
 def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_path):
     model, out = csplat.read(sample_path).select(slice(0, 1200)), tmp_path / "out.csplat"
-    target = csplat.Target(size_bytes=18_000, prune=False, effort=1)
+    target = csplat.Target(size=18_000, prune=False, effort=1)
     result = csplat.encode_with_report(model, levels=FittedLevelBuilder(1), target=target)
     assert 17_460 < len(result.data) == result.report.search.size_bytes <= 18_000
     assert_valid(result.data)
     assert [1200, 300] == counts_by_level(result.data, (0, 1))
-    alone = csplat.encode(model, target=replace(target, size_bytes=int(0.72 * 18_000)))
+    alone = csplat.encode(model, target=replace(target, size=int(0.72 * 18_000)))
     scorer = Scorer.of_source(model, virtual_cameras(model, 3, 96, 72))
     assert scorer.psnr(decode(result.data)) > scorer.psnr(decode(alone)) - 0.3  # as a search for the rest of the size
     np.save(tmp_path / "weights.npy", np.linspace(0.1, 1.0, 1200, dtype=np.float32))
@@ -452,7 +450,7 @@ def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_p
         encoded = encode_file(load_scene(model), str(out), EncodeOptions(), levels=1, **what)
         assert_valid(out.read_bytes())
         assert [count, count // 4] == counts_by_level(out, (0, 1))
-        assert encoded.report.options["levels"]["count"] == 1
+        assert encoded.result.report.options["levels"]["count"] == 1
     target = csplat.Target(max_error={"means": 0.01})
     bounded = csplat.encode_with_report(model, levels=FittedLevelBuilder(1), target=target)
     assert bounded.report.search.size_bytes == len(bounded.data)

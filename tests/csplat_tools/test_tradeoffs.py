@@ -23,7 +23,7 @@ GRID = {  # name: options of the encoder, target, words
     "presets=small": (EncodeOptions("small"), None, "--preset small"),
     "precision=36": (EncodeOptions("fast", 36.0), None, "--attribute-psnr 36 --preset fast"),
     "targets=.38e2": (EncodeOptions("fast"), Target(psnr=38.0), "--target-psnr .38e2 --preset fast"),
-    "targets=1MB": (EncodeOptions("fast"), Target(size_bytes=10**6), "--target-size 1MB --preset fast"),
+    "targets=1MB": (EncodeOptions("fast"), Target(size=10**6), "--target-size 1MB --preset fast"),
     "simplify=0.5": (EncodeOptions("fast"), Target(keep=0.5), "--keep 0.5 --preset fast"),
 }
 
@@ -95,7 +95,7 @@ def test_table_and_json_have_all_rows_and_the_files_that_no_other_beats(measured
     assert "not measured: targets=60: out of <reach>" == last
     report = json.loads(json.dumps(found.as_json()))
     assert ["precision=20"] == report["pareto"]
-    assert (20_000, 31.5) == (report["points"][1]["size_bytes"], report["points"][1]["photographs"]["b"]["psnr"])
+    assert (20_000, 31.5) == (report["points"][1]["size_bytes"], report["points"][1]["images"]["b"]["psnr"])
     assert "image PSNR" not in format_tradeoff(measured((10, 30.0)))
 
 
@@ -130,7 +130,7 @@ def test_a_row_agrees_with_its_command_and_with_compare(tmp_path, monkeypatch):
         call(*words, "--quiet")
         assert row["size_bytes"] == (tmp_path / words[2]).stat().st_size
         compared = json.loads(call("compare", *words[1:3], *views).stdout)
-        for key in ("psnr", "ssim", "photographs"):
+        for key in ("psnr", "ssim", "images"):
             assert compared[key] == row[key]
 
 

@@ -207,7 +207,7 @@ def fixed(request):
 
 @pytest.fixture(scope="module")
 def views():
-    return split_views(renders_of(shell(8), cameras(6), BLACK, None), BLACK, validation_count=2)
+    return split_views(renders_of(shell(8), cameras(6), BLACK), BLACK, validation_count=2)
 
 
 @pytest.mark.parametrize(
@@ -261,11 +261,11 @@ def test_a_scene_is_pruned_and_tuned_to_a_size(views, monkeypatch):
     model = shell(8)
     around = ViewSet("cameras", (0.0, 0.0, 0.0), [one.camera for one in views.train[:2]], (), ())
     options = FinetuneOptions(iterations=8, validate_every=4, warm_up=2, device="cuda", byte_cost=1e-3)
-    tuned = choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size_bytes=3600))
+    tuned = choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size=3600))
     assert 2800 < tuned.size_bytes <= 3600
     assert 240 == len(tuned.made.decoded)
     with pytest.raises(InputError, match="more than 300"):
-        choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size_bytes=300))
+        choose_and_finetune(model, around, EncodeOptions("small"), options, Target(size=300))
 
 
 def spread(make_model, **fields):

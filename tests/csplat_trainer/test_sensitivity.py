@@ -14,9 +14,9 @@ from checked import covariances, quaternion_of
 from command_line import call, invoke
 from sensitivity_cases import cameras, small_scene
 
+from csplat.context import Context
 from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError
-from csplat.out_of_core import OutOfCoreOptions
 from csplat.ply import write_ply
 from csplat_render.contributions import Contributions
 from csplat_render.reference_rasteriser import Decisions, render_exact
@@ -124,7 +124,7 @@ def test_means_agree_roughly_with_finite_differences():
 
 def test_nothing_cancels_within_a_view_whatever_the_number_of_threads():
     model, views = small_scene(300, 3), cameras(3)
-    one, two = (measure_sensitivity(model, views, metric=True, threads=threads) for threads in (1, 2))
+    one, two = (measure_sensitivity(model, views, metric=True, context=Context(threads=threads)) for threads in (1, 2))
     for name in ("colour", "opacity", "shape", "shape_net", "shape_metric", "means_squares", "metric", "views"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name), name)
     assert (one.shape >= one.shape_net * (1 - 1e-6)).all()
@@ -149,7 +149,7 @@ def test_encode_uses_the_file_of_the_command(tmp_path, camera_file):
     assert 40 <= facts["unseen"] < 400
     call("sensitivity", ply, npz, "--cameras", camera_file, status=1)  # not without --force
     encoded = encode_file(str(ply), str(out), EncodeOptions(), importance=npz, prune_unseen=True, source_index=index)
-    assert 400 - facts["unseen"] == encoded.report.splat_count
+    assert 400 - facts["unseen"] == encoded.result.report.splat_count
     assert set(range(400)) - set(np.load(index).tolist()) >= set(range(40))
     call("verify", out, "--source", ply, "--source-index", index)
 
@@ -169,11 +169,12 @@ def test_invalid_options_and_cameras_without_splats_in_view_are_refused(tmp_path
 
 
 def test_contradictory_arguments_are_refused_before_the_scene_is_read(tmp_path):
-    pruned, always = {"prune_unseen": True}, OutOfCoreOptions(always=True)
+    pruned = {"prune_unseen": True}
     for arguments, message in (
-        (pruned, "requires a file of `csplat sensitivity`"), ({**pruned, "out_of_core": always}, "requires a file of"),
+        (pruned, "requires a file of `csplat sensitivity`"),
+        ({**pruned, "context": Context(workers=1)}, "requires a file of"),
         ({**pruned, "importance": "w.npy", "target": Target(psnr=30.0)}, "prune_unseen and a target"),
-        ({"importance": "w.npy", "out_of_core": OutOfCoreOptions(resume=True)}, "larger than memory"),
+        ({"importance": "w.npy", "context": Context(resume=True)}, "larger than memory"),
     ):  # fmt: skip
         with pytest.raises(InputError, match=message):
             encode_file(str(tmp_path / "missing.ply"), str(tmp_path / "out.csplat"), EncodeOptions(), **arguments)

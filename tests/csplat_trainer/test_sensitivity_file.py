@@ -142,5 +142,5 @@ def test_pruning_reports_the_share_that_other_views_see(tmp_path, monkeypatch):
     missed = read_sensitivity(npz, read_ply(ply)).missed_share
     assert missed > 0.0
     pruned = encode_file(str(ply), str(out), EncodeOptions(), importance=str(npz), prune_unseen=True)
-    assert f"{100 * missed:.1f} % of the splats were pruned although" in " ".join(pruned.report.notes)
+    assert f"{100 * missed:.1f} % of the splats were pruned although" in " ".join(pruned.result.report.notes)
     assert "left out" not in invoke("encode", ply, out, "--importance", npz, "--force", "-q").stderr

@@ -180,7 +180,7 @@ def test_compare_agrees_with_the_metrics_of_train(make_model, tmp_path, alpha, b
     assert "; no test images" in untested.stderr
     colour = ",".join(str(value) for value in record.background)
     again = call("compare", ply, ply, "--data", folder, "--background", colour, "--json", "--test-every", every)
-    scores, metrics = json.loads(again.stdout)["photographs"]["a"], json.loads(log.read_text())["metrics"]
+    scores, metrics = json.loads(again.stdout)["images"]["a"], json.loads(log.read_text())["metrics"]
     for name in ("psnr", "psnr_mean"):
         assert scores[name] == pytest.approx(metrics[name], abs=0.01)
 
@@ -226,8 +226,8 @@ def test_one_training_gives_several_files(file_runs):
 def test_a_training_is_planned_by_its_target_and_its_tuning_by_its_length():
     for target, max_splats, planned in (
         (None, None, (20_000, 0.8)), (None, 500, (500, 0.8)), (Target(keep=0.5), 500, (500, 0.5)),
-        (Target(psnr=30.0), None, (20_000, 1.0)), (Target(size_bytes=80_000), None, (10_000, 0.8)),
-        (Target(size_bytes=80_000), 16_000, (16_000, 0.5)), (Target(size_bytes=80_000), 4_000, (4_000, 1.0)),
+        (Target(psnr=30.0), None, (20_000, 1.0)), (Target(size=80_000), None, (10_000, 0.8)),
+        (Target(size=80_000), 16_000, (16_000, 0.5)), (Target(size=80_000), 4_000, (4_000, 1.0)),
     ):  # fmt: skip
         options = plan_training(TrainOptions(seed=7), target, max_splats=max_splats)
         assert (*planned, 7) == (options.max_splats, options.final_share, options.seed)

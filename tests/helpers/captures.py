@@ -16,6 +16,7 @@ from PIL import Image
 from posed_sets import to_opengl, write_document
 
 from csplat import EncodeOptions, Target, write_ply
+from csplat.context import DEFAULT_CONTEXT
 from csplat.model import SplatModel, normalise_quats
 from csplat_render import render
 from csplat_render.camera import intrinsics, look_at, orbit, resized
@@ -153,14 +154,16 @@ def photographed(scene):
     return ViewSet("made", BLACK, training, (), seen_from[::8], pictures)
 
 
-def found_within(source, views=None, encoding=None, *, no_prune=False, importance=None, refit=True, **goal):
+def found_within(
+    source, views=None, encoding=None, *, no_prune=False, importance=None, refit=True, context=DEFAULT_CONTEXT, **goal
+):
     """Return the file at a target by a brief search in small views, by default of forty cameras."""
     views = views or judged_by(cameras(40))
     # Larger views take fewer steps of a fit. The size only matters if virtual views are added.
     size = SMALL if views.virtual else (960, 720)
     simplifying = SimplifyOptions(effort=1, view_size=size, refit=refit)
     target = Target(prune=not no_prune, **goal)
-    chosen = {"importance": importance, "simplifying": simplifying}
+    chosen = {"importance": importance, "simplifying": simplifying, "context": context}
     return meet_target(source, encoding or EncodeOptions(), target=target, views=views, **chosen)
 
 
@@ -213,7 +216,8 @@ def make_trained(folder):
 def make_tuned(folder, source):
     path, report = folder / "a.csplat", folder / "finetune.json"
     with pytest.MonkeyPatch.context() as patch:
-        change_options(patch, "csplat_tools.cli.finetune.EncodeOptions", attribute_psnr=28.0, seed=1, threads=1)
+        change_options(patch, "csplat_tools.cli.finetune.EncodeOptions", attribute_psnr=28.0)
+        change_options(patch, "csplat_tools.cli.finetune.Context", seed=1, threads=1)
         change_options(patch, "csplat_trainer.tuning.tuning_options.FinetuneOptions", seed=1)
         words = ("finetune", source.ply, path, "--data", source.data, "--iterations", 100, "--report", report)
         messages = call(*words).stderr

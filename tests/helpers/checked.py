@@ -9,7 +9,8 @@ from numpy.polynomial import Legendre
 
 import csplat
 from csplat.disk_files import local_file
-from csplat.encoder import EncodeOptions, encode_with_report
+from csplat.encode_api import encode_with_report
+from csplat.encoder import EncodeOptions
 from csplat.encoder.error_bounds import measured_sums
 from csplat.errors import InputError
 from csplat.formats import detect_format

@@ -19,10 +19,10 @@ def flipped(data, bit):
     return bytes(damaged)
 
 
-def stated(source_count=2, pruned_count=0, flags=0, records=()):
-    head = _spec.pack_stated_errors_head(_spec.StatedErrorsHead(source_count, pruned_count, 0, flags, len(records)))
+def declared(source_count=2, pruned_count=0, flags=0, records=()):
+    head = _spec.pack_declared_errors_head(_spec.DeclaredErrorsHead(source_count, pruned_count, 0, flags, len(records)))
     body = [
-        _spec.pack_stated_error_record(_spec.StatedErrorRecord(measure, 0, 0, 0, largest, rms))
+        _spec.pack_declared_error_record(_spec.DeclaredErrorRecord(measure, 0, 0, 0, largest, rms))
         for measure, largest, rms in records
     ]
-    return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, payload=head + b"".join(body)),))).data
+    return build(scene(chunks=(Chunk(_spec.CHUNK_DECLARED_ERRORS, payload=head + b"".join(body)),))).data

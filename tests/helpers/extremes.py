@@ -19,7 +19,8 @@ from captures import cameras, shell, views_of
 
 from csplat import EncodeOptions, decode
 from csplat.decoder import read_declared_bounds, read_header
-from csplat.encoder import EncodePlan, Target, encode_with_report, fix_quantisation
+from csplat.encode_api import encode_with_report
+from csplat.encoder import EncodePlan, Target, fix_quantisation
 from csplat.errors import InputError
 from csplat.ply import lint_ply, read_ply
 from csplat_conformance.declared_bounds import Source, verify_bounds
@@ -258,7 +259,7 @@ def _learn(source):
 
 
 def tune_on_renders(source, views, validation_count, options):
-    split = split_views(renders_of(source, views, BLACK, None), BLACK, validation_count=validation_count)
+    split = split_views(renders_of(source, views, BLACK), BLACK, validation_count=validation_count)
     fixed = fix_quantisation(EncodePlan.of(source, COARSE))
     return fixed, tune(fixed, split, options), split
 

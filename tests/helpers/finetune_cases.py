@@ -40,7 +40,7 @@ def coarse():
 
 @functools.cache
 def views_of_source():
-    return split_views(renders_of(SOURCE, cameras(14), BLACK, None), BLACK, validation_count=3)
+    return split_views(renders_of(SOURCE, cameras(14), BLACK), BLACK, validation_count=3)
 
 
 def psnr(model, views):

@@ -4,22 +4,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from csplat import EncodeOptions
+from csplat import Context, EncodeOptions, encode_with_report
 from csplat.encoder import LevelNode
-from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene import join_blocks
 
 WHOLE = 600  # splats per bucket
 COUNT = 6 * WHOLE
 FAST = EncodeOptions(
-    preset="fast", threads=1, sh_degree=1, sh_coding="codebook", codebook_size=32, bucket_splats=WHOLE
+    preset="fast", sh_degree=1, sh_coding="codebook", codebook_size=32, bucket_splats=WHOLE
 )  # fmt: skip
 
 
-def encode_large(scene, target, options, *, progress=None, levels=None, **limits):
-    return encode_scene(
-        scene, target, options, OutOfCoreOptions(always=True, **limits), levels=levels, progress=progress
-    )
+def encode_large(scene, target, options, *, levels=None, workers=1, **context):
+    asked = Context(threads=1, workers=workers, **context)
+    return encode_with_report(scene, options, out=target, levels=levels, context=asked).report
 
 
 @dataclass(frozen=True)
@@ -34,23 +32,22 @@ class EveryFourth:
     def seconds(self, count):
         return 1e-5 * count
 
-    def build_part(self, splats, scene_count, threads):
-        assert (COUNT, 1) == (scene_count, threads)
+    def build_part(self, splats, scene_count, context):
+        assert (COUNT, 1) == (scene_count, context.threads)
         coarse = replace(splats.select(np.arange(0, len(splats), 4)), extra={}, means_double=None)
         return [LevelNode(0, 1, rows=np.arange(len(splats))), LevelNode(1, None, splats=coarse)]
 
-    def build_top(self, roots, threads, progress):
-        assert threads in (1, 2)
+    def build_top(self, roots, context):
         parts = list(roots)
-        progress("building levels", 1.0)
+        context.progress("building levels", 1.0)
         scene = join_blocks(parts[0], parts)
         return [0] * len(parts), [LevelNode(2, None, splats=scene.select(np.arange(0, len(scene), 4)))]
 
-    def measure(self, encoded, threads, progress):  # noqa: ARG002 - of the protocol
+    def measure(self, encoded, context):  # noqa: ARG002 - of the protocol
         nodes = [replace(node, error=float(node.level), squares=(0.5,)) for node in encoded.nodes]
         return replace(encoded, nodes=nodes)
 
-    def encode_plan(self, plan, codebooks=None, progress=None):
+    def encode_plan(self, plan, codebooks=None):
         raise NotImplementedError
 
 

@@ -218,7 +218,7 @@ def search_at_psnr(once, captures):
 @pytest.fixture(scope="session")
 def search_at_size(once, captures):
     """The best file of `captures.crowded()` within 1,500 bytes, by a real search."""
-    return once("search at a size", lambda: captures.found_within(captures.crowded(), size_bytes=1500))
+    return once("search at a size", lambda: captures.found_within(captures.crowded(), size=1500))
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ import pytest
 from typer.testing import CliRunner
 
 import csplat
-from csplat.encoder import encode_with_report
+from csplat.encode_api import encode_with_report
 from csplat_conformance.encoders import all_inputs
 from csplat_tools.cli.app import app
 
@@ -49,7 +49,7 @@ def test_reports_are_written_for_people_programs_and_ci(tmp_path):
     report = json.loads((tmp_path / "r.json").read_text())
     assert ("encoder", True) == (report["suite"], report["passed"])
     assert ["L1", "L2", "L3"] == [one["level"] for one in report["outcomes"]]
-    assert 0.0 == report["outcomes"][2]["details"]["means"]["stated_max"]
+    assert 0.0 == report["outcomes"][2]["details"]["means"]["declared_max"]
     root = ET.fromstring((tmp_path / "r.xml").read_text())  # noqa: S314 - our own file
     assert {"tests": "3", "failures": "0"}.items() <= root.attrib.items()
     kept = {path.relative_to(tmp_path / "kept").as_posix() for path in (tmp_path / "kept").rglob("*.*")}

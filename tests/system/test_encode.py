@@ -25,10 +25,10 @@ import pytest
 from command_line import PROGRAM, invoke, printed, refused, status_of
 from typer.main import get_command
 
-from csplat import decode, write_ply
-from csplat.out_of_core import OutOfCoreOptions, encode_scene
+from csplat import Context, decode, write_ply
 from csplat.ply import read_ply
 from csplat_tools.cli.app import app
+from csplat_tools.encode_file import encode_file
 
 pytestmark = pytest.mark.usefixtures("no_estimated_up")
 
@@ -50,7 +50,7 @@ def test_reports_as_json(tmp_path, ply):
     size = out.stat().st_size
     assert (200, size, size / 200) == (report["splats"], report["size_bytes"], report["bytes_per_splat"])
     assert report["ratio"] == ply.stat().st_size / size
-    assert {"means", "covariance", "opacities", "sh0", "sh1", "sh2"} == set(report["stated_errors"])
+    assert {"means", "covariance", "opacities", "sh0", "sh1", "sh2"} == set(report["declared_errors"])
     assert {"preset": "fast"} == report["options"]["asked"]
     quiet = invoke("encode", ply, out, "--quiet", "--force")
     assert ("", "") == (quiet.stdout, quiet.stderr)
@@ -437,19 +437,19 @@ def test_numbers_of_any_length_are_refused(ply, tmp_path):
             refused(*words, digits, status=2)
 
 
-def test_the_command_passes_out_of_core_options(ply, tmp_path, monkeypatch):
-    limits, words = [], ("encode", ply, tmp_path / "out.csplat", "--memory", "300MB")
+def test_the_command_passes_threads_memory_and_the_continuation(ply, tmp_path, monkeypatch):
+    contexts, words = [], ("encode", ply, tmp_path / "out.csplat", "--memory", "300MB")
 
-    def encode_here(scene, target, options, asked, **others):
-        limits.append(asked)
-        return encode_scene(scene, target, options, asked, **others)
+    def encode_here(*given, context, **others):
+        contexts.append(context)
+        return encode_file(*given, context=context, **others)
 
-    monkeypatch.setattr("csplat_tools.encode_file.encode_scene", encode_here)
+    monkeypatch.setattr("csplat_tools.cli.encode.encode_file", encode_here)
     cost = json.loads(printed(*words, "--dry-run", "--json"))
     assert (200, 2, True) == (cost["splats"], cost["sh_degree"], cost["in_memory"])
     assert not words[2].exists()
-    printed(*words, "--resume", "--preset", "fast", "--quiet")
-    assert [OutOfCoreOptions(memory_bytes=300_000_000, resume=True)] == limits
+    printed(*words, "--resume", "--threads", 2, "--preset", "fast", "--quiet")
+    assert [Context(threads=2, memory=300_000_000, resume=True)] == contexts
     refused(*words[:3], "--resume", "--target-psnr", "40", "--force", status=2)
 
 

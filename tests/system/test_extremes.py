@@ -18,7 +18,8 @@ from tables import failures
 from typer.testing import CliRunner
 
 from csplat import EncodeOptions, decode, encode, write_ply
-from csplat.encoder import Target, encode_with_report
+from csplat.encode_api import encode_with_report
+from csplat.encoder import Target
 from csplat.errors import InputError, LimitError
 from csplat.ply import read_ply
 from csplat_render import render
@@ -209,7 +210,7 @@ def test_the_whole_chain(name, tmp_path):
     assert condition.repairs == tuple(re.findall(r"^repair: ([a-z-]+):", done.stderr, re.MULTILINE))
     assert ("huge values coarsen" in done.stderr) == (name == "exploded")
     done = run("verify", file, "--source", ply, "--source-index", tmp_path / "index.npy", "--json")
-    assert json.loads(done.stdout)["proof"]["rms_and_counts_proved"]
+    assert json.loads(done.stdout)["verification"]["rms_and_counts_verified"]
     run("decode", file, back)
     assert len(condition.make()["means"]) - condition.dropped == len(read_ply(back, strict=True))
     assert json.loads(run("info", file, "--json").stdout)["size_bytes"] == file.stat().st_size

@@ -158,7 +158,8 @@ for call in (
 def test_a_target_of_largest_errors_needs_no_search(files, tmp_path):
     stages, target = [], csplat.Target(max_error={"means": 0.01})
     found = csplat.encode_with_report(files[0], target=target)
-    assert found.data == csplat.encode(files[0], target=target, progress=lambda *stage: stages.append(stage))
+    context = csplat.Context(progress=lambda *stage: stages.append(stage))
+    assert found.data == csplat.encode(files[0], target=target, context=context)
     assert found.report.search.reached["means"] <= 0.01
     assert (len(found.data), None) == (found.size_bytes, found.psnr)
     found.save(tmp_path / "found.csplat")
@@ -175,15 +176,15 @@ def test_a_search_and_a_builder_of_levels_are_called_by_their_entry_points(files
     def search(*given, **named):
         raise Called(given, named)
 
-    place = "csplat.encoder.encode_api.load_plugins"
+    place = "csplat.encode_api.load_plugins"
     monkeypatch.setattr(place, lambda group: {"csplat.search": {"target": search}}[group])
     target, weights = csplat.Target(psnr=40.0), np.ones(60)
     with pytest.raises(Called) as raised:
         csplat.encode_with_report(files[0], target=target, views="views", importance=weights)
     (model, options), named = raised.value.args
     assert (files[0], csplat.EncodeOptions()) == (model, options)
-    named.pop("progress")
-    assert {"target": target, "views": "views", "importance": weights, "levels": None} == named
+    wanted = {"target": target, "views": "views", "importance": weights, "levels": None, "context": csplat.Context()}
+    assert wanted == named
     monkeypatch.setattr(place, lambda _: {})
     with pytest.raises(InputError, match=r"no search for targets is installed.*pip install 'csplat\[render\]'"):
         csplat.encode(files[0], target=target)
@@ -200,7 +201,6 @@ def test_a_search_and_a_builder_of_levels_are_called_by_their_entry_points(files
 @pytest.mark.parametrize(("named", "message"), [
     ({"target": 40.0}, r"target is 40.0, expected csplat\.Target\(psnr=\.\.\.\)"),
     ({"views": "views"}, "views are given without a target"),
-    ({"target": csplat.Target(psnr=40.0), "metadata": {"a": 1}}, "a target excludes origin and metadata"),
     ({"target": csplat.Target(psnr=40.0), "options": "small"}, r"EncodeOptions\(preset="),
 ])  # fmt: skip
 def test_arguments_that_contradict_a_target_are_refused(files, named, message):
@@ -234,7 +234,7 @@ def arguments_of(monkeypatch, module, name, words):
     ("encode scene.ply o --max-error means=0.01", {"max_error": {"means": 0.01}}),
     ("encode scene.ply o --target-psnr 40", {"psnr": 40.0}),
     ("encode scene.ply o --keep 0.5 --effort 1", {"keep": 0.5, "effort": 1}),
-    ("encode scene.ply o --target-size 5kB --no-prune", {"size_bytes": 5000, "prune": False}),
+    ("encode scene.ply o --target-size 5kB --no-prune", {"size": 5000, "prune": False}),
 ])  # fmt: skip
 def test_commands_call_the_public_functions(files, monkeypatch, words, given):
     monkeypatch.chdir(files[1].parent)

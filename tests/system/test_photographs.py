@@ -11,7 +11,7 @@ from command_line import call, invoke
 from PIL import Image
 from posed_sets import to_opengl, write_document
 
-from csplat import EncodeOptions, encode, write_ply
+from csplat import Context, EncodeOptions, encode, write_ply
 from csplat.errors import InputError
 from csplat.ply import read_ply
 from csplat_render import render
@@ -76,7 +76,7 @@ def test_both_scenes_are_scored_on_the_test_images(files, data):
     result = compared(*files, "--data", data)
     assert ["images/view0.png", "images/view8.png"] == [view["image"] for view in result["views"]]
     assert ["capture", [0.0, 0.0, 0.0]] == [result["cameras"], result["background"]]
-    scores = result["photographs"]
+    scores = result["images"]
     a, b = scores["a"], scores["b"]
     assert ("test", 2, 2, None) == (scores["split"], a["views"], b["views"], a["lpips"])
     assert a["psnr"] > 50.0  # rounding to bytes is the only error
@@ -85,7 +85,7 @@ def test_both_scenes_are_scored_on_the_test_images(files, data):
     assert "B - A" in call("compare", *files, "--data", data).stdout  # the table
     training = compared(*files, "--data", data, "--split", "train", "--test-every", 3)
     assert [1, 2, 4, 5, 7, 8] == [int(view["image"][-5]) for view in training["views"]]
-    assert 6 == training["photographs"]["a"]["views"]
+    assert 6 == training["images"]["a"]["views"]
 
 
 def test_a_background_is_composited_behind_images_and_scene(scene, files, tmp_path):
@@ -93,8 +93,8 @@ def test_a_background_is_composited_behind_images_and_scene(scene, files, tmp_pa
     for words, background in (((), [0.0, 0.0, 0.0]), (("--background", "white"), [1.0, 1.0, 1.0])):
         result = compared(*files, "--data", data, *words)
         assert background == result["background"]
-        assert result["photographs"]["a"]["psnr"] > 45.0
-        assert result["photographs"]["a"]["psnr_covered"] is not None
+        assert result["images"]["a"]["psnr"] > 45.0
+        assert result["images"]["a"]["psnr_covered"] is not None
 
 
 def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
@@ -102,7 +102,7 @@ def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
     data = write_set(tmp_path / "capture", scene, alpha=False, shift=shift)
     write_ply(tmp_path / "moved.ply", replace(scene, origin=shift))
     result = compared(tmp_path / "moved.ply", tmp_path / "moved.ply", "--data", data)
-    assert result["photographs"]["a"]["psnr"] > 50.0
+    assert result["images"]["a"]["psnr"] > 50.0
     call("render", tmp_path / "moved.ply", "--data", data, tmp_path / "out")
     assert ["view0.png", "view8.png"] == sorted(path.name for path in (tmp_path / "out").iterdir())
     with Image.open(tmp_path / "out" / "view0.png") as one, Image.open(data / "images" / "view0.png") as two:
@@ -112,7 +112,7 @@ def test_cameras_are_moved_to_the_origin_of_the_scene(scene, tmp_path):
 
 def test_lpips_is_computed_with_weights(files, data, data_dir):
     weights = data_dir / "lpips" / "lpips_alex.npz"
-    scores = compared(*files, "--data", data, "--lpips", weights)["photographs"]
+    scores = compared(*files, "--data", data, "--lpips", weights)["images"]
     assert 0.0 <= scores["a"]["lpips"] < scores["b"]["lpips"] < 1.0
 
 
@@ -186,7 +186,7 @@ def test_the_renderer_is_prepared_once_after_reading(files, tmp_path):
     calls = []
     save_cameras(tmp_path / "cameras.json", cameras(2))
     views = find_view_set(read_ply(files[0]), cameras=str(tmp_path / "cameras.json"), count=0)
-    note = {"prepare": lambda: calls.append("prepare"), "progress": lambda stage, _: calls.append(stage)}
-    compare(*files, views=views, **note)
+    context = Context(progress=lambda stage, _: calls.append(stage))
+    compare(*files, views=views, prepare=lambda: calls.append("prepare"), context=context)
     assert 1 == calls.count("prepare")
     assert calls.index("prepare") < calls.index("comparing")

@@ -141,16 +141,16 @@ def test_nearness(spec):
             assert spec.is_near(y, x, array) == (not far), (array, y, x, far)
 
 
-def test_permitted_stated_errors(spec):
+def test_permitted_declared_errors(spec):
     # SER-7
     for measure, reach, error in itertools.product(
         ("means", "covariance", "opacities", "sh0", "sh3"), (0.0, 3.0, 5e6), (0.0, 1e-12, 1e-7, 3e-3, 0.5, 1e6)
     ):
         for wide in (0.0, 1e-13, 1e-9, 1.9e-7, 2.1e-7, 1.9e-6, 2.1e-6, 9e-5 * error, 1.1e-4 * error, error):
-            for stated in (error - wide, error + wide):
-                allowed = spec.may_be_stated(stated, error, measure, reach)
-                assert allowed == is_valid_bound(measure, stated, error, reach)
-                assert not (allowed and error > 1e-3 and abs(stated - error) > 0.002 * error)
+            for declared in (error - wide, error + wide):
+                allowed = spec.may_be_declared(declared, error, measure, reach)
+                assert allowed == is_valid_bound(measure, declared, error, reach)
+                assert not (allowed and error > 1e-3 and abs(declared - error) > 0.002 * error)
 
 
 def test_the_sh_basis(spec):

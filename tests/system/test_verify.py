@@ -57,8 +57,8 @@ def test_every_violation_is_listed_with_its_clause(ply, csplat_file):
 def test_verify_proves_the_declared_errors_of_their_source(tmp_path, ply, csplat_file):
     index, words = ("--source-index", tmp_path / "index.npy"), ("verify", csplat_file, "--source", ply)
     assert "the declared errors hold" in printed(*words, *index)
-    proof = json.loads(printed(*words, *index, "--json"))["proof"]
-    assert all((proof["rms_and_counts_proved"], *(one["holds"] for one in proof["measures"].values())))
+    verified = json.loads(printed(*words, *index, "--json"))["verification"]
+    assert all((verified["rms_and_counts_verified"], *(one["holds"] for one in verified["measures"].values())))
     assert "rms and counts are not proved" in printed(*words)
     model = read_ply(ply)
     fewer = model.select(slice(0, 199))

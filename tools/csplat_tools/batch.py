@@ -29,6 +29,7 @@ from pathlib import Path, PurePath, PurePosixPath
 from typing import Any, Literal
 
 import csplat
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import check_chunks
 from csplat.disk_files import (
     FOLDER_NAMES,
@@ -44,8 +45,7 @@ from csplat.file_source import read_bytes
 from csplat.formats import formats
 from csplat.out_of_core.bucket_workers import open_client
 from csplat.remote_store import is_url
-from csplat.system import core_count, interrupts_held, split_words
-from csplat.types import Progress, null_progress
+from csplat.system import interrupts_held, split_words
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import is_csplat, write_bytes
@@ -122,10 +122,8 @@ def run_batch(
     *,
     ending: str | None = None,
     match: str = "*",
-    workers: int | None = None,
-    scheduler: str | None = None,
     force: bool = False,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Batch:
     """Run one command on many scenes, as `csplat batch` does.
 
@@ -138,25 +136,25 @@ def run_batch(
         command: the command with its options: `encode` skips .csplat files, `decode` and `extract` skip all others.
         ending: file name ending of outputs without a name; `None`: by the command.
         match: shell pattern of names within a folder, such as `*.ply`.
-        workers: number of processes, which share the cores; `None`: one per core.
-        scheduler: address of a Dask scheduler, whose workers see the same files and run the scenes instead.
         force: repeat all scenes, and replace existing files.
-        progress: called with the fraction of the scenes that are finished.
+        context: workers, which run the scenes and share the threads; progress. Workers of a Dask scheduler have to see
+            the same files.
 
     Raises:
         CommandLineError, InputError, OSError: command, scenes, folder or scheduler cannot be used.
     """
     target, words = Path(folder).absolute(), tuple(command)
+    workers, scheduler = (None, context.workers) if isinstance(context.workers, str) else (context.workers, None)
     tasks = find_tasks(Path(scenes).absolute() if scheduler else Path(scenes), words, ending, match, without=target)
-    count, others = min(workers or core_count(), len(tasks)), set(multiprocessing.active_children())
-    threads = max(1, core_count() // count) if scheduler is None else 1
-    make = partial(run_scene, target, words, threads, apart=scheduler is not None, force=force)
+    count, others = min(workers or context.thread_count, len(tasks)), set(multiprocessing.active_children())
+    worker_context = Context(threads=max(1, context.thread_count // count) if scheduler is None else 1)
+    make = partial(run_scene, target, words, worker_context, apart=scheduler is not None, force=force)
     ended, lost, processes = dict[str, SceneResult](), list[Task](), set(others)
     sizes = {task: path.stat().st_size for task in tasks if (path := Path(task.source)).is_file()}
     todo = deque(sorted(tasks, key=lambda task: -sizes.get(task, 0)))  # the largest first
     running: dict[Future[SceneResult], tuple[Any, Task]] = {}
     with nullcontext() if scheduler is None else open_client(scheduler) as client, _interrupts_noted() as interrupts:
-        new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker, (threads,))
+        new = partial(ProcessPoolExecutor, 1, multiprocessing.get_context("spawn"), _begin_worker, (worker_context,))
         idle = [new() for _ in range(count)] if client is None else [client.get_executor(pure=False)] * len(tasks)
         try:
             while (todo or running) and not interrupts:
@@ -172,7 +170,7 @@ def run_batch(
                         executor, lost = new(), [*lost, task]
                     idle.append(executor)
                     ended[task.output] = _result(future, task)
-                    (progress or null_progress)("scenes", len(ended) / len(tasks))
+                    context.progress("scenes", len(ended) / len(tasks))
         finally:
             lost += [task for _, task in running.values()]
             _end_processes(processes - others, [target / task.output for task in lost])
@@ -229,7 +227,7 @@ def _interrupts_noted() -> Iterator[list[int]]:
         raise KeyboardInterrupt
 
 
-def _begin_worker(threads: int) -> None:
+def _begin_worker(context: Context) -> None:
     """Prepare a worker process: it ends on request, or when this program was killed."""
 
     def end_with(parent: Any) -> None:
@@ -238,7 +236,7 @@ def _begin_worker(threads: int) -> None:
         time.sleep(_CLEANUP_SECONDS)
         os._exit(_STATUS_ENDED)
 
-    os.environ.setdefault("NUMBA_NUM_THREADS", str(threads))
+    os.environ.setdefault("NUMBA_NUM_THREADS", str(context.thread_count))
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent receives it, too
     threading.Thread(target=end_with, args=[multiprocessing.parent_process()], daemon=True).start()
 
@@ -341,7 +339,9 @@ def _output_name(within: str, root: str, ending: str, *, whole: bool = False) ->
     return str(path.with_name(stem + ending))
 
 
-def run_scene(folder: Path, command: Sequence[str], threads: int, task: Task, apart: bool, force: bool) -> SceneResult:
+def run_scene(
+    folder: Path, command: Sequence[str], context: Context, task: Task, apart: bool, force: bool
+) -> SceneResult:
     """Run a command on a scene, unless an earlier run has made the output. If `apart`, it runs in its own process.
 
     Raises:
@@ -357,7 +357,7 @@ def run_scene(folder: Path, command: Sequence[str], threads: int, task: Task, ap
             output.parent.mkdir(parents=True, exist_ok=True)
             words = [*command, *task.options, "--json", "--quiet", *(["--force"] if force else [])]
             if command[0] == "encode":
-                words += [] if "--threads" in words else ["--threads", str(threads)]
+                words += [] if "--threads" in words else ["--threads", str(context.thread_count)]
                 words += ["--resume"] if Path(f"{output}.work").is_dir() else []  # an earlier run was interrupted
             begun, words = time.perf_counter(), [*words, "--", str(source), str(output)]
             if apart:

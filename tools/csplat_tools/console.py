@@ -6,7 +6,6 @@ Progress is a bar on a terminal, otherwise a line every ten seconds. There is at
 from __future__ import annotations
 
 import json
-import re
 import sys
 import threading
 import time
@@ -15,9 +14,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 
-from csplat.errors import InputError
 from csplat.file_source import named_errors
-from csplat.types import Progress
+from csplat.types import Progress, null_progress
 
 if TYPE_CHECKING:
     from rich.progress import Progress as Bars
@@ -38,8 +36,6 @@ _MINUTES_FROM = 100.0  # seconds; longer durations are given in minutes
 #: Regular expression of a number, with one group.
 NUMBER = r"([0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?)"
 
-_UNITS = {"": 1, "b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "kib": 2**10, "mib": 2**20, "gib": 2**30}
-_FILE_BYTES_MIN = 64  # size of a file's header: no file is smaller
 
 STANDARD_OUTPUT = "standard output"  # its name in messages
 
@@ -84,14 +80,14 @@ S = TypeVar("S", bound=RunProgress)
 
 
 @contextmanager
-def progress_bar(*, quiet: bool = False) -> Iterator[Progress | None]:
+def progress_bar(*, quiet: bool = False) -> Iterator[Progress]:
     """Show progress, on the display that is shown already if there is one.
 
     Yields:
-        The progress callback; `None` if nothing is shown.
+        The progress callback, `null_progress` if nothing is shown.
     """
     with _displayed(quiet=quiet) as display:
-        yield None if display is None else display.report
+        yield null_progress if display is None else display.report
 
 
 @contextmanager
@@ -223,22 +219,6 @@ def format_bytes(size_bytes: int) -> str:
         if size_bytes >= divisor:
             return f"{size_bytes / divisor:.1f} {unit}"
     return f"{size_bytes} bytes"
-
-
-def parse_size_bytes(text: str) -> int:
-    """Parse a size such as `5MB`, `300 kB`, `1.5MiB` or `123456`; MB is 10⁶, MiB is 2²⁰ bytes.
-
-    Raises:
-        InputError: the text is not a size, or is smaller than any file.
-    """
-    match = re.fullmatch(NUMBER + r"\s*([kmg]?i?b?)", text.strip(), re.IGNORECASE)
-    unit = None if match is None else _UNITS.get(match[2].lower())
-    size = None if match is None or unit is None else float(match[1]) * unit
-    if size is None or not 1.0 <= size < 2.0**63:
-        raise InputError(f"a size is {text!r}, expected bytes, or a number with kB, MB, GB, KiB, MiB or GiB")
-    if size < _FILE_BYTES_MIN:
-        raise InputError(f"no file has {size:.0f} bytes or fewer; did you mean {text.strip()}MB?")
-    return int(size)
 
 
 def format_seconds(seconds: float) -> str:

@@ -245,7 +245,7 @@ class Conversion:
             "losses": findings_as_json(self.losses),
             "axes": list(self.axes),
             "filter_axes": self.filter_axes,
-            "defects": findings_as_json(self.findings),
+            "findings": findings_as_json(self.findings),
         }
 
     def lost_words(self) -> str:

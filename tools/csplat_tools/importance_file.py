@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import read_array
-from csplat.encoder import EncodeOptions, EncodeResult, Importance, Origin, Target, encode_with_report
+from csplat.encode_api import encode_planned, encode_with_report
+from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Importance, Origin, Target, Views
 from csplat.errors import InputError
 from csplat.file_source import open_binary
 from csplat.model import SplatModel
-from csplat.types import Progress
 from csplat_render.scene_frame import scene_frame
 from csplat_tools.level_builder import FittedLevelBuilder
 from csplat_trainer.sensitivity_file import StoredSensitivity, read_sensitivity
@@ -59,10 +60,10 @@ def encode_by_importance(
     path: str,
     *,
     target: Target | None = None,
-    views: Any = None,
+    views: Views | None = None,
     prune_unseen: bool = False,
     levels: FittedLevelBuilder | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> EncodeResult:
     """Encode a scene with the importance of its splats.
 
@@ -73,7 +74,7 @@ def encode_by_importance(
         target, views: as for `csplat.encode`; not with `prune_unseen`.
         prune_unseen: prune the splats that no view of the sensitivities saw.
         levels: builds levels of detail; `None`: the file has none.
-        progress: progress callback.
+        context: as for `csplat.encode`.
 
     Raises:
         InputError: the file is invalid or belongs to another scene; or `prune_unseen` is set and no view saw any
@@ -87,21 +88,20 @@ def encode_by_importance(
     weights = encoder_importance(importance, model)
     if target is not None:
         return encode_with_report(
-            model, options, levels=levels, target=target, views=views, importance=weights, progress=progress
+            model, options, levels=levels, target=target, views=views, importance=weights, context=context
         )
     notes = _class_notes(options, weights)
     if not prune_unseen or stored is None or stored.seen.all():
-        result = encode_with_report(model, options, levels=levels, importance=weights, progress=progress)
+        result = encode_with_report(model, options, levels=levels, importance=weights, context=context)
         return _with_notes(result, *notes)
     rows = np.flatnonzero(stored.seen)
     if not len(rows):
         raise InputError(f"{path}: no view saw any splat, so all would be pruned")
     pruned = {"unseen": len(model) - len(rows), "views": stored.view_count, "source": stored.source}
     left = weights.select(rows) if isinstance(weights, Importance) else None
-    result = encode_with_report(
-        model.select(rows), options, levels=levels, importance=left, origin=Origin(len(model), rows),
-        metadata={"pruned": pruned}, progress=progress,
-    )  # fmt: skip
+    origin = Origin(len(model), rows)
+    plan = EncodePlan.of(model.select(rows), options, importance=left, origin=origin, context=context)
+    result = encode_planned(plan, levels, {"pruned": pruned})
     if stored.missed_share > 0.0:  # NaN if no view was held out
         missed = f"{100 * stored.missed_share:.1f} % of the splats were pruned although held-out views saw them:"
         notes = (*notes, f"{missed} `csplat sensitivity` with more views misses fewer")

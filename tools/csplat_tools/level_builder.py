@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import csplat
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import (
     BUCKET_SPLATS,
     EncodedTiles,
@@ -33,7 +34,7 @@ from csplat.errors import InputError
 from csplat.formats.sog.sog_reader import read_leaf_numbers
 from csplat.model import SplatModel
 from csplat.scene import join_blocks
-from csplat.types import F32, I64, Progress, null_progress
+from csplat.types import F32, I64, null_progress
 from csplat_tools.optional_packages import require_renderer
 
 # Modules that render are imported where they are used: the cost of levels can be estimated without them.
@@ -93,70 +94,59 @@ class FittedLevelBuilder:
             return count * _SECONDS_WHOLE
         return count * (_SECONDS_FITTED if count <= self.fitted_splats else _SECONDS_MERGED)
 
-    def encode_plan(
-        self, plan: EncodePlan, codebooks: FileCodebooks | None = None, progress: Progress = null_progress
-    ) -> EncodedTiles:
+    def encode_plan(self, plan: EncodePlan, codebooks: FileCodebooks | None = None) -> EncodedTiles:
         """Encode a planned scene with its levels, in memory. Arguments are as for `csplat.encoder.encode_levels`."""
-        threads = plan.options.threads
-        nodes = self.build(plan.model, threads, progress) if self.nodes is None else self.nodes
-        return self.measure(encode_levels(plan, nodes, codebooks, progress), threads, progress)
+        nodes = self.build(plan.model, plan.context) if self.nodes is None else self.nodes
+        return self.measure(encode_levels(plan, nodes, codebooks), plan.context)
 
-    def build(
-        self, model: SplatModel, threads: int | None = None, progress: Progress = null_progress
-    ) -> list[LevelNode]:
+    def build(self, model: SplatModel, context: Context = DEFAULT_CONTEXT) -> list[LevelNode]:
         """Build the nodes of a scene. Their errors are 0 until `measure` is called.
 
         Args:
             model: the scene.
-            threads: number of threads; `None`: all. No node depends on it.
-            progress: called with the stage and the completed fraction.
+            context: threads and progress.
         """
         if not len(model):
             return []
         if len(model) <= self.whole_splats:
             from csplat_tools.level_fitting import LevelFitter
 
-            return self._build_leaves(
-                model, LevelFitter(_plain(model), threads=threads, progress=progress).fit, self.count
-            )
+            return self._build_leaves(model, LevelFitter(_plain(model), context=context).fit, self.count)
         nodes, roots, numbers = list[LevelNode](), list[SplatModel](), list[list[int]]()
-        buckets = bucket_rows(model.means, self.bucket_splats)
+        buckets, silent = bucket_rows(model.means, self.bucket_splats), replace(context, progress=null_progress)
         for done, rows in enumerate(buckets):
-            part = self.build_part(model.select(rows), len(model), threads)
+            part = self.build_part(model.select(rows), len(model), silent)
             numbers.append([len(nodes) + number for number, node in enumerate(part) if node.parent is None])
             roots.append(join_roots(part))
             nodes += [_moved(node, len(nodes), rows) for node in part]
-            progress("building levels", (done + 1) / len(buckets))
-        parents, top = self.build_top(roots, threads, progress)
+            context.progress("building levels", (done + 1) / len(buckets))
+        parents, top = self.build_top(roots, context)
         for own, parent in zip(numbers, parents, strict=False):
             for number in own:
                 nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
         return nodes + [_moved(node, len(nodes)) for node in top]
 
-    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
+    def build_part(self, splats: SplatModel, scene_count: int, context: Context) -> list[LevelNode]:
         """Build the nodes of a bucket, up to one node or the last level.
 
         Args:
             splats: the bucket.
             scene_count: number of splats of the scene.
-            threads: number of threads; `None`: all. No node depends on it.
+            context: threads and progress.
         """
         from csplat_tools.level_fitting import PART_WORK, LevelFitter
 
-        fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, threads=threads)
+        fitter = LevelFitter(_plain(splats), is_part=True, work=PART_WORK, context=context)
         return self._build_leaves(
             splats, fitter.fit if scene_count <= self.fitted_splats else _merge, self._part_levels
         )
 
-    def build_top(
-        self, roots: Iterable[SplatModel], threads: int | None = None, progress: Progress = null_progress
-    ) -> tuple[list[int | None], list[LevelNode]]:
+    def build_top(self, roots: Iterable[SplatModel], context: Context) -> tuple[list[int | None], list[LevelNode]]:
         """Build the nodes above all buckets.
 
         Args:
             roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
-            threads: number of threads; `None`: all.
-            progress: called with the stage and the completed fraction.
+            context: threads and progress.
 
         Returns:
             The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
@@ -169,18 +159,16 @@ class FittedLevelBuilder:
         nodes = [LevelNode(self._part_levels, None, splats=splats) for splats in parts]
         places = np.repeat(np.arange(len(parts)), [len(splats) for splats in parts])
         scene = join_blocks(parts[0], parts)
-        fitter = LevelFitter(scene, is_part=True, threads=threads, progress=progress)
+        fitter = LevelFitter(scene, is_part=True, context=context)
         nodes = self._add_levels(nodes, scene, places, fitter.fit, self.count)
         nodes = [replace(node, parent=None if node.parent is None else node.parent - len(parts)) for node in nodes]
         return [node.parent for node in nodes[: len(parts)]], nodes[len(parts) :]
 
-    def measure(
-        self, encoded: EncodedTiles, threads: int | None = None, progress: Progress = null_progress
-    ) -> EncodedTiles:
+    def measure(self, encoded: EncodedTiles, context: Context) -> EncodedTiles:
         """Return the same tiles with errors of the nodes that have none yet."""
         from csplat_tools.level_errors import measure_errors
 
-        return measure_errors(encoded, threads=threads, progress=progress)
+        return measure_errors(encoded, context=context)
 
     @property
     def _part_levels(self) -> int:

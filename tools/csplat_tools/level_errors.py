@@ -13,11 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
 from csplat.encoder import EncodedTiles, FileNode
 from csplat.errors import LimitError
 from csplat.model import SplatModel
-from csplat.types import F32, F64, Progress, null_progress
+from csplat.types import F32, F64
 from csplat_render.camera import Camera, look_at
 from csplat_render.rasteriser import Rasteriser
 
@@ -39,16 +40,14 @@ def measure_errors(
     encoded: EncodedTiles,
     *,
     reference_splats: int = REFERENCE_SPLATS,
-    threads: int | None = None,
-    progress: Progress = null_progress,
+    context: Context = DEFAULT_CONTEXT,
 ) -> EncodedTiles:
     """Return the same tiles with errors of the nodes that have none yet.
 
     Args:
         encoded: the tiles, with nodes by ascending level.
         reference_splats: maximum number of splats that a node is compared with, if a level of its subtree has as few.
-        threads: number of threads; `None`: all. No error depends on it.
-        progress: called with the fraction of the nodes that are done.
+        context: threads and progress.
     """
     nodes = list(encoded.nodes)
     children: list[list[int]] = [[] for _ in nodes]
@@ -57,7 +56,7 @@ def measure_errors(
             children[node.parent].append(number)
     step = encoded.plan.parameters.lattice.step
     regions = np.empty((len(nodes), 2, 3))
-    rasteriser = Rasteriser(gradients=False, threads=threads)
+    rasteriser = Rasteriser(gradients=False, context=context)
     for number, node in enumerate(nodes):  # children come before their parents
         corners = [corner for tile in node.tiles for corner in tile.corners(step)]
         corners += [corner for child in children[number] for corner in regions[child]]
@@ -75,7 +74,7 @@ def measure_errors(
         squares = (np.sqrt(squares) + np.sqrt(below)) ** 2
         error = max(_first_alike(squares, radius), *(nodes[child].error for child in children[number]))
         nodes[number] = replace(node, error=error, squares=tuple(squares.tolist()))
-        progress("measuring levels", (number + 1) / len(nodes))
+        context.progress("measuring levels", (number + 1) / len(nodes))
     return replace(encoded, nodes=nodes)
 
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import LimitError
 from csplat.model import SplatModel
-from csplat.types import I64, Progress, null_progress
+from csplat.types import I64
 from csplat_render.camera import Camera
 from csplat_render.scorer import Scorer, renderer
 from csplat_tools.level_merging import light_of, merge_neighbours
@@ -67,15 +68,13 @@ class LevelFitter:
             scenes, garden500k, built as parts, gains 0.4, 1.1 and 1.6 dB at levels 1 to 3, but all of the aerial scene
             loses 0.9, 1.0 and 0.8.
         work: how much is done.
-        threads: number of threads; `None`: all. No result depends on it.
-        progress: called with the stage and the completed fraction.
+        context: threads and progress.
     """
 
     scene: SplatModel
     is_part: bool = False
     work: Work = SCENE_WORK
-    threads: int | None = None
-    progress: Progress = null_progress
+    context: Context = DEFAULT_CONTEXT
 
     def fit(self, finer: SplatModel, nodes: I64, count: int, level: int) -> tuple[I64, SplatModel]:
         """Choose or merge splats, and refit them. Only merge them if a view has too many to be rendered.
@@ -102,12 +101,10 @@ class LevelFitter:
             rows = self._choose(finer, nodes, count, used)
             nodes, chosen = nodes[rows], finer.select(rows)
         steps = _between(self.work.splats_to_move / len(chosen), self.work.steps)
-        draw = renderer(self.scene, (0.0, 0.0, 0.0), threads=self.threads)
-        fitted = refit_splats(
-            chosen, used, [draw(camera).rgb for camera in used], steps=steps, moves=True, threads=self.threads,
-            progress=self.progress,
-        )  # fmt: skip
-        scorer = Scorer.of_source(self.scene, check, threads=self.threads)
+        draw = renderer(self.scene, (0.0, 0.0, 0.0), context=self.context)
+        renders = [draw(camera).rgb for camera in used]
+        fitted = refit_splats(chosen, used, renders, steps=steps, moves=True, context=self.context)
+        scorer = Scorer.of_source(self.scene, check, context=self.context)
         return nodes, fitted if scorer.psnr(fitted) >= scorer.psnr(chosen) else chosen
 
     def _cameras(self, finer_count: int, level: int) -> tuple[list[Camera], list[Camera]]:
@@ -122,7 +119,7 @@ class LevelFitter:
 
     def _choose(self, finer: SplatModel, nodes: I64, count: int, cameras: list[Camera]) -> I64:
         groups = [
-            MeasuredViews.of(finer, part, (0.0, 0.0, 0.0), threads=self.threads, progress=self.progress)
+            MeasuredViews.of(finer, part, (0.0, 0.0, 0.0), context=self.context)
             for part in (cameras[::2], cameras[1::2])
         ]
         # No view tells unseen splats apart: the same fraction is kept, with the largest opacity times area.
@@ -131,7 +128,7 @@ class LevelFitter:
         unseen = unseen[np.argsort(-light[unseen], kind="stable")]
         left = np.delete(np.arange(len(finer)), unseen[len(unseen) * count // len(finer) :])
         groups = [replace(group, pruning_error=group.pruning_error.of_rows(left)) for group in groups]
-        order = PruningOrder(finer.select(left), groups, threads=self.threads, progress=self.progress)
+        order = PruningOrder(finer.select(left), groups, context=self.context)
         rows = left[order.kept(count)]
         by_node = np.lexsort((light, nodes))
         brightest = by_node[np.flatnonzero(np.diff(nodes[by_node], append=-1))]  # the last of each node

@@ -13,6 +13,7 @@ from typing import Any
 
 import csplat
 from csplat._spec import VERSION_MAJOR, VERSION_MINOR
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import missing_package
 from csplat.system import core_count
 from csplat_tools.console import note, progress_bar
@@ -54,14 +55,12 @@ def prepare_renderer(
 
     others = [_warm_up_adam] if simplify else []
     with progress_bar(quiet=quiet) as progress:
-        if progress is not None:
-            progress("preparing the renderer", 0.0)
+        progress("preparing the renderer", 0.0)
         warm_up(
             None if quiet else note, gradients=gradients or simplify, simplify=simplify, ssim=ssim, lpips=lpips,
             others=others,
         )  # fmt: skip
-        if progress is not None:
-            progress("preparing the renderer", 1.0)
+        progress("preparing the renderer", 1.0)
 
 
 def require_trainer(*, plots: bool = False) -> None:
@@ -163,13 +162,12 @@ def _limit_spinning() -> None:
 _PACKAGES = ("numpy", "numba", "scipy", "deflate", "zstandard", "matplotlib", "pillow")
 
 
-def describe_machine(threads: int | None) -> dict[str, Any]:
-    """Return processor, cores, threads in use (`None` for all), system and versions as JSON-compatible values."""
-    cores = core_count()
+def describe_machine(context: Context = DEFAULT_CONTEXT) -> dict[str, Any]:
+    """Return processor, cores, threads in use, system and versions as JSON-compatible values."""
     return {
         "processor": processor_name(),
-        "cores": cores,
-        "threads": threads or cores,
+        "cores": core_count(),
+        "threads": context.thread_count,
         "system": f"{platform.system()} {platform.machine()}",
         "python": platform.python_version(),
         "csplat": csplat.__version__,

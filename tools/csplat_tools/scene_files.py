@@ -12,6 +12,7 @@ import numpy as np
 
 import csplat
 from csplat import formats
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import size_on_disk
 from csplat.errors import LimitError
 from csplat.file_source import File
@@ -21,7 +22,7 @@ from csplat.ply.column_names import dropped_columns
 from csplat.scene import Scene, drop_bands, join_blocks
 from csplat.scene_metadata import LICENCE, Direction, SceneMetadata
 from csplat.splat_file import SplatFile
-from csplat.system import available_memory_bytes, default_memory_bytes
+from csplat.system import available_memory_bytes
 from csplat.types import Progress, null_progress
 from csplat_tools.file_streams import is_csplat, kept_path, local_path, naming, source_path
 
@@ -107,9 +108,10 @@ def read_source(
     keep_extra: bool = False,
     sh_degree: int | None = None,
     opened: Scene | None = None,
+    in_memory: bool = True,
     progress: Progress | None = None,
 ) -> Scene:
-    """Read a scene to be encoded into memory, in any format but .csplat, and repair defects if that is safe.
+    """Read a scene to be encoded, and repair defects if that is safe.
 
     Args:
         file: a path, or `-`; an open binary file; or bytes.
@@ -117,35 +119,42 @@ def read_source(
         format, sh_degree: as in `csplat.open`.
         strict: refuse defects that would be repaired.
         keep_extra: keep additional columns.
-        opened: the scene of the file, if it is open; `sh_degree` has no effect then.
+        opened: the scene of the file, if it is open, with `sh_degree`.
+        in_memory: read all splats into memory. Otherwise the result is `opened` with the overrides.
         progress: progress callback.
 
     Raises:
         CsplatError: the scene is not valid.
         OSError: the scene cannot be read.
     """
+    overrides = overrides or MetadataOverrides()
+    if opened is not None and not in_memory:
+        dropped = [] if keep_extra or not opened.extra else [dropped_columns(list(opened.extra))]
+        findings = [*opened.findings, *dropped]
+        refuse(findings, strict=strict)
+        return overrides.apply_to_scene(opened).changed(findings=findings)
     report = progress or null_progress
     report("reading", 0.0)
     with source_path(file) as local:
-        if opened is None:
+        if opened is None or opened.format in CHEAP_TO_REOPEN:
             scene = formats.read_scene(local, format, strict=strict, keep_extra=keep_extra, sh_degree=sh_degree)
         else:
             scene = (opened if keep_extra else opened.without_extra()).loaded()
             refuse(scene.findings, strict=strict)
     report("reading", 1.0)
     assert scene.in_memory is not None
-    model = (overrides or MetadataOverrides()).apply_to_model(scene.in_memory)
+    model = overrides.apply_to_model(scene.in_memory)
     return scene.changed(metadata=model.metadata, in_memory=model)
 
 
 @contextmanager
-def open_scenes(given: Sequence[SceneLike], memory_bytes: int | None = None) -> Iterator[Sequence[Scene]]:
+def open_scenes(given: Sequence[SceneLike], context: Context = DEFAULT_CONTEXT) -> Iterator[Sequence[Scene]]:
     """Read scenes for a comparison into memory, or open all of them if they do not fit together.
 
     Args:
         given: scenes as for `load_scene`. If any is in memory already, all are read into memory; scenes that are open
             remain so.
-        memory_bytes: approximate limit of the memory; `None`: half of the free memory.
+        context: memory; the limit is approximate.
 
     Yields:
         The scenes, which can be read within the context. Scenes in memory are as from `load_scene`.
@@ -157,7 +166,6 @@ def open_scenes(given: Sequence[SceneLike], memory_bytes: int | None = None) -> 
     if all(isinstance(scene, Scene) and scene.in_memory is None for scene in given):
         yield [scene for scene in given if isinstance(scene, Scene)]
         return
-    bound = default_memory_bytes() if memory_bytes is None else memory_bytes
     with ExitStack() as stack:
         local: dict[int, Path] = {}
         fits: dict[int, Scene] = {}
@@ -165,11 +173,11 @@ def open_scenes(given: Sequence[SceneLike], memory_bytes: int | None = None) -> 
             if not isinstance(scene, (SplatModel, Scene)):
                 with naming(scene):
                     local[place] = stack.enter_context(kept_path(scene))
-        has_large = memory_bytes is not None or any(size_on_disk(path) > _SMALL for path in local.values())
+        has_large = context.memory is not None or any(size_on_disk(path) > _SMALL for path in local.values())
         if len(local) == len(given) and has_large:
             with ExitStack() as opening:
                 opened = [_opened(opening, given[place], path) for place, path in local.items()]
-                if _together_bytes(opened) > bound:
+                if _together_bytes(opened) > context.memory_limit:
                     stack.push(opening.pop_all())
                     yield opened
                     return

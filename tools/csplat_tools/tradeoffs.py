@@ -15,14 +15,16 @@ from html import escape
 from pathlib import PurePath
 from typing import TYPE_CHECKING, Any, cast
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
-from csplat.encoder import PRESETS, EncodeOptions, PresetName, Target, encode_with_report
+from csplat.encode_api import encode_with_report
+from csplat.encoder import PRESETS, EncodeOptions, PresetName, Target
 from csplat.errors import CsplatError, InputError
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.types import Progress, null_progress
 from csplat_tools import html_report as html
-from csplat_tools.console import NUMBER, format_bytes, format_table, parse_size_bytes
+from csplat_tools.console import NUMBER, format_bytes, format_table
 from csplat_tools.file_streams import STANDARD_STREAM
 from csplat_tools.html_report import INK, draw_svg
 from csplat_tools.inspect.comparison import compare
@@ -100,7 +102,7 @@ def _setting(group: str, value: str, options: EncodeOptions) -> GridSetting:
         return GridSetting(group, value, options, None, ("--preset", value))
     target: Target | None = None
     if group == "targets" and not re.fullmatch(NUMBER, value):
-        option, target = "--target-size", Target(size_bytes=parse_size_bytes(value))
+        option, target = "--target-size", Target(size=value)
     elif not re.fullmatch(NUMBER, value):
         raise InputError(f"{value!r} is not a number, expected numbers separated by colons")
     elif group == "precision":
@@ -148,7 +150,7 @@ class TradeoffRow:
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
         values = {name: value for name, value in vars(self).items() if name not in ("setting", "image_scores")}
-        return {"name": self.setting.name, **values, "photographs": self.image_scores}
+        return {"name": self.setting.name, **values, "images": self.image_scores}
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,7 +169,7 @@ class Tradeoff:
     views: ViewSet
     rows: Sequence[TradeoffRow]
     failures: dict[str, str]
-    machine: dict[str, Any] = field(default_factory=lambda: describe_machine(None))
+    machine: dict[str, Any] = field(default_factory=describe_machine)
 
     @property
     def front(self) -> list[TradeoffRow]:
@@ -204,7 +206,7 @@ def tradeoff(
     path: str = "scene.ply",
     view_words: Sequence[str] = (),
     say: Callable[[str], None] | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Tradeoff:
     """Encode a scene with each setting of a grid, and measure the files, as `csplat tradeoff` does.
 
@@ -217,7 +219,7 @@ def tradeoff(
         path: path of the scene in commands.
         view_words: options of `csplat encode` that give the same views, for commands.
         say: called with a line for each setting.
-        progress: progress callback.
+        context: threads, seed and progress.
 
     Examples:
         >>> import csplat_tools
@@ -233,15 +235,15 @@ def tradeoff(
     source = load_scene(scene) if isinstance(scene, (SplatModel, Scene)) else read_source(scene)
     if not source.count:
         raise InputError("the scene has no splats")
-    around = views or find_view_set(source.model())
+    around = views or find_view_set(source.model(), seed=context.seed)
 
     def measure(setting: GridSetting) -> TradeoffRow:
         start = time.perf_counter()
         used = around if setting.target else None
-        made = encode_with_report(source.model(), setting.options, target=setting.target, views=used, progress=progress)
+        made = encode_with_report(source.model(), setting.options, target=setting.target, views=used, context=context)
         encode_seconds = time.perf_counter() - start
-        decoded, decode_seconds = _decode(made.data)
-        compared = compare(source, decoded, views=around, source_index=made.source_index, progress=progress)
+        decoded, decode_seconds = _decode(made.data, context)
+        compared = compare(source, decoded, views=around, source_index=made.source_index, context=context)
         words = (path, _output(path, setting), *setting.words, *(view_words if setting.target else ()))
         return TradeoffRow(
             setting, shlex.join(("csplat", "encode", *words)), len(made.data), source.size_bytes / len(made.data),
@@ -249,8 +251,8 @@ def tradeoff(
             decode_seconds,
         )  # fmt: skip
 
-    rows, failures = measure_grid(parse_grid() if grid is None else grid, measure, say, progress)
-    return Tradeoff(source, around, rows, failures)
+    rows, failures = measure_grid(parse_grid() if grid is None else grid, measure, say, context.progress)
+    return Tradeoff(source, around, rows, failures, describe_machine(context))
 
 
 def measure_grid(
@@ -287,12 +289,12 @@ def measure_grid(
     return sorted(rows, key=lambda row: row.size_bytes), failures
 
 
-def _decode(data: bytes) -> tuple[SplatModel, float]:
+def _decode(data: bytes, context: Context) -> tuple[SplatModel, float]:
     """Return the decoded splats, and the median of the times in seconds."""
     models, seconds = list[SplatModel](), list[float]()
     for _ in range(_DECODE_RUNS):
         start = time.perf_counter()
-        models[:] = [decode(data)]
+        models[:] = [decode(data, context=context)]
         seconds.append(time.perf_counter() - start)
     return models[0], statistics.median(seconds)
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Literal, overload
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import missing_package
 from csplat.model import SplatModel
 from csplat_render.camera import Camera
@@ -32,7 +33,7 @@ def render(
     backend: Literal["cpu"] = ...,
     antialiased: bool | None = ...,
     sh_degree: int | None = ...,
-    threads: int | None = ...,
+    context: Context = ...,
 ) -> RenderResult: ...
 
 
@@ -46,7 +47,7 @@ def render(
     backend: Backend,
     antialiased: bool | None = ...,
     sh_degree: int | None = ...,
-    threads: int | None = ...,
+    context: Context = ...,
 ) -> Render: ...
 
 
@@ -59,7 +60,7 @@ def render(
     backend: Backend = "cpu",
     antialiased: bool | None = None,
     sh_degree: int | None = None,
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Render:
     """Render one image.
 
@@ -78,7 +79,7 @@ def render(
             GPU's shaders on the CPU, for tests. GPUs require the extra `gpu`.
         antialiased: apply the mip-splatting filter; `None`: the model's own setting.
         sh_degree: highest SH degree; `None`: the model's.
-        threads: number of threads; `None`: all.
+        context: threads.
 
     Returns:
         `rgb` [H, W, 3] float32, not clipped; `alpha` [H, W]; on the CPU `depth` [H, W], scene units; and more.
@@ -116,7 +117,7 @@ def render(
         antialiased = isinstance(splats, SplatModel) and splats.metadata.antialiased
     if mode == "exact":
         return render_exact(splats, camera, background=background, antialiased=antialiased, sh_degree=sh_degree)
-    rasteriser = Rasteriser(mode, np.float32, gradients=False, threads=threads)
+    rasteriser = Rasteriser(mode, np.float32, gradients=False, context=context)
     return rasteriser.forward(splats, camera, background=background, antialiased=antialiased, sh_degree=sh_degree)
 
 

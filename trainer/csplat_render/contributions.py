@@ -28,6 +28,7 @@ from typing import Any
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.model import sh_degree_of
 from csplat.spherical_harmonics import BASIS_SIZE
 from csplat_render.binning import TILE
@@ -135,7 +136,7 @@ class Contributions(Rasteriser):
     Args:
         dtype: see `Rasteriser`.
         transmittance_min: transmittance at which a pixel is finished.
-        threads: see `Rasteriser`.
+        context: threads.
     """
 
     def __init__(
@@ -143,9 +144,9 @@ class Contributions(Rasteriser):
         dtype: Any = np.float32,
         *,
         transmittance_min: float = TRANSMITTANCE_MIN,
-        threads: int | None = None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> None:
-        super().__init__("standard", dtype, gradients=True, threads=threads)
+        super().__init__("standard", dtype, gradients=True, context=context)
         self._limits[2] = transmittance_min
 
     def project_view(
@@ -165,7 +166,7 @@ class Contributions(Rasteriser):
         arrays = checked_splats(splats, self.dtype)
         degree = sh_degree_of(arrays.shN.shape[1])
         tiles_x, tiles_y = -(-camera.W // TILE), -(-camera.H // TILE)
-        with thread_count(self.threads):
+        with thread_count(self.context.threads):
             view, _, _ = self._project(arrays, camera, degree, antialiased=antialiased)
             shape, extent, box, near = (self._buffers[name] for name in ("shape", "extent", "box", "near"))
             order = self._depth_order(near)
@@ -216,7 +217,7 @@ class Contributions(Rasteriser):
         transmittance, last = self._buffer("through", size, self.dtype), self._buffer("last", size, self.dtype)
         rgb = np.empty((*size, 3), self.dtype)
         behind = np.ascontiguousarray(background, self.dtype)
-        with thread_count(self.threads):
+        with thread_count(self.context.threads):
             blend_counted(
                 drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits, behind,
                 rgb, transmittance, last, self._buffer("used", (len(drawn.starts) - 1,), np.int64),
@@ -262,7 +263,7 @@ class Contributions(Rasteriser):
         records = self._buffer("sums", (len(drawn.ids), COLOUR_SUMS), self.dtype)
         used = self._buffer("used", (len(drawn.starts) - 1,), np.int64)
         rgb = np.empty((*size, 3), self.dtype)
-        with thread_count(self.threads):
+        with thread_count(self.context.threads):
             set_colours(drawn.rows, drawn.basis, coefficients, active, offset, drawn.shape)
             blend(
                 drawn.starts, drawn.ids, drawn.shape, drawn.box, tiles_x, self._limits,

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import Progress
 from csplat_render.camera import Camera
 from csplat_render.contributions import Contributions
 from csplat_render.conventions import TRANSMITTANCE_MIN, Array
@@ -52,8 +52,7 @@ def measure_pruning_error(
     background: ArrayLike = (0.0, 0.0, 0.0),
     dtype: Any = np.float32,
     transmittance_min: float = TRANSMITTANCE_MIN,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
     on_render: Callable[[Array], None] | None = None,
 ) -> PruningError:
     """Measure the effect of pruning each splat alone on the renders of a scene.
@@ -64,8 +63,7 @@ def measure_pruning_error(
         background: red, green, blue of the background.
         dtype: dtype of pixels, float32 or (for tests) float64.
         transmittance_min: transmittance at which a pixel is finished; 0: never.
-        threads: number of threads; `None`: all. The result does not depend on it.
-        progress: called with the stage and the completed fraction.
+        context: threads and progress.
         on_render: called with the render of each view, [H, W, 3].
 
     Raises:
@@ -74,15 +72,14 @@ def measure_pruning_error(
     """
     if not cameras:
         raise InputError("measuring the pruning error requires at least one camera")
-    contributions = Contributions(dtype, transmittance_min=transmittance_min, threads=threads)
+    contributions = Contributions(dtype, transmittance_min=transmittance_min, context=context)
     error, seen, behind = np.zeros(len(model)), np.zeros(len(model), np.bool_), np.asarray(background, np.float64)
     for number, camera in enumerate(cameras):
         view = contributions.project_view(model, camera, antialiased=model.metadata.antialiased, basis=False)
         render = contributions.measure_pruning(view, error, seen, background=behind)
         if on_render is not None:
             on_render(render)
-        if progress is not None:
-            progress("measuring splats", (number + 1) / len(cameras))
+        context.progress("measuring splats", (number + 1) / len(cameras))
     return PruningError(error, seen, sum(3 * camera.W * camera.H for camera in cameras))
 
 

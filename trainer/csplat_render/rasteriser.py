@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError, LimitError
 from csplat_render.binning import (
     CHUNKS,
@@ -73,7 +74,7 @@ class Rasteriser:
             a sixth of the time, with PSNRs of 40 to 52 dB on trained scenes.
         dtype: dtype of pixels and gradients, float32 or (for tests) float64. Projection always uses float64.
         gradients: enable `backward`; without it, `forward` is slightly faster.
-        threads: number of threads; `None`: all.
+        context: threads.
 
     Raises:
         InputError: the mode or the dtype does not exist.
@@ -85,14 +86,14 @@ class Rasteriser:
         dtype: Any = np.float32,
         *,
         gradients: bool = True,
-        threads: int | None = None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> None:
         self._alpha_min, transmittance_min = thresholds_of(mode)
         self.dtype = np.dtype(dtype)
         if self.dtype not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise InputError(f"the rasteriser's dtype is {self.dtype}, expected float32 or float64")
         self.gradients = gradients
-        self.threads = threads
+        self.context = context
         self._limits = np.array([self._alpha_min, ALPHA_CAP, transmittance_min], self.dtype)
         self._buffers: dict[str, Array] = {}
         self._last: _ForwardState | None = None
@@ -139,7 +140,7 @@ class Rasteriser:
         tile_count = tiles_x * tiles_y
         rgb = np.empty((height, width, 3), self.dtype)
         transmittance, depth = np.empty((height, width), self.dtype), np.empty((height, width), self.dtype)
-        with thread_count(self.threads):
+        with thread_count(self.context.threads):
             view, radii, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
             shape, extent, box, near = (self._buffers[name] for name in ("shape", "extent", "box", "near"))
             order = self._depth_order(near)
@@ -166,7 +167,7 @@ class Rasteriser:
         """Find the splats that a render would show, and their depths. Takes the arguments of `forward`."""
         arrays = checked_splats(splats, self.dtype)
         degree = checked_degree(None, arrays.shN.shape[1])
-        with thread_count(self.threads):
+        with thread_count(self.context.threads):
             *_, ignored = self._project(arrays, camera, degree, antialiased=antialiased)
         near, box = self._buffers["near"].copy(), self._buffers["box"]
         tiles = np.where(near > 0, ((box[:, 1::2] - 1) // TILE - box[:, ::2] // TILE + 1).prod(axis=1), 0)
@@ -206,7 +207,7 @@ class Rasteriser:
             last.radii,
         )
         shape, box = self._buffer("shape", (n, 10), np.float64), self._buffer("box", (n, 4), np.int32)
-        with thread_count(self.threads):
+        with thread_count(self.context.threads):
             blend_backward(
                 self._buffer("starts", (last.tile_count + 1,), np.int64),
                 self._buffer("used", (last.tile_count,), np.int64), buffers["ids"], buffers["slots"], shape, box,

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32, F64, Mask, Progress
@@ -33,7 +34,7 @@ class Renderable(Protocol):
         ...
 
     def renderer(
-        self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+        self, background: ArrayLike, *, mode: Mode = "standard", context: Context = DEFAULT_CONTEXT
     ) -> Callable[[Camera], Render]:
         """Return a function that renders the scene, like `renderer` of this module."""
         ...
@@ -65,7 +66,7 @@ class Scorer:
         references: the reference image of each view, or a function that returns it on demand.
         background: red, green, blue of the background.
         mode: mode of the renderer.
-        threads: number of threads; `None`: all. No score depends on it.
+        context: threads.
         origin: origin of the camera coordinates; `None`: the origin of the scored scene.
         pixels: number of pixels to compare in each view; `None`: all pixels.
 
@@ -77,7 +78,7 @@ class Scorer:
     references: Sequence[ReferenceImage | Callable[[], ReferenceImage]]
     background: ArrayLike = (0.0, 0.0, 0.0)
     mode: Mode = "standard"
-    threads: int | None = None
+    context: Context = DEFAULT_CONTEXT
     origin: Sequence[float] | None = None
     pixels: Sequence[int] | None = None
 
@@ -97,32 +98,29 @@ class Scorer:
         background: ArrayLike = (0.0, 0.0, 0.0),
         *,
         mode: Mode = "standard",
-        threads: int | None = None,
         kept_bytes: int = 1 << 30,
-        progress: Progress | None = None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> Scorer:
         """Create a scorer whose references are renders of a source.
 
         Args:
             source: the scene to compare with.
             cameras: cameras of the views, relative to the source's origin.
-            background, mode, threads: see `Scorer`.
+            background, mode: see `Scorer`.
             kept_bytes: maximum memory for the source's renders; if it does not suffice, they are rendered again for
                 each scored scene.
-            progress: called with the stage and the completed fraction.
+            context: threads and progress.
         """
-        render = renderer(source, background, mode=mode, threads=threads)
+        render = renderer(source, background, mode=mode, context=context)
         references: list[ReferenceImage | Callable[[], ReferenceImage]]
         references = [partial(_render_reference, render, camera) for camera in cameras]
         if sum(12 * camera.W * camera.H for camera in cameras) <= kept_bytes:
             references = []
             for camera in cameras:
-                if progress is not None:
-                    progress("drawing the source", len(references) / len(cameras))
+                context.progress("drawing the source", len(references) / len(cameras))
                 references.append(_render_reference(render, camera))
-            if progress is not None:
-                progress("drawing the source", 1.0)
-        return cls(cameras, references, background, mode, threads, source.origin)
+            context.progress("drawing the source", 1.0)
+        return cls(cameras, references, background, mode, context, source.origin)
 
     def reference(self, number: int) -> ReferenceImage:
         """Return the reference image of a view."""
@@ -192,7 +190,7 @@ class Scorer:
         return metrics.Scores.of(scores, ignored)
 
     def _renderer(self, model: SplatModel | Renderable) -> Callable[[Camera], Render]:
-        render = renderer(model, self.background, mode=self.mode, threads=self.threads)
+        render = renderer(model, self.background, mode=self.mode, context=self.context)
         if self.origin is None:
             return render
         shift = np.subtract(model.origin, self.origin)
@@ -200,7 +198,11 @@ class Scorer:
 
 
 def renderer(
-    model: SplatModel | Renderable, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+    model: SplatModel | Renderable,
+    background: ArrayLike,
+    *,
+    mode: Mode = "standard",
+    context: Context = DEFAULT_CONTEXT,
 ) -> Callable[[Camera], Render]:
     """Return a function that renders a scene for a camera and reuses its memory between calls.
 
@@ -208,17 +210,17 @@ def renderer(
         model: the scene. Cameras are relative to its origin.
         background: red, green, blue of the background.
         mode: `exact`, `standard` or `fast`.
-        threads: number of threads; `None`: all.
+        context: threads.
     """
     if not isinstance(model, SplatModel):
-        return model.renderer(background, mode=mode, threads=threads)
+        return model.renderer(background, mode=mode, context=context)
     # Imported lazily: numba takes a second to import, and code that uses only the classes does not need it.
     from csplat_render.rasteriser import Rasteriser
     from csplat_render.reference_rasteriser import render_exact
 
     if mode == "exact":
         return lambda camera: render_exact(model, camera, background=background, antialiased=model.metadata.antialiased)
-    rasteriser = Rasteriser(mode, gradients=False, threads=threads)
+    rasteriser = Rasteriser(mode, gradients=False, context=context)
     return lambda camera: rasteriser.forward(
         model, camera, background=background, antialiased=model.metadata.antialiased
     )

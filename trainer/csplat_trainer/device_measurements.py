@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import Importance
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, Progress
+from csplat.types import F32
 from csplat_render.camera import Camera
 from csplat_render.pruning_error import PruningError, measure_pruning_error
 from csplat_trainer.sensitivity import measure_sensitivity
@@ -25,8 +26,7 @@ def measure_importance(
     background: F32,
     device: Device,
     *,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Importance:
     """Measure the importance of each splat.
 
@@ -35,21 +35,20 @@ def measure_importance(
         cameras: the views, at least one; relative to the scene's origin.
         background: [3].
         device: `cpu` or `cuda`.
-        threads: number of threads on the CPU; `None` for all.
-        progress: progress callback.
+        context: threads and progress.
 
     Raises:
         InputError: no view shows any splat, or the device is not usable.
     """
     if device == "cpu":
         sensitivity = measure_sensitivity(
-            model, cameras, background=background, metric=True, magnitudes=False, threads=threads, progress=progress
+            model, cameras, background=background, metric=True, magnitudes=False, context=context
         )
     else:
         rasteriser = _rasteriser(model)
         from csplat_trainer.gsplat_derivatives import estimate_sensitivity
 
-        sensitivity = estimate_sensitivity(rasteriser, model, cameras, background, progress)
+        sensitivity = estimate_sensitivity(rasteriser, model, cameras, background, progress=context.progress)
     if not sensitivity.seen.any():
         raise InputError("no view shows any splat: check that the cameras belong to the scene")
     return StoredSensitivity.of(model, sensitivity).importance()
@@ -61,12 +60,11 @@ def measure_pruning(
     background: F32,
     device: Device,
     *,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> PruningError:
     """Measure the pruning error of each splat; arguments and errors as for `measure_importance`."""
     if device == "cpu":
-        return measure_pruning_error(model, cameras, background=background, threads=threads, progress=progress)
+        return measure_pruning_error(model, cameras, background=background, context=context)
     rasteriser = _rasteriser(model)
     from csplat_trainer.gsplat_derivatives import estimate_pruning, splats_of
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Protocol
 
 import numpy as np
 from numpy.random import Generator
 
-from csplat.types import F32
+from csplat.context import DEFAULT_CONTEXT, Context
+from csplat.types import F32, null_progress
 from csplat_render.camera import Camera
 from csplat_render.conventions import UncheckedSplats
 from csplat_render.kernels import lane_range, parallel_kernel
@@ -65,19 +67,28 @@ class CpuEngine:
         parameters: initial state; changed in place by `step`.
         options: weights of the loss, antialiasing, noise.
         perceptual: an additional term of the loss.
+        context: threads.
 
     Attributes:
         parameters: the state of the optimisation.
         screen: gradients on screen since the last densification, if the strategy uses them.
     """
 
-    def __init__(self, parameters: Parameters, options: TrainOptions, perceptual: PerceptualLoss | None = None) -> None:
+    def __init__(
+        self,
+        parameters: Parameters,
+        options: TrainOptions,
+        perceptual: PerceptualLoss | None = None,
+        *,
+        context: Context = DEFAULT_CONTEXT,
+    ) -> None:
         self.parameters = parameters
         self.screen = ScreenGradients.none(len(parameters)) if options.strategy == "gradient" else None
         self._options = options
         self._perceptual = perceptual
+        self._context = replace(context, progress=null_progress)
         self._samples = options.strategy in ("mcmc", "fixed")
-        self._rasteriser = Rasteriser("standard", np.float32)
+        self._rasteriser = Rasteriser("standard", np.float32, context=self._context)
         self._losses = SizedLosses(options.loss)
         self._alphas = self._logit_gradient = np.empty(0, np.float32)
         self._normals = np.empty((0, 3), np.float32)
@@ -150,7 +161,7 @@ class CpuEngine:
     def measure_pruning(self, cameras: Sequence[Camera], background: F32) -> PruningError:
         """Measure the pruning errors of the splats in some views; arguments as for `measure_pruning_error`."""
         model = to_model(self.parameters.values, antialiased=self._options.antialiased)
-        return measure_pruning_error(model, cameras, background=background)
+        return measure_pruning_error(model, cameras, background=background, context=self._context)
 
     def _forward(self, camera: Camera, background: F32, degree: int) -> F32:
         v = self.parameters.values

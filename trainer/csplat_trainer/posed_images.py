@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.types import F32, F64, U8, Mask
 from csplat_render.camera import Camera
@@ -173,22 +174,23 @@ def image_scorer(
     background: ArrayLike,
     *,
     mode: Mode = "standard",
-    threads: int | None = None,
     origin: Sequence[float] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Scorer:
     """Return a scorer on images of a data set; each is composed on use.
 
     Args:
         images: at least one.
         background: background colour of renders, and of images with an alpha channel.
-        mode, threads, origin: as in `Scorer`.
+        mode, origin: as in `Scorer`.
+        context: threads.
     """
     colour = np.asarray(background, np.float32)
     cameras = [image.camera for image in images]
     references = [partial(_reference_image, image, colour) for image in images]
     masked = any(image.masked is not None for image in images)
     pixel_counts = [_pixel_count(image) for image in images] if masked else None
-    return Scorer(cameras, references, colour, mode, threads, origin, pixel_counts)
+    return Scorer(cameras, references, colour, mode, context, origin, pixel_counts)
 
 
 def evaluate(

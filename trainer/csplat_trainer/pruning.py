@@ -15,8 +15,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.model import SplatModel
-from csplat.types import F32, F64, I64, Mask, Progress
+from csplat.types import F32, F64, I64, Mask
 from csplat_render import Camera
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.pruning_error import PruningError, measure_pruning_error
@@ -47,13 +48,12 @@ class MeasuredViews:
         background: ArrayLike,
         *,
         keep_renders: bool = False,
-        threads: int | None = None,
-        progress: Progress | None = None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> MeasuredViews:
         """Measure the pruning errors of a scene; other arguments as for `measure_pruning_error`."""
         renders = list[F32]()
         pruning_error = measure_pruning_error(
-            model, cameras, background=background, threads=threads, progress=progress,
+            model, cameras, background=background, context=context,
             on_render=renders.append if keep_renders else None,
         )  # fmt: skip
         return cls(cameras, pruning_error, renders)
@@ -73,8 +73,7 @@ class PruningOrder:
         groups: views with the pruning errors of the scene. Each round measures the next group, and adds the last
             measurements of the others: two groups give twice the views at the cost of a single group.
         background: background colour of the views.
-        threads: number of threads; `None` for all. The order does not depend on it.
-        progress: progress callback.
+        context: threads and progress.
         rows: [G] int64, indices of splats in the order of pruning.
         errors: [G], error of removing each, measured in its round: summed over pixels, channels and views.
         rounds: number of pruned splats by round.
@@ -84,8 +83,7 @@ class PruningOrder:
     model: SplatModel
     groups: list[MeasuredViews]
     background: ArrayLike = (0.0, 0.0, 0.0)
-    threads: int | None = None
-    progress: Progress | None = None
+    context: Context = DEFAULT_CONTEXT
     rows: I64 = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
     errors: F64 = field(default_factory=lambda: np.zeros(0), init=False)
     rounds: list[int] = field(default_factory=list, init=False)
@@ -125,9 +123,7 @@ class PruningOrder:
         if self.rounds:
             turn = (len(self.rounds) - 1) % len(self.groups)
             left, cameras = self.model.select(self._left), self.groups[turn].cameras
-            self.groups[turn] = MeasuredViews.of(
-                left, cameras, self.background, threads=self.threads, progress=self.progress
-            )
+            self.groups[turn] = MeasuredViews.of(left, cameras, self.background, context=self.context)
         keys = pruning_keys(self.model.opacities[self._left], total_error(self.groups))
         order = np.argsort(keys, kind="stable")[: len(self._left) - count]
         order = order[np.isfinite(keys[order])]

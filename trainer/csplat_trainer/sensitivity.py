@@ -35,10 +35,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.spherical_harmonics import BASIS_SIZE
-from csplat.types import F32, F64, Progress
+from csplat.types import F32, F64
 from csplat_render.binning import TILE
 from csplat_render.blending import (
     BATCH,
@@ -136,8 +137,7 @@ def measure_sensitivity(
     metric: bool = False,
     magnitudes: bool = True,
     dtype: Any = np.float32,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Sensitivity:
     """Measure how much renders depend on each splat.
 
@@ -148,8 +148,7 @@ def measure_sensitivity(
         metric: compute the matrices of SH coefficients, too, which take 2 B (B + 1) bytes per splat.
         magnitudes: compute the sensitivities themselves, which take 112 + 12 B bytes per splat.
         dtype: dtype of pixels, float32 or, for tests, float64.
-        threads: number of threads; `None` for all. The result does not depend on it.
-        progress: progress callback.
+        context: threads and progress.
 
     Raises:
         InputError: there are no cameras.
@@ -157,19 +156,18 @@ def measure_sensitivity(
     """
     if not cameras:
         raise InputError("measuring sensitivity requires at least one camera")
-    drawing = _Derivatives(model, metric=metric, magnitudes=magnitudes, dtype=dtype, threads=threads)
+    drawing = _Derivatives(model, metric=metric, magnitudes=magnitudes, dtype=dtype, context=context)
     for number, camera in enumerate(cameras):
         drawing.add(camera, background)
-        if progress is not None:
-            progress("measuring sensitivity", (number + 1) / len(cameras))
+        context.progress("measuring sensitivity", (number + 1) / len(cameras))
     return drawing.result()
 
 
 class _Derivatives(Rasteriser):
     """A rasteriser that sums the derivatives of views. Owns the sums."""
 
-    def __init__(self, model: SplatModel, *, metric: bool, magnitudes: bool, dtype: Any, threads: int | None) -> None:
-        super().__init__("standard", dtype, gradients=True, threads=threads)
+    def __init__(self, model: SplatModel, *, metric: bool, magnitudes: bool, dtype: Any, context: Context) -> None:
+        super().__init__("standard", dtype, gradients=True, context=context)
         n, count = len(model), 1 + model.shN.shape[1]
         self._model = model
         rows = n if magnitudes else 0
@@ -192,7 +190,7 @@ class _Derivatives(Rasteriser):
         forms = self._buffer("forms", (n, FORM_SIZE), np.float64)
         records = self._buffer("derivatives", (last.intersections, DERIVATIVE_SUMS), self.dtype)
         view = view_vector(camera)
-        with thread_count(self.threads):
+        with thread_count(self.context.threads):
             covariance_forms(a.means, a.quats, a.scales, view, last.antialiased, shape, near, forms)
             sum_derivatives(
                 self._buffer("starts", (last.tile_count + 1,), np.int64),

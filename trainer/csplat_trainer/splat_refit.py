@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.model import SplatModel
-from csplat.types import F32, Progress
+from csplat.types import F32
 from csplat_render import Camera
 from csplat_render.conventions import Gradients, HasSplats, UncheckedSplats
 from csplat_render.rasteriser import Rasteriser
@@ -49,9 +50,7 @@ def refit_splats(
     steps: int,
     background: ArrayLike = (0.0, 0.0, 0.0),
     moves: bool = False,
-    seed: int = 0,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> SplatModel:
     """Move colours, opacities, scales and rotations along the gradient of the squared error, view by view.
 
@@ -62,15 +61,13 @@ def refit_splats(
         steps: number of steps, one view each.
         background: red, green, blue behind the splats.
         moves: fit the centres instead of `shN`, whose values codebooks then still have; `means_double` is dropped.
-        seed: seed of the order of the views.
-        threads: number of threads; `None` for all. The result does not depend on it.
-        progress: progress callback.
+        context: threads, progress, and the seed of the order of the views.
 
     Returns:
         The scene; splats that no view shows are unchanged.
     """
-    views = _TrainingViews(cameras, references, background, model.metadata.antialiased, threads)
-    refit = _FloatRefit(views, steps, seed, progress, model, moves=moves)
+    views = _TrainingViews(cameras, references, background, model.metadata.antialiased, context)
+    refit = _FloatRefit(views, steps, context, model, moves=moves)
     factor = 1.0 if model.sh_degree else _SH_FACTOR
     refit.run(factor * _step_length(views.rms(refit.splats())))
     return refit.applied_to(model)
@@ -84,23 +81,21 @@ def quantisation_aware_refit(
     steps: int,
     before: SplatModel,
     background: ArrayLike = (0.0, 0.0, 0.0),
-    seed: int = 0,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> FreeValues:
     """Refit splats through the quantisers of a file, as the decoded file would render them; weigh its bytes.
 
     Args:
         fixed: the encoder's quantisation.
-        cameras, references, steps, background, seed, threads, progress: as for `refit_splats`.
+        cameras, references, steps, background, context: as for `refit_splats`.
         before: the same splats before any refit through quantisers; their error is not due to quantisation.
 
     Returns:
         Values for `FixedQuantisation.encode`.
     """
     model = fixed.encode_plan.model
-    views = _TrainingViews(cameras, references, background, model.metadata.antialiased, threads)
-    refit = _QuantisedRefit(views, steps, seed, progress, fixed)
+    views = _TrainingViews(cameras, references, background, model.metadata.antialiased, context)
+    refit = _QuantisedRefit(views, steps, context, fixed)
     rms, pruning_rms = views.rms(refit.scene.dequantise()[0]), views.rms(before)
     quantised = max(rms**2 - pruning_rms**2, _LEAST_QUANTISED * rms**2)
     if math.isfinite(quantised):
@@ -120,11 +115,11 @@ class _TrainingViews:
         references: Sequence[F32],
         background: ArrayLike,
         antialiased: bool,
-        threads: int | None,
+        context: Context,
     ) -> None:
         self._cameras, self._references = cameras, references
         self._background, self._antialiased = background, antialiased
-        self._rasteriser = Rasteriser(threads=threads)
+        self._rasteriser = Rasteriser(context=context)
 
     def __len__(self) -> int:
         return len(self._cameras)
@@ -157,9 +152,9 @@ def _step_length(rms: float) -> float:
 class _Refit:
     """A refit to training views by a `Fitter`, with steps that become shorter along half a cosine."""
 
-    def __init__(self, views: _TrainingViews, steps: int, seed: int, progress: Progress | None) -> None:
-        self._views, self._progress, self._length = views, progress, 0.0
-        self._fitter = Fitter(len(views), steps, seed)
+    def __init__(self, views: _TrainingViews, steps: int, context: Context) -> None:
+        self._views, self._context, self._length = views, context, 0.0
+        self._fitter = Fitter(len(views), steps, context.seed)
         passes = [self._fitter.rng.permutation(len(views)) for _ in range(-(-steps // len(views)))]
         self._fitter.queue = np.concatenate(passes)[:steps][::-1].tolist()  # the last is the next
 
@@ -175,8 +170,7 @@ class _Refit:
         return LossValue(error, math.nan, math.nan, error)
 
     def after_step(self) -> None:
-        if self._progress is not None:
-            self._progress("adjusting splats", self._fitter.iteration / self._fitter.iterations)
+        self._context.progress("adjusting splats", self._fitter.iteration / self._fitter.iterations)
 
     def _move(self, view: int, rates: dict[str, float]) -> float:
         """Make a step on a view, and return its mean squared error before."""
@@ -190,13 +184,12 @@ class _FloatRefit(_Refit):
         self,
         views: _TrainingViews,
         steps: int,
-        seed: int,
-        progress: Progress | None,
+        context: Context,
         model: SplatModel,
         *,
         moves: bool,
     ) -> None:
-        super().__init__(views, steps, seed, progress)
+        super().__init__(views, steps, context)
         self._start, self._moves = model, moves
         values = _values_to_fit(model)
         if moves:
@@ -260,10 +253,8 @@ def _values_to_fit(model: SplatModel) -> dict[str, F32]:
 class _QuantisedRefit(_Refit):
     """A refit through quantisers; `lambda_` is the squared error of a render that all bits are worth."""
 
-    def __init__(
-        self, views: _TrainingViews, steps: int, seed: int, progress: Progress | None, fixed: FixedQuantisation
-    ) -> None:
-        super().__init__(views, steps, seed, progress)
+    def __init__(self, views: _TrainingViews, steps: int, context: Context, fixed: FixedQuantisation) -> None:
+        super().__init__(views, steps, context)
         self.lambda_ = 0.0
         self.scene = TunedScene(fixed)
         self.scene.parameters.beta2 = _BETA2

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.random import Generator
 
 import csplat
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene_metadata import TRAINING, VIEW
@@ -47,8 +48,8 @@ def train(
     options: TrainOptions | None = None,
     *,
     outputs: Outputs | None = None,
-    progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[FitStep], None] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> TrainResult:
     """Train splats on images, as `csplat train` does; requires the packages of the render extra.
 
@@ -58,8 +59,8 @@ def train(
         data: a data set, or its path for `load`: a folder, or a `transforms.json`.
         options: options of the training.
         outputs: checkpoints and previews.
-        progress: progress callback, called every `log_every` steps.
-        on_step: called at the same time with the progress of the run.
+        on_step: called with the progress of the run, every `log_every` steps.
+        context: threads and progress.
 
     Returns:
         The scene, the log, and scores on the test images.
@@ -74,19 +75,25 @@ def train(
     """
 
     def show(now: FitStep) -> None:
-        if progress is not None:
-            progress("training", now.iteration / now.iterations)
+        context.progress("training", now.iteration / now.iterations)
         if on_step is not None:
             on_step(now)
 
     images = data if isinstance(data, DataSet) else load(data)
-    return _Training(images, options or TrainOptions(), outputs or Outputs(), show).run()
+    return _Training(images, options or TrainOptions(), outputs or Outputs(), show, context).run()
 
 
 class _Training:
     """A training by a `Fitter`: its images, engine and strategy."""
 
-    def __init__(self, data: DataSet, options: TrainOptions, outputs: Outputs, show: Callable[[FitStep], None]) -> None:
+    def __init__(
+        self,
+        data: DataSet,
+        options: TrainOptions,
+        outputs: Outputs,
+        show: Callable[[FitStep], None],
+        context: Context,
+    ) -> None:
         if not data.train:
             raise InputError("there are no images to train on")
         data.read()
@@ -104,7 +111,7 @@ class _Training:
         self._lpips = _lpips(options, outputs)
         extent_factor = min(1.0, _LARGE_EXTENT / self._scene.extent)
         self._engine = _engine(
-            parameters, replace(options, scale_weight=extent_factor * options.scale_weight), self._lpips
+            parameters, replace(options, scale_weight=extent_factor * options.scale_weight), self._lpips, context
         )
         self._colour = _COLOURS.get(options.background, data.background)
         self._background = np.array(self._colour, np.float32)
@@ -369,10 +376,10 @@ def _lpips(options: TrainOptions, outputs: Outputs) -> Lpips | None:
         return None
 
 
-def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None) -> Engine:
+def _engine(parameters: Parameters, options: TrainOptions, lpips: Lpips | None, context: Context) -> Engine:
     if options.device == "cpu":
         perceptual = PerceptualLoss(lpips) if options.lpips_weight > 0.0 and lpips is not None else None
-        return CpuEngine(parameters, options, perceptual)
+        return CpuEngine(parameters, options, perceptual, context=context)
     if options.lpips_weight > 0.0:
         raise InputError("the perceptual loss requires --device cpu: omit --lpips-weight on other devices")
     try:

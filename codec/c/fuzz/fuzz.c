@@ -319,12 +319,12 @@ static int read_otherwise(csplat *file)
 {
     const csplat_info *info = csplat_get_info(file);
     int accepted = csplat_check(file) == CSPLAT_OK, found;
-    csplat_stated_errors errors;
+    csplat_declared_errors errors;
     const char *text;
     size_t length;
     for (int which = 0; which < 3; which++)
         accepted &= csplat_read_text(file, (csplat_text)which, &text, &length) == CSPLAT_OK;
-    accepted &= csplat_read_stated_errors(file, &errors, &found) == CSPLAT_OK;
+    accepted &= csplat_read_declared_errors(file, &errors, &found) == CSPLAT_OK;
     accepted &= read_cuts(file);
     for (uint32_t i = 0; i < info->tile_count; i++)
         accepted &= read_tile_otherwise(file, i);

@@ -80,7 +80,7 @@ static csplat_code read_all(caller *c, size_t size, const csplat_options *option
     csplat_packed packed;
     csplat_packed_geometry geometry;
     csplat_columns columns;
-    csplat_stated_errors errors;
+    csplat_declared_errors errors;
     const csplat_node *nodes;
     csplat *d;
     const char *text;
@@ -96,7 +96,7 @@ static csplat_code read_all(caller *c, size_t size, const csplat_options *option
     for (int which = 0; which < 3 && !code; which++)
         code = csplat_read_text(d, (csplat_text)which, &text, &length);
     if (!code)
-        code = csplat_read_stated_errors(d, &errors, &found);
+        code = csplat_read_declared_errors(d, &errors, &found);
     if (!code)
         code = csplat_read_nodes(d, &nodes, &count);
     if (!code)
@@ -148,7 +148,7 @@ static void budgets_hold(const unsigned char *data, size_t size)
 {
     csplat_options options = {0};
     csplat_scene *scene;
-    csplat_stated_errors errors;
+    csplat_declared_errors errors;
     const char *text;
     size_t length;
     csplat *d;
@@ -157,7 +157,7 @@ static void budgets_hold(const unsigned char *data, size_t size)
     options.splats_max = scene->splat_count - 1;
     csplat_free_scene(d, scene);
     HOLDS(!csplat_check(d) && !csplat_read_text(d, CSPLAT_METADATA, &text, &length) && text && text[length] == '\0');
-    HOLDS(!csplat_read_stated_errors(d, &errors, &found));
+    HOLDS(!csplat_read_declared_errors(d, &errors, &found));
     csplat_close(d);
     HOLDS(!csplat_open_memory(&d, data, size, &options, NULL) && csplat_decode(d, CSPLAT_SH_DEGREE_MAX, &scene) == CSPLAT_E_LIMIT && !scene);
     csplat_close(d);

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder.codebooks import check_unnamed_codebooks, read_codebooks
 from csplat.decoder.container import TILE_FLAGS, SceneHeader, Tile, open_chunk, view_of
 from csplat.decoder.index import parse_header
@@ -41,6 +41,9 @@ if TYPE_CHECKING:
     from csplat.file_source import File
 
 _THREADS_MAX = 8  # maximum by default; more threads are limited by memory bandwidth
+
+#: The default of functions that decode tile by tile.
+ONE_THREAD = Context(threads=1)
 
 _T = TypeVar("_T")
 
@@ -121,7 +124,7 @@ def decode(
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
     sh_degree: int | None = None,
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> SplatModel:
     """Decode a file, or some tiles and SH bands of it.
 
@@ -131,7 +134,7 @@ def decode(
         tiles: indices of the tiles to decode, in the order requested, of any level; default: all of level 0.
             `csplat.open(data).cut(...)` selects the tiles of a coarser version of the scene.
         sh_degree: highest SH band to decode; default: all.
-        threads: number of threads; default: one per processor, up to 8.
+        context: threads; default: one per core, up to 8.
 
     Returns:
         The splats. A part is bit for bit the same part of a whole decode. Coarser levels have no extra columns.
@@ -152,7 +155,7 @@ def decode(
         InputError: an argument is invalid.
         OSError: the file cannot be read.
     """
-    return decode_scene(data, limits=limits, tiles=tiles, sh_degree=sh_degree, threads=threads).model
+    return decode_scene(data, limits=limits, tiles=tiles, sh_degree=sh_degree, context=context).model
 
 
 def decode_scene(
@@ -161,13 +164,13 @@ def decode_scene(
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
     sh_degree: int | None = None,
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> DecodedScene:
     """Decode a file, and return its other content and the checks made as well; arguments and errors as in `decode`."""
-    return decode_request(_request_of(data, limits, tiles, sh_degree), threads)
+    return decode_request(_request_of(data, limits, tiles, sh_degree), context)
 
 
-def decode_request(request: DecodeRequest, threads: int | None = None) -> DecodedScene:
+def decode_request(request: DecodeRequest, context: Context = DEFAULT_CONTEXT) -> DecodedScene:
     """Decode what was requested, as `decode_scene` does."""
     header, degree = request.output_header, request.degree
     check_budget(header, request.tiles, degree, float_bytes(header, degree), request.limits, whole=request.whole)
@@ -181,7 +184,7 @@ def decode_request(request: DecodeRequest, threads: int | None = None) -> Decode
 
     options, bounds = read_side_chunks(request)
     metadata = scene_metadata(request.view, request.header, request.limits)
-    _write_all(request, write, threads)
+    _write_all(request, write, context)
     model = _model_of(header, arrays, metadata)
     checks = ("header_crc", "index_crc", "chunk_crc")
     return DecodedScene(
@@ -195,7 +198,7 @@ def decode_integers(
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
     sh_degree: int | None = None,
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> dict[str, NDArray[Any]]:
     """Decode the integer arrays of spec 9.2, by default of all levels; arguments and errors as in `decode`."""
     request = _request_of(data, limits, tiles, sh_degree, every_level=True)
@@ -211,7 +214,7 @@ def decode_integers(
 
     read_side_chunks(request)
     scene_metadata(request.view, request.header, request.limits)
-    _write_all(request, write, threads)
+    _write_all(request, write, context)
     return out
 
 
@@ -221,7 +224,7 @@ def iter_tiles(
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
     sh_degree: int | None = None,
-    threads: int | None = 1,
+    context: Context = ONE_THREAD,
 ) -> Iterator[DecodedTile]:
     """Decode tile by tile; memory holds the codebooks and one tile per thread.
 
@@ -232,12 +235,12 @@ def iter_tiles(
         limits: as in `decode`; `limits.bytes` applies to each tile.
         tiles: as in `decode`.
         sh_degree: as in `decode`.
-        threads: number of tiles decoded at the same time; `None`: as in `decode`.
+        context: threads, each for a tile.
     """
-    return request_tiles(_request_of(data, limits, tiles, sh_degree), threads)
+    return request_tiles(_request_of(data, limits, tiles, sh_degree), context)
 
 
-def request_tiles(request: DecodeRequest, threads: int | None = 1) -> Iterator[DecodedTile]:
+def request_tiles(request: DecodeRequest, context: Context = ONE_THREAD) -> Iterator[DecodedTile]:
     """Decode what was requested tile by tile, as `iter_tiles` does."""
     _check_tile_budget(request)
 
@@ -245,7 +248,7 @@ def request_tiles(request: DecodeRequest, threads: int | None = 1) -> Iterator[D
         read_side_chunks(request)
         if request.whole:
             scene_metadata(request.view, request.header, request.limits)
-        for tile, arrays in _iterate(request, threads):
+        for tile, arrays in _iterate(request, context):
             yield DecodedTile(tile, **vars(arrays))
 
     return iterate()
@@ -257,16 +260,16 @@ def iter_packed(
     limits: Limits | None = None,
     tiles: Sequence[int] | None = None,
     sh_degree: int | None = None,
-    threads: int | None = 1,
+    context: Context = ONE_THREAD,
 ) -> Iterator[PackedTile]:
     """Decode to integers and tables tile by tile, see `csplat.packed`; extra columns are left out.
 
     Arguments and errors as in `iter_tiles`.
     """
-    return request_packed(_request_of(data, limits, tiles, sh_degree), threads)
+    return request_packed(_request_of(data, limits, tiles, sh_degree), context)
 
 
-def request_packed(request: DecodeRequest, threads: int | None = 1) -> Iterator[PackedTile]:
+def request_packed(request: DecodeRequest, context: Context = ONE_THREAD) -> Iterator[PackedTile]:
     """Decode what was requested to integers and tables, as `iter_packed` does."""
     _check_tile_budget(request)
     header = request.header
@@ -279,7 +282,7 @@ def request_packed(request: DecodeRequest, threads: int | None = 1) -> Iterator[
             books = read_codebooks(request.view, header, request.tiles, request.degree)
         tables = pack_tables(books, header)
         yield from _each_tile(
-            request, lambda _index, source: pack_tile(source, header, tables), threads, ahead=1, books=books
+            request, lambda _index, source: pack_tile(source, header, tables), context, ahead=1, books=books
         )
 
     return iterate()
@@ -380,7 +383,7 @@ def read_side_chunks(request: DecodeRequest) -> tuple[dict[str, Any] | None, Dec
     return options, bounds_chunk(view, header)
 
 
-def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], None], threads: int | None) -> None:
+def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], None], context: Context) -> None:
     """Decode all tiles by calling `write` with each tile's position in `request.tiles`, first splat and blocks."""
     starts = [0]
     for tile in request.tiles:
@@ -389,11 +392,11 @@ def _write_all(request: DecodeRequest, write: Callable[[int, int, TileBlocks], N
     def convert(index: int, source: TileBlocks) -> None:
         write(index, starts[index], source)
 
-    for _ in _each_tile(request, convert, threads, ahead=len(request.tiles)):
+    for _ in _each_tile(request, convert, context, ahead=len(request.tiles)):
         pass
 
 
-def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile, SplatArrays]]:
+def _iterate(request: DecodeRequest, context: Context) -> Iterator[tuple[Tile, SplatArrays]]:
     """Decode tiles in order, each to arrays of its own."""
     header = request.output_header
     table = opacity_table(header.attribute(_spec.ATTRIBUTE_OPACITIES))
@@ -405,7 +408,7 @@ def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile
         return source.tile, arrays
 
     # With one tile more than threads, no thread waits for the caller.
-    for done in _each_tile(request, convert, threads, ahead=1):
+    for done in _each_tile(request, convert, context, ahead=1):
         pages.after(sum(layer.size for layer in done[0].layers.values()))
         yield done
 
@@ -413,7 +416,7 @@ def _iterate(request: DecodeRequest, threads: int | None) -> Iterator[tuple[Tile
 def _each_tile(
     request: DecodeRequest,
     convert: Callable[[int, TileBlocks], _T],
-    threads: int | None,
+    context: Context,
     *,
     ahead: int,
     books: Mapping[int, Codebook] | None = None,
@@ -425,7 +428,7 @@ def _each_tile(
     Args:
         request: the tiles.
         convert: returns the result for a tile's position in `request.tiles` and its blocks.
-        threads: as in `decode`.
+        context: as in `decode`.
         ahead: number of tiles, finished or waiting, in addition to the tiles being decoded.
         books: the codebooks of these tiles; `None`: they are read here.
     """
@@ -440,7 +443,8 @@ def _each_tile(
             return convert(index, read_tile(view, header, tiles[index], degree, books))
 
     indices = range(len(tiles))
-    count = _thread_count(threads, len(tiles))
+    threads = min(context.thread_count, _THREADS_MAX) if context.threads is None else context.threads
+    count = max(1, min(threads, len(tiles)))
     if count == 1:
         yield from map(decode_tile, indices)
         return
@@ -455,14 +459,6 @@ def _each_tile(
                 yield waiting.popleft().result()
         finally:
             pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _thread_count(threads: int | None, task_count: int) -> int:
-    if threads is None:
-        threads = min(os.cpu_count() or 1, _THREADS_MAX)
-    if threads < 1:
-        raise InputError(f"threads is {threads}, expected 1 or more")
-    return max(1, min(threads, task_count))
 
 
 def _model_of(header: SceneHeader, arrays: SplatArrays, metadata: SceneMetadata) -> SplatModel:

@@ -45,7 +45,7 @@ _RECORD_SIZES: Final = {
     "layer_size": _spec.LAYER_RECORD_SIZE,
 }
 _SINGLE_CHUNKS = (
-    _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS, _spec.CHUNK_TREE,
+    _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS, _spec.CHUNK_TREE,
 )  # fmt: skip
 
 

@@ -156,14 +156,14 @@ def parse_json(text: bytes, kind: type[dict[str, Any] | list[Any]], at: int) -> 
 
 def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None:
     """Return the content of the SERR chunk, `None` if the file has none."""
-    record = header.chunk(_spec.CHUNK_STATED_ERRORS)
+    record = header.chunk(_spec.CHUNK_DECLARED_ERRORS)
     if record is None:
         return None
     cursor = open_chunk(view, record, record.type, record.flags, "SER-3")
-    at = cursor.take(_spec.STATED_ERRORS_HEAD_SIZE)
-    head = _spec.unpack_stated_errors_head(view, at)
+    at = cursor.take(_spec.DECLARED_ERRORS_HEAD_SIZE)
+    head = _spec.unpack_declared_errors_head(view, at)
     if head.error_flags & ~sum(_spec.ERROR_FLAG_NAMES):
-        refuse_field(_spec.ERROR_RESERVED, "RES-1", head, at, _spec.STATED_ERRORS_HEAD_OFFSETS, "error_flags")
+        refuse_field(_spec.ERROR_RESERVED, "RES-1", head, at, _spec.DECLARED_ERRORS_HEAD_OFFSETS, "error_flags")
     if head.source_count - head.pruned_count != header.splat_count:
         kept_count, wanted = head.source_count - head.pruned_count, header.splat_count
         raise FormatError(
@@ -172,8 +172,8 @@ def bounds_chunk(view: memoryview, header: SceneHeader) -> DeclaredBounds | None
     records: list[DeclaredBound] = []
     last = 0
     for _ in range(head.record_count):
-        at = cursor.take(_spec.STATED_ERROR_RECORD_SIZE)
-        item = _spec.unpack_stated_error_record(view, at)
+        at = cursor.take(_spec.DECLARED_ERROR_RECORD_SIZE)
+        item = _spec.unpack_declared_error_record(view, at)
         last = _check_bound_record(item, at, last)
         records.append(DeclaredBound(_spec.MEASURE_NAMES[item.measure], item.max, item.rms))
     cursor.finish()
@@ -237,9 +237,9 @@ def _check_tree(value: Any) -> None:
         level = nested
 
 
-def _check_bound_record(record: _spec.StatedErrorRecord, at: int, last: int) -> int:
+def _check_bound_record(record: _spec.DeclaredErrorRecord, at: int, last: int) -> int:
     """Check SER-1 and SER-2; return the measure."""
-    offsets = _spec.STATED_ERROR_RECORD_OFFSETS
+    offsets = _spec.DECLARED_ERROR_RECORD_OFFSETS
     check_reserved(record, at, offsets)
     if record.measure not in _spec.MEASURE_NAMES or record.measure <= last:
         refuse_field(_spec.ERROR_VALUE, "SER-1", record, at, offsets, "measure", "registered ids, ascending")

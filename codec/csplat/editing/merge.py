@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 
 from csplat import _spec
 from csplat.byte_store import FileWindow
+from csplat.context import Context
 from csplat.decoder import read_header
 from csplat.decoder.container import SceneHeader, Tile
 from csplat.decoder.tiles import codebook_references
 from csplat.disk_files import BinaryWriter, open_writer, temporary_file, temporary_folder
 from csplat.editing.extract import ChunkPrefetcher, TileCopier, chunk_payload, copy_nodes, scene_fields
 from csplat.editing.transform import DEFAULT_AXES
+from csplat.encode_api import encode
 from csplat.encoder import EncodeOptions
 from csplat.encoder.container import (
     FileChunk,
@@ -43,7 +45,6 @@ from csplat.encoder.entropy import DeflateSettings
 from csplat.errors import InputError
 from csplat.file_source import File, open_binary
 from csplat.model import SplatModel
-from csplat.out_of_core import OutOfCoreOptions, encode_scene
 from csplat.scene import Scene
 from csplat.scene_metadata import CONTRADICTS, UNSPECIFIED, SceneMetadata
 from csplat.splat_file import SplatFile
@@ -86,7 +87,7 @@ def merge(
     Tiles are copied bit for bit, without decoding, if the files agree on steps and levels of all attributes, SH degree,
     origin and extra columns. That is true for parts of the same file (`extract`) and files encoded with the same steps.
     Codebooks get new ids. Copying takes memory for the codebooks of one file and a few megabytes. Other files are
-    decoded and encoded together by `csplat.out_of_core.encode_scene`, which loses quality once more, and levels of
+    decoded and encoded together by `csplat.encode`, which loses quality once more, and levels of
     detail; `MergeResult.why` gives the reason. Pending data is kept in temporary files.
 
     Metadata and cameras are kept if they are the same in all files. A file without axes is assumed to have x right, y
@@ -280,7 +281,7 @@ def _encode_again(
     dropped = {column.name for scene in scenes for column in scene.header.extras} - whole.extra.keys()
     with temporary_folder() as folder:
         path = folder / "merged.csplat"
-        encode_scene(whole, path, options, OutOfCoreOptions(folder=folder / "work"))
+        encode(whole, options, out=path, context=Context(folder=folder / "work"))
         with open_binary(path) as coded, open_writer(output) as stream:
             shutil.copyfileobj(coded, stream)
         return MergeResult(whole.count, len(read_header(path).tiles), path.stat().st_size, why, tuple(sorted(dropped)))

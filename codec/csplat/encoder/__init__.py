@@ -1,7 +1,7 @@
 """Encode scenes to `.csplat` files.
 
-`encode` and `encode_with_report` encode in one call, with the given options or to a `Target`. `EncodePlan` and
-`encode_tiles` encode in steps, for callers that refit colours to the quantised geometry; `fix_quantisation` is for
+`csplat.encode` encodes in one call, with the given options or to a `Target`. `EncodePlan` and `encode_tiles` encode in
+steps, for callers that refit colours to the quantised geometry; `fix_quantisation` is for
 callers that tune all values. `encode_levels` adds levels of detail.
 """
 
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from csplat.encoder.buckets import bucket_rows
 from csplat.encoder.container import FileNode
-from csplat.encoder.encode_api import encode, encode_with_report
 from csplat.encoder.encode_options import (
     BUCKET_SPLATS,
     PRESETS,
@@ -31,7 +30,7 @@ from csplat.encoder.quantisation_classes import max_class_count
 from csplat.encoder.sh_codebook import FileCodebooks
 from csplat.encoder.shape_codebook import mean_axes
 from csplat.encoder.splat_importance import GaussNewtonBlocks, Importance, apply_weight_floor
-from csplat.encoder.target import SearchReport, Target
+from csplat.encoder.target import SearchReport, Target, Views
 
 __all__ = [
     "BUCKET_SPLATS",
@@ -56,15 +55,14 @@ __all__ = [
     "SearchReport",
     "ShCoding",
     "Target",
+    "Views",
     "apply_weight_floor",
     "bucket_rows",
     "canonicalise_shape",
     "cluster",
     "covariance_entries",
-    "encode",
     "encode_levels",
     "encode_tiles",
-    "encode_with_report",
     "fix_quantisation",
     "max_class_count",
     "mean_axes",

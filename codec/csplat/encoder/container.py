@@ -16,7 +16,7 @@ from csplat.encoder.entropy import DeflateSettings, unsigned_stream
 from csplat.errors import InputError
 
 #: Chunks that no renderer needs, which are last in a file with levels of detail.
-_LAST = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+_LAST = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS)
 
 
 @dataclass(frozen=True)

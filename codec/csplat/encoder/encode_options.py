@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, fields
 from numbers import Integral, Real
 from typing import Any, Literal, get_args
@@ -62,8 +61,6 @@ class EncodeOptions:
         deflate_level: level of DEFLATE, 1 to 12 for libdeflate, 1 to 9 for zlib.
         deflate: "auto", "libdeflate" or "zlib".
         keep_extra: write the model's extra columns.
-        seed: seed of k-means.
-        threads: number of threads; `None`: all cores. Has no effect on the bytes.
 
     Examples:
         >>> import csplat
@@ -102,8 +99,6 @@ class EncodeOptions:
     deflate_level: int | None = None
     deflate: Deflate = "auto"
     keep_extra: bool = False
-    seed: int = 0
-    threads: int | None = None
 
     def __post_init__(self) -> None:
         for name, words in _WORDS.items():
@@ -119,21 +114,16 @@ class EncodeOptions:
                 raise InputError(f"{name} is {value!r}, expected {what}{low:g} to {high:g}")
             object.__setattr__(self, name, number)  # json cannot write NumPy's numbers
 
-    @property
-    def thread_count(self) -> int:
-        """`threads`, or the number of cores."""
-        return self.threads or os.cpu_count() or 1
-
     def kept_degree(self, source_degree: int) -> int:
         """Return the SH degree of the file of a scene."""
         return source_degree if self.sh_degree is None else min(self.sh_degree, source_degree)
 
     def chosen(self) -> dict[str, Any]:
-        """Return the options that the caller set, except `threads`, which has no effect on the bytes."""
+        """Return the options that the caller set."""
         return {
             field.name: getattr(self, field.name)
             for field in fields(self)
-            if field.name != "threads" and (field.name == "preset" or getattr(self, field.name) != field.default)
+            if field.name == "preset" or getattr(self, field.name) != field.default
         }
 
 
@@ -196,10 +186,8 @@ _RANGES: dict[str, tuple[type[int | float], float, float]] = {
     "tile_splats": (int, 1, _spec.TILE_SPLATS_MAX),
     "bucket_splats": (int, 100, math.inf),
     "deflate_level": (int, 1, 12),
-    "seed": (int, 0, math.inf),
-    "threads": (int, 1, math.inf),
 }
-_NEVER_NONE = ("tile_splats", "bucket_splats", "seed")
+_NEVER_NONE = ("tile_splats", "bucket_splats")
 
 
 def _number(value: Any, kind: type[int | float]) -> int | float | None:

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder.buckets import BucketStore, MemoryBuckets, bucket_rows, sample_rows
 from csplat.encoder.coding_parameters import CodingParameters, choose_parameters
 from csplat.encoder.encode_options import EncodeOptions
@@ -46,7 +47,7 @@ from csplat.encoder.splat_importance import (
 from csplat.encoder.tiling import TileSplats, cut_scene, dequantise_means, dequantise_opacities
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
-from csplat.types import F32, I64, Progress, null_progress
+from csplat.types import F32, I64
 
 _EXTRA_COLUMNS_MAX = 255  # TLE-2: block_count is a byte
 
@@ -85,6 +86,7 @@ class EncodePlan:
         sample: plan of the sample on which choices are made, for a scene of several buckets without importance.
         buckets: `BucketStore.rows` of such a scene.
         is_sample: the model is such a sample.
+        context: threads, seed and progress of all steps; progress is called from any thread.
     """
 
     model: SplatModel
@@ -99,6 +101,7 @@ class EncodePlan:
     sample: EncodePlan | None = None
     buckets: Sequence[NDArray[np.intp]] = ()
     is_sample: bool = False
+    context: Context = DEFAULT_CONTEXT
 
     @classmethod
     def of(
@@ -110,7 +113,7 @@ class EncodePlan:
         origin: Origin | None = None,
         allow_classes: bool = True,
         contrast: float | None = None,
-        progress: Progress | None = None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> EncodePlan:
         """Plan the encoding of a scene.
 
@@ -121,7 +124,7 @@ class EncodePlan:
             origin: the source of the scene; `None`: the scene itself.
             allow_classes: allow several quantisation classes, if the importance has Gauss-Newton blocks.
             contrast: contrast of the scene that the model is a sample of; see `measure_contrast`.
-            progress: called with the stage and the fraction done, 0 to 1, from any thread.
+            context: see `EncodePlan`.
 
         Raises:
             InputError: a value fits no lattice, an option is not allowed for the model, or importance or origin have
@@ -136,7 +139,7 @@ class EncodePlan:
             raise InputError(f"origin has {len(origin.source_index)} splats, expected {len(model)}")
         model = clip_scales(model)
         if len(model) > options.bucket_splats and importance is None and not options.shape_codebook_size:
-            return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats), options, origin, progress)
+            return cls.of_buckets(MemoryBuckets.of(model, options.bucket_splats), options, origin, context)
         parameters = choose_parameters(model, options, importance_given=importance is not None, contrast=contrast)
         extras = extra_records(model, options)
         blocks = get_blocks(model, importance) if allow_classes else None
@@ -147,7 +150,7 @@ class EncodePlan:
         if options.shape_codebook_size and len(model):
             weights = shape_weights(model, importance)
             metric = shape_metric(weights, importance)
-            shapes = choose_shapes(model, weights, metric, tiles, parameters, options, progress or null_progress)
+            shapes = choose_shapes(model, weights, metric, tiles, parameters, options, context)
         return cls(
             model,
             options,
@@ -159,23 +162,24 @@ class EncodePlan:
             shapes,
             classes,
             is_sample=contrast is not None,
+            context=context,
         )
 
     @classmethod
     def of_buckets(
-        cls, store: BucketStore, options: EncodeOptions, origin: Origin, progress: Progress | None = None
+        cls, store: BucketStore, options: EncodeOptions, origin: Origin, context: Context = DEFAULT_CONTEXT
     ) -> EncodePlan:
         """Plan the encoding of a scene of several buckets on a sample of it.
 
         Args:
             store: the scene, in memory or on disk.
-            options, origin, progress: as for `of`.
+            options, origin, context: as for `of`.
 
         Raises:
             InputError: as in `of`.
         """
         survey = store.survey()
-        sample = cls.of(survey.sample, options, contrast=survey.contrast, progress=progress)
+        sample = cls.of(survey.sample, options, contrast=survey.contrast, context=context)
         sample = replace(sample, parameters=final_parameters(sample.parameters, survey.largest_sh))
         tiles = cut_scene(store.model, sample.parameters, buckets=store.rows)
         return replace(sample, model=store.model, origin=origin, tiles=tiles, sample=sample, buckets=store.rows)
@@ -209,11 +213,11 @@ class EncodePlan:
         sample = None if self.sample is None else self.sample.with_colours(sh0[rows], shN[rows])
         return replace(self, model=model, origin=replace(self.origin, refitted=True), sample=sample)
 
-    def choose_sh_coding(self, progress: Progress | None = None) -> tuple[EncodePlan, FileCodebooks]:
+    def choose_sh_coding(self) -> tuple[EncodePlan, FileCodebooks]:
         """Choose the SH coding; return the complete plan and the codebooks with the assignment of the splats."""
         model, parameters, importance = self.model, self.parameters, self.importance
         if self.sample is not None:
-            sample, codebooks = self.sample.choose_sh_coding(progress)
+            sample, codebooks = self.sample.choose_sh_coding()
             assigned = replace(codebooks, sh_plan=self._assign_all(sample.parameters, codebooks))
             return replace(self, parameters=sample.parameters, sample=None), assigned
         uses_weights = parameters.adaptive > 0.0 or parameters.sh_coding in ("auto", "codebook")
@@ -227,7 +231,7 @@ class EncodePlan:
             measured=importance is not None,
             is_sample=self.is_sample,
             trial=trial_rows(model, self.tiles, self.classes),
-            progress=progress or null_progress,
+            context=self.context,
         )
         return replace(self, parameters=parameters), codebooks
 
@@ -237,7 +241,7 @@ class EncodePlan:
         index = None if sh_plan.book is None else np.empty(count, np.int32)
         weights = None if sh_plan.weights is None else np.empty(count, np.float32)
         for rows in self.buckets if index is not None or weights is not None else ():
-            part = assign_splats(codebooks, self.model.select(rows), parameters, self.options.thread_count)
+            part = assign_splats(codebooks, self.model.select(rows), parameters, self.context)
             if weights is not None and part.weights is not None:
                 weights[rows] = part.weights
             if index is not None and part.book is not None:

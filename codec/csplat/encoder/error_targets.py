@@ -10,6 +10,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder.encode_options import EncodeOptions
 from csplat.encoder.encode_plan import EncodePlan
 from csplat.encoder.pipeline import EncodeResult, encode_tiles
@@ -17,7 +18,6 @@ from csplat.encoder.splat_importance import Importance
 from csplat.encoder.target import SearchReport, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import Progress
 
 _TRIES = 12  # largest number of files
 _NEAR = 0.9  # fraction of a bound; a coarser step is tried if the error is below
@@ -38,7 +38,7 @@ def meet_bounds(
     target: Target,
     *,
     importance: NDArray[Any] | Importance | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> tuple[EncodeResult, EncodeOptions]:
     """Find steps with which no splat's error exceeds the bounds of a target.
 
@@ -47,7 +47,7 @@ def meet_bounds(
         encoding: the other options; steps of unbounded measures are kept.
         target: `max_error` has the bounds.
         importance: importance of the splats, as for the encoder.
-        progress: progress callback.
+        context: threads, seed and progress.
 
     Returns:
         The file, and the options that made it. The largest errors that it declares are within the bounds, and close to
@@ -62,8 +62,8 @@ def meet_bounds(
     files = 0
     while True:
         files += 1
-        plan = EncodePlan.of(source, options, importance=importance, progress=progress)
-        result = encode_tiles(plan, progress=progress).write()
+        plan = EncodePlan.of(source, options, importance=importance, context=context)
+        result = encode_tiles(plan).write()
         ratios = {name: result.largest_error(name) / bounds[name] for name in bounds}
         if all(ratio <= 1.0 for ratio in ratios.values()):
             if best is None or result.size_bytes < best[0].size_bytes:

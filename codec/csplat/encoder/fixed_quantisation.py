@@ -33,7 +33,7 @@ from csplat.encoder.shape_codebook import ShapeCodebook, dequantise_shapes
 from csplat.encoder.tiling import dequantise_means, dequantise_opacities, quantise_and_sort
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, I32, I64, Progress
+from csplat.types import F32, I32, I64
 
 _THREADED_MIN = 50_000  # splats; with fewer, starting threads takes longer than they save
 
@@ -145,12 +145,11 @@ class FixedQuantisation:
         if self.shapes is not None:
             values.sizes[self.shapes.escaped] = 0.0
 
-    def encode(self, values: FreeValues, progress: Progress | None = None) -> EncodedTiles:
+    def encode(self, values: FreeValues) -> EncodedTiles:
         """Encode values; a decoder returns `dequantise(values)`.
 
         Args:
             values: constrained values.
-            progress: see `EncodePlan.of`.
 
         Returns:
             Tiles that declare the errors against the source, except the errors of colours, which are refitted.
@@ -169,14 +168,12 @@ class FixedQuantisation:
             model, means=values.means, quats=quats, scales=scales, opacities=values.opacities, sh0=values.sh0, shN=shN
         )
         errors = measured_sums(self.source, decoded, self.source_index)
-        return encode_tiles(
-            replace(self.encode_plan, model=model, shapes=shapes), codebooks, errors=errors, progress=progress
-        )
+        return encode_tiles(replace(self.encode_plan, model=model, shapes=shapes), codebooks, errors=errors)
 
     def dequantise(self, values: FreeValues) -> DecodedValues:
         """Return the values that a decoder of the file returns, bit for bit."""
         tiles, parameters = self.encode_plan.tiles, self.parameters
-        if self.encode_plan.options.threads == 1 or len(self.encode_plan.model) < _THREADED_MIN:
+        if self.encode_plan.context.threads == 1 or len(self.encode_plan.model) < _THREADED_MIN:
             shN, (quats, scales) = self.dequantise_sh(values.sh), self._dequantise_shapes(values)
             means, sh0 = dequantise_means(values.means, tiles, parameters.lattice), self.dequantise_sh0(values.sh0)
         else:
@@ -258,15 +255,12 @@ class FixedQuantisation:
         return ShCodebook(_quantise_entries(sh[: book.size], self.parameters), book.index)
 
 
-def fix_quantisation(
-    plan: EncodePlan, source: SplatModel | None = None, progress: Progress | None = None
-) -> FixedQuantisation:
+def fix_quantisation(plan: EncodePlan, source: SplatModel | None = None) -> FixedQuantisation:
     """Complete a plan, and fix its quantisation.
 
     Args:
         plan: the plan.
         source: the scene that the plan's `Origin` refers to; `None`: the plan's scene.
-        progress: see `EncodePlan.of`.
 
     Raises:
         InputError: there are no splats, or the source does not have the origin's number of splats.
@@ -276,7 +270,7 @@ def fix_quantisation(
     source, source_count = plan.model if source is None else source, plan.origin.source_count
     if len(source) != source_count:
         raise InputError(f"the source has {len(source)} splats, expected {source_count} by the origin")
-    plan, codebooks = plan.choose_sh_coding(progress)
+    plan, codebooks = plan.choose_sh_coding()
     parameters = replace(plan.parameters, canonical=True)
     rows = [quantise_and_sort(plan.model, tile, parameters).rows for tile in plan.tiles]
     order = np.concatenate(rows).astype(np.int64)

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
@@ -26,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder.splat_importance import ErrorMetric, doubled_triangles, matrix_products
 from csplat.errors import InputError
 from csplat.types import F32, F64, I16, I32, I64, U32
@@ -55,12 +55,10 @@ def cluster(
     weights: F32,
     size: int,
     *,
-    seed: int,
     iterations: int = 8,
     sample_per_entry: int = 24,
     near_groups: int = 0,
-    threads: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> tuple[I32, U32]:
     """Train a codebook of at most `size` entries, and assign the points to it.
 
@@ -71,12 +69,10 @@ def cluster(
             on a coarser lattice.
         weights: [N], finite and >= 0. Only ratios matter. If all are zero, all points weigh the same.
         size: maximum number of entries, > 0.
-        seed: seed of the sample and of the initial entries, >= 0.
         iterations: k-means iterations on the sample.
         sample_per_entry: points of the sample per entry, > 0.
         near_groups: see `assign`; once a point has an entry, `_NEXT_GROUPS` groups are searched for a nearer entry.
-        threads: see `assign`.
-        progress: called with the number of iterations done and the total.
+        context: threads, progress, and the seed of the sample and of the initial entries.
 
     Returns:
         entries [K, D] int32, K <= size, distinct and used, in arbitrary order; index [N] uint32, the entry of each
@@ -86,35 +82,33 @@ def cluster(
         InputError: a shape, dtype, weight or number is outside these ranges.
     """
     w = _check_points(points, weights)
-    if min(size, sample_per_entry) <= 0 or min(iterations, near_groups, seed) < 0:
+    if min(size, sample_per_entry) <= 0 or min(iterations, near_groups) < 0:
         raise InputError("cluster: size and sample_per_entry must be > 0, other numbers >= 0")
     if len(points) <= size:
         return _distinct(points)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(context.seed)
     rows, sample_w = _priority_sample(w, size * sample_per_entry, rng)
     sample = points[rows]
-    entries = _first_entries(sample, sample_w, size, rng, near_groups, threads)
+    entries = _first_entries(sample, sample_w, size, rng, near_groups, context)
     index: U32 | None = None
     for step in range(iterations + 1):
         most = size >> (2 + 4 * step // iterations) if step < iterations else 0
         if step == iterations and len(sample) < len(points):
             rows, sample_w = _priority_sample(w, max(_REFINED_POINTS, size * _REFINED_PER_ENTRY), rng)
             sample, index = points[rows], None
-        index, error = search_nearest(sample, entries, near_groups, threads, start=index)
+        index, error = search_nearest(sample, entries, near_groups, context, start=index)
         entries = _move_to_means(sample, sample_w, index, entries)
-        _relocate(entries, index, sample, sample_w, error, most, min(near_groups, _NEXT_GROUPS), rng, threads)
-        if progress:
-            progress(step + 1, iterations + 2)
+        _relocate(entries, index, sample, sample_w, error, most, min(near_groups, _NEXT_GROUPS), rng, context)
+        context.progress("codebook", (step + 1) / (iterations + 2))
     is_sample = len(sample) < len(points)
-    index = search_nearest(points, entries, near_groups, threads, start=None if is_sample else index)[0]
+    index = search_nearest(points, entries, near_groups, context, start=None if is_sample else index)[0]
     entries = entries if is_sample else _move_to_means(points, w, index, entries)
-    if progress:
-        progress(iterations + 2, iterations + 2)
+    context.progress("codebook", 1.0)
     distinct, merged = _distinct(entries)
     return _drop_unused(distinct, merged[index])
 
 
-def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: int | None = None) -> U32:
+def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, context: Context = DEFAULT_CONTEXT) -> U32:
     """Assign each point to the nearest entry, the first of several at equal distance.
 
     Args:
@@ -122,7 +116,7 @@ def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: in
         entries: [K, D], K > 0.
         near_groups: 0 searches every entry. Otherwise entries are clustered into about sqrt(K) groups, and this number
             of groups with the nearest centroids is searched: faster for thousands of entries, but approximate.
-        threads: number of threads; `None`: all processors. No effect on the result.
+        context: threads.
 
     Returns:
         [N] uint32, indices of entries.
@@ -135,7 +129,7 @@ def assign(points: I16 | I32, entries: I32, *, near_groups: int = 0, threads: in
         raise InputError(f"assign: entries {entries.dtype} {entries.shape}, points {points.shape}")
     if not len(entries):
         raise InputError("assign: no entries")
-    return search_nearest(points, entries, near_groups, threads)[0]
+    return search_nearest(points, entries, near_groups, context)[0]
 
 
 def rank_by_frequency(index: U32, entries: I32) -> tuple[U32, I32]:
@@ -151,7 +145,7 @@ def search_nearest(
     points: I16 | I32,
     entries: I32,
     near_groups: int = 0,
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
     *,
     start: U32 | None = None,
     other: bool = False,
@@ -166,7 +160,7 @@ def search_nearest(
             entries are first divided by a power of two and rounded.
         entries: [K, D], K > 0.
         near_groups: see `assign`.
-        threads: see `assign`.
+        context: threads.
         start: [N], an entry near each point. The result is as near, and at most `_NEXT_GROUPS` groups are searched.
         other: exclude entry n for point n: the points are the entries.
 
@@ -180,7 +174,7 @@ def search_nearest(
     table = _table(coarse)
     if 0 < near_groups < math.isqrt(len(entries)):
         near = near_groups if start is None else min(near_groups, _NEXT_GROUPS)
-        find = _near_entries(coarse, table, near, threads, other)
+        find = _near_entries(coarse, table, near, context, other)
     else:
         start = None
         find = _every_entry(table, other)
@@ -199,21 +193,21 @@ def search_nearest(
         error[part] = (norm - 2.0 * best) * 4.0**shift
 
     with one_blas_thread():
-        run_blocks(work, len(points), _BLOCK, threads)
+        run_blocks(work, len(points), _BLOCK, context)
     return index, error
 
 
-def run_blocks(work: Callable[[slice], object], count: int, length: int, threads: int | None) -> None:
+def run_blocks(work: Callable[[slice], object], count: int, length: int, context: Context) -> None:
     """Call `work` with the slices of `length` of `count` rows, in threads unless there is one slice.
 
     Args:
         work: writes results to these rows; releases the GIL for most of its time.
         count: number of rows.
         length: rows per slice.
-        threads: number of threads; `None`: all processors.
+        context: threads.
     """
     slices = [slice(start, min(start + length, count)) for start in range(0, count, length)]
-    workers = min(threads or os.cpu_count() or 1, len(slices))
+    workers = min(context.thread_count, len(slices))
     if workers <= 1:  # a small scene takes less time than starting a thread
         for part in slices:
             work(part)
@@ -244,7 +238,7 @@ def one_blas_thread() -> Iterator[None]:
 
 @one_blas_thread()
 def reassign_by_metric(
-    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, threads: int, candidates: int
+    points: Floats, metric: ErrorMetric, entries: Floats, index: I64, context: Context, candidates: int
 ) -> I64:
     """Assign each point to the entry with the least error among the neighbours of its present entry.
 
@@ -257,7 +251,7 @@ def reassign_by_metric(
         metric: metric of the points.
         entries: [K, D, C].
         index: [N], the present entry of each point.
-        threads: number of threads; no effect on the result.
+        context: threads.
         candidates: number of entries compared: the present entry and its nearest neighbours.
 
     Returns:
@@ -284,13 +278,16 @@ def reassign_by_metric(
             features[:, size * channels :] = doubled_triangles(triangles)
             best[rows] = near[group, (features @ table[near[group]].T).argmin(axis=1)]
 
-    with ThreadPoolExecutor(max(1, threads)) as pool:
+    threads = context.thread_count
+    with ThreadPoolExecutor(threads) as pool:
         list(pool.map(work, [range(start, len(entries), threads) for start in range(threads)]))
     return best
 
 
 @one_blas_thread()
-def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I64, threads: int) -> tuple[I32, I64]:
+def refine_by_metric(
+    points: Floats, metric: ErrorMetric, entries: I32, index: I64, context: Context
+) -> tuple[I32, I64]:
     """Iterate assignment and centroids under the metric.
 
     Args:
@@ -298,15 +295,15 @@ def refine_by_metric(points: Floats, metric: ErrorMetric, entries: I32, index: I
         metric: metric of the points.
         entries: [K, D, C], lattice integers.
         index: [N], the entry of each point.
-        threads: number of threads; no effect on the result.
+        context: threads.
 
     Returns:
         entries [K', D, C], distinct and used; index [N].
     """
     for _ in range(_REFINE_ROUNDS):
-        index = reassign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+        index = reassign_by_metric(points, metric, entries, index, context, _CANDIDATES)
         entries = _solve_entries(points, metric, entries, index)
-    index = reassign_by_metric(points, metric, entries, index, threads, _CANDIDATES)
+    index = reassign_by_metric(points, metric, entries, index, context, _CANDIDATES)
     flat, inverse = np.unique(entries.reshape(len(entries), -1), axis=0, return_inverse=True)
     index = inverse.reshape(-1)[index]
     used, index = np.unique(index, return_inverse=True)
@@ -356,9 +353,7 @@ def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
     return _largest(importance / (1.0 - rng.random(len(importance))), count)
 
 
-def _first_entries(
-    sample: I16 | I32, w: F64, size: int, rng: np.random.Generator, near: int, threads: int | None
-) -> I32:
+def _first_entries(sample: I16 | I32, w: F64, size: int, rng: np.random.Generator, near: int, context: Context) -> I32:
     """Draw initial entries in rounds, with a probability that grows with w d², d being the distance to earlier draws.
 
     Bahmani et al., "Scalable k-means++", but with exactly `size` points.
@@ -370,7 +365,7 @@ def _first_entries(
         new = sample[_draw_rows(w * error, size * done // rounds - len(entries), rng)]
         entries = np.concatenate([entries, new.astype(np.int32)])
         if len(new) and done < rounds:
-            distance = search_nearest(sample, new.astype(np.int32), near, threads)[1]
+            distance = search_nearest(sample, new.astype(np.int32), near, context)[1]
             error = np.minimum(error, distance) if len(entries) > len(new) else distance
     return entries
 
@@ -396,7 +391,7 @@ def _relocate(
     most: int,
     near_groups: int,
     rng: np.random.Generator,
-    threads: int | None,
+    context: Context,
 ) -> None:
     """Move the cheapest entries, and all without weight, into the clusters with the largest errors, in place.
 
@@ -408,7 +403,7 @@ def _relocate(
     errors = np.bincount(index, w * error, len(entries))
     loss = weight
     if most:  # the distance is infinite if the groups searched have no other entry
-        distance = search_nearest(entries, entries, near_groups, threads, other=True)[1]
+        distance = search_nearest(entries, entries, near_groups, context, other=True)[1]
         loss = np.multiply(weight, distance, out=np.zeros_like(weight), where=weight > 0.0)
     cheap, worst = np.argsort(loss, kind="stable"), np.argsort(-errors, kind="stable")
     limit = max(most, int(np.count_nonzero(weight == 0)))
@@ -483,9 +478,9 @@ def _every_entry(table: F32, other: bool) -> _Find:
     return find
 
 
-def _near_entries(entries: I64, table: F32, near: int, threads: int | None, other: bool) -> _Find:
+def _near_entries(entries: I64, table: F32, near: int, context: Context, other: bool) -> _Find:
     """Return a search of the entries in the `near` groups with the nearest centroids."""
-    centres, label = _groups(entries, threads)
+    centres, label = _groups(entries, context)
     order = np.argsort(label, kind="stable")
     ends = np.searchsorted(label[order], np.arange(len(centres) + 1))
     matrices = [np.ascontiguousarray(table[order[a:b]].T) for a, b in pairwise(ends)]
@@ -538,18 +533,18 @@ def _keep_better(rows: I64, scores: F32, first: int, index: I64, best: F32) -> N
     best[rows] = score[better]
 
 
-def _groups(entries: I64, threads: int | None) -> tuple[I64, U32]:
+def _groups(entries: I64, context: Context) -> tuple[I64, U32]:
     """Cluster entries [K, D] into about sqrt(K) groups by plain k-means; return centroids and labels [K]."""
     count = math.isqrt(len(entries))
     rows = entries.astype(np.int32)
     centres = rows[np.arange(count) * len(rows) // count]
-    label, _ = search_nearest(rows, centres, 0, threads)
+    label, _ = search_nearest(rows, centres, 0, context)
     for _ in range(_GROUP_ITERATIONS - 1):
         size = np.bincount(label, minlength=count)
         sums = [np.bincount(label, column, count) for column in rows.T]
         used = size > 0
         centres[used] = np.rint(np.stack(sums, 1)[used] / size[used, None])
-        label, _ = search_nearest(rows, centres, 0, threads)
+        label, _ = search_nearest(rows, centres, 0, context)
     return centres.astype(np.int64), label
 
 

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import Context
 from csplat.encoder.coding_parameters import SAME_STEPS, StepFactors
 from csplat.encoder.container import FileNode, FileTile, order_nodes
 from csplat.encoder.encode_plan import EncodePlan, clip_scales
@@ -17,7 +18,6 @@ from csplat.encoder.sh_codebook import FileCodebooks, ShCodingPlan, assign_splat
 from csplat.encoder.tiling import cut_scene
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
-from csplat.types import Progress, null_progress
 
 Rows = NDArray[np.intp]
 
@@ -46,7 +46,7 @@ class LevelNode:
 
 
 class LevelBuilder(Protocol):
-    """Builds levels of detail, and measures their errors; picklable. No result depends on `threads`."""
+    """Builds levels of detail, and measures their errors; picklable. Of a context, they use threads and progress."""
 
     @property
     def whole_splats(self) -> int:
@@ -61,32 +61,27 @@ class LevelBuilder(Protocol):
         """Return the approximate time for the levels of a scene of `count` splats, by one process."""
         ...
 
-    def encode_plan(
-        self, plan: EncodePlan, codebooks: FileCodebooks | None = None, progress: Progress = null_progress
-    ) -> EncodedTiles:
+    def encode_plan(self, plan: EncodePlan, codebooks: FileCodebooks | None = None) -> EncodedTiles:
         """Encode a planned scene with its levels, in memory; arguments as for `encode_levels`."""
         ...
 
-    def build_part(self, splats: SplatModel, scene_count: int, threads: int | None) -> list[LevelNode]:
+    def build_part(self, splats: SplatModel, scene_count: int, context: Context) -> list[LevelNode]:
         """Build the nodes of a bucket of a scene of `scene_count` splats."""
         ...
 
-    def build_top(
-        self, roots: Iterable[SplatModel], threads: int | None, progress: Progress
-    ) -> tuple[list[int | None], list[LevelNode]]:
+    def build_top(self, roots: Iterable[SplatModel], context: Context) -> tuple[list[int | None], list[LevelNode]]:
         """Build the nodes above all buckets.
 
         Args:
             roots: the splats of the coarsest level of each bucket, which are not read if no level is above them.
-            threads: number of threads; `None`: all.
-            progress: called with the stage and the completed fraction of it.
+            context: threads and progress.
 
         Returns:
             The number of the parent of each bucket, and the nodes; neither if no level is above the buckets.
         """
         ...
 
-    def measure(self, encoded: EncodedTiles, threads: int | None, progress: Progress) -> EncodedTiles:
+    def measure(self, encoded: EncodedTiles, context: Context) -> EncodedTiles:
         """Return the same tiles with errors of the nodes that have none yet."""
         ...
 
@@ -95,7 +90,6 @@ def encode_levels(
     plan: EncodePlan,
     nodes: Sequence[LevelNode],
     codebooks: FileCodebooks | None = None,
-    progress: Progress | None = None,
 ) -> EncodedTiles:
     """Encode the tiles of a scene and of its coarser versions.
 
@@ -105,28 +99,26 @@ def encode_levels(
         plan: the plan of the scene; its tiles are replaced by the tiles of the leaves.
         nodes: the nodes, whose leaves hold each splat once.
         codebooks: SH codebooks, if the plan's SH coding is chosen; `None`: choose it now.
-        progress: see `EncodePlan.of`.
 
     Raises:
         InputError: the leaves do not hold each splat once, a parent is not above its child, or a value fits no lattice.
     """
     _check_nodes(nodes, len(plan.model))
-    progress = progress or null_progress
     if codebooks is None:
-        plan, codebooks = plan.choose_sh_coding(progress)
+        plan, codebooks = plan.choose_sh_coding()
     leaves = [number for number, node in enumerate(nodes) if node.level == 0]
     of_leaves = [
         cut_scene(plan.model, plan.parameters, plan.classes, [rows])
         for rows in (nodes[number].rows for number in leaves) if rows is not None
     ]  # fmt: skip
     plan = replace(plan, tiles=[tile for tiles in of_leaves for tile in tiles])
-    encoded = encode_tiles(plan, codebooks, progress=progress)
+    encoded = encode_tiles(plan, codebooks)
     parts = iter(encoded.tiles)
     tiles_by_node = {number: [next(parts).tile for _ in tiles] for number, tiles in zip(leaves, of_leaves, strict=True)}
     coarse = [number for number, node in enumerate(nodes) if node.level]
     for done, number in enumerate(coarse):
         tiles_by_node[number] = encode_coarse(nodes[number], plan, codebooks)
-        progress("levels", (done + 1) / len(coarse))
+        plan.context.progress("levels", (done + 1) / len(coarse))
     tree = [FileNode(node.parent, tiles_by_node[number], node.error) for number, node in enumerate(nodes)]
     return replace(encoded, nodes=order_nodes(tree))
 
@@ -172,8 +164,8 @@ def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebook
 
     On lego60k, escapes would take 12 % of the bytes of level 1 and 25 % of level 2, and gain 0.2 and 0.0 dB.
     """
-    sh_plan, threads = codebooks.sh_plan, plan.options.thread_count
+    sh_plan = codebooks.sh_plan
     if sh_plan.book is None:
-        return replace(assign_splats(codebooks, splats, plan.parameters, threads), extras=())
-    book = nearest_entries(sh_plan.book, splats, plan.parameters, threads)
+        return replace(assign_splats(codebooks, splats, plan.parameters, plan.context), extras=())
+    book = nearest_entries(sh_plan.book, splats, plan.parameters, plan.context)
     return replace(sh_plan, weights=None, book=book, extras=())

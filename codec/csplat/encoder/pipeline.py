@@ -92,23 +92,45 @@ class EncodeResult:
     """An encoded scene.
 
     Attributes:
-        data: the bytes of the file.
-        source_index: [N] int64; row i of the decoded arrays is row source_index[i] of the model or its `Origin`.
         report: choices and errors.
+        content: the bytes of the file; `None` if the scene was encoded on disk.
+        rows: `source_index`; `None` likewise.
     """
 
-    data: bytes
-    source_index: NDArray[np.int64]
     report: EncodeReport
+    content: bytes | None = None
+    rows: NDArray[np.int64] | None = None
 
     def __repr__(self) -> str:
         quality = "" if self.psnr is None else f", {self.psnr:.2f} dB"
         return f"EncodeResult({self.size_bytes:,} bytes, {self.report.splat_count:,} splats{quality})"
 
     @property
+    def data(self) -> bytes:
+        """The bytes of the file.
+
+        Raises:
+            InputError: the scene was encoded on disk, and only the file has them.
+        """
+        if self.content is None:
+            raise InputError("the scene was encoded on disk: its bytes are in the file")
+        return self.content
+
+    @property
+    def source_index(self) -> NDArray[np.int64]:
+        """[N] int64; row i of the decoded arrays is row source_index[i] of the model or its `Origin`.
+
+        Raises:
+            InputError: the scene was encoded on disk, where the order of splats is not recorded.
+        """
+        if self.rows is None:
+            raise InputError("the scene was encoded on disk, where the order of splats is not recorded")
+        return self.rows
+
+    @property
     def size_bytes(self) -> int:
         """Size of the file."""
-        return len(self.data)
+        return self.report.size_bytes
 
     @property
     def psnr(self) -> float | None:
@@ -195,7 +217,7 @@ class EncodedTiles:
         """
         stream = BytesIO()
         report = self.write_to(stream, metadata)
-        return EncodeResult(stream.getvalue(), self.source_index, report)
+        return EncodeResult(report, stream.getvalue(), self.source_index)
 
     def part(self, nodes: Sequence[FileNode]) -> bytes:
         """Return a file of the tiles of some nodes alone, as one level without extra columns, in their order."""
@@ -236,7 +258,6 @@ def encode_tiles(
     codebooks: FileCodebooks | None = None,
     *,
     errors: ErrorSums | None = None,
-    progress: Progress | None = None,
 ) -> EncodedTiles:
     """Encode the tiles of a scene, which is most of the work.
 
@@ -244,14 +265,13 @@ def encode_tiles(
         plan: the plan.
         codebooks: SH codebooks, if the plan's SH coding is chosen; `None`: choose it now.
         errors: errors to declare; `None`: the errors of the tiles.
-        progress: see `EncodePlan.of`.
 
     Raises:
         InputError: a value fits no lattice.
     """
     if codebooks is None:
-        plan, codebooks = plan.choose_sh_coding(progress)
-    tiles = _encode_all(plan, codebooks.sh_plan, progress)
+        plan, codebooks = plan.choose_sh_coding()
+    tiles = _encode_all(plan, codebooks.sh_plan)
     errors = errors or ErrorSums.total(part.errors for part in tiles)
     if plan.shapes is not None and not any(book.id == SHAPE_CODEBOOK_ID for book in codebooks.records):
         record, chunk = shape_codebook_chunk(plan.shapes, plan.parameters.deflate)
@@ -259,15 +279,14 @@ def encode_tiles(
     return EncodedTiles(plan, codebooks, tiles, errors)
 
 
-def _encode_all(plan: EncodePlan, sh_plan: ShCodingPlan, progress: Progress | None) -> list[EncodedTile]:
-    threads, done = plan.options.thread_count, 0
+def _encode_all(plan: EncodePlan, sh_plan: ShCodingPlan) -> list[EncodedTile]:
+    threads, done = plan.context.thread_count, 0
 
     def encode_one(tile: TileSplats) -> EncodedTile:
         nonlocal done
         encoded = encode_tile(plan.model, tile, plan.parameters, sh_plan, plan.shapes)
         done += len(tile.rows)
-        if progress is not None:
-            progress("tiles", done / max(1, len(plan.model)))
+        plan.context.progress("tiles", done / max(1, len(plan.model)))
         return encoded
 
     if threads == 1 or len(plan.tiles) < 2:
@@ -420,7 +439,7 @@ def encoding_settings(plan: EncodePlan, sh_plan: ShCodingPlan) -> dict[str, Any]
         **({} if plan.classes is None else {"classes": plan.classes.as_json()}),
         "deflate_level": parameters.deflate.level,
         "deflate": parameters.deflate.library,
-        "seed": options.seed,
+        "seed": plan.context.seed,
     }
 
 
@@ -444,7 +463,7 @@ def file_chunks(plan: EncodePlan, errors: ErrorSums, settings: dict[str, Any]) -
     except (TypeError, ValueError) as problem:
         raise InputError(f"metadata or cameras cannot be written as JSON: {problem}") from None
     chunks.append(FileChunk(_spec.CHUNK_OPTIONS, json_payload(settings, deflate)))
-    chunks.append(FileChunk(_spec.CHUNK_STATED_ERRORS, _declared_errors_chunk(plan, errors)))
+    chunks.append(FileChunk(_spec.CHUNK_DECLARED_ERRORS, _declared_errors_chunk(plan, errors)))
     return chunks
 
 
@@ -472,9 +491,9 @@ def _declared_errors_chunk(plan: EncodePlan, errors: ErrorSums) -> bytes:
     ids = {name: id for id, name in _spec.MEASURE_NAMES.items()}
     bounds = sorted((ids[name], *pair) for name, pair in declared_errors(errors, origin).items())
     count, flags = origin.source_count, origin.refitted * _spec.ERROR_FLAG_REFITTED
-    head = _spec.StatedErrorsHead(count, count - errors.count, model.sh_degree, flags, len(bounds))
-    records = [_spec.pack_stated_error_record(_spec.StatedErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
-    return _spec.pack_stated_errors_head(head) + b"".join(records)
+    head = _spec.DeclaredErrorsHead(count, count - errors.count, model.sh_degree, flags, len(bounds))
+    records = [_spec.pack_declared_error_record(_spec.DeclaredErrorRecord(id, 0, 0, 0, *pair)) for id, *pair in bounds]
+    return _spec.pack_declared_errors_head(head) + b"".join(records)
 
 
 def _versions(parameters: CodingParameters) -> str:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import Context
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import CodingParameters, band_slice
 from csplat.encoder.container import FileChunk, IndexedCodebook
@@ -25,7 +26,7 @@ from csplat.encoder.splat_importance import ErrorMetric, splat_weights
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.portable_math import log2
-from csplat.types import F32, F64, I16, I32, U32, Progress
+from csplat.types import F32, F64, I16, I32, U32
 
 Rows = NDArray[np.intp]
 
@@ -167,21 +168,21 @@ def choose_sh_coding(
     measured: bool,
     is_sample: bool,
     trial: Rows,
-    progress: Progress,
+    context: Context,
 ) -> tuple[CodingParameters, FileCodebooks]:
     """Choose the SH coding, and train the codebook if the coding uses a codebook.
 
     Args:
         model: the scene.
         parameters: `sh_coding` is "auto", "codebook", "scalar" or "none".
-        options: `codebook_size`, `escape_fraction`, `keep_extra`, `seed`.
+        options: `codebook_size`, `escape_fraction`, `keep_extra`.
         weights: [N] float32, importance of the splats; `None` if no choice depends on it.
         metric: Gauss-Newton matrices of the coefficients; `None`: the identity, times the weights.
         measured: the weights are measured, not guessed from opacity and size.
         is_sample: the model is a sample of the scene, and the codebook is trained on part of the sample. The
             returned assignment covers this part only.
         trial: rows of about a tile, on which scalar coding is tried.
-        progress: called with the stage and the fraction done.
+        context: threads, seed and progress.
 
     Returns:
         The parameters with SH coding and step, and the codebooks.
@@ -198,7 +199,7 @@ def choose_sh_coding(
     size = _codebook_size(len(model), fine, options)
     step = max(1, len(model) // max(_TRAINING_SPLATS, _TRAINING_USERS * size)) if is_sample else 1
     rule, index, distortion = _train(
-        model.shN[::step], replace(error_weights, weights=weights[::step]), size, fine, options, progress
+        model.shN[::step], replace(error_weights, weights=weights[::step]), size, fine, options, context
     )
     rgb = rule.entries.reshape(len(rule.entries), -1, 3).transpose(2, 1, 0).astype(np.float32)
     book = ShCodebook(colour_integers(np.ascontiguousarray(rgb), fine.chroma_shift), index)
@@ -223,7 +224,7 @@ def largest_sh(shN: F32) -> float:
 
 
 def assign_splats(
-    codebooks: FileCodebooks, model: SplatModel, parameters: CodingParameters, threads: int
+    codebooks: FileCodebooks, model: SplatModel, parameters: CodingParameters, context: Context
 ) -> ShCodingPlan:
     """Assign splats outside the training set.
 
@@ -231,34 +232,34 @@ def assign_splats(
         codebooks: trained on a sample of the scene.
         model: a bucket of the scene; the result may depend on which splats are assigned together.
         parameters: the final parameters.
-        threads: number of threads; no effect on the result.
+        context: threads.
     """
     sh_plan, rule = codebooks.sh_plan, codebooks.rule
     weights = None if sh_plan.weights is None else splat_weights(model, None)
     if rule is None or sh_plan.book is None or weights is None:
         return replace(sh_plan, weights=weights)
-    points = _lattice_points(model.shN, parameters, threads)
-    index = assign(points, rule.entries, near_groups=rule.near_groups, threads=threads).astype(np.int32)
+    points = _lattice_points(model.shN, parameters, context)
+    index = assign(points, rule.entries, near_groups=rule.near_groups, context=context).astype(np.int32)
     error_weights = _ErrorWeights(weights, None, measured=False)
-    errors = _errors(model.shN, index, rule.entries, parameters, error_weights, threads)
+    errors = _errors(model.shN, index, rule.entries, parameters, error_weights, context)
     index[errors >= rule.threshold] = sh_plan.book.size
     return replace(sh_plan, weights=weights, book=ShCodebook(sh_plan.book.entries, index))
 
 
-def nearest_entries(book: ShCodebook, model: SplatModel, parameters: CodingParameters, threads: int) -> ShCodebook:
+def nearest_entries(book: ShCodebook, model: SplatModel, parameters: CodingParameters, context: Context) -> ShCodebook:
     """Return a codebook with the entry that is nearest to each splat of another model, without escapes.
 
     Args:
         book: the codebook.
         model: the splats.
         parameters: the final parameters.
-        threads: number of threads; no effect on the result.
+        context: threads.
     """
     rgb = lift_colour(book.entries, parameters.chroma_shift).transpose(2, 1, 0)
     entries = np.ascontiguousarray(rgb, np.int32).reshape(book.size, -1)
     near_groups = _NEAR_GROUPS if book.size >= _GROUPED_ENTRIES_MIN else 0
-    points = _lattice_points(model.shN, parameters, threads)
-    index = assign(points, entries, near_groups=near_groups, threads=threads)
+    points = _lattice_points(model.shN, parameters, context)
+    index = assign(points, entries, near_groups=near_groups, context=context)
     return ShCodebook(book.entries, index.astype(np.int32))
 
 
@@ -401,24 +402,21 @@ def _train(
     size: int,
     parameters: CodingParameters,
     options: EncodeOptions,
-    progress: Progress,
+    context: Context,
 ) -> tuple[AssignmentRule, I32, float]:
     """Train a codebook; return it with the entry of each splat [N] and the weighted mean squared error."""
-    weights, threads = error_weights.weights, options.thread_count
-    points = _lattice_points(shN, parameters, threads)
+    weights = error_weights.weights
+    points = _lattice_points(shN, parameters, context)
     effort = {}
     if size >= _GROUPED_ENTRIES_MIN:
         effort = {"near_groups": _NEAR_GROUPS, "iterations": _ITERATIONS, "sample_per_entry": _SAMPLE_PER_ENTRY}
 
-    def report_steps(done: int, steps: int) -> None:
-        progress("codebook", done / steps)
-
-    clustered = cluster(points, weights, size, seed=options.seed, threads=threads, progress=report_steps, **effort)
+    clustered = cluster(points, weights, size, context=context, **effort)
     if error_weights.metric is not None:
-        clustered = _refine(shN, points, error_weights.metric, clustered, parameters, threads)
+        clustered = _refine(shN, points, error_weights.metric, clustered, parameters, context)
     ranked, entries = rank_by_frequency(clustered[1], clustered[0])
     index = ranked.astype(np.int32)
-    errors = _errors(shN, index, entries, parameters, error_weights, threads)
+    errors = _errors(shN, index, entries, parameters, error_weights, context)
     escaped = _choose_escapes(shN, errors, parameters, options, error_weights)
     threshold = float(errors[escaped].min(initial=np.inf))
     errors[escaped] = 0.0
@@ -429,18 +427,18 @@ def _train(
 
 
 def _refine(
-    shN: F32, points: I16, metric: ErrorMetric, found: tuple[I32, U32], parameters: CodingParameters, threads: int
+    shN: F32, points: I16, metric: ErrorMetric, found: tuple[I32, U32], parameters: CodingParameters, context: Context
 ) -> tuple[I32, U32]:
     """Refine a codebook and its assignment under the metric."""
     entries, index = found
     count = points.shape[1] // 3
     targets = np.clip(shN[:, :count] * np.float32(1.0 / parameters.sh_step), -_CLIP, _CLIP)
     start = entries.reshape(-1, count, 3)
-    entries, refined = refine_by_metric(targets, metric, start, index.astype(np.int64), threads)
+    entries, refined = refine_by_metric(targets, metric, start, index.astype(np.int64), context)
     return np.clip(entries, -_CLIP, _CLIP).reshape(len(entries), -1), refined.astype(np.uint32)
 
 
-def _lattice_points(shN: F32, parameters: CodingParameters, threads: int) -> I16:
+def _lattice_points(shN: F32, parameters: CodingParameters, context: Context) -> I16:
     """Return R, G, B integers [N, 3K] of the kept bands, clipped to `_CLIP`."""
     kept = parameters.sh_coefficients
     points = np.empty((len(shN), 3 * kept), np.int16)
@@ -451,7 +449,7 @@ def _lattice_points(shN: F32, parameters: CodingParameters, threads: int) -> I16
         rows *= np.float32(1.0 / parameters.sh_step)
         points[part] = np.rint(rows, out=rows)
 
-    run_blocks(work, len(shN), _BLOCK, threads)
+    run_blocks(work, len(shN), _BLOCK, context)
     return points
 
 
@@ -465,7 +463,7 @@ def _codebook_size(count: int, parameters: CodingParameters, options: EncodeOpti
 
 
 def _errors(
-    shN: F32, index: I32, entries: I32, parameters: CodingParameters, error_weights: _ErrorWeights, threads: int
+    shN: F32, index: I32, entries: I32, parameters: CodingParameters, error_weights: _ErrorWeights, context: Context
 ) -> F64:
     """Return the weighted squared error of each splat, [N], infinite if a coefficient was clipped."""
     kept = parameters.sh_coefficients
@@ -479,7 +477,7 @@ def _errors(
         errors[part] = error_weights.errors(difference, part)
         errors[part][clipped] = np.inf
 
-    run_blocks(work, len(shN), _BLOCK, threads)
+    run_blocks(work, len(shN), _BLOCK, context)
     return errors
 
 

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import Context
 from csplat.encoder import entropy
 from csplat.encoder.coding_parameters import SAME_STEPS, CodingParameters, StepFactors
 from csplat.encoder.container import FileChunk, IndexedCodebook
@@ -27,7 +28,7 @@ from csplat.encoder.quantisation import canonicalise_shape, lattice_exponent, la
 from csplat.encoder.splat_importance import ErrorMetric
 from csplat.encoder.tiling import TileSplats, quantise_and_sort
 from csplat.model import SplatModel
-from csplat.types import F32, F64, I16, I32, I64, Mask, Progress
+from csplat.types import F32, F64, I16, I32, I64, Mask, null_progress
 
 Integers = NDArray[Any]
 Floats = NDArray[Any]
@@ -129,7 +130,7 @@ def choose_shapes(
     tiles: Sequence[TileSplats],
     parameters: CodingParameters,
     options: EncodeOptions,
-    progress: Progress,
+    context: Context,
 ) -> ShapeCodebook | None:
     """Train a codebook, and assign splats to it.
 
@@ -139,8 +140,8 @@ def choose_shapes(
         metric: metric of xx, yy, zz, √2 xy, √2 xz, √2 yz; `None`: the identity, times the weights.
         tiles: tiles of the scene.
         parameters: steps and codings.
-        options: `shape_codebook_size`, `shape_escape_fraction`, `seed`.
-        progress: called with the stage and the fraction done.
+        options: `shape_codebook_size`, `shape_escape_fraction`.
+        context: threads, seed and progress.
 
     Returns:
         The codebook, or `None` if it would not make the file smaller.
@@ -153,10 +154,11 @@ def choose_shapes(
     if fraction is None and metric is None:
         fraction = _ESCAPES
     training = shapes.weights * shapes.fits
+    steps = replace(context, progress=null_progress)  # of each round
     codebook: ShapeCodebook | None = None
     for step in range(_ROUNDS):
-        progress("shapes", step / _ROUNDS)
-        entries, index = _cluster(shapes, training, size, parameters, options.seed, options.thread_count)
+        context.progress("shapes", step / _ROUNDS)
+        entries, index = _cluster(shapes, training, size, parameters, steps)
         errors, summand = _assignment_errors(shapes, entries, index, parameters)
         if fraction is None:
             assigned = _worth_assigning(shapes, errors, index, summand)
@@ -168,7 +170,7 @@ def choose_shapes(
         training = shapes.weights * assigned
     assert codebook is not None
     codebook = _keep_where_smaller(model, codebook, tiles, parameters)
-    progress("shapes", 1.0)
+    context.progress("shapes", 1.0)
     return codebook
 
 
@@ -336,27 +338,27 @@ def _points(covariances: F64) -> I16:
 
 
 def _cluster(
-    shapes: _ShapeInput, weights: F64, size: int, parameters: CodingParameters, seed: int, threads: int
+    shapes: _ShapeInput, weights: F64, size: int, parameters: CodingParameters, context: Context
 ) -> tuple[I32, I64]:
     """Train entries [6, K] on the file's lattices, and return them with the entry of each splat, [N]."""
     points = _points(shapes.covariances)
-    _, start = cluster(points, weights.astype(np.float32), size, seed=seed, threads=threads)
+    _, start = cluster(points, weights.astype(np.float32), size, context=context)
     entries = _centroids(shapes, weights, start.astype(np.int64), parameters)
-    index = _assign(shapes, points, entries, parameters, threads)
+    index = _assign(shapes, points, entries, parameters, context)
     for _ in range(1, 1 if shapes.metric is None else _METRIC_ROUNDS):
         entries = _centroids(shapes, weights, index, parameters)
-        index = _assign(shapes, points, entries, parameters, threads)
+        index = _assign(shapes, points, entries, parameters, context)
     return entries, index
 
 
-def _assign(shapes: _ShapeInput, points: I16, entries: I32, parameters: CodingParameters, threads: int) -> I64:
+def _assign(shapes: _ShapeInput, points: I16, entries: I32, parameters: CodingParameters, context: Context) -> I64:
     """Return the nearest entry of each splat, [N], under the metric if the shapes have a metric."""
     decoded = _dequantise(entries, parameters)[0]
-    index = search_nearest(points, _points(decoded).astype(np.int32), 0, threads)[0].astype(np.int64)
+    index = search_nearest(points, _points(decoded).astype(np.int32), 0, context)[0].astype(np.int64)
     if shapes.metric is None:
         return index
     vectors, centroids = _vectors(shapes.covariances)[:, :, None], _vectors(decoded)[:, :, None]
-    return reassign_by_metric(vectors, shapes.metric, centroids, index, threads, _CANDIDATES)
+    return reassign_by_metric(vectors, shapes.metric, centroids, index, context, _CANDIDATES)
 
 
 def _centroids(shapes: _ShapeInput, weights: F64, index: I64, parameters: CodingParameters) -> I32:

@@ -8,8 +8,9 @@ from dataclasses import asdict, dataclass, field
 from numbers import Real
 from typing import Any, Protocol
 
-from csplat._spec import MEASURE_NAMES
+from csplat._spec import HEADER_SIZE, MEASURE_NAMES
 from csplat.errors import InputError
+from csplat.sizes import Size, parse_size
 from csplat.types import PSNR_CAP
 
 _DROPS = (0.001, 60.0)  # allowed range of `max_psnr_drop`, dB
@@ -41,7 +42,7 @@ class Target:
 
     Attributes:
         psnr: least PSNR, dB, at most 99; the search finds the smallest such file, or the fewest splats.
-        size_bytes: largest size; the search finds the file with the best PSNR.
+        size: largest size, bytes or text such as "60kB"; the search finds the file with the best PSNR.
         max_psnr_drop: largest drop of the PSNR below the source's, 0.001 to 60 dB; the search finds the smallest such
             file, or the fewest splats.
         keep: fraction of the splats to keep, above 0, at most 1, at the precision of the preset.
@@ -56,7 +57,7 @@ class Target:
     """
 
     psnr: float | None = None
-    size_bytes: int | None = None
+    size: Size | None = None
     max_psnr_drop: float | None = None
     keep: float | None = None
     max_error: Mapping[str, float] = field(default_factory=dict)
@@ -64,6 +65,8 @@ class Target:
     effort: int = 3
 
     def __post_init__(self) -> None:
+        if self.size is not None:
+            object.__setattr__(self, "size", _file_size(self.size))
         for name, value in {**{name: getattr(self, name) for name in (*_ASKED, "effort")}, **self.max_error}.items():
             if value is not None and not isinstance(value, Real):
                 raise InputError(f"{name} is {value!r}, expected a number")
@@ -76,8 +79,6 @@ class Target:
             raise InputError(f"largest errors exclude {given[0]}: pruned and refitted splats have no bounds")
         if self.keep is not None and not self.prune:
             raise InputError("a kept fraction excludes prune=False")
-        if self.size_bytes is not None and self.size_bytes < 1:
-            raise InputError(f"the target size is {self.size_bytes} bytes, expected at least 1")
         if self.psnr is not None and not 0.0 < self.psnr <= PSNR_CAP:
             raise InputError(f"the target PSNR is {self.psnr:g} dB, expected above 0 and at most {PSNR_CAP:g}")
         if self.max_psnr_drop is not None and not _DROPS[0] <= self.max_psnr_drop <= _DROPS[1]:
@@ -95,6 +96,11 @@ class Target:
                 )
             if not (math.isfinite(bound) and bound > 0.0):
                 raise InputError(f"the largest error of {name} is {bound:g}, expected above 0")
+
+    @property
+    def size_bytes(self) -> int | None:
+        """`size` in bytes."""
+        return None if self.size is None else parse_size(self.size)
 
     @property
     def is_rendered(self) -> bool:
@@ -126,7 +132,15 @@ class Target:
         return {**given, "max_error": dict(self.max_error)} if self.max_error else given
 
 
-_ASKED = {"psnr": "a PSNR", "size_bytes": "a size", "max_psnr_drop": "a drop of PSNR", "keep": "a kept fraction"}
+def _file_size(size: Size) -> int:
+    """Return the number of bytes of a size; a bare number below that of the smallest file lacks its unit."""
+    count = parse_size(size)
+    if count <= HEADER_SIZE:
+        raise InputError(f"no file has {count} bytes or fewer; did you mean {str(size).strip()}MB?")
+    return count
+
+
+_ASKED = {"psnr": "a PSNR", "size": "a size", "max_psnr_drop": "a drop of PSNR", "keep": "a kept fraction"}
 
 
 @dataclass(frozen=True)
@@ -142,7 +156,7 @@ class SearchReport:
         reached: largest errors of the file by measure, for bounded measures.
         psnr: PSNR of the file on the test views against renders of the source, dB; `None`, like the following fields,
             if nothing was rendered.
-        photographs: PSNR of `file` and `source` against the test images, if any.
+        images: PSNR of `file` and `source` against the test images, if any.
         worst_psnr: PSNR of the worst view, dB.
         spread: standard deviation of the PSNR over other choices of such views, dB.
         elsewhere: PSNR on virtual views that were not used in the search, dB, by kind.
@@ -162,7 +176,7 @@ class SearchReport:
     seconds: float
     reached: dict[str, float] = field(default_factory=dict)
     psnr: float | None = None
-    photographs: dict[str, float] = field(default_factory=dict)
+    images: dict[str, float] = field(default_factory=dict)
     worst_psnr: float | None = None
     spread: float | None = None
     elsewhere: dict[str, float] = field(default_factory=dict)

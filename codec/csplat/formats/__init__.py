@@ -18,6 +18,7 @@ from urllib.parse import urlsplit
 
 from csplat._spec import MAGIC
 from csplat.byte_store import Store
+from csplat.context import Context
 from csplat.decoder import Limits, decode
 from csplat.detect import detect_content, detect_name, read_head, refusal
 from csplat.disk_files import local_file, size_on_disk, temporary_folder, work_folder
@@ -193,6 +194,7 @@ def open(
         scene = _version_of(file_format, scene, path.name, level, max_splats, sh_degree)
         if not scene.format:
             scene = scene.changed(format=file_format.name, name=path.name, size_bytes=size_on_disk(path))
+        scene.identity = {"name": path.name, "size": scene.size_bytes, "changed": path.stat().st_mtime_ns}
         return scene.keep_open(stack.pop_all())  # which closes a `SplatFile` itself a second time, without effect
 
 
@@ -381,11 +383,11 @@ def format_by_name(name: str) -> Format:
 
 
 def _write_csplat(path: Path, scene: Scene) -> None:
-    from csplat.encoder import EncodeOptions  # imported lazily: reading does not load the encoder
-    from csplat.out_of_core import OutOfCoreOptions, encode_scene
+    from csplat.encode_api import encode  # imported lazily: reading does not load the encoder
+    from csplat.encoder import EncodeOptions
 
     with tempfile.TemporaryDirectory(prefix=".csplat-", dir=work_folder(path)) as folder:
-        encode_scene(scene, path, EncodeOptions(keep_extra=True), OutOfCoreOptions(folder=Path(folder) / "work"))
+        encode(scene, EncodeOptions(keep_extra=True), out=path, context=Context(folder=Path(folder) / "work"))
 
 
 _PLY_FORMAT = Format(

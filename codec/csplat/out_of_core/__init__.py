@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from csplat.out_of_core.disk_encode import EncodingCost, OutOfCoreOptions, encode_scene, estimate_cost
+from csplat.out_of_core.disk_encode import EncodingCost, encode_on_disk, estimate_cost, working_folder
 
-__all__ = ["EncodingCost", "OutOfCoreOptions", "encode_scene", "estimate_cost"]
+__all__ = ["EncodingCost", "encode_on_disk", "estimate_cost", "working_folder"]

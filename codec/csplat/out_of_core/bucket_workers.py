@@ -32,7 +32,6 @@ from csplat.file_source import open_binary
 from csplat.out_of_core.disk_buckets import Bucket, damaged_file, read_bucket, write_splats
 from csplat.scene import join_blocks
 from csplat.system import map_in_processes
-from csplat.types import null_progress
 
 _HEAD = struct.Struct("<QI")  # size and CRC-32 of the records
 
@@ -64,27 +63,24 @@ def roots_path(folder: Path, bucket: Bucket) -> Path:
     return folder / f"roots-{bucket.index:06}"
 
 
-def code_buckets(
-    coding: BucketCoding, buckets: Sequence[Bucket], workers: int, scheduler: str | None
-) -> Iterator[Bucket]:
+def code_buckets(coding: BucketCoding, buckets: Sequence[Bucket], workers: int | str) -> Iterator[Bucket]:
     """Code buckets, and yield each when it is done.
 
     Args:
         coding: parameters of all buckets.
         buckets: the buckets to code.
-        workers: number of processes; 1: only this process.
-        scheduler: address of a Dask scheduler, whose workers code instead, and access the working folder under the
-            same path; Dask repeats the work of a lost worker.
+        workers: number of processes; 1: only this process. Or the address of a Dask scheduler, whose workers code
+            instead, and access the working folder under the same path; Dask repeats the work of a lost worker.
 
     Raises:
         InputError: a value does not fit on the lattice, a file is damaged, or `dask.distributed` is not installed.
         OSError: a file cannot be read or written; a process was killed; the scheduler does not respond.
     """
-    if scheduler is None:
+    if isinstance(workers, int):
         for bucket, _ in map_in_processes(_code_bucket, coding, buckets, workers):
             yield bucket
         return
-    with open_client(scheduler) as client, client.as_current():
+    with open_client(workers) as client, client.as_current():
         shared = client.scatter(coding, broadcast=True)
         futures = {client.submit(_code_bucket, shared, bucket, pure=False): bucket for bucket in buckets}
         for future in import_module("distributed").as_completed(list(futures)):
@@ -140,16 +136,16 @@ def _code_bucket(coding: BucketCoding, bucket: Bucket) -> None:
 def _encode_bucket(coding: BucketCoding, bucket: Bucket) -> EncodedTiles:
     """Encode a bucket, with its levels of detail and their errors if there are any; write its coarsest nodes."""
     model = clip_scales(read_bucket(coding.folder, coding.plan.model, bucket))
-    threads = coding.plan.options.threads
+    context = coding.plan.context
     plan = replace(coding.plan, model=model, origin=Origin(len(model), np.arange(len(model))))
-    sh_plan = assign_splats(coding.codebooks, model, plan.parameters, plan.options.thread_count)
+    sh_plan = assign_splats(coding.codebooks, model, plan.parameters, context)
     codebooks = replace(coding.codebooks, sh_plan=sh_plan)
     if coding.levels is None:
         return encode_tiles(replace(plan, tiles=cut_scene(model, plan.parameters)), codebooks)
-    nodes = coding.levels.build_part(model, coding.plan.origin.source_count, threads)
+    nodes = coding.levels.build_part(model, coding.plan.origin.source_count, context)
     roots = [node.splats for node in nodes if node.parent is None and node.splats is not None]
     write_splats(roots_path(coding.folder, bucket), join_blocks(roots[0], roots))
-    return coding.levels.measure(encode_levels(plan, nodes, codebooks), threads, null_progress)
+    return coding.levels.measure(encode_levels(plan, nodes, codebooks), context)
 
 
 def read_coded(folder: Path, bucket: Bucket) -> tuple[list[EncodedTile], list[FileNode]]:

@@ -1,10 +1,9 @@
-"""Encode a scene of any size to a file: in memory if it fits, otherwise in buckets on disk."""
+"""Encode a scene in buckets on disk if it does not fit in memory, and estimate the cost of an encoding."""
 
 from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from csplat import __version__
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import atomic_writer
-from csplat.encoder import EncodedTiles, EncodeOptions, EncodePlan, EncodeReport, Origin, encode_tiles
+from csplat.encoder import EncodedTiles, EncodeOptions, EncodePlan, EncodeReport, Origin
 from csplat.encoder.container import FileNode, order_nodes
 from csplat.encoder.error_bounds import ErrorSums
 from csplat.encoder.levels import LevelBuilder, encode_coarse
@@ -28,8 +28,6 @@ from csplat.out_of_core.bucket_workers import (
 )
 from csplat.out_of_core.disk_buckets import PENDING_BYTES, DiskBuckets, read_splats, splat_bytes
 from csplat.scene import Scene
-from csplat.system import default_memory_bytes
-from csplat.types import Progress, null_progress
 
 _MB = 1_000_000
 _PROGRAM = 120 * _MB  # memory of a process that has loaded the encoder
@@ -52,33 +50,6 @@ _FILE_BYTES = {
     "balanced": (6.5, 8.0, 8.5, 9.0, 9.3),
     "small": (5.0, 6.5, 7.0, 7.5, 7.6),
 }
-
-
-@dataclass(frozen=True)
-class OutOfCoreOptions:
-    """Options for encoding scenes that may be larger than memory.
-
-    Attributes:
-        memory_bytes: limit of the memory of all processes together; `None`: half of the free memory. The file does not
-            depend on it.
-        folder: working folder; `None`: the path of the file with the suffix `.work`.
-        resume: continue an interrupted encoding if the working folder exists.
-        scheduler: address of a Dask scheduler whose workers code the buckets; they access the working folder under the
-            same path.
-        always: encode scenes of several buckets on disk, even if they fit in memory.
-    """
-
-    memory_bytes: int | None = None
-    folder: str | os.PathLike[str] | None = None
-    resume: bool = False
-    scheduler: str | None = None
-    always: bool = False
-
-    def working_folder(self, target: str | os.PathLike[str]) -> Path:
-        """Return the path of the working folder of a file; the name of a file of 251 to 255 bytes is shortened."""
-        path = Path(target)
-        name = path.name if len(os.fsencode(path.name)) <= _NAME_BYTES_MAX else path.name[:_NAME_PART]
-        return path.with_name(f"{name}.work") if self.folder is None else Path(self.folder)
 
 
 @dataclass(frozen=True)
@@ -109,43 +80,54 @@ class EncodingCost:
         return {**asdict(self), "seconds": round(self.seconds, 1)}
 
 
+def working_folder(context: Context, out: str | os.PathLike[str]) -> Path:
+    """Return the path of the working folder of a file; the name of a file of 251 to 255 bytes is shortened."""
+    path = Path(out)
+    name = path.name if len(os.fsencode(path.name)) <= _NAME_BYTES_MAX else path.name[:_NAME_PART]
+    return path.with_name(f"{name}.work") if context.folder is None else Path(context.folder)
+
+
 def estimate_cost(
     scene: Scene,
     options: EncodeOptions,
-    limits: OutOfCoreOptions | None = None,
+    context: Context = DEFAULT_CONTEXT,
     levels: LevelBuilder | None = None,
+    *,
+    out: str | os.PathLike[str] | None = None,
 ) -> EncodingCost:
     """Estimate the cost of an encoding, and decide where it takes place.
 
     Args:
         scene: the scene; its blocks are not read.
         options: options of the encoder.
-        limits: memory and disk.
+        context: threads, workers and memory; whether to resume.
         levels: builds levels of detail; `None`: the file has none.
+        out: path of the file, whose interrupted encoding is continued on disk; `None`: unknown.
 
     Raises:
         InputError: there is too little memory.
     """
-    limits = limits or OutOfCoreOptions()
     count, degree = scene.count, options.kept_degree(scene.sh_degree)
-    bound = default_memory_bytes() if limits.memory_bytes is None else limits.memory_bytes
+    bound = context.memory_limit
+    resumes = context.resume and out is not None and working_folder(context, out).exists()
     row = splat_bytes(_with_written_columns(scene, options).empty())
-    workers, passes, disk = options.thread_count, 1, int(count * row * _CODED)
+    processes = context.workers if isinstance(context.workers, int) else context.thread_count
+    workers, passes, disk = context.thread_count, 1, int(count * row * _CODED)
     per_bucket = min(count, options.bucket_splats)
     is_one = count <= (options.bucket_splats if levels is None else levels.whole_splats)
     building = 0 if levels is None else _building_bytes(count if is_one else per_bucket, row)
     memory = least = _PROGRAM + int(count * row * _WHOLE_ROW) + building
     # Building levels takes most of the time, and processes share it better than threads.
-    in_memory = is_one or (levels is None and memory <= bound and not limits.always and limits.scheduler is None)
+    in_memory = is_one or (levels is None and memory <= bound and context.workers is None and not resumes)
     if not in_memory:
         if options.shape_codebook_size:
             raise InputError(f"a codebook of shapes requires the scene in memory, about {memory / _MB:,.0f} MB")
         worker = _PROGRAM + int(per_bucket * row * _PER_ROW) + building
         memory = least = worker + PENDING_BYTES
-        workers, passes, disk = max(1, min(workers, (bound - _PROGRAM) // worker)), 4, disk + count * row
+        workers, passes, disk = max(1, min(processes, (bound - _PROGRAM) // worker)), 4, disk + count * row
         if workers > 1:
             memory = max(memory, _PROGRAM + workers * worker)
-    if least > bound and not (in_memory and limits.memory_bytes is None):
+    if least > bound and not (in_memory and context.memory is None):
         raise InputError(
             f"{bound / _MB:,.0f} MB of memory are too little for this scene, which requires {least / _MB:,.0f} MB"
         )
@@ -163,69 +145,45 @@ def _building_bytes(count: int, row: int) -> int:
     return _LEVEL_RENDERS + int(count * (row * _LEVEL_ROWS + _LEVEL_SPLAT))
 
 
-def encode_scene(
+def encode_on_disk(
     scene: Scene,
-    target: str | os.PathLike[str],
-    options: EncodeOptions | None = None,
-    limits: OutOfCoreOptions | None = None,
-    *,
+    out: str | os.PathLike[str],
+    options: EncodeOptions,
+    context: Context = DEFAULT_CONTEXT,
     levels: LevelBuilder | None = None,
-    source: Mapping[str, Any] | None = None,
-    progress: Progress | None = None,
 ) -> EncodeReport:
-    """Encode a scene that is read block by block; the bytes are the same as with `encode`.
-
-    A scene that does not fit in memory is sorted into buckets of neighbours in a working folder on disk. The buckets
-    are coded one by one, by `options.threads` processes. If the encoding is interrupted, finished work stays in the
-    folder. Scripts must guard their own code by `if __name__ == "__main__":`, because worker processes import it.
+    """Encode a scene of several buckets that is read block by block, see `csplat.encode`.
 
     Args:
-        scene: the scene, for example from `csplat.open`.
-        target: path of the file, which appears when complete.
+        scene: the scene.
+        out: path of the file, which appears when complete.
         options: options of the encoder.
-        limits: memory, disk and workers.
-        levels: builds levels of detail (`csplat_tools.level_builder`); `None`: the file has none.
-        source: identity of the scene, JSON-compatible; checked when resuming.
-        progress: called with the stage and the completed fraction of it, 0 to 1.
+        context: threads, workers, memory, working folder, whether to resume, seed and progress.
+        levels: builds levels of detail; `None`: the file has none.
 
     Returns:
         The chosen parameters and the error bounds that the file declares.
 
     Raises:
-        InputError: as `encode`; the memory limit is too low; the disk is too small; the folder already exists,
-            belongs to another scene or is damaged.
-        CsplatError: the scene cannot be read.
-        OSError: a file cannot be read or written; or a worker was killed.
+        CsplatError, OSError: as in `csplat.encode`.
     """
-    options, limits, progress = options or EncodeOptions(), limits or OutOfCoreOptions(), progress or null_progress
-    folder = limits.working_folder(target)
-    if limits.resume and folder.exists():
-        limits = replace(limits, always=True)
-    cost = estimate_cost(scene, options, limits, levels)
+    cost = estimate_cost(scene, options, context, levels, out=out)
     settings = {} if levels is None else {"levels": levels.settings(scene.count)}
-    if cost.in_memory:
-        if levels is None:
-            encoded = encode_tiles(EncodePlan.of(scene.model(), options, progress=progress), progress=progress)
-        else:
-            plan = EncodePlan.of(scene.model(), options, progress=progress)
-            encoded = levels.encode_plan(plan, progress=progress)
-        with atomic_writer(target) as stream:
-            return encoded.write_to(stream, settings, progress=progress)
-    scene = _with_written_columns(scene, options)
     key = {
-        "source": dict(source or {}),
-        "options": options.chosen(),
+        "source": dict(scene.identity),
+        "options": {**options.chosen(), "seed": context.seed},
         "splats": scene.count,
         "csplat": __version__,
         "levels": settings.get("levels"),
     }
     store = DiskBuckets.of(
-        scene, folder, key, bucket_splats=options.bucket_splats, resume=limits.resume, disk_bytes=cost.disk_bytes,
-        progress=progress,
+        _with_written_columns(scene, options), working_folder(context, out), key, bucket_splats=options.bucket_splats,
+        resume=context.resume, disk_bytes=cost.disk_bytes, progress=context.progress,
     )  # fmt: skip
-    encoded = _encode_buckets(store, options, cost.workers, limits.scheduler, levels, progress)
-    with atomic_writer(target) as stream:
-        report = encoded.write_to(stream, settings, progress=progress)
+    workers = context.workers if isinstance(context.workers, str) else cost.workers
+    encoded = _encode_buckets(store, options, replace(context, workers=workers), levels)
+    with atomic_writer(out) as stream:
+        report = encoded.write_to(stream, settings, context.progress)
     store.remove()
     return report
 
@@ -236,30 +194,32 @@ def _with_written_columns(scene: Scene, options: EncodeOptions) -> Scene:
 
 
 def _encode_buckets(
-    store: DiskBuckets,
-    options: EncodeOptions,
-    workers: int,
-    scheduler: str | None,
-    levels: LevelBuilder | None,
-    progress: Progress,
+    store: DiskBuckets, options: EncodeOptions, context: Context, levels: LevelBuilder | None
 ) -> EncodedTiles:
-    """Plan the encoding on the sample, encode the buckets that are not encoded yet, and the levels above them."""
+    """Plan the encoding on the sample, encode the buckets that are not encoded yet, and the levels above them.
+
+    Args:
+        store: the sorted scene.
+        options, levels: as in `encode_on_disk`.
+        context: likewise; the number of its workers is that of the processes.
+    """
     count, buckets = sum(store.counts), store.buckets
     origin = Origin(count, np.zeros(0, np.int64))
-    plan, codebooks = EncodePlan.of_buckets(store, options, origin, progress).choose_sh_coding(progress)
+    plan, codebooks = EncodePlan.of_buckets(store, options, origin, context).choose_sh_coding()
     left = [bucket for bucket in buckets if not coded_path(store.folder, bucket).exists()]
     uncoded = Counter(bucket.section for bucket in left)
     for section in set(range(len(store.counts))) - set(uncoded):
         store.remove_section(section)
     done = count - sum(bucket.stop - bucket.start for bucket in left)
-    threads = options.threads if workers == 1 and scheduler is None else 1
-    coding = BucketCoding(store.folder, replace(plan, options=replace(options, threads=threads)), codebooks, levels)
-    for bucket in code_buckets(coding, left, workers, scheduler):
+    # A context that worker processes receive has no progress callback.
+    alone = Context(threads=context.threads if context.workers == 1 else 1, seed=context.seed)
+    coding = BucketCoding(store.folder, replace(plan, context=alone), codebooks, levels)
+    for bucket in code_buckets(coding, left, context.workers or 1):
         uncoded[bucket.section] -= 1
         if not uncoded[bucket.section]:
             store.remove_section(bucket.section)
         done += bucket.stop - bucket.start
-        progress("coding", done / count)
+        context.progress("coding", done / count)
     tiles, nodes, roots = list[EncodedTile](), list[FileNode](), list[list[int]]()
     for bucket in buckets:
         leaves, part = read_coded(store.folder, bucket)
@@ -274,14 +234,14 @@ def _encode_buckets(
         read_splats(roots_path(store.folder, bucket), plain, sum(nodes[number].splat_count for number in numbers))
         for bucket, numbers in zip(buckets, roots, strict=True)
     )
-    parents, top = levels.build_top(parts, options.threads, progress)
+    parents, top = levels.build_top(parts, context)
     for numbers, parent in zip(roots, parents, strict=False):
         for number in numbers:
             nodes[number] = replace(nodes[number], parent=None if parent is None else parent + len(nodes))
     nodes += [
         _renumbered(FileNode(node.parent, encode_coarse(node, plan, codebooks)), len(nodes)) for node in top
     ]  # fmt: skip
-    return levels.measure(replace(encoded, nodes=order_nodes(nodes)), options.threads, progress)
+    return levels.measure(replace(encoded, nodes=order_nodes(nodes)), context)
 
 
 def _renumbered(node: FileNode, first: int) -> FileNode:

@@ -128,7 +128,7 @@ test('a reader returns the same tiles as a whole decode', async () => {
         assert.equal(hash(tile.extra[column]), hash(values.slice(first, first + splatCount)), `${name} ${column}`);
       }
     }
-    const { metadata, cameras, options, statedErrors } = whole;
-    assert.deepEqual(await reader.describe(), { metadata, cameras, options, statedErrors });
+    const { metadata, cameras, options, declaredErrors } = whole;
+    assert.deepEqual(await reader.describe(), { metadata, cameras, options, declaredErrors });
   }
 });

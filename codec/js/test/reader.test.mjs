@@ -34,7 +34,7 @@ test('with a small first request each part is fetched separately', async (t) => 
     metadata: whole.metadata,
     cameras: whole.cameras,
     options: whole.options,
-    statedErrors: whole.statedErrors,
+    declaredErrors: whole.declaredErrors,
   });
 });
 

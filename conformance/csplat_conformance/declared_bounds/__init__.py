@@ -1,4 +1,4 @@
-"""Verify declared error bounds: the errors that a file states against its source (spec 5.5, chunk SERR).
+"""Verify declared error bounds: the errors that a file declares against its source (spec 5.5, chunk SERR).
 
     >>> from csplat_conformance.declared_bounds import Source, verify_bounds
     >>> verify_bounds(Source.of(model), scene.model, scene.header, scene.declared_bounds).holds     # doctest: +SKIP

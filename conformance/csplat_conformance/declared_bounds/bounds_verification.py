@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import DeclaredBounds, SceneHeader
 from csplat.disk_files import finite_or_none
 from csplat.model import SplatModel
@@ -112,20 +113,21 @@ class BoundsVerification:
         if self.measures and not self.rms_verified:
             notes.append(_NEEDS_INDEX)
         if self.unverified:
-            notes.append(f"not proved: {', '.join(self.unverified)}: the file states no error of them, compare renders")
+            names = ", ".join(self.unverified)
+            notes.append(f"not proved: {names}: the file declares no bounds for them, compare renders")
         return tuple(notes)
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values; errors that overflowed are `null`."""
         return {
-            "rms_and_counts_proved": self.rms_verified and self.holds,
+            "rms_and_counts_verified": self.rms_verified and self.holds,
             "failures": list(self.failures),
-            "not_proved": list(self.unverified),
+            "unverified": list(self.unverified),
             "notes": list(self.notes),
             "measures": {
                 measure.name: {
-                    "stated_max": measure.declared_max,
-                    "stated_rms": measure.declared_rms,
+                    "declared_max": measure.declared_max,
+                    "declared_rms": measure.declared_rms,
                     "measured_max": finite_or_none(measure.measured_max),
                     "measured_rms": finite_or_none(measure.measured_rms),
                     "holds": measure.holds,
@@ -140,10 +142,10 @@ def verify_bounds(
     source: Source,
     decoded: SplatModel,
     header: SceneHeader,
-    stated: DeclaredBounds | None,
+    declared: DeclaredBounds | None,
     source_index: NDArray[Any] | None = None,
     *,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> BoundsVerification:
     """Verify the error bounds of a decoded file against its source.
 
@@ -151,27 +153,27 @@ def verify_bounds(
         source: the encoded scene.
         decoded: the decoded file.
         header: the file's header and index.
-        stated: the error bounds of the file; `None` if it declares none.
+        declared: the error bounds of the file; `None` if it declares none.
         source_index: [N] integers, the source splat of each splat of the file; `None` if unknown.
-        progress: called with the progress of the search for partners.
+        context: threads, and progress of the search for partners.
 
     Raises:
         InputError: `source_index` does not contain one index of a source splat for each splat of the file.
     """
-    claims = _read_claims(measure_names(source, decoded), len(source), source.sh_degree, header, stated)
+    claims = _read_claims(measure_names(source, decoded), len(source), source.sh_degree, header, declared)
     if claims.wrong:
         return _outcome(claims)
     if source_index is not None:
         check_source_index(source_index, len(source), len(decoded))
         pairs = PairErrors(
-            measure_pairs(source, decoded, source_index),
+            measure_pairs(source, decoded, source_index, context=context),
             find_wrong_extras(source, decoded, source_index),
             source.reach(decoded.origin),
         )
         return _judge_pairs(claims, header, pairs, source_index)
     if "means" not in claims.bounds:  # there is no search radius
         return _outcome(replace(claims, unverified=claims.names if header.splat_count else ()))
-    return _search_partners(claims, source, decoded, header, progress)
+    return _search_partners(claims, source, decoded, header, context)
 
 
 def verify_bounds_by_tile(
@@ -180,7 +182,7 @@ def verify_bounds_by_tile(
     source_index: NDArray[Any],
     splats_max: int,
     *,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> BoundsVerification:
     """Verify the error bounds of a file in bounded memory, with the result of `verify_bounds`.
 
@@ -191,7 +193,7 @@ def verify_bounds_by_tile(
     claims = _read_claims(names, scene.count, degree, opened.header, opened.declared_bounds)
     if claims.wrong:
         return _outcome(claims)
-    pairs = measure_pairs_by_tile(scene, opened, source_index, splats_max, progress=progress)
+    pairs = measure_pairs_by_tile(scene, opened, source_index, splats_max, context=context)
     return _judge_pairs(claims, opened.header, pairs, source_index)
 
 
@@ -213,19 +215,20 @@ class _Claims:
 
 
 def _read_claims(
-    names: Sequence[str], source_count: int, source_degree: int, header: SceneHeader, stated: DeclaredBounds | None
+    names: Sequence[str], source_count: int, source_degree: int, header: SceneHeader, declared: DeclaredBounds | None
 ) -> _Claims:
-    if stated is None:
-        return _Claims(tuple(names), {}, tuple(names), [("SER-6", "the file states no errors")])
-    bounds = {record.measure: (record.max, record.rms) for record in stated.records}
+    if declared is None:
+        return _Claims(tuple(names), {}, tuple(names), [("SER-6", "the file declares no bounds")])
+    bounds = {record.measure: (record.max, record.rms) for record in declared.records}
     unverified = tuple(name for name in names if name not in bounds) if header.splat_count else ()
     wrong = []
-    if source_count != stated.source_count:
-        wrong.append(("SER-5", f"the source has {source_count} splats, the file states {stated.source_count}"))
-    if source_degree != stated.source_sh_degree:
-        wrong.append(("SER-5", f"the source has SH degree {source_degree}, the file states {stated.source_sh_degree}"))
-    if not stated.refitted:
-        wrong += [("SER-6", f"the file states no error of {name}") for name in unverified]
+    if source_count != declared.source_count:
+        wrong.append(("SER-5", f"the source has {source_count} splats, the file declares {declared.source_count}"))
+    if source_degree != declared.source_sh_degree:
+        degree = declared.source_sh_degree
+        wrong.append(("SER-5", f"the source has SH degree {source_degree}, the file declares {degree}"))
+    if not declared.refitted:
+        wrong += [("SER-6", f"the file declares no bound for {name}") for name in unverified]
     return _Claims(tuple(names), bounds, unverified, wrong)
 
 
@@ -262,22 +265,22 @@ def _judge_pairs(
 
 
 def find_contradictions(
-    name: str, found: tuple[float, float], stated: tuple[float, float], reach: float, worst: WorstSplat | None
+    name: str, found: tuple[float, float], declared: tuple[float, float], reach: float, worst: WorstSplat | None
 ) -> list[str]:
     """Return a line for each declared bound that is below the true error, or further above it than SER-5 allows.
 
     Args:
         name: name of the measure.
         found: (max, rms) as measured.
-        stated: (max, rms) as declared.
+        declared: (max, rms) as in the file.
         reach: see `bound_tolerance`.
         worst: the splat with the largest error.
     """
     lines = []
-    for kind, true, declared in zip(("max", "rms"), found, stated, strict=True):
-        if is_valid_bound(name, declared, true, reach):
+    for kind, true, bound in zip(("max", "rms"), found, declared, strict=True):
+        if is_valid_bound(name, bound, true, reach):
             continue
-        line = f"{name}: {kind} {true:.9g} is {'above' if declared < true else 'well below'} the stated {declared:.9g}"
+        line = f"{name}: {kind} {true:.9g} is {'above' if bound < true else 'well below'} the declared {bound:.9g}"
         if kind == "max" and worst is not None:
             line += f": splat {worst.splat} (tile {worst.tile}), source splat {worst.source_splat}"
         lines.append(line)
@@ -294,11 +297,11 @@ def tile_of(header: SceneHeader, splat: int) -> int:
 
 
 def _search_partners(
-    claims: _Claims, source: Source, decoded: SplatModel, header: SceneHeader, progress: Progress | None
+    claims: _Claims, source: Source, decoded: SplatModel, header: SceneHeader, context: Context
 ) -> BoundsVerification:
     bounds = claims.bounds
     largest = {name: pair[0] for name, pair in bounds.items()}
-    partners = find_partners(source, decoded, largest, lattice_radii(decoded, header), progress=progress)
+    partners = find_partners(source, decoded, largest, lattice_radii(decoded, header), context=context)
     alone = np.flatnonzero(partners == UNMATCHED)
     undecided = int(np.count_nonzero(partners == UNDECIDED))
     lines = []
@@ -307,11 +310,11 @@ def _search_partners(
     worst: dict[str, WorstSplat] = {}
     searched_count = min(_SEARCHED_MAX, max(_SEARCHED_MIN, _DISTANCES_MAX // max(1, len(source))))
     if len(alone):
-        worst = _find_worst(source, decoded, header, largest, alone[:searched_count], progress)
+        worst = _find_worst(source, decoded, header, largest, alone[:searched_count], context.progress)
         many = f"{len(alone)} splats of the file have" if len(alone) > 1 else "1 splat of the file has"
-        lines.append(f"{many} no splat of the source within the stated maxima")
+        lines.append(f"{many} no splat of the source within the declared maxima")
         lines += [
-            f"{name}: {splat.found:.9g} is above the stated {largest[name]:.9g}: splat {splat.splat}"
+            f"{name}: {splat.found:.9g} is above the declared {largest[name]:.9g}: splat {splat.splat}"
             f" (tile {splat.tile}), nearest source splat {splat.source_splat}"
             for name, splat in worst.items()
         ]
@@ -337,7 +340,7 @@ def _find_worst(
     header: SceneHeader,
     bounds: Mapping[str, float],
     rows: I64,
-    progress: Progress | None,
+    progress: Progress,
 ) -> dict[str, WorstSplat]:
     """Return by measure the splat of `rows` that exceeds its bound most.
 
@@ -349,8 +352,7 @@ def _find_worst(
     reach, source = source.reach(decoded.origin), source.about(decoded.origin)
     means = source.means.astype(np.float64)
     for done, row in enumerate(rows.tolist()):
-        if progress is not None:
-            progress("searching the nearest splats", done / len(rows))
+        progress("searching the nearest splats", done / len(rows))
         near = _nearest_points(means, decoded.means[row])
         errors = pair_differences(source, decoded, near, np.full(len(near), row))
         largest = {name: np.abs(errors[name]).max(axis=1) for name in bounds if name in errors}

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE, SplatModel
 from csplat.types import F32, F64
@@ -160,7 +161,7 @@ def _bands(source: Source | SplatModel, decoded: SplatModel) -> range:
 
 
 def measure_pairs(
-    source: Source, decoded: SplatModel, source_index: SplatRows, *, threads: int | None = None
+    source: Source, decoded: SplatModel, source_index: SplatRows, *, context: Context = DEFAULT_CONTEXT
 ) -> dict[str, MeasuredError]:
     """Measure the errors of decoded splats compared with their source splats.
 
@@ -168,7 +169,7 @@ def measure_pairs(
         source: the encoded scene.
         decoded: the decoded file, N splats.
         source_index: [N] integers; decoded splat i was source splat `source_index[i]`.
-        threads: number of threads, one per core by default. The result does not depend on it.
+        context: threads.
 
     Returns:
         The errors by measure. The maximum is over components; the square of a vector is the sum over components. A
@@ -184,7 +185,7 @@ def measure_pairs(
         errors = pair_differences(source, decoded, source_index[rows], rows)
         return {name: _reduce(values, start) for name, values in errors.items()}
 
-    with ThreadPoolExecutor(threads) as pool:
+    with ThreadPoolExecutor(context.threads) as pool:
         blocks = list(pool.map(measure_block, range(0, len(decoded), _BLOCK)))
     return {
         name: _combine_blocks([block[name] for block in blocks], len(decoded))

@@ -17,9 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from csplat import _spec
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import SceneHeader
 from csplat.model import SplatModel
-from csplat.types import F64, I64, U64, Progress
+from csplat.types import F64, I64, U64
 from csplat_conformance.declared_bounds.measurement import Source, pair_differences
 from csplat_conformance.tolerance import bound_tolerance
 
@@ -44,8 +45,7 @@ def find_partners(
     radii: F64,
     *,
     candidates_max: int = _CANDIDATES_MAX,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> I64:
     """Find a source splat within the bounds for each decoded splat.
 
@@ -56,8 +56,7 @@ def find_partners(
             compared.
         radii: [N], distance within which the partner's centre is expected; the search goes on up to the bound.
         candidates_max: largest number of splats of one cell to compare with one splat.
-        threads: number of threads, one per core by default. The result does not depend on it.
-        progress: called with the fraction of the splats that have a partner.
+        context: threads, and progress as the fraction of the splats that have a partner.
 
     Returns:
         [N] index of a source splat within the bounds, `UNMATCHED` or `UNDECIDED`.
@@ -77,11 +76,10 @@ def find_partners(
             continue
         search = partial(_search_grid, _Grid(source, float(radius), bounds), source, decoded, bounds, candidates_max)
         parts = [rows[start : start + _BLOCK] for start in range(0, len(rows), _BLOCK)]
-        with ThreadPoolExecutor(threads) as pool:
+        with ThreadPoolExecutor(context.threads) as pool:
             for part, matches in zip(parts, pool.map(search, parts), strict=True):
                 partners[part] = matches
-                if progress is not None:
-                    progress(STAGE, float(np.count_nonzero(partners >= 0)) / len(partners))
+                context.progress(STAGE, float(np.count_nonzero(partners >= 0)) / len(partners))
     return partners
 
 

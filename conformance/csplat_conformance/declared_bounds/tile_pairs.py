@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import SceneHeader, Tile
 from csplat.scene import BLOCK_SPLATS, Scene
 from csplat.splat_file import SplatFile
-from csplat.types import Progress, null_progress
+from csplat.types import Progress
 from csplat_conformance.declared_bounds.measurement import (
     PairErrors,
     Source,
@@ -60,7 +61,7 @@ def measure_pairs_by_tile(
     source_index: NDArray[Any],
     splats_max: int,
     *,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> PairErrors:
     """Measure the errors of a file's splats, as `measure_pairs` does in memory.
 
@@ -69,7 +70,7 @@ def measure_pairs_by_tile(
         opened: the file.
         source_index: [N] integers, the source splat of each splat of the file; may be memory-mapped.
         splats_max: largest number of source splats to hold at once, if no tile has more.
-        progress: called with the progress of the comparison.
+        context: threads and progress.
 
     Raises:
         InputError: `source_index` does not contain one index of a source splat for each splat of the file, or the
@@ -81,7 +82,7 @@ def measure_pairs_by_tile(
     groups = list(_groups(opened.header, splats_max)) or [[]]
     parts, lines, reach = [], {}, 0.0
     for number, tiles in enumerate(groups):
-        report = partial(_report_part, progress or null_progress, number, len(groups))
+        report = partial(_report_part, context.progress, number, len(groups))
         start = tiles[0].start if tiles else 0
         rows = source_index[start : start + sum(tile.splat_count for tile in tiles)]
         order = np.argsort(rows)
@@ -98,7 +99,7 @@ def measure_pairs_by_tile(
         models = opened.models([tile.index for tile in tiles]) if tiles else [opened.empty()]
         for decoded in models:
             own, positions = np.split(positions, [len(decoded)])
-            parts.append((start, len(decoded), measure_pairs(source, decoded, own)))
+            parts.append((start, len(decoded), measure_pairs(source, decoded, own, context=context)))
             lines.update(dict.fromkeys(find_wrong_extras(source, decoded, own)))
             start += len(decoded)
     return PairErrors(merge_errors(parts), list(lines), reach)

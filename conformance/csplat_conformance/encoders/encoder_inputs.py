@@ -451,7 +451,7 @@ def unusual_inputs() -> list[EncoderInput]:
         ),
         rows_input(
             "nasty/degree_5",
-            "105 columns f_rest: csplat's highest degree is 4, and the file has to state the source's",
+            "105 columns f_rest: csplat's highest degree is 4, and the file has to declare the source's",
             lambda: cloud(64, 5, 42),
             renders=False,
         ),

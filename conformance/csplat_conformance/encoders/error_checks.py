@@ -60,7 +60,7 @@ _ROWS_MAX = 4096  # splats to examine
 _SAME_ROTATION_MIN = 0.8  # smallest cosine of half the angle between rotations that are compared
 
 _NOT_PAIRED = "the source splat of each splat is unknown"
-_NO_BOUNDS = "the file states no errors"
+_NO_BOUNDS = "the file declares no bounds"
 _TRUNCATED = "truncated instead of rounded?"
 
 
@@ -78,24 +78,24 @@ def check_errors(case: EncoderInput, scene: DecodedScene, pairs: SplatPairs) -> 
     source = case.source() if case.source is not None else None
     if source is None or pairs.strays or pairs.surplus:
         return Verdict(Status.SKIPPED, _NOT_PAIRED), ""
-    stated = scene.declared_bounds
-    if stated is None:
+    declared = scene.declared_bounds
+    if declared is None:
         # An empty scene has no errors.
         return (
             (Verdict(Status.NOT_PROVED, _NO_BOUNDS), _NO_BOUNDS) if len(scene.model) else (Verdict(Status.PASSED), "")
         )
-    verification = verify_bounds(source, scene.model, scene.header, stated, pairs.source_index)
+    verification = verify_bounds(source, scene.model, scene.header, declared, pairs.source_index)
     details = verification.as_json()["measures"]
     unverified = (
-        f"{', '.join(verification.unverified)}: refitted, no error is stated" if verification.unverified else ""
+        f"{', '.join(verification.unverified)}: refitted, no bound is declared" if verification.unverified else ""
     )
-    why = f"{', '.join(verification.unverified)} refitted" if verification.unverified and stated.refitted else ""
+    why = f"{', '.join(verification.unverified)} refitted" if verification.unverified and declared.refitted else ""
     if not verification.holds:
         return Verdict(Status.FAILED, join_lines(verification.failures), verification.clauses, details=details), why
     coarse = coarse_errors(case, source, verification)
     warnings = [*coarse.values()]
-    if len(scene.model) and not stated.refitted:  # refitted values differ on purpose
-        names = frozenset(record.measure for record in stated.records) - coarse.keys()
+    if len(scene.model) and not declared.refitted:  # refitted values differ on purpose
+        names = frozenset(record.measure for record in declared.records) - coarse.keys()
         warnings += find_truncation(source, scene.model, scene.header, pairs.source_index, names)
     message = join_lines((unverified,) * bool(unverified) + tuple(warnings))
     status = Status.NOT_PROVED if unverified else Status.WARNED if warnings else Status.PASSED
@@ -137,7 +137,7 @@ def _worst_splat(measure: MeasureVerification) -> str:
 
 
 def find_truncation(
-    source: Source, decoded: SplatModel, header: SceneHeader, index: I64, stated: frozenset[str]
+    source: Source, decoded: SplatModel, header: SceneHeader, index: I64, declared: frozenset[str]
 ) -> list[str]:
     """Search for signs of truncation.
 
@@ -146,12 +146,12 @@ def find_truncation(
         decoded: the decoded file.
         header: header of the file.
         index: [N], source splat of each decoded splat.
-        stated: names of the measures to examine.
+        declared: names of the measures to examine.
 
     Returns:
         A line for each attribute that shows signs of truncation.
     """
-    return [line for measure, line in _truncated_attributes(source, decoded, header, index) if measure in stated]
+    return [line for measure, line in _truncated_attributes(source, decoded, header, index) if measure in declared]
 
 
 def _truncated_attributes(

@@ -98,17 +98,17 @@ def _count_text(count: int, first: int) -> str:
 
 
 def _wrong_counts(source: Source, scene: DecodedScene, pairs: SplatPairs) -> list[Defect]:
-    stated = scene.declared_bounds
-    if stated is None:
-        text = f"{pairs.missing} splats of the source are missing, and the file does not state it"
+    declared = scene.declared_bounds
+    if declared is None:
+        text = f"{pairs.missing} splats of the source are missing, and the file does not declare it"
         return [("SER-5", text)] if pairs.missing else []
     wrong = []
-    if stated.source_count != len(source):
-        wrong.append(("SRC-1", f"the stated source_count is {stated.source_count}, expected {len(source)}"))
-    elif stated.pruned_count != pairs.missing:
-        wrong.append(("SER-5", f"the stated pruned_count is {stated.pruned_count}, expected {pairs.missing}"))
-    if stated.source_sh_degree != source.sh_degree:
-        text = f"the stated source_sh_degree is {stated.source_sh_degree}, expected {source.sh_degree}"
+    if declared.source_count != len(source):
+        wrong.append(("SRC-1", f"the declared source_count is {declared.source_count}, expected {len(source)}"))
+    elif declared.pruned_count != pairs.missing:
+        wrong.append(("SER-5", f"the declared pruned_count is {declared.pruned_count}, expected {pairs.missing}"))
+    if declared.source_sh_degree != source.sh_degree:
+        text = f"the declared source_sh_degree is {declared.source_sh_degree}, expected {source.sh_degree}"
         wrong.append(("SER-5", text))
     return wrong
 

@@ -189,19 +189,19 @@ _ROUNDING = 1.0 + 2.0**-20  # SER-2
 def check_declared_bounds(payload: Payload, index: Index) -> None:
     """Check SERR: SER-1 to SER-4, and SER-5 as far as possible without the source."""
     log = payload.log
-    head = payload.structure(_spec.StatedErrorsHead, "head")
-    stated = head.record
-    unlisted = stated.error_flags & ~sum(_spec.ERROR_FLAG_NAMES)
+    head = payload.structure(_spec.DeclaredErrorsHead, "head")
+    declared = head.record
+    unlisted = declared.error_flags & ~sum(_spec.ERROR_FLAG_NAMES)
     if unlisted:
         log.add_field("RES-1", head, "error_flags", f"bits {unlisted:#04x} are reserved")
     splats = index.head.record.splat_count
-    if stated.source_count - stated.pruned_count != splats:
-        message = f"{stated.source_count} minus {stated.pruned_count} pruned, expected {splats}"
+    if declared.source_count - declared.pruned_count != splats:
+        message = f"{declared.source_count} minus {declared.pruned_count} pruned, expected {splats}"
         log.add_field("SER-4", head, "source_count", message)
     last = 0
-    for i in range(stated.record_count):
+    for i in range(declared.record_count):
         name = _spec.MEASURE_NAMES.get(payload.view[payload.at] if payload.left else 0, str(i))
-        record = payload.structure(_spec.StatedErrorRecord, f"record[{name}]")
+        record = payload.structure(_spec.DeclaredErrorRecord, f"record[{name}]")
         measure = record.record.measure
         if measure not in _spec.MEASURE_NAMES:
             log.add_field("SER-1", record, "measure", f"{measure} is not in the registry")
@@ -209,11 +209,11 @@ def check_declared_bounds(payload: Payload, index: Index) -> None:
             log.add_field("SER-1", record, "measure", f"{measure} after {last}, expected ascending measures")
         last = max(last, measure)
         if _check_bound(log, record) and measure in _spec.MEASURE_NAMES:
-            _check_bound_possible(log, record, index, stated.source_sh_degree)
+            _check_bound_possible(log, record, index, declared.source_sh_degree)
     payload.finish()
 
 
-def _check_bound(log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord]) -> bool:
+def _check_bound(log: ViolationLog, record: PlacedRecord[_spec.DeclaredErrorRecord]) -> bool:
     """Check SER-2; return True if maximum and rms can be compared."""
     largest, rms = record.record.max, record.record.rms
     wrong = [key for key, value in (("max", largest), ("rms", rms)) if not 0.0 <= value < math.inf]
@@ -230,7 +230,7 @@ def _check_bound(log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord
 
 
 def _check_bound_possible(
-    log: ViolationLog, record: PlacedRecord[_spec.StatedErrorRecord], index: Index, source_degree: int
+    log: ViolationLog, record: PlacedRecord[_spec.DeclaredErrorRecord], index: Index, source_degree: int
 ) -> None:
     """Check SER-5 without the source: some pair of scenes must have errors that permit this bound.
 

@@ -291,7 +291,7 @@ def _check_name(log: ViolationLog, placed: PlacedRecord[_spec.ExtraRecord], name
 
 
 #: Chunks that 4.3.6 recommends at the end of a file with levels.
-_LAST_CHUNKS = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+_LAST_CHUNKS = (_spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS)
 _SINGLE_CHUNKS = (_spec.CHUNK_METADATA, *_LAST_CHUNKS, _spec.CHUNK_TREE)
 #: The first number after the layers of this version; the order of later layers is not checked (4.3.6).
 _LAYER_END = max(_spec.LAYER_NAMES) + 1

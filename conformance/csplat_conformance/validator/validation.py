@@ -42,7 +42,7 @@ _END_CLAUSES = {
     _spec.CHUNK_METADATA: "JSN-2",
     _spec.CHUNK_CAMERAS: "JSN-2",
     _spec.CHUNK_OPTIONS: "JSN-2",
-    _spec.CHUNK_STATED_ERRORS: "SER-3",
+    _spec.CHUNK_DECLARED_ERRORS: "SER-3",
     _spec.CHUNK_TREE: "TRE-2",
 }
 _STAGE = "validating"
@@ -206,7 +206,7 @@ def _read_directory_chunks(
         payload = check_frame(view, chunk, _END_CLAUSES.get(chunk.kind, "CHK-3"), log)
         if chunk.kind in _TEXT_CHUNKS:
             _read_payload(payload, log, partial(check_text, payload, chunk.kind, json_bytes_max))
-        elif chunk.kind == _spec.CHUNK_STATED_ERRORS:
+        elif chunk.kind == _spec.CHUNK_DECLARED_ERRORS:
             _read_payload(payload, log, partial(check_declared_bounds, payload, index))
         elif chunk.kind == _spec.CHUNK_CODEBOOK:
             _read_payload(payload, log, partial(read_codebook, payload, chunk, index, books))

@@ -147,11 +147,11 @@ _LAYOUTS: Final[dict[type[Any], _Layout]] = {
     _spec.SparseParams: _Layout(_spec.unpack_sparse_params, _spec.SPARSE_PARAMS_SIZE, _spec.SPARSE_PARAMS_OFFSETS),
     _spec.RawParams: _Layout(_spec.unpack_raw_params, _spec.RAW_PARAMS_SIZE, _spec.RAW_PARAMS_OFFSETS),
     _spec.StreamHead: _Layout(_spec.unpack_stream_head, _spec.STREAM_HEAD_SIZE, _spec.STREAM_HEAD_OFFSETS),
-    _spec.StatedErrorsHead: _Layout(
-        _spec.unpack_stated_errors_head, _spec.STATED_ERRORS_HEAD_SIZE, _spec.STATED_ERRORS_HEAD_OFFSETS
+    _spec.DeclaredErrorsHead: _Layout(
+        _spec.unpack_declared_errors_head, _spec.DECLARED_ERRORS_HEAD_SIZE, _spec.DECLARED_ERRORS_HEAD_OFFSETS
     ),
-    _spec.StatedErrorRecord: _Layout(
-        _spec.unpack_stated_error_record, _spec.STATED_ERROR_RECORD_SIZE, _spec.STATED_ERROR_RECORD_OFFSETS
+    _spec.DeclaredErrorRecord: _Layout(
+        _spec.unpack_declared_error_record, _spec.DECLARED_ERROR_RECORD_SIZE, _spec.DECLARED_ERROR_RECORD_OFFSETS
     ),
 }
 

@@ -90,8 +90,8 @@ RANGES: Final[tuple[Range, ...]] = (
     Range("stream_head", "width", "masks", 1, 1, "STR-2", "E_STREAM"),
     Range("stream_head", "width", "entries of codebooks", 1, 4, "STR-2", "E_STREAM"),
     Range("stream_head", "width", "JSON", 1, 1, "STR-2", "E_STREAM"),
-    Range("stated_error_record", "max", "", 0.0, 1.7976931348623157e+308, "SER-2", "E_VALUE"),
-    Range("stated_error_record", "rms", "", 0.0, 1.7976931348623157e+308, "SER-2", "E_VALUE"),
+    Range("declared_error_record", "max", "", 0.0, 1.7976931348623157e+308, "SER-2", "E_VALUE"),
+    Range("declared_error_record", "rms", "", 0.0, 1.7976931348623157e+308, "SER-2", "E_VALUE"),
 )
 
 CHOICES: Final[tuple[Choice, ...]] = (
@@ -104,7 +104,7 @@ CHOICES: Final[tuple[Choice, ...]] = (
     Choice("block_head", "coding", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "BLK-1", "E_UNSUPPORTED"),
     Choice("stream_head", "coder", "", (0, 1), (2,), "RES-2", "E_UNSUPPORTED"),
     Choice("stream_head", "transforms", "", (0, 1, 2, 3, 4), (5,), "RES-2", "E_UNSUPPORTED"),
-    Choice("stated_error_record", "measure", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "SER-1", "E_VALUE"),
+    Choice("declared_error_record", "measure", "", (1, 2, 3, 4, 5, 6, 7, 8), (0, 9), "SER-1", "E_VALUE"),
 )
 
 MASKS: Final[tuple[Mask, ...]] = (
@@ -132,8 +132,8 @@ MASKS: Final[tuple[Mask, ...]] = (
     Mask("sparse_params", "reserved_0", "", 0, 16, "RES-1", "E_RESERVED"),
     Mask("raw_params", "reserved_0", "", 0, 16, "RES-1", "E_RESERVED"),
     Mask("stream_head", "reserved_0", "", 0, 16, "RES-1", "E_RESERVED"),
-    Mask("stated_errors_head", "error_flags", "", 1, 8, "RES-1", "E_RESERVED"),
-    Mask("stated_error_record", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
-    Mask("stated_error_record", "reserved_1", "", 0, 16, "RES-1", "E_RESERVED"),
-    Mask("stated_error_record", "reserved_2", "", 0, 32, "RES-1", "E_RESERVED"),
+    Mask("declared_errors_head", "error_flags", "", 1, 8, "RES-1", "E_RESERVED"),
+    Mask("declared_error_record", "reserved_0", "", 0, 8, "RES-1", "E_RESERVED"),
+    Mask("declared_error_record", "reserved_1", "", 0, 16, "RES-1", "E_RESERVED"),
+    Mask("declared_error_record", "reserved_2", "", 0, 32, "RES-1", "E_RESERVED"),
 )

@@ -173,9 +173,9 @@ def _value(entry: Field, raw: bytes) -> str:
 UNCOVERED: Final = {
     "CHK-5": "applies to editors",
     "CHK-7": "the vectors that are marked optional, for decoders that read the payload",
-    "SER-5": "checking stated errors requires the source: `test_bounds_verification.py`, `test_validation.py`",
+    "SER-5": "checking declared errors requires the source: `test_bounds_verification.py`, `test_validation.py`",
     "SER-6": "applies to encoders: `test_bounds_verification.py`",
-    "SER-7": "applies to checkers of stated errors: `test_spec_pseudocode.py`",
+    "SER-7": "applies to checkers of declared errors: `test_spec_pseudocode.py`",
     "SRC-1": "applies to encoders: `test_error_bounds.py`",
     "SRC-2": "applies to encoders: `test_error_bounds.py`",
     "SRC-3": "applies to encoders: `test_encoder_suite.py`",

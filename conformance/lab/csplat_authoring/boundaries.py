@@ -25,7 +25,7 @@ Rule = Range | Choice | Mask
 _BLAMED: Final = {
     ("header", "version_minor"): "version_major",
     ("codebook_record", "band_last"): "band_first",
-    ("stated_error_record", "rms"): "max",
+    ("declared_error_record", "rms"): "max",
 }
 #: Further codes with which a decoder may refuse, because it checks another clause first.
 _ALSO: Final = {
@@ -71,7 +71,7 @@ class BoundaryCase:
             changes[f"{prefix}.extent"] = self._with(f"{prefix}.extent", 0)
         elif (self.rule.structure, field) == ("codebook_record", "band_first"):
             changes[f"{prefix}.band_last"] = max(self.value, _holding(self.base, f"{prefix}.band_last")[0])
-        elif (self.rule.structure, field, self.suffix) == ("stated_error_record", "rms", "above"):
+        elif (self.rule.structure, field, self.suffix) == ("declared_error_record", "rms", "above"):
             changes[f"{prefix}.max"] = math.nextafter(self.value, 0.0)
         elif (self.rule.structure, field) == ("directory_record", "flags"):
             chunk = prefix.removeprefix("directory[").removesuffix("]")

@@ -235,12 +235,12 @@ def _ancillary(chunk: Chunk) -> Writer:
     if chunk.text is not None:
         _stream(out, "stream", list(chunk.text), chunk.stream_coding)
     elif chunk.errors is not None:
-        stated = chunk.errors
-        head = [stated.source_count, stated.pruned_count, stated.source_sh_degree, stated.flags]
-        out.structure("head", "stated_errors_head", [*head, len(stated.records)])
-        for measure, largest, rms in stated.records:
+        declared = chunk.errors
+        head = [declared.source_count, declared.pruned_count, declared.source_sh_degree, declared.flags]
+        out.structure("head", "declared_errors_head", [*head, len(declared.records)])
+        for measure, largest, rms in declared.records:
             name = f"record[{_spec.MEASURE_NAMES[measure]}]"
-            out.structure(name, "stated_error_record", [measure, 0, 0, 0, largest, rms])
+            out.structure(name, "declared_error_record", [measure, 0, 0, 0, largest, rms])
     elif chunk.payload:
         out.raw("payload", chunk.payload)
     _tail(out, chunk.tail)

@@ -44,11 +44,11 @@ from csplat_authoring.scene import (
     Block,
     Chunk,
     Codebook,
+    DeclaredErrors,
     Extra,
     Node,
     Rows,
     Scene,
-    StatedErrors,
     Stream,
     Tile,
 )
@@ -320,7 +320,7 @@ def _chunk(table: dict[str, Any]) -> Chunk:
     for key, value in table.items():
         if key == "errors":
             records = tuple((_MEASURES[measure], largest, rms) for measure, largest, rms in value["records"])
-            values[key] = StatedErrors(**(value | {"records": records}))
+            values[key] = DeclaredErrors(**(value | {"records": records}))
         elif key == "stream":
             values["stream_coding"] = _stream(value)
         else:

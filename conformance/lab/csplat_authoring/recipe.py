@@ -11,7 +11,7 @@ from csplat_authoring.builder import Built, build, repair
 from csplat_authoring.scene import Scene
 
 #: CHK-6: chunks whose payload a decoder may leave unread.
-_ANCILLARY = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_STATED_ERRORS)
+_ANCILLARY = (_spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS, _spec.CHUNK_DECLARED_ERRORS)
 
 
 @dataclass(frozen=True)

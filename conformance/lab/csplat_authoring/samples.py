@@ -16,10 +16,10 @@ from csplat_authoring.scene import (
     Block,
     Chunk,
     Codebook,
+    DeclaredErrors,
     Extra,
     Rows,
     Scene,
-    StatedErrors,
     Stream,
     Tile,
 )
@@ -195,7 +195,7 @@ def rich_scene() -> Scene:
         extras=(Extra("label", _spec.EXTRA_DTYPE_U16),),
         chunks=(
             Chunk(_spec.CHUNK_METADATA, b'{"title":"rich"}'),
-            Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(6, 1, 3, 0, ((_spec.MEASURE_MEANS, 0.5, 0.25),))),
+            Chunk(_spec.CHUNK_DECLARED_ERRORS, errors=DeclaredErrors(6, 1, 3, 0, ((_spec.MEASURE_MEANS, 0.5, 0.25),))),
         ),
         sh_degree=2,
     )

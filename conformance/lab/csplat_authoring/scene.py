@@ -161,7 +161,7 @@ class Extra:
 
 
 @dataclass(frozen=True)
-class StatedErrors:
+class DeclaredErrors:
     """The payload of a SERR chunk; records are (measure, max, rms)."""
 
     source_count: int
@@ -173,12 +173,12 @@ class StatedErrors:
 
 @dataclass(frozen=True)
 class Chunk:
-    """A chunk of the whole file: a JSON text, stated errors or any payload."""
+    """A chunk of the whole file: a JSON text, declared errors or any payload."""
 
     type: bytes
     text: bytes | None = None
     stream_coding: Stream = PLAIN
-    errors: StatedErrors | None = None
+    errors: DeclaredErrors | None = None
     payload: bytes = b""
     flags: int | None = None
     id: int = 0

@@ -6,7 +6,7 @@ Usage:
     python -m encoder_faults FAULT in.ply out.csplat      # encode with one fault, as the conformance suite does
 
 Each fault is a mistake that the author of another encoder could make: in reading the PLY and preparing the scene
-(`reading`), in converting values to integers, in bytes of the file, and in the errors and counts that it states
+(`reading`), in converting values to integers, in bytes of the file, and in the errors and counts that it declares
 (`encoding`), or in the way the program ends and in the files it leaves behind (`behaviour`). Some are harmless choices,
 which the suite must not report.
 """

@@ -1,6 +1,6 @@
-"""Faults in converting values to integers, in bytes of the file, and in what the file states; output by chance.
+"""Faults in converting values to integers, in bytes of the file, and in what the file declares; output by chance.
 
-Errors are measured after the conversion, so the files state them honestly.
+Errors are measured after the conversion, so the files declare them honestly.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from unittest import mock
 import numpy as np
 
 from csplat import _spec, ply
+from csplat.context import DEFAULT_CONTEXT
 from csplat.encoder import (
     container,
     encode_plan,
@@ -86,7 +87,7 @@ def rounding(module, name, rint, where=(quantisation, shape_codebook)):
 
 def truncated(module, name, where=(quantisation, shape_codebook)):
     stage = rounding(module, name, np.trunc, where)
-    return EncoderFault("a cast rounds", *COARSE, DEGREE_3, stage=stage, options={"sh_coding": "scalar", "threads": 1})
+    return EncoderFault("a cast rounds", *COARSE, DEGREE_3, stage=stage, options={"sh_coding": "scalar"})
 
 
 # Colours --------------------------------------------------------------------------------------------
@@ -138,7 +139,10 @@ def payload_crc(_chunk_crc):
 
 # Chance ---------------------------------------------------------------------------------------------
 def seeded_by_chance(cluster):
-    return lambda *args, **options: cluster(*args, **{**options, "seed": int.from_bytes(os.urandom(4), "little")})
+    def run(*args, context=DEFAULT_CONTEXT, **options):
+        return cluster(*args, context=replace(context, seed=int.from_bytes(os.urandom(4), "little")), **options)
+
+    return run
 
 
 def with_time(settings):
@@ -147,36 +151,36 @@ def with_time(settings):
 
 # Bytes of the file: checksums are repaired unless they are the fault ---------------------------------
 def serr_at(data):
-    """Return the offset of the payload of the stated errors."""
+    """Return the offset of the payload of the declared errors."""
     fields = built_from(data).fields.items()
     types = [entry.offset for name, entry in fields if name.startswith("directory[") and name.endswith("type")]
-    (record,) = (offset for offset in types if data[offset:].startswith(_spec.CHUNK_STATED_ERRORS))
+    (record,) = (offset for offset in types if data[offset:].startswith(_spec.CHUNK_DECLARED_ERRORS))
     return _spec.unpack_directory_record(data, record).offset + _spec.CHUNK_HEADER_SIZE
 
 
-def stated(change):
-    """Return a change of a file: `change` maps each record of the stated errors to a new one."""
+def declared(change):
+    """Return a change of a file: `change` maps each record of the declared errors to a new one."""
 
     def run(data):
         built, at, out = built_from(data), serr_at(data), bytearray(data)
-        count = _spec.unpack_stated_errors_head(data, at).record_count
+        count = _spec.unpack_declared_errors_head(data, at).record_count
         for i in range(count):
-            place = at + _spec.STATED_ERRORS_HEAD_SIZE + i * _spec.STATED_ERROR_RECORD_SIZE
-            record = change(_spec.unpack_stated_error_record(data, place))
-            out[place : place + _spec.STATED_ERROR_RECORD_SIZE] = _spec.pack_stated_error_record(record)
+            place = at + _spec.DECLARED_ERRORS_HEAD_SIZE + i * _spec.DECLARED_ERROR_RECORD_SIZE
+            record = change(_spec.unpack_declared_error_record(data, place))
+            out[place : place + _spec.DECLARED_ERROR_RECORD_SIZE] = _spec.pack_declared_error_record(record)
         return replace(built, data=bytes(out)).patched({})
 
     return run
 
 
 def head(**fields):
-    """Return a change of a file: each function maps a field of the head of the stated errors to a new value."""
+    """Return a change of a file: each function maps a field of the head of the declared errors to a new value."""
 
     def run(data):
         built, at = built_from(data), serr_at(data)
-        old = _spec.unpack_stated_errors_head(data, at)
+        old = _spec.unpack_declared_errors_head(data, at)
         new = old._replace(**{name: make(getattr(old, name)) for name, make in fields.items()})
-        changed_data = data[:at] + _spec.pack_stated_errors_head(new) + data[at + _spec.STATED_ERRORS_HEAD_SIZE :]
+        changed_data = data[:at] + _spec.pack_declared_errors_head(new) + data[at + _spec.DECLARED_ERRORS_HEAD_SIZE :]
         return replace(built, data=changed_data).patched({})
 
     return run
@@ -190,13 +194,13 @@ refitted = head(error_flags=lambda _: _spec.ERROR_FLAG_REFITTED)
 
 
 def bounded(bounds):
-    """Return a change of a file: it states the given (max, rms) by measure."""
+    """Return a change of a file: it declares the given (max, rms) by measure."""
 
     def run(record):
         most, rms = bounds[_spec.MEASURE_NAMES[record.measure]]
         return record._replace(max=most, rms=rms)
 
-    return stated(run)
+    return declared(run)
 
 
 def index_field(name, change):
@@ -246,16 +250,16 @@ COMPONENTS = {"sh0": 3, "sh1": 9, "sh2": 15, "sh3": 21}
 L3 = ("L3", "SER-5")
 
 
-def restated(change):
-    """Return a stage in which `change` maps the stated errors by measure to those to state instead."""
-    return replaced(pipeline, "declared_errors", lambda states: lambda errors, origin: change(states(errors, origin)))
+def redeclared(change):
+    """Return a stage in which `change` maps the declared errors by measure to those to declare instead."""
+    return replaced(pipeline, "declared_errors", lambda declare: lambda errors, origin: change(declare(errors, origin)))
 
 
 def scaled(only, kind, factor):
     """Return a stage that multiplies the max or the rms of some measures by a factor."""
 
     by = np.array([factor, 1.0] if kind == "max" else [1.0, factor])
-    return restated(
+    return redeclared(
         lambda bounds: {name: tuple((pair * by).tolist()) if name in only else pair for name, pair in bounds.items()}
     )
 
@@ -300,7 +304,7 @@ def over_components(bounds):
 @contextlib.contextmanager
 def dropped_rows_counted():
     """Count rows that the reader drops as pruned splats."""
-    findings, read, pack = [], ply.read_ply, _spec.pack_stated_errors_head
+    findings, read, pack = [], ply.read_ply, _spec.pack_declared_errors_head
 
     def with_dropped(head):
         count = sum(one.count for one in findings if one.id == "nonfinite-rows")
@@ -308,13 +312,13 @@ def dropped_rows_counted():
 
     with (
         mock.patch.object(ply, "read_ply", lambda path, **options: read(path, report=findings, **options)),
-        mock.patch.object(_spec, "pack_stated_errors_head", with_dropped),
+        mock.patch.object(_spec, "pack_declared_errors_head", with_dropped),
     ):
         yield
 
 
 def without_chunk(chunks):
-    return lambda *args: [one for one in chunks(*args) if one.type != _spec.CHUNK_STATED_ERRORS]
+    return lambda *args: [one for one in chunks(*args) if one.type != _spec.CHUNK_DECLARED_ERRORS]
 
 
 def without_band_sign(model):
@@ -324,7 +328,7 @@ def without_band_sign(model):
 
 
 def none_of(*names):
-    return restated(lambda bounds: {name: pair for name, pair in bounds.items() if name not in names})
+    return redeclared(lambda bounds: {name: pair for name, pair in bounds.items() if name not in names})
 
 
 @contextlib.contextmanager
@@ -448,7 +452,8 @@ FAULTS = {
     "rms_overstated": EncoderFault("one percent more is on the safe side", Harm.BOUND, L3, DEGREE_3,
         stage=scaled(MEASURES, "rms", 1.01)),
     "rounded_up": EncoderFault("SER-5 permits an excess of one part in ten thousand", Harm.HARMLESS, inputs=DEGREE_3,
-        stage=restated(lambda bounds: {name: (most * 1.00009, rms * 1.00009) for name, (most, rms) in bounds.items()})),
+        stage=redeclared(lambda bounds: {name: (most * 1.00009, rms * 1.00009)
+                                         for name, (most, rms) in bounds.items()})),
     "binary64_errors_fine": EncoderFault(
         "errors may be computed from alpha and rotations that are not rounded, even with the finest levels",
         Harm.HARMLESS, inputs=f"{DEGREE_3},ordinary/quaternions,ordinary/transparent_and_opaque", honest=in_binary64,
@@ -462,7 +467,8 @@ FAULTS = {
         stage=replaced(pipeline, "covariance_errors", not_relative)),
     "covariance_not_clipped": EncoderFault("scales need no bound", Harm.BOUND, L3, "nasty/*scale*",
         stage=scales_without_bound),
-    "rms_over_components": EncoderFault("a mean is over all numbers", Harm.BOUND, L3, stage=restated(over_components)),
+    "rms_over_components": EncoderFault("a mean is over all numbers", Harm.BOUND, L3,
+        stage=redeclared(over_components)),
     # statements about the source
     "pruned_invented": EncoderFault("counts do not matter", Harm.FACTS, ("L2", "SRC-1"), data=counts(3, 3)),
     "nan_rows_counted": EncoderFault("rows with NaN are pruned splats", Harm.FACTS, ("L2", "SRC-1"),
@@ -470,11 +476,11 @@ FAULTS = {
     "degree_of_the_file": EncoderFault("the source's SH degree is the file's", Harm.FACTS, ("L2", "SER-5"), DEGREE_3,
         options={"sh_degree": 1}, stage=none_of("sh2", "sh3"), data=head(source_sh_degree=lambda _: 1)),
     # omitted statements
-    "refitted_halved": EncoderFault("any error may be stated for refitted attributes", Harm.BOUND, ("L3", "SER-5"),
-        data=lambda data: refitted(stated(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2))(data))),
+    "refitted_halved": EncoderFault("any error may be declared for refitted attributes", Harm.BOUND, ("L3", "SER-5"),
+        data=lambda data: refitted(declared(lambda r: r._replace(max=r.max / 2, rms=r.rms / 2))(data))),
     "refitted_claimed": EncoderFault("with REFITTED, colours may have any values", Harm.PICTURE, ("L4", ""),
         scene=changed(sh0=lambda m: m.sh0[:, ::-1].copy()), stage=none_of("sh0", "sh1"), data=refitted),
-    "errors_left_out": EncoderFault("without stated errors, values may be arbitrary", Harm.PICTURE, ("L4", ""),
+    "errors_left_out": EncoderFault("without declared errors, values may be arbitrary", Harm.PICTURE, ("L4", ""),
         DEGREE_3, scene=changed(shN=without_band_sign), stage=replaced(pipeline, "file_chunks", without_chunk)),
     "some_errors_left_out": EncoderFault("some of the errors may be omitted", Harm.PICTURE, ("L3", "SER-6"), DEGREE_3,
         scene=changed(shN=without_band_sign), stage=none_of("sh1", "sh2", "sh3")),

@@ -1,4 +1,4 @@
-"""The type of a fault, ways to make one, and the scenes that stated errors are measured against."""
+"""The type of a fault, ways to make one, and the scenes that declared errors are measured against."""
 
 import contextlib
 import io
@@ -32,7 +32,7 @@ class Harm(StrEnum):
 
     VALIDITY = "validity"  #: a decoder refuses the file, or there is no file
     PICTURE = "picture"  #: renders are wrong
-    BOUND = "bound"  #: a stated error does not hold, or is unreliable
+    BOUND = "bound"  #: a declared error does not hold, or is unreliable
     FACTS = "facts"  #: the file makes false statements about the source or its splats
     DETERMINISM = "determinism"  #: the same input gives different bytes
     FILES = "files"  #: files of the user are changed, left behind, or cannot be encoded
@@ -55,7 +55,7 @@ class EncoderFault:
         keep: returns the indices of the splats to encode, in order; the others count as pruned.
         stage: context manager that patches reader and encoder.
         options: options of the encoder.
-        honest: returns the scene against which the errors that the file states are measured after encoding.
+        honest: returns the scene against which the errors that the file declares are measured after encoding.
         data: changes the file.
         index: changes the map from splats of the file to splats of the source.
         end: called with input, output and the encoded bytes in place of writing the output; may end the process.

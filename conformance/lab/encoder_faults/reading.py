@@ -1,5 +1,7 @@
 """Faults in reading a PLY and preparing the scene: columns, rows, numbers, header, range, frame, metadata."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from csplat.model import normalise_quats
@@ -208,12 +210,12 @@ FAULTS = {
         "float16 is accurate enough for SH, and errors are measured after rounding to it", Harm.BOUND, L3, DEGREE_3,
         scene=half("shN")),
     "sh_clipped": EncoderFault("SH lie within ±1", Harm.PICTURE, L3, STRONG, scene=clipped("shN", 1)),
-    "sh_clipped_honest": EncoderFault("SH lie within ±1; errors are stated honestly", Harm.PICTURE, ("L4", ""), STRONG,
-        scene=clipped("shN", 1), honest=as_read),
+    "sh_clipped_honest": EncoderFault("SH lie within ±1; errors are declared honestly", Harm.PICTURE, ("L4", ""),
+        STRONG, scene=clipped("shN", 1), honest=as_read),
     "scales_clipped": EncoderFault("scales lie within ±20", Harm.PICTURE, L3, "nasty/huge_scales",
         scene=clipped("scales", 20)),
     "needles_thickened_honest": EncoderFault(
-        "axes thinner than a fiftieth of the longest can be widened; errors are stated honestly", Harm.HARMLESS,
+        "axes thinner than a fiftieth of the longest can be widened; errors are declared honestly", Harm.HARMLESS,
         inputs="ordinary/needles_and_discs",
         scene=changed(scales=lambda m: np.maximum(m.scales, m.scales.max(axis=1, keepdims=True) - np.float32(4))),
         honest=as_read),
@@ -224,11 +226,11 @@ FAULTS = {
         keep=lambda m: np.flatnonzero(m.opacities >= 0.02)),
     "pruned_most": EncoderFault("any number of splats may be pruned if the file counts them", Harm.COARSE, ("L2", ""),
         keep=lambda m: np.flatnonzero(m.opacities >= np.quantile(m.opacities, 0.6))),
-    "bands_dropped": EncoderFault("degree 1 is enough; errors are stated honestly", Harm.COARSE, ("L3", ""), DEGREE_3,
+    "bands_dropped": EncoderFault("degree 1 is enough; errors are declared honestly", Harm.COARSE, ("L3", ""), DEGREE_3,
         options={"sh_degree": 1}),
-    "alpha_of_three": EncoderFault("three levels of alpha are enough; errors are stated honestly", Harm.COARSE,
+    "alpha_of_three": EncoderFault("three levels of alpha are enough; errors are declared honestly", Harm.COARSE,
         ("L3", ""), options={"opacity_levels": 2}),
-    "coarse": EncoderFault("errors may have any size if they are stated honestly", Harm.PICTURE, ("L4", ""),
+    "coarse": EncoderFault("errors may have any size if they are declared honestly", Harm.PICTURE, ("L4", ""),
         options={"attribute_psnr": 16.0, "sh_coding": "none"}),
     # frame
     "y_and_z_swapped": EncoderFault("z points up", Harm.PICTURE, FAR,
@@ -237,7 +239,7 @@ FAULTS = {
         inputs="ordinary/degree_1,nasty/far_doubles", scene=own_origin, honest=in_binary64),
     # metadata
     "axes_guessed": EncoderFault("every scene is right-down-forward", Harm.FACTS, INVENTED,
-        scene=changed(coordinate_system=lambda _: "RDF")),
+        scene=changed(metadata=lambda m: replace(m.metadata, coordinate_system="RDF"))),
     "degree_always_3": EncoderFault("every scene has degree 3", Harm.FACTS, INVENTED, scene=of_degree_3),
     "extra_invented": EncoderFault("an additional column does no harm", Harm.FACTS, INVENTED, scene=with_extra,
         options={"keep_extra": True}),

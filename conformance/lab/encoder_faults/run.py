@@ -16,7 +16,9 @@ import numpy as np
 
 import csplat
 from csplat import ply as ply_files
-from csplat.encoder import Origin, encode_with_report
+from csplat.context import Context
+from csplat.encode_api import encode_planned, encode_with_report
+from csplat.encoder import EncodePlan, Origin
 from csplat.errors import CsplatError
 from csplat_conformance.conformance_report import ConformanceReport, Outcome, Status
 from csplat_conformance.encoders import LEVELS, EncoderSuiteOptions, all_inputs, run_encoder
@@ -65,7 +67,9 @@ def _encoded(fault, ply):
         if fault.keep is not None:
             rows = fault.keep(model).astype(np.int64)
             model, origin = model.select(rows), Origin(len(model), rows)
-        result = encode_with_report(model, csplat.EncodeOptions(**fault.options), origin=origin)
+        context = Context(threads=1)  # stages patch modules, which is not safe with several threads
+        options = csplat.EncodeOptions(**fault.options)
+        result = encode_planned(EncodePlan.of(model, options, origin=origin, context=context))
     return result.data, result.source_index
 
 

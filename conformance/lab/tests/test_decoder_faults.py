@@ -105,7 +105,7 @@ def test_a_renderer_may_be_off_by_2_ulp_and_an_exact_decoder_by_none(ulps, by, f
 
 def test_a_decoder_that_leaves_ancillary_payloads_unread_passes_every_vector_on_chunks():
     # CHK-6: frame and CRC of these chunks are checked all the same.
-    def frames(view, header, kind=_spec.CHUNK_STATED_ERRORS, *_):
+    def frames(view, header, kind=_spec.CHUNK_DECLARED_ERRORS, *_):
         if record := header.chunk(kind):
             open_chunk(view, record, record.type, record.flags, "CHK-6")
 

@@ -107,7 +107,7 @@ def test_ends_of_a_run_are_distinguished(report_of, name, status):
 def test_our_encoder_without_a_fault_passes_the_same_checks(tmp_path):
     # The failures come from the faults and not from the method of planting them.
     data, _ = honest(written(tmp_path, "ordinary/degree_1").read_bytes())
-    for change in (encoding.stated(lambda record: record), encoding.counts(0, 0)):
+    for change in (encoding.declared(lambda record: record), encoding.counts(0, 0)):
         assert data == change(data)
 
 

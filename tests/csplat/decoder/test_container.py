@@ -17,6 +17,7 @@ from damage_cases import BUILT, RICH, SMALL, flipped
 from csplat import _spec
 from csplat.decoder import Limits, decode, decode_integers, read_header
 from csplat.decoder.container import Cursor
+from csplat.decoder.decode_api import ONE_THREAD
 from csplat.decoder.entropy import read_stream
 from csplat.errors import FormatError, LimitError, UnsupportedError
 from csplat_authoring.builder import repair
@@ -28,7 +29,7 @@ def test_flipped_bits_of_a_part_are_refused_by_its_reader():
     layer = read_header(SMALL).tiles[0].layers[0]
     for bit in range(8 * layer.offset, 8 * (layer.offset + layer.size), 3):
         with pytest.raises(FormatError) as caught:
-            decode(flipped(SMALL, bit), tiles=[0], sh_degree=0, threads=1)
+            decode(flipped(SMALL, bit), tiles=[0], sh_degree=0, context=ONE_THREAD)
         assert ("E_CRC", layer.offset, "CHK-1") == (caught.value.code, caught.value.offset, caught.value.clause)
 
 
@@ -75,7 +76,7 @@ def check_one(data: bytes) -> None:
     errors = []
     for function in (decode, decode_integers):
         try:
-            function(data, limits=Limits(bytes=50_000_000, json_bytes=100_000), threads=1)
+            function(data, limits=Limits(bytes=50_000_000, json_bytes=100_000), context=ONE_THREAD)
         except (FormatError, UnsupportedError, LimitError) as error:
             errors.append(error)
     assert len(errors) in (0, 2)

@@ -17,10 +17,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from damage_cases import BUILT, RICH, SMALL, flipped, stated
+from damage_cases import BUILT, RICH, SMALL, declared, flipped
 
 from csplat import SplatModel, _spec
+from csplat.context import Context
 from csplat.decoder import decode, decode_integers, decode_scene, iter_tiles, read_header, read_metadata
+from csplat.decoder.decode_api import ONE_THREAD
 from csplat.errors import CsplatError, FormatError, InputError, LimitError, UnsupportedError
 from csplat.scene_metadata import SceneMetadata
 from csplat_authoring.builder import build, chunk_records, repair
@@ -165,7 +167,7 @@ def test_any_buffer_path_or_stream_is_decoded_with_valid_arguments(tmp_path):
     for data in (5, None, memoryview(RICH)[::2], io.StringIO("text")):
         with pytest.raises(InputError):
             decode(data)
-    for arguments in ({"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 5}, {"sh_degree": -1}, {"threads": 0}):
+    for arguments in ({"tiles": [2]}, {"tiles": [-1]}, {"sh_degree": 5}, {"sh_degree": -1}):
         with pytest.raises(InputError):
             decode(RICH, **arguments)
 
@@ -184,7 +186,7 @@ def test_parts_equal_the_same_parts_of_the_whole():
             assert whole[name][rows].tolist() == integers[name].tolist()
         assert whole["exponents"][tiles, : integers["exponents"].shape[1]].tolist() == integers["exponents"].tolist()
     for threads in (1, 2, 7):
-        assert_same(full, decode(RICH, threads=threads))
+        assert_same(full, decode(RICH, context=Context(threads=threads)))
     for place, one in zip(places, iter_tiles(RICH), strict=True):  # CNF-4
         assert_same(full, one, place)
 
@@ -233,12 +235,12 @@ def refusal(data, **arguments) -> CsplatError:
 def test_prefixes_and_trailing_bytes_are_refused():
     # CNF-3
     for data in (SMALL, RICH):
-        assert {"E_TRUNCATED"} == {refusal(data[:size], threads=1).code for size in range(len(data))}
+        assert {"E_TRUNCATED"} == {refusal(data[:size], context=ONE_THREAD).code for size in range(len(data))}
     assert "E_MAGIC" == refusal(b"ply\n").code
     for size in range(_spec.HEADER_SIZE, len(SMALL)):  # also with its size and checksums repaired
         cut = bytearray(SMALL[:size])
         cut[20:28] = size.to_bytes(8, "little")
-        refusal(repair(bytes(cut)), threads=1)
+        refusal(repair(bytes(cut)), context=ONE_THREAD)
     for extra in (b"\0", b"\n", SMALL):
         error = refusal(SMALL + extra)
         assert ("E_TRAILING", len(SMALL)) == (error.code, error.offset)
@@ -251,7 +253,7 @@ def test_every_flipped_bit_is_refused():
     named = 8 * _spec.HEADER_OFFSETS["profile"]
     for data, stride in ((SMALL, 1), (RICH, 73)):
         for bit in range(0, 8 * len(data), stride):
-            code = refusal(flipped(data, bit), threads=1).code
+            code = refusal(flipped(data, bit), context=ONE_THREAD).code
             assert code in ({"E_MAGIC", "E_VERSION"} if bit < named else {"E_CRC"}), bit
 
 
@@ -261,7 +263,7 @@ def test_flipped_bits_with_all_checksums_repaired_are_refused_or_decoded():
     # Every seventh bit, so that each bit position within a byte occurs.
     for bit in range(0, 8 * len(SMALL), 7):
         with suppress(CsplatError):
-            assert 2 == len(decode(repair(flipped(SMALL, bit), records), threads=1))
+            assert 2 == len(decode(repair(flipped(SMALL, bit), records), context=ONE_THREAD))
 
 
 def test_errors_of_version_and_crc_name_the_stored_and_expected_values():
@@ -297,4 +299,4 @@ def test_huge_counts_in_a_small_index_cost_nothing():
 ])  # fmt: skip
 def test_impossible_declared_errors_are_refused(fields, clause):
     with pytest.raises(FormatError, match=clause):
-        decode(stated(**fields))
+        decode(declared(**fields))

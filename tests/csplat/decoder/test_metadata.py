@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from damage_cases import stated
+from damage_cases import declared
 from tables import failures
 
 from csplat import _spec
@@ -54,7 +54,7 @@ def test_the_three_json_texts_are_read():
 
 
 def test_declared_errors_are_read():
-    data = stated(source_count=5, pruned_count=3, flags=1, records=((1, 0.5, 0.25), (4, 1.0, 1.7)))
+    data = declared(source_count=5, pruned_count=3, flags=1, records=((1, 0.5, 0.25), (4, 1.0, 1.7)))
     errors = read_declared_bounds(data)
     assert errors == decode_scene(data).declared_bounds
     assert (5, 3, True) == (errors.source_count, errors.pruned_count, errors.refitted)

@@ -10,7 +10,8 @@ from checked import measure_errors
 
 from csplat import EncodeOptions, decode, encode
 from csplat.decoder import decode_scene, read_options
-from csplat.encoder import EncodePlan, Origin, encode_tiles, encode_with_report
+from csplat.encode_api import encode_planned, encode_with_report
+from csplat.encoder import EncodePlan, Origin, encode_tiles
 from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_tools.inspect.file_description import describe_file
@@ -21,7 +22,7 @@ COLOURS = ("sh0", "shN")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("options", [
-    {}, {"means_coding": "axis", "tile_splats": 50, "threads": 2}, {"attribute_psnr": 30.0},
+    {}, {"means_coding": "axis", "tile_splats": 50}, {"attribute_psnr": 30.0},
     {"shape_codebook_size": 32},
 ])  # fmt: skip
 def test_a_plan_holds_decoded_geometry_and_the_source_colours(make_model, options):
@@ -64,7 +65,7 @@ def test_a_part_with_other_colours_or_shapes_declares_the_errors_of_the_rest(mak
     plan = EncodePlan.of(source.select(rows), origin=Origin(400, rows))
     refitted = encode_tiles(plan.with_colours(plan.scene.sh0 + 1, plan.scene.shN)).write()
     shapes = replace(source, scales=source.scales + np.float32(0.1)).select(rows)
-    adjusted = encode_with_report(shapes, origin=Origin(400, rows, refitted=True, adjusted=True))
+    adjusted = encode_planned(EncodePlan.of(shapes, origin=Origin(400, rows, refitted=True, adjusted=True)))
     for result, declared in ((refitted, ["means", "covariance", "opacities"]), (adjusted, ["means"])):
         scene = decode_scene(result.data)
 
@@ -79,7 +80,7 @@ def test_a_part_with_other_colours_or_shapes_declares_the_errors_of_the_rest(mak
         assert verify(source).holds
         moved = replace(source, means=source.means + np.float32(0.1))
         assert not any(verify(moved, index).holds for index in (None, result.source_index))
-        assert "the file states 400" in verify(source.select(slice(0, 399))).failures[0]
+        assert "the file declares 400" in verify(source.select(slice(0, 399))).failures[0]
 
 
 def test_errors_may_be_declared_against_another_scene(make_model):
@@ -91,8 +92,8 @@ def test_errors_may_be_declared_against_another_scene(make_model):
     truth = measure_errors(source, decoded, result.source_index)
     assert 0.4 < truth["means"][0] < 0.5
     for name, pair in truth.items():
-        for error, stated in zip(pair, result.report.errors[name], strict=True):
-            assert error <= stated <= error * 1.0001 + 1e-11
+        for error, declared in zip(pair, result.report.errors[name], strict=True):
+            assert error <= declared <= error * 1.0001 + 1e-11
 
 
 def test_a_file_is_written_twice_with_the_same_splats(make_model):

@@ -9,7 +9,8 @@ from quantisation_cases import ARRAYS, COUNT, assert_dequantised_as_decoded, imp
 
 from csplat import decode
 from csplat.decoder import decode_scene, read_declared_bounds, read_options
-from csplat.encoder import EncodeOptions, EncodePlan, Origin, encode_with_report, fix_quantisation
+from csplat.encode_api import encode_with_report
+from csplat.encoder import EncodeOptions, EncodePlan, Origin, fix_quantisation
 from csplat.errors import InputError
 from csplat.model import normalise_quats
 
@@ -101,11 +102,11 @@ def test_errors_are_declared_against_the_source(make_model):
     values = moved(fixed, share=0.05)
     result = fixed.encode(values).write({"finetuned": {"steps": 7}})
     assert_dequantised_as_decoded(fixed, values, result)
-    stated = read_declared_bounds(result.data)
-    assert (300, 200, True) == (stated.source_count, stated.pruned_count, stated.refitted)
+    declared = read_declared_bounds(result.data)
+    assert (300, 200, True) == (declared.source_count, declared.pruned_count, declared.refitted)
     truth = measure_errors(source, decode(result.data), result.source_index)
-    assert {"means", "covariance", "opacities"} == {record.measure for record in stated.records}
-    for record in stated.records:
+    assert {"means", "covariance", "opacities"} == {record.measure for record in declared.records}
+    for record in declared.records:
         for error, bound in zip(truth[record.measure], (record.max, record.rms), strict=True):
             assert error <= bound <= error * 1.0001 + 1e-12
     assert {"steps": 7} == read_options(result.data)["finetuned"]

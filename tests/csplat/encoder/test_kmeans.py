@@ -18,8 +18,10 @@ from codebooks_cases import exact, few_shapes, scene
 
 import csplat
 from csplat import _spec
+from csplat.context import Context
 from csplat.decoder import decode_scene
-from csplat.encoder import EncodeOptions, Importance, encode_with_report, kmeans
+from csplat.encode_api import encode_with_report
+from csplat.encoder import EncodeOptions, Importance, kmeans
 from csplat.encoder.error_bounds import covariance_entries
 from csplat.encoder.kmeans import (
     assign,
@@ -105,7 +107,7 @@ def test_searching_near_groups_loses_less_than_two_per_cent_and_all_groups_nothi
 
 def clustered(points, weights, size, *, iterations=3, **options):
     """Cluster points; assert that the entries are distinct and used."""
-    entries, index = cluster(points, weights, size, seed=0, iterations=iterations, **options)
+    entries, index = cluster(points, weights, size, iterations=iterations, **options)
     assert (np.int32, np.uint32) == (entries.dtype, index.dtype)
     assert len(index) == len(points)
     assert len(np.unique(entries, axis=0)) == len(entries) <= size
@@ -177,7 +179,7 @@ def test_invalid_arguments_are_refused():
     cases += [(bad, weights, 8, "points") for bad in (points.astype(np.float32), points[0], points[:, :0])]
     for given, by, size, message in (*cases, (points, weights, 0, "size")):
         with pytest.raises(InputError, match=message):
-            cluster(given, by, size, seed=0, iterations=1)
+            cluster(given, by, size, iterations=1)
     for shape, message in (((0, 9), "no entries"), ((4, 8), "entries")):
         with pytest.raises(InputError, match=message):
             assign(points, np.empty(shape, np.int32))
@@ -207,14 +209,16 @@ def test_the_thread_count_of_blas_is_restored():
 def test_reassigning_over_all_entries_finds_the_best():
     points, matrices, metric, entries = scene()
     errors = np.stack([exact(points - entry, matrices, np.ones(len(points))) for entry in entries], axis=1)
-    found = reassign_by_metric(points, metric, entries, np.zeros(len(points), np.int64), 2, candidates=len(entries))
+    found = reassign_by_metric(
+        points, metric, entries, np.zeros(len(points), np.int64), Context(threads=2), len(entries)
+    )
     np.testing.assert_allclose(errors.min(axis=1), errors[np.arange(len(points)), found], rtol=1e-4)
 
 
 def test_refining_reduces_errors_without_unused_entries():
     points, _, metric, entries = scene()
     start = np.linalg.norm((points[:, None] - entries).reshape(len(points), len(entries), -1), axis=2).argmin(axis=1)
-    moved, index = refine_by_metric(points, metric, entries, start, 1)
+    moved, index = refine_by_metric(points, metric, entries, start, Context(threads=1))
     before = metric.errors(points - entries[start], slice(None)).sum()
     assert metric.errors(points - moved[index], slice(None)).sum() < 0.8 * before
     assert set(range(len(moved))) == set(index.tolist())
@@ -291,11 +295,12 @@ def test_axes_are_recovered_from_covariances():
 
 def digests(threads):
     """Return SHA-256s of clusters by two kinds of search, and of files with both kinds of codebooks."""
+    context = Context(threads=threads, seed=7)
     points, weights = blobs(1500, 45, 150, 12.0)
     made = []
     for near_groups, scale in ((0, 1), (6, 1), (0, 300)):
         scaled = points.astype(np.int32) * scale
-        entries, index = cluster(scaled, weights, 100, seed=7, iterations=3, near_groups=near_groups, threads=threads)
+        entries, index = cluster(scaled, weights, 100, iterations=3, near_groups=near_groups, context=context)
         made.append(entries.tobytes() + index.tobytes())
     rng, n = np.random.default_rng(4), 1200
     shapes = {"means": (3,), "quats": (4,), "scales": (3,), "sh0": (3,), "shN": (8, 3)}
@@ -303,10 +308,10 @@ def digests(threads):
     fields |= {"quats": normalise_quats(fields["quats"]), "opacities": rng.random(n).astype(np.float32)}
     model = csplat.SplatModel(**fields)
     sizes = {"codebook_size": 64, "shape_codebook_size": 150}
-    options = EncodeOptions(sh_coding="codebook", tile_splats=800, threads=threads, **sizes)
+    options = EncodeOptions(sh_coding="codebook", tile_splats=800, **sizes)
     matrices = [scene(n, size)[2].triangles for size in (8, 6)]
     for importance in (Importance(rng.random(n), rng.random(n), *matrices), None):
-        result = encode_with_report(model, options, importance=importance)
+        result = encode_with_report(model, options, importance=importance, context=context)
         assert all(result.report.options[name] for name in sizes)
         made.append(result.data)
     return [hashlib.sha256(one).hexdigest() for one in made]

@@ -13,7 +13,9 @@ from codebooks_cases import few_shapes
 from quantisation_cases import COUNT, important, unequal
 
 import csplat
-from csplat.encoder import EncodeOptions, EncodePlan, Importance, encode_with_report, fix_quantisation, quantisation
+from csplat.context import Context
+from csplat.encode_api import encode_with_report
+from csplat.encoder import EncodeOptions, EncodePlan, Importance, fix_quantisation, quantisation
 from csplat.encoder.coding_parameters import choose_parameters
 from csplat.encoder.encode_plan import trial_rows
 from csplat.encoder.error_bounds import covariance_entries
@@ -176,7 +178,7 @@ def test_the_error_of_rounding_is_predicted():
     from csplat_tools.optimise.scene_sensitivity import measure_importance
 
     scene, views, options = shell(0), cameras(12), EncodeOptions(attribute_psnr=58)
-    importance = measure_importance(scene, views, (0.0, 0.0, 0.0), threads=None)
+    importance = measure_importance(scene, views, (0.0, 0.0, 0.0))
     plan = choose_parameters(scene, options, importance_given=True)
     foretold = rounding_errors(scene, importance.blocks, plan).sum()
     decoded = csplat.decode(encode_with_report(scene, options).data)
@@ -244,7 +246,7 @@ def test_invalid_blocks_and_matrices_are_refused(model, make_model):
 
 
 def test_the_number_of_threads_does_not_change_the_bytes_of_classes(model, graded):
-    assert graded.data == encode_with_report(model, EncodeOptions(threads=3), importance=important(model)).data
+    assert graded.data == encode_with_report(model, importance=important(model), context=Context(threads=3)).data
     assert "classes" in graded.report.options
 
 

@@ -13,7 +13,9 @@ from checked import encoded
 from codebooks_cases import exact, scene
 from quantisation_cases import COUNT, important, unequal
 
-from csplat.encoder import EncodeOptions, Importance, encode_with_report
+from csplat.context import DEFAULT_CONTEXT
+from csplat.encode_api import encode_with_report
+from csplat.encoder import EncodeOptions, Importance
 from csplat.encoder.coding_parameters import choose_parameters
 from csplat.encoder.kmeans import refine_by_metric
 from csplat.encoder.splat_importance import (
@@ -37,7 +39,7 @@ def test_errors_agree_with_the_matrices():
 def test_entries_of_points_without_weight_do_not_move():
     points, _, metric, entries = scene(50, 2, 1, 5)
     silent = ErrorMetric(np.zeros(50, np.float32), np.zeros_like(metric.triangles))
-    moved, _ = refine_by_metric(points, silent, entries, np.arange(50) % 5, 1)
+    moved, _ = refine_by_metric(points, silent, entries, np.arange(50) % 5, DEFAULT_CONTEXT)
     assert {tuple(row) for row in moved.reshape(len(moved), -1)} <= {tuple(row) for row in entries.reshape(5, -1)}
 
 

@@ -1,6 +1,6 @@
 """Tests of csplat.encoder.target.
 
-Also: csplat.encoder.error_targets.
+Also: csplat.encoder.error_targets, csplat.sizes.
 """
 
 from dataclasses import replace
@@ -11,7 +11,8 @@ from captures import shell
 from checked import measure_errors
 
 from csplat import EncodeOptions, decode, encode
-from csplat.encoder import Target, encode_with_report
+from csplat.encode_api import encode_with_report
+from csplat.encoder import Target
 from csplat.errors import InputError
 from csplat_conformance.validator import validate
 
@@ -28,7 +29,7 @@ def scene():
 @pytest.mark.slow
 def test_impossible_bounds_are_refused(scene):
     for measure, bound in (("opacities", 1e-9), ("opacities", 1e-310), ("covariance", 1e-310)):
-        for more in ({}, {"size_bytes": 10**6}):
+        for more in ({}, {"size": 10**6}):
             with pytest.raises(InputError, match=f"no lattice keeps the error of {measure} within {bound:g}"):
                 encode(scene, target=Target(max_error={measure: bound}, **more))
 
@@ -36,9 +37,9 @@ def test_impossible_bounds_are_refused(scene):
 @pytest.mark.parametrize(
     ("asked", "message"),
     [
-        ({}, "no target"), ({"size_bytes": 1000, "psnr": 40.0}, "one of them"),
+        ({}, "no target"), ({"size": 1000, "psnr": 40.0}, "one of them"),
         ({"keep": 0.5, "max_psnr_drop": 1.0}, "one of them"), ({"keep": 0.5, "max_error": {"means": 1.0}}, "no bounds"),
-        ({"max_psnr_drop": 0.5, "max_error": {"means": 1.0}}, "no bounds"), ({"size_bytes": 0}, "expected at least 1"),
+        ({"max_psnr_drop": 0.5, "max_error": {"means": 1.0}}, "no bounds"), ({"size": 0}, "expected bytes"),
         ({"psnr": 99.5}, "at most 99"), ({"psnr": float("nan")}, "above 0"), ({"max_psnr_drop": 0.0}, "0.001 to 60"),
         ({"max_psnr_drop": 1e-16}, "0.001 to 60"), ({"max_psnr_drop": 4000.0}, "0.001 to 60"),
         ({"keep": 1.5}, "at most 1"), ({"keep": 0.0}, "above 0"), ({"psnr": -1.0}, "above 0"),

@@ -18,12 +18,12 @@ from large_cases import COUNT, FAST, WHOLE, EveryFourth, Interrupt, encode_large
 from models import with_facts
 
 import csplat
-from csplat import EncodeOptions, InputError, decode, encode, encode_with_report, write_ply
-from csplat.out_of_core import OutOfCoreOptions, encode_scene, estimate_cost
+from csplat import Context, EncodeOptions, InputError, decode, encode, encode_with_report, write_ply
+from csplat.out_of_core import estimate_cost
 from csplat.ply import read_ply
 from csplat.scene import Scene
 from csplat_conformance.validator import validate
-from csplat_tools.encode_file import encode_file, may_exceed_memory
+from csplat_tools.encode_file import encode_file
 
 
 @pytest.fixture(scope="module")
@@ -72,8 +72,8 @@ def test_an_out_of_core_encoding_is_resumed_with_more_memory(model, whole, tmp_p
     target = tmp_path / "out.csplat"
     with pytest.raises(KeyboardInterrupt):
         encode_large(Scene.of(model), target, FAST, progress=Interrupt("coding", after=2))
-    stages, resume = [], OutOfCoreOptions(resume=True)
-    encode_scene(Scene.of(model), target, FAST, resume, progress=lambda stage, _done: stages.append(stage))
+    stages = []
+    encode(model, FAST, out=target, context=Context(resume=True, progress=lambda stage, _done: stages.append(stage)))
     assert "coding" in stages
     assert "sorting" not in stages
     assert whole == target.read_bytes()
@@ -88,34 +88,18 @@ def ply(model, tmp_path):
 
 @pytest.mark.slow
 def test_a_file_is_encoded_out_of_core_on_request(ply, tmp_path):
-    target, limits = tmp_path / "out.csplat", OutOfCoreOptions(memory_bytes=300_000_000, always=True)
-    options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
+    target, stages = tmp_path / "out.csplat", set()
+    options = EncodeOptions(preset="fast", sh_degree=1, bucket_splats=WHOLE)
+    context = Context(memory=300_000_000, workers=1, progress=lambda stage, _done: stages.add(stage))
     with csplat.open(ply) as scene:
-        cost = estimate_cost(scene, options, limits)
+        cost = estimate_cost(scene, options, context)
     assert (COUNT, 1, False) == (cost.splats, cost.sh_degree, cost.in_memory)
     assert 0 < cost.memory_bytes <= 300e6
-    stages = set()
-    encoded = encode_file(
-        str(ply), str(target), options, out_of_core=limits, progress=lambda stage, _done: stages.add(stage)
-    )
+    encoded = encode_file(str(ply), str(target), options, context=context)
     assert {"sorting", "coding"} <= stages
-    assert encoded.report.size_bytes == target.stat().st_size
+    assert encoded.result.size_bytes == target.stat().st_size
     with csplat.open(ply) as scene:
         assert encode(scene.model(), options) == target.read_bytes()
-
-
-def test_only_large_files_may_exceed_the_memory(ply, tmp_path):
-    def may_leave(path, size, **limits):
-        os.truncate(path, size)  # a sparse file
-        return may_exceed_memory(path, OutOfCoreOptions(**limits))
-
-    assert not may_leave(ply, 4 << 20, memory_bytes=1)
-    assert may_leave(ply, 5 << 20, memory_bytes=19 << 20)
-    assert not may_leave(ply, 5 << 20, memory_bytes=21 << 20)
-    assert may_leave(ply, 4 << 20, memory_bytes=1, resume=True)
-    csplat_file = tmp_path / "scene.csplat"
-    csplat_file.write_bytes(b"CSPLAT")
-    assert may_leave(csplat_file, 5 << 20, memory_bytes=1 << 40)  # its decoded size is unknown
 
 
 @pytest.mark.slow
@@ -142,7 +126,7 @@ def with_levels(model, tmp_path_factory):
 @pytest.mark.parametrize("memory", [None, 900_000_000])
 def test_levels_do_not_depend_on_processes_or_memory(model, with_levels, tmp_path, memory):
     target = tmp_path / "out.csplat"
-    encode_large(Scene.of(model), target, replace(FAST, threads=2), levels=EveryFourth(), memory_bytes=memory)
+    encode_large(Scene.of(model), target, FAST, workers=2, levels=EveryFourth(), memory=memory)
     assert with_levels == target.read_bytes()
 
 
@@ -181,14 +165,12 @@ def test_a_disk_that_fills_up_while_levels_are_written_is_reported(model, with_l
 
 def test_a_scene_built_in_one_piece_requires_its_memory(model, tmp_path):
     with pytest.raises(InputError, match="300 MB of memory are too little for this scene, which requires 3"):
-        encode_large(
-            Scene.of(model), tmp_path / "out.csplat", FAST, levels=EveryFourth(COUNT), memory_bytes=300_000_000
-        )
+        encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, levels=EveryFourth(COUNT), memory=300_000_000)
 
 
 @pytest.mark.slow
 def test_two_processes_give_the_same_bytes(model, whole, tmp_path):
-    encode_large(Scene.of(model), tmp_path / "out.csplat", replace(FAST, threads=2))
+    encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, workers=2)
     assert whole == (tmp_path / "out.csplat").read_bytes()
 
 
@@ -214,7 +196,7 @@ def test_doubles_and_huge_values_give_the_bytes_of_memory(model, tmp_path):
     scales[17], scales[1600], shN[3200] = 95.0, 1e5, 3e8
     means = (doubles - np.array(origin)).astype(np.float32)
     hard = replace(model, means=means, origin=origin, means_double=doubles, scales=scales, shN=shN)
-    options = EncodeOptions(preset="fast", sh_degree=1, threads=1, bucket_splats=WHOLE)
+    options = EncodeOptions(preset="fast", sh_degree=1, bucket_splats=WHOLE)
     encode_large(Scene.of(hard), tmp_path / "out.csplat", options)
     assert encode(hard, options) == (tmp_path / "out.csplat").read_bytes()
 
@@ -232,7 +214,7 @@ def test_an_interrupted_encoding_is_resumed(model, whole, tmp_path, stage, after
     with pytest.raises(
         InputError, match=r"started with options .*: continue with the former options, or remove the folder"
     ):
-        encode_large(scene, target, replace(FAST, seed=1), resume=True)
+        encode_large(scene, target, FAST, seed=1, resume=True)
     coded = []
     encode_large(scene, target, FAST, resume=True, progress=lambda stage, _done: coded.append(stage))
     assert whole == target.read_bytes()
@@ -243,7 +225,7 @@ def test_an_interrupted_encoding_is_resumed(model, whole, tmp_path, stage, after
 
 @pytest.mark.slow
 def test_an_encoding_with_a_killed_worker_is_resumed(model, whole, tmp_path):
-    target, two = tmp_path / "out.csplat", replace(FAST, threads=2)
+    target = tmp_path / "out.csplat"
 
     def kill(stage, _done):
         if stage == "coding":
@@ -251,10 +233,10 @@ def test_an_encoding_with_a_killed_worker_is_resumed(model, whole, tmp_path):
                 os.kill(child.pid, signal.SIGKILL)
 
     with pytest.raises(OSError, match="a worker process was killed") as error:
-        encode_large(Scene.of(model), target, two, progress=kill)
+        encode_large(Scene.of(model), target, FAST, workers=2, progress=kill)
     assert errno.ENOMEM == error.value.errno
     assert not target.exists()
-    encode_large(Scene.of(model), target, two, resume=True)
+    encode_large(Scene.of(model), target, FAST, workers=2, resume=True)
     assert whole == target.read_bytes()
 
 
@@ -331,7 +313,7 @@ def test_a_scene_that_shrinks_while_it_is_read_is_refused(model, tmp_path):
 
 def test_too_little_memory_is_refused(model, tmp_path):
     with pytest.raises(InputError, match="100 MB of memory are too little for this scene, which requires 2"):
-        encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, memory_bytes=100_000_000)
+        encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, memory="100MB")
     with pytest.raises(InputError, match="a codebook of shapes requires the scene in memory"):
         encode_large(Scene.of(model), tmp_path / "out.csplat", replace(FAST, shape_codebook_size=64))
     assert not list(tmp_path.iterdir())
@@ -352,10 +334,10 @@ def test_a_cluster_with_a_killed_worker_gives_the_same_bytes(model, whole, with_
                 os.kill(victims.pop(), signal.SIGKILL)
                 victims.clear()
 
-        encode_large(Scene.of(model), target, FAST, scheduler=cluster.scheduler_address, progress=kill)
+        encode_large(Scene.of(model), target, FAST, workers=cluster.scheduler_address, progress=kill)
         assert not victims
         assert whole == target.read_bytes()
-        encode_large(Scene.of(model), target, FAST, scheduler=cluster.scheduler_address, levels=EveryFourth())
+        encode_large(Scene.of(model), target, FAST, workers=cluster.scheduler_address, levels=EveryFourth())
     assert with_levels == target.read_bytes()
 
 
@@ -364,7 +346,7 @@ def test_an_unreachable_cluster_is_reported(model, tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="a cluster requires the extra [scale]")
     monkeypatch.setattr(distributed, "Client", partial_client(distributed.Client))
     with pytest.raises(OSError, match=r"127\.0\.0\.1:9"):
-        encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, scheduler="tcp://127.0.0.1:9")
+        encode_large(Scene.of(model), tmp_path / "out.csplat", FAST, workers="tcp://127.0.0.1:9")
 
 
 def partial_client(client):

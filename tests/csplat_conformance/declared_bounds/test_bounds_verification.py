@@ -19,7 +19,8 @@ from typer.testing import CliRunner
 from csplat import _spec
 from csplat.decoder import decode, decode_scene, read_header
 from csplat.disk_files import read_array
-from csplat.encoder import EncodeOptions, encode, encode_with_report
+from csplat.encode_api import encode, encode_with_report
+from csplat.encoder import EncodeOptions
 from csplat.errors import CsplatError
 from csplat.ply import write_ply
 from csplat.scene import Scene
@@ -44,8 +45,8 @@ def test_errors_declared_by_the_encoder_are_verified(make_model, preset):
     result = encode_with_report(source, EncodeOptions(preset=preset, tile_splats=400))
     scene = decode_scene(result.data)
     for index in (result.source_index, None):
-        proof = verify(source, scene, index)
-        assert ((), index is not None) == (proof.failures, proof.rms_verified)
+        verified = verify(source, scene, index)
+        assert ((), index is not None) == (verified.failures, verified.rms_verified)
 
 
 @pytest.mark.slow
@@ -70,9 +71,9 @@ def test_declared_errors_that_are_too_small_or_inexact_are_not_verified(make_mod
     for factor, held in ((0.5, False), (1e200, True)):  # RMS needs an index
         records = tuple(replace(one, max=one.max * factor, rms=one.rms * factor) for one in bounds.records)
         for refitted in (False, True):
-            stated = replace(bounds, refitted=refitted, records=records)
-            assert held == verify(source, scene, declared=stated).holds
-            assert not verify(source, scene, index, stated).holds
+            declared = replace(bounds, refitted=refitted, records=records)
+            assert held == verify(source, scene, declared=declared).holds
+            assert not verify(source, scene, index, declared).holds
 
 
 def test_refitted_or_undeclared_attributes_are_not_verified(make_model):
@@ -81,12 +82,12 @@ def test_refitted_or_undeclared_attributes_are_not_verified(make_model):
     scene = decode_scene(encode(source))
     fewer = replace(scene.declared_bounds, records=scene.declared_bounds.records[:2])
     refitted, silent, nothing = (
-        verify(source, scene, declared=stated) for stated in (replace(fewer, refitted=True), fewer, None)
+        verify(source, scene, declared=declared) for declared in (replace(fewer, refitted=True), fewer, None)
     )
     assert (True, ("opacities", "sh0")) == (refitted.holds, refitted.unverified)
     assert "renders" in refitted.notes[-1]
-    assert silent.failures == ("the file states no error of opacities", "the file states no error of sh0")
-    assert nothing.failures == ("the file states no errors",)
+    assert silent.failures == ("the file declares no bound for opacities", "the file declares no bound for sh0")
+    assert nothing.failures == ("the file declares no bounds",)
 
 
 @pytest.mark.slow
@@ -98,15 +99,19 @@ def test_a_failure_names_splat_tile_source_and_error(make_model, indexed):
     sh0 = scene.model.sh0.copy()
     sh0[700] += np.float32(5.0)
     changed = replace(scene, model=replace(scene.model, sh0=sh0))
-    proof = verify(source, changed, result.source_index if indexed else None)
-    (wrong,) = (one for one in proof.measures if one.holds is False)
+    verified = verify(source, changed, result.source_index if indexed else None)
+    (wrong,) = (one for one in verified.measures if one.holds is False)
     worst, partner = wrong.worst, result.source_index[700]
     tile = scene.header.tiles[worst.tile]
     assert ("sh0", 700, partner) == (wrong.name, worst.splat, worst.source_splat)
     assert tile.start <= 700 < tile.start + tile.splat_count
     assert worst.found == pytest.approx(5.0, rel=0.1)
-    line = next(line for line in proof.failures if line.startswith("sh0: "))
-    for words in (f"splat 700 (tile {worst.tile})", f"source splat {partner}", f"the stated {wrong.declared_max:.9g}"):
+    line = next(line for line in verified.failures if line.startswith("sh0: "))
+    for words in (
+        f"splat 700 (tile {worst.tile})",
+        f"source splat {partner}",
+        f"the declared {wrong.declared_max:.9g}",
+    ):
         assert words in line
 
 
@@ -116,9 +121,9 @@ def test_extra_columns_but_no_normals_are_verified(make_model):
     result = encode_with_report(source, EncodeOptions(keep_extra=True))
     scene = decode_scene(result.data)
     assert verify(replace(source, extra=label), scene, result.source_index).holds
-    proof = verify(replace(source, extra={"label": np.zeros(50, np.int16)}), scene, result.source_index)
-    assert proof.failures == ("the extra column 'label' differs from that of the source",)
-    assert proof.clauses == ("SRC-3",)
+    verified = verify(replace(source, extra={"label": np.zeros(50, np.int16)}), scene, result.source_index)
+    assert verified.failures == ("the extra column 'label' differs from that of the source",)
+    assert verified.clauses == ("SRC-3",)
 
 
 @pytest.mark.slow
@@ -191,7 +196,7 @@ def test_files_are_verified_tile_by_tile(make_model):
         result = encode_with_report(source, OPTIONS)
         found = both(source, result.data, result.source_index)
         assert not found["failures"]
-        assert found["rms_and_counts_proved"] == bool(found["measures"])
+        assert found["rms_and_counts_verified"] == bool(found["measures"])
 
     assert [] == failures(scenes, check)
 
@@ -226,7 +231,11 @@ def test_a_scene_beyond_the_memory_is_verified_with_an_index_alone(make_model, t
     indexed = [*command, "--source-index", str(index)]
     assert 0 == CliRunner().invoke(app, command).exit_code
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("csplat_tools.cli.verify.verify_file", partial(verify_file, memory_bytes=100_000))
+        small = partial(replace, memory=100_000)
+        patch.setattr(
+            "csplat_tools.cli.verify.verify_file",
+            lambda *words, context, **options: verify_file(*words, context=small(context), **options),
+        )
         alone, by_tile = (CliRunner().invoke(app, words) for words in (command, indexed))
     assert (1, 0) == (alone.exit_code, by_tile.exit_code), by_tile.output
     assert "takes 0 MB of memory, expected at most 0 MB; give --source-index" in " ".join(alone.stderr.split())

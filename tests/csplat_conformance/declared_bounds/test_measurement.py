@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from checked import covariances, disturbed, measure_errors
 
+from csplat.context import Context
 from csplat.errors import InputError
 from csplat_conformance.declared_bounds import Source, check_source_index, measurement
 
@@ -59,8 +60,9 @@ def test_agrees_with_the_encoder_in_any_number_of_threads(make_model):
     rng = np.random.default_rng(2)
     index = rng.permutation(9000)[:8500]
     decoded = disturbed(source.select(index), rng)
-    ours, theirs = measure_pairs(source, decoded, index, threads=1), measure_errors(source, decoded, index)
-    assert ours == measure_pairs(source, decoded, index, threads=3)
+    ours = measure_pairs(source, decoded, index, context=Context(threads=1))
+    theirs = measure_errors(source, decoded, index)
+    assert ours == measure_pairs(source, decoded, index, context=Context(threads=3))
     assert set(ours) == set(theirs)
     for name, pair in ours.items():
         assert pair == pytest.approx(theirs[name], rel=1e-5), name

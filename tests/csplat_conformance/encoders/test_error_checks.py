@@ -1,4 +1,4 @@
-"""The encoder suite's checks of the errors that a file states, and where pictures must judge instead.
+"""The encoder suite's checks of the errors that a file declares, and where pictures must judge instead.
 
 Also: csplat_conformance.encoders.render_checks.
 """
@@ -13,6 +13,7 @@ import pytest
 from encoder_runs_cases import COMMAND, INPUTS, L3, PLAIN, judged, model_of, running
 
 import csplat
+from csplat.context import Context
 from csplat.decoder import decode_scene
 from csplat.encoder import quantisation, shape_codebook
 from csplat_conformance.conformance_report import Status
@@ -22,12 +23,12 @@ from csplat_conformance.encoders.error_checks import find_truncation
 from csplat_conformance.encoders.file_checks import check_content, pair_splats
 
 
-def stating(change=tuple, **facts):
-    """Return a change of the records that a scene states, and of other facts of its errors."""
+def declaring(change=tuple, **facts):
+    """Return a change of the records that a scene declares, and of other facts of its errors."""
 
     def changed(scene):
-        stated = scene.declared_bounds
-        return replace(scene, declared_bounds=replace(stated, records=tuple(change(stated.records)), **facts))
+        declared = scene.declared_bounds
+        return replace(scene, declared_bounds=replace(declared, records=tuple(change(declared.records)), **facts))
 
     return changed
 
@@ -48,25 +49,25 @@ def unchanged(scene):
     return scene
 
 
-REFITTED = stating(without("sh0", "sh1"), refitted=True)
+REFITTED = declaring(without("sh0", "sh1"), refitted=True)
 
 
-def test_errors_are_not_proved_if_they_are_not_stated_or_attributes_are_refitted(plain, tmp_path):
+def test_errors_are_not_proved_if_they_are_not_declared_or_attributes_are_refitted(plain, tmp_path):
     empty = model_of("nasty/empty", tmp_path)
     for name, model, change, status, message, alone in (
-        (PLAIN, plain, silent, Status.NOT_PROVED, "the file states no errors", "the file states no errors"),
-        (PLAIN, plain, REFITTED, Status.NOT_PROVED, "sh0, sh1: refitted, no error is stated", "sh0, sh1 refitted"),
+        (PLAIN, plain, silent, Status.NOT_PROVED, "the file declares no bounds", "the file declares no bounds"),
+        (PLAIN, plain, REFITTED, Status.NOT_PROVED, "sh0, sh1: refitted, no bound is declared", "sh0, sh1 refitted"),
         ("nasty/empty", empty, silent, Status.PASSED, "", ""),
-        (PLAIN, plain, stating(without("sh1")), Status.FAILED, "the file states no error of sh1", ""),
+        (PLAIN, plain, declaring(without("sh1")), Status.FAILED, "the file declares no bound for sh1", ""),
     ):
         _, errors, found = judged(name, model, change)
         assert (status, message, alone) == (errors.status, errors.message, found)
     assert ("SER-6",) == errors.clauses
 
 
-def test_stated_errors_hold_for_refitted_attributes_too(plain):
+def test_declared_errors_hold_for_refitted_attributes_too(plain):
     assert judged(PLAIN, plain, REFITTED)[1].details["means"]["holds"]
-    _, errors, _ = judged(PLAIN, plain, stating(halved, refitted=True))
+    _, errors, _ = judged(PLAIN, plain, declaring(halved, refitted=True))
     assert (Status.FAILED, ("SER-5",)) == (errors.status, errors.clauses)
     assert errors.message.startswith("means: max ")
     assert ", source splat " in errors.message
@@ -75,20 +76,20 @@ def test_stated_errors_hold_for_refitted_attributes_too(plain):
 
 
 def honest(model):
-    """Let a scene state its true errors."""
+    """Let a scene declare its true errors."""
 
     def change(scene):
         means = (one.means.astype(np.float64) for one in (model, scene.model))
         index = pair_splats(*means, INPUTS[PLAIN].separation).source_index
         true = {name: one[:2] for name, one in measure_pairs(Source.of(model), scene.model, index).items()}
-        return stating(
+        return declaring(
             lambda records: (replace(one, max=true[one.measure][0], rms=true[one.measure][1]) for one in records)
         )(scene)
 
     return change
 
 
-def test_coarse_files_and_large_errors_that_are_stated_cause_a_warning(plain):
+def test_coarse_files_and_large_errors_that_are_declared_cause_a_warning(plain):
     _, errors, _ = judged(PLAIN, plain, attribute_psnr=14.0, sh_coding="none")
     assert (Status.WARNED, True) == (errors.status, "is coarse: splat " in errors.message)
     for name, change, message in (
@@ -107,7 +108,7 @@ def statuses(report):
     return [(one.level, one.status) for one in report.outcomes]
 
 
-@pytest.mark.parametrize(("change", "why"), [(silent, "the file states no errors"), (REFITTED, "sh0, sh1 refitted")])
+@pytest.mark.parametrize(("change", "why"), [(silent, "the file declares no bounds"), (REFITTED, "sh0, sh1 refitted")])
 def test_pictures_judge_at_any_level_where_errors_prove_nothing(altered, change, why):
     seen, bad, blind = (altered(change, render_score=score) for score in (lambda *_: 41.0, lambda *_: 11.0, None))
     passed, open_ = Status.PASSED, Status.NOT_PROVED
@@ -167,7 +168,8 @@ def rounding(rint):
 def test_cut_values_are_distinguished_from_rounded_values(tmp_path, name, cut):
     one, model = INPUTS[name], model_of(name, tmp_path)
     with rounding(lambda values, out=None: cut(values, out=out)):
-        scene = decode_scene(csplat.encode(model, csplat.EncodeOptions(sh_coding="scalar", threads=1)))
+        data = csplat.encode(model, csplat.EncodeOptions(sh_coding="scalar"), context=Context(threads=1))
+        scene = decode_scene(data)
     _, pairs = check_content(one, one.source(), scene, None)
     every = frozenset(("means", "covariance", "opacities", "sh0", "sh1", "sh2", "sh3"))
     lines = find_truncation(one.source(), scene.model, scene.header, pairs.source_index, every)

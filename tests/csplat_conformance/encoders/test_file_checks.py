@@ -70,8 +70,8 @@ def test_leaving_much_out_causes_a_warning():
     one = INPUTS["ordinary/degree_0"]
     for kept, status in ((100, Status.WARNED), (200, Status.PASSED)):
         scene = decode_scene(csplat.encode(one.source().to_model((0.0, 0.0, 0.0)).select(np.arange(kept))))
-        stated = replace(scene.declared_bounds, source_count=216, pruned_count=216 - kept)
-        content, _ = check_content(one, one.source(), replace(scene, declared_bounds=stated), None)
+        declared = replace(scene.declared_bounds, source_count=216, pruned_count=216 - kept)
+        content, _ = check_content(one, one.source(), replace(scene, declared_bounds=declared), None)
         assert status is content.status
         assert str(216 - kept) in content.message
 

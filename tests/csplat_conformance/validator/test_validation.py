@@ -18,10 +18,11 @@ from validator_cases import INVALID, SMALL, SPLATS_MAX, VECTOR_LIST
 
 import csplat
 from csplat import _spec
+from csplat.context import Context
 from csplat_authoring.builder import build, repair
 from csplat_authoring.recipes import sound_recipes
 from csplat_authoring.samples import attributes, rich_scene, scene, tile
-from csplat_authoring.scene import Attribute, Chunk, Node, StatedErrors
+from csplat_authoring.scene import Attribute, Chunk, DeclaredErrors, Node
 from csplat_conformance.validator import validate
 from csplat_conformance.validator.ancillary_chunks import JsonError, parse_json
 from csplat_selftest.fuzzing.damage import damaged_file
@@ -31,7 +32,7 @@ RICH = build(rich_scene())
 
 
 #: Vectors whose defect the validator reports at a better offset than the manifest: rms itself, not the max before it.
-AT_RMS = ("stated_error_record_rms_below", "stated_error_record_rms_above", "error_rms_nan", "error_rms_infinite")
+AT_RMS = ("declared_error_record_rms_below", "declared_error_record_rms_above", "error_rms_nan", "error_rms_infinite")
 
 
 def clauses_of(data, **options):
@@ -163,18 +164,18 @@ def test_splats_of_level_0_and_texts_beyond_the_budget_are_not_read():
     assert all("STR-8" in clauses_of(RICH.data, json_bytes_max=most) for most in (3, 255))
 
 
-def stated(*records, pruned=0, degree=0):
-    errors = StatedErrors(2 + pruned, pruned, degree, 0, records)
-    return build(scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))).data
+def declared(*records, pruned=0, degree=0):
+    errors = DeclaredErrors(2 + pruned, pruned, degree, 0, records)
+    return build(scene(chunks=(Chunk(_spec.CHUNK_DECLARED_ERRORS, errors=errors),))).data
 
 
 def test_impossible_declared_errors_are_found():
     means, opacities, sh2 = _spec.MEASURE_MEANS, _spec.MEASURE_OPACITIES, _spec.MEASURE_SH2
-    assert set() == clauses_of(stated((means, 0.5, 0.5 / 2**0.5), (opacities, 1.0, 1.0)))
-    assert "SER-5" in clauses_of(stated((means, 0.5, 0.3)))  # one of two splats alone gives 0.35
-    assert "SER-5" in clauses_of(stated((opacities, 1.5, 1.5)))
-    assert "SER-5" in clauses_of(stated((sh2, 0.5, 0.5)))  # neither has such a band
-    assert set() == clauses_of(stated((sh2, 0.5, 0.5), degree=2))
+    assert set() == clauses_of(declared((means, 0.5, 0.5 / 2**0.5), (opacities, 1.0, 1.0)))
+    assert "SER-5" in clauses_of(declared((means, 0.5, 0.3)))  # one of two splats alone gives 0.35
+    assert "SER-5" in clauses_of(declared((opacities, 1.5, 1.5)))
+    assert "SER-5" in clauses_of(declared((sh2, 0.5, 0.5)))  # neither has such a band
+    assert set() == clauses_of(declared((sh2, 0.5, 0.5), degree=2))
 
 
 def test_json_texts_are_parsed():
@@ -236,8 +237,8 @@ def test_the_validator_agrees_with_the_decoder_on_damaged_files():
 def error_of(data):
     """Return the clause and code of the decoder's error, or None. Only integers are decoded at all levels (CHK-8)."""
     try:
-        csplat.decode(data, threads=1)
-        csplat.decode_integers(data, threads=1)
+        csplat.decode(data, context=Context(threads=1))
+        csplat.decode_integers(data, context=Context(threads=1))
     except csplat.CsplatError as error:
         return error.clause, error.code
     return None

@@ -12,7 +12,7 @@ import pytest
 from captures import views_of
 from command_line import call, change_options, change_views
 
-from csplat import InputError, Target, write_ply
+from csplat import Context, InputError, Target, write_ply
 from csplat.ply import read_ply
 from csplat_render.camera_files import save_cameras
 from csplat_render.pruning_error import measure_pruning_error
@@ -98,8 +98,8 @@ def test_a_refit_improves_validation_views_at_any_number_of_threads(source):
     shell = source.select(slice(10, 300))
     shell = replace(shell, scales=shell.scales + np.float32(0.7), shN=shell.shN[:, :0])
     views = views_of(camera_sequence(shell, 40, (48, 36), seed=3))
-    both = (replace(SMALL, threads=threads) for threads in (1, 2))
-    one, two = (simplify(shell, Target(keep=0.5), views=views, options=options) for options in both)
+    contexts = (Context(threads=threads) for threads in (1, 2))
+    one, two = (simplify(shell, Target(keep=0.5), views=views, options=SMALL, context=how) for how in contexts)
     assert one.report["check_psnr"] > one.report["check_psnr_pruned"] + 1.0
     np.testing.assert_array_equal(one.source_index, two.source_index)
     np.testing.assert_equal(asdict(one.model), asdict(two.model))
@@ -179,7 +179,7 @@ def test_the_requested_number_is_kept(source, given):
 
 def test_other_targets_and_options_out_of_range_are_refused(source):
     for scene, target, message in (
-        (source, {"size_bytes": 1000}, "is no target of simplify, expected keep or psnr or max_psnr_drop"),
+        (source, {"size": 1000}, "is no target of simplify, expected keep or psnr or max_psnr_drop"),
         (source, {"psnr": 40.0, "max_error": {"means": 1.0}}, "is no target of simplify"),
         (source, {"max_psnr_drop": 0.3}, "name a data set"), (source.select(slice(0)), {"keep": 0.5}, "without splats"),
     ):  # fmt: skip

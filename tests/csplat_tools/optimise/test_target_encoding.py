@@ -20,8 +20,10 @@ from checked import cloud, measure_errors
 from command_line import call, change_views, invoke
 from tables import failures
 
-from csplat import EncodeOptions, InputError, decode, decode_scene, write_ply
-from csplat.encoder import Importance, SearchReport, Target, encode_with_report, meet_bounds
+from csplat import Context, EncodeOptions, InputError, decode, decode_scene, write_ply
+from csplat.encode_api import encode_with_report
+from csplat.encoder import Importance, SearchReport, Target, meet_bounds
+from csplat.sizes import parse_size
 from csplat_conformance.declared_bounds import Source, verify_bounds
 from csplat_render.camera import intrinsics, look_at, resized
 from csplat_render.camera_files import save_cameras
@@ -29,7 +31,6 @@ from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
 from csplat_tools.cli.command_output import Output
 from csplat_tools.cli.shared_options import parse_max_error
-from csplat_tools.console import parse_size_bytes
 from csplat_tools.optimise.candidates import WholeScene
 from csplat_tools.optimise.scene_sensitivity import complete_importance, measure_importance
 from csplat_tools.optimise.search_report import format_search, psnr_spread
@@ -94,7 +95,7 @@ def test_a_psnr_is_reached_with_fewer_splats(many, search_at_psnr):
 @pytest.mark.slow
 @pytest.mark.parametrize("no_prune", [True, False])
 def test_a_size_that_no_file_needs_gives_the_finest_file_at_once(many, no_prune):
-    found = search(many, judged_by(cameras(40)), size_bytes=10**6, no_prune=no_prune).report.search
+    found = search(many, judged_by(cameras(40)), size=10**6, no_prune=no_prune).report.search
     assert (1, 0, 0) == (found.encodes, found.pruning_views, found.sensitivity_views)
     assert (900, 80.0) == (found.splats, found.chosen["attribute_psnr"])
     assert found.psnr > 50.0
@@ -107,9 +108,9 @@ def test_a_size_that_no_file_needs_gives_the_finest_file_at_once(many, no_prune)
 def test_a_size_or_a_psnr_drop_against_images_is_met_with_fewer_splats(many, search_at_size, search_at_loss):
     decoded, report, photographs = decode(search_at_loss.data), search_at_loss.report.search, photographed(many)
     scorer = with_validation_views(photographs).image_validation_scorer()
-    assert report.photographs["source"] < 28.0
-    assert report.photographs["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
-    assert report.photographs["file"] >= report.photographs["source"] - 1.0  # the validation images decide
+    assert report.images["source"] < 28.0
+    assert report.images["file"] == pytest.approx(photographs.image_test_scorer().psnr(decoded))
+    assert report.images["file"] >= report.images["source"] - 1.0  # the validation images decide
     assert scorer.psnr(many) - 0.5 <= scorer.psnr(decoded) <= scorer.psnr(many) - 0.3
     assert 0.9 * 1500 <= len(search_at_size.data) <= 1500
     assert search_at_size.report.search.psnr > 24.0
@@ -144,8 +145,8 @@ def test_extreme_scenes_meet_a_psnr(name):
 def test_a_share_of_the_splats_is_refitted_and_verified_at_any_number_of_threads(scene):
     shapes = np.arange(300) % 8
     alike = replace(scene, quats=scene.quats[shapes], scales=scene.scales[shapes])
-    options = EncodeOptions(shape_codebook_size=64, threads=2)
-    kept, other = (search(alike, None, replace(options, threads=threads), keep=0.6) for threads in (2, 1))
+    options, contexts = EncodeOptions(shape_codebook_size=64), (Context(threads=threads) for threads in (2, 1))
+    kept, other = (search(alike, None, options, keep=0.6, context=context) for context in contexts)
     assert kept.data == other.data
     decoded, index = decode_scene(kept.data), kept.source_index
     assert 180 == kept.report.search.splats == len(decoded.model) == len(np.unique(index))
@@ -163,7 +164,7 @@ def test_a_refit_through_the_quantisers_improves_test_views(scene):
     # Of coarse geometry and fine colours.
     coarse = EncodeOptions(opacity_levels=8, scale_step=0.3, quat_levels=8, sh0_step=0.005, sh_step=0.005)
     bare, views = replace(scene, shN=scene.shN[:, :0]), with_validation_views(judged_by(cameras(40)))
-    removal = SimplifyOptions(effort=2, view_size=(960, 720)).pruner(bare, views, use_classes=False, progress=None)
+    removal = SimplifyOptions(effort=2, view_size=(960, 720)).pruner(bare, views, use_classes=False)
     part, judge = removal.refit(300), views.test_scorer(bare)
     quick, fitted = (part.encode(coarse, use_classes=False, draft=draft).write().data for draft in (True, False))
     assert judge.psnr(decode(fitted)) > judge.psnr(decode(quick)) + 0.2
@@ -234,12 +235,12 @@ def unequal():
 @pytest.fixture(scope="module")
 def measured(unequal):
     """Importance of the splats, measured in twelve views."""
-    return measure_importance(unequal, cameras(12), BLACK, threads=None)
+    return measure_importance(unequal, cameras(12), BLACK)
 
 
 @pytest.mark.slow
 def test_quantisation_classes_reduce_the_size_also_with_a_given_importance(unequal, measured):
-    judge, whole = Scorer.of_source(unequal, cameras(6), BLACK), WholeScene(unequal, None, measured, None)
+    judge, whole = Scorer.of_source(unequal, cameras(6), BLACK), WholeScene(unequal, None, measured)
     classes, plain = (
         whole.encode(EncodeOptions(attribute_psnr=psnr), use_classes=use_classes, draft=False).write()
         for psnr, use_classes in ((48.0, True), (47.0, False))
@@ -316,10 +317,10 @@ def test_extra_test_cameras_are_nearer_and_farther(scene):
 
 def test_sizes_and_bounds_are_parsed_or_refused():
     sizes = {"5MB": 5_000_000, "1.5 MiB": 1_572_864, "300kB": 300_000, "300KiB": 307_200, "123456": 123_456}
-    assert sizes == {text: parse_size_bytes(text) for text in sizes}
+    assert sizes == {text: parse_size(text) for text in sizes}
     for text in ("", "MB", "5 apples", "-3MB", "0", "1e30GB", "5 M B"):
         with pytest.raises(InputError, match="a size is"):
-            parse_size_bytes(text)
+            parse_size(text)
     assert {"means": 0.001, "opacities": 0.01} == parse_max_error("means=0.001,opacities=1e-2", None)
     assert {"means": 0.002} == parse_max_error("means=1mm", 0.5)
     for text, unit, message in (

@@ -61,7 +61,7 @@ def test_a_psnr_is_reached_by_nearly_the_smallest_file(goal):
 def test_a_size_is_filled_by_nearly_the_best_file(goal):
     def check(case):
         name, no_prune = case
-        found = found_in(name, no_prune=no_prune, size_bytes=goal)
+        found = found_in(name, no_prune=no_prune, size=goal)
         assert 0.95 * goal <= len(found.file) <= goal
         if goal == 90_000:
             worse = SCENES[name].best(goal, no_prune=no_prune) - found.file.psnr()
@@ -128,8 +128,8 @@ def test_an_impossible_target_is_refused_after_few_candidates():
         "98 dB of 97": (high, no_file, {"psnr": 98.0}),
         "98 dB of 97, all splats": (high, no_file, {"psnr": 98.0, "no_prune": True}),
         "38 dB of 36": (low, "no file reaches 38.00 dB; the best found has 36", {"psnr": 38.0, "no_prune": True}),
-        "size": (PLAIN, "no file has at most 300 bytes; the smallest found has", {"size_bytes": 300}),
-        "size, all": (PLAIN, "no file with all splats has at most 300 bytes", {"size_bytes": 300, "no_prune": True}),
+        "size": (PLAIN, "no file has at most 300 bytes; the smallest found has", {"size": 300}),
+        "size, all": (PLAIN, "no file with all splats has at most 300 bytes", {"size": 300, "no_prune": True}),
         # At any precision, the error of a file equals that of the images.
         "drop": (middle, "no file reaches 49.50 dB on the valid", {"max_psnr_drop": 0.5, "photo_psnr": 50.0}),
         # Errors of means only depend on the quality; the bound requires more of it than the goal.
@@ -159,14 +159,14 @@ def test_a_search_stops_where_files_take_longer_than_their_saving_is_worth():
 def test_a_size_prunes_splats_if_that_raises_the_psnr_or_all_exceed_it():
     better = {}
     for name in ("plain", "without SH", "many unneeded splats", "no splat to spare"):
-        fewer, all_stay = (found_in(name, no_prune=no_prune, size_bytes=90_000).file for no_prune in (False, True))
+        fewer, all_stay = (found_in(name, no_prune=no_prune, size=90_000).file for no_prune in (False, True))
         better[name] = round(fewer.psnr() - all_stay.psnr(), 2)
     assert better.pop("no splat to spare") > -0.6
     assert better.pop("many unneeded splats") > 5.0
     assert min(better.values()) > 0.0, better
     with pytest.raises(InputError, match="no file with all splats has"):
-        search(PLAIN, size_bytes=12_000, no_prune=True)
-    found = search(PLAIN, size_bytes=12_000)
+        search(PLAIN, size=12_000, no_prune=True)
+    found = search(PLAIN, size=12_000)
     assert 0.9 * 12_000 <= len(found.file) <= 12_000
     assert found.file.contents.splats < 4000
 
@@ -192,7 +192,7 @@ def test_test_views_with_larger_errors_cost_no_more_candidates_and_a_low_effort_
     assert 38.0 <= brief.file.psnr() <= 38.4
 
 
-@pytest.mark.parametrize("goal", [{"size_bytes": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}])
+@pytest.mark.parametrize("goal", [{"size": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}])
 def test_test_views_do_not_choose_the_file_of_a_size_or_drop(goal):
     one, other = (search(PLAIN, judging=judging, **goal) for judging in (Views(), Views(3.0, 5.0)))
     assert one.file.contents == other.file.contents

@@ -18,7 +18,7 @@ from models import with_facts
 
 import csplat
 import csplat_tools
-from csplat import EncodeOptions, InputError, disk_files, encode_with_report, file_source, write_ply
+from csplat import Context, EncodeOptions, InputError, disk_files, encode_with_report, file_source, write_ply
 from csplat.decoder import Limits, decode, decode_api, iter_tiles, read_header
 from csplat.ply import read_ply
 from csplat.scene import Scene
@@ -51,7 +51,7 @@ def test_tiles_before_a_damaged_one_are_decoded_but_none_goes_to_standard_output
         layer = tiles[place].layers[0]
         data[layer.offset + layer.size - 1] ^= 1
     for threads in (1, 3):
-        decoded = iter_tiles(bytes(data), threads=threads)
+        decoded = iter_tiles(bytes(data), context=Context(threads=threads))
         assert [tile.splat_count for tile in tiles[:4]] == [len(next(decoded).means) for _ in range(4)]
         with pytest.raises(csplat.CsplatError, match=f"E_CRC at byte {tiles[4].layers[0].offset} "):
             next(decoded)
@@ -64,7 +64,7 @@ def test_threads_and_released_pages_do_not_change_the_result_and_limits_are_per_
     monkeypatch.setattr(decode_api, "PageReleaser", partial(file_source.PageReleaser, step_bytes=1))
     expected = decode(many_tiles)
     opened = SplatFile.open(many_tiles.read_bytes())
-    tiles = [list(iter_tiles(many_tiles, threads=threads)) for threads in (1, 3)]
+    tiles = [list(iter_tiles(many_tiles, context=Context(threads=threads))) for threads in (1, 3)]
     for models in (*tiles, list(opened.models()), list(opened.models())):
         assert [tile.splat_count for tile in opened.header.tiles] == [len(model.means) for model in models]
         for name in ("means", "quats", "scales", "opacities", "sh0", "shN"):
@@ -104,12 +104,12 @@ def files_of_both(model, tmp_path):
     return source, encoded, index
 
 
-def by_disk(model, every=1, progress=None):
+def by_disk(model, every=1):
     """Return a scene in blocks of 300 splats that is drawn in slices of about 100."""
     scene = Scene.like(
         model, len(model), lambda: (model.select(slice(at, at + 300)) for at in range(0, len(model), 300))
     )
-    return SlicedScene(scene, model.select(slice(None, None, every)), every, LITTLE, progress, slice_bytes=60_000)
+    return SlicedScene(scene, model.select(slice(None, None, every)), every, LITTLE, slice_bytes=60_000)
 
 
 @pytest.fixture
@@ -164,18 +164,18 @@ def test_slices_have_equal_costs_and_do_not_split_a_depth():
 
 
 def test_scenes_that_fit_are_loaded_and_others_opened(files_of_both):
-    with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], LITTLE) as opened:
+    with open_scenes(files_of_both[:2]) as loaded, open_scenes(files_of_both[:2], Context(memory=LITTLE)) as opened:
         assert all(scene.in_memory is not None for scene in loaded)
         assert [None, None] == [scene.in_memory for scene in opened]
         assert [scene_sizes(scene) for scene in loaded] == [scene_sizes(scene) for scene in opened]
         with open_scenes(opened) as again:
             assert opened == again
-        with open_scenes((loaded[0], files_of_both[1]), LITTLE) as both:
+        with open_scenes((loaded[0], files_of_both[1]), Context(memory=LITTLE)) as both:
             assert all(scene.in_memory is not None for scene in both)
 
 
 def test_a_sample_has_every_nth_splat_and_gives_about_the_same_views(files_of_both, model, sample_path):
-    with open_scenes(files_of_both[:2], LITTLE) as (source, _):
+    with open_scenes(files_of_both[:2], Context(memory=LITTLE)) as (source, _):
         found, every = sample_scene(source, splats_max=220)
     assert (7, 0) == (every, found.sh_degree)
     np.testing.assert_array_equal(model.means[::7], found.means)
@@ -202,7 +202,7 @@ def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, model, vi
 
     by_disk, errors, in_memory = report("memory")
     assert not by_disk
-    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, memory_bytes=LITTLE))
+    monkeypatch.setattr("csplat_tools.cli.compare.open_scenes", partial(open_scenes, context=Context(memory=LITTLE)))
     by_disk, others, of_disk = report("disk")
     assert by_disk
     assert bool(in_memory == of_disk)
@@ -213,7 +213,7 @@ def test_an_out_of_core_comparison_equals_one_in_memory(files_of_both, model, vi
     moved, views = tmp_path / "moved.ply", csplat_tools.find_view_set(model, cameras=camera_file, count=0)
     write_ply(moved, replace(model, means=model.means + np.float32(0.001)))
     wanted, shown = (
-        csplat_tools.compare(source, str(moved), views=views, memory_bytes=most) for most in (None, LITTLE)
+        csplat_tools.compare(source, str(moved), views=views, context=Context(memory=most)) for most in (None, LITTLE)
     )
     assert (wanted.quality, "order") == (shown.quality, shown.attributes.pairing)
     others = {name: pytest.approx(error, rel=1e-12) for name, error in shown.attributes.errors.items()}
@@ -225,11 +225,11 @@ def test_what_cannot_be_drawn_is_an_error_before_drawing(model, view, files_of_b
         renderer(by_disk(model), BEHIND, mode="exact")(view)
     monkeypatch.setattr(SlicedScene, "least_bytes", 450_000_000)
     with pytest.raises(InputError, match=r"^the memory is 0 MB, expected at least 482 MB to draw these scenes$"):
-        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+        csplat_tools.compare(*files_of_both[:2], context=Context(memory=LITTLE))
     monkeypatch.setattr(SlicedScene, "least_bytes", -(10**12))
     monkeypatch.setattr(disk_files.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(InputError, match="TMPDIR"):
-        csplat_tools.compare(*files_of_both[:2], memory_bytes=LITTLE)
+        csplat_tools.compare(*files_of_both[:2], context=Context(memory=LITTLE))
 
 
 def test_an_interrupted_render_leaves_no_files(model, view, monkeypatch, tmp_path):
@@ -240,5 +240,5 @@ def test_an_interrupted_render_leaves_no_files(model, view, monkeypatch, tmp_pat
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        renderer(by_disk(model, progress=interrupted), BEHIND)(view)
+        renderer(by_disk(model), BEHIND, context=Context(progress=interrupted))(view)
     assert [] == list(tmp_path.iterdir())

@@ -164,12 +164,12 @@ def test_map_coordinates_of_a_set_do_not_change_scores(sets, scene, tmp_path):
 
 #: A command, and where its JSON has the scores of the source on the test images.
 SCORES = {
-    "compare PLY PLY": ("photographs", "a"),
+    "compare PLY PLY": ("images", "a"),
     "finetune PLY OUT/t.csplat --iterations 1 --keep 0.7": ("scores", "source"),
-    "simplify PLY OUT/less.ply --keep 0.9": ("photographs", "source"),
-    "simplify PLY OUT/few.ply --max-psnr-drop 1 --effort 1": ("photographs", "source"),
-    "tradeoff PLY --what presets": ("points", 0, "photographs", "a"),
-    "encode PLY OUT/e.csplat --max-psnr-drop 3 --no-prune --preset fast": ("target", "photographs", "source"),
+    "simplify PLY OUT/less.ply --keep 0.9": ("images", "source"),
+    "simplify PLY OUT/few.ply --max-psnr-drop 1 --effort 1": ("images", "source"),
+    "tradeoff PLY --what presets": ("points", 0, "images", "a"),
+    "encode PLY OUT/e.csplat --max-psnr-drop 3 --no-prune --preset fast": ("target", "images", "source"),
     "sensitivity PLY OUT/s.npz": (),
 }
 
@@ -222,5 +222,5 @@ def test_every_command_reports_the_score_of_the_training(tmp_path, kind, every, 
     assert {held_out} == counts
     assert max(scores.values()) - min(scores.values()) < 0.01, scores
     if kind == "blender":
-        simplified = reports["simplify PLY OUT/less.ply --keep 0.9"]["photographs"]["psnr"]
-        assert simplified == pytest.approx(run("compare PLY OUT/less.ply")["photographs"]["b"]["psnr"], abs=0.01)
+        simplified = reports["simplify PLY OUT/less.ply --keep 0.9"]["images"]["psnr"]
+        assert simplified == pytest.approx(run("compare PLY OUT/less.ply")["images"]["b"]["psnr"], abs=0.01)

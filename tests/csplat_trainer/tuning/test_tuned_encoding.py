@@ -10,7 +10,7 @@ from finetune_cases import BARE, BRIEF, COARSE, COMMAND_OPTIONS, QUICK, SOURCE, 
 
 import csplat
 import csplat_trainer
-from csplat import decode
+from csplat import Context, decode
 
 pytest.importorskip("numba", reason="requires the extra [render]")
 
@@ -19,7 +19,12 @@ pytest.importorskip("numba", reason="requires the extra [render]")
 def test_finetune_takes_a_model_and_views_and_reports_every_step():
     steps, stages, views = [], [], views_of_source()
     tuned = csplat_trainer.finetune(
-        SOURCE, views, COARSE, QUICK, on_step=steps.append, progress=lambda *stage: stages.append(stage)
+        SOURCE,
+        views,
+        COARSE,
+        QUICK,
+        on_step=steps.append,
+        context=Context(progress=lambda *stage: stages.append(stage)),
     )
     assert len(tuned.data) < len(csplat.encode(SOURCE))
     assert psnr(tuned.decoded, views.validation) > psnr(decode(tuned.plain.data), views.validation)
@@ -34,7 +39,7 @@ def test_finetune_takes_a_data_set_and_writes_no_file_that_decodes_differently(t
     tuned = csplat_trainer.finetune(model, data, COARSE, replace(QUICK, iterations=2))
     assert (len(data.train), 2) == (tuned.log["train_views"], tuned.log["steps"])
 
-    def wrong(data):
+    def wrong(data, **_):
         return replace(decode(data), sh0=decode(data).sh0 + np.float32(1e-6))
 
     monkeypatch.setattr("csplat_trainer.tuning.tuned_encoding.decode", wrong)

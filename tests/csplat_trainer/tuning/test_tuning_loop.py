@@ -20,6 +20,7 @@ from finetune_cases import BLACK, BRIEF, COARSE, FEW, QUICK, SOURCE, coarse, fix
 
 import csplat
 from csplat import EncodeOptions, decode, write_ply
+from csplat.context import Context
 from csplat.decoder import read_declared_bounds, read_options
 from csplat.errors import InputError
 from csplat_render.rasteriser import Rasteriser
@@ -74,7 +75,7 @@ def test_the_decoded_file_has_the_psnr_of_the_tuning():
 def test_a_run_without_gain_ends_early_unless_files_are_too_large(monkeypatch):
     few = shell(3).select(slice(0, 40))  # coded so finely that tuning gains nothing
     fixed = fixed_by(EncodeOptions(preset="fast", attribute_psnr=90.0, sh_coding="scalar"), few)
-    views = split_views(renders_of(few, cameras(8), BLACK, None), BLACK, validation_count=3)
+    views = split_views(renders_of(few, cameras(8), BLACK), BLACK, validation_count=3)
     options = replace(FEW, iterations=30, patience=2, byte_cost=0.0).scaled(5.0)
     tuned = tune(fixed, views, options)
     assert tuned.log["converged"]
@@ -92,7 +93,7 @@ def test_the_same_seed_gives_the_same_bytes_at_any_number_of_threads():
     files = []
     for seed, threads in ((1, 1), (1, 2), (2, 1)):
         fixed = fixed_by(COARSE)
-        tuned = tune(fixed, views_of_source(), replace(FEW, seed=seed), threads=threads)
+        tuned = tune(fixed, views_of_source(), replace(FEW, seed=seed), context=Context(threads=threads))
         files.append(written(fixed, tuned.best_values))
     assert files[0] == files[1]
     assert files[0] != files[2]
@@ -110,7 +111,7 @@ def test_a_killed_run_resumes_as_if_uninterrupted(tmp_path, share):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run(progress=kill, outputs=Outputs(file, 3))
+        run(on_step=kill, outputs=Outputs(file, 3))
     whole, rest = run(), run(outputs=Outputs(resume=file))
     assert written(fixed, whole.best_values) == written(fixed, rest.best_values)
     for name in ("losses", "validations", "exposures", "byte_cost"):
@@ -213,8 +214,8 @@ def test_the_command_tunes_and_reports(tuned_file):
     assert 100 == len(facts["log"]["losses"])
     options = read_options(data)
     assert (facts["unseen"], 4096) == (options["finetuned"]["unseen"], options["asked"]["shape_codebook_size"])
-    proof = call("verify", tuned_file.path, "--source", tuned_file.source.ply)
-    assert "not proved: sh0, sh1: the file states no error of them, compare renders" in proof.stdout
+    verified = call("verify", tuned_file.path, "--source", tuned_file.source.ply)
+    assert "not proved: sh0, sh1: the file declares no bounds for them, compare renders" in verified.stdout
 
 
 @pytest.mark.slow
@@ -245,8 +246,8 @@ def test_unseen_splats_and_those_with_the_least_effect_are_pruned_and_counted(ca
     more = () if keep is None else ("--keep", keep)
     facts = tuned_facts(capture, out, *BRIEF, "--source-index", index, *more)
     assert (301, left, 1) == (facts["source_splats"], facts["splats"], facts["unseen"])
-    stated = read_declared_bounds(out.read_bytes())
-    assert (301, 301 - left) == (stated.source_count, stated.pruned_count)
+    declared = read_declared_bounds(out.read_bytes())
+    assert (301, 301 - left) == (declared.source_count, declared.pruned_count)
     assert 1 == read_options(out.read_bytes())["finetuned"]["unseen"]
     call("verify", out, "--source", capture / "scene.ply", "--source-index", index)
     assert left == len({*np.load(index).tolist()} & {*range(1, 301)})  # never the splat behind the cameras
@@ -324,7 +325,7 @@ def test_what_a_tuning_adds_to_the_error_of_its_draft_is_allowed_for(stub_tuner,
 
 def test_a_tuned_file_that_is_too_large_is_tuned_from_a_smaller_draft(stub_tuner):
     stub_tuner.overrun = 1.1
-    assert 8_500 <= stub_tuner.tune_to(csplat.Target(size_bytes=10_000)).size_bytes <= 10_000
+    assert 8_500 <= stub_tuner.tune_to(csplat.Target(size=10_000)).size_bytes <= 10_000
     assert [10_000, 8_016] == [goal.size_bytes for goal in stub_tuner.goals]
 
 

@@ -39,7 +39,7 @@ def test_training_renders_are_those_of_the_source():
     camera = cameras(1)[0]
     for model in (SOURCE, replace(SOURCE, sh0=SOURCE.sh0 * np.float32(1e6))):
         wanted = render(model, camera, background=BLACK).rgb
-        found = renders_of(model, [camera], BLACK, None)[0].image(BLACK, np.empty((H, W, 3), np.float32))
+        found = renders_of(model, [camera], BLACK)[0].image(BLACK, np.empty((H, W, 3), np.float32))
         assert np.allclose(found, np.clip(wanted, -6e4, 6e4), rtol=6e-4, atol=1e-6)
     with pytest.raises(InputError, match="reference image has shape"):
         TuningView(camera, np.zeros((1, 1, 3), np.float32))
@@ -63,5 +63,5 @@ def test_tuning_increases_the_psnr_of_test_images(tuned_file):
     assert after > before + 1.0
     assert source > before
     scene, path, data = tuned_file.source.ply, tuned_file.path, tuned_file.source.data
-    compared = json.loads(call("compare", scene, path, "--data", data, "--json").stdout)["photographs"]
+    compared = json.loads(call("compare", scene, path, "--data", data, "--json").stdout)["images"]
     assert (source, after) == pytest.approx((compared["a"]["psnr"], compared["b"]["psnr"]), abs=1e-4)

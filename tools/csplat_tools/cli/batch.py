@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.errors import counted
 from csplat_tools.batch import PAGE, CommandLineError, run_batch
 from csplat_tools.cli import shared_options as shared
@@ -55,10 +56,10 @@ def batch(
     out.check(inputs=(scenes,))
     try:
         with out.bar() as progress:
+            context = Context(workers=scheduler or workers, progress=progress)
             done = run_batch(
-                scenes, folder, line or ("encode",), ending=ending, match=match, workers=workers, scheduler=scheduler,
-                force=force, progress=progress,
-            )  # fmt: skip
+                scenes, folder, line or ("encode",), ending=ending, match=match, force=force, context=context
+            )
     except CommandLineError as error:
         raise typer.BadParameter(str(error)) from None
     counts = (f"{len(done.select(state))} {state.replace('_', ' ')}" for state in ("done", "done_before", "failed"))

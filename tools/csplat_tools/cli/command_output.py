@@ -124,6 +124,6 @@ class Output:
             if finding.kind in ("repair", "loss") or not (self.quiet or finding.usual):
                 note(f"{name}: {finding}" if name else str(finding))
 
-    def bar(self) -> AbstractContextManager[Progress | None]:
+    def bar(self) -> AbstractContextManager[Progress]:
         """Return the progress bar, see `progress_bar`."""
         return progress_bar(quiet=self.quiet)

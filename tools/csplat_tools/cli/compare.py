@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.disk_files import read_array
 from csplat.errors import InputError, counted
-from csplat.system import default_memory_bytes
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.console import format_bytes
@@ -85,10 +85,11 @@ def compare(
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
     given = b if (chosen, max_splats) == (0, None) else load_scene(b, level=chosen, max_splats=max_splats)
     with open_scenes((a, given)) as (source, other), out.bar() as progress:
+        context = Context(progress=progress)
         if source.in_memory is None:
             if mode == "exact":
                 raise InputError("--backend exact requires both scenes in memory, and they do not fit: use cpu")
-            bound = format_bytes(default_memory_bytes())
+            bound = format_bytes(context.memory_limit)
             out.remark(f"A and B do not fit in {bound} of memory: they are rendered from the disk")
         for name, scene in ((a, source), (b, other)):
             out.print_findings(findings_of(scene), Path(name).name)
@@ -103,7 +104,7 @@ def compare(
         compared = csplat_tools.compare(
             source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, background=views.colour,
             mode=mode, backend=device, force=out.force,
-            prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), progress=progress,
+            prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), context=context,
         )  # fmt: skip
     out.publish(compared.as_json(), format_comparison(compared, Path(a).name, Path(b).name))
     if pictures is not None:

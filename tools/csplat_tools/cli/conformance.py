@@ -237,8 +237,8 @@ def _joined(patterns: Sequence[str] | None) -> str | None:
     return ",".join(patterns) if patterns else None
 
 
-def _moved(bar: Progress | None) -> Callable[[int, int], None] | None:
-    return (lambda done, count: bar("conformance", done / count)) if bar else None
+def _moved(bar: Progress) -> Callable[[int, int], None]:
+    return lambda done, count: bar("conformance", done / count)
 
 
 def _checked_folder(name: str, *, force: bool) -> Path:

@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 import csplat
+from csplat.context import Context
 from csplat.encoder import EncodeOptions, Target
 from csplat.model import SplatModel
-from csplat.out_of_core import OutOfCoreOptions, estimate_cost
+from csplat.out_of_core import estimate_cost
 from csplat.scene import Scene
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli import shared_options as shared
@@ -122,19 +123,20 @@ def encode(
     shared.require_one({"--background": background}, {"--cameras": cameras, "--data": data})
     shared.parse_sh_degree(sh_degree)
     options = shared.checked(
-        EncodeOptions, preset=preset, sh_degree=sh_degree, attribute_psnr=attribute_psnr, keep_extra=keep_extra,
-        threads=threads,
-    )  # fmt: skip
+        EncodeOptions, preset=preset, sh_degree=sh_degree, attribute_psnr=attribute_psnr, keep_extra=keep_extra
+    )
     target = shared.parse_target(
         psnr=target_psnr, size=target_size, max_psnr_drop=max_psnr_drop, keep=keep, max_error=max_error,
         prune=not no_prune, effort=effort,
     )  # fmt: skip
     level_count = shared.parse_levels(levels)
     overrides = shared.parse_overrides(up, unit_metres=unit_metres, antialiased=antialiased or None, licence=licence)
-    limits = OutOfCoreOptions(shared.parse_bytes(memory), resume=resume, scheduler=scheduler)
     with out.bar() as progress:
+        context = shared.checked(
+            Context, threads=threads, workers=scheduler, memory=memory, resume=resume, progress=progress
+        )
         if dry_run:
-            _publish_estimate(source, read_as, options, limits, level_count, out)
+            _publish_estimate(source, read_as, options, context, level_count, out)
             return
         out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
         check_name(output, ".csplat", "encode", source)
@@ -150,48 +152,54 @@ def encode(
             if max_error is not None:
                 target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))
             if target.is_rendered:
-                around = _find_views(scene.model(), options, target, views, out)
+                around = _find_views(scene.model(), options, target, views, out, context)
         encoded = encode_file(
             scene, output, options, target=target, views=around, overrides=overrides, importance=importance,
-            source_index=source_index, levels=level_count, out_of_core=limits, format=read_as, progress=progress,
+            source_index=source_index, levels=level_count, format=read_as, context=context,
         )  # fmt: skip
         _publish(encoded, source, output, out, up=up)
         if level_count is None:
-            written = Scene.of(encoded.source).changed(count=encoded.report.splat_count)
-            out.remark(*describe_levels(written, options, limits))
+            written = encoded.source.changed(count=encoded.result.report.splat_count)
+            out.remark(*describe_levels(written, options, context))
 
 
 def _publish(encoded: EncodedFile, source: str, output: str, out: Output, *, up: str | None) -> None:
     """Publish the result."""
-    out.print_findings(encoded.findings)
-    for line in encoded.report.notes:
+    report, model = encoded.result.report, encoded.source.in_memory
+    out.print_findings(encoded.source.findings)
+    for line in report.notes:
         note(line)
-    if encoded.report.search is not None:
+    if report.search is not None:
         from csplat_tools.optimise.search_report import format_search
 
-        out.remark(*format_search(encoded.report.search))
-    out.remark(*format_declared_errors(encoded.report.errors))
-    if not out.quiet and encoded.result is not None:
-        every = max(1, len(encoded.source) // _UP_SPLATS)
-        axis = estimate_up(encoded.source.select(slice(None, None, every)), every)
+        out.remark(*format_search(report.search))
+    out.remark(*format_declared_errors(report.errors))
+    if not out.quiet and model is not None:
+        every = max(1, len(model) // _UP_SPLATS)
+        axis = estimate_up(model.select(slice(None, None, every)), every)
         shared.take_estimated_up(axis, out, given=up, shown=False)
     out.remark(format_encoding(encoded, source, output))
     out.publish(encoded.as_json())
 
 
 def _publish_estimate(
-    source: str, read_as: str | None, options: EncodeOptions, limits: OutOfCoreOptions, levels: LevelCount, out: Output
+    source: str, read_as: str | None, options: EncodeOptions, context: Context, levels: LevelCount, out: Output
 ) -> None:
     """Report memory, disk space and time that an encoding would take."""
     with source_path(source) as local, csplat.open(local, read_as, sh_degree=read_degree(options)) as scene:
-        cost = estimate_cost(scene, options, limits, choose_levels(scene.count, options, levels))
-        lines = describe_levels(scene, options, limits) if levels is None else []
+        cost = estimate_cost(scene, options, context, choose_levels(scene.count, options, levels))
+        lines = describe_levels(scene, options, context) if levels is None else []
     out.publish(cost.as_json(), format_cost(cost))
     out.remark(*lines)
 
 
 def _find_views(
-    model: SplatModel, options: EncodeOptions, target: Target, views: shared.ViewOptions, out: Output
+    model: SplatModel,
+    options: EncodeOptions,
+    target: Target,
+    views: shared.ViewOptions,
+    out: Output,
+    context: Context,
 ) -> ViewSet:
     """Compile the renderer, find the views of a scene, and announce how long the search will take."""
     prepare_renderer(quiet=out.quiet, simplify=True)
@@ -201,7 +209,7 @@ def _find_views(
     if len(model) and view_set.test:
         may_prune = target.prune and target.keep is None
         out.announce_time(
-            lambda: expected_search_seconds(model, options, target, view_set),
+            lambda: expected_search_seconds(model, options, target, view_set, context),
             "--no-prune takes a sixth of that, a preset seconds" if may_prune else "a preset takes seconds",
         )
     return view_set

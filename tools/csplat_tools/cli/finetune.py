@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.encoder import EncodeOptions
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
@@ -85,7 +86,7 @@ def finetune(
         named["--checkpoint"] = checkpoint
     out.check(output, inputs=(source, *views.inputs, resume), named=named)
     check_name(output, ".csplat", "finetune", source)
-    with out.bar():
+    with out.bar() as progress:
         scene = read_source(source, MetadataOverrides(), sh_degree=read_degree(encoding))
         out.print_findings(scene.findings)
         model = scene.model()
@@ -94,7 +95,8 @@ def finetune(
         around.read_images()
         result = tuning.run_finetuning(
             model, around, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
-            target=target, source_index=source_index, page=page, quiet=out.quiet,
+            target=target, source_index=source_index, page=page,
+            context=Context(progress=progress), quiet=out.quiet,
         )  # fmt: skip
     out.remark(format_tuning_report(result))
     out.publish(result)

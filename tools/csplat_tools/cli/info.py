@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.errors import InputError
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
@@ -57,5 +58,5 @@ def info(
             if page is not None:
                 from csplat_tools.inspect.file_report import write_page
 
-                write_page(page, source, data, description, original, progress=progress)
+                write_page(page, source, data, description, original, context=Context(progress=progress))
     out.publish(description.as_json(), format_description(description))

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.errors import counted
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli import shared_options as shared
@@ -97,7 +98,7 @@ def render(
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, backend=device, force=out.force,
-            prepare=partial(prepare_renderer, quiet=out.quiet), progress=progress,
+            prepare=partial(prepare_renderer, quiet=out.quiet), context=Context(progress=progress),
         )  # fmt: skip
     if rendered.ignored_count:
         note(f"{counted(rendered.ignored_count, 'splat')} with NaN or infinities, not drawn")

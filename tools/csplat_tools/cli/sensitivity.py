@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name
@@ -59,7 +60,7 @@ def sensitivity(
             lambda: _PASSES * total_render_seconds(model, around.training or around.test),
             "--cameras with fewer or smaller views takes less",
         )
-        measured = measure_scene(model, around, progress=progress)
+        measured = measure_scene(model, around, context=Context(progress=progress))
     measured.write(output)
     scores = measured.as_json()
     out.remark(*format_sensitivity(scores))

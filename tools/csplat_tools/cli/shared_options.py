@@ -23,7 +23,7 @@ from csplat.scene_metadata import Direction, check_axes, unit_up
 from csplat_render import Backend, Mode
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
-from csplat_tools.console import NUMBER, parse_size_bytes, print_data
+from csplat_tools.console import NUMBER, print_data
 from csplat_tools.level_builder import LEVELS_MAX, LevelCount
 from csplat_tools.scene_files import MetadataOverrides
 from csplat_tools.views import VIRTUAL, DataOptions, Split, ViewSet, find_view_set
@@ -332,15 +332,6 @@ def parse_size(text: str) -> tuple[int, int]:
     return int(match[1]), int(match[2])
 
 
-def parse_bytes(text: str | None) -> int | None:
-    """Parse a number of bytes from `2GB`; return `None` for `None`.
-
-    Raises:
-        InputError: the text is not a size.
-    """
-    return None if text is None else parse_size_bytes(text)
-
-
 def parse_numbers(option: str, text: str | None, *counts: int) -> tuple[float, ...] | None:
     """Parse finite numbers from text such as `1,0.5,-2`; return `None` for `None`.
 
@@ -449,12 +440,11 @@ def parse_target(
     Lengths with a unit in `max_error` are parsed as if a scene unit were a metre; see `parse_max_error`.
     """
     decibels = parse_decibels(psnr, "--target-psnr"), parse_decibels(max_psnr_drop, "--max-psnr-drop")
-    size_bytes = checked(parse_bytes, size)
     bounds = {} if max_error is None else checked(parse_max_error, max_error, 1.0)
-    if not bounds and all(value is None for value in (*decibels, size_bytes, keep)):
+    if not bounds and all(value is None for value in (*decibels, size, keep)):
         return None
     return checked(
-        Target, decibels[0], size_bytes, decibels[1], keep, bounds, prune,
+        Target, decibels[0], size, decibels[1], keep, bounds, prune,
         Target.effort if effort is None else effort,
     )  # fmt: skip
 

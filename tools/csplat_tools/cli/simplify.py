@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
 from csplat_tools.file_streams import check_name, write_model
@@ -74,7 +75,8 @@ def simplify(
             lambda: passes * total_render_seconds(model, shrink_cameras(around.training, size)),
             "--effort 1 takes less",
         )
-        result = csplat_tools.simplify(model, target, views=around, options=options, progress=progress)
+        context = Context(progress=progress)
+        result = csplat_tools.simplify(model, target, views=around, options=options, context=context)
     write_model(output, result.model, absolute=False)
     out.remark(*result.notes, *format_simplification(result.report))
     out.publish(result.report)

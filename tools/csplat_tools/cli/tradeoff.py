@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import TRUSTS_PATHS, Output
 from csplat_tools.console import note
@@ -57,20 +58,22 @@ def tradeoff(
     if page is not None:
         require_plots()
     with out.bar() as progress:
-        read = read_source(source)
+        read, context = read_source(source), Context(progress=progress)
         out.print_findings(read.findings)
         prepare_renderer(quiet=out.quiet, simplify=bool(searches), ssim=True)
         around = views.find(read.model(), out)
         if len(read.model()):
             out.announce_time(
-                lambda: sum(expected_search_seconds(read.model(), *search, around) for search in searches),
+                lambda: sum(
+                    expected_search_seconds(read.model(), *search, around, context=context) for search in searches
+                ),
                 "--what presets,precision takes less",
             )
         words = [*(["--cameras", cameras] if cameras else []), *(["--data", data] if data else [])]
         words += ["--trust-paths"] if TRUSTS_PATHS.get() else []
         measured = csplat_tools.tradeoff(
             read, grid, views=around, path=source, view_words=words, say=None if out.quiet else note,
-            progress=progress,
+            context=context,
         )  # fmt: skip
         if page is not None:
             write_bytes(page, make_tradeoff_page(measured).encode())

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.encoder import EncodeOptions
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
@@ -111,13 +112,18 @@ def train(
     if not to_file:
         check_name(output, ".ply", "train", source)
     files = Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume)
-    if not to_file:
-        out.publish(run_training(data, output, options, files, overrides=overrides, page=page, quiet=out.quiet))
-        return
-    encoding = EncodeOptions(preset or "small", seed=seed, shape_codebook_size=SHAPE_ENTRIES)
-    result = run_training_to_file(
-        data, output, options, files, encoding, tuning_after(training=options), target=target,
-        overrides=overrides, page=page, quiet=out.quiet,
-    )  # fmt: skip
-    out.remark(format_tuning_report(result["file"]))
+    encoding = EncodeOptions(preset or "small", shape_codebook_size=SHAPE_ENTRIES)
+    with out.bar() as progress:
+        context = Context(seed=seed, progress=progress)
+        if to_file:
+            result = run_training_to_file(
+                data, output, options, files, encoding, tuning_after(training=options), target=target,
+                overrides=overrides, page=page, context=context, quiet=out.quiet,
+            )  # fmt: skip
+        else:
+            result = run_training(
+                data, output, options, files, overrides=overrides, page=page, context=context, quiet=out.quiet
+            )
+    if to_file:
+        out.remark(format_tuning_report(result["file"]))
     out.publish(result)

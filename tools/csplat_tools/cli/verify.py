@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.errors import CsplatError, counted
 from csplat_tools.cli import shared_options as shared
 from csplat_tools.cli.command_output import Output
@@ -45,13 +46,14 @@ def verify(
     out.check(inputs=(path, source, source_index))
     try:
         with out.bar() as progress:
-            verified = verify_file(path, source, source_index, max_splats=max_splats, progress=progress)
+            context = Context(progress=progress)
+            verified = verify_file(path, source, source_index, max_splats=max_splats, context=context)
     except CsplatError as error:
         out.publish({"holds": False, "error": {"code": error.code, "message": str(error)}})
         raise
     out.publish(verified.as_json(), "" if out.quiet else format_verification(verified))
     if not verified.holds:
-        _print_reasons(verified, path, unverified=source is not None and verified.proof is None)
+        _print_reasons(verified, path, unverified=source is not None and verified.bounds is None)
         raise typer.Exit(EXIT_FAILED)
 
 
@@ -64,5 +66,5 @@ def _print_reasons(verified: Verification, path: str, *, unverified: bool) -> No
         note(f"error: {path}: {counted(len(violations), 'violation')} of {clauses}; copy or make it again ({codes})")
     if unverified:
         note("error: the declared errors were not checked")
-    for failure in verified.proof.failures if verified.proof is not None else ():
+    for failure in verified.bounds.failures if verified.bounds is not None else ():
         note(f"error: {failure}")

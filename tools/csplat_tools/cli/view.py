@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from csplat.context import Context
 from csplat.decoder import decode_scene
 from csplat.encoder import PresetName
 from csplat.errors import counted
@@ -67,7 +68,8 @@ def view(
     wishes = page_parameters(cameras, shared.parse_overrides(up))
     with ExitStack() as stack:
         with out.bar() as progress:
-            scene = stack.enter_context(open_viewer_scene(source, preset=_PRESETS[0], progress=progress))
+            context = Context(progress=progress)
+            scene = stack.enter_context(open_viewer_scene(source, preset=_PRESETS[0], context=context))
         wishes |= _scene_parameters(scene, cameras, up, out)
         server = open_server(scene, host=host, port=port, wishes=wishes)
         with server as opened:
@@ -111,7 +113,10 @@ def export_html(
     wishes = page_parameters(cameras, shared.parse_overrides(up))
     out.check(output, inputs=(source, cameras))
     check_name(output, ".html", "export-html", source)
-    with out.bar() as progress, open_viewer_scene(source, preset=_PRESETS[1], progress=progress) as scene:
+    with (
+        out.bar() as progress,
+        open_viewer_scene(source, preset=_PRESETS[1], context=Context(progress=progress)) as scene,
+    ):
         data = scene.read()
         decode_scene(data)
         wishes |= _scene_parameters(scene, cameras, up, out)

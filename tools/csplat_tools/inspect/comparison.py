@@ -11,12 +11,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import check_free_space, finite_or_none, temporary_root
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene import Scene
 from csplat.splat_file import SplatFile
-from csplat.system import default_memory_bytes
 from csplat.types import F32, Progress, null_progress
 from csplat_conformance.declared_bounds import (
     Source,
@@ -126,7 +126,7 @@ class Comparison:
             "cameras": self.cameras,
             "background": list(self.background),
             "mode": self.mode,
-            "photographs": self.image_scores,
+            "images": self.image_scores,
             **self.quality.as_json(),
             "ignored": {"a": self.ignored, "b": self.quality.ignored},
             "views": [
@@ -150,9 +150,8 @@ def compare(
     mode: Mode = "standard",
     backend: Backend = "cpu",
     force: bool = False,
-    memory_bytes: int | None = None,
     prepare: Callable[[], object] | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Comparison:
     """Compare a scene with its source, as `csplat compare` does. Requires the packages of the render extra.
 
@@ -170,10 +169,9 @@ def compare(
         backend: what renders, as in `csplat_render.render`. A GPU computes PSNR alone, unless images are needed for
             something else: `pictures`, `lpips`, or the images of a data set. Both scenes have to fit in memory.
         force: existing files in `pictures` may be replaced.
-        memory_bytes: approximate limit of the memory, without images of a data set; scenes that do not fit together
-            are compared out of core. `None`: half of the free memory.
         prepare: called when all inputs have been checked, before the first render.
-        progress: progress callback.
+        context: threads, progress, and memory, without images of a data set; scenes that do not fit together are
+            compared out of core.
 
     Examples:
         >>> import csplat_tools
@@ -183,27 +181,27 @@ def compare(
 
     Raises:
         CsplatError: a file is not valid, or an output exists; there are no test views; the renderer is not installed;
-            the disk is full, or `memory_bytes` is too low.
+            the disk is full, or too little memory is allowed.
         OSError: a file cannot be read or written.
     """
     start = time.perf_counter()
-    bound = default_memory_bytes() if memory_bytes is None else memory_bytes
+    bound = context.memory_limit
     require_renderer()
     if pictures is not None:
         require_images()
     distance = None if lpips is None else load_lpips(None if lpips == AUTO_WEIGHTS else lpips)
-    with open_scenes((a, b), memory_bytes) as (source, other):
-        views = views or _views(source, background, progress)
+    with open_scenes((a, b), context) as (source, other):
+        views = views or _views(source, background, context)
         if not views.test:
             raise InputError(f"{views.name} has no {views.split} views")
-        image_scorer = views.image_test_scorer(mode=mode) if views.images else None
+        image_scorer = views.image_test_scorer(mode=mode, context=context) if views.images else None
         viewers: list[OnView] = []
         if pictures is not None:
             names = image_names([camera.image for camera in views.test])
             viewers.append(_ImageWriter(os.fspath(pictures), names, image_scorer, amplification, force=force))
         first: SplatModel | Renderable
         second: SplatModel | Renderable
-        first, second, errors = _measure(source, other, views.test, bound, source_index, progress)
+        first, second, errors = _measure(source, other, views.test, bound, source_index, context)
         if prepare is not None:
             prepare()
         image_scores = None if image_scorer is None else _ImageScores(image_scorer, distance)
@@ -213,11 +211,11 @@ def compare(
             first, second = (_on_gpu(scene, device) for scene in (first, second))
         if isinstance(first, GpuScene) and isinstance(second, GpuScene) and not viewers and distance is None:
             colour = background or views.test_background
-            quality = compare_scenes(first, second, views.test, colour, progress=progress)
+            quality = compare_scenes(first, second, views.test, colour, progress=context.progress)
             ignored = first.ignored
         else:
-            scorer = views.test_scorer(first, mode=mode, background=background, progress=progress)
-            quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=progress)
+            scorer = views.test_scorer(first, mode=mode, background=background, context=context)
+            quality = scorer.scores(second, lpips=distance, on_view=_all_of(viewers), progress=context.progress)
             ignored = scorer.reference(0).ignored
         return Comparison(
             source, other, errors, quality, ignored, views.name,
@@ -231,7 +229,7 @@ def attribute_errors(
     other: Scene,
     source_index: NDArray[Any] | None = None,
     *,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> AttributeErrors | None:
     """Measure the errors of a scene's splats against the splats of its source.
 
@@ -239,7 +237,7 @@ def attribute_errors(
         source: the source, in memory.
         other: the scene whose errors are measured, in memory.
         source_index: [N] integers, the index in the source of each splat of `other`; `None`: unknown.
-        progress: progress callback of a search.
+        context: threads, and progress of a search.
 
     Returns:
         The errors; `None` if pairs of splats cannot be found.
@@ -250,20 +248,20 @@ def attribute_errors(
     model, theirs = source.model(), other.model()
     ours = Source.of(model)
     if source_index is not None:
-        return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index))
+        return AttributeErrors("index", len(theirs), 0, _errors(ours, theirs, source_index, context))
     if _same_order(model, theirs):
-        return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs))))
+        return AttributeErrors("order", len(theirs), 0, _errors(ours, theirs, np.arange(len(theirs)), context))
     declared = other.declared_bounds if isinstance(other, SplatFile) else None
     if declared is None or not isinstance(other, SplatFile) or not len(theirs):
         return None
     bounds = {record.measure: record.max for record in declared.records}
     if not bounds.keys() >= {"means", "opacities", "sh0"}:
         return None
-    partners = find_partners(ours, theirs, bounds, lattice_radii(theirs, other.header), progress=progress)
+    partners = find_partners(ours, theirs, bounds, lattice_radii(theirs, other.header), context=context)
     matched = np.flatnonzero(partners >= 0)
     if not len(matched):
         return None
-    errors = _errors(ours, theirs.select(matched), partners[matched])
+    errors = _errors(ours, theirs.select(matched), partners[matched], context)
     return AttributeErrors("search", len(matched), len(theirs) - len(matched), errors)
 
 
@@ -273,31 +271,31 @@ def attribute_errors_out_of_core(
     memory_bytes: int,
     source_index: NDArray[Any] | None = None,
     *,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> AttributeErrors | None:
     """Measure errors as `attribute_errors` does, out of core, without search; an index requires a .csplat file."""
     if source_index is not None:
         if not isinstance(other, SplatFile):
             return None
         most = splats_in_memory(other, memory_bytes)
-        pairs = measure_pairs_by_tile(source, other, source_index, most, progress=progress)
+        pairs = measure_pairs_by_tile(source, other, source_index, most, context=context)
         errors = {name: (measured.max, measured.rms) for name, measured in pairs.measured.items()}
         return AttributeErrors("index", other.count, 0, errors)
     if source.count != other.count or not _same_order(
-        *(sample_scene(scene, progress=progress)[0] for scene in (source, other))
+        *(sample_scene(scene, progress=context.progress)[0] for scene in (source, other))
     ):
         return None
     parts = [
-        (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs))))
-        for start, ours, theirs in _paired_blocks(source, other, progress)
+        (start, len(theirs), measure_pairs(Source.of(ours), theirs, np.arange(len(theirs)), context=context))
+        for start, ours, theirs in _paired_blocks(source, other, context.progress)
     ]
     errors = {name: (measured.max, measured.rms) for name, measured in merge_errors(parts).items()}
     return AttributeErrors("order", other.count, 0, errors)
 
 
-def _paired_blocks(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tuple[int, SplatModel, SplatModel]]:
+def _paired_blocks(a: Scene, b: Scene, progress: Progress) -> Iterator[tuple[int, SplatModel, SplatModel]]:
     """Yield paired blocks of two scenes in the same order, with the index of the first splat."""
-    first = a.with_progress("measuring splats", progress or null_progress).blocks()
+    first = a.with_progress("measuring splats", progress).blocks()
     second = b.with_progress("", null_progress).blocks()
     start, ours, theirs = 0, a.empty(), b.empty()
     while start < a.count:
@@ -308,8 +306,9 @@ def _paired_blocks(a: Scene, b: Scene, progress: Progress | None) -> Iterator[tu
         ours, theirs, start = ours.select(slice(count, None)), theirs.select(slice(count, None)), start + count
 
 
-def _errors(source: Source, other: SplatModel, index: NDArray[Any]) -> dict[str, tuple[float, float]]:
-    return {name: (measured.max, measured.rms) for name, measured in measure_pairs(source, other, index).items()}
+def _errors(source: Source, other: SplatModel, index: NDArray[Any], context: Context) -> dict[str, tuple[float, float]]:
+    measured = measure_pairs(source, other, index, context=context)
+    return {name: (error.max, error.rms) for name, error in measured.items()}
 
 
 def _same_order(source: SplatModel, other: SplatModel) -> bool:
@@ -323,8 +322,8 @@ def _same_order(source: SplatModel, other: SplatModel) -> bool:
     return float(np.median(distances)) <= _NEAR * spread
 
 
-def _views(source: Scene, background: Colour | None, progress: Progress | None) -> ViewSet:
-    model, every = sample_scene(source, progress=progress)
+def _views(source: Scene, background: Colour | None, context: Context) -> ViewSet:
+    model, every = sample_scene(source, progress=context.progress)
     return find_view_set(model, background=background, count=0, every=every)
 
 
@@ -334,14 +333,14 @@ def _measure(
     cameras: Sequence[Camera],
     memory_bytes: int,
     source_index: NDArray[np.integer[Any]] | None,
-    progress: Progress | None,
+    context: Context,
 ) -> tuple[SplatModel | SlicedScene, SplatModel | SlicedScene, AttributeErrors | None]:
     """Return both scenes in a form to render, and the errors of B's splats."""
     if source.in_memory is not None and other.in_memory is not None:
-        return source.in_memory, other.in_memory, attribute_errors(source, other, source_index, progress=progress)
+        return source.in_memory, other.in_memory, attribute_errors(source, other, source_index, context=context)
     kept = sum(_PIXEL_BYTES * camera.W * camera.H for camera in cameras)
     first, second = (
-        SlicedScene(scene, *sample_scene(scene, progress=progress), memory_bytes - kept, progress)
+        SlicedScene(scene, *sample_scene(scene, progress=context.progress), memory_bytes - kept)
         for scene in (source, other)
     )
     for scene in (first, second):
@@ -353,7 +352,7 @@ def _measure(
         max(first.disk_bytes, second.disk_bytes),
         "scenes are rendered: TMPDIR sets another folder",
     )
-    return first, second, attribute_errors_out_of_core(source, other, memory_bytes, source_index, progress=progress)
+    return first, second, attribute_errors_out_of_core(source, other, memory_bytes, source_index, context=context)
 
 
 def _on_gpu(scene: SplatModel | Renderable, device: Device) -> GpuScene:

@@ -204,7 +204,7 @@ class FileDescription:
             "cameras": None if metadata.cameras is None else len(metadata.cameras),
             "options": self.options,
             "metadata": dict(metadata.entries) or None,
-            "stated_errors": None if self.declared_bounds is None else _bounds_as_json(self.declared_bounds),
+            "declared_errors": None if self.declared_bounds is None else _bounds_as_json(self.declared_bounds),
         }
 
 
@@ -262,7 +262,7 @@ def describe_other_format(path: Path) -> tuple[dict[str, Any], str]:
             "flat": metadata.flat,
             "extra": {name: str(dtype) for name, dtype in scene.extra.items()},
             "metadata": dict(metadata.entries),
-            "defects": findings_as_json(scene.findings),
+            "findings": findings_as_json(scene.findings),
         }
         average = "" if per_splat is None else f", {per_splat:.2f} bytes per splat"
         words = describe_placement(scene, count, metadata)

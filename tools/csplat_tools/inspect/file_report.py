@@ -8,8 +8,8 @@ from html import escape
 from mmap import mmap
 from pathlib import PurePath
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import DeclaredBounds, decode
-from csplat.types import Progress
 from csplat_tools import html_report as html
 from csplat_tools.console import format_bytes
 from csplat_tools.file_streams import STANDARD_STREAM, write_bytes
@@ -77,7 +77,7 @@ def write_page(
     description: FileDescription,
     source: str | None = None,
     *,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> None:
     """Write the report.
 
@@ -87,14 +87,14 @@ def write_page(
         data: its bytes.
         description: its description.
         source: a scene to compare it with, which requires the renderer.
-        progress: progress callback of the comparison.
+        context: threads and progress of the comparison.
 
     Raises:
         CsplatError: the file or the source is not valid.
         OSError: the source cannot be read, or the report cannot be written.
     """
     title = "standard input" if name == STANDARD_STREAM else PurePath(name).name
-    comparison = None if source is None else _compare(data, source, progress)
+    comparison = None if source is None else _compare(data, source, context)
     write_bytes(path, make_page(title, description, comparison).encode())
 
 
@@ -108,16 +108,16 @@ def make_page(title: str, description: FileDescription, comparison: _SourceCompa
     return html.document(f"{title}: content", parts, summary)
 
 
-def _compare(data: bytes | mmap, source: str, progress: Progress | None) -> _SourceComparison:
+def _compare(data: bytes | mmap, source: str, context: Context) -> _SourceComparison:
     """Score renders of the file on the views of `psnr`, and find the hardest place in views that show the scene."""
     from csplat_render.scorer import Scorer
     from csplat_tools.views import display_cameras, find_view_set
 
-    loaded, model = load_scene(source), decode(data)
+    loaded, model = load_scene(source), decode(data, context=context)
     views = find_view_set(loaded.model(), count=0)
     hardest, shown = html.HardestPlaceSearch(), display_cameras(loaded.model(), views)
-    scores = views.test_scorer(loaded.model()).scores(model, progress=progress)
-    showing = Scorer.of_source(loaded.model(), shown, views.test_background)
+    scores = views.test_scorer(loaded.model(), context=context).scores(model, progress=context.progress)
+    showing = Scorer.of_source(loaded.model(), shown, views.test_background, context=context)
     showing.scores(model, ssim=False, on_view=hardest.examine)
     place = hardest.found()
     assert place is not None

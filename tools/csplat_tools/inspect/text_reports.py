@@ -202,30 +202,30 @@ def _declared_errors(declared: DeclaredBounds) -> str:
 
 def format_verification(verified: Verification) -> str:
     """Format the result of a verification: violations, and the verified errors."""
-    validation, proof = verified.validation, verified.proof
+    validation, bounds = verified.validation, verified.bounds
     lines = [
         *map(str, (*validation.violations, *validation.unread)),
         *(f"remark: {remark}" for remark in validation.remarks),
     ]
     if validation.conforms:
         lines.append(f"intact: {counted(validation.splat_count, 'splat')}; checked: {', '.join(validation.checks)}")
-    if proof is not None:
-        if proof.measures:
-            lines.append(_measures(proof))
-        lines += proof.notes
-        if proof.holds:
-            lines.append(_verdict(proof))
+    if bounds is not None:
+        if bounds.measures:
+            lines.append(_measures(bounds))
+        lines += bounds.notes
+        if bounds.holds:
+            lines.append(_verdict(bounds))
     return "\n".join(lines)
 
 
-def _verdict(proof: BoundsVerification) -> str:
-    if not any(measure.holds for measure in proof.measures):
+def _verdict(bounds: BoundsVerification) -> str:
+    if not any(measure.holds for measure in bounds.measures):
         return "the file declares no errors that could be verified"
-    return "the declared errors hold" if proof.rms_verified else "the declared maxima hold"
+    return "the declared errors hold" if bounds.rms_verified else "the declared maxima hold"
 
 
-def _measures(proof: BoundsVerification) -> str:
-    if proof.rms_verified:
+def _measures(bounds: BoundsVerification) -> str:
+    if bounds.rms_verified:
         header = ("error", "declared max", "found max", "declared rms", "found rms", "")
         rows = [
             (
@@ -233,10 +233,10 @@ def _measures(proof: BoundsVerification) -> str:
                 *map(_number, (measure.declared_max, measure.measured_max, measure.declared_rms, measure.measured_rms)),
                 _word(measure),
             )
-            for measure in proof.measures
+            for measure in bounds.measures
         ]
         return format_table(header, rows)
-    rows = [(measure.name, _number(measure.declared_max), _word(measure)) for measure in proof.measures]
+    rows = [(measure.name, _number(measure.declared_max), _word(measure)) for measure in bounds.measures]
     return format_table(("error", "declared max", ""), rows)
 
 
@@ -268,8 +268,8 @@ def format_simplification(report: Mapping[str, Any]) -> list[str]:
         rows.append(("validation views", f"{report['validation_psnr']:.2f}"))
     if "psnr" in report:
         rows.append((f"{report['test_views']['views']} test views", f"{report['psnr']:.2f}"))
-    if "photographs" in report:
-        scores = report["photographs"]
+    if "images" in report:
+        scores = report["images"]
         rows.append(("held-out images, source", f"{scores['source']:.2f}"))
         rows.append(("held-out images", f"{scores['psnr']:.2f}"))
     lines.append(format_table(("PSNR", "dB"), rows))

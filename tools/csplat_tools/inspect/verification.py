@@ -9,13 +9,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 import csplat
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
 from csplat.disk_files import read_array, size_on_disk
 from csplat.errors import InputError
 from csplat.model import MAX_SH_DEGREE
 from csplat.splat_file import SplatFile
-from csplat.system import available_memory_bytes, default_memory_bytes
-from csplat.types import Progress
+from csplat.system import available_memory_bytes
 from csplat_conformance.declared_bounds import (
     BoundsVerification,
     Source,
@@ -36,20 +36,20 @@ class Verification:
 
     Attributes:
         validation: violations of the spec, and the checks made.
-        proof: verification of the declared bounds; `None` without a source, or if the file violates the spec.
+        bounds: verification of the declared bounds; `None` without a source, or if the file violates the spec.
     """
 
     validation: Validation
-    proof: BoundsVerification | None
+    bounds: BoundsVerification | None
 
     @property
     def holds(self) -> bool:
         """True if the file conforms to the spec, and no declared bound was exceeded."""
-        return self.validation.conforms and (self.proof is None or self.proof.holds)
+        return self.validation.conforms and (self.bounds is None or self.bounds.holds)
 
     def as_json(self) -> dict[str, Any]:
         """Return everything as JSON-compatible values."""
-        validation, proof = self.validation, self.proof
+        validation, bounds = self.validation, self.bounds
         return {
             "holds": self.holds,
             "conforms": validation.conforms,
@@ -62,7 +62,7 @@ class Verification:
             "splats": validation.splat_count,
             "tiles": validation.tile_count,
             "checks": list(validation.checks),
-            "proof": None if proof is None else proof.as_json(),
+            "verification": None if bounds is None else bounds.as_json(),
         }
 
 
@@ -72,8 +72,7 @@ def verify_file(
     source_index: str | None = None,
     *,
     max_splats: int | None = None,
-    memory_bytes: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Verification:
     """Find every violation in a file; if there is none and a source is given, verify its declared bounds.
 
@@ -82,9 +81,8 @@ def verify_file(
         source: its source.
         source_index: the .npy file that the encoder wrote.
         max_splats: refuse a scene of more splats (LIM-1); `None`: no limit.
-        memory_bytes: approximate limit of the memory; larger scenes are verified tile by tile, which requires a source
-            index. `None`: half of the free memory, or all of it without an index.
-        progress: progress callback for validating and matching.
+        context: threads, progress, and memory, by default all of it without an index; larger scenes are verified tile
+            by tile, which requires a source index.
 
     Raises:
         CsplatError: source or index are not valid, or too large without an index.
@@ -92,25 +90,25 @@ def verify_file(
     """
     rows = None if source_index is None else read_array(source_index, most_bytes=_INDEX_BYTES)
     with mapped_csplat(path) as data:
-        validation = validate(data, splats_max=max_splats, progress=progress)
+        validation = validate(data, splats_max=max_splats, progress=context.progress)
         if source is None or not validation.conforms:
             return Verification(validation, None)
-        return Verification(validation, _verify_bounds(data, source, rows, memory_bytes, progress))
+        return Verification(validation, _verify_bounds(data, source, rows, context))
 
 
-def _verify_bounds(
-    data: bytes | mmap, source: str, rows: NDArray[Any] | None, memory_bytes: int | None, progress: Progress | None
-) -> BoundsVerification:
+def _verify_bounds(data: bytes | mmap, source: str, rows: NDArray[Any] | None, context: Context) -> BoundsVerification:
     opened = SplatFile.open(data)
     header, bounds = opened.header, opened.declared_bounds
     degree = MAX_SH_DEGREE  # bands above have not been read by the encoder
-    if memory_bytes is None:
-        memory_bytes = available_memory_bytes() if rows is None else default_memory_bytes()
+    memory_bytes = context.memory_limit
+    if context.memory is None and rows is None:
+        memory_bytes = available_memory_bytes()
     with source_path(source) as local:
         needed = comparison_bytes(opened, bounds.source_count if bounds else 0, size_on_disk(local))
         if needed <= memory_bytes:
             model = csplat.read(local, keep_extra=bool(header.extras), sh_degree=degree)
-            return verify_bounds(Source.of(model), decode(data), header, bounds, rows, progress=progress)
+            decoded = decode(data, context=context)
+            return verify_bounds(Source.of(model), decoded, header, bounds, rows, context=context)
         if rows is None:
             raise InputError(
                 f"the declared errors were not checked: this takes {needed / 1e6:,.0f} MB of memory, expected at most "
@@ -118,4 +116,4 @@ def _verify_bounds(
             )
         with csplat.open(local, sh_degree=degree) as scene:
             most = splats_in_memory(opened, memory_bytes)
-            return verify_bounds_by_tile(scene, opened, rows, most, progress=progress)
+            return verify_bounds_by_tile(scene, opened, rows, most, context=context)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
 from csplat.encoder import (
     PRESETS,
@@ -117,13 +118,13 @@ class WholeScene:
         model: the scene.
         importance: the caller's importance of the splats.
         measured: importance measured in views, for quantisation classes.
-        progress: progress callback.
+        context: threads, seed and progress.
     """
 
     model: SplatModel
     importance: Weights | None
     measured: Importance | None
-    progress: Progress | None
+    context: Context = DEFAULT_CONTEXT
     refits: bool = False
 
     @property
@@ -139,8 +140,7 @@ class WholeScene:
     def encode(self, options: EncodeOptions, *, use_classes: bool, draft: bool) -> EncodedTiles:  # noqa: ARG002  # the protocol's
         """Quantise and code the splats."""
         weights = self.measured if use_classes and self.measured is not None else self.importance
-        plan = EncodePlan.of(self.model, options, importance=weights, progress=self.progress)
-        return encode_tiles(plan, progress=self.progress)
+        return encode_tiles(EncodePlan.of(self.model, options, importance=weights, context=self.context))
 
     def metadata(self, validation_psnr: float) -> None:  # the protocol's
         """Return nothing."""
@@ -174,10 +174,10 @@ class Candidate:
     test_errors: F64 | None = field(default=None, repr=False)
     test_psnr: float | None = None
 
-    def with_levels(self, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
+    def with_levels(self, levels: FittedLevelBuilder) -> Candidate:
         """Return the same splats in a file with levels of detail, which is not measured in the test views yet."""
         coded, entries = self.coded, self.subset.metadata(self.validation_psnr) or {}
-        encoded = levels.encode_plan(coded.plan, coded.codebooks, progress or null_progress)
+        encoded = levels.encode_plan(coded.plan, coded.codebooks)
         if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
             encoded = replace(encoded, errors=coded.errors)
         result = encoded.write({**entries, "levels": levels.settings(len(coded.plan.model))})

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import (
     EncodedTiles,
     EncodeOptions,
@@ -27,7 +28,7 @@ from csplat.encoder import (
 )
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, F64, I64, Progress
+from csplat.types import F32, F64, I64
 from csplat_render import Camera
 from csplat_render.scorer import ReferenceImage, Scorer
 from csplat_tools.optimise.rate_distortion import NOTHING, error_of_psnr
@@ -56,9 +57,7 @@ class Pruner:
         refits: fit colours, opacities, scales and rotations of the kept splats to renders of the source.
         use_classes: kept splats may be sorted into quantisation classes, and later files start from tuned values; False
             for surroundings, of which virtual views show too little.
-        seed: seed of further virtual views, and of the order in which views are used.
-        threads: number of threads; `None` for all. No result depends on it.
-        progress: progress callback.
+        context: threads and progress; seed of further virtual views, and of the order in which views are used.
     """
 
     source: SplatModel
@@ -67,17 +66,13 @@ class Pruner:
     steps_factor: float = 1.0
     refits: bool = True
     use_classes: bool = True
-    seed: int = 0
-    threads: int | None = None
-    progress: Progress | None = None
+    context: Context = DEFAULT_CONTEXT
     _last: PrunedSubset | None = field(default=None, init=False)
 
     @cached_property
     def sufficient(self) -> SufficientViews:
         """Training views whose pruning errors agree with the errors of held-out views, and the held-out views."""
-        return find_sufficient_views(
-            self.source, self.views, size=self.size, threads=self.threads, progress=self.progress
-        )
+        return find_sufficient_views(self.source, self.views, size=self.size, context=self.context)
 
     @cached_property
     def measured(self) -> list[MeasuredViews]:
@@ -85,21 +80,18 @@ class Pruner:
         batches = self.sufficient.batches
         groups = [functools.reduce(operator.add, batches[start::2]) for start in range(min(2, len(batches)))]
         if self.views.virtual:
-            cameras = camera_sequence(self.source, len(self.sufficient.used), self.size, seed=self.seed + 1)
+            cameras = camera_sequence(self.source, len(self.sufficient.used), self.size, seed=self.context.seed + 1)
             for part in (cameras[::2], cameras[1::2]):
                 group = MeasuredViews.of(
-                    self.source, part, self.views.background, keep_renders=True, threads=self.threads,
-                    progress=self.progress,
-                )  # fmt: skip
+                    self.source, part, self.views.background, keep_renders=True, context=self.context
+                )
                 groups.append(group)
         return groups
 
     @cached_property
     def order(self) -> PruningOrder:
         """The pruning order."""
-        return PruningOrder(
-            self.source, [*self.measured], self.views.background, threads=self.threads, progress=self.progress
-        )
+        return PruningOrder(self.source, [*self.measured], self.views.background, context=self.context)
 
     @cached_property
     def cameras(self) -> Sequence[Camera]:
@@ -116,7 +108,7 @@ class Pruner:
         """Scorer on held-out views, against which refits are checked."""
         check = self.sufficient.check
         references = [ReferenceImage(render) for render in check.renders]
-        return Scorer(check.cameras, references, self.views.background, threads=self.threads)
+        return Scorer(check.cameras, references, self.views.background, context=self.context)
 
     @property
     def view_count(self) -> int:
@@ -165,7 +157,7 @@ class Pruner:
                 model, steps = _with_values_of(self._last.model, self._last.rows, pruned, rows), steps // 2
             model = refit_splats(
                 model, self.cameras, self.references, steps=self.steps(steps), background=self.views.background,
-                seed=self.seed, threads=self.threads, progress=self.progress,
+                context=self.context,
             )  # fmt: skip
             after = self.check_scorer.psnr(model)
         is_refused = after < before
@@ -221,15 +213,14 @@ class PrunedSubset:
         tuned = None if draft else self._tuned.get(kind)
         plan = EncodePlan.of(
             self.model if tuned is None else tuned, options, importance=self._weights(options, use_classes=use_classes),
-            origin=Origin(len(pruner.source), self.rows, refitted=refits, adjusted=refits), progress=pruner.progress,
+            origin=Origin(len(pruner.source), self.rows, refitted=refits, adjusted=refits), context=pruner.context,
         )  # fmt: skip
         if draft or not refits:
-            return encode_tiles(plan, progress=pruner.progress)
-        fixed = fix_quantisation(plan, pruner.source, pruner.progress)
+            return encode_tiles(plan)
+        fixed = fix_quantisation(plan, pruner.source)
         values = quantisation_aware_refit(
             fixed, pruner.cameras, pruner.references, steps=pruner.steps(_STEPS // (2 if tuned is None else 4)),
-            before=self.model, background=pruner.views.background, seed=pruner.seed, threads=pruner.threads,
-            progress=pruner.progress,
+            before=self.model, background=pruner.views.background, context=pruner.context,
         )  # fmt: skip
         start = fixed.start()
         before, after = (pruner.check_scorer.psnr(self._decoded(fixed, tried)) for tried in (start, values))
@@ -237,7 +228,7 @@ class PrunedSubset:
         # Longer chains overfit, and in surroundings the rate term moves what few views show (fox120k: 1 to 3 dB less).
         if tuned is None and pruner.use_classes:
             self._tuned[kind] = self._with_values(fixed, values)
-        return fixed.encode(values, pruner.progress)
+        return fixed.encode(values)
 
     def _with_values(self, fixed: FixedQuantisation, values: FreeValues) -> SplatModel:
         """Return the splats with tuned values before rounding, or decoded values if splats share them."""
@@ -272,9 +263,7 @@ class PrunedSubset:
         pruner = self.pruner
         cameras = importance_views(replace(pruner.views, training=pruner.sufficient.used), len(self.model))
         try:
-            return measure_importance(
-                self.model, cameras, pruner.views.background, threads=pruner.threads, progress=pruner.progress
-            )
+            return measure_importance(self.model, cameras, pruner.views.background, context=pruner.context)
         except InputError:
             return None
 

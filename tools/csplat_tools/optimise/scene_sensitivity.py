@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import EncodeOptions, Importance, apply_weight_floor, max_class_count
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import measure_pruning_error
 from csplat_tools.file_streams import open_output
@@ -70,15 +70,14 @@ def measure_scene(
     views: ViewSet,
     *,
     matrices: bool = True,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> SceneSensitivity:
     """Measure the sensitivities of a scene in all training views, or in sufficiently many virtual views.
 
     Args:
         model: the scene.
         views: the views. Without training views, the test views are used.
-        matrices, threads, progress: as for `measure_views`.
+        matrices, context: as for `measure_views`.
 
     Raises:
         InputError: there are no splats, or no views, or they show no splat.
@@ -92,12 +91,12 @@ def measure_scene(
     )
     if views.virtual and views.training:
         size = (views.training[0].W, views.training[0].H)
-        sufficient = find_sufficient_views(model, views, size=size, threads=threads, progress=progress)
+        sufficient = find_sufficient_views(model, views, size=size, context=context)
         cameras, check, source = sufficient.used, [*sufficient.check.cameras], "virtual"
-    measured = measure_views(model, cameras, views.background, matrices=matrices, threads=threads, progress=progress)
+    measured = measure_views(model, cameras, views.background, matrices=matrices, context=context)
     missed = float("nan")
     if check:
-        elsewhere = measure_pruning_error(model, check, background=views.background, threads=threads).seen
+        elsewhere = measure_pruning_error(model, check, background=views.background, context=context).seen
         missed = float(np.mean(elsewhere & ~measured.seen))
     return SceneSensitivity(model, measured, source, missed)
 
@@ -109,8 +108,7 @@ def measure_views(
     *,
     matrices: bool,
     magnitudes: bool = True,
-    threads: int | None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Sensitivity:
     """Measure the sensitivities of a scene in given views.
 
@@ -120,22 +118,19 @@ def measure_views(
         background: background colour.
         matrices: measure the matrices of SH coefficients, too.
         magnitudes: measure gradient magnitudes, too; weights are made from squares.
-        threads: number of threads; `None` for all.
-        progress: progress callback.
+        context: threads and progress.
 
     Raises:
         InputError: there are no splats, or no view shows any.
     """
     if not len(model):
         raise InputError(_NOTHING)
-    if progress is not None:
-        progress("compiling", 0.0)  # takes some seconds unless cached
-        measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
-        progress("compiling", 1.0)
+    context.progress("compiling", 0.0)  # takes some seconds unless cached
+    measure_sensitivity(model.select(np.zeros(1, np.intp)), cameras[:1], metric=matrices, magnitudes=magnitudes)
+    context.progress("compiling", 1.0)
     sensitivity = measure_sensitivity(
-        model, cameras, background=background, metric=matrices, magnitudes=magnitudes, threads=threads,
-        progress=progress,
-    )  # fmt: skip
+        model, cameras, background=background, metric=matrices, magnitudes=magnitudes, context=context
+    )
     if not sensitivity.seen.any():
         raise InputError("no view shows any splat: check that the cameras belong to the scene")
     return sensitivity
@@ -146,20 +141,17 @@ def measure_importance(
     cameras: Sequence[Camera],
     background: Colour,
     *,
-    threads: int | None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Importance:
     """Measure the importance for the encoder: SH weights, bounded below by opacity and size, and Gauss–Newton blocks.
 
     Args:
-        model, cameras, background, threads, progress: as for `measure_views`.
+        model, cameras, background, context: as for `measure_views`.
 
     Raises:
         InputError: as for `measure_views`.
     """
-    sensitivity = measure_views(
-        model, cameras, background, matrices=False, magnitudes=False, threads=threads, progress=progress
-    )
+    sensitivity = measure_views(model, cameras, background, matrices=False, magnitudes=False, context=context)
     weights = StoredSensitivity.of(model, sensitivity).importance()
     return replace(weights, sh=apply_weight_floor(weights.sh, model))
 
@@ -180,7 +172,7 @@ def complete_importance(
     importance: Weights | None,
     *,
     inside: bool,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> tuple[Importance | None, int]:
     """Return the caller's importance, completed by measurements.
 
@@ -190,7 +182,7 @@ def complete_importance(
         encoding: the caller's options; some exclude quantisation classes.
         importance: the caller's importance. If it has Gauss–Newton blocks, nothing is measured; else it is kept for SH.
         inside: the views are virtual, in a surrounding scene; nothing is measured in such views.
-        progress: progress callback.
+        context: threads and progress.
 
     Returns:
         The importance, `None` if it is unknown or would change nothing; and the number of views used here.
@@ -204,7 +196,7 @@ def complete_importance(
         return None, 0
     seen_from = importance_views(views, len(source))
     try:
-        measured = measure_importance(source, seen_from, views.background, threads=encoding.threads, progress=progress)
+        measured = measure_importance(source, seen_from, views.background, context=context)
     except InputError:
         return None, 0  # no splat is visible
     if isinstance(importance, Importance):

@@ -24,9 +24,9 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
     """Format the report of a search as sentences for users."""
     goal = report.goal
     asked = [f"{name} within {bound:g}" for name, bound in goal.get("max_error", {}).items()]
-    if "size_bytes" in goal:
-        percentage = 100.0 * report.size_bytes / goal["size_bytes"]
-        asked.append(f"{format_bytes(goal['size_bytes'])}; the file uses {percentage:.1f} %")
+    if "size" in goal:
+        percentage = 100.0 * report.size_bytes / goal["size"]
+        asked.append(f"{format_bytes(goal['size'])}; the file uses {percentage:.1f} %")
     if "psnr" in goal:
         asked.append(f"{goal['psnr']:g} dB; the file has {report.psnr:.2f} dB")
     if "keep" in goal:
@@ -34,8 +34,8 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
     if "max_psnr_drop" in goal:
         asked.append(f"a drop of {goal['max_psnr_drop']:g} dB on the validation images")
     lines = [f"target: {'; '.join(asked)}"]
-    if report.photographs:
-        file, source = report.photographs["file"], report.photographs["source"]
+    if report.images:
+        file, source = report.images["file"], report.images["source"]
         lines.append(f"test images: {file:.2f} dB, the source {source:.2f} dB")
     lines += [f"chosen: {line}" for line in report.why]
     if report.psnr is not None:

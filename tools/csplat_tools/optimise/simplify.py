@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
@@ -36,8 +36,6 @@ class SimplifyOptions:
         view_size: width and height of training renders, pixels; `None`: chosen by the number of splats.
         views: largest number of virtual views if no views are given; `None`: chosen by the number of splats.
         background: red, green, blue behind virtual views; given views have their own.
-        seed: seed of the virtual views, and of the order in which views are used.
-        threads: number of threads; `None` for all. The result does not depend on it.
 
     Raises:
         InputError: a value is out of range.
@@ -48,8 +46,6 @@ class SimplifyOptions:
     view_size: tuple[int, int] | None = None
     views: int | None = None
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    seed: int = 0
-    threads: int | None = None
 
     def __post_init__(self) -> None:
         if not 1 <= self.effort <= 9:
@@ -76,14 +72,12 @@ class SimplifyOptions:
         views: ViewSet,
         *,
         use_classes: bool = True,
-        progress: Callable[[str, float], None] | None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> Pruner:
         """Return the pruner of a scene, with fewer steps if renders are larger than usual."""
         size = self.views_and_size(len(source))[1]
         larger = max(1.0, math.sqrt(math.prod(size) / math.prod(VIEW_SIZE)))
-        return Pruner(
-            source, views, size, self.work / larger, self.refit, use_classes, self.seed, self.threads, progress
-        )
+        return Pruner(source, views, size, self.work / larger, self.refit, use_classes, context)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +103,7 @@ def simplify(
     *,
     views: ViewSet | None = None,
     options: SimplifyOptions | None = None,
-    progress: Callable[[str, float], None] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Simplified:
     """Prune splats to a target, and refit the others, as `csplat simplify` does.
 
@@ -121,7 +115,7 @@ def simplify(
         views: the kept splats are fitted to training views; validation views determine how many may be pruned. `None`:
             virtual views.
         options: number and size of views, instead of the target's effort.
-        progress: progress callback.
+        context: threads and progress; seed of the virtual views, and of the order in which views are used.
 
     Returns:
         The simplified scene; its splats are in the source's order. If the search for a PSNR finds no pruned scene that
@@ -149,8 +143,8 @@ def simplify(
         raise InputError("a largest drop of PSNR requires images: name a data set")
     if views is None:
         count, size = options.views_and_size(len(source))
-        views = find_view_set(source, background=options.background, count=count, size=size, seed=options.seed)
-    pruner, scores = options.pruner(source, views, progress=progress), dict[str, Any]()
+        views = find_view_set(source, background=options.background, count=count, size=size, seed=context.seed)
+    pruner, scores = options.pruner(source, views, context=context), dict[str, Any]()
     if target.keep is not None:
         subset = pruner.refit(target.count(len(source)))
     else:
@@ -170,9 +164,9 @@ def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, flo
         InputError: even the source misses the PSNR.
     """
     source, views = pruner.source, pruner.views
-    scorer = views.validation_scorer(source, threads=pruner.threads)
+    scorer = views.validation_scorer(source, context=pruner.context)
     if target.max_psnr_drop is not None:
-        scorer = views.image_validation_scorer(threads=pruner.threads)
+        scorer = views.image_validation_scorer(context=pruner.context)
     source_error = scorer.pooled(scorer.errors(source))
     goal = target.psnr if target.max_psnr_drop is None else psnr_of_mse(source_error) - target.max_psnr_drop
     assert goal is not None
@@ -199,16 +193,16 @@ def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, flo
 
 def _test_scores(pruner: Pruner, model: SplatModel) -> dict[str, Any]:
     """Return the scores on the test views, for the report; empty without test views."""
-    views, threads = pruner.views, pruner.threads
+    views, context = pruner.views, pruner.context
     if not views.test:
         return {}
     scores: dict[str, Any] = {
-        "psnr": views.test_scorer(pruner.source, threads=threads).psnr(model),
+        "psnr": views.test_scorer(pruner.source, context=context).psnr(model),
         "test_views": {"cameras": views.name, "views": len(views.test)},
     }
     if views.images:
-        scorer = views.image_test_scorer(threads=threads)
-        scores["photographs"] = {"source": scorer.psnr(pruner.source), "psnr": scorer.psnr(model)}
+        scorer = views.image_test_scorer(context=context)
+        scores["images"] = {"source": scorer.psnr(pruner.source), "psnr": scorer.psnr(model)}
     return scores
 
 

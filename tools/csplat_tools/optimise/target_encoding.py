@@ -6,10 +6,10 @@ import time
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Target, meet_bounds
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import Progress
 from csplat_tools.optimise.candidates import Weights
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.views import ViewSet, find_view_set
@@ -29,13 +29,13 @@ def meet_target(
     importance: Weights | None = None,
     simplifying: SimplifyOptions | None = None,
     levels: FittedLevelBuilder | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> EncodeResult:
     """Search for the file that meets a target which requires rendering.
 
     Args:
         source: the scene.
-        options, target, importance, progress: as for `csplat.encode_with_report`.
+        options, target, importance, context: as for `csplat.encode_with_report`.
         views: training, validation and test views; `None`: virtual views around the scene.
         simplifying: options of pruning and refitting, instead of the target's effort; the views determine the
             background.
@@ -58,21 +58,23 @@ def meet_target(
     check_target(source, target, options)
     encodes = 0
     if options.position_error is not None:
-        EncodePlan.of(source, options)  # refuses an error that cannot be kept before the search
+        EncodePlan.of(source, options, context=context)  # refuses an error that cannot be kept before the search
     if target.max_error:
-        bounded, options = meet_bounds(source, options, target, importance=importance, progress=progress)
+        bounded, options = meet_bounds(source, options, target, importance=importance, context=context)
         assert bounded.report.search is not None
         encodes = bounded.report.search.encodes
     chosen, report = search_target(
-        source, target, views or find_view_set(source), options, importance=importance,
-        options=simplifying or SimplifyOptions(effort=target.effort), levels=levels, progress=progress,
+        source, target, views or find_view_set(source, seed=context.seed), options, importance=importance,
+        options=simplifying or SimplifyOptions(effort=target.effort), levels=levels, context=context,
     )  # fmt: skip
     seconds = round(time.perf_counter() - start, 3)
     return chosen.result.with_search(replace(report, encodes=encodes + report.encodes, seconds=seconds))
 
 
-def expected_search_seconds(source: SplatModel, options: EncodeOptions, target: Target, views: ViewSet) -> float:
+def expected_search_seconds(
+    source: SplatModel, options: EncodeOptions, target: Target, views: ViewSet, context: Context = DEFAULT_CONTEXT
+) -> float:
     """Estimate the seconds of `meet_target` on this machine, from the time of some renders of test views."""
     from csplat_tools.optimise.target_search import expected_renders
 
-    return expected_renders(options, target) * render_seconds(source, views.test, threads=options.threads)
+    return expected_renders(options, target) * render_seconds(source, views.test, context=context)

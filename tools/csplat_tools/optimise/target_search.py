@@ -31,12 +31,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from csplat.context import Context
 from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, SearchReport, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene import drop_bands
-from csplat.types import Progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scene_frame import scene_frame
 from csplat_render.scorer import Scorer
@@ -644,7 +644,7 @@ def search_target(
     importance: Weights | None,
     options: SimplifyOptions,
     levels: FittedLevelBuilder | None,
-    progress: Progress | None,
+    context: Context,
 ) -> tuple[Candidate, SearchReport]:
     """Search for the file that meets a target, by rendering candidates.
 
@@ -652,7 +652,7 @@ def search_target(
         source: the scene.
         target: the target, other than largest errors alone.
         views: training, validation and test views.
-        encoding, importance, progress: as for `csplat.encode_with_report`.
+        encoding, importance, context: as for `csplat.encode_with_report`.
         options: options of pruning and refitting.
         levels: builds levels of detail, whose bytes count; `None`: the file has none.
 
@@ -663,47 +663,47 @@ def search_target(
         InputError: the target is out of reach, no splat is visible, or a drop of PSNR is requested without images.
     """
     views = with_validation_views(views)
-    test_scorer = views.test_scorer(source, threads=encoding.threads)
+    test_scorer = views.test_scorer(source, context=context)
     if views.name != VIRTUAL and _is_empty(test_scorer):
         raise InputError("no splat is visible in the given views: check that the cameras belong to the scene")
     if target.max_psnr_drop is not None and not views.images:
         raise InputError("a largest drop of PSNR requires images (--data), against which it is measured")
     inside = views.virtual and scene_frame(source).kind == "surrounding"
-    options, pruner, sensitivity_views = replace(options, threads=encoding.threads), None, 0
-    pool = CandidatePool(encoding, views.validation_scorer(source, threads=encoding.threads), progress)
-    images = None if target.max_psnr_drop is None else views.image_validation_scorer(threads=encoding.threads)
-    goal, whole = Goal.of(target, source, test_scorer, images), WholeScene(source, importance, None, progress)
+    pruner, sensitivity_views = None, 0
+    pool = CandidatePool(encoding, views.validation_scorer(source, context=context), context.progress)
+    images = None if target.max_psnr_drop is None else views.image_validation_scorer(context=context)
+    goal, whole = Goal.of(target, source, test_scorer, images), WholeScene(source, importance, None, context)
     finest = None if levels is not None else TargetSearch(goal, pool, whole, None).finest()
     if finest is None and not _keeps_all(target, encoding):
-        pruner = options.pruner(source, views, use_classes=not inside, progress=progress)
+        pruner = options.pruner(source, views, use_classes=not inside, context=context)
     if finest is not None:
         chosen = finest
     elif pruner is not None and target.keep is not None:
         chosen = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
-        chosen = chosen if levels is None else chosen.with_levels(levels, progress)
+        chosen = chosen if levels is None else chosen.with_levels(levels)
     else:
         if pruner is None:
             measured, sensitivity_views = complete_importance(
-                source, views, encoding, importance, inside=inside, progress=progress
+                source, views, encoding, importance, inside=inside, context=context
             )
             whole = replace(whole, measured=measured)
         search = TargetSearch(goal, pool, whole, pruner, options.work)
-        chosen = search.best() if levels is None else _best_with_levels(search, levels, progress)
+        chosen = search.best() if levels is None else _best_with_levels(search, levels)
     remarks = [_INSIDE_REMARK] * (inside and chosen.splats < len(source))
     if finest is not None:
         remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
     report = make_report(
         target, chosen, pool, test_scorer, splats_before=len(source), views_of=views.name, remarks=remarks,
         encodes=len(pool.made), seconds=0.0,
-        photographs=_image_psnr(source, chosen, views, encoding.threads) if views.images else {},
+        images=_image_psnr(source, chosen, views, context) if views.images else {},
         sensitivity_views=sensitivity_views, pruning_views=0 if pruner is None else pruner.view_count,
-        elsewhere=_psnr_elsewhere(source, chosen, views, encoding.threads),
+        elsewhere=_psnr_elsewhere(source, chosen, views, context),
         reached={name: chosen.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
     return chosen, report
 
 
-def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
+def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder) -> Candidate:
     """Return the best file with levels of detail, whose bytes count for a size.
 
     Their bytes are only known once they are built for the splats of a file. So the size that is left for level 0 is
@@ -714,11 +714,11 @@ def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder, progress
     """
     size_bytes = search.goal.size_bytes
     if size_bytes is None:
-        return search.best().with_levels(levels, progress)
+        return search.best().with_levels(levels)
     left, best, smallest = size_bytes * _LEVEL_0, None, math.inf
     for _ in range(_ROUNDS):
         goal = replace(search.goal, size_bytes=max(1, int(left)))
-        candidate = replace(search, goal=goal).best().with_levels(levels, progress)
+        candidate = replace(search, goal=goal).best().with_levels(levels)
         smallest = min(smallest, candidate.size_bytes)
         if candidate.size_bytes <= size_bytes and (best is None or candidate.error < best.error):
             best = candidate
@@ -761,16 +761,16 @@ def _is_empty(scorer: Scorer) -> bool:
     return all(np.ptp(image, axis=(0, 1)).max() == 0.0 for image in images)
 
 
-def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
+def _psnr_elsewhere(source: SplatModel, found: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
     """Return the PSNR on views that were not used in the search, by kind."""
     model, groups = decode(found.result.data), extra_test_cameras(source).items()
     return {
-        kind: round(Scorer.of_source(source, cameras, views.background, threads=threads).psnr(model), 3)
+        kind: round(Scorer.of_source(source, cameras, views.background, context=context).psnr(model), 3)
         for kind, cameras in groups
     }
 
 
-def _image_psnr(source: SplatModel, found: Candidate, views: ViewSet, threads: int | None) -> dict[str, float]:
+def _image_psnr(source: SplatModel, found: Candidate, views: ViewSet, context: Context) -> dict[str, float]:
     """Return the PSNR of file and source against the test images, dB."""
-    scorer = views.image_test_scorer(threads=threads)
+    scorer = views.image_test_scorer(context=context)
     return {"file": scorer.psnr(decode(found.result.data)), "source": scorer.psnr(source)}

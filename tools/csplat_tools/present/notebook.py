@@ -10,7 +10,8 @@ import html
 
 import numpy as np
 
-from csplat.encoder import EncodeOptions, encode
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
 from csplat_render.scene_frame import surface_areas, visible_opacity
 from csplat_render.up_estimate import estimate_up

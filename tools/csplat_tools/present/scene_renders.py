@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, Progress
+from csplat.types import F32
 from csplat_render import Backend, Camera, Mode
 from csplat_render.camera import resized
 from csplat_render.camera_files import load_cameras
@@ -95,7 +96,7 @@ def render_folder(
     alpha: bool = False,
     force: bool = False,
     prepare: Callable[[], object] | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Rendered:
     """Render a scene and write NAME.png for each camera.
 
@@ -110,7 +111,7 @@ def render_folder(
         alpha: write NAME.alpha.png, too; 255 is opaque.
         force: existing files may be replaced.
         prepare: called when the folder has been checked, before the first render.
-        progress: progress callback.
+        context: threads and progress.
 
     Raises:
         InputError: a file exists; the renderer is not installed; there is no GPU, or it cannot give the depth.
@@ -126,7 +127,7 @@ def render_folder(
     target = make_output_folder(folder, [name + ending for name in names for ending in endings], force=force)
     files, ignored = [], 0
     with _remove_if_empty(target if is_new else None):
-        renders = _renders(model, cameras, background, mode, backend, prepare, progress)
+        renders = _renders(model, cameras, background, mode, backend, prepare, context)
         for name, result in zip(names, renders, strict=True):
             ignored = max(ignored, result.ignored)
             files.append(target / f"{name}.png")
@@ -152,7 +153,7 @@ def render_film(
     backend: Backend = "cpu",
     force: bool = False,
     prepare: Callable[[], object] | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> Rendered:
     """Render a scene into one animated file.
 
@@ -161,7 +162,7 @@ def render_film(
         cameras: the views, at least one, of one size.
         path: path of the file; its ending determines the format, see `write_film`.
         fps: frames per second.
-        background, mode, backend, prepare, progress: see `render_folder`.
+        background, mode, backend, prepare, context: see `render_folder`.
         force: an existing file may be replaced.
 
     Raises:
@@ -172,7 +173,7 @@ def render_film(
     check_output(path, force=force)
     check_film(path, [(camera.W, camera.H) for camera in cameras], fps)
     frames, ignored = [], 0
-    for result in _renders(model, cameras, background, mode, backend, prepare, progress):
+    for result in _renders(model, cameras, background, mode, backend, prepare, context):
         ignored = max(ignored, result.ignored)
         frames.append(to_uint8(result.rgb))
     write_film(path, frames, fps)
@@ -201,19 +202,17 @@ def _renders(
     mode: Mode,
     backend: Backend,
     prepare: Callable[[], object] | None,
-    progress: Progress | None,
+    context: Context,
 ) -> Iterator[Render]:
     if prepare is not None:
         prepare()
     record = model.metadata.training
     behind = background or (record.background if record else BLACK)
-    draw = renderer(on_backend(model, backend), behind, mode=mode)
+    draw = renderer(on_backend(model, backend), behind, mode=mode, context=context)
     for number, camera in enumerate(cameras):
-        if progress is not None:
-            progress("rendering", number / len(cameras))
+        context.progress("rendering", number / len(cameras))
         yield draw(camera)
-    if progress is not None:
-        progress("rendering", 1.0)
+    context.progress("rendering", 1.0)
 
 
 @contextmanager

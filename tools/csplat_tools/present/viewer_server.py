@@ -25,13 +25,14 @@ from typing import BinaryIO, cast
 from urllib.parse import quote, unquote, urlencode, urlsplit
 
 from csplat._spec import ERROR_TRAILING, ERROR_TRUNCATED
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import SceneHeader, decode, read_header
-from csplat.encoder import EncodeOptions, PresetName, encode_with_report
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions, PresetName
 from csplat.errors import CsplatError, FormatError, InputError
 from csplat.file_source import open_binary, read_bytes
 from csplat.lint import Finding
 from csplat.scene_metadata import UNSPECIFIED, Direction
-from csplat.types import Progress
 from csplat_render.camera_files import load_cameras
 from csplat_render.up_estimate import estimate_up
 from csplat_tools.file_streams import STANDARD_STREAM, is_csplat, local_path, mapped_csplat
@@ -142,13 +143,13 @@ class SceneServer(ThreadingHTTPServer):
 
 
 @contextmanager
-def open_viewer_scene(path: str, *, preset: PresetName, progress: Progress | None = None) -> Iterator[ViewerScene]:
+def open_viewer_scene(path: str, *, preset: PresetName, context: Context = DEFAULT_CONTEXT) -> Iterator[ViewerScene]:
     """Prepare a scene: check the header of a .csplat file, or encode a file of another format.
 
     Args:
         path: the file, or `-`.
         preset: preset of the encoder.
-        progress: progress callback of reading and encoding.
+        context: threads and seed of encoding, and progress.
 
     Yields:
         The scene; its content can be read within the context.
@@ -160,7 +161,7 @@ def open_viewer_scene(path: str, *, preset: PresetName, progress: Progress | Non
     with local_path(path) as local:
         name = "scene" if path == STANDARD_STREAM else Path(path).stem or "scene"
         stem = os.fsencode(name).decode("utf-8", "replace")  # a name in another encoding is no part of a URL
-        yield _check_scene(local, stem) if is_csplat(local) else _encode_scene(local, stem, preset, progress)
+        yield _check_scene(local, stem) if is_csplat(local) else _encode_scene(local, stem, preset, context)
 
 
 @contextmanager
@@ -314,9 +315,9 @@ def _seems_up(path: Path, header: SceneHeader) -> Direction | None:
         return None  # the page shows the intact part, and reports the error
 
 
-def _encode_scene(path: Path, stem: str, preset: PresetName, progress: Progress | None) -> ViewerScene:
-    source = read_source(str(path), progress=progress)
-    data = encode_with_report(source.model(), EncodeOptions(preset=preset), progress=progress).data
+def _encode_scene(path: Path, stem: str, preset: PresetName, context: Context) -> ViewerScene:
+    source = read_source(str(path), progress=context.progress)
+    data = encode(source.model(), EncodeOptions(preset=preset), context=context)
     header, up = read_header(data), estimate_up(source.model())
     return ViewerScene(f"{stem}.csplat", data, len(data), header, up, tuple(source.findings), source.size_bytes)
 

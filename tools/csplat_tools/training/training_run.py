@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import csplat_trainer
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import resolve_links
 from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError, counted
@@ -40,7 +41,7 @@ def run_training(
     overrides: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Read a data set, train, and write the scene.
@@ -53,7 +54,7 @@ def run_training(
         overrides: overrides of the data set's metadata.
         plot: a PNG to write with the loss over the steps.
         page: an HTML report to write.
-        threads: number of threads; `None` for all.
+        context: threads and progress.
         quiet: print nothing.
 
     Returns:
@@ -64,12 +65,13 @@ def run_training(
         OSError: a file cannot be read or written.
     """
     data_set = _load(data, options, files)
-    result = _train(data_set, options, files, plot=plot, threads=threads, quiet=quiet)
+    result = _train(data_set, options, files, plot=plot, context=context, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     write_model(output, model, absolute=False)
     if page is not None:
         views = find_view_set(model, data=data_set, validation_count=0)
-        write_training_page(page, output, result.log, None, show_views(model, {"trained scene": model}, views, threads))
+        shown = show_views(model, {"trained scene": model}, views, context)
+        write_training_page(page, output, result.log, None, shown)
     if not quiet:
         record = result.model.metadata.training
         note(f"the metadata of {output} contain the options for comparing it with its images: {record}")
@@ -88,6 +90,7 @@ def run_training_to_file(
     overrides: MetadataOverrides | None = None,
     plot: str | None = None,
     page: str | None = None,
+    context: Context = DEFAULT_CONTEXT,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Read a data set, train, and tune a file to the same images; the trained scene itself is not written.
@@ -98,9 +101,10 @@ def run_training_to_file(
         output: the `.csplat` file to write, or `-`.
         files: as for `run_training`. Checkpoints of the tuning are next to the training's
             (`tuning_checkpoint`); a run resumes from them if the training had ended.
-        encoding: options of the encoder; its number of threads applies to everything.
+        encoding: options of the encoder.
         tuning: options of the tuning.
         target: as for `run_finetuning`; but the training has already pruned to a fraction to keep.
+        context: threads and progress; seed of the encoder and of pruning.
 
     Returns:
         `training`, the log of `run_training`, and `file`, the report of `run_finetuning`.
@@ -113,7 +117,7 @@ def run_training_to_file(
     data_set = _load(data, options, files)
     for image in data_set.val:  # training does not read these images: this finds damaged files before it
         _ = image.pixels, image.mask
-    result = _train(data_set, options, files, plot=plot, threads=encoding.threads, quiet=quiet)
+    result = _train(data_set, options, files, plot=plot, context=context, quiet=quiet)
     model = (overrides or MetadataOverrides()).apply_to_model(result.model)
     views = find_view_set(model, data=data_set, validation_count=0)  # the tuning splits the training views
     known = None
@@ -122,7 +126,7 @@ def run_training_to_file(
     report = run_finetuning(
         model, views, output, encoding, tuning, tuning_files,
         target=None if target is None or target.keep is not None else target, known=known, page=page,
-        training=result.log, quiet=quiet,
+        training=result.log, context=context, quiet=quiet,
     )  # fmt: skip
     return {"training": result.log, "file": report}
 
@@ -148,7 +152,7 @@ def plan_training(
         InputError: the target is of another kind, or the checkpoint is damaged.
     """
     if target is not None:
-        target.require("train", "psnr", "size_bytes", "keep")
+        target.require("train", "psnr", "size", "keep")
         if max_splats is None and resume is not None and target.keep is None:
             max_splats = load_checkpoint(resume).options.get("max_splats")
     share = _KEEP
@@ -198,13 +202,13 @@ def _tuning_outputs(files: Outputs, options: TrainOptions) -> Outputs:
 
 
 def _train(
-    data_set: DataSet, options: TrainOptions, files: Outputs, *, plot: str | None, threads: int | None, quiet: bool
+    data_set: DataSet, options: TrainOptions, files: Outputs, *, plot: str | None, context: Context, quiet: bool
 ) -> TrainResult:
     """Read the images, train, plot the loss, and print a summary."""
     for line in () if quiet else data_set.report:
         note(line)
     data_set.read()  # before kernels are compiled, to find damaged images early
-    with thread_count(threads):
+    with thread_count(context.threads):
         if options.device == "cpu":
             prepare_renderer(quiet=quiet, gradients=True)
         with step_progress("training", describe_step, quiet=quiet) as show:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import read_header
 from csplat.encoder import EncodeResult
 from csplat.errors import counted
@@ -58,7 +59,7 @@ def score_models(
     models: Mapping[str, SplatModel],
     views: ViewSet,
     lpips: Distance | None,
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
     *,
     known: Mapping[str, Mapping[str, float | None]] | None = None,
 ) -> ModelScores | None:
@@ -69,7 +70,7 @@ def score_models(
         models: models by name; the source itself is left out if its renders are the reference.
         views: the views; only test views are used.
         lpips: computes LPIPS; `None`: it is not computed.
-        threads: number of threads; `None` for all.
+        context: threads and progress.
         known: scores of models that were scored against the same images before, by name.
 
     Returns:
@@ -78,7 +79,7 @@ def score_models(
     if not views.test:
         return None
     has_images = bool(views.images)
-    scorer = views.image_test_scorer(threads=threads) if has_images else views.test_scorer(source, threads=threads)
+    scorer = views.image_test_scorer(context=context) if has_images else views.test_scorer(source, context=context)
     scores: dict[str, dict[str, float | None]] = {}
     for name, model in models.items():
         if known is not None and name in known:
@@ -209,7 +210,7 @@ class ShownView:
 
 
 def show_views(
-    source: SplatModel, models: Mapping[str, SplatModel], views: ViewSet, threads: int | None
+    source: SplatModel, models: Mapping[str, SplatModel], views: ViewSet, context: Context
 ) -> list[ShownView]:
     """Render a few test views, evenly spread, and return the renders next to the reference images.
 
@@ -217,13 +218,13 @@ def show_views(
         source: the scene, whose renders are the reference if the views have no images.
         models: models to render, by caption.
         views: the views.
-        threads: number of threads; `None` for all.
+        context: threads and progress.
     """
     if not views.test:
         return []
     places = evenly_spaced(range(len(views.test)), _SHOWN_VIEWS)
     views = replace(views, test=[views.test[place] for place in places])
-    scorer = views.image_test_scorer(threads=threads) if views.images else views.test_scorer(source, threads=threads)
+    scorer = views.image_test_scorer(context=context) if views.images else views.test_scorer(source, context=context)
     reference = "image" if views.images else "the source"
     rows: list[dict[str, U8]] = [{} for _ in places]
     for name, model in models.items():

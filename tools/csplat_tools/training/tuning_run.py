@@ -13,16 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 import csplat_trainer
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodePlan, Importance, Origin, ShCoding, Target, encode_tiles
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import F32, I64, Progress
+from csplat.types import F32, I64, null_progress
 from csplat_render import Camera
 from csplat_render.kernels import thread_count
 from csplat_render.metrics import Distance
 from csplat_render.scorer import Scorer
-from csplat_tools.console import progress_bar, step_progress
+from csplat_tools.console import step_progress
 from csplat_tools.file_streams import write_array, write_bytes
 from csplat_tools.importance_file import read_importance
 from csplat_tools.optimise.candidates import Candidate, CandidatePool, WholeScene
@@ -122,6 +123,7 @@ def run_finetuning(
     known: Mapping[str, Mapping[str, float | None]] | None = None,
     page: str | None = None,
     training: Mapping[str, Any] | None = None,
+    context: Context = DEFAULT_CONTEXT,
     quiet: bool = False,
 ) -> dict[str, Any]:
     """Prune, fix the quantisation, tune, write the file, and score it.
@@ -139,6 +141,7 @@ def run_finetuning(
         known: as for `score_models`.
         page: an HTML report to write.
         training: log of the preceding training, for the report.
+        context: threads and progress; seed of the encoder and of pruning.
         quiet: print only errors.
 
     Returns:
@@ -148,13 +151,12 @@ def run_finetuning(
         CsplatError: an option or a file is not usable.
         OSError: a file cannot be read or written.
     """
-    threads = encoding.threads
-    with thread_count(threads):
+    with thread_count(context.threads):
         prepare_renderer(quiet=quiet, gradients=True)
-        with progress_bar(quiet=quiet) as progress, step_progress("tuning", describe_step, quiet=quiet) as show:
+        with step_progress("tuning", describe_step, quiet=quiet) as show:
             tuned = choose_and_finetune(
                 source, views, encoding, options, target, files=files, prune_unseen=prune_unseen, importance=importance,
-                progress=progress, on_step=show,
+                context=context, on_step=show,
             )  # fmt: skip
         made, timer = tuned.made, StageTimer(dict(tuned.seconds))
         write_bytes(output, made.data)
@@ -162,8 +164,8 @@ def run_finetuning(
             write_array(source_index, made.result.source_index)
         with timer.stage("judging"):
             models = {"source": source, "before tuning": decode(made.plain.data), "file": made.decoded}
-            scores = score_models(source, models, views, lpips, threads, known=known)
-        shown = [] if page is None else show_views(source, models, views, threads)
+            scores = score_models(source, models, views, lpips, context, known=known)
+        shown = [] if page is None else show_views(source, models, views, context)
     report = make_tuning_report(source, made.plain, made.result, scores, made.log, timer.seconds, tuned.pruning)
     report["log"] = made.log
     if page is not None:
@@ -209,7 +211,7 @@ class Tuner:
         effort: amount of work of pruning and refitting, 1 to 9.
         importance: importance of the source's splats; `None`: the importance of each file's splats is measured in the
             training views, as `csplat sensitivity` does.
-        progress, on_step: as for `csplat_trainer.finetune`.
+        context, on_step: as for `csplat_trainer.finetune`.
     """
 
     source: SplatModel
@@ -220,7 +222,7 @@ class Tuner:
     prune_unseen: bool
     effort: int
     importance: NDArray[Any] | Importance | None = None
-    progress: Progress | None = None
+    context: Context = DEFAULT_CONTEXT
     on_step: Callable[[FitStep], None] | None = None
     _timer: StageTimer = field(default_factory=StageTimer, init=False)
 
@@ -235,7 +237,7 @@ class Tuner:
         def as_views(cameras: Sequence[Camera]) -> list[TuningView]:
             if views.images:
                 return [TuningView(image.camera, image) for image in views.images_of(cameras)]
-            return renders_of(self.source, cameras, background, self.encoding.threads)
+            return renders_of(self.source, cameras, background, context=self.context)
 
         training = as_views(views.training)
         if views.validation:
@@ -253,7 +255,7 @@ class Tuner:
             return np.arange(len(self.source))
         errors = measure_pruning(
             self.source, [*self.views.training, *self.views.validation], self._background, self.options.device,
-            threads=self.encoding.threads, progress=self.progress,
+            context=self.context,
         )  # fmt: skip
         if not errors.seen.any():
             raise InputError("no view shows any splat: check that the cameras belong to the scene")
@@ -262,11 +264,11 @@ class Tuner:
     def _pruner(self, options: SimplifyOptions) -> Pruner:
         """Return a pruner of the splats to choose from. Without validation views, some training views serve as such."""
         views = with_validation_views(replace(self.views, training=self._measuring, test=()))
-        return options.pruner(self.source.select(self.rows), views, use_classes=False, progress=self.progress)
+        return options.pruner(self.source.select(self.rows), views, use_classes=False, context=self.context)
 
     @property
     def _pruning_options(self) -> SimplifyOptions:
-        return SimplifyOptions(effort=self.effort, threads=self.encoding.threads)
+        return SimplifyOptions(effort=self.effort)
 
     @property
     def _measuring(self) -> Sequence[Camera]:
@@ -312,7 +314,7 @@ class Tuner:
             pruning["simplified_from"] = len(self.rows)
         made = csplat_trainer.finetune(
             model, views, encoding, self.options, size_bytes=size_bytes, importance=weights, source=self.source,
-            origin=Origin(len(self.source), rows), metadata=pruning, outputs=self.outputs, progress=self.progress,
+            origin=Origin(len(self.source), rows), metadata=pruning, outputs=self.outputs, context=self.context,
             on_step=self.on_step,
         )  # fmt: skip
         self.outputs = replace(self.outputs, resume=None)  # the checkpoint was of this file
@@ -325,10 +327,7 @@ class Tuner:
         given = self.importance
         if given is not None:
             return given.select(rows) if isinstance(given, Importance) else given[rows]
-        return measure_importance(
-            model, self._measuring, self._background, self.options.device, threads=self.encoding.threads,
-            progress=self.progress,
-        )  # fmt: skip
+        return measure_importance(model, self._measuring, self._background, self.options.device, context=self.context)
 
     @property
     def _background(self) -> F32:
@@ -344,14 +343,15 @@ class Tuner:
         if self.encoding.attribute_psnr is not None:
             return self.encoding
         count = min(len(model), _SAMPLE)
-        rows = np.sort(np.random.default_rng(self.encoding.seed).choice(len(model), count, replace=False))
+        rows = np.sort(np.random.default_rng(self.context.seed).choice(len(model), count, replace=False))
         sample = model.select(rows)
         sample_weights = weights.select(rows) if isinstance(weights, Importance) else weights[rows]
+        silent = replace(self.context, progress=null_progress)
 
         def encoded_bytes(
             splats: SplatModel, its_weights: NDArray[Any] | Importance | None, options: EncodeOptions
         ) -> int:
-            plan = EncodePlan.of(splats, options, importance=its_weights, allow_classes=False)
+            plan = EncodePlan.of(splats, options, importance=its_weights, allow_classes=False, context=silent)
             return len(encode_tiles(plan).write().data)
 
         sample_bytes = functools.cache(functools.partial(encoded_bytes, sample, sample_weights))
@@ -387,9 +387,8 @@ class Tuner:
             while len(rows) > kept_count:
                 model = self.source.select(rows)
                 errors = measure_pruning(
-                    model, self._measuring, self._background, self.options.device,
-                    threads=self.encoding.threads, progress=self.progress,
-                )  # fmt: skip
+                    model, self._measuring, self._background, self.options.device, context=self.context
+                )
                 rows = rows[kept_in_round(model.opacities, errors, kept_count)]
             model = self.source.select(rows)
             weights = self._importance_of(model, rows)
@@ -426,9 +425,9 @@ class Tuner:
             if self.views.images:
                 pruner.steps_factor *= _DRAFT_STEPS
             cameras = shrink_cameras(pruner.views.validation, pruner.size)  # not the views of refits
-            scorer = Scorer.of_source(pruner.source, cameras, self.views.background, threads=pruner.threads)
-            pool = CandidatePool(self.encoding, scorer, self.progress)
-            whole = WholeScene(pruner.source, None, None, None)
+            scorer = Scorer.of_source(pruner.source, cameras, self.views.background, context=self.context)
+            pool = CandidatePool(self.encoding, scorer, self.context.progress)
+            whole = WholeScene(pruner.source, None, None, replace(self.context, progress=null_progress))
             aim = math.inf if target.psnr is None else error_of_psnr(target.psnr + _AIM)
             missed = 0.0 if target.psnr is None else self._image_error(pruner.source)
             size_bytes = target.size_bytes
@@ -466,7 +465,7 @@ class Tuner:
         images = [view.reference for view in self.tuning_views.validation if isinstance(view.reference, PosedImage)]
         if not images:
             return 0.0
-        scorer = image_scorer(images, self.tuning_views.background, threads=self.encoding.threads)
+        scorer = image_scorer(images, self.tuning_views.background, context=self.context)
         return scorer.pooled(scorer.errors(model))
 
 
@@ -480,7 +479,7 @@ def choose_and_finetune(
     files: Outputs | None = None,
     prune_unseen: bool | None = None,
     importance: str | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
     on_step: Callable[[FitStep], None] | None = None,
 ) -> TunedSubset:
     """Choose the splats of the file, and tune them.
@@ -494,7 +493,7 @@ def choose_and_finetune(
         files: checkpoints; not used for a PSNR, for which several files may be tuned.
         prune_unseen: prune splats that no training or validation view shows; `None`: only if the views have images.
         importance: a file with the importance of the source's splats; `None`: as for `Tuner`.
-        progress, on_step: as for `csplat_trainer.finetune`.
+        context, on_step: as for `csplat_trainer.finetune`.
 
     Raises:
         InputError: no file meets the target, no view shows any splat, an option is set that the target determines, or
@@ -502,13 +501,13 @@ def choose_and_finetune(
         CsplatError: as for `csplat_trainer.finetune`.
     """
     if target is not None:
-        target.require("finetune", "psnr", "size_bytes", "keep")
+        target.require("finetune", "psnr", "size", "keep")
         check_target(source, target, encoding)
     tuner = Tuner(
         source, views, encoding, options,
         Outputs() if files is None or (target is not None and target.psnr is not None) else files,
         bool(views.images) if prune_unseen is None else prune_unseen,
-        Target.effort if target is None else target.effort, _read_importance(importance, source), progress, on_step,
+        Target.effort if target is None else target.effort, _read_importance(importance, source), context, on_step,
     )  # fmt: skip
     if target is None:
         return tuner.tune_kept(None)

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.scene import BLOCK_SPLATS, Scene
-from csplat.types import F32, F64, Progress
+from csplat.types import F32, F64
 from csplat_conformance.declared_bounds import Source
 from csplat_render import Camera, Mode
 from csplat_render.conventions import HasSplats, RenderResult
@@ -48,7 +49,6 @@ class SlicedScene:
         scene: its splats.
         sample, every: as returned by `sample_scene`.
         memory_bytes: approximate limit of the memory.
-        progress: progress callback of a render.
         slice_bytes: least memory for a slice, bytes.
     """
 
@@ -56,7 +56,6 @@ class SlicedScene:
     sample: SplatModel
     every: int
     memory_bytes: int
-    progress: Progress | None = None
     slice_bytes: int = 1 << 24
 
     @property
@@ -94,7 +93,7 @@ class SlicedScene:
         return _BASE_BYTES + _BLOCKS * BLOCK_SPLATS * self.record.itemsize
 
     def renderer(
-        self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+        self, background: ArrayLike, *, mode: Mode = "standard", context: Context = DEFAULT_CONTEXT
     ) -> Callable[[Camera], RenderResult]:
         """Return a function that draws the scene from a camera, like `csplat_render.scorer.renderer`, without `radii`.
 
@@ -103,19 +102,17 @@ class SlicedScene:
         """
         if mode == "exact":
             raise InputError("mode exact requires a scene that fits in memory: use standard")
-        return lambda camera: _SlicedRender(self, camera, background, mode, threads).drawn()
+        return lambda camera: _SlicedRender(self, camera, background, mode, context).drawn()
 
 
 class _SlicedRender:
     """A render in progress. Owns the state of its pixels."""
 
-    def __init__(
-        self, scene: SlicedScene, camera: Camera, background: ArrayLike, mode: Mode, threads: int | None
-    ) -> None:
+    def __init__(self, scene: SlicedScene, camera: Camera, background: ArrayLike, mode: Mode, context: Context) -> None:
         from csplat_render.rasteriser import Rasteriser  # numba takes a second to import
 
-        self._scene, self._camera, self._background = scene, camera, background
-        self._rasteriser = Rasteriser(mode, gradients=False, threads=threads)
+        self._scene, self._camera, self._background, self._progress = scene, camera, background, context.progress
+        self._rasteriser = Rasteriser(mode, gradients=False, context=context)
         self._state = self._rasteriser.initial_state(camera)
         self._record, self._splat_bytes = scene.record, scene.splat_bytes
         self._ignored, self._visible, self._done, self._pairs = 0, 0, 0, 0
@@ -135,8 +132,7 @@ class _SlicedRender:
         return _FULL * self._scene.room_bytes
 
     def _report(self, share: float) -> None:
-        if self._scene.progress is not None:
-            self._scene.progress(STAGE, share)
+        self._progress(STAGE, share)
 
     def _visible_splats(self, splats: HasSplats) -> tuple[F32, F64, int]:
         """Return [n] depths and [n] bytes for drawing, both 0 if invisible, and the number of ignored splats."""

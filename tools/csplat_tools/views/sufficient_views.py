@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
-from csplat.types import Progress
 from csplat_render import Camera
 from csplat_render.pruning_error import PruningError
 from csplat_tools.views import HELD_OUT_COUNT, VIEW_SIZE, ViewSet, shrink_cameras
@@ -53,8 +53,7 @@ def find_sufficient_views(
     views: ViewSet,
     *,
     size: tuple[int, int] = VIEW_SIZE,
-    threads: int | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> SufficientViews:
     """Add training views until they suffice, and measure the pruning errors of the source in them.
 
@@ -64,15 +63,14 @@ def find_sufficient_views(
             held-out views. Other training views are all used, with the validation views as held-out views.
         size: width and height of the renders, pixels; the user's cameras keep their aspect ratio and are never
             enlarged.
-        threads: number of threads; `None` for all.
-        progress: progress callback.
+        context: threads and progress.
 
     Raises:
         InputError: there are no training or no validation views.
     """
 
     def measure(cameras: Sequence[Camera]) -> MeasuredViews:
-        return MeasuredViews.of(model, cameras, views.background, keep_renders=True, threads=threads, progress=progress)
+        return MeasuredViews.of(model, cameras, views.background, keep_renders=True, context=context)
 
     if not views.training or not views.validation:
         count = len(views.training) + len(views.validation)

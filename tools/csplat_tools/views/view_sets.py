@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import resolve_links
 from csplat.errors import InputError, counted
 from csplat.model import SplatModel
@@ -118,46 +119,45 @@ class ViewSet:
         *,
         background: Colour | None = None,
         mode: Mode = "standard",
-        threads: int | None = None,
-        progress: Callable[[str, float], None] | None = None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> Scorer:
         """Return the scorer on the test views, against the source's renders.
 
         Args:
             source: the scene.
             background: background colour; `None`: `test_background`.
-            mode, threads: mode of the renderer, and its number of threads.
-            progress: progress callback of rendering the source.
+            mode: mode of the renderer.
+            context: threads and progress.
 
         Raises:
             InputError: there are no test views.
         """
         colour = background or self.test_background
-        return Scorer.of_source(source, self.test, colour, mode=mode, threads=threads, progress=progress)
+        return Scorer.of_source(source, self.test, colour, mode=mode, context=context)
 
-    def validation_scorer(self, source: SplatModel, *, threads: int | None = None) -> Scorer:
+    def validation_scorer(self, source: SplatModel, *, context: Context = DEFAULT_CONTEXT) -> Scorer:
         """Return the scorer on the validation views, against the source's renders.
 
         Raises:
             InputError: there are no validation views.
         """
-        return Scorer.of_source(source, self.validation, self.background, threads=threads)
+        return Scorer.of_source(source, self.validation, self.background, context=context)
 
-    def image_test_scorer(self, *, mode: Mode = "standard", threads: int | None = None) -> Scorer:
+    def image_test_scorer(self, *, mode: Mode = "standard", context: Context = DEFAULT_CONTEXT) -> Scorer:
         """Return the scorer on the test views, against their images.
 
         Raises:
             InputError: there are no images, or no test views.
         """
-        return self._image_scorer(self.test, mode, threads)
+        return self._image_scorer(self.test, mode, context)
 
-    def image_validation_scorer(self, *, threads: int | None = None) -> Scorer:
+    def image_validation_scorer(self, *, context: Context = DEFAULT_CONTEXT) -> Scorer:
         """Return the scorer on the validation views, against their images.
 
         Raises:
             InputError: there are no images, or no validation views.
         """
-        return self._image_scorer(self.validation, "standard", threads)
+        return self._image_scorer(self.validation, "standard", context)
 
     def images_of(self, cameras: Sequence[Camera]) -> list[PosedImage]:
         """Return the images of the given cameras, in their order."""
@@ -173,13 +173,13 @@ class ViewSet:
         for image in self.images:
             _ = image.pixels, image.mask
 
-    def _image_scorer(self, cameras: Sequence[Camera], mode: Mode, threads: int | None) -> Scorer:
+    def _image_scorer(self, cameras: Sequence[Camera], mode: Mode, context: Context) -> Scorer:
         from csplat_trainer.posed_images import image_scorer
 
         if not self.images:
             raise InputError("the views have no images: name a data set")
         shown = self.images_of(cameras)
-        return image_scorer(shown, self.background, mode=mode, threads=threads, origin=self.origin)
+        return image_scorer(shown, self.background, mode=mode, context=context, origin=self.origin)
 
 
 def describe_views(count: int, name: str) -> str:
@@ -317,7 +317,7 @@ def render_seconds(
     cameras: Sequence[Camera],
     *,
     mode: Mode = "standard",
-    threads: int | None = None,
+    context: Context = DEFAULT_CONTEXT,
     clock: Callable[[], float] = time.perf_counter,
 ) -> float:
     """Measure the seconds for a render.
@@ -325,10 +325,11 @@ def render_seconds(
     Args:
         source: the scene.
         cameras: the views, at least one.
-        mode, threads: mode of the renderer, and its number of threads.
+        mode: mode of the renderer.
+        context: threads.
         clock: returns seconds.
     """
-    draw = renderer(source, (0.0, 0.0, 0.0), mode=mode, threads=threads)
+    draw = renderer(source, (0.0, 0.0, 0.0), mode=mode, context=context)
     tried, times = cameras[:: max(1, len(cameras) // _TIMED_MAX)][:_TIMED_MAX], 1
     if mode == "exact":
         times = _TIMED_DIVISOR**2

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
-from csplat.types import F32, Progress
+from csplat.types import F32
 from csplat_render.camera import Camera
 from csplat_render.contributions import Contributions, ProjectedView
 from csplat_render.conventions import Array, HasSplats
@@ -42,8 +43,8 @@ class ColourOperator:
         cameras: the views.
         background: red, green, blue of the background.
         antialiased: see `Rasteriser.forward`.
-        threads: number of threads; `None`: all. No result depends on it.
         cache_bytes: memory for projected views.
+        context: threads.
     """
 
     def __init__(
@@ -53,12 +54,12 @@ class ColourOperator:
         *,
         background: ArrayLike = (0.0, 0.0, 0.0),
         antialiased: bool = False,
-        threads: int | None = None,
         cache_bytes: int = CACHE_BYTES,
+        context: Context = DEFAULT_CONTEXT,
     ) -> None:
         self.cameras = cameras
         self.antialiased = antialiased
-        self._contributions = Contributions(threads=threads)
+        self._contributions = Contributions(context=context)
         self._background = np.asarray(background, np.float32)
         self._black = np.zeros(3, np.float32)
         self._cache_left = cache_bytes
@@ -132,9 +133,8 @@ def fit_colours(
     least_gain: float = 0.01,
     background: ArrayLike = (0.0, 0.0, 0.0),
     antialiased: bool = False,
-    threads: int | None = None,
     cache_bytes: int = CACHE_BYTES,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> tuple[F32, list[float]]:
     """Fit the colours of splats to images.
 
@@ -147,9 +147,8 @@ def fit_colours(
         least_gain: stop when a step reduces the error by less than this fraction.
         background: red, green, blue of the background.
         antialiased: see `Rasteriser.forward`.
-        threads: number of threads; `None`: all. The result does not depend on it.
         cache_bytes: memory for projected views.
-        progress: called with the stage and the completed fraction.
+        context: threads and progress.
 
     Returns:
         [N, B, 3] float32, the coefficients; and the minimised sum according to the linearised model, before the first
@@ -161,7 +160,7 @@ def fit_colours(
     if not cameras or len(references) != len(cameras):
         raise InputError(f"found {len(cameras)} cameras and {len(references)} reference images, expected one for each")
     operator = ColourOperator(
-        splats, cameras, background=background, antialiased=antialiased, threads=threads, cache_bytes=cache_bytes
+        splats, cameras, background=background, antialiased=antialiased, cache_bytes=cache_bytes, context=context
     )
     x = np.concatenate([splats.sh0[:, None], splats.shN], axis=1, dtype=np.float32)
     gradient, diagonal = np.zeros_like(x), np.zeros(x.shape[:2], np.float32)
@@ -171,8 +170,7 @@ def fit_colours(
     direction = scale * residual
     product = _dot(residual, direction)
     for step in range(steps):
-        if progress is not None:
-            progress("fitting colours", (step + 1) / (steps + 1))
+        context.progress("fitting colours", (step + 1) / (steps + 1))
         image = np.float32(ridge) * direction
         operator.normal(direction, image)
         curvature = _dot(direction, image)
@@ -187,8 +185,7 @@ def fit_colours(
         preconditioned = scale * residual
         product, before = _dot(residual, preconditioned), product
         direction = preconditioned + np.float32(product / before) * direction
-    if progress is not None:
-        progress("fitting colours", 1.0)
+    context.progress("fitting colours", 1.0)
     return x, errors
 
 

@@ -12,7 +12,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from csplat.encoder import EncodeOptions, encode
+from csplat.context import Context
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions
 from csplat.model import SplatModel
 from csplat.ply import read_ply
 from csplat_bench.encoders import MadeFile, read_file
@@ -86,10 +88,10 @@ def _decode(made: MadeFile, *_: object) -> Mapping[str, Any]:
 
 def encode_once(ply: Path, preset: Any, threads: int | None) -> tuple[float, float, int, int]:
     """Encode a PLY from arrays to bytes; return wall and CPU seconds, growth and size of the arrays in bytes."""
-    model, options = read_ply(ply), EncodeOptions(preset=preset, threads=threads)
+    model, options = read_ply(ply), EncodeOptions(preset=preset)
     gc.collect()
     before = reset_peak()
-    _, timing = timed(encode, model, options)
+    _, timing = timed(encode, model, options, context=Context(threads=threads))
     arrays = sum(getattr(model, name).nbytes for name in ARRAYS)
     return timing.wall, timing.cpu, peak_bytes() - before, arrays
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from csplat import _spec
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodePlan, EncodeResult, Origin, canonicalise_shape, cluster, encode_tiles
 from csplat.errors import InputError
@@ -47,7 +48,6 @@ class Reduction:
         sh_degree: drop the SH bands above; `None`: keep all.
         distil: fit the remaining bands to renders of the source; otherwise they are unchanged.
         kmeans: entries of a codebook for each attribute; `None`: no clustering.
-        threads: number of threads; `None` for all. The result does not depend on it.
 
     Raises:
         InputError: a value is out of range.
@@ -57,7 +57,6 @@ class Reduction:
     sh_degree: int | None = None
     distil: bool = False
     kmeans: int | None = None
-    threads: int | None = None
 
     def __post_init__(self) -> None:
         if self.prune_opacity is not None:
@@ -74,7 +73,7 @@ def encode_reduced(
     encoding: EncodeOptions | None = None,
     *,
     views: ViewSet | None = None,
-    progress: Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> EncodeResult:
     """Prune, drop SH bands, cluster, and encode.
 
@@ -83,7 +82,7 @@ def encode_reduced(
         reduction: the steps. If its `sh_degree` is `None`, that of `encoding` is used.
         encoding: options of the encoder.
         views: training and validation views for distilling; `None` for virtual ones.
-        progress: progress callback.
+        context: threads, seed and progress.
 
     Returns:
         The file and its source index. The file declares error bounds against the source, except for distilled
@@ -104,7 +103,7 @@ def encode_reduced(
         if views is None:
             held_out = _VIEWS // _HOLD_OUT_EVERY
             views = find_view_set(source, count=_VIEWS - held_out, validation_count=held_out)
-        renders = SourceRenders.of_source(source, views, threads=reduction.threads)
+        renders = SourceRenders.of_source(source, views, context=context)
     model, rows = source, np.arange(len(source), dtype=np.int64)
     report: dict[str, Any] = {"splats": len(source)}
     if reduction.prune_opacity is not None:
@@ -113,19 +112,17 @@ def encode_reduced(
     if degree < source.sh_degree:
         report |= {"sh_degree": degree, "sh": "distilled" if reduction.distil else "truncated"}
     if reduction.kmeans is not None:
-        model = drop_bands(model, degree) if renders is None else renders.distilled(model, degree, progress)
-        model, report["kmeans"] = cluster_attributes(
-            model, reduction.kmeans, threads=reduction.threads, progress=progress
-        )
+        model = drop_bands(model, degree) if renders is None else renders.distilled(model, degree)
+        model, report["kmeans"] = cluster_attributes(model, reduction.kmeans, context=context)
         model = _with_bands(model, source.sh_degree)
     origin = Origin(len(source), rows, refitted=renders is not None)
-    plan = EncodePlan.of(model, encoding, origin=origin, progress=progress)
+    plan = EncodePlan.of(model, encoding, origin=origin, context=context)
     if renders is not None and reduction.kmeans is None:
-        distilled = _with_bands(renders.distilled(plan.scene, degree, progress), source.sh_degree)
+        distilled = _with_bands(renders.distilled(plan.scene, degree), source.sh_degree)
         plan = plan.with_colours(distilled.sh0, distilled.shN)
-    tiles = encode_tiles(plan, progress=progress)
+    tiles = encode_tiles(plan)
     if renders is not None or reduction.kmeans is not None:
-        decoded = decode(tiles.write().data)
+        decoded = decode(tiles.write().data, context=context)
         tiles = tiles if reduction.kmeans is None else tiles.against(source, decoded)
         if renders is not None:
             report |= {"views": len(renders.cameras), "check_psnr": round(renders.check_scorer.psnr(decoded), 3)}
@@ -174,17 +171,17 @@ class SourceRenders:
         references: [H, W, 3], the source's render of each.
         check_scorer: scorer on the validation views.
         background: background colour.
-        threads: number of threads; `None` for all. No result depends on it.
+        context: threads and progress.
     """
 
     cameras: Sequence[Camera]
     references: Sequence[F32]
     check_scorer: Scorer
     background: tuple[float, float, float]
-    threads: int | None
+    context: Context
 
     @classmethod
-    def of_source(cls, source: SplatModel, views: ViewSet, *, threads: int | None = None) -> SourceRenders:
+    def of_source(cls, source: SplatModel, views: ViewSet, *, context: Context = DEFAULT_CONTEXT) -> SourceRenders:
         """Render the source in the training and validation views, reduced to a small size.
 
         Raises:
@@ -193,33 +190,32 @@ class SourceRenders:
         if not views.training:
             raise InputError("there are no training views to fit colours to")
         training, validation = shrink_cameras(views.training), shrink_cameras(views.validation)
-        draw = renderer(source, views.background, threads=threads)
+        draw = renderer(source, views.background, context=context)
         references = [draw(camera).rgb for camera in training]
-        check_scorer = Scorer.of_source(source, validation, views.background, threads=threads)
-        return cls(training, references, check_scorer, views.background, threads)
+        check_scorer = Scorer.of_source(source, validation, views.background, context=context)
+        return cls(training, references, check_scorer, views.background, context)
 
-    def distilled(self, model: SplatModel, sh_degree: int, progress: Progress | None = None) -> SplatModel:
+    def distilled(self, model: SplatModel, sh_degree: int) -> SplatModel:
         """Return the geometry of a model with SH up to a degree, fitted to the source's renders."""
         from csplat_bench.colour_refit import fit_colours  # requires numba, unlike the other steps
 
         low = drop_bands(model, sh_degree)
         found, _ = fit_colours(
             low, self.cameras, self.references, steps=_FIT_STEPS, least_gain=0.01, background=self.background,
-            antialiased=low.metadata.antialiased, threads=self.threads, progress=progress,
+            antialiased=low.metadata.antialiased, context=self.context,
         )  # fmt: skip
         return replace(low, sh0=np.ascontiguousarray(found[:, 0]), shN=np.ascontiguousarray(found[:, 1:]))
 
 
 def cluster_attributes(
-    model: SplatModel, entries: int, *, threads: int | None = None, progress: Progress | None = None
+    model: SplatModel, entries: int, *, context: Context = DEFAULT_CONTEXT
 ) -> tuple[SplatModel, dict[str, Any]]:
     """Replace the values of each splat by codebook entries, attribute by attribute.
 
     Args:
         model: the scene.
         entries: largest number of entries of each codebook.
-        threads: number of threads; `None` for all. The result does not depend on it.
-        progress: progress callback.
+        context: threads, seed and progress.
 
     Returns:
         The scene, and by attribute the size of the codebook and the squared error as a fraction of the variance.
@@ -231,23 +227,21 @@ def cluster_attributes(
         )
     report, changes = dict[str, Any](), dict[str, Any]()
     for number, name in enumerate(ATTRIBUTES):
-        show = partial(_report, progress, number)
-        show(0, 1)
+        context.progress("clustering", number / len(ATTRIBUTES))
         values: F32 = getattr(model, name)
         if not values.size:
             continue  # no splats, or no bands above 0
         flat = values.reshape(len(model), -1).astype(np.float64)
-        found, size = _clustered(flat, entries, threads, show)
+        found, size = _clustered(flat, entries, replace(context, progress=partial(_report, context.progress, number)))
         report[name] = {"sizes": [size], "error_share": _error_share(flat, found)}
         changes[name] = _valid(name, found.astype(np.float32)).reshape(values.shape)
-    if progress is not None:
-        progress("clustering", 1.0)
+    context.progress("clustering", 1.0)
     return replace(model, **changes), report
 
 
-def _report(progress: Progress | None, number: int, done: int, steps: int) -> None:
-    if progress is not None:
-        progress("clustering", (number + done / steps) / len(ATTRIBUTES))
+def _report(progress: Progress, number: int, _: str, done: float) -> None:
+    """Report the progress of one attribute as a part of the progress of all."""
+    progress("clustering", (number + done) / len(ATTRIBUTES))
 
 
 def _valid(name: str, values: F32) -> F32:
@@ -256,7 +250,7 @@ def _valid(name: str, values: F32) -> F32:
     return np.clip(values, 0.0, 1.0) if name == "opacities" else values
 
 
-def _clustered(values: F64, entries: int, threads: int | None, show: Any) -> tuple[F64, int]:
+def _clustered(values: F64, entries: int, context: Context) -> tuple[F64, int]:
     """Return the entry assigned to each splat, and the number of entries."""
     if entries >= len(values):
         index = np.unique(values, axis=0, return_inverse=True)[1].reshape(-1).astype(np.uint32)
@@ -266,7 +260,7 @@ def _clustered(values: F64, entries: int, threads: int | None, show: Any) -> tup
         points = np.rint(centred * (_NORM / longest if longest > 0.0 else 0.0)).astype(np.int32)
         near = _NEAR_GROUPS if entries >= _GROUPED else 0
         weights = np.ones(len(points), np.float32)
-        index = cluster(points, weights, entries, seed=0, near_groups=near, threads=threads, progress=show)[1]
+        index = cluster(points, weights, entries, near_groups=near, context=context)[1]
     count = int(index.max()) + 1
     sums = [np.bincount(index, column, count) for column in values.T]  # bincount adds in splat order: reproducible
     means = np.stack(sums, axis=1) / np.maximum(np.bincount(index, minlength=count), 1)[:, None]

@@ -122,7 +122,7 @@ def read_results(path: Path) -> dict[str, Any]:
 
 def describe() -> tuple[str, dict[str, str]]:
     """Return a description of the machine, and the versions of packages."""
-    found = describe_machine(None)
+    found = describe_machine()
     machine = f"{found['processor']}, {found['cores']} cores, {_memory()}, {found['system']}"
     packages = {name: version for name, version in found["packages"].items() if version != "absent"}
     return machine, {"csplat": found["csplat"], "python": found["python"], **packages}

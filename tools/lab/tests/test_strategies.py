@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from checked import measure_errors
 
-from csplat import EncodeOptions, decode
+from csplat import Context, EncodeOptions, decode
 from csplat.decoder import decode_scene
 from csplat.encoder.error_bounds import covariance_errors
 from csplat.errors import InputError
@@ -86,7 +86,7 @@ def test_entries_are_the_means_of_their_splats(source):
     np.testing.assert_allclose(np.linalg.norm(found.quats, axis=1), 1.0, atol=1e-6)
     assert 7 >= len(np.unique(found.quats, axis=0))
     told = []
-    _, whole = cluster_attributes(source, 1, progress=lambda *step: told.append(step))
+    _, whole = cluster_attributes(source, 1, context=Context(progress=lambda *step: told.append(step)))
     assert 1.0 == pytest.approx(whole["means"]["error_share"])
     assert 0.0 < report["means"]["error_share"] < 1.0
     assert ("clustering", 1.0) == told[-1]
@@ -103,7 +103,7 @@ def test_an_entry_per_splat_changes_nothing_but_the_order_of_axes(source):
 
 @pytest.mark.slow
 def test_clusters_do_not_depend_on_threads(make_model):
-    one, two = (cluster_attributes(make_model(1000, 1), 50, threads=count)[0] for count in (1, 2))
+    one, two = (cluster_attributes(make_model(1000, 1), 50, context=Context(threads=count))[0] for count in (1, 2))
     for name in ATTRIBUTES:
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 

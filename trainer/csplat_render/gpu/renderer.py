@@ -14,6 +14,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError, LimitError
 from csplat.model import SplatModel
 from csplat.packed import PackedTile
@@ -170,14 +171,14 @@ class GpuScene:
         self.tables = self._upload(np.concatenate([*tables.runs, np.zeros(4, np.uint32)]))
 
     def renderer(
-        self, background: ArrayLike, *, mode: Mode = "standard", threads: int | None = None
+        self, background: ArrayLike, *, mode: Mode = "standard", context: Context = DEFAULT_CONTEXT
     ) -> Callable[[Camera], GpuRender]:
         """Return a function that renders the scene, like `csplat_render.scorer.renderer`.
 
         Raises:
             InputError: the mode is not `standard`.
         """
-        del threads  # the CPU's
+        del context  # its threads are the CPU's
         if mode != "standard":
             raise InputError(f"mode {mode} requires the backend cpu: the GPU has standard alone")
         own = GpuRenderer(self)

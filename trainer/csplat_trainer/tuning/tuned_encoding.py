@@ -5,17 +5,18 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
 from csplat.encoder import DecodedValues, EncodeOptions, EncodePlan, EncodeResult, Importance, Origin, fix_quantisation
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
-from csplat.types import I64
+from csplat.types import I64, null_progress
 from csplat_render.camera import relative_to
 from csplat_trainer.data import DataSet
 from csplat_trainer.device_measurements import measure_importance
@@ -80,8 +81,8 @@ def finetune(
     origin: Origin | None = None,
     metadata: Mapping[str, Any] | None = None,
     outputs: Outputs | None = None,
-    progress: Callable[[str, float], None] | None = None,
     on_step: Callable[[FitStep], None] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> TunedFile:
     """Encode a scene, and optimise the values of the file through its quantisers; `csplat finetune` calls it.
 
@@ -91,15 +92,15 @@ def finetune(
         model: the splats of the file.
         views: views with images of a data set, or with renders of the scene itself (`renders_of`). Of a data set, the
             training images are used, in front of the background that the scene records.
-        encoding: options of the encoder; its number of threads applies to everything.
+        encoding: options of the encoder.
         options: options of the tuning.
         size_bytes: largest size of the file, as in `tune`; the file may be larger if lambda reaches its limit.
         importance: importance of the splats, as for the encoder; `None`: measured in the training views.
         source, origin: the scene that the splats were chosen from, and their indices in it, if some were pruned.
         metadata: metadata about the tuning, in addition to the steps and the number of views.
         outputs: checkpoints.
-        progress: progress callback.
         on_step: called with the progress of the tuning, every `log_every` steps.
+        context: threads, progress, and the seed of the encoder.
 
     Examples:
         >>> import csplat, csplat_trainer
@@ -115,18 +116,20 @@ def finetune(
     """
     check_model("finetune", model)
     timer, encoding, options = StageTimer(), encoding or EncodeOptions(), options or FinetuneOptions()
+    silent = replace(context, progress=null_progress)
     if isinstance(views, DataSet):
         views = _views_of(views, model)
     if importance is None:
         importance = measure_importance(
-            model, [view.camera for view in views.train], views.background, options.device, threads=encoding.threads,
-            progress=progress,
-        )  # fmt: skip
+            model, [view.camera for view in views.train], views.background, options.device, context=context
+        )
     with timer.stage("encoding"):
         draft = EncodePlan.of(
-            model, encoding, importance=importance, origin=origin, allow_classes=False, progress=progress
+            model, encoding, importance=importance, origin=origin, allow_classes=False, context=context
         )
-        fixed = fix_quantisation(draft, source or model, progress)
+        fixed = fix_quantisation(draft, source or model)
+        # The tuning encodes many times, and reports its own steps.
+        fixed = replace(fixed, encode_plan=replace(fixed.encode_plan, context=silent))
         coded = fixed.encode(fixed.start())
         plain = coded.write()
 
@@ -139,19 +142,11 @@ def finetune(
         if size_bytes < 1:
             raise InputError("the target size is smaller than the metadata of the file")
 
-    def show(now: FitStep) -> None:
-        if progress is not None:
-            progress("tuning", now.iteration / now.iterations)
-        if on_step is not None:
-            on_step(now)
-
     with timer.stage("tuning"):
-        tuned = tune(
-            fixed, views, options, size_bytes=size_bytes, progress=show, outputs=outputs, threads=encoding.threads
-        )
+        tuned = tune(fixed, views, options, size_bytes=size_bytes, outputs=outputs, on_step=on_step, context=context)
     with timer.stage("encoding"):
         result = fixed.encode(tuned.best_values).write(tuning_metadata(tuned.log["best_iteration"]))
-        decoded = decode(result.data)
+        decoded = decode(result.data, context=silent)
     _check_identity(fixed.dequantise(tuned.best_values), fixed.source_index, result, decoded)
     return TunedFile(result, decoded, plain, tuned.log, timer.seconds)
 

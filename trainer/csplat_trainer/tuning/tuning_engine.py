@@ -6,6 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import DecodedValues, FixedQuantisation, FreeValues
 from csplat.types import F32
 from csplat_render.rasteriser import Rasteriser
@@ -52,7 +53,7 @@ class CpuTuning:
         options: options of the tuning.
         background: [3].
         parameters: state to continue from; `None`: the values that the encoder found.
-        threads: number of threads; `None` for all.
+        context: threads.
     """
 
     def __init__(
@@ -61,11 +62,11 @@ class CpuTuning:
         options: FinetuneOptions,
         background: F32,
         parameters: Parameters | None = None,
-        threads: int | None = None,
+        context: Context = DEFAULT_CONTEXT,
     ) -> None:
         self._scene = TunedScene(fixed, parameters)
         self._background, self._antialiased = background, fixed.encode_plan.model.metadata.antialiased
-        self._rasteriser = Rasteriser(threads=threads)
+        self._rasteriser = Rasteriser(context=context)
         self._losses = SizedLosses(options.loss)
 
     @property

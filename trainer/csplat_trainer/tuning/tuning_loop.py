@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import FixedQuantisation, FreeValues
 from csplat.errors import InputError
 from csplat_render.metrics import psnr_of_mse
@@ -51,9 +52,9 @@ def tune(
     options: FinetuneOptions | None = None,
     *,
     size_bytes: int | None = None,
-    progress: Callable[[FitStep], None] | None = None,
     outputs: Outputs | None = None,
-    threads: int | None = None,
+    on_step: Callable[[FitStep], None] | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> TuningResult:
     """Fine-tune a fixed quantisation.
 
@@ -64,15 +65,21 @@ def tune(
         views: training and validation views.
         options: options of the tuning.
         size_bytes: largest size of the file; lambda is adjusted to meet it, starting at `byte_cost`.
-        progress: called every `log_every` steps.
         outputs: checkpoints; a run resumes from a checkpoint of the same fixed quantisation.
-        threads: number of threads; `None` for all.
+        on_step: called with the progress of the tuning, every `log_every` steps.
+        context: threads and progress.
 
     Raises:
         InputError: a checkpoint is damaged, or of another scene, views or options; or a loss or a value is not finite.
     """
+
+    def show(now: FitStep) -> None:
+        context.progress("tuning", now.iteration / now.iterations)
+        if on_step is not None:
+            on_step(now)
+
     outputs = outputs or Outputs()
-    tuning = _Tuning(fixed, views, options or FinetuneOptions(), outputs, progress, threads, size_bytes)
+    tuning = _Tuning(fixed, views, options or FinetuneOptions(), outputs, show, context, size_bytes)
     if outputs.resume is not None:
         tuning.resume(outputs.resume)
     return tuning.run()
@@ -98,12 +105,12 @@ class _Tuning:
         views: TuningViews,
         options: FinetuneOptions,
         outputs: Outputs,
-        show: Callable[[FitStep], None] | None,
-        threads: int | None,
+        show: Callable[[FitStep], None],
+        context: Context,
         size_bytes: int | None,
     ) -> None:
         self._views, self._options, self._outputs, self._show = views, options, outputs, show
-        self._fixed, self._threads = fixed, threads
+        self._fixed, self._context = fixed, context
         self._engine = self._make_engine(None)
         self._extent = float(np.exp(np.clip(np.median(np.median(fixed.encode_plan.model.scales, axis=1)), -80.0, 80.0)))
         self._fitter = Fitter(len(views.train), options.iterations, options.seed)
@@ -171,7 +178,7 @@ class _Tuning:
         fitter, options, outputs = self._fitter, self._options, self._outputs
         if fitter.is_due(options.validate_every) or fitter.is_last:
             self._validate()
-        if self._show is not None and (fitter.is_due(options.log_every) or fitter.is_last):
+        if fitter.is_due(options.log_every) or fitter.is_last:
             model = self._fixed.encode_plan.model
             size_bytes = self._log["validations"][-1]["size_bytes"]
             self._show(fitter.report(len(model), model.sh_degree, size_bytes=size_bytes))
@@ -199,7 +206,7 @@ class _Tuning:
     def _make_engine(self, parameters: Parameters | None) -> TuningEngine:
         fixed, options, background = self._fixed, self._options, self._views.background
         if options.device == "cpu":
-            return CpuTuning(fixed, options, background, parameters, self._threads)
+            return CpuTuning(fixed, options, background, parameters, self._context)
         try:
             from csplat_trainer.tuning.gsplat_tuning import GsplatTuning
         except ImportError:

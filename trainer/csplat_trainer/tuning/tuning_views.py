@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.types import F32
@@ -112,12 +113,20 @@ def split_views(views: Sequence[TuningView], background: F32, validation_count: 
     return TuningViews(training, [views[number] for number in sorted(validation)], background)
 
 
-def renders_of(source: SplatModel, cameras: Sequence[Camera], background: F32, threads: int | None) -> list[TuningView]:
+def renders_of(
+    source: SplatModel, cameras: Sequence[Camera], background: F32, context: Context = DEFAULT_CONTEXT
+) -> list[TuningView]:
     """Return renders of a scene as views, the reference for its file without images.
 
     There are hundreds, so they are stored in float16: a PSNR of at least 66 dB up to white.
+
+    Args:
+        source: the scene.
+        cameras: the views, relative to the scene's origin.
+        background: [3], the background of the renders.
+        context: threads.
     """
-    rasteriser = Rasteriser(gradients=False, threads=threads)
+    rasteriser = Rasteriser(gradients=False, context=context)
     views = []
     for camera in cameras:
         render = rasteriser.forward(source, camera, background=background, antialiased=source.metadata.antialiased).rgb

@@ -237,9 +237,7 @@ def _build_palette(scene: Scene, sample: SplatModel, weights_of: Callable[[Splat
         return steps.astype(np.int16)
 
     size = min(_LARGEST_PALETTE, 1 << max(10, scene.count.bit_length() - 1))  # as in splat-transform
-    entries, labels = cluster(
-        points(sample), weights_of(sample), size, seed=0, iterations=_ITERATIONS, near_groups=_NEAR
-    )
+    entries, labels = cluster(points(sample), weights_of(sample), size, iterations=_ITERATIONS, near_groups=_NEAR)
     if len(labels) < scene.count:
         labels = np.concatenate([assign(points(model), entries, near_groups=_NEAR) for model in scene.blocks()])
     total, sums = np.zeros(len(entries)), np.zeros((3 * coefficients, len(entries)))

@@ -35,10 +35,10 @@ from csplat_authoring.scene import (
     Block,
     Chunk,
     Codebook,
+    DeclaredErrors,
     Extra,
     Node,
     Scene,
-    StatedErrors,
     Stream,
 )
 
@@ -203,16 +203,16 @@ def _texts() -> list[Recipe]:
     def meta(name: str, why: str, text: bytes, stream_coding: Stream = PLAIN) -> Recipe:
         return _extreme(name, why, "JSN-1", scene(chunks=(Chunk(_spec.CHUNK_METADATA, text, stream_coding),)))
 
-    nothing = StatedErrors(2, 0, 255, 0, ())
+    nothing = DeclaredErrors(2, 0, 255, 0, ())
     return [
         meta("json_64_deep", "the deepest nesting that is allowed", deepest),
         meta("json_long_number", "a number of 5,000 digits is valid JSON", number, long_number),
         meta("json_odd", "white space, escapes, U+0000, minus zero, a large number", b" \t\r\n" + other + b"\n"),
         _extreme(
-            "stated_errors_none",
+            "declared_errors_none",
             "a head without records",
             "SER-3 SER-4",
-            scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=nothing),)),
+            scene(chunks=(Chunk(_spec.CHUNK_DECLARED_ERRORS, errors=nothing),)),
         ),
         _extreme(
             "unit_smallest",

@@ -1,4 +1,4 @@
-"""JSON texts and stated errors: valid ones, and invalid ones that violate one rule each."""
+"""JSON texts and declared errors: valid ones, and invalid ones that violate one rule each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 from csplat import _spec
 from csplat_authoring.recipe import Recipe, invalid_recipe, valid_recipe
 from csplat_authoring.samples import scene
-from csplat_authoring.scene import Chunk, StatedErrors
+from csplat_authoring.scene import Chunk, DeclaredErrors
 
 _valid = partial(valid_recipe, "extreme")
 _META, _CAMS, _OPTS = _spec.CHUNK_METADATA, _spec.CHUNK_CAMERAS, _spec.CHUNK_OPTIONS
@@ -115,7 +115,7 @@ _GOOD: Final = b"""\t\r\n { "numbers" : [ 0 , -0 , 9 , -9 , 19 , 90.9 , -0.99 , 
 
 
 def good_text_recipes() -> list[Recipe]:
-    """Return valid files whose texts use every production of JSON, and stated errors at their limits."""
+    """Return valid files whose texts use every production of JSON, and declared errors at their limits."""
     many = b'{"a":[' + b",".join(b"[" * 62 + b"]" * 62 for _ in range(3)) + b"]}"
     texts = (Chunk(_META, _GOOD), Chunk(_CAMS, b" [ ] "), Chunk(_OPTS, b"{}"))
     deep = (Chunk(_META, many), Chunk(_CAMS, b"[{},{}]"))
@@ -131,21 +131,21 @@ def good_text_recipes() -> list[Recipe]:
     return [
         _good("json_grammar", "every production of JSON, numbers, escapes and characters at their limits", *texts),
         _good("json_deep_again", "the deepest nesting three times, one after the other", *deep),
-        _stated("error_rms_at_bounds", "each rms as large as its max allows", StatedErrors(2, 0, 4, 0, at_bounds)),
-        _stated("error_rms_zero", "an rms of 0 and a max of 0, of every measure", StatedErrors(2, 0, 3, 0, zeros)),
-        _stated("error_minus_zero", "max and rms of −0, together and next to 0", StatedErrors(2, 0, 3, 0, signs)),
+        _declared("error_rms_at_bounds", "each rms as large as its max allows", DeclaredErrors(2, 0, 4, 0, at_bounds)),
+        _declared("error_rms_zero", "an rms of 0 and a max of 0, of every measure", DeclaredErrors(2, 0, 3, 0, zeros)),
+        _declared("error_minus_zero", "max and rms of −0, together and next to 0", DeclaredErrors(2, 0, 3, 0, signs)),
         _valid(
             "error_counts_of_none",
             "all splats of the source are gone",
             "SER-4",
-            scene(tiles=[], chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=StatedErrors(5, 5)),)),
+            scene(tiles=[], chunks=(Chunk(_spec.CHUNK_DECLARED_ERRORS, errors=DeclaredErrors(5, 5)),)),
         ),
-        _stated("error_counts_large", "2^64 − 1 splats in the source", StatedErrors(large, large - 2), "SER-4"),
+        _declared("error_counts_large", "2^64 − 1 splats in the source", DeclaredErrors(large, large - 2), "SER-4"),
     ]
 
 
 def bad_text_recipes() -> list[Recipe]:
-    """Return files with an invalid text or stated error."""
+    """Return files with an invalid text or declared error."""
     result = [_bad(name, _META, text, why) for name, (text, why) in _BAD.items()]
     result += [_bad(name, kind, text, why) for name, (kind, text, why) in _BAD_ELSEWHERE.items()]
     slack = 1.0 + 2.0**-20
@@ -173,8 +173,8 @@ def _good(name: str, why: str, *chunks: Chunk) -> Recipe:
     return _valid(name, why, "JSN-1", scene(chunks=chunks))
 
 
-def _stated(name: str, why: str, errors: StatedErrors, clause: str = "SER-2") -> Recipe:
-    return _valid(name, why, clause, scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),)))
+def _declared(name: str, why: str, errors: DeclaredErrors, clause: str = "SER-2") -> Recipe:
+    return _valid(name, why, clause, scene(chunks=(Chunk(_spec.CHUNK_DECLARED_ERRORS, errors=errors),)))
 
 
 def _bad(name: str, kind: bytes, text: bytes, why: str) -> Recipe:
@@ -184,6 +184,6 @@ def _bad(name: str, kind: bytes, text: bytes, why: str) -> Recipe:
 
 def _bad_error(name: str, why: str, measure: str, largest: float, rms: float) -> Recipe:
     ids = {name: value for value, name in _spec.MEASURE_NAMES.items()}
-    errors = StatedErrors(2, records=((ids[measure], largest, rms),))
-    made = scene(chunks=(Chunk(_spec.CHUNK_STATED_ERRORS, errors=errors),))
+    errors = DeclaredErrors(2, records=((ids[measure], largest, rms),))
+    made = scene(chunks=(Chunk(_spec.CHUNK_DECLARED_ERRORS, errors=errors),))
     return invalid_recipe(name, why, "SER-2", "E_VALUE", made, at=f"SERR/record[{measure}].max")

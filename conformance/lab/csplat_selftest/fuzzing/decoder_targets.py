@@ -14,6 +14,7 @@ from typing import Any
 
 import csplat
 from csplat import _spec, decoder
+from csplat.context import Context
 from csplat.errors import CsplatError
 from csplat_authoring.builder import Built, build, repair
 from csplat_authoring.recipes import sound_recipes
@@ -84,7 +85,7 @@ class DecoderTarget:
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 # One thread is three times faster on small files; occasionally use all.
-                model = decoder.decode(data, limits=LIMITS, threads=1 if chance % 16 else None)
+                model = decoder.decode(data, limits=LIMITS, context=Context(threads=1 if chance % 16 else None))
                 if len(model) > LIMITS.splats:
                     return "finding", "more splats than the limits permit"
                 return _compare_decoders(data, len(model)) if chance % 8 == 1 else ("decoded", "")
@@ -154,7 +155,7 @@ class OthersTarget(DecoderTarget):
 
     def attempt(self, data: bytes) -> tuple[str, str]:
         """Decode with all decoders and compare."""
-        ours = adapter.answer(data, _SMALL, threads=1)  # one thread, because others are not traced
+        ours = adapter.answer(data, _SMALL, context=Context(threads=1))  # one thread, because others are not traced
         if ours.status not in (Status.PASSED, Status.REFUSED):
             return "finding", f"Python, {ours.status}: {ours.message}"
         became = {ours.code or "decoded"}
@@ -198,7 +199,7 @@ def _built(data: bytes) -> Built | None:
 def _compare_decoders(data: bytes, count: int) -> tuple[str, str]:
     """Decode a valid file with the other decoding functions, which must accept it, too."""
     try:
-        integers = decoder.decode_integers(data, limits=LIMITS, threads=1)
+        integers = decoder.decode_integers(data, limits=LIMITS, context=Context(threads=1))
         tiles = list(decoder.iter_tiles(data, limits=LIMITS))
     except CsplatError as error:
         if error.code == _spec.ERROR_LIMIT:  # a budget counts the bytes of the returned arrays, which differ
@@ -258,9 +259,10 @@ class ValidatorTarget(DecoderTarget):
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             try:
-                decoder.decode(data, limits=LIMITS, threads=1)
+                decoder.decode(data, limits=LIMITS, context=Context(threads=1))
                 if decoder.read_header(data).coarse_tiles:
-                    decoder.decode_integers(data, limits=LIMITS, threads=1)  # reads the coarser levels, too
+                    # reads the coarser levels, too
+                    decoder.decode_integers(data, limits=LIMITS, context=Context(threads=1))
             except CsplatError as caught:
                 error = caught
             if error is not None and error.code == _spec.ERROR_LIMIT:  # budgets are not part of the format

@@ -20,6 +20,7 @@ from types import CodeType, ModuleType
 from typing import Any, Final
 
 from csplat import decoder
+from csplat.context import Context
 from csplat.errors import InputError
 from csplat_conformance import adapter
 from csplat_conformance.answers import Answer, cuts_of_vector
@@ -125,7 +126,7 @@ class PythonDecoder:
             _tell(writing, f"the import: {type(error).__name__}")
             return
         # One thread is five times faster; then use all threads, which have separate code.
-        caught = next((name for threads in (1, None) if (name := failing(_ask(threads)))), "")
+        caught = next((name for threads in (1, None) if (name := failing(_ask(Context(threads=threads))))), "")
         caught = caught or failing_cuts(_ask_cuts)
         _tell(writing, caught)
         if not caught:
@@ -147,10 +148,10 @@ class PythonDecoder:
         __import__(package)
 
 
-def _ask(threads: int | None) -> Any:
+def _ask(context: Context) -> Any:
     def ask(data: bytes) -> Answer:
         try:
-            return adapter.answer(data, threads=threads)
+            return adapter.answer(data, context=context)
         except Exception as error:  # noqa: BLE001 - a mutant may fail in any way
             return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
 
@@ -171,7 +172,7 @@ def _run_cuts(command: str) -> Callable[[Vector], Answer]:
 
 def _fuzzed_answer(data: bytes) -> Answer:
     try:
-        return adapter.answer(data, LIMITS, threads=1)
+        return adapter.answer(data, LIMITS, context=Context(threads=1))
     except Exception as error:  # noqa: BLE001 - a mutant may fail in any way
         return Answer(Status.CRASHED, f"{type(error).__name__}: {error}")
 

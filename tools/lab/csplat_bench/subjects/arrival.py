@@ -33,7 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import csplat
-from csplat.encoder import EncodeOptions, PresetName, encode
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions, PresetName
 from csplat.formats import format_by_name, write
 from csplat.ply import read_ply
 from csplat_bench.engine_stage import HEIGHT, WIDTH, chosen_view, opened_page, pinhole, placed_in

@@ -25,7 +25,8 @@ from pathlib import Path
 from typing import Any
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, encode
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions
 from csplat.ply import read_ply
 from csplat_bench.browser import open_page, serve
 from csplat_bench.protocol import AbsentError, Measure, Setup

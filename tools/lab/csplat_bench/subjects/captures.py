@@ -20,8 +20,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+from csplat.context import Context
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, Target, encode
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError
 from csplat.ply import read_ply, write_ply
 from csplat_bench.data_set_folders import (
@@ -130,16 +132,18 @@ def _tuned(ply: Path, data: DataSet, options: TrainOptions, megabytes: float) ->
         training, checkpoint = _train(ply, data, options), ply.with_suffix(".npz")
         if not checkpoint.exists():
             raise InputError(f"{checkpoint} is missing: tuning continues a training of csplat")
-        target, start = Target(size_bytes=round(1e6 * megabytes)), time.perf_counter()
+        target, start = Target(size=round(1e6 * megabytes)), time.perf_counter()
         trained = train(
             replace(data, test=[]),
             plan_training(options, target, resume=checkpoint),
             outputs=Outputs(resume=checkpoint),
         )
         pruning = time.perf_counter() - start
-        encoding = EncodeOptions("small", seed=options.seed, shape_codebook_size=SHAPE_ENTRIES)
+        encoding = EncodeOptions("small", shape_codebook_size=SHAPE_ENTRIES)
         views = find_view_set(trained.model, data=data, validation_count=0)
-        tuned = choose_and_finetune(trained.model, views, encoding, tuning_after(options), target)
+        tuned = choose_and_finetune(
+            trained.model, views, encoding, tuning_after(options), target, context=Context(seed=options.seed)
+        )
         seconds = {"pruning": round(pruning, 1), **tuned.seconds}
         write_json(path.with_suffix(".json"), {"training": training, "seconds": seconds, "machine": _machine(options)})
         write_bytes(str(path), tuned.made.data)

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from csplat.decoder import decode
-from csplat.encoder import EncodeOptions, encode
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply, write_ply

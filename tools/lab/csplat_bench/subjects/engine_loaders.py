@@ -18,7 +18,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import Any
 
-from csplat.encoder import EncodeOptions, encode
+from csplat.encode_api import encode
+from csplat.encoder import EncodeOptions
 from csplat.formats import read, write
 from csplat_bench.engine_stage import ENGINES, chosen_view, opened_page, pinhole
 from csplat_bench.protocol import Measure, Setup

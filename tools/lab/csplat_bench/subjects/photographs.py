@@ -28,11 +28,11 @@ from csplat.encoder import EncodeOptions, Target
 from csplat.errors import InputError
 from csplat.model import SplatModel
 from csplat.ply import read_ply
+from csplat.sizes import parse_size
 from csplat_bench.measuring import alone, run_program
 from csplat_bench.protocol import AbsentError, Measure, Setup
 from csplat_bench.suites import Case
 from csplat_render.lpips import Lpips, load_lpips
-from csplat_tools.console import parse_size_bytes
 from csplat_tools.training.training_run import plan_training, run_training, run_training_to_file, tuning_after
 from csplat_tools.training.tuning_run import SHAPE_ENTRIES
 from csplat_tools.views import DataOptions
@@ -133,7 +133,7 @@ def _finish(data_set: _Set, case: Case, file: Path) -> dict[str, Any]:
     training = data_set.path_of(case["of"], ".npz")
     if not training.exists():
         raise InputError(f"{training} does not exist, expected the checkpoint of the training {case['of']!r}")
-    size = None if "target_size" not in case.settings else parse_size_bytes(case["target_size"])
+    size = None if "target_size" not in case.settings else parse_size(case["target_size"])
     start = time.perf_counter()
     report = alone(finish_training, data_set.options, str(training), str(file), dict(case.settings), size)
     return {"by": "train", **_describe(report["file"], time.perf_counter() - start, file)}

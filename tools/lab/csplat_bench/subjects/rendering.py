@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from csplat.context import Context
 from csplat.ply import read_ply
 from csplat_bench.measuring import Timing, timed
 from csplat_bench.protocol import Measure, Setup
@@ -29,16 +30,16 @@ from csplat_tools.views import comparison_cameras
 @contextmanager
 def measure_rendering(setup: Setup, name: str, _: Sequence[Case]) -> Iterator[Measure]:
     """Yield the function that renders all views once, with and without gradients."""
-    scene, threads = find_scene(name, setup.data, setup.work), setup.options["threads"]
+    scene, context = find_scene(name, setup.data, setup.work), Context(threads=setup.options["threads"])
     warm_up(note)
     model = read_ply(scene.path)
     cameras = list(scene.cameras or comparison_cameras(model))[: setup.options["views"]]
-    standard = Rasteriser("standard", gradients=False, threads=threads)
+    standard = Rasteriser("standard", gradients=False, context=context)
     references = [standard.forward(model, camera).rgb.clip(0.0, 1.0) for camera in cameras]
 
     def measure(case: Case) -> Mapping[str, Any]:
         mode, antialiased = case["mode"], case.get("antialiased", False)
-        plain, training = (Rasteriser(mode, gradients=gradients, threads=threads) for gradients in (False, True))
+        plain, training = (Rasteriser(mode, gradients=gradients, context=context) for gradients in (False, True))
         forward, backward, drawn, errors = list[Timing](), list[Timing](), list[int](), list[float]()
         for camera, reference in zip(cameras, references, strict=True):
             render, timing = timed(plain.forward, model, camera, antialiased=antialiased)

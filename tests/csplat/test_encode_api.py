@@ -1,4 +1,4 @@
-"""Scenes survive encoding and decoding within the errors that the file states, or they are refused.
+"""Scenes survive encoding and decoding within the errors that the file declares, or they are refused.
 
 Also: csplat.encoder.coding_parameters, csplat.encoder.encode_options, csplat.encoder.pipeline,
 csplat.encoder.sh_codebook.
@@ -19,8 +19,10 @@ from tables import failures
 
 import csplat
 from csplat import SplatModel, _spec
+from csplat.context import Context
 from csplat.decoder import read_options
-from csplat.encoder import PRESETS, EncodeOptions, encode, encode_with_report
+from csplat.encode_api import encode, encode_planned, encode_with_report
+from csplat.encoder import PRESETS, EncodeOptions, EncodePlan
 from csplat.errors import InputError
 from csplat.scene_metadata import SceneMetadata
 
@@ -219,14 +221,13 @@ def test_bytes_do_not_depend_on_threads(make_model):
     # CNF-10
     for coding in ("scalar", "codebook"):
         options = {"sh_coding": coding, "tile_splats": 150, "codebook_size": 32}
-        one, four = (encode(make_model(600, 2), EncodeOptions(threads=n, **options)) for n in (1, 4))
+        one, four = (encode(make_model(600, 2), EncodeOptions(**options), context=Context(threads=n)) for n in (1, 4))
         assert bool(one == four)
 
 
 OUT_OF_RANGE = (
     ("preset", "tiny"), ("position_bits", 17), ("position_bits", 8.5), ("sh_degree", 5), ("quat_levels", 2),
     ("deflate_level", 0), ("scale_step", 0), ("scale_step", math.nan), ("sh_step", "0.1"), ("tile_splats", None),
-    ("seed", -1), ("threads", 0),
 )  # fmt: skip
 
 
@@ -285,11 +286,12 @@ def test_transparent_splats_keep_their_sh_and_do_not_prevent_a_codebook(make_mod
 
 def test_the_report_has_options_metadata_and_progress_of_each_stage(make_model):
     seen, metadata = {}, {"simplified": {"why": "a test"}, "more": 7}
-    options = EncodeOptions(preset="small", seed=7, sh_coding="codebook", tile_splats=100)
-    result = encode_with_report(make_model(500, 2), options, metadata=metadata, progress=seen.__setitem__)
+    options = EncodeOptions(preset="small", sh_coding="codebook", tile_splats=100)
+    plan = EncodePlan.of(make_model(500, 2), options, context=Context(seed=7, progress=seen.__setitem__))
+    result = encode_planned(plan, metadata=metadata)
     recorded = read_options(result.data)
-    asked = {"preset": "small", "seed": 7, "sh_coding": "codebook", "tile_splats": 100}
-    assert result.report.options == recorded == recorded | metadata | {"asked": asked}
+    asked = {"preset": "small", "sh_coding": "codebook", "tile_splats": 100}
+    assert result.report.options == recorded == recorded | metadata | {"asked": asked, "seed": 7}
     assert {"codebook": 1.0, "tiles": 1.0} == seen
 
 

@@ -1,17 +1,18 @@
-"""Encode a scene in one call, with the given options or to a target."""
+"""Encode a scene in one call: of any size, with the given options or to a target, with or without levels of detail."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal, Protocol, overload
 
 from numpy.typing import NDArray
 
+from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.disk_files import BinaryWriter, open_writer
 from csplat.encoder.encode_options import EncodeOptions
-from csplat.encoder.encode_plan import EncodePlan, Origin
+from csplat.encoder.encode_plan import EncodePlan
 from csplat.encoder.error_targets import meet_bounds
 from csplat.encoder.levels import LevelBuilder
 from csplat.encoder.pipeline import EncodeResult, encode_tiles
@@ -19,12 +20,14 @@ from csplat.encoder.splat_importance import Importance
 from csplat.encoder.target import Target, Views
 from csplat.errors import InputError
 from csplat.model import SplatModel, check_model
+from csplat.out_of_core import encode_on_disk, estimate_cost
 from csplat.plugins import load_plugins
-from csplat.types import null_progress
+from csplat.scene import Scene
 
 #: Levels of detail: their number above the scene, "auto" for as many as it takes to reach 4,096 splats, or a builder.
 Levels = int | Literal["auto"] | LevelBuilder | None
-_Progress = Callable[[str, float], None]
+
+Output = str | os.PathLike[str] | BinaryWriter
 
 
 class Search(Protocol):
@@ -39,7 +42,7 @@ class Search(Protocol):
         views: Views | None,
         importance: NDArray[Any] | Importance | None,
         levels: LevelBuilder | None,
-        progress: _Progress | None,
+        context: Context,
     ) -> EncodeResult:
         """Return the best file within the target; arguments as for `encode_with_report`."""
         ...
@@ -47,7 +50,7 @@ class Search(Protocol):
 
 @overload
 def encode(
-    model: SplatModel,
+    scene: SplatModel | Scene,
     options: EncodeOptions | None = None,
     *,
     out: None = None,
@@ -55,50 +58,56 @@ def encode(
     views: Views | None = None,
     importance: NDArray[Any] | Importance | None = None,
     levels: Levels = None,
-    progress: _Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> bytes: ...
 
 
 @overload
 def encode(
-    model: SplatModel,
+    scene: SplatModel | Scene,
     options: EncodeOptions | None = None,
     *,
-    out: str | os.PathLike[str] | BinaryWriter,
+    out: Output,
     target: Target | None = None,
     views: Views | None = None,
     importance: NDArray[Any] | Importance | None = None,
     levels: Levels = None,
-    progress: _Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> None: ...
 
 
 def encode(
-    model: SplatModel,
+    scene: SplatModel | Scene,
     options: EncodeOptions | None = None,
     *,
-    out: str | os.PathLike[str] | BinaryWriter | None = None,
+    out: Output | None = None,
     target: Target | None = None,
     views: Views | None = None,
     importance: NDArray[Any] | Importance | None = None,
     levels: Levels = None,
-    progress: _Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> bytes | None:
     """Encode a scene.
 
+    A scene that does not fit in memory is encoded on disk, if `out` is a path, with the same bytes: it is sorted into
+    buckets of neighbours in a working folder, and these are coded one by one, by worker processes. If the encoding is
+    interrupted, finished work stays in the folder. Scripts must guard their own code by `if __name__ == "__main__":`,
+    because worker processes import it.
+
     Args:
-        model: the scene.
+        scene: a model, or a scene of any size from `csplat.open`.
         options: default: the preset "balanced". With a target, options that are set are not changed by the search; the
             preset "fast" tries no codebooks and keeps all splats.
         out: a path, written atomically and replaced if it exists, or an open binary file; `None`: return the bytes.
         target: the target that a search meets; `None`: encode with the options as they are. All targets but largest
-            errors alone require rendering, which takes minutes, and the packages of the extra `render`.
+            errors alone require rendering, which takes minutes, and the packages of the extra `render`. A target
+            requires the scene in memory.
         views: a `csplat_tools.ViewSet` of training, validation and test views for the search; `None`: virtual ones
             around the scene.
-        importance: see `EncodePlan.of`.
+        importance: see `EncodePlan.of`; requires the scene in memory.
         levels: number of levels of detail above the scene, 1 to 16, "auto" or a builder; their bytes count for a
             target. Building them takes minutes per million splats, and the extra `render`. `None`: the file has none.
-        progress: called with the stage and the fraction done, 0 to 1.
+        context: threads, workers, memory, seed and progress.
 
     Returns:
         The bytes of a `.csplat` file, `None` with `out`. They depend only on the arguments and the versions of the
@@ -111,41 +120,35 @@ def encode(
         >>> data = csplat.encode(model, csplat.EncodeOptions(preset="fast"))
         >>> Path("small.csplat").write_bytes(data) == len(data)
         True
-        >>> csplat.encode(model, out="small.csplat")
+        >>> with csplat.open("scene.ply") as scene:
+        ...     csplat.encode(scene, out="small.csplat", context=csplat.Context(memory="4GB"))
         >>> csplat.encode(model, out="small.csplat", target=csplat.Target(psnr=38), levels="auto")  # doctest: +SKIP
 
     Raises:
-        InputError: `model` is not a model, a value fits no lattice, an option is not allowed for the model or is
-            determined by the target, or the target is out of reach.
+        InputError: `scene` is neither a model nor a scene, a value fits no lattice, an option is not allowed for the
+            scene or is determined by the target, the target is out of reach; memory or disk are too small, the working
+            folder exists, belongs to another scene or is damaged.
+        CsplatError: the scene cannot be read.
+        OSError: a file cannot be read or written; or a worker was killed.
     """
     result = encode_with_report(
-        model, options, target=target, views=views, importance=importance, levels=levels, progress=progress
+        scene, options, out=out, target=target, views=views, importance=importance, levels=levels, context=context
     )
-    if out is None:
-        return result.data
-    with open_writer(out) as stream:
-        stream.write(result.data)
-    return None
+    return result.data if out is None else None
 
 
 def encode_with_report(
-    model: SplatModel,
+    scene: SplatModel | Scene,
     options: EncodeOptions | None = None,
     *,
+    out: Output | None = None,
     target: Target | None = None,
     views: Views | None = None,
     importance: NDArray[Any] | Importance | None = None,
     levels: Levels = None,
-    origin: Origin | None = None,
-    metadata: Mapping[str, Any] | None = None,
-    progress: _Progress | None = None,
+    context: Context = DEFAULT_CONTEXT,
 ) -> EncodeResult:
-    """Encode a scene, and report choices and errors.
-
-    Args:
-        model, options, target, views, importance, levels, progress: see `encode`.
-        origin: see `EncodePlan.of`; not with a target.
-        metadata: see `EncodedTiles.write`; not with a target.
+    """Encode a scene, and report choices and errors; arguments and errors as in `encode`.
 
     Examples:
         >>> import csplat
@@ -157,44 +160,71 @@ def encode_with_report(
         >>> result.report.search.reached["means"] <= 0.001
         True
         >>> result.save("bounded.csplat")
-
-    Raises:
-        InputError: as in `encode` and `EncodePlan.of`; or the target requires the extra `render`.
-        OSError: an image of the views cannot be read.
     """
-    check_model("the encoder", model)
     options = EncodeOptions() if options is None else options
     if not isinstance(options, EncodeOptions):
         raise InputError(f"options is {options!r}, expected csplat.EncodeOptions(preset=...)")
-    builder = _builder_of(levels, len(model), options)
-    if target is None:
-        if views is not None:
-            raise InputError("views are given without a target, expected both or neither")
-        plan = EncodePlan.of(model, options, importance=importance, origin=origin, progress=progress)
-        return _encode(plan, builder, metadata, progress)
-    if not isinstance(target, Target):
+    if target is None and views is not None:
+        raise InputError("views are given without a target, expected both or neither")
+    if not isinstance(target, Target | None):
         raise InputError(f"target is {target!r}, expected csplat.Target(psnr=...)")
-    if origin is not None or metadata is not None:
-        raise InputError("a target excludes origin and metadata")
+    if not isinstance(scene, Scene):
+        check_model("the encoder", scene)
+        scene = Scene.of(scene)
+    builder = _builder_of(levels, scene.count, options)
+    if target is not None or importance is not None:
+        if context.is_bounded:
+            raise InputError("a target and an importance exclude workers, a limit of memory, and resume")
+    elif scene.in_memory is None or context.is_bounded:
+        path = out if isinstance(out, str | os.PathLike) else None
+        if not estimate_cost(scene, options, context, builder, out=path).in_memory:
+            if path is None:
+                raise InputError("the scene is too large to be encoded in memory, and requires a path as out")
+            return EncodeResult(encode_on_disk(scene, path, options, context, builder))
+    result = _encode_model(scene.model(), options, target, views, importance, builder, context)
+    if out is not None:
+        with open_writer(out) as stream:
+            stream.write(result.data)
+    return result
+
+
+def _encode_model(
+    model: SplatModel,
+    options: EncodeOptions,
+    target: Target | None,
+    views: Views | None,
+    importance: NDArray[Any] | Importance | None,
+    levels: LevelBuilder | None,
+    context: Context,
+) -> EncodeResult:
+    if target is None:
+        return encode_planned(EncodePlan.of(model, options, importance=importance, context=context), levels)
     if target.is_rendered:
         search: Search = _plugin("csplat.search", "target", "search for targets")
-        return search(
-            model, options, target=target, views=views, importance=importance, levels=builder, progress=progress
-        )
-    bounded, options = meet_bounds(model, options, target, importance=importance, progress=progress)
-    if builder is None or bounded.report.search is None:
+        return search(model, options, target=target, views=views, importance=importance, levels=levels, context=context)
+    bounded, options = meet_bounds(model, options, target, importance=importance, context=context)
+    if levels is None or bounded.report.search is None:
         return bounded
-    result = _encode(EncodePlan.of(model, options, importance=importance, progress=progress), builder, None, progress)
+    result = encode_planned(EncodePlan.of(model, options, importance=importance, context=context), levels)
     return result.with_search(replace(bounded.report.search, size_bytes=result.size_bytes))
 
 
-def _encode(
-    plan: EncodePlan, levels: LevelBuilder | None, metadata: Mapping[str, Any] | None, progress: _Progress | None
+def encode_planned(
+    plan: EncodePlan, levels: LevelBuilder | None = None, metadata: Mapping[str, Any] | None = None
 ) -> EncodeResult:
+    """Encode a planned scene in memory.
+
+    Args:
+        plan: the plan.
+        levels: builds levels of detail; `None`: the file has none.
+        metadata: see `EncodedTiles.write`.
+
+    Raises:
+        InputError: a value fits no lattice, or an error is too large to be declared.
+    """
     if levels is None:
-        return encode_tiles(plan, progress=progress).write(metadata)
-    encoded = levels.encode_plan(plan, progress=progress or null_progress)
-    return encoded.write({**(metadata or {}), "levels": levels.settings(len(plan.model))})
+        return encode_tiles(plan).write(metadata)
+    return levels.encode_plan(plan).write({**(metadata or {}), "levels": levels.settings(len(plan.model))})
 
 
 def _builder_of(levels: Levels, count: int, options: EncodeOptions) -> LevelBuilder | None:
