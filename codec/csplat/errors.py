@@ -142,15 +142,15 @@ class StoreError(CsplatError):
         super().__init__(message)
 
 
-def counted(count: int, one: str, many: str | None = None) -> str:
+def counted(count: int, singular: str, plural: str | None = None) -> str:
     """Format a count with its noun: `1 tile`, `59,325 tiles`.
 
     Args:
         count: the number.
-        one: singular of the noun.
-        many: plural of the noun; `None`: the singular with an s.
+        singular: singular of the noun.
+        plural: plural of the noun; `None`: the singular with an s.
     """
-    return f"{count:,} {one if count == 1 else many or one + 's'}"
+    return f"{count:,} {singular if count == 1 else plural or singular + 's'}"
 
 
 def missing_package(error: ModuleNotFoundError, package: str | None = None, *, extra: str = "render") -> InputError:

@@ -119,9 +119,15 @@ class Scene:
             kept["in_memory"] = None
         return Scene(**{**kept, **fields})
 
-    def blocks(self) -> Iterator[SplatModel]:
-        """Yield all splats in order, at most `BLOCK_SPLATS` at a time."""
-        return self.reader()
+    def blocks(self, splats_max: int = BLOCK_SPLATS) -> Iterator[SplatModel]:
+        """Yield all splats in order, at most `splats_max` at a time; `BLOCK_SPLATS` may be in memory."""
+        if splats_max < 1:
+            raise InputError(f"splats_max is {splats_max}, expected at least 1")
+        for block in self.reader():
+            if len(block) <= splats_max:
+                yield block
+            else:
+                yield from (block.select(slice(at, at + splats_max)) for at in range(0, len(block), splats_max))
 
     def numbered(self) -> Iterator[tuple[slice, SplatModel]]:
         """Yield each block with the range of its splats in the scene."""

@@ -205,12 +205,12 @@ def whole_number(text: str) -> float:
     return int(text) if abs(value) <= 2**53 else value
 
 
-def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tuple[Status, str]:
-    if not found:
+def _compare_header(expect: Mapping[str, Any], header: Mapping[str, Any]) -> tuple[Status, str]:
+    if not header:
         return Status.WRONG_ANSWER, "no header.json"
     wrong = []
     for key, value in expect.items():
-        reported = found.get(key)
+        reported = header.get(key)
         if key == "scene_flags" and isinstance(reported, list):
             reported, value = sorted(map(str, reported)), sorted(value)  # noqa: PLW2901 - an unordered set
         if reported != value:
@@ -218,14 +218,14 @@ def _compare_header(expect: Mapping[str, Any], found: Mapping[str, Any]) -> tupl
     return (Status.FAILED, "; ".join(wrong)) if wrong else (Status.PASSED, "")
 
 
-def _compare_size(key: str, summary: list[Any], found: tuple[int, str] | None) -> list[tuple[Status, str]]:
+def _compare_size(key: str, summary: list[Any], array: tuple[int, str] | None) -> list[tuple[Status, str]]:
     dtype, shape, _ = summary
-    if found is None:
+    if array is None:
         return [(Status.WRONG_ANSWER, f"{key} is missing")]
     size = math.prod(shape) * int(dtype[1:])
-    if found[0] != size:
-        status = Status.PARTIAL_OUTPUT if found[0] < size else Status.FAILED
-        return [(status, f"{key} has {found[0]} bytes, expected {size}, {dtype} {shape}")]
+    if array[0] != size:
+        status = Status.PARTIAL_OUTPUT if array[0] < size else Status.FAILED
+        return [(status, f"{key} has {array[0]} bytes, expected {size}, {dtype} {shape}")]
     return []
 
 
@@ -261,15 +261,15 @@ def skip_cuts(vector: Vector, why: str) -> Outcome:
     return Outcome(vector.name, level_name(CUTS), Status.SKIPPED, tuple(vector.clauses), "", why)
 
 
-def _compare_cuts(expect: Sequence[tuple[str, Cut]], found: Sequence[Cut]) -> tuple[Status, str]:
-    if len(found) != len(expect):
-        status = Status.PARTIAL_OUTPUT if len(found) < len(expect) else Status.FAILED
-        return (status if found else Status.NO_OUTPUT), f"{len(found)} cuts, expected {len(expect)}, a line for each"
-    answered = (text for (text, _), cut in zip(expect, found, strict=True) if cut != _spec.ERROR_UNSUPPORTED)
+def _compare_cuts(expect: Sequence[tuple[str, Cut]], cuts: Sequence[Cut]) -> tuple[Status, str]:
+    if len(cuts) != len(expect):
+        status = Status.PARTIAL_OUTPUT if len(cuts) < len(expect) else Status.FAILED
+        return (status if cuts else Status.NO_OUTPUT), f"{len(cuts)} cuts, expected {len(expect)}, a line for each"
+    answered = (text for (text, _), cut in zip(expect, cuts, strict=True) if cut != _spec.ERROR_UNSUPPORTED)
     offered = {kind for text in answered for kind in _kinds(text)}
     wrong = [
         f"the cut {_shorten(text)!r} is {_shorten(_cut_text(cut))}, expected {_shorten(_cut_text(wanted))}"
-        for (text, wanted), cut in zip(expect, found, strict=True)
+        for (text, wanted), cut in zip(expect, cuts, strict=True)
         if cut != wanted and _kinds(text) <= offered
     ]
     if wrong:

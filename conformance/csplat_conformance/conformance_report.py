@@ -160,10 +160,10 @@ def _word(status: Status) -> str:
     return "ok" if status is Status.PASSED else str(status) if status in _GOOD else str(status).upper()
 
 
-def _remark(one: Outcome) -> str:
-    message = " ".join(one.message.split())  # may come from a foreign program: keep it on one line
-    where = ", ".join([*one.clauses, *([one.code] if one.code else [])])
-    if not where or (one.good and not message):
+def _remark(outcome: Outcome) -> str:
+    message = " ".join(outcome.message.split())  # may come from a foreign program: keep it on one line
+    where = ", ".join([*outcome.clauses, *([outcome.code] if outcome.code else [])])
+    if not where or (outcome.good and not message):
         return message
     return f"{message} ({where})" if message else f"({where})"
 
@@ -193,16 +193,16 @@ def to_json(report: ConformanceReport) -> dict[str, Any]:
     }
 
 
-def _outcome_json(one: Outcome) -> dict[str, Any]:
+def _outcome_json(outcome: Outcome) -> dict[str, Any]:
     return {
-        "name": one.name,
-        "level": one.level,
-        "status": str(one.status),
-        "clauses": list(one.clauses),
-        "code": one.code,
-        "message": one.message,
-        "seconds": round(one.seconds, 4),
-        "details": one.details,
+        "name": outcome.name,
+        "level": outcome.level,
+        "status": str(outcome.status),
+        "clauses": list(outcome.clauses),
+        "code": outcome.code,
+        "message": outcome.message,
+        "seconds": round(outcome.seconds, 4),
+        "details": outcome.details,
     }
 
 
@@ -231,18 +231,18 @@ def _junit_totals(outcomes: Sequence[Outcome]) -> str:
     return f'tests="{len(outcomes)}" failures="{failures}" errors="{errors}" skipped="{skipped}" time="{seconds:.3f}"'
 
 
-def _junit_case(one: Outcome, suite: str) -> str:
-    head = f'    <testcase classname="{_xml(suite)}" name="{_xml(one.name)}" time="{one.seconds:.3f}"'
-    if one.status is Status.PASSED:
+def _junit_case(outcome: Outcome, suite: str) -> str:
+    head = f'    <testcase classname="{_xml(suite)}" name="{_xml(outcome.name)}" time="{outcome.seconds:.3f}"'
+    if outcome.status is Status.PASSED:
         return head + "/>"
-    if one.status is Status.WARNED:
-        return f"{head}><system-out>{_xml(f'warning: {one.message}')}</system-out></testcase>"
-    if one.status in _OPEN:
-        message = one.message if one.status is Status.SKIPPED else f"{one.status}: {one.message}"
+    if outcome.status is Status.WARNED:
+        return f"{head}><system-out>{_xml(f'warning: {outcome.message}')}</system-out></testcase>"
+    if outcome.status in _OPEN:
+        message = outcome.message if outcome.status is Status.SKIPPED else f"{outcome.status}: {outcome.message}"
         return f'{head}><skipped message="{_xml(message)}"/></testcase>'
-    kind = "error" if one.status in _ERRORS else "failure"
-    message = f'message="{_xml(f"{one.status}: {_remark(one)}")}"'
-    return f'{head}><{kind} type="{_xml(one.code or str(one.status))}" {message}/></testcase>'
+    kind = "error" if outcome.status in _ERRORS else "failure"
+    message = f'message="{_xml(f"{outcome.status}: {_remark(outcome)}")}"'
+    return f'{head}><{kind} type="{_xml(outcome.code or str(outcome.status))}" {message}/></testcase>'
 
 
 def _xml(text: str) -> str:

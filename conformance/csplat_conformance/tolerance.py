@@ -73,15 +73,15 @@ def _ordinals(values: NDArray[np.float32]) -> NDArray[np.int64]:
     return np.where(np.signbit(values), -magnitudes, magnitudes)
 
 
-def describe_deviation(name: str, found: bytes, expected: NDArray[Any]) -> str:
+def describe_deviation(name: str, data: bytes, expected: NDArray[Any]) -> str:
     """Return a line about values beyond the tolerance of CNF-7, or an empty string.
 
     Args:
         name: name of the array, such as `means`.
-        found: raw values, with the size of `expected`.
+        data: raw values, with the size of `expected`.
         expected: exact values, float32.
     """
-    values, exact = np.frombuffer(found, "<f4").astype(np.float32), expected.ravel()
+    values, exact = np.frombuffer(data, "<f4").astype(np.float32), expected.ravel()
     ulps = ulps_between(values, exact)
     with np.errstate(invalid="ignore"):  # signalling NaN
         distances = np.abs(values.astype(np.float64) - exact)

@@ -44,6 +44,9 @@ def test_a_ply_in_blocks_is_the_ply_at_once(tmp_path, large):
 def test_a_scene_in_memory_is_read_in_blocks(large):
     scene = Scene.of(large)
     assert [BLOCK_SPLATS, 1000] == [len(one) for one in scene.blocks()]
+    assert [30_000, 30_000, 5536, 1000] == [len(one) for one in scene.blocks(30_000)]
+    with pytest.raises(InputError, match="splats_max is 0"):
+        next(scene.blocks(0))
     same(large, scene.model())
     assert 0 == len(Scene(0, 1, lambda: iter(())).model())
 

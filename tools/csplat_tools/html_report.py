@@ -450,7 +450,7 @@ def _window_sums(values: F64, height: int, width: int) -> F64:
 
 
 def _framed(image: F32, rows: slice, columns: slice) -> U8:
-    """Return the whole view, reduced, with a frame that is visible on any background."""
+    """Return the whole view, [H, W, 3], reduced, with a frame that is visible on any background."""
     shown = _reduced(to_uint8(image)).copy()
     factor = shown.shape[0] / image.shape[0]
     top, bottom, left, right = (round(factor * at) for at in (rows.start, rows.stop, columns.start, columns.stop))
@@ -463,7 +463,7 @@ def _framed(image: F32, rows: slice, columns: slice) -> U8:
 
 
 def _data_uri(pixels: U8) -> str:
-    """Return an image as a data URI for an `img` element: WebP, or PNG if pillow was built without it."""
+    """Return an image [H, W, 3] as a data URI for an `img` element: WebP, or PNG if pillow was built without it."""
     from PIL import Image, features
 
     kind, options = ("WEBP", _WEBP) if features.check("webp") else ("PNG", {})

@@ -39,17 +39,17 @@ def read_importance(path: str, model: SplatModel) -> NDArray[Any] | Importance |
 
 
 def encoder_importance(
-    found: NDArray[Any] | Importance | StoredSensitivity, model: SplatModel
+    contents: NDArray[Any] | Importance | StoredSensitivity, model: SplatModel
 ) -> NDArray[Any] | Importance:
     """Return the importance for the encoder from the result of `read_importance`.
 
     In surrounding scenes, virtual views show too little to determine how coarsely splats may be quantised. So
     sensitivities measured in such views do not sort splats into quantisation classes.
     """
-    if not isinstance(found, StoredSensitivity):
-        return found
-    weights = found.importance()
-    if found.source == "virtual" and scene_frame(model).kind == "surrounding":
+    if not isinstance(contents, StoredSensitivity):
+        return contents
+    weights = contents.importance()
+    if contents.source == "virtual" and scene_frame(model).kind == "surrounding":
         return replace(weights, blocks=None)
     return weights
 

@@ -63,11 +63,10 @@ class FittedLevelBuilder:
         leaf_splats: maximum number of splats of a leaf; smaller leaves take more bytes, larger leaves load later
             when they are seen.
         root_splats: maximum number of splats of the root, the first picture of a scene; 4,096 are about 50 kB.
-        whole_splats: number of splats up to which a scene is built in one piece, with more work. Built like a bucket,
-            level 1 of garden500k has 27.5 instead of 32.0 dB.
+        whole_splats: number of splats up to which a scene is built in one piece, with more work and a better level 1.
         fitted_splats: number of splats of a scene up to which levels of buckets are fitted to renders. In larger
-            scenes, neighbours are only merged: 411,296 splats of SH degree 0 take 14 CPU s instead of 35. On two cores,
-            100 million would take 75 to 90 minutes with the fit, and 40 million take 30 to 35.
+            scenes, neighbours are only merged. On two cores, 100 million splats would take 75 to 90 minutes with the
+            fit, and 40 million take 30 to 35.
         bucket_splats: see `EncodeOptions`.
         nodes: nodes of the scene, which are taken instead.
     """
@@ -326,6 +325,6 @@ def _with_bands(splats: SplatModel, scene: SplatModel) -> SplatModel:
 
 
 def _rows_by_node(places: I64, node_count: int) -> list[NDArray[np.intp]]:
-    """Return the rows of the splats of each node, ascending."""
+    """Return the rows of the splats of each node, ascending, given the node of each splat, [N]."""
     ends = np.cumsum(np.bincount(places, minlength=node_count))
     return np.split(np.argsort(places, kind="stable"), ends[:-1])

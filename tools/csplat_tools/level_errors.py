@@ -81,7 +81,7 @@ def measure_errors(
 def _reference(
     nodes: Sequence[FileNode], children: Sequence[Sequence[int]], number: int, splat_count: int
 ) -> list[int]:
-    """Return the finest level of a node's subtree with at most `splat_count` splats, else its coarsest level."""
+    """Return the nodes of a subtree's finest level with at most `splat_count` splats, else of its coarsest level."""
     cut: list[int] = []
     for level in range(nodes[number].level):
         pending, cut = list(reversed(children[number])), []
@@ -97,13 +97,13 @@ def _reference(
 
 
 def _radius(region: F64, splats: SplatModel | None = None) -> float:
-    """Return half the diagonal of a region, or, if that is 0, the largest standard deviation of splats."""
+    """Return half the diagonal of a region, [2, 3], or, if that is 0, the largest standard deviation of splats."""
     radius = float(np.linalg.norm(region[1] - region[0])) / 2.0
     return radius if radius or splats is None else float(np.exp(np.float64(splats.scales.max())))
 
 
 def _errors_below(cut: Sequence[tuple[FileNode, float]], radius: float) -> F64:
-    """Return the squared errors of a level of a subtree at the pixel sizes of a node of this radius.
+    """Return the squared errors of a level of a subtree, [sizes], at the pixel sizes of a node of this radius.
 
     They are averages over the nodes, weighted by the areas of their regions. The error of a node is its error at the
     next finer size that was measured.
@@ -118,7 +118,7 @@ def _errors_below(cut: Sequence[tuple[FileNode, float]], radius: float) -> F64:
 
 
 def _first_alike(squares: F64, radius: float) -> float:
-    """Return the smallest pixel size from which on all squared errors are small, in scene units, as float32."""
+    """Return the smallest pixel size, scene units, from which on all squared errors, [sizes], are small, as float32."""
     first = _SIZES - int(np.argmin([*(squares <= _SQUARED_ERROR_MAX)[::-1], False]))
     return float(np.float32(radius * 2.0**first / _RADIUS_PIXELS))
 

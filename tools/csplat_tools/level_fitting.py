@@ -24,8 +24,7 @@ from csplat_trainer.pruning import MeasuredViews, PruningOrder, total_error
 from csplat_trainer.splat_refit import refit_splats
 
 _PIXELS_PER_SPLAT = 8.0  # pixels of a view per splat of level 1; views of each coarser level are half as wide
-#: Pixels, the smallest and largest views of level 1. With 640 instead of 400, level 1 of garden500k loses 1.2 dB at its
-#: pixel size, gains 0.5 at half of it, and takes 1.7 times as long; level 1 of fox120k gains 0.0 and 0.2 dB.
+#: Pixels, the smallest and largest views of level 1. Larger views take longer, and do not help at its pixel size.
 _WIDTHS = (128, 448)
 _LEAST_WIDTH = 64  # pixels, of the views of the coarsest levels
 _CHECKS_EVERY = 4  # a held-out view for four others, up to `HELD_OUT_COUNT`
@@ -48,11 +47,9 @@ class Work:
     steps: tuple[int, int]
 
 
-#: A million splats take five minutes. On garden500k, less than half of it costs 2 dB at level 1. Half as many steps at
-#: most cost level 1 of fox120k 1.1 dB, and level 2 of lego60k 0.5.
+#: Work on the levels of a whole scene. With half of it, levels 1 and 2 are clearly worse.
 SCENE_WORK = Work(6e7, (40, 120), 7.5e7, (100, 1600))
-#: A million splats of a bucket take 70 CPU s. In four buckets of an aerial scene, the fit gains 2.5, 3.5 and 3.7 dB at
-#: levels 1 to 3. Twice as many views gain 0.1 dB. As few steps as at level 1 cost levels 2 and 3 half a dB.
+#: Work on the levels of a bucket, less than on a scene. More views hardly help; coarser levels need more steps.
 PART_WORK = Work(0.0, (16, 16), 6e6, (60, 240))
 
 
@@ -62,11 +59,9 @@ class LevelFitter:
 
     Attributes:
         scene: a scene or a part of a scene, in whose renders levels are measured.
-        is_part: it is a part or a coarse version of a larger scene: views are from outside, and neighbours are merged
-            instead of chosen, which would leave holes where no view sees anything. In four buckets of an aerial scene,
-            views as of whole scenes cost 1.1 dB at level 2, and 1.4 at level 3. With every second view as of whole
-            scenes, garden500k, built as parts, gains 0.4, 1.1 and 1.6 dB at levels 1 to 3, but all of the aerial scene
-            loses 0.9, 1.0 and 0.8.
+        is_part: it is a part or a coarse version of a larger scene: views are from outside, and neighbours are merged.
+            Choosing splats would leave holes where no view sees anything. Views as of whole scenes suit some scenes,
+            and make the levels of others worse.
         work: how much is done.
         context: threads and progress.
     """

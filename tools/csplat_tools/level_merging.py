@@ -21,17 +21,14 @@ from csplat.types import F32, F64, I64
 from csplat_render.kernels import kernel
 
 _NEIGHBOURS = 8  # with which a splat may be merged; 16 gain 0.1 dB at level 1, and take twice as long
-# Splats that a pass keeps: three passes leave a quarter. Levels 1 and 3 of fox120k: 35.7 and 21.6 dB; with five passes
-# 35.9 and 20.2, since clumps of unmerged splats stay; with two 33.9 and 22.1, since bad pairs are merged too. For level
-# 1 of lego60k: 32.0, 32.3 and 28.2 dB.
+# Fraction of the splats that a pass keeps: three passes leave a quarter. With more passes, clumps of unmerged splats
+# stay; with fewer, bad pairs are merged.
 _KEPT = 0.629
 # A cost is divided by this power of the squared sum of both images. With 0, all small splats are merged before any
-# large splat, and with 1, size does not count. Level 1 of fox120k: 34.3 dB (0), 35.4 (0.5), 35.8 (1); of lego60k: 31.9,
-# 32.2, 31.3.
+# large splat; with 1, size does not count.
 _ENERGY_EXPONENT = 0.6
 # Merged splats keep opacity × area. What an opacity above 0.99 would have to carry goes into the area with this power:
-# all of it hides too much, and none of it leaves holes. Levels 1 and 3 of lego60k: 32.7, 17.6 dB (0), 32.8, 18.8 (0.5),
-# 32.1, 18.7 (1).
+# all of it hides too much, and none of it leaves holes.
 _GROWTH = 0.5
 _OPACITY_MAX = 0.99  # alpha that renderers cap at
 _THINNEST = 1e-3  # least standard deviation, divided by the largest, so that a flat splat has an image from the side
@@ -158,8 +155,8 @@ def _overlap(first: tuple[F64, ...], second: tuple[F64, ...], x: F64, y: F64) ->
     """Return the integral of the product of two Gaussians of height 1 in a plane, up to 2π.
 
     Args:
-        first, second: entries xx, xy, yy of their covariances.
-        x, y: the offset between their centres.
+        first, second: entries xx, xy, yy of their covariances, [n] each.
+        x, y: the offset between their centres, [n].
     """
     total = tuple(a + b for a, b in zip(first, second, strict=True))
     determinant = _determinant(total)
@@ -174,7 +171,7 @@ def _determinant(entries: tuple[F64, ...]) -> F64:
 
 
 def _merged(splats: SplatModel, pairs: I64) -> SplatModel:
-    """Return all splats, with the first splat of each pair replaced by the merged splat."""
+    """Return all splats, with the first splat of each pair, [2, P], replaced by the merged splat."""
     two = [splats.select(rows) for rows in pairs]
     light = [light_of(part) for part in two]
     share = light[0] / (light[0] + light[1])
@@ -212,6 +209,6 @@ def light_of(splats: SplatModel) -> F64:
 
 
 def _areas(scales: F32) -> F64:
-    """Return the areas of the projections of ellipsoids, averaged over directions, up to a factor (Knud Thomsen)."""
+    """Return the areas [N] of projections of ellipsoids [N, 3], mean over directions, up to a factor (Knud Thomsen)."""
     a, b, c = np.exp(scales.astype(np.float64)).T
     return np.asarray((a * b + a * c + b * c) / 3.0)

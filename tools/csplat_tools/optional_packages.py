@@ -53,12 +53,12 @@ def prepare_renderer(
     require_renderer()
     from csplat_render.warmup import warm_up
 
-    others = [_warm_up_adam] if simplify else []
+    kernel_calls = [_warm_up_adam] if simplify else []
     with progress_bar(quiet=quiet) as progress:
         progress("preparing the renderer", 0.0)
         warm_up(
             None if quiet else note, gradients=gradients or simplify, simplify=simplify, ssim=ssim, lpips=lpips,
-            others=others,
+            kernel_calls=kernel_calls,
         )  # fmt: skip
         progress("preparing the renderer", 1.0)
 

@@ -148,11 +148,11 @@ def read_source(
 
 
 @contextmanager
-def open_scenes(given: Sequence[SceneLike], context: Context = DEFAULT_CONTEXT) -> Iterator[Sequence[Scene]]:
+def open_scenes(scenes: Sequence[SceneLike], context: Context = DEFAULT_CONTEXT) -> Iterator[Sequence[Scene]]:
     """Read scenes for a comparison into memory, or open all of them if they do not fit together.
 
     Args:
-        given: scenes as for `load_scene`. If any is in memory already, all are read into memory; scenes that are open
+        scenes: as for `load_scene`. If any is in memory already, all are read into memory; scenes that are open
             remain so.
         context: memory; the limit is approximate.
 
@@ -163,20 +163,20 @@ def open_scenes(given: Sequence[SceneLike], context: Context = DEFAULT_CONTEXT) 
         CsplatError: as for `load_scene`.
         OSError: a file cannot be read.
     """
-    if all(isinstance(scene, Scene) and scene.in_memory is None for scene in given):
-        yield [scene for scene in given if isinstance(scene, Scene)]
+    if all(isinstance(scene, Scene) and scene.in_memory is None for scene in scenes):
+        yield [scene for scene in scenes if isinstance(scene, Scene)]
         return
     with ExitStack() as stack:
         local: dict[int, Path] = {}
         fits: dict[int, Scene] = {}
-        for place, scene in enumerate(given):
+        for place, scene in enumerate(scenes):
             if not isinstance(scene, (SplatModel, Scene)):
                 with naming(scene):
                     local[place] = stack.enter_context(kept_path(scene))
         has_large = context.memory is not None or any(size_on_disk(path) > _SMALL for path in local.values())
-        if len(local) == len(given) and has_large:
+        if len(local) == len(scenes) and has_large:
             with ExitStack() as opening:
-                opened = [_opened(opening, given[place], path) for place, path in local.items()]
+                opened = [_opened(opening, scenes[place], path) for place, path in local.items()]
                 if _together_bytes(opened) > context.memory_limit:
                     stack.push(opening.pop_all())
                     yield opened
@@ -185,18 +185,18 @@ def open_scenes(given: Sequence[SceneLike], context: Context = DEFAULT_CONTEXT) 
                     place: scene.loaded() for place, scene in enumerate(opened) if scene.format not in CHEAP_TO_REOPEN
                 }
         loaded = []
-        for place, scene in enumerate(given):
+        for place, scene in enumerate(scenes):
             with naming(scene):
                 loaded.append(fits[place] if place in fits else load_scene(local.get(place, scene)))
         yield loaded
 
 
-def _opened(stack: ExitStack, given: object, path: Path) -> Scene:
-    with naming(given):
+def _opened(stack: ExitStack, source: object, path: Path) -> Scene:
+    with naming(source):
         scene = stack.enter_context(csplat.open(path))
 
     def reader() -> Iterator[SplatModel]:
-        with naming(given):
+        with naming(source):
             yield from scene.blocks()
 
     return scene if isinstance(scene, SplatFile) else scene.changed(reader=reader)

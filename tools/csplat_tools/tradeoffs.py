@@ -307,7 +307,7 @@ def _output(path: str, setting: GridSetting) -> str:
 # Columns of the table: title, meaning, attribute of the row, and format.
 _COLUMNS = (
     ("bytes", "Size of the file.", "size_bytes", ",d"),
-    ("smaller", "Size of the source divided by that of the file.", "ratio", ".1f"),
+    ("smaller", "Size of the source divided by the size of the file.", "ratio", ".1f"),
     ("PSNR", "Similarity of renders of the file and the source, dB. At 30 dB a difference is visible, at 40 dB hardly.",
      "psnr", ".2f"),
     ("SSIM", "Structural similarity, 1 at best: mean over the views.", "ssim", ".4f"),

@@ -293,7 +293,7 @@ def _make_blend(counted: bool) -> ParallelKernel[...]:
             lane, lanes: see `parallel_kernel`; the result does not depend on the number of lanes.
             starts: [tiles + 1] int64, start of each tile's splats in `ids`.
             ids: [intersections] int32, splats, tile by tile, nearest first.
-            shape: [N, 10] float64, see `project`; if `counted`, its last column is that of `ProjectedView.shape`.
+            shape: [N, 10] float64, see `project`; if `counted`, with the last column of `ProjectedView.shape`.
             box: [N, 4] int32, see `project`.
             tiles_x: number of tiles per row.
             limits: [3], minimum alpha, maximum alpha, minimum transmittance; float32 or float64, the dtype of pixels.

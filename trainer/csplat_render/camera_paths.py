@@ -192,7 +192,7 @@ def _sway(cloud: Cloud, first: Camera, frame: SceneFrame, count: int, K: F64, wi
 
 
 def _arc(cloud: Cloud, frame: SceneFrame, count: int) -> tuple[F64, float, float]:
-    """Return the longest good arc around the middle of surroundings: azimuths back and forth, elevation, distance."""
+    """Return the longest good arc inside surroundings: azimuths back and forth [count], elevation, distance."""
     K = intrinsics(640, 480, FIELD_OF_VIEW)
     azimuths = np.arange(_TURNS) * 360.0 / _TURNS
     circles = [(elevation, distance) for distance in _ARC_DISTANCES for elevation in _ARC_ELEVATIONS]

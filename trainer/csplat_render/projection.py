@@ -333,8 +333,8 @@ def _clamp(value: float) -> float:
 def sum_records(begin: int, end: int, records: Any, tiles: Any, tiles_x: int, shape: Any, i: int) -> tuple[float, ...]:
     """Sum the gradient records of a splat over its tiles.
 
-    With D the vector from the splat's centre to the tile's, δ that from the tile's centre to a pixel, and e = Σ⁻¹ (D +
-    δ), the sums of slope·e and slope·e eᵀ follow from the moments Σ slope·(1, δ, δ δᵀ) in the record.
+    Let D be the vector from the splat's centre to the tile's, δ the vector from the tile's centre to a pixel, and
+    e = Σ⁻¹ (D + δ). The sums of slope·e and slope·e eᵀ follow from the moments Σ slope·(1, δ, δ δᵀ) in the record.
 
     Returns:
         Sums over the pixels of: slope, slope·e_x, slope·e_y, slope·e_x², slope·e_x·e_y, slope·e_y², and the gradients

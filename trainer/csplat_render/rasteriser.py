@@ -110,8 +110,8 @@ class Rasteriser:
     ) -> RenderResult:
         """Render an image.
 
-        Splats may be rendered in slices of depth, nearest first, that pass on a `state`. The last image is then the one
-        of all splats, bit for bit.
+        Splats may be rendered in slices of depth, nearest first, that pass on a `state`. The last image then equals the
+        image of all splats, bit for bit.
 
         Args:
             splats: the splats to render; arrays of another dtype are converted.
@@ -225,7 +225,7 @@ class Rasteriser:
     def _project(
         self, splats: UncheckedSplats, camera: Camera, degree: int, *, antialiased: bool
     ) -> tuple[Array, Array, int]:
-        """Fill the buffers shape, extent, box and near; return view, radii and the number of ignored splats."""
+        """Fill the buffers shape, extent, box and near; return view, radii [N] and the number of ignored splats."""
         n, view = len(splats.means), view_vector(camera)
         ignored, radii = self._buffer("ignored", (-(-n // BLOCK),), np.int64), np.empty(n, np.float32)
         project(

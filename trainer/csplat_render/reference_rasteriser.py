@@ -93,7 +93,7 @@ def render_exact(
 def _project(
     splats: HasSplats, camera: Camera, degree: int, antialiased: bool, decisions: Decisions
 ) -> tuple[Array, dict[str, Array], int]:
-    """Return the indices of the splats in front of the camera, nearest first; their projections; the ignored count."""
+    """Return the indices [n] of splats in front of the camera, nearest first; their projections; the ignored count."""
     coefficients = np.concatenate([splats.sh0[:, None], splats.shN[:, : (degree + 1) ** 2 - 1]], 1, dtype=np.float64)
     arrays = [splats.means, splats.quats, splats.scales, splats.opacities[:, None], coefficients]
     finite = np.all([np.isfinite(array).all(tuple(range(1, array.ndim))) for array in arrays], axis=0)
@@ -160,7 +160,7 @@ def _unit(quats: Array) -> Array:
 
 
 def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: Decisions) -> Array:
-    """Clamp x/z or y/z to the image with a margin, in which the perspective is linearised."""
+    """Clamp x/z or y/z, [n], to the image with a margin, in which the perspective is linearised."""
     margin = FOV_MARGIN * 0.5 * size / focal
     low, high = -centre / focal - margin, (size - centre) / focal + margin
     return np.where(decisions.ask(tangent > low), np.where(decisions.ask(tangent < high), tangent, high), low)
@@ -169,7 +169,7 @@ def _clamp(tangent: Array, focal: float, centre: float, size: int, decisions: De
 def _blend(
     drawn: dict[str, Array], camera: Camera, transmittance_min: float, decisions: Decisions
 ) -> tuple[Array, Array, Array]:
-    """Return colour, transmittance and depth of every pixel."""
+    """Return colour [H, W, 3], transmittance [H, W] and depth [H, W]."""
     ys, xs = np.mgrid[: camera.H, : camera.W].reshape(2, -1) + 0.5
     before = np.ones(len(xs))
     rgb, depth = np.zeros((len(xs), 3)), np.zeros(len(xs))

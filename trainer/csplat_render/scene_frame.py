@@ -230,7 +230,7 @@ def weighted_quantiles(values: F64, weights: F64, at: tuple[float, ...]) -> F64:
 
 
 def _up(model: SplatModel, half: F64) -> F64:
-    """Return the scene's own up direction, else the short axis of a flat scene, else −y, the default of PLY."""
+    """Return the scene's own up direction [3], else the short axis of a flat scene, else −y, the default of PLY."""
     stored = model.metadata.up
     if stored is not None:
         direction: F64 = np.array(stored)
@@ -251,8 +251,8 @@ def _project_cloud(cloud: Cloud, camera: Camera, cell: int) -> tuple[I64, F64, F
     """Project the points into the cells of a coarse image.
 
     Returns:
-        For the points inside the image: index of the cell, row by row; depth along z; optical depth that the point adds
-        to its cell; size of its splat, pixels.
+        For the n points inside the image, [n] each: index of the cell, row by row; depth along z; optical depth that
+        the point adds to its cell; size of its splat, pixels.
     """
     V = camera.viewmat
     x, y, z = (

@@ -120,7 +120,7 @@ def _around_object(
 def _object_view(
     frame: SceneFrame, camera_at: _CameraAt, cloud: Cloud, angles: list[tuple[float, float]], offset: F64
 ) -> Camera:
-    """Return the farthest view with sufficient cover and nothing close to the camera."""
+    """Return the farthest view with sufficient cover and nothing close to the camera; `offset` is [3]."""
     needed = MIN_COVER + _COVER_MARGIN
     best, best_rank = camera_at(*angles[0], OBJECT_DISTANCES[0], offset=offset), (False, -1.0)
     highest, highest_at = 1.0, OBJECT_DISTANCES[0]

@@ -27,7 +27,7 @@ def warm_up(
     simplify: bool = False,
     ssim: bool = False,
     lpips: bool = False,
-    others: Sequence[Callable[[], object]] = (),
+    kernel_calls: Sequence[Callable[[], object]] = (),
     dtype: Any = np.float32,
 ) -> float:
     """Compile kernels, or load them from numba's cache, by running them on a single splat.
@@ -38,7 +38,7 @@ def warm_up(
         simplify: compile the kernels of `measure_pruning_error`.
         ssim: compile the kernels of `metrics.ssim`.
         lpips: compile the kernels of `lpips.Lpips`.
-        others: functions that call further kernels.
+        kernel_calls: functions that call further kernels.
         dtype: dtype of pixels and gradients, see `Rasteriser`; the other kernels have a fixed dtype.
 
     Returns:
@@ -69,7 +69,7 @@ def warm_up(
             metrics.ssim(image.rgb, image.rgb)
         if lpips:
             convolve(image.rgb.astype(np.float32), np.ones((3, 3, 3, 4), np.float32), np.zeros(4, np.float32), 1, 1)
-        for call in others:
+        for call in kernel_calls:
             call()
     seconds = time.perf_counter() - started
     if announce is not None and compiles:

@@ -176,13 +176,13 @@ class CpuEngine:
 
 
 def _per_half_image(norms: F32, camera: Camera) -> F32:
-    """Convert gradient norms per pixel into norms per half an image, the unit of `grad_threshold`."""
+    """Convert gradient norms [N] per pixel into norms per half an image, the unit of `grad_threshold`."""
     return norms * np.float32(0.5 * max(camera.W, camera.H))
 
 
 @parallel_kernel(relaxed=True)
 def _activate(lane: int, lanes: int, logits: F32, alphas: F32) -> None:
-    """Compute opacities from logits; vectorises over splats."""
+    """Compute opacities [N] from logits [N]; vectorises over splats."""
     one = np.float32(1.0)
     first, end = lane_range(lane, lanes, len(logits))
     x, y = logits[first:end], alphas[first:end]
@@ -202,7 +202,7 @@ def _chain(
     scale_weight: np.float32,
     by_logit: F32,
 ) -> None:
-    """Propagate gradients from opacities to logits, and add those of both regularisers; vectorises over splats.
+    """Propagate gradients to logits, and add the gradients of both regularisers; vectorises over splats.
 
     Args:
         alphas: [N].

@@ -159,7 +159,10 @@ class _Derivatives:
 
     @torch.no_grad()
     def _add(self, means: Tensor, covariances: Tensor, opacities: Tensor, colours: Tensor, basis: Tensor) -> Tensor:
-        """Add the products of derivatives, and return which splats are drawn."""
+        """Add the products of derivatives, and return which splats are drawn, [N].
+
+        Means and colours are [N, 3], covariances [N, 3, 3], opacities [N], the basis [N, K].
+        """
         self.opacity += opacities.square() / _DRAWS
         squares = colours.square().mean(dim=1) / _DRAWS  # each channel has its own signs
         if self._matrices:

@@ -153,7 +153,7 @@ class SizedLosses:
 
 @parallel_kernel(relaxed=True)
 def _ssim_partials(lane: int, lanes: int, x: F32, y: F32, across: F32, partial: F32, sums: F64) -> None:
-    """Compute SSIM of each value and its derivatives by mean, square and product; vectorises over a row."""
+    """Compute SSIM of each value of [H, 3 W] and its derivatives by mean, square and product; vectorises over a row."""
     height, width = x.shape
     c1, c2, two, one = np.float32(C1), np.float32(C2), np.float32(2.0), np.float32(1.0)
     moments = np.empty((5, width), np.float32)
@@ -187,7 +187,7 @@ def _ssim_partials(lane: int, lanes: int, x: F32, y: F32, across: F32, partial: 
 
 @parallel_kernel(relaxed=True)
 def _blur_partials(lane: int, lanes: int, partial: F32, across: F32) -> None:
-    """Blur the three derivatives along each row; vectorises over the values of a row."""
+    """Blur the three derivatives, [3, H, 3 W] with a margin, along each row; vectorises over the values of a row."""
     for r in range(lane, partial.shape[1], lanes):
         for f in range(3):
             blur_across(partial[f, r], _TAPS, across[f, r + RADIUS])
@@ -197,7 +197,7 @@ def _blur_partials(lane: int, lanes: int, partial: F32, across: F32) -> None:
 def _combine(
     lane: int, lanes: int, x: F32, y: F32, across: F32, l1_step: np.float32, ssim_step: np.float32, gradient: F32
 ) -> None:
-    """Blur the derivatives across the rows and add the gradient of L1; vectorises over a row."""
+    """Blur the derivatives across the rows of [H, 3 W] and add the gradient of L1; vectorises over a row."""
     height, width = x.shape
     blurred = np.empty((3, width), np.float32)
     for r in range(lane, height, lanes):
@@ -212,7 +212,7 @@ def _combine(
 
 @parallel_kernel(relaxed=True)
 def _l1_alone(lane: int, lanes: int, x: F32, y: F32, l1_step: np.float32, gradient: F32, sums: F64) -> None:
-    """Compute L1 and squared error of each row; vectorises over the values of a row."""
+    """Compute L1 and squared error of each row of [H, 3 W]; vectorises over the values of a row."""
     height, width = x.shape
     for r in range(lane, height, lanes):
         l1_sum, square_sum = np.float32(0.0), np.float32(0.0)

@@ -178,7 +178,7 @@ def _adam(
     b2: np.float32,
     a2: np.float32,
 ) -> None:
-    """Adam on a flat array; vectorises over its values.
+    """Make a step of Adam on arrays [n]; vectorises over their values.
 
     `a2` is 1 - `b2`; a compiler that knew this might use a difference of squares, which is NaN for infinite ones.
     """
@@ -204,7 +204,7 @@ def _adam(
 
 @relaxed_kernel
 def _constrain(quats: F32, logits: F32) -> None:
-    """Normalise quaternions and clip logits, splat by splat."""
+    """Normalise quats [N, 4] and clip logits [N], splat by splat."""
     limit = np.float32(_LOGIT_LIMIT)
     for i in range(len(logits)):
         logits[i] = min(max(logits[i], -limit), limit)

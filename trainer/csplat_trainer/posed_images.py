@@ -155,7 +155,7 @@ def halve(image: PosedImage) -> PosedImage:
 
 @parallel_kernel()
 def _compose(lane: int, lanes: int, pixels: U8, background: F32, out: F32) -> None:
-    """Blend each row with the background; a thread takes a run of rows."""
+    """Blend each row of [H, W, 3 or 4] with the background [3]; a thread takes a run of rows."""
     over = np.float32(1.0 / 255.0)
     for r in range(lane, pixels.shape[0], lanes):
         for c in range(pixels.shape[1]):

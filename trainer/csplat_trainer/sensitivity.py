@@ -232,7 +232,7 @@ class _Derivatives(Rasteriser):
 
 
 def _mean_over(sums: F64, pixels: int) -> F64:
-    """Divide an array in place, limit it to float32, and return it; sums that overflowed float64 become 0."""
+    """Divide an array of any shape in place, and limit it to float32; sums that overflowed float64 become 0."""
     sums /= pixels
     np.nan_to_num(sums, copy=False, nan=0.0, posinf=0.0, neginf=0.0)
     return np.clip(sums, -_MAX_SUM, _MAX_SUM, out=sums)

@@ -62,17 +62,17 @@ class StoredSensitivity:
 
     @classmethod
     def of(
-        cls, model: SplatModel, found: Sensitivity, source: str = "virtual", missed_share: float = float("nan")
+        cls, model: SplatModel, sensitivity: Sensitivity, source: str = "virtual", missed_share: float = float("nan")
     ) -> StoredSensitivity:
         """Return the contents of a file for the measured sensitivities of a scene."""
         return cls(
-            {name: group.astype(np.float32) for name in GROUPS if (group := getattr(found, name)) is not None},
-            found.views.astype(np.int32),
+            {name: group.astype(np.float32) for name in GROUPS if (group := getattr(sensitivity, name)) is not None},
+            sensitivity.views.astype(np.int32),
             source,
-            found.view_count,
+            sensitivity.view_count,
             missed_share,
-            _over_mean(found.shape_metric, found.shape_squares / 6.0),
-            None if found.metric is None or not model.sh_degree else _pack(found.metric),
+            _over_mean(sensitivity.shape_metric, sensitivity.shape_squares / 6.0),
+            None if sensitivity.metric is None or not model.sh_degree else _pack(sensitivity.metric),
         )
 
     @property
@@ -112,10 +112,10 @@ def scene_digest(model: SplatModel) -> str:
 
 
 def write_sensitivity(
-    stream: BinaryIO, model: SplatModel, found: Sensitivity, source: str, missed_share: float = float("nan")
+    stream: BinaryIO, model: SplatModel, sensitivity: Sensitivity, source: str, missed_share: float = float("nan")
 ) -> None:
     """Write the measured sensitivities of a scene; `source` and `missed_share` as in `StoredSensitivity`."""
-    stored = StoredSensitivity.of(model, found, source, missed_share)
+    stored = StoredSensitivity.of(model, sensitivity, source, missed_share)
     arrays: dict[str, Any] = dict(stored.groups)
     if stored.matrices is not None:
         arrays["matrices"] = stored.matrices
@@ -124,7 +124,7 @@ def write_sensitivity(
         format=np.array(_FORMAT),
         scene=np.array(scene_digest(model)),
         source=np.array(source),
-        view_count=np.array(found.view_count),
+        view_count=np.array(sensitivity.view_count),
         missed_share=np.array(missed_share),
         views=stored.views,
         shape_matrices=stored.shape_matrices,

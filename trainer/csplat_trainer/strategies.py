@@ -101,7 +101,7 @@ def share_opacity(alphas: F64, counts: I64) -> tuple[F64, F64]:
 
 
 def _draw_by_opacity(alphas: F32, among: I64, count: int, rng: Generator) -> I64:
-    """Draw `count` of the indices `among` with replacement, in proportion to the splats' opacity."""
+    """Draw `count` of the indices `among` [n] with replacement, in proportion to the splats' opacities [N]."""
     edges = np.cumsum(alphas[among].astype(np.float64))
     drawn = np.searchsorted(edges, rng.random(count) * edges[-1], side="right")
     chosen: I64 = among[np.minimum(drawn, len(among) - 1)]
@@ -140,7 +140,7 @@ def add_noise(parameters: Parameters, strength: float, normals: F32) -> None:
 def _noise(
     lane: int, lanes: int, means: F32, quats: F32, scales: F32, logits: F32, strength: np.float32, normals: F32
 ) -> None:
-    """Add the noise to each mean; parallel over runs of splats."""
+    """Add the noise to each mean, in proportion to `normals` [N, 3]; parallel over runs of splats."""
     highest = math.log(_GATE_OFF / (1.0 - _GATE_OFF))
     for i in range(*lane_range(lane, lanes, means.shape[0])):
         if logits[i] > highest:

@@ -111,7 +111,7 @@ class TunedScene:
         return rows
 
     def _by_shape(self, gradients: Gradients) -> tuple[F32, F32, F32]:
-        """Return the gradients of the file's rotations and scales, and of the splats' log-scale offsets."""
+        """Return the gradients of the file's rotations [S, 4] and scales [S, 3], and of log-scale offsets [N]."""
         shapes = self.fixed.shapes
         if shapes is None or self._shape_users is None:
             return gradients.quats, gradients.scales, np.zeros(0, np.float32)

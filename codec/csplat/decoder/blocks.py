@@ -319,9 +319,9 @@ def check_integers(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.
         _check_columns(lows, highs, record, at)
 
 
-def _check_level(found: int, low: int, high: int, at: int, clause: str) -> None:
-    if not low <= found <= high:
-        raise FormatError(_spec.ERROR_RANGE, at, clause, "level", found=found, wanted=f"{low} to {high}")
+def _check_level(level: int, low: int, high: int, at: int, clause: str) -> None:
+    if not low <= level <= high:
+        raise FormatError(_spec.ERROR_RANGE, at, clause, "level", found=level, wanted=f"{low} to {high}")
 
 
 def _check_columns(lows: tuple[int, ...], highs: tuple[int, ...], record: _spec.AttributeRecord, at: int) -> None:

@@ -82,8 +82,8 @@ def _check_head(head: _spec.StreamHead, at: int, count: int | None, width_max: i
         _refuse(at, "packed_size", "STR-5", head.packed_size, f"a multiple of 3 up to {3 * size}")
 
 
-def _refuse(at: int, name: str, clause: str, found: object, wanted: object) -> None:
-    raise FormatError(_spec.ERROR_STREAM, at + _OFFSETS[name], clause, name, found=found, wanted=wanted)
+def _refuse(at: int, name: str, clause: str, value: object, wanted: object) -> None:
+    raise FormatError(_spec.ERROR_STREAM, at + _OFFSETS[name], clause, name, found=value, wanted=wanted)
 
 
 # Coders ------------------------------------------------------------------------------------------

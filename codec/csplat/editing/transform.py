@@ -258,7 +258,7 @@ def _left_product(quat: F64) -> F64:
 
 
 def _rotate_sh(shN: F32, matrix: F64) -> F32:
-    """Rotate SH band by band: the colour in direction v becomes the colour in direction M v."""
+    """Rotate SH [N, K, 3] by M [3, 3], band by band: the colour in direction v becomes the colour in direction M v."""
     out = np.empty_like(shN)
     for band, turn in enumerate(sh_rotations(sh_degree_of(shN.shape[1]), matrix), start=1):
         part = slice(band**2 - 1, (band + 1) ** 2 - 1)

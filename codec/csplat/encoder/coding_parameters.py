@@ -304,7 +304,7 @@ def _clamp_step(step: float, reach: float) -> float:
 
 
 def _source_step(values: F32, step: float) -> float:
-    """Return the step of the power-of-two grid that the values are on, or `step` if there is none or it is too fine.
+    """Return the step of the power-of-two grid of values [N, 3], or `step` if there is none or it is too fine.
 
     Means and log scales from SPZ are on such a grid, which represents them exactly in fewer bits.
     """
@@ -340,7 +340,10 @@ def _rms(squares: float, weights: float) -> float:
 
 
 def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, float]:
-    """Return Σ w d² and Σ w over pairs of neighbours: d² is the mean square of the colour difference, w = αα'."""
+    """Return Σ w d² and Σ w over pairs of neighbours: d² is the mean square of the colour difference, w = αα'.
+
+    The Morton order has its middle at the median of the positions `sample`, [n, 3].
+    """
     squares = weights = 0.0
     if len(model) <= _NEIGHBOUR_DISTANCE or not reach:
         return squares, weights
@@ -354,7 +357,7 @@ def _contrast(model: SplatModel, sample: F64, reach: float) -> tuple[float, floa
 
 
 def _neighbour_runs(means: F32, centre: NDArray[Any], reach: float) -> list[NDArray[np.intp]]:
-    """Return runs of splats in Morton order: all splats of a small scene, some splats of a large scene."""
+    """Return runs of rows of means [N, 3] in Morton order: all of a small scene, some of a large scene."""
     codes = np.empty(len(means), np.int64)
     scale, top = np.float32(min(1.0 / reach, _CELLS_MAX)), (1 << _CODE_BITS) - 1
     shift = np.float32(0.5) - (centre / reach).astype(np.float32)

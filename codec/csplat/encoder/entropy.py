@@ -243,7 +243,7 @@ def _code_offsets(integers: Integers, exponent: int, deflate: DeflateSettings) -
 
 
 def _make_stream(values: Integers, width: int, transforms: tuple[int, ...], deflate: DeflateSettings) -> bytes:
-    """Apply BYTE_PLANES and RUN_LENGTH, choose the coder, and return head and coded bytes."""
+    """Apply BYTE_PLANES and RUN_LENGTH to values [N], choose the coder, and return head and coded bytes."""
     steps = [step for step in transforms if step != _spec.TRANSFORM_NONE]
     if width > 1:
         steps.append(_spec.TRANSFORM_BYTE_PLANES)

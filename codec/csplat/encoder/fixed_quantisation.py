@@ -239,7 +239,7 @@ class FixedQuantisation:
         return quantise_sh(own, self.parameters, np.full(len(own), self.parameters.escape_coarse, np.int32))[2]
 
     def _shape_values(self, values: FreeValues) -> tuple[ShapeCodebook | None, F32, F32]:
-        """Return the shape codebook of these values, and quats and scales per splat, which only escaped splats use."""
+        """Return the shape codebook of the values, and quats [N, 4] and scales [N, 3], used only by escaped splats."""
         if self.shapes is None:
             return None, values.quats, values.scales
         parameters, size, own = self.parameters, self.shapes.size, self.shapes.escaped
@@ -283,7 +283,7 @@ def fix_quantisation(plan: EncodePlan, source: SplatModel | None = None) -> Fixe
 
 
 def _reorder(plan: EncodePlan, order: I64, counts: Sequence[int]) -> EncodePlan:
-    """Put splats into tile order and canonical axis order, and drop the data that only an open SH coding needs."""
+    """Put splats into tile order [N] and canonical axis order, and drop the data that only an open SH coding needs."""
     model = plan.model.select(order)
     rotation, scales = canonicalise_shape(model.quats, model.scales)
     ends = np.cumsum(counts)

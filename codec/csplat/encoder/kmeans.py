@@ -148,7 +148,7 @@ def search_nearest(
     context: Context = DEFAULT_CONTEXT,
     *,
     start: U32 | None = None,
-    other: bool = False,
+    exclude_own: bool = False,
 ) -> tuple[U32, F64]:
     """Assign each point to the nearest entry, and return the squared distances.
 
@@ -162,7 +162,7 @@ def search_nearest(
         near_groups: see `assign`.
         context: threads.
         start: [N], an entry near each point. The result is as near, and at most `_NEXT_GROUPS` groups are searched.
-        other: exclude entry n for point n: the points are the entries.
+        exclude_own: exclude entry n for point n: the points are the entries.
 
     Returns:
         index [N] uint32; squared distances [N] float64 of the divided integers, in lattice units.
@@ -174,10 +174,10 @@ def search_nearest(
     table = _table(coarse)
     if 0 < near_groups < math.isqrt(len(entries)):
         near = near_groups if start is None else min(near_groups, _NEXT_GROUPS)
-        find = _near_entries(coarse, table, near, context, other)
+        find = _near_entries(coarse, table, near, context, exclude_own)
     else:
         start = None
-        find = _every_entry(table, other)
+        find = _every_entry(table, exclude_own)
 
     def work(part: slice) -> None:
         rows = np.ones((part.stop - part.start, table.shape[1]), np.float32)
@@ -354,9 +354,10 @@ def _draw_rows(importance: F64, count: int, rng: np.random.Generator) -> I64:
 
 
 def _first_entries(sample: I16 | I32, w: F64, size: int, rng: np.random.Generator, near: int, context: Context) -> I32:
-    """Draw initial entries in rounds, with a probability that grows with w d², d being the distance to earlier draws.
+    """Draw initial entries, [size, D], from a sample [n, D] with weights w [n].
 
-    Bahmani et al., "Scalable k-means++", but with exactly `size` points.
+    Rounds draw with a probability that grows with w d², d being the distance to earlier draws (Bahmani et al.,
+    "Scalable k-means++", but with exactly `size` points).
     """
     error = np.ones(len(sample))
     entries = np.empty((0, sample.shape[1]), np.int32)
@@ -398,12 +399,13 @@ def _relocate(
     K-means alone never moves an entry between distant clusters (Patanè and Russo, "The enhanced LBG algorithm"). Giving
     up an entry costs about its weight times the squared distance to its nearest neighbour; splitting a cluster saves
     about half of its error. At most `most` entries with weight move, each to a point drawn from its new cluster.
+    Entries are [K, D], points [N, D]; index, w and error are [N].
     """
     weight = np.bincount(index, w, len(entries)).astype(np.float64)
     errors = np.bincount(index, w * error, len(entries))
     loss = weight
     if most:  # the distance is infinite if the groups searched have no other entry
-        distance = search_nearest(entries, entries, near_groups, context, other=True)[1]
+        distance = search_nearest(entries, entries, near_groups, context, exclude_own=True)[1]
         loss = np.multiply(weight, distance, out=np.zeros_like(weight), where=weight > 0.0)
     cheap, worst = np.argsort(loss, kind="stable"), np.argsort(-errors, kind="stable")
     limit = max(most, int(np.count_nonzero(weight == 0)))
@@ -429,7 +431,7 @@ def _drop_unused(entries: I32, index: U32) -> tuple[I32, U32]:
 
 
 def _shift(points: I16 | I32, entries: I32) -> int:
-    """Return the smallest shift after which all scores of `search_nearest` are exact."""
+    """Return the smallest shift after which all scores of points [N, D] and entries [K, D] are exact."""
     x, c = _largest_norm(points), _largest_norm(entries)
     slack = math.sqrt(points.shape[1])  # rounding moves a vector by at most half of this
     shift = 0
@@ -457,8 +459,8 @@ def _table(entries: I64) -> F32:
     return np.concatenate([entries, half[:, None]], axis=1).astype(np.float32)
 
 
-def _every_entry(table: F32, other: bool) -> _Find:
-    """Return a search of every entry."""
+def _every_entry(table: F32, exclude_own: bool) -> _Find:
+    """Return a search of every entry in a `_table`, [K, D + 1]."""
     matrix = np.ascontiguousarray(table.T)
     width = min(matrix.shape[1], _PRODUCT_COLUMNS)
     step = _PRODUCT // width
@@ -469,7 +471,7 @@ def _every_entry(table: F32, other: bool) -> _Find:
             rows = np.arange(len(x[part]))
             for k in range(0, matrix.shape[1], width):
                 scores = x[part] @ matrix[:, k : k + width]
-                if other:
+                if exclude_own:
                     own = rows + (start + at - k)
                     here = (own >= 0) & (own < scores.shape[1])
                     scores[rows[here], own[here]] = -np.inf
@@ -478,8 +480,8 @@ def _every_entry(table: F32, other: bool) -> _Find:
     return find
 
 
-def _near_entries(entries: I64, table: F32, near: int, context: Context, other: bool) -> _Find:
-    """Return a search of the entries in the `near` groups with the nearest centroids."""
+def _near_entries(entries: I64, table: F32, near: int, context: Context, exclude_own: bool) -> _Find:
+    """Return a search of the entries [K, D] in the `near` groups with the nearest centroids; `table` is [K, D + 1]."""
     centres, label = _groups(entries, context)
     order = np.argsort(label, kind="stable")
     ends = np.searchsorted(label[order], np.arange(len(centres) + 1))
@@ -495,7 +497,7 @@ def _near_entries(entries: I64, table: F32, near: int, context: Context, other: 
             width = matrices[group].shape[1]
             for rows in np.array_split(chosen, -(-len(chosen) * width // _PRODUCT)) if width else ():
                 scores = np.take(x, rows, axis=0) @ matrices[group]  # unlike x[rows], `take` releases the GIL
-                if other:
+                if exclude_own:
                     own = place[rows + start] - ends[group]
                     here = np.flatnonzero((own >= 0) & (own < width))
                     scores[here, own[here]] = -np.inf

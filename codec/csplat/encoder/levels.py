@@ -21,7 +21,7 @@ from csplat.model import SplatModel, check_model
 
 Rows = NDArray[np.intp]
 
-#: Steps of levels above 1: on lego60k they save a tenth of their bytes, and cost 0.4 dB of 30.
+#: Factors of the steps of levels above 1: fewer bytes for a small loss of quality.
 _COARSE_STEPS = StepFactors(opacities=2, scales=1, quats=2, sh0=1)
 
 
@@ -126,8 +126,8 @@ def encode_levels(
 def encode_coarse(node: LevelNode, plan: EncodePlan, codebooks: FileCodebooks) -> list[FileTile]:
     """Encode the splats of a node above level 0 with the SH codebooks of the scene, above level 1 with coarser steps.
 
-    The step of the means doubles from level to level, from level 2 on. If it did from level 1 on, level 1 of lego60k,
-    fox120k and garden500k would have 3 to 4 % fewer bytes, and 0.3 to 0.8 dB less.
+    The step of the means doubles from level to level, from level 2 on. At level 1, doubling would cost quality for few
+    bytes.
 
     Args:
         node: the node.
@@ -160,9 +160,9 @@ def _check_nodes(nodes: Sequence[LevelNode], count: int) -> None:
 
 
 def _assign_coarse(splats: SplatModel, plan: EncodePlan, codebooks: FileCodebooks) -> ShCodingPlan:
-    """Return the SH coding of coarse splats, without escapes, which large splats often are.
+    """Return the SH coding of coarse splats, without escapes.
 
-    On lego60k, escapes would take 12 % of the bytes of level 1 and 25 % of level 2, and gain 0.2 and 0.0 dB.
+    Large splats would often be escaped, which takes many bytes for hardly any quality.
     """
     sh_plan = codebooks.sh_plan
     if sh_plan.book is None:

@@ -265,14 +265,14 @@ def canonicalise_shape(quats: F32, scales: F32) -> tuple[F32, F32]:
 
 
 def _exchange_axes(swap: NDArray[np.bool_], turned: Quaternion, kept: Quaternion) -> Quaternion:
-    """Select the turned rotation, normalised, if axes are exchanged, and the old rotation otherwise."""
+    """Select turned rotations, normalised, if `swap` [N], and kept rotations otherwise; components are [N]."""
     root = np.float32(np.sqrt(0.5))
     w, x, y, z = (np.where(swap, new * root, old) for new, old in zip(turned, kept, strict=True))
     return w, x, y, z
 
 
 def _largest_component_first(w: F32, x: F32, y: F32, z: F32) -> Quaternion:
-    """Multiply from the right by 1, i, j or k so that the component of largest magnitude becomes w."""
+    """Multiply from the right by 1, i, j or k so that w has the largest magnitude; components are [N]."""
     aw, ax, ay, az = np.abs(w), np.abs(x), np.abs(y), np.abs(z)
     x_leads = ax > np.maximum(aw, np.maximum(ay, az))
     y_leads = ~x_leads & (ay > np.maximum(aw, az))

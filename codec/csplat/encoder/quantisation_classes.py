@@ -1,10 +1,10 @@
 """Choose quantisation classes: splats whose errors are equally visible share tiles, and each class has its own steps.
 
 Doubling a step multiplies the squared error of renders by four and saves a bit per integer. The rate at a given
-distortion is therefore lowest if every integer adds the same error, but splats differ in that by orders of magnitude.
-The format has no steps per splat. A tile may, however, coarsen the file's lattices by powers of two, and the tiles of
-different classes may overlap. The means then take more bytes, as they are less dense in a tile; scales, opacities and
-colours take fewer, as they are similar within a class.
+distortion is therefore lowest if every integer adds the same error. With equal steps, the errors of splats differ by
+orders of magnitude, and the format has no steps per splat. A tile may, however, coarsen the file's lattices by powers
+of two, and the tiles of different classes may overlap. The means then take more bytes, as they are less dense in a
+tile; scales, opacities and colours take fewer, as they are similar within a class.
 
 Splats are clustered as in k-means, with the rate at equal distortion in place of squared distances (the Itakura-Saito
 divergence). Let the steps of class k differ from the chosen steps by o_ka octaves for attribute a, which has m_a
@@ -163,7 +163,10 @@ def _assign_classes(errors: F64, integers: F64, octaves: F64) -> U8:
 def _as_steps(
     parameters: CodingParameters, index: U8, octaves: F64, free: Sequence[str]
 ) -> tuple[CodingParameters, QuantisationClasses | None]:
-    """Set the file's steps to the steps of the finest class, and express coarser steps as multiples of them."""
+    """Set the file's steps to the steps of the finest class, and express coarser steps as multiples of them.
+
+    `index` [N] is the class of each splat. `octaves`, [classes, attributes], has a column for each attribute of `free`.
+    """
     used = np.unique(index)
     if len(used) < 2:
         return parameters, None
@@ -192,7 +195,7 @@ def _as_steps(
 
 
 def _coarser_levels(levels: int, octaves: F64, one_byte: int) -> tuple[int, list[int]]:
-    """Return the levels of the finest class, limited to one byte, and the step multiple of each class."""
+    """Return the levels of the finest class, limited to one byte, and the step multiple of each class in [classes]."""
     most = one_byte if levels <= one_byte else max(levels, _LEVELS_MAX)
     finest = min(max(_LEVELS_MIN, round(levels * 2.0 ** -float(octaves.min()))), most)
     coarsest = max(1, finest // _LEVELS_MIN)

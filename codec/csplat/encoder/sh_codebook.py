@@ -36,9 +36,7 @@ _TRIAL_SPLATS = 1 << 14  # maximum number of splats on which scalar coding is tr
 _CODEBOOK_SPLATS_MIN = 256  # splats; in smaller scenes a codebook costs more bytes than it saves
 _TRAINING_SPLATS, _TRAINING_USERS = 1 << 16, 64  # minimum numbers of splats, and per entry, to train a codebook on
 _NEAR_GROUPS = 4  # see `assign`; 8 take a tenth to a fifth longer for 0.2 to 1.3 % less RMS error
-# See `cluster`, if groups are searched. With 7 and 16 encoding takes 10 % longer for 1 % less RMS error and 0.05 dB
-# (fox120k), 40 % longer for 8 % less and 0.04 dB (garden500k).
-_ITERATIONS, _SAMPLE_PER_ENTRY = 4, 8
+_ITERATIONS, _SAMPLE_PER_ENTRY = 4, 8  # see `cluster`, if groups are searched; more take longer for little quality
 _GROUPED_ENTRIES_MIN = 4096  # entries from which searching near groups is worth the additional distortion
 _FULL_SHARE_SPLATS = 1 << 15  # splats; smaller scenes get the number of entries of this size, within `_USERS_MIN`
 _USERS_MIN = 6  # splats per entry, below which an entry costs more bytes than it saves
@@ -331,7 +329,7 @@ def _scalar_blocks(columns: NDArray[Any], exponent: int, parameters: CodingParam
 def _encode_by_codebook(
     source: F32, book: ShCodebook, parameters: CodingParameters, sums: _BandSums
 ) -> dict[int, bytes]:
-    """Return the block of each band: indices in band 1, and the integers of the escaped splats in every band."""
+    """Return the block of each band of [N, K, 3]: indices in band 1, and integers of escaped splats in every band."""
     decoded, escaped = book.dequantise(parameters), book.escaped
     coarse = np.full(len(escaped), parameters.escape_coarse, np.int32)
     columns, exponent, own = quantise_sh(source[escaped], parameters, coarse)
@@ -382,7 +380,7 @@ class _BandSums:
 
 
 def _reference_weight(weights: F32 | None) -> float:
-    """Return the 95th percentile of the weights or, if that is 0, of the positive weights."""
+    """Return the 95th percentile of the weights [N] or, if that is 0, of the positive weights."""
     if weights is None or not len(weights):
         return 1.0
     if (reference := float(np.quantile(weights, _IMPORTANT))) > 0.0:
@@ -427,10 +425,10 @@ def _train(
 
 
 def _refine(
-    shN: F32, points: I16, metric: ErrorMetric, found: tuple[I32, U32], parameters: CodingParameters, context: Context
+    shN: F32, points: I16, metric: ErrorMetric, book: tuple[I32, U32], parameters: CodingParameters, context: Context
 ) -> tuple[I32, U32]:
-    """Refine a codebook and its assignment under the metric."""
-    entries, index = found
+    """Refine entries [E, 3 K] and index [N] under the metric, for points [N, 3 K] of `shN`."""
+    entries, index = book
     count = points.shape[1] // 3
     targets = np.clip(shN[:, :count] * np.float32(1.0 / parameters.sh_step), -_CLIP, _CLIP)
     start = entries.reshape(-1, count, 3)
@@ -484,7 +482,7 @@ def _errors(
 def _choose_escapes(
     shN: F32, errors: F64, parameters: CodingParameters, options: EncodeOptions, error_weights: _ErrorWeights
 ) -> Rows:
-    """Return the splats to escape: the splats with the largest weighted errors, and all clipped splats.
+    """Return the rows to escape, [n]: the splats with the largest of the errors [N], and all clipped splats.
 
     If weights are measured, rank by the reduction of the error instead, and escape no splat that gains nothing: an
     important splat may be near its entry, and the lattice of escapes is coarser.
@@ -545,7 +543,7 @@ def _codebook_pays(
 def _try_scalar(
     model: SplatModel, error_weights: _ErrorWeights, trial: Rows, parameters: CodingParameters
 ) -> tuple[float, float]:
-    """Return rate (bytes per splat) and distortion (weighted mean squared error) of scalar coding."""
+    """Return bytes per splat and weighted mean squared error of scalar coding of the rows `trial` [n]."""
     source = np.take(model.shN, trial, axis=0)[:, : parameters.sh_coefficients]
     columns, _, decoded = quantise_sh(source, parameters, None)
     size = sum(len(block) for _, block in _scalar_blocks(columns, 0, parameters))

@@ -33,7 +33,7 @@ from csplat.types import F32, F64, I16, I32, I64, Mask, null_progress
 Integers = NDArray[Any]
 Floats = NDArray[Any]
 
-#: Codebook id, above that of SH. It does not depend on the SH degree, so that files keep their bytes.
+#: Codebook id, above the id of the SH codebook. It does not depend on the SH degree, so that files keep their bytes.
 SHAPE_CODEBOOK_ID = 4
 
 _TRACE_STEPS = 2048  # lattice steps per trace; assignments are exact up to norms of about 2,300
@@ -319,9 +319,9 @@ def _shape_input(
     return _ShapeInput(covariances, sizes, weights.astype(np.float64), metric, plain, fits, bits)
 
 
-def _covariance_errors(target: F64, found: F64, growth: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
-    """Return the weighted squared errors [N] of `found` · e^(2 · growth) against `target`, both [6, N]."""
-    difference = _vectors(found * np.exp(2.0 * np.clip(growth, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - target)
+def _covariance_errors(target: F64, coded: F64, growth: F64, weights: NDArray[Any], metric: ErrorMetric | None) -> F64:
+    """Return the weighted squared errors [N] of `coded` · e^(2 · growth) against `target`, both [6, N]."""
+    difference = _vectors(coded * np.exp(2.0 * np.clip(growth, -_LOG_SIZE_MAX, _LOG_SIZE_MAX)) - target)
     if metric is not None:
         return metric.errors(difference[:, :, None], slice(None))
     return np.asarray(np.einsum("ni,ni->n", difference, difference) * weights)
@@ -393,12 +393,12 @@ def _assignment_errors(shapes: _ShapeInput, entries: I32, index: I64, parameters
     return _covariance_errors(shapes.covariances, assigned, growth, shapes.weights, shapes.metric), summand
 
 
-def _best_growth(target: F64, found: F64, metric: ErrorMetric) -> F64:
-    """Return the summand of the log scales, [N], that brings covariances `found` closest to `target`, both [6, N].
+def _best_growth(target: F64, assigned: F64, metric: ErrorMetric) -> F64:
+    """Return the summand of the log scales, [N], that brings covariances `assigned` closest to `target`, both [6, N].
 
     A summand t scales a covariance a by s = e^(2t). The error (s a - b)ᵀ M (s a - b) is least for s = aᵀ M b / aᵀ M a.
     """
-    a, b = _vectors(found)[:, :, None], _vectors(target)[:, :, None]
+    a, b = _vectors(assigned)[:, :, None], _vectors(target)[:, :, None]
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = metric.products(a, b) / metric.products(a, a)
     usable = np.isfinite(ratio) & (ratio > 0.0)
@@ -406,7 +406,7 @@ def _best_growth(target: F64, found: F64, metric: ErrorMetric) -> F64:
 
 
 def _worth_assigning(shapes: _ShapeInput, errors: F64, index: I64, summand: I32) -> Mask:
-    """Return True for the splats whose assignment lowers D + λ R.
+    """Return a mask [N] of the splats whose assignment lowers D + λ R; errors, index and summand are [N].
 
     R is the entropy of the integers of a shape, or of index and summand. A scalar quantiser of 6 dimensions has
     D ∝ 2^(-2R/6), so λ = -dD/dR = 2 ln 2 / 6 · D with the mean distortion D without a codebook.
@@ -420,7 +420,7 @@ def _worth_assigning(shapes: _ShapeInput, errors: F64, index: I64, summand: I32)
 
 
 def _all_but_worst(shapes: _ShapeInput, errors: F64, fraction: float) -> Mask:
-    """Return True for the splats to assign: all but the given fraction, which has the largest weighted errors."""
+    """Return a mask [N] of the splats to assign: all but a fraction with the largest weighted errors, [N]."""
     assigned = shapes.fits.copy()
     worst = np.argsort(-np.where(shapes.fits, errors, np.inf), kind="stable")
     assigned[worst[: int(len(errors) * fraction)]] = False
@@ -432,7 +432,7 @@ def _entropy(values: NDArray[Any]) -> float:
 
 
 def _rank_entries(entries: I32, index: I64, summand: I32, assigned: Mask) -> ShapeCodebook:
-    """Escape the splats that are not assigned, drop unused entries, and sort the others by frequency."""
+    """Escape splats that are not assigned [N], drop unused entries of [6, K], and sort the others by frequency."""
     used, inverse = np.unique(index[assigned], return_inverse=True)
     ranked, order = rank_by_frequency(inverse.astype(np.uint32), np.ascontiguousarray(entries[:, used].T))
     full = np.full(len(index), len(used), np.int32)

@@ -311,13 +311,13 @@ def doubled_triangles(triangles: Floats) -> F64:
     return np.asarray(triangles * np.where(upper_i == upper_j, 1.0, 2.0), np.float64)
 
 
-def _make_metric(name: str, weights: F32, found: Floats, size: int) -> ErrorMetric:
+def _make_metric(name: str, weights: F32, values: Floats, size: int) -> ErrorMetric:
     shape = (len(weights), size * (size + 1) // 2)
-    if found.shape != shape or found.dtype.kind != "f":
-        raise InputError(f"importance has {name} {found.dtype} {list(found.shape)}, expected floats {list(shape)}")
-    if not np.isfinite(found).all():
+    if values.shape != shape or values.dtype.kind != "f":
+        raise InputError(f"importance has {name} {values.dtype} {list(values.shape)}, expected floats {list(shape)}")
+    if not np.isfinite(values).all():
         raise InputError(f"importance has {name} that are not finite")
-    return ErrorMetric(weights, found)
+    return ErrorMetric(weights, values)
 
 
 def _matrix_size(triangles: Floats) -> int:

@@ -190,7 +190,7 @@ def dequantise_opacities(opacities: F32, tiles: Sequence[TileSplats], parameters
 def _cut_groups(
     model: SplatModel, rows: Rows, groups: U8 | None, factors: Sequence[StepFactors], parameters: CodingParameters
 ) -> list[TileSplats]:
-    """Cut each group of the splats `rows` into tiles; the class of a group is its number modulo the classes."""
+    """Cut each of the `groups` [n] of splats `rows` [n] into tiles; its class is its number modulo the classes."""
     tiles: list[TileSplats] = []
     for group in (0,) if groups is None else np.unique(groups):
         chosen = rows if groups is None else rows[groups == group]
@@ -204,7 +204,7 @@ def _cut_groups(
 
 
 def _cut_within(model: SplatModel, rows: Rows, lattice: Lattice, tile_splats: int) -> list[TileSplats]:
-    """Cut some splats into tiles, finer where means would move by more than the lattice allows.
+    """Cut the splats `rows` [n] into tiles, finer where means would move by more than the lattice allows.
 
     Half a step per axis is within the error, but decoded means are rounded to float32, by up to another half.
     """
@@ -275,7 +275,7 @@ def _exceeds(values: F32, limit: float) -> Mask:
 
 
 def _halve(coordinate: F32, tile_splats: int) -> list[Rows]:
-    """Split at a multiple of the tile size, so that tiles are full; the first half is last, to be popped first."""
+    """Split [n] at a multiple of the tile size, so that tiles are full; the first half is last, to be popped first."""
     parts = math.ceil(len(coordinate) / tile_splats)
     share = len(coordinate) * (parts // 2) // parts
     limit = np.partition(coordinate, share)[share]

@@ -300,23 +300,24 @@ def _clamp_statistics() -> ClampStatistics:
     return ClampStatistics()
 
 
-def _lost_contents(found: Format, levels: Sequence[Scene]) -> list[Finding]:
-    lost = found.losses(levels[0]) if levels else ()
-    return [Finding("lost-contents", len(lost), f"{found.title} cannot hold {', '.join(lost)}", "loss")] if lost else []
+def _lost_contents(file_format: Format, levels: Sequence[Scene]) -> list[Finding]:
+    lost = file_format.losses(levels[0]) if levels else ()
+    text = f"{file_format.title} cannot hold {', '.join(lost)}"
+    return [Finding("lost-contents", len(lost), text, "loss")] if lost else []
 
 
-def _clamped_values(found: Format, levels: Sequence[Scene], statistics: ClampStatistics) -> list[Finding]:
+def _clamped_values(file_format: Format, levels: Sequence[Scene], statistics: ClampStatistics) -> list[Finding]:
     degree = max((scene.sh_degree for scene in levels), default=0)
 
     def holders(name: str, least: float, most: float) -> list[str]:
         return [
-            file_format.name
-            for file_format in formats()
-            if file_format.write is not None and (name != "shN" or file_format.degree >= min(degree, found.degree))
-            if name not in file_format.ranges or file_format.ranges[name].holds(least, most)
+            holder.name
+            for holder in formats()
+            if holder.write is not None and (name != "shN" or holder.degree >= min(degree, file_format.degree))
+            if name not in holder.ranges or holder.ranges[name].holds(least, most)
         ]
 
-    return statistics.findings(found.title, holders)
+    return statistics.findings(file_format.title, holders)
 
 
 def detect_format(path: Path, format: str | None = None) -> Format:
@@ -437,24 +438,24 @@ def _copied(store: Store) -> Iterator[Path]:
 
 
 def _opened(
-    found: Format, path: Path, level: int = 0, max_splats: int | None = None, sh_degree: int | None = None
+    file_format: Format, path: Path, level: int = 0, max_splats: int | None = None, sh_degree: int | None = None
 ) -> AbstractContextManager[Scene]:
     """Open a file of another format than csplat."""
     check_sh_degree(sh_degree)
-    assert found.open is not None
+    assert file_format.open is not None
     if level and max_splats is not None:
         raise InputError("level and max_splats exclude each other")
-    if level and found.open_level is None:
-        raise InputError(f"{path.name} is {found.title}, which has no levels: level {level} cannot be read")
-    if found.open_level is not None:
-        return found.open_level(path, level, max_splats)
-    if found.open_bands is not None and sh_degree is not None:
-        return found.open_bands(path, sh_degree)
-    return found.open(path)
+    if level and file_format.open_level is None:
+        raise InputError(f"{path.name} is {file_format.title}, which has no levels: level {level} cannot be read")
+    if file_format.open_level is not None:
+        return file_format.open_level(path, level, max_splats)
+    if file_format.open_bands is not None and sh_degree is not None:
+        return file_format.open_bands(path, sh_degree)
+    return file_format.open(path)
 
 
 def _version_of(
-    found: Format, opened: Scene, name: str, level: int, max_splats: int | None, sh_degree: int | None
+    file_format: Format, opened: Scene, name: str, level: int, max_splats: int | None, sh_degree: int | None
 ) -> Scene:
     """Return the requested version of an opened scene along the default axes."""
     check_sh_degree(sh_degree)
@@ -465,10 +466,9 @@ def _version_of(
         which = "the coarsest version" if scene.levels else "the scene, which has no other version,"
         raise InputError(f"{name}: {which} has {scene.count:,} splats, expected at most {max_splats:,}")
     refuse(scene.findings, strict=False)
-    return _along_default_axes(found, scene if sh_degree is None else scene.with_sh_degree(sh_degree))
+    return _along_default_axes(file_format, scene if sh_degree is None else scene.with_sh_degree(sh_degree))
 
 
-def _along_default_axes(found: Format, scene: Scene) -> Scene:
-    return (
-        convert_axes(scene, DEFAULT_AXES).changed(file_axes=scene.metadata.coordinate_system) if found.axes else scene
-    )
+def _along_default_axes(file_format: Format, scene: Scene) -> Scene:
+    file_axes = scene.metadata.coordinate_system
+    return convert_axes(scene, DEFAULT_AXES).changed(file_axes=file_axes) if file_format.axes else scene

@@ -234,11 +234,11 @@ class ClampStatistics:
         return findings
 
 
-def _clamped_sizes(name: str, stored: ValueRange, found: RangeStatistics) -> str:
+def _clamped_sizes(name: str, stored: ValueRange, clamped: RangeStatistics) -> str:
     """Describe clamped logarithms of scales as sizes; return "" for other attributes."""
     if name != "scales":
         return ""
-    ends = [(found.most, stored.high)] * bool(found.above) + [(found.least, stored.low)] * bool(found.below)
+    ends = [(clamped.most, stored.high)] * bool(clamped.above) + [(clamped.least, stored.low)] * bool(clamped.below)
     sizes = (f"{np.exp(np.float64(value)):.3g} becomes {np.exp(np.float64(end)):.3g}" for value, end in ends)
     return f" (a size of {', one of '.join(sizes)} scene units)"
 
@@ -275,11 +275,11 @@ class MovedSplats:
         return [Finding("moved-splats", self.count, text, "loss", attribute="means", largest_error=self.largest)]
 
 
-def classify_scales(found: RangeStatistics, name: str, *, strict: bool, writer: str = "") -> tuple[bool, list[Finding]]:
+def classify_scales(stats: RangeStatistics, name: str, *, strict: bool, writer: str = "") -> tuple[bool, list[Finding]]:
     """Decide whether scales are logarithms.
 
     Args:
-        found: statistics of the scales of a file, with an allowed range from 0 on.
+        stats: statistics of the scales of a file, with an allowed range from 0 on.
         name: name of their column, for messages.
         strict: negative scales are an error. Otherwise their sign is ignored, because covariances contain squares.
         writer: the program that wrote the file, if the file names it.
@@ -287,35 +287,35 @@ def classify_scales(found: RangeStatistics, name: str, *, strict: bool, writer: 
     Returns:
         True if the scales are logarithms; and findings, which contain an error if they are neither.
     """
-    if found.first is None:
+    if stats.first is None:
         return False, []
-    share, (row, value) = found.below / found.count, found.first
-    if share >= _MOST_ARE_LOGS and _LOGS[0] <= found.least and found.most <= _LOGS[1]:
+    share, (row, value) = stats.below / stats.count, stats.first
+    if share >= _MOST_ARE_LOGS and _LOGS[0] <= stats.least and stats.most <= _LOGS[1]:
         by = f" (written by {writer})" if writer else ""
         text = f"{name}: {share:.0%} of the values are negative, standard deviations never are: read as logarithms{by}"
-        return True, [Finding("log-scales", found.rows, text, "repair")]
+        return True, [Finding("log-scales", stats.rows, text, "repair")]
     text = f"{name} of splat {row} is {value:.6g}, expected a standard deviation of at least 0"
     if not strict:
-        repair = f"{text}; {counted(found.rows, 'splat')} of that kind: the sign is ignored"
-        return False, [Finding("negative-scales", found.rows, repair, "repair")]
-    text += f"; {share:.1%} of the values are negative, from {found.least:.3g} to {found.most:.3g}: export it again"
-    return False, [Finding("negative-scales", found.rows, text, "error")]
+        repair = f"{text}; {counted(stats.rows, 'splat')} of that kind: the sign is ignored"
+        return False, [Finding("negative-scales", stats.rows, repair, "repair")]
+    text += f"; {share:.1%} of the values are negative, from {stats.least:.3g} to {stats.most:.3g}: export it again"
+    return False, [Finding("negative-scales", stats.rows, text, "error")]
 
 
-def classify_opacities(found: RangeStatistics, name: str) -> tuple[bool, list[Finding]]:
+def classify_opacities(stats: RangeStatistics, name: str) -> tuple[bool, list[Finding]]:
     """Decide whether opacities are logits; like `classify_scales`, with an allowed range of 0 to 1."""
-    if found.first is None:
+    if stats.first is None:
         return False, []
-    share, (row, value) = found.rows / found.count, found.first
-    if share >= _MANY_LOGITS and found.below and (found.above or found.least < _OVERSHOOT[0]):
-        text = f"{name}: {share:.0%} of the values are outside 0 to 1, from {found.least:.3g} to {found.most:.3g}"
-        return True, [Finding("logit-opacities", found.rows, f"{text}: read as logits", "repair")]
+    share, (row, value) = stats.rows / stats.count, stats.first
+    if share >= _MANY_LOGITS and stats.below and (stats.above or stats.least < _OVERSHOOT[0]):
+        text = f"{name}: {share:.0%} of the values are outside 0 to 1, from {stats.least:.3g} to {stats.most:.3g}"
+        return True, [Finding("logit-opacities", stats.rows, f"{text}: read as logits", "repair")]
     text = f"{name} of splat {row} is {value:.6g}, expected 0 to 1"
-    if _OVERSHOOT[0] <= found.least and found.most <= _OVERSHOOT[1]:
-        repair = f"{text}; {counted(found.rows, 'splat')} of that kind: clipped"
-        return False, [Finding("out-of-range-opacities", found.rows, repair, "repair")]
-    text += f"; the values range from {found.least:.3g} to {found.most:.3g}: export it again"
-    return False, [Finding("out-of-range-opacities", found.rows, text, "error")]
+    if _OVERSHOOT[0] <= stats.least and stats.most <= _OVERSHOOT[1]:
+        repair = f"{text}; {counted(stats.rows, 'splat')} of that kind: clipped"
+        return False, [Finding("out-of-range-opacities", stats.rows, repair, "repair")]
+    text += f"; the values range from {stats.least:.3g} to {stats.most:.3g}: export it again"
+    return False, [Finding("out-of-range-opacities", stats.rows, text, "error")]
 
 
 _OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

@@ -161,7 +161,7 @@ def _sections(name: str, data: Any, level: int, most: int) -> tuple[list[_Sectio
 
 
 def _buckets(where: str, data: Any, head: _SectionHead, centres: int) -> tuple[NDArray[np.int64], F64, float]:
-    """Return `ends`, `corners` and `step` of a `_Section`; the lengths of partial buckets precede the centres."""
+    """Return `ends` [B], `corners` [B, 3] and `step` of a `_Section`; partial buckets' lengths precede the centres."""
     if head.centre_size != _CENTRE_SIZE or head.full + head.partial > head.buckets:
         raise InputError(
             f"{where}: {head.full:,} full and {head.partial:,} partial buckets, expected {head.buckets:,} together"
@@ -188,7 +188,7 @@ def _section_blocks(section: _Section) -> Iterator[tuple[Rows, ...]]:
 
 
 def _decode_sh(coded: Rows, widest: int, low: float, high: float) -> F32:
-    """Decode SH coefficients, which are ordered by band, then by channel."""
+    """Decode SH coefficients [n, 3 K], ordered by band, then by channel, to [n, widest / 3, 3]."""
     width = coded.shape[1]
     bands = [np.arange(start, end).reshape(3, -1).T for start, end in pairwise(_COEFFICIENTS) if end <= width]
     values = coded[:, np.concatenate([np.zeros(0, np.int64), *(band.ravel() for band in bands)])].astype(np.float32)

@@ -315,7 +315,7 @@ def _decode_first_three(rotations: U8) -> F32:
 
 
 def _decode_rotations(rotations: U8) -> F32:
-    """Decode the three smallest of x y z w: ten bits each, sign and magnitude, the first in the highest bits."""
+    """Decode [N, 4] bytes to wxyz: three smallest in ten bits each, sign and magnitude, the first in the highest."""
     words = rotations.view("<u4")[:, 0]
     fields = (words[:, None] >> np.array([20, 10, 0], np.uint32)).astype(np.int32)
     sizes = fields & 511

@@ -34,9 +34,7 @@ _PROGRAM = 120 * _MB  # memory of a process that has loaded the encoder
 _PER_ROW = 2.2  # memory for coding a bucket or sample, as a multiple of the size of its arrays
 _WHOLE_ROW = 3.0  # memory for encoding a whole scene in memory, likewise
 _CODED = 0.3  # maximum size of a file, as a multiple of the size of its arrays
-#: By SH degree: seconds per million splats for one reading pass and for coding; seconds for a codebook. Within 10 % of
-#: times measured with copies of fox120k at `balanced`: 10 M and 100 M splats of degree 0, 3 M of degrees 1, 2 and 3,
-#: 30 M of degree 3. Degree 4 takes 1.13 times the CPU time of degree 3 (300,000 splats in memory).
+#: By SH degree: seconds per million splats for one reading pass and for coding at `balanced`; seconds for a codebook.
 _SECONDS = ((0.2, 3.1, 0.0), (0.35, 7.0, 8.0), (0.45, 7.3, 12.0), (0.55, 8.0, 20.0), (0.65, 9.0, 22.5))
 # Levels of detail. Memory of each process for building the levels of a bucket: renders, a multiple of the size of its
 # arrays, and bytes per splat. Size of the file relative to a file without levels.
@@ -201,7 +199,7 @@ def _encode_buckets(
     Args:
         store: the sorted scene.
         options, levels: as in `encode_on_disk`.
-        context: likewise; the number of its workers is that of the processes.
+        context: as in `encode_on_disk`; it has a worker for each process.
     """
     count, buckets = sum(store.counts), store.buckets
     origin = Origin(count, np.zeros(0, np.int64))

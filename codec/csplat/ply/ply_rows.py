@@ -17,9 +17,9 @@ _SHOWN = 40  # maximum number of characters of a name in a message
 _MAX_DIGITS = 18  # digits of the length of a list in text; longer ones exceed every file
 
 
-def is_list(one: Any) -> bool:
+def is_list(prop: Any) -> bool:
     """Return True if a property is a list."""
-    return hasattr(one, "len_dtype")
+    return hasattr(prop, "len_dtype")
 
 
 def row_type(properties: Sequence[Any], order: str = "=") -> np.dtype[Any]:

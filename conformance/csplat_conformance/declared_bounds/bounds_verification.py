@@ -265,19 +265,19 @@ def _judge_pairs(
 
 
 def find_contradictions(
-    name: str, found: tuple[float, float], declared: tuple[float, float], reach: float, worst: WorstSplat | None
+    name: str, measured: tuple[float, float], declared: tuple[float, float], reach: float, worst: WorstSplat | None
 ) -> list[str]:
     """Return a line for each declared bound that is below the true error, or further above it than SER-5 allows.
 
     Args:
         name: name of the measure.
-        found: (max, rms) as measured.
+        measured: (max, rms) as measured.
         declared: (max, rms) as in the file.
         reach: see `bound_tolerance`.
         worst: the splat with the largest error.
     """
     lines = []
-    for kind, true, bound in zip(("max", "rms"), found, declared, strict=True):
+    for kind, true, bound in zip(("max", "rms"), measured, declared, strict=True):
         if is_valid_bound(name, bound, true, reach):
             continue
         line = f"{name}: {kind} {true:.9g} is {'above' if bound < true else 'well below'} the declared {bound:.9g}"
@@ -342,7 +342,7 @@ def _find_worst(
     rows: I64,
     progress: Progress,
 ) -> dict[str, WorstSplat]:
-    """Return by measure the splat of `rows` that exceeds its bound most.
+    """Return by measure the splat of `rows` [n] that exceeds its bound most.
 
     Each splat is compared with whichever nearby source splat exceeds the fewest bounds.
     """

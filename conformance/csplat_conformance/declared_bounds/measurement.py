@@ -296,7 +296,7 @@ def check_source_index(
 
 
 def _reduce(values: F64, start: int) -> tuple[float, float, int]:
-    """Return the largest magnitude, the sum of squares, and the splat with the largest magnitude.
+    """Return the largest magnitude in [n, C], the sum of squares, and the splat with the largest magnitude.
 
     BLAS is not used, because its sums depend on the number of threads.
     """
@@ -334,7 +334,7 @@ def _distances(source: Source, decoded: SplatModel, source_rows: SplatRows, deco
 def _covariance_errors(
     source: Source, decoded: SplatModel, source_rows: SplatRows, decoded_rows: SplatRows | slice
 ) -> F64:
-    """Compute |S' - S| / |S|, scaled by the source's largest variance; logarithms beyond ±88 count as ±88 (5.5)."""
+    """Compute |S' - S| / |S|, [n], scaled by the source's largest variance; logs beyond ±88 count as ±88 (5.5)."""
     scales = source.scales[source_rows].clip(-88.0, 88.0)
     x, y, z = scales.T  # NumPy is slow along an axis of three
     largest = np.maximum(np.maximum(x, y), z).astype(np.float64)

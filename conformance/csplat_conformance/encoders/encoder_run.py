@@ -216,11 +216,11 @@ def _index_bytes(run: EncoderRun) -> bytes | None:
     return run.index.read_bytes() if run.index is not None and run.index.is_file() else None
 
 
-def _first_difference(one: bytes, other: bytes) -> int:
-    for at, (a, b) in enumerate(zip(one, other, strict=False)):
+def _first_difference(first: bytes, second: bytes) -> int:
+    for at, (a, b) in enumerate(zip(first, second, strict=False)):
         if a != b:
             return at
-    return min(len(one), len(other))
+    return min(len(first), len(second))
 
 
 def _field_at(data: bytes, at: int) -> str:

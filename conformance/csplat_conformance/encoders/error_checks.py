@@ -186,7 +186,7 @@ def _truncated_attributes(
 
 
 def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error along an axis in steps of the tile's lattice, excluding the rounding to binary32."""
+    """Return the largest error along an axis in lattice steps, without rounding to binary32; `index` is [N]."""
     step = header.attribute(_spec.ATTRIBUTE_MEANS).step
     near, reach = source.about(decoded.origin), source.reach(decoded.origin)
     largest = 0.0
@@ -201,7 +201,7 @@ def _mean_steps(source: Source, decoded: SplatModel, header: SceneHeader, index:
 
 
 def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, index: I64) -> float:
-    """Return the largest error in steps of alpha, or of its root if the file's mapping is SQUARE."""
+    """Return the largest error in steps of alpha, or of its root if the file's mapping is SQUARE; `index` is [N]."""
     record = header.attribute(_spec.ATTRIBUTE_OPACITIES)
     ours, theirs = decoded.opacities.astype(np.float64), source.opacities[index].astype(np.float64)
     if record.mapping == _spec.MAPPING_SQUARE:
@@ -215,7 +215,7 @@ def _opacity_steps(source: Source, decoded: SplatModel, header: SceneHeader, ind
 def _compare_one_sided(
     measure: str, name: str, source: NDArray[np.floating], decoded: NDArray[np.floating]
 ) -> Iterator[tuple[str, str]]:
-    """Yield a line if nearly all errors have one sign."""
+    """Yield a line if nearly all errors of two arrays of one shape have one sign."""
     theirs, ours = source.astype(np.float64).ravel(), decoded.astype(np.float64).ravel()
     theirs, first = np.unique(theirs, return_index=True)
     ours = ours[first]
@@ -233,7 +233,7 @@ def _compare_one_sided(
 def _coded_colours(
     source: NDArray[np.float32], decoded: NDArray[np.float32], header: SceneHeader, attribute: int
 ) -> tuple[F64, F64]:
-    """Return the values that the encoder rounds: R, G, B, or Co and Cg. Y is excluded: it compensates errors."""
+    """Return the values of [..., 3] that the encoder rounds: R, G, B, or Co and Cg. Y compensates errors."""
     theirs, ours = source.astype(np.float64), decoded.astype(np.float64)
     if header.attribute(attribute).mapping != _spec.MAPPING_YCOCG:
         return theirs, ours
@@ -270,7 +270,7 @@ def _axis_rotations() -> F64:
 
 
 def _right_factor(q: F64) -> F64:
-    """Return M with p·M = p q for quaternions p as rows."""
+    """Return M [4, 4] with p·M = p q for quaternions p as rows, and q [4]."""
     w, x, y, z = q
     return np.array([[w, x, y, z], [-x, w, -z, y], [-y, z, w, -x], [-z, -y, x, w]])
 

@@ -219,9 +219,9 @@ def pair_splats(source: F64, decoded: F64, separation: float) -> SplatPairs:
     return SplatPairs(index, len(decoded) - len(near), len(near) - paired, len(source) - paired, examples)
 
 
-def _first_index(which: NDArray[np.bool_]) -> int:
+def _first_index(mask: NDArray[np.bool_]) -> int:
     """Return the index of the first True, or −1 if there is none."""
-    return int(which.argmax()) if which.any() else _NONE
+    return int(mask.argmax()) if mask.any() else _NONE
 
 
 def _nearest(centres: F64, decoded: F64, separation: float) -> I64:

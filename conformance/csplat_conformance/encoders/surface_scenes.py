@@ -89,7 +89,7 @@ def _box(side: int) -> list[Surface]:
 
 
 def _facing(normals: F64, rng: np.random.Generator) -> F64:
-    """Return rotations that map z to the normals, with a random rotation about the normal, sign and length."""
+    """Return quats [N, 4] that map z to normals [N, 3], with a random rotation about the normal, sign and length."""
     # The vector half-way between z and the normal gives half the rotation; the opposite of z is reached about x.
     half = np.stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
     half[half[:, 0] < 1e-9] = (0.0, 1.0, 0.0, 0.0)
@@ -101,7 +101,7 @@ def _facing(normals: F64, rng: np.random.Generator) -> F64:
 
 
 def _permute_axes(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F64, F64]:
-    """Return the same splats with their axes in a random order, as in trained scenes."""
+    """Return quats [N, 4] and scales [N, 3] of the same splats, with axes in a random order, as in trained scenes."""
     quats, scales = quats.copy(), scales.copy()
     for first in (0, 1, 0):
         rows = rng.random(len(quats)) < 0.5
@@ -117,7 +117,7 @@ def _permute_axes(quats: F64, scales: F64, rng: np.random.Generator) -> tuple[F6
 
 
 def _snap_to_facets(normals: F64) -> F64:
-    """Return for each normal the nearest facet normal, so that splats of one facet have the same highlights."""
+    """Return the facet normal nearest to each normal, [N, 3], so that splats of a facet have the same highlights."""
     facets = _ball(_FACETS)[1]
     nearest: F64 = facets[np.argmax(normals @ facets.T, axis=1)]
     return nearest

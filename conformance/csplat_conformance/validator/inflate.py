@@ -150,10 +150,10 @@ class Inflater:
             pattern = out[-distance:].rjust(distance, b"\0")
             out += (pattern * (length // distance + 1))[:length]
 
-    def _value(self, symbol: int, each: int) -> int:
-        """Return length - 3 (`each` is 4 symbols per number of extra bits) or distance - 1 (`each` is 2)."""
-        extra = max(0, symbol // each - 1)
-        first = symbol if symbol < each else (each + symbol % each) << extra
+    def _value(self, symbol: int, group: int) -> int:
+        """Return length - 3 (`group` is 4 symbols per number of extra bits) or distance - 1 (`group` is 2)."""
+        extra = max(0, symbol // group - 1)
+        first = symbol if symbol < group else (group + symbol % group) << extra
         return first + self._number(extra)
 
     def _symbol(self, code: _Code) -> int:

@@ -258,7 +258,7 @@ def read_offsets(payload: Payload, name: str, columns: int) -> tuple[list[int], 
 
 
 def _axes(codes: I64) -> I64:
-    """Split codes into axes: bit 3·b + a of a code is bit b of axis a (6.4.2)."""
+    """Split codes [n] into axes [3, n]: bit 3·b + a of a code is bit b of axis a (6.4.2)."""
     rows = np.zeros((_MORTON_AXES, len(codes)), np.int64)
     for axis in range(_MORTON_AXES):
         for bit in range(_spec.MORTON_BITS_MAX):
@@ -478,7 +478,7 @@ def read_codebook(payload: Payload, chunk: Chunk, index: Index, books: CodebookE
 def _check_entries(
     log: ViolationLog, index: Index, book: CodebookAt, attributes: list[int], table: I64, where: Place
 ) -> bool:
-    """Check CBK-7 for all entries. Scales are checked in the tile, with their summand."""
+    """Check CBK-7 for all entries, [K, columns]. Scales are checked in the tile, with their summand."""
     sound = True
     for attribute in attributes:
         columns = attribute_columns(book, attribute)

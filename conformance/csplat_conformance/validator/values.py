@@ -82,7 +82,7 @@ def _check_lattice(
 
 
 def _lift(rows: I64, chroma_shift: int) -> I64:
-    """Return R, G, B of Y, Co, Cg (7.1). LAT-4 bounds all intermediate values by 2^53."""
+    """Return R, G, B of Y, Co, Cg, [3 K, n] (7.1). LAT-4 bounds all intermediate values by 2^53."""
     y, co, cg = np.split(rows, 3)
     co, cg = co << chroma_shift, cg << chroma_shift
     t = y - (cg >> 1)

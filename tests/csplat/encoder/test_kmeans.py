@@ -79,7 +79,7 @@ def test_search_for_another_entry_skips_the_own_one():
         rows = np.unique(np.r_[0 : min(100, entry_count), max(0, entry_count - 53) : entry_count])
         expected = squared_distances(points[rows], points)
         expected[np.arange(len(rows)), rows] = 10**6
-        index, error = search_nearest(points, points, other=True)
+        index, error = search_nearest(points, points, exclude_own=True)
         np.testing.assert_array_equal(expected.argmin(1), index[rows])
         np.testing.assert_array_equal(expected.min(1), error[rows])
 

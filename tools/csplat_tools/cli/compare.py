@@ -61,7 +61,7 @@ def compare(
     of black, or of the given views; at most 99 dB. Compare only values for
     the same cameras and background. With --data, A and B are also scored
     against the held-out images. Scenes that do not fit in memory are rendered
-    from the disk. --level is that of B. --backend gpu computes PSNR on a GPU
+    from the disk. --level applies to B. --backend gpu computes PSNR on a GPU
     (extra gpu), which may differ in the third decimal. Requires the render
     extra.
 

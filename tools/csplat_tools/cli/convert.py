@@ -53,10 +53,10 @@ def convert(
 
     Changes are made in this order: --to-axes (in --help-all), --rotate,
     --scale, --translate, --crop, --drop-floaters, --sh-degree. They are along
-    the axes of IN (those of its format, where these are fixed, as y up in
-    glTF), or of --to-axes. A line reports what the format cannot hold. For
-    .csplat files, `csplat encode` has presets and targets. A new folder with
-    a file lod-meta.json gets streamed SOG, with all levels of detail.
+    the axes of IN, or of --to-axes. Some formats have fixed axes, such as y
+    up in glTF. A line reports what the format cannot hold. For .csplat files,
+    `csplat encode` has presets and targets. A new folder with a file
+    lod-meta.json gets streamed SOG, with all levels of detail.
 
     Formats, their highest SH degree, and what else they hold (header: axes,
     origin, unit, metadata, antialiased, flat):

@@ -177,7 +177,7 @@ def _publish(encoded: EncodedFile, source: str, output: str, out: Output, *, up:
     if not out.quiet and model is not None:
         every = max(1, len(model) // _UP_SPLATS)
         axis = estimate_up(model.select(slice(None, None, every)), every)
-        shared.take_estimated_up(axis, out, given=up, shown=False)
+        shared.take_estimated_up(axis, out, up=up, shown=False)
     out.remark(format_encoding(encoded, source, output))
     out.publish(encoded.as_json())
 

@@ -94,7 +94,7 @@ def render(
         shots = find_cameras(to_frame, cameras, orbit, data_set, pixels, report=notes)
         out.remark(*notes)
         if orbit is not None:
-            shared.take_estimated_up(estimate_up(to_frame), out, given=up)
+            shared.take_estimated_up(estimate_up(to_frame), out, up=up)
         write = partial(render_film, fps=fps) if is_video else partial(render_folder, depth=depth, alpha=alpha)
         rendered = write(
             model, shots, output, background=views.colour, mode=mode, backend=device, force=out.force,

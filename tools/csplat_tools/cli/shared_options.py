@@ -215,17 +215,17 @@ def checked(kind: Callable[..., T], *args: Any, **values: Any) -> T:
 
 
 def take_estimated_up(
-    axis: Direction | None, output: Output, *, given: object = None, shown: bool = True
+    axis: Direction | None, output: Output, *, up: object = None, shown: bool = True
 ) -> Direction | None:
     """Return the estimated up direction, with a remark, if neither the user nor the scene specifies one.
 
     Args:
         axis: the estimate of `estimate_up`; `None`: there is none.
         output: prints remarks.
-        given: the user's direction; `None`: not given.
+        up: the user's direction; `None`: not given.
         shown: True if the command's result shows the scene with this direction up.
     """
-    if axis is None or given is not None:
+    if axis is None or up is not None:
         return None
     word = up_word(axis)
     output.remark(
@@ -311,16 +311,16 @@ class ViewOptions:
         return view_set
 
 
-def parse_overrides(up: str | None, axes: str | None = None, **others: Any) -> MetadataOverrides:
+def parse_overrides(up: str | None, axes: str | None = None, **fields: Any) -> MetadataOverrides:
     """Return overrides of a scene's metadata.
 
     Args:
         up: the up direction, see `parse_up`.
         axes: the axes, see `parse_axes`.
-        others: other fields of `MetadataOverrides`.
+        fields: other fields of `MetadataOverrides`.
     """
     return MetadataOverrides(
-        None if axes is None else parse_axes(axes), up=None if up is None else parse_up(up), **others
+        None if axes is None else parse_axes(axes), up=None if up is None else parse_up(up), **fields
     )
 
 

@@ -14,8 +14,8 @@ from csplat_tools.inspect.text_reports import format_simplification
 from csplat_tools.optional_packages import prepare_renderer, require_renderer
 from csplat_tools.scene_files import load_scene
 
-#: Cost in renders of all training views: for --keep (measured: donut 9, plane3 19), and for a target, which searches
-#: for the fraction to keep (20 and 45). Half of the cost is fitting.
+#: Cost in renders of all training views: for --keep, and for a target, which searches for the fraction to keep. Half of
+#: the cost is fitting.
 _PASSES = (20.0, 45.0)
 
 

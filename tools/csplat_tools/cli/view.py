@@ -169,7 +169,7 @@ def _scene_parameters(scene: ViewerScene, cameras: str | None, up: str | None, o
         notes: list[str] = []
         wishes = page_parameters(cameras, report=notes, origin=scene.header.origin)
         out.remark(*notes)
-    return wishes | estimated_up_parameters(shared.take_estimated_up(scene.seems_up, out, given=up))
+    return wishes | estimated_up_parameters(shared.take_estimated_up(scene.seems_up, out, up=up))
 
 
 def _encoded(scene: ViewerScene, preset: str) -> list[str]:

@@ -56,7 +56,7 @@ _IMPORT = re.compile(
 _DECLARED = re.compile(r"^export\s+(?=(?:const|class|(?:async\s+)?function\s*\*?)\s+(?P<name>[\w$]+))", re.MULTILINE)
 _LISTED = re.compile(r"^export\s+\{(?P<names>[^}]*?),?\s*\};", re.MULTILINE)
 _STATEMENT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
-# Lines of comments. Those in template strings are GLSL comments, and are removed, too.
+# Lines of comments. GLSL comments in template strings are removed, too.
 _COMMENT = re.compile(r"^ *(?://.*|/\*\*(?:(?!\*/)[\s\S])*\*/)\n", re.MULTILINE)
 _STYLE = '<link rel="stylesheet" href="viewer.css">'
 _SCRIPT = '<script type="module" src="main.mjs"></script>'

@@ -143,7 +143,7 @@ def pack_tile(tile: PackedTile, tables: SharedTables, shift: F64, *, antialiased
 
 
 def pack_splats(splats: UncheckedSplats, part: slice, shift: F64, *, antialiased: bool, sh_degree: int) -> TileWords:
-    """Pack some splats of a model as binary32 patterns; those with NaN or infinity get an opacity of 0.
+    """Pack some splats of a model as binary32 patterns; splats with NaN or infinity get an opacity of 0.
 
     Args:
         splats: the model, float32.

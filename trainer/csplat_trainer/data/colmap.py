@@ -133,9 +133,9 @@ def read_colmap(
     return UnreadDataSet("COLMAP set", train, test, points, colours, report, test_every)
 
 
-def _shown_name(name: str, found: FoundImages) -> str:
+def _shown_name(name: str, images: FoundImages) -> str:
     """Return the name of an image, or the name of its file if the former is not UTF-8."""
-    return name if name == printable(name) else printable(_relative(found.files[name], found.folder))
+    return name if name == printable(name) else printable(_relative(images.files[name], images.folder))
 
 
 def _each_once(registered: list[ColmapImage], path: Path, report: list[str]) -> list[ColmapImage]:
@@ -203,13 +203,13 @@ def _folders(place: SetFolder, model: Path, images: str | None) -> tuple[str, ..
     return (second, first, *others) if _UNDISTORTED_FIRST in _relative(model, place.path).split("/") else _IMAGE_FOLDERS
 
 
-def _agree(cameras: dict[int, Lens], others: dict[int, Lens]) -> bool:
+def _agree(cameras: dict[int, Lens], text_cameras: dict[int, Lens]) -> bool:
     """Return True if cameras are equal up to the precision of text files."""
 
     def numbers(some: dict[int, Lens]) -> list[tuple[float, ...]]:
         return [(number, lens.width, lens.height, lens.fx, lens.cx) for number, lens in sorted(some.items())]
 
-    return len(cameras) == len(others) and np.allclose(numbers(cameras), numbers(others), rtol=1e-4)
+    return len(cameras) == len(text_cameras) and np.allclose(numbers(cameras), numbers(text_cameras), rtol=1e-4)
 
 
 def _masks(place: SetFolder, images: dict[str, Path], report: list[str]) -> dict[str, Path]:
@@ -228,7 +228,7 @@ def _masks(place: SetFolder, images: dict[str, Path], report: list[str]) -> dict
 
 
 def _points(place: SetFolder, model: Path, report: list[str]) -> tuple[F64, F32] | tuple[None, None]:
-    """Read the points of a model, or of the PLY that 3DGS writes."""
+    """Read the points [M, 3] and colours [M, 3] of a model, or of the PLY that 3DGS writes."""
     path = _file(model, "points3D")
     if path is not None:
         return read_points(place.checked(path), report)
@@ -611,7 +611,7 @@ def _lens(model: str, width: float, height: float, values: list[float], where: s
 
 
 def _viewmat(pose: Sequence[float], where: str) -> F64:
-    """Return the matrix of a rotation w x y z and a translation."""
+    """Return the matrix [4, 4] of a rotation w x y z and a translation."""
     q, t = np.array(pose[:4], np.float64), np.array(pose[4:7], np.float64)
     length = float(np.linalg.norm(q))
     if not (np.isfinite(length) and length > 0.0):

@@ -353,7 +353,7 @@ def _is_turned(image: Image.Image, lens: Lens) -> bool:
 
 
 def _turn_upright(pixels: U8, image: Image.Image) -> U8:
-    """Turn decoded pixels as the file's EXIF specifies."""
+    """Turn decoded pixels, [H, W, ...], as the file's EXIF specifies."""
     quarters, flips = _ON_ITS_SIDE[image.getexif()[ExifTags.Base.Orientation]]
     turned = np.rot90(pixels, quarters)
     return turned[::-1] if flips else turned
@@ -362,7 +362,7 @@ def _turn_upright(pixels: U8, image: Image.Image) -> U8:
 def _read_pixels(
     path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None, *, turned: bool, with_alpha: bool
 ) -> U8:
-    """Return the undistorted pixels of a file in the requested size, `turned` by EXIF or as stored."""
+    """Return the undistorted pixels [H, W, 3 or 4] of a file in the requested size, `turned` by EXIF or as stored."""
     with open_image(path) as stored:
         pixels = rgb_pixels(stored, path)
         if not with_alpha:
@@ -379,7 +379,7 @@ def _read_pixels(
 
 
 def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | None) -> Mask:
-    """Return the pixels of an image that count, those with a mask brighter than half; the mask's size may differ."""
+    """Return the pixels of an image that count, [H, W]: the mask, of any size, is brighter than half there."""
     sides = int(lens.width), int(lens.height)
     with open_image(path, budget=False) as stored:  # compared with the size of its image before
         values = mask_values(stored, path).values
@@ -395,7 +395,7 @@ def _read_mask(path: Path, lens: Lens, straight: Lens, size: tuple[int, int] | N
 
 
 def _undistort(pixels: U8, lens: Lens, straight: Lens) -> U8:
-    """Undistort an image by linear interpolation, with colours weighted by their alpha."""
+    """Undistort an image [H, W, C] by linear interpolation, with colours weighted by their alpha."""
     height, width = pixels.shape[:2]
     v, u = np.mgrid[0:height, 0:width] + 0.5
     x, y = distorted(u, v, lens, straight)

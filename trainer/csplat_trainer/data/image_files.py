@@ -434,8 +434,8 @@ def _find_in(place: SetFolder, folder: Path, names: Sequence[str], where: str, *
     return FoundImages(folder, {name: place.checked(path, where) for name, path in files.items()}, notes)
 
 
-def _is_large(found: FoundImages, size: tuple[int, int]) -> bool:
-    width, height = image_size(next(iter(found.files.values())))
+def _is_large(images: FoundImages, size: tuple[int, int]) -> bool:
+    width, height = image_size(next(iter(images.files.values())))
     return width >= size[0] and height >= size[1]
 
 

@@ -216,7 +216,7 @@ def _stored_as(image: Image.Image, path: Path) -> str:
 
 
 def _unit_grey(image: Image.Image, path: Path) -> F64:
-    """Scale grey values to 0..1."""
+    """Scale grey values [H, W] to 0..1."""
     stored = np.asarray(image)
     if image.mode != _FLOAT:
         values: F64 = stored / 65535.0
@@ -231,7 +231,7 @@ def _unit_grey(image: Image.Image, path: Path) -> F64:
 
 
 def _grey_mask(image: Image.Image, path: Path) -> U8:
-    """Convert a mask of more than 8 bits to 8; labels and values up to 255 are kept, others are scaled."""
+    """Convert a mask [H, W] of more than 8 bits to 8; labels and values up to 255 are kept, others are scaled."""
     stored = np.asarray(image)
     low, high = float(stored.min()), float(stored.max())
     if low >= 0.0 and high <= 255.0 and (image.mode != _FLOAT or high > 1.0):

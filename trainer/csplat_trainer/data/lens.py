@@ -151,7 +151,7 @@ def _polynomial(factors: tuple[float, ...], r2: F64) -> F64:
 
 
 def _border(lens: Lens, count: int) -> tuple[F64, F64]:
-    """Return `count` centres of pixels along each of the four sides."""
+    """Return u and v of `count` centres of pixels along each of the four sides, [4 count]."""
     u = np.linspace(0.5, lens.width - 0.5, count)
     v = np.linspace(0.5, lens.height - 0.5, count)
     ends_u, ends_v = np.repeat(u[[0, -1]], count), np.repeat(v[[0, -1]], count)

@@ -176,16 +176,16 @@ def _choose_axes(custom: str, shots: Sequence[Shot]) -> tuple[str, Direction | N
     return custom, usual, ""
 
 
-def _settle(found: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
+def _settle(data: UnreadDataSet, place: SetFolder) -> UnreadDataSet:
     """Resolve the links of images and masks, so that the files read later are the files that were checked."""
     train, test, val = (
         [
             replace(shot, path=place.settled(shot.path), mask=None if shot.mask is None else place.settled(shot.mask))
             for shot in part
         ]
-        for part in (found.train, found.test, found.val)
+        for part in (data.train, data.test, data.val)
     )
-    return replace(found, train=train, test=test, val=val)
+    return replace(data, train=train, test=test, val=val)
 
 
 def _read(
@@ -255,7 +255,7 @@ Origin = tuple[float, float, float]
 _NEAR_SIZES = 256.0  # distance from 0, in sizes of the scene; beyond, a step of float32 exceeds 1.5e-5 of the size
 
 
-def choose_origin(found: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
+def choose_origin(data: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
     """Choose an origin for a set, and return its cameras and points relative to it, and the origin.
 
     The origin is 0 if the set is around 0 or near it. Else it is the middle of the cameras, rounded to a power of ten
@@ -265,31 +265,31 @@ def choose_origin(found: UnreadDataSet) -> tuple[UnreadDataSet, Origin]:
     Raises:
         InputError: a camera's position overflows float32.
     """
-    shots = [*found.train, *found.test, *found.val]
+    shots = [*data.train, *data.test, *data.val]
     viewmats = np.stack([shot.viewmat for shot in shots])
     for shot in shots:
         if not np.abs(shot.viewmat[:3, 3]).max() < np.finfo(np.float32).max:
             far = float(np.abs(shot.viewmat[:3, 3]).max())
             raise InputError(f"the camera of {shot.name} is {far:.3g} units from 0, expected a place in the scene")
-    viewmats = viewmats[~camera_outliers(viewmats, found.points)]
+    viewmats = viewmats[~camera_outliers(viewmats, data.points)]
     positions = -np.einsum("nji,nj->ni", viewmats[:, :3, :3], viewmats[:, :3, 3])
     middle = np.median(positions, axis=0)
-    if found.points is not None and len(found.points):
-        subject = np.median(found.points, axis=0) - middle
+    if data.points is not None and len(data.points):
+        subject = np.median(data.points, axis=0) - middle
     else:
         subject = nearest_point(positions - middle, viewmats[:, 2, :3])
     spread = float(np.median(np.linalg.norm(positions - middle, axis=1)))
     size = max(spread, float(np.linalg.norm(subject)))
     if size == 0.0 or np.abs(middle).max() <= _NEAR_SIZES * size:
-        return found, (0.0, 0.0, 0.0)
+        return data, (0.0, 0.0, 0.0)
     digits = -math.floor(math.log10(size))
     x, y, z = (round(value, digits) + 0.0 for value in middle.tolist())  # no negative zeros
     origin = np.array([x, y, z])
-    train, test, val = ([_relative_to(shot, origin) for shot in part] for part in (found.train, found.test, found.val))
-    points = None if found.points is None else found.points - origin
+    train, test, val = ([_relative_to(shot, origin) for shot in part] for part in (data.train, data.test, data.val))
+    points = None if data.points is None else data.points - origin
     words = " ".join(str(value).removesuffix(".0") for value in (x, y, z))
     report = f"coordinates are far from 0: the scene is relative to the origin {words}"
-    return replace(found, train=train, test=test, val=val, points=points, report=[*found.report, report]), (x, y, z)
+    return replace(data, train=train, test=test, val=val, points=points, report=[*data.report, report]), (x, y, z)
 
 
 def describe_outliers(data: DataSet) -> str:

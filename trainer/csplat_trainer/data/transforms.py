@@ -143,7 +143,7 @@ def _shots(
     key: str = "frames",
     needed: bool = True,
 ) -> list[Shot]:
-    """Read the frames of a document, without those that lack an image or a pose; if `needed`, at least one."""
+    """Read the frames of a document that have an image and a pose; if `needed`, at least one."""
     folder = path.parent
     frames = _frames(document, key, path, report, needed=needed)
     names = [frame.name for frame in frames]
@@ -261,7 +261,7 @@ def _masks(place: SetFolder, frames: Sequence[_Frame], path: Path, report: list[
 def _points(
     place: SetFolder, document: Mapping[str, Any], shots: Sequence[Shot], path: Path, report: list[str]
 ) -> tuple[F64 | None, F32 | None]:
-    """Read the point cloud of nerfstudio's `ply_file_path`, in the coordinates of the cameras."""
+    """Read points and colours [M, 3] of nerfstudio's `ply_file_path`, in the coordinates of the cameras."""
     name = document.get("ply_file_path")
     if name is None:
         return _points_next_to(shots, place, report)
@@ -283,7 +283,7 @@ def _points(
 
 
 def _points_next_to(train: Sequence[Shot], place: SetFolder, report: list[str]) -> tuple[F64 | None, F32 | None]:
-    """Read the points that 3DGS and similar programs write next to a Blender set.
+    """Read the points and colours [M, 3] that 3DGS and similar programs write next to a Blender set.
 
     If images have transparency, points are ignored: they are often random, and the visual hull is better.
     """
@@ -307,7 +307,7 @@ def _read_list(document: Mapping[str, Any], key: str, path: Path) -> list[str]:
 
 
 def _plain(name: str, image: Path, folder: Path) -> str:
-    """Return the name of an image without `./`, with the ending that Blender's sets omit; that on disk if not UTF-8."""
+    """Return an image's name without `./`, with the ending that Blender omits; if not UTF-8, its name on disk."""
     if name != printable(name) and image.is_relative_to(folder):
         return printable(image.relative_to(folder).as_posix())
     return printable(PurePosixPath(normalise_name(name)).with_name(image.name).as_posix())

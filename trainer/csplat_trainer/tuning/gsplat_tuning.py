@@ -146,21 +146,21 @@ class GsplatTuning:
         return quantised
 
     @torch.no_grad()
-    def _add_costs(self, gradients: dict[str, Tensor], found: QuantisedValues, costs: RateTerm) -> None:
+    def _add_costs(self, gradients: dict[str, Tensor], quantised: QuantisedValues, costs: RateTerm) -> None:
         """Add the slopes of the rate term to gradients, as `RateTerm.add_to`."""
         if self._costs is None or self._costs[0] is not costs:
             self._costs = costs, {name: self._rasteriser.upload(table) for name, table in costs.tables.items()}
         plan, tables = self._fixed.parameters, self._costs[1]
-        per_bit = costs.weight / len(found.alphas)
-        gradients["scales"] += per_bit / plan.scale_step * _slopes(tables["scales"], found.scales)
+        per_bit = costs.weight / len(quantised.alphas)
+        gradients["scales"] += per_bit / plan.scale_step * _slopes(tables["scales"], quantised.scales)
         over = _ROOT2 * plan.quat_levels
-        gradients["quats"][:, 1:] += per_bit * over * _slopes(tables["quats"], found.quats)
-        chain = 0.5 * plan.opacity_levels * found.alphas.sqrt() * (1.0 - found.alphas)
-        gradients["logits"] += per_bit * chain * _slopes(tables["opacities"], found.opacities[:, None])[:, 0]
-        gradients["sizes"] += per_bit / plan.scale_step * _slopes(tables["sizes"], found.sizes[:, None])[:, 0]
-        self._add_colours(gradients["sh0"][:, None], found.sh0[:, None], tables["sh0"], per_bit / plan.sh0_step)
+        gradients["quats"][:, 1:] += per_bit * over * _slopes(tables["quats"], quantised.quats)
+        chain = 0.5 * plan.opacity_levels * quantised.alphas.sqrt() * (1.0 - quantised.alphas)
+        gradients["logits"] += per_bit * chain * _slopes(tables["opacities"], quantised.opacities[:, None])[:, 0]
+        gradients["sizes"] += per_bit / plan.scale_step * _slopes(tables["sizes"], quantised.sizes[:, None])[:, 0]
+        self._add_colours(gradients["sh0"][:, None], quantised.sh0[:, None], tables["sh0"], per_bit / plan.sh0_step)
         if "shN" in tables:
-            self._add_colours(gradients["shN"], found.sh, tables["shN"], per_bit / plan.sh_step)
+            self._add_colours(gradients["shN"], quantised.sh, tables["shN"], per_bit / plan.sh_step)
 
     def _add_colours(self, gradient: Tensor, integers: Tensor, table: Tensor, factor: float) -> None:
         """Add the slopes of colours [n, K, 3]: Y = (R + 2 G + B) / 4, Co = R - B, Cg = G - (R + B) / 2."""
@@ -175,8 +175,8 @@ class GsplatTuning:
 _ROOT2 = 2.0**0.5
 
 
-def _degree(found: QuantisedValues) -> int:
-    return math.isqrt(1 + found.decoded["shN"].shape[1]) - 1
+def _degree(quantised: QuantisedValues) -> int:
+    return math.isqrt(1 + quantised.decoded["shN"].shape[1]) - 1
 
 
 def _places(integers: Tensor) -> Tensor:

@@ -161,7 +161,7 @@ def _views_of(data: DataSet, model: SplatModel) -> TuningViews:
 
 
 def _check_identity(seen: DecodedValues, source_index: I64, result: EncodeResult, decoded: SplatModel) -> None:
-    """Raise a `RuntimeError` unless the file holds the tuned values, bit for bit."""
+    """Raise a `RuntimeError` unless the file holds the tuned values, bit for bit; `source_index` is [N]."""
     places = np.empty(int(source_index.max()) + 1, np.int64)
     places[source_index] = np.arange(len(source_index))
     rows = places[result.source_index]

@@ -297,21 +297,21 @@ def _is_manifest(path: PurePosixPath) -> bool:
     return path.name.lower() in (_ONE, _LEVELS) and _OF_MACOS not in path.parts
 
 
-def _only_scene(parts: SogParts, found: Sequence[PurePosixPath]) -> PurePosixPath:
+def _only_scene(parts: SogParts, manifests: Sequence[PurePosixPath]) -> PurePosixPath:
     """Return the only manifest that is not part of another scene.
 
     Args:
         parts: the folder or the whole zip.
-        found: paths of all manifests.
+        manifests: paths of all manifests.
     """
     inside: set[PurePosixPath] = set()
-    for manifest in found if len(found) > 1 else ():
+    for manifest in manifests if len(manifests) > 1 else ():
         if manifest.name.lower() == _LEVELS:
             meta = parts.json(str(manifest)).value
             files = meta.get("filenames") if isinstance(meta, dict) else None
             names = [*files, meta.get("environment")] if isinstance(files, list) else []
             inside |= {manifest.parent / use_slashes(name) for name in names if isinstance(name, str)}
-    scenes = [manifest for manifest in found if manifest not in inside]
+    scenes = [manifest for manifest in manifests if manifest not in inside]
     if len(scenes) != 1:
         _refuse_several(parts, scenes)
     return scenes[0]

@@ -90,7 +90,7 @@ def encode_files(scene: Scene, losses: SogLosses) -> Iterator[tuple[str, bytes]]
         raise InputError(f"the scene has {count:,} splats, SOG allows {_LARGEST_SIDE}² at most")
     low, high, sample = _sample(scene)
     weights_of = partial(_splat_weights, median_area=float(np.median(_log_area(sample))) if count else 0.0)
-    # Square roots keep the tails of the distribution accurate, which would be visible (donut: 60.6 dB, otherwise 53.1).
+    # Square roots keep the tails of the distribution accurate, where errors are visible.
     roots = np.sqrt(weights_of(sample))
     scales, colours = _build_codebook(sample.scales, roots), _build_codebook(sample.sh0, roots)
     meta: dict[str, Any] = {"version": 2, "asset": {"generator": "csplat"}, "count": count}
@@ -139,13 +139,13 @@ def encode_files(scene: Scene, losses: SogLosses) -> Iterator[tuple[str, bytes]]
 
 
 def _range_of(codebook: F32) -> ValueRange:
-    """Return the range of a codebook; rounding to its outermost codes, which are means of rare values, is coarse."""
+    """Return the range of a codebook [256]; rounding to its outermost codes, means of rare values, is coarse."""
     low, high = float(codebook[0]), float(codebook[-1])
     return ValueRange(low, high, 2.0 * max(float(np.diff(codebook)[[0, -1]].max()), _COARSE * (high - low)))
 
 
 def _sample(scene: Scene) -> tuple[F64, F64, SplatModel]:
-    """Return the bounds of the logarithms of all positions, and at most `_SAMPLE` evenly spaced splats."""
+    """Return the bounds [3] of the logarithms of all positions, and at most `_SAMPLE` evenly spaced splats."""
     step = -(-scene.count // _SAMPLE) or 1
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
     samples = []
@@ -164,13 +164,13 @@ def _signed_logs(means: F32) -> F64:
 
 
 def _log_area(model: SplatModel) -> F64:
-    """Return the logarithm of the area of each splat's largest cross-section, up to a constant."""
+    """Return the logarithm of the area of each splat's largest cross-section, [N], up to a constant."""
     area: F64 = np.sort(model.scales, 1)[:, 1:].sum(1, dtype=np.float64)
     return area
 
 
 def _splat_weights(model: SplatModel, median_area: float) -> F32:
-    """Weight splats by their share of a render: opacity times area relative to the scene's median (a logarithm)."""
+    """Return weights [N] by the share of a render: opacity times area relative to the scene's median (a logarithm)."""
     area = np.exp(_log_area(model) - median_area).clip(1e-2, 1e2)
     weights: F32 = (model.opacities * area + _LEAST_WEIGHT).astype(np.float32)
     return weights
@@ -225,7 +225,7 @@ def _build_palette(scene: Scene, sample: SplatModel, weights_of: Callable[[Splat
     """Cluster the SH vectors of all splats.
 
     Returns:
-        The codebook of coefficients, the palette image, and the label of each splat.
+        The codebook of coefficients, [256]; the palette image, [height, width, 4]; and the label of each splat, [N].
     """
     coefficients = (scene.sh_degree + 1) ** 2 - 1
     lengths = np.sqrt(np.einsum("nkc,nkc->n", sample.shN, sample.shN))
