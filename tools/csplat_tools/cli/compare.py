@@ -94,15 +94,15 @@ def compare(
         for name, scene in ((a, source), (b, other)):
             out.print_findings(findings_of(scene), Path(name).name)
         model, every = sample_scene(source, progress=progress)
-        around = views.find(model, out, count=0, split=split, every=every)
+        view_set = views.find(model, out, count=0, split=split, every=every)
         if mode == "exact":
             from csplat_tools.views.view_sets import total_render_seconds
 
             out.announce_time(
-                lambda: 2 * total_render_seconds(model, around.test, mode=mode), "--backend cpu takes seconds"
+                lambda: 2 * total_render_seconds(model, view_set.test, mode=mode), "--backend cpu takes seconds"
             )
         compared = csplat_tools.compare(
-            source, other, views=around, source_index=rows, lpips=lpips, pictures=pictures, background=views.colour,
+            source, other, views=view_set, source_index=rows, lpips=lpips, pictures=pictures, background=views.colour,
             mode=mode, backend=device, force=out.force,
             prepare=partial(prepare_renderer, quiet=out.quiet, ssim=True, lpips=lpips is not None), context=context,
         )  # fmt: skip

@@ -141,7 +141,7 @@ def encode(
         out.check(output, inputs=(source, importance, *views.inputs), named={"--source-index": source_index})
         check_name(output, ".csplat", "encode", source)
         scene: str | Scene = source
-        around = None
+        view_set = None
         if target is not None:
             if target.is_rendered:
                 require_renderer()
@@ -152,9 +152,9 @@ def encode(
             if max_error is not None:
                 target = replace(target, max_error=shared.parse_max_error(max_error, scene.metadata.unit_metres))
             if target.is_rendered:
-                around = _find_views(scene.model(), options, target, views, out, context)
+                view_set = _find_views(scene.model(), options, target, views, out, context)
         encoded = encode_file(
-            scene, output, options, target=target, views=around, overrides=overrides, importance=importance,
+            scene, output, options, target=target, views=view_set, overrides=overrides, importance=importance,
             source_index=source_index, levels=level_count, format=read_as, context=context,
         )  # fmt: skip
         _publish(encoded, source, output, out, up=up)

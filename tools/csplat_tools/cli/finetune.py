@@ -20,7 +20,7 @@ def finetune(
     source: Annotated[str, typer.Argument(metavar="IN.ply", help="A trained 3DGS scene.")],
     output: Annotated[str, typer.Argument(metavar="OUT.csplat", help="The file to write.")],
     data: shared.Data = None,
-    itself: Annotated[bool, typer.Option("--self", help="Tune to the scene's own renders.")] = False,
+    own_renders: Annotated[bool, typer.Option("--self", help="Tune to the scene's own renders.")] = False,
     preset: shared.Preset = "balanced",
     keep: shared.Keep = None,
     target_size: shared.TargetSize = None,
@@ -47,7 +47,7 @@ def finetune(
 
     --data or --self is required: values are tuned through the encoder's
     quantisers until renders of the file match the images, or the renders of
-    the scene itself. Targets choose the number of splats and lambda. Requires
+    the scene own_renders. Targets choose the number of splats and lambda. Requires
     the render extra.
 
     Examples:
@@ -58,9 +58,9 @@ def finetune(
     """
     out = Output(force, report, as_json, quiet)
     views = shared.ViewOptions(cameras, data, background)
-    if data is None and not itself:
+    if data is None and not own_renders:
         raise typer.BadParameter("expected --data or --self")
-    shared.refuse_together({"--data": data, "--self": itself})
+    shared.refuse_together({"--data": data, "--self": own_renders})
     by_psnr = {"--target-psnr": target_psnr}
     shared.refuse_together({**by_psnr, "--target-size": target_size, "--keep": keep})
     shared.refuse_together(by_psnr, {"--checkpoint": checkpoint, "--resume": resume})
@@ -73,9 +73,9 @@ def finetune(
     from csplat_trainer.training_options import Outputs
     from csplat_trainer.tuning.tuning_options import FinetuneOptions
 
-    cost = tuning.RATE_WEIGHT[itself] if byte_cost is None else byte_cost
+    cost = tuning.RATE_WEIGHT[own_renders] if byte_cost is None else byte_cost
     options = shared.checked(FinetuneOptions, iterations=iterations, byte_cost=cost).scaled(
-        tuning.LEARNING_FACTOR[itself]
+        tuning.LEARNING_FACTOR[own_renders]
     )
     encoding = EncodeOptions(preset, shape_codebook_size=tuning.SHAPE_ENTRIES)
     replaces = shared.is_same_file(checkpoint, resume)  # a run may replace the checkpoint that it goes on from
@@ -90,11 +90,11 @@ def finetune(
         scene = read_source(source, MetadataOverrides(), sh_degree=read_degree(encoding))
         out.print_findings(scene.findings)
         model = scene.model()
-        kept_back = tuning.default_validation_count(tuning.VIEWS, cameras=cameras, data=data)
-        around = views.find(model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=kept_back)
-        around.read_images()
+        validation_count = tuning.default_validation_count(tuning.VIEWS, cameras=cameras, data=data)
+        view_set = views.find(model, out, count=tuning.VIEWS, size=tuning.VIEW_SIZE, validation_count=validation_count)
+        view_set.read_images()
         result = tuning.run_finetuning(
-            model, around, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
+            model, view_set, output, encoding, options, Outputs(checkpoint, shared.CHECKPOINT_EVERY, resume=resume),
             target=target, source_index=source_index, page=page,
             context=Context(progress=progress), quiet=out.quiet,
         )  # fmt: skip

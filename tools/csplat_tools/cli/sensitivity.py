@@ -53,14 +53,14 @@ def sensitivity(
         model = read.model()
         are_virtual = data is None and cameras is None
         prepare_renderer(quiet=out.quiet, simplify=are_virtual)
-        around = views.find(
+        view_set = views.find(
             model, out, count=None if cameras is None else 0, validation_count=None if data is None else 0
         )
         out.announce_time(
-            lambda: _PASSES * total_render_seconds(model, around.training or around.test),
+            lambda: _PASSES * total_render_seconds(model, view_set.training or view_set.test),
             "--cameras with fewer or smaller views takes less",
         )
-        measured = measure_scene(model, around, context=Context(progress=progress))
+        measured = measure_scene(model, view_set, context=Context(progress=progress))
     measured.write(output)
     scores = measured.as_json()
     out.remark(*format_sensitivity(scores))

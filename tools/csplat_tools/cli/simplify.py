@@ -68,15 +68,15 @@ def simplify(
         out.print_findings(read.findings)
         model = overrides.apply_to_model(read.model())
         prepare_renderer(quiet=out.quiet, simplify=True)
-        around = views.find(model, out)
+        view_set = views.find(model, out)
         passes = _PASSES[keep is None] * (0.5 + 0.5 * options.work)
         size = options.views_and_size(len(model))[1]
         out.announce_time(
-            lambda: passes * total_render_seconds(model, shrink_cameras(around.training, size)),
+            lambda: passes * total_render_seconds(model, shrink_cameras(view_set.training, size)),
             "--effort 1 takes less",
         )
         context = Context(progress=progress)
-        result = csplat_tools.simplify(model, target, views=around, options=options, context=context)
+        result = csplat_tools.simplify(model, target, views=view_set, options=options, context=context)
     write_model(output, result.model, absolute=False)
     out.remark(*result.notes, *format_simplification(result.report))
     out.publish(result.report)

@@ -61,18 +61,18 @@ def tradeoff(
         read, context = read_source(source), Context(progress=progress)
         out.print_findings(read.findings)
         prepare_renderer(quiet=out.quiet, simplify=bool(searches), ssim=True)
-        around = views.find(read.model(), out)
+        view_set = views.find(read.model(), out)
         if len(read.model()):
             out.announce_time(
                 lambda: sum(
-                    expected_search_seconds(read.model(), *search, around, context=context) for search in searches
+                    expected_search_seconds(read.model(), *search, view_set, context=context) for search in searches
                 ),
                 "--what presets,precision takes less",
             )
         words = [*(["--cameras", cameras] if cameras else []), *(["--data", data] if data else [])]
         words += ["--trust-paths"] if TRUSTS_PATHS.get() else []
         measured = csplat_tools.tradeoff(
-            read, grid, views=around, path=source, view_words=words, say=None if out.quiet else note,
+            read, grid, views=view_set, path=source, view_words=words, say=None if out.quiet else note,
             context=context,
         )  # fmt: skip
         if page is not None:
