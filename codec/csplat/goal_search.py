@@ -6,6 +6,7 @@ most the goal. Callers make and measure something for each value, and take logar
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 
@@ -46,19 +47,19 @@ def next_value(
         The value; `None` if a result is within the tolerance, or if no value is left to try.
     """
     met = max((result for _, result in measured if result <= goal), default=-math.inf)
-    if met >= goal - tolerance or (tries is not None and len(measured) >= tries):
+    is_near = math.isfinite(met) and met >= goal - tolerance
+    if is_near or (tries is not None and len(measured) >= tries):
         return None
     expected, aim, (low, high) = _function(model), max(goal - margin, 0.5 * (met + goal)), bounds
     if measured:
-        value, result = _nearest(goal, measured)
-        others = [pair for pair in measured if abs(pair[0] - value) >= least_step]
-        across = [pair for pair in others if (pair[1] <= goal) != (result <= goal)]
-        low, high, factor = max(low, value - largest_step), min(high, value + largest_step), 1.0
-        if others:
-            other, its_result = _nearest(goal, across or others)
+        first, second, is_bracket = _pair(goal, measured, least_step)
+        (value, result), factor = first, 1.0
+        low, high = max(low, value - largest_step), min(high, value + largest_step)
+        if second is not None:
+            other, its_result = second
             change, edge = expected(other) - expected(value), _EDGE * abs(other - value)
             factor = (its_result - result) / change if change else 1.0
-            if across and factor > 0.0:
+            if is_bracket and factor > 0.0:
                 low, high = max(low, min(value, other) + edge), min(high, max(value, other) - edge)
             else:
                 factor = min(max(factor, _SLOPES[0]), _SLOPES[1])
@@ -75,8 +76,21 @@ def _function(model: float | Callable[[float], float]) -> Callable[[float], floa
     return model if callable(model) else lambda value: model * value
 
 
-def _nearest(goal: float, measured: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    return min(measured, key=lambda pair: abs(pair[1] - goal))
+def _pair(
+    goal: float, measured: Sequence[tuple[float, float]], least_step: float
+) -> tuple[tuple[float, float], tuple[float, float] | None, bool]:
+    """Return the two pairs that determine the model, the nearest to the goal first, and True if they enclose the goal.
+
+    Of all such pairs, their values are the nearest to each other.
+    """
+    by_result = sorted(measured, key=lambda pair: abs(pair[1] - goal))
+    met, missed = ([pair for pair in by_result if (pair[1] <= goal) == is_met] for is_met in (True, False))
+    if met and missed:
+        ends = min(itertools.product(met, missed), key=lambda pairs: abs(pairs[0][0] - pairs[1][0]))
+        first, second = sorted(ends, key=lambda pair: abs(pair[1] - goal))
+        return first, second, True
+    first = by_result[0]
+    return first, next((pair for pair in by_result if abs(pair[0] - first[0]) >= least_step), None), False
 
 
 def _inverse(expected: Callable[[float], float], result: float, low: float, high: float) -> float:

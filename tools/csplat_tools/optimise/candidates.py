@@ -22,7 +22,7 @@ from csplat.encoder import (
     encode_tiles,
 )
 from csplat.model import SplatModel
-from csplat.types import F64, Progress, null_progress
+from csplat.types import Progress, null_progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 
@@ -156,9 +156,8 @@ class Candidate:
         is_draft: the refit through the quantisers was skipped.
         options: options of the encoder.
         coded, result: the encoder's tiles, and its result.
-        error: mean squared error on the validation views, by which candidates are compared.
-        goal_error: mean squared error on the views of the goal; `None` until it is measured.
-        test_errors: [V] mean squared error by test view; `None` until it is measured.
+        error: mean squared error on the validation views, against renders of the source.
+        image_error: mean squared error against the validation images; `None` until it is measured.
         test_psnr: PSNR on the test views, pooled, dB; `None` until it is measured.
     """
 
@@ -170,8 +169,7 @@ class Candidate:
     coded: EncodedTiles = field(repr=False)
     result: EncodeResult = field(repr=False)
     error: float
-    goal_error: float | None = None
-    test_errors: F64 | None = field(default=None, repr=False)
+    image_error: float | None = None
     test_psnr: float | None = None
 
     def with_levels(self, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
@@ -181,7 +179,7 @@ class Candidate:
         if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
             encoded = replace(encoded, errors=coded.errors)
         result = encoded.write({**entries, "levels": levels.settings(len(coded.plan.model))})
-        return replace(self, coded=encoded, result=result, test_errors=None, test_psnr=None)
+        return replace(self, coded=encoded, result=result, test_psnr=None)
 
     @property
     def size_bytes(self) -> int:
