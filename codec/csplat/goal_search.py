@@ -57,13 +57,15 @@ def next_value(
         low, high = max(low, value - largest_step), min(high, value + largest_step)
         if second is not None:
             other, its_result = second
-            change, edge = expected(other) - expected(value), _EDGE * abs(other - value)
+            change, edge = expected(other) - expected(value), max(_EDGE * abs(other - value), least_step)
             factor = (its_result - result) / change if change else 1.0
             if is_bracket and factor > 0.0:
                 low, high = max(low, min(value, other) + edge), min(high, max(value, other) - edge)
             else:
                 factor = min(max(factor, _SLOPES[0]), _SLOPES[1])
         aim = expected(value) + (aim - result) / factor
+    if low > high:
+        return None
     proposed = _inverse(expected, aim, low, high)
     while any(abs(proposed - value) < least_step for value, _ in measured):
         if math.isfinite(met):

@@ -172,15 +172,6 @@ class Candidate:
     image_error: float | None = None
     test_psnr: float | None = None
 
-    def with_levels(self, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
-        """Return the same splats in a file with levels of detail, which is not measured in the test views yet."""
-        coded, entries = self.coded, self.subset.metadata(self.validation_psnr) or {}
-        encoded = levels.encode_plan(coded.plan, coded.codebooks, progress or null_progress)
-        if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
-            encoded = replace(encoded, errors=coded.errors)
-        result = encoded.write({**entries, "levels": levels.settings(len(coded.plan.model))})
-        return replace(self, coded=encoded, result=result, test_psnr=None)
-
     @property
     def size_bytes(self) -> int:
         """Size of the file."""
@@ -261,6 +252,19 @@ class CandidatePool:
         self.made.append(Candidate(subset, coding, quality, draft, options, coded, result, error))
         report(stage, 1.0)
         return self.made[-1]
+
+    def with_levels(self, one: Candidate, levels: FittedLevelBuilder) -> Candidate:
+        """Return the splats of a candidate in a file with levels of detail.
+
+        Its tiles differ from the tiles that the splats were refitted for, so its error is larger.
+        """
+        coded, entries = one.coded, {"levels": levels.settings(len(one.coded.plan.model))}
+        encoded = levels.encode_plan(coded.plan, coded.codebooks, self.progress or null_progress)
+        if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
+            encoded = replace(encoded, errors=coded.errors)
+        error = self.error(self.validation_scorer, encoded.write(entries).data)
+        result = encoded.write({**(one.subset.metadata(psnr_of_mse(error)) or {}), **entries})
+        return replace(one, coded=encoded, result=result, error=error, image_error=None, test_psnr=None)
 
     def error(self, scorer: Scorer, data: bytes) -> float:
         """Return the mean squared error of a file in some views."""

@@ -90,6 +90,7 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 # Distances, and the worth of another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
+_LEAST_LEFT = 0.01  # least factor of a goal that is left for the file without levels
 _TOLERANCE = 1.1  # factor by which pruning may take more of the error than it should, before it takes too much
 _SECONDS_PER_PERCENT = 10.0  # CPU seconds that a percent of the bytes is worth at the default effort
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
@@ -183,6 +184,43 @@ class TargetSearch:
         if not met:
             raise InputError(self._out_of_reach())
         return min(met, key=lambda candidate: candidate.size_bytes if self.goal.size_bytes is None else candidate.error)
+
+    def best_with_levels(self, levels: FittedLevelBuilder) -> Candidate:
+        """Return the best file with levels of detail, whose bytes count for a size.
+
+        Bytes and error of the whole file are only known once the levels are built for the splats of a file. So the goal
+        of the file without levels is predicted, and corrected by what the whole file has.
+
+        Raises:
+            InputError: no file meets the goal.
+        """
+        goal, made = self.goal, list[tuple[float, Candidate]]()  # with the log of the factor of the goal
+        is_size, near = goal.size_bytes is not None, _WORTH / self._bytes_per_db * self._log_result_per_db
+        while True:
+            log_factor = next_value(
+                0.0, [(before, self._log_result(file)) for before, file in made],
+                lambda before: before - is_size * math.log(_LEVEL_0), bounds=(math.log(_LEAST_LEFT), 0.0),
+                margin=0.5 * near * bool(made), tolerance=near, tries=_ROUNDS,
+            )  # fmt: skip
+            if log_factor is None:
+                break
+            factor = math.exp(log_factor)
+            error = goal.source_error + factor * (goal.error - goal.source_error)
+            size_bytes = None if goal.size_bytes is None else max(1, int(factor * goal.size_bytes))
+            without = replace(self, goal=replace(goal, size_bytes=size_bytes, error=error))
+            file = self.pool.with_levels(without.best(), levels)
+            self._score(file)
+            made.append((log_factor, file))
+        met = [file for _, file in made if self._is_met(file)]
+        if met:
+            return min(met, key=lambda file: file.error if is_size else file.size_bytes)
+        if is_size:
+            smallest = min(file.size_bytes for _, file in made)
+            raise InputError(
+                f"no file with levels of detail has at most {goal.size_bytes} bytes; the smallest has {smallest}"
+            )
+        best = max(file.validation_psnr for _, file in made)
+        raise InputError(f"no file with levels of detail reaches the target; the best has {best:.2f} dB")
 
     def finest(self) -> Candidate | None:
         """Return the file of all splats at the finest precision if it meets the target size, otherwise `None`.
@@ -656,7 +694,7 @@ def search_target(
         chosen = finest
     elif pruner is not None and target.keep is not None:
         chosen = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
-        chosen = chosen if levels is None else chosen.with_levels(levels, progress)
+        chosen = chosen if levels is None else pool.with_levels(chosen, levels)
     else:
         if pruner is None:
             measured, sensitivity_views = complete_importance(
@@ -664,7 +702,7 @@ def search_target(
             )
             whole = replace(whole, measured=measured)
         search = TargetSearch(goal, pool, whole, pruner, options.work)
-        chosen = search.best() if levels is None else _best_with_levels(search, levels, progress)
+        chosen = search.best() if levels is None else search.best_with_levels(levels)
     remarks = [_INSIDE_REMARK] * (inside and chosen.splats < len(source))
     if finest is not None:
         remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
@@ -677,36 +715,6 @@ def search_target(
         reached={name: chosen.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
     return chosen, report
-
-
-def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder, progress: Progress | None) -> Candidate:
-    """Return the best file with levels of detail, whose bytes count for a size.
-
-    Their bytes are only known once they are built for the splats of a file. So the size that is left for level 0 is
-    predicted, and corrected by the size of the file.
-
-    Raises:
-        InputError: no file meets the goal.
-    """
-    size_bytes = search.goal.size_bytes
-    if size_bytes is None:
-        return search.best().with_levels(levels, progress)
-    goal, made = math.log(size_bytes), list[tuple[float, Candidate]]()
-    while True:
-        left = next_value(
-            goal, [(before, math.log(file.size_bytes)) for before, file in made],
-            lambda before: before - math.log(_LEVEL_0), bounds=(0.0, goal), margin=0.5 * _WORTH, tolerance=_WORTH,
-            tries=_ROUNDS,
-        )  # fmt: skip
-        if left is None:
-            break
-        one = replace(search, goal=replace(search.goal, size_bytes=max(1, int(math.exp(left)))))
-        made.append((left, one.best().with_levels(levels, progress)))
-    fitting = [file for _, file in made if file.size_bytes <= size_bytes]
-    if not fitting:
-        smallest = min(file.size_bytes for _, file in made)
-        raise InputError(f"no file with levels of detail has at most {size_bytes} bytes; the smallest has {smallest}")
-    return min(fitting, key=lambda file: file.error)
 
 
 def expected_renders(encoding: EncodeOptions, target: Target) -> float:

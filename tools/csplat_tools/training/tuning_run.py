@@ -371,8 +371,8 @@ class Tuner:
         def search(most: float) -> float:
             while True:
                 quality = next_value(
-                    math.log(most), measured, _LOG_BYTES_PER_DB, bounds=_PRECISIONS, tolerance=_PRECISE,
-                    least_step=_PRECISE / _LOG_BYTES_PER_DB,
+                    math.log(most), measured, _LOG_BYTES_PER_DB, bounds=_PRECISIONS, margin=0.5 * _PRECISE,
+                    tolerance=_PRECISE, least_step=0.5 * _PRECISE / _LOG_BYTES_PER_DB,
                 )  # fmt: skip
                 if quality is None:
                     break
