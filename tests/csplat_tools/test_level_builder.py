@@ -41,6 +41,7 @@ from csplat_tools.encode_file import encode_file
 from csplat_tools.level_builder import FittedLevelBuilder, choose_levels, kd_groups
 from csplat_tools.level_merging import merge_neighbours
 from csplat_tools.scene_files import load_scene
+from csplat_tools.views import find_view_set
 
 pytestmark = pytest.mark.usefixtures("little_level_work")
 
@@ -451,6 +452,10 @@ def test_a_size_counts_all_levels_and_other_targets_have_them(sample_path, tmp_p
         assert_valid(out.read_bytes())
         assert [count, count // 4] == counts_by_level(out, (0, 1))
         assert encoded.result.report.options["levels"]["count"] == 1
+    sharp = csplat.encode_with_report(model, levels=FittedLevelBuilder(1), target=csplat.Target(psnr=28.0, effort=1))
+    found = find_view_set(model).validation_scorer(model).psnr(decode(sharp.data))
+    assert 28.0 <= found == pytest.approx(sharp.report.search.validation_psnr, abs=1e-4)  # although tiles differ
+    assert sharp.report.search.splats < 1200
     target = csplat.Target(max_error={"means": 0.01})
     bounded = csplat.encode_with_report(model, levels=FittedLevelBuilder(1), target=target)
     assert bounded.report.search.size_bytes == len(bounded.data)

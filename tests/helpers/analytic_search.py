@@ -210,7 +210,7 @@ def search(
     pool = CandidatePool(options or EncodeOptions(), _Judge(scene, DECIDING), decode=lambda data: data)
     removal = None if no_prune else analytic_removal(scene, grades=grades)
     whole = _Splats(scene, model, refits=False, classifiable=grades, file_seconds=scene.file_seconds)
-    goal, work = Goal.of(asked, model, judge, photographs), SimplifyOptions(effort=effort).work
+    goal, work = Goal.of(asked, model, photographs), SimplifyOptions(effort=effort).work
     try:
         best = TargetSearch(goal, pool, whole, removal, work).best()
     finally:

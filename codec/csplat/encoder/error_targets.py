@@ -17,12 +17,14 @@ from csplat.encoder.pipeline import EncodeResult, encode_tiles
 from csplat.encoder.splat_importance import Importance
 from csplat.encoder.target import SearchReport, Target
 from csplat.errors import InputError
+from csplat.goal_search import next_value
 from csplat.model import SplatModel
 
-_TRIES = 12  # largest number of files
-_NEAR = 0.9  # fraction of a bound; a coarser step is tried if the error is below
-_AIM = 0.97  # fraction of a bound that a new step aims at
-_FASTEST = 8.0  # largest factor from one step to the next
+_TRIES = 8  # largest number of steps of a measure
+_COARSENESS = (-20.0, 20.0)  # range of the logarithm of the factor by which steps may differ from the first
+# Logarithms of an error relative to its bound: what new steps aim at, and errors that are near enough.
+_MARGIN, _TOLERANCE = 0.03, 0.1
+_LARGEST_STEP, _LEAST_STEP = 2.0, 0.02  # logarithm of the factor from one step to the next
 _KNOBS = {
     "means": ("position_error", "position_step", "position_bits"),
     "covariance": ("scale_step", "quat_levels", "shape_codebook_size"),
@@ -56,29 +58,35 @@ def meet_bounds(
     Raises:
         InputError: `encoding` sets a step that a bound determines, or no step is fine enough.
     """
-    start, bounds = time.perf_counter(), target.max_error
-    options = _first_options(source, encoding, bounds)
+    start, bounds, files = time.perf_counter(), target.max_error, dict[EncodeOptions, EncodeResult]()
+    # By family of measures: log of the bounds that steps are chosen for, relative to `bounds`; and for each such value
+    # the log of the largest error relative to its bound.
+    coarseness = {_family(name): 0.0 for name in bounds}
+    measured = {family: dict[float, float]() for family in coarseness}
     best: tuple[EncodeResult, EncodeOptions] | None = None
-    files = 0
     while True:
-        files += 1
-        plan = EncodePlan.of(source, options, importance=importance, context=context)
-        result = encode_tiles(plan).write()
-        ratios = {name: result.largest_error(name) / bounds[name] for name in bounds}
-        if all(ratio <= 1.0 for ratio in ratios.values()):
-            if best is None or result.size_bytes < best[0].size_bytes:
-                best = result, options
-            changed = _scaled_options(options, {name: ratio for name, ratio in ratios.items() if 0.0 < ratio < _NEAR})
-            if changed == options or files > _TRIES // 2:
-                break
-        else:
-            wrong = {name: ratio for name, ratio in ratios.items() if ratio > 1.0}
-            if best is not None:
-                break  # the last step was too coarse
-            changed = _scaled_options(options, wrong)
-            if changed == options or files == _TRIES:
-                break
-        options = changed
+        options = _options_for(
+            source, encoding, {name: bound * math.exp(coarseness[_family(name)]) for name, bound in bounds.items()}
+        )
+        if options not in files:
+            plan = EncodePlan.of(source, options, importance=importance, context=context)
+            files[options] = encode_tiles(plan).write()
+        result, before = files[options], dict(coarseness)
+        ratios = {name: result.largest_error(name) / bound for name, bound in bounds.items()}
+        if max(ratios.values()) <= 1.0 and (best is None or result.size_bytes < best[0].size_bytes):
+            best = result, options
+        for family, excesses in measured.items():
+            ratio = max(ratio for name, ratio in ratios.items() if _family(name) == family)
+            excess = math.log(ratio or 1.0)  # without an error, steps need not be coarser
+            excesses[coarseness[family]] = max(excess, excesses.get(coarseness[family], excess))
+            proposed = next_value(
+                0.0, list(excesses.items()), 1.0, bounds=_COARSENESS, margin=_MARGIN, tolerance=_TOLERANCE,
+                largest_step=_LARGEST_STEP, least_step=_LEAST_STEP, tries=_TRIES,
+            )  # fmt: skip
+            met = [value for value, excess in excesses.items() if excess <= 0.0]
+            coarseness[family] = max(met, default=coarseness[family]) if proposed is None else proposed
+        if coarseness == before:
+            break
     if best is None:
         worst = max(ratios, key=lambda name: ratios[name])
         raise InputError(
@@ -91,15 +99,15 @@ def meet_bounds(
         size_bytes=result.size_bytes,
         splats=result.report.splat_count,
         splats_before=len(source),
-        encodes=files,
+        encodes=len(files),
         seconds=round(time.perf_counter() - start, 3),
         reached={name: result.largest_error(name) for name in bounds},
     )
     return result.with_search(search), options
 
 
-def _first_options(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:
-    """Return the options with first guesses for the steps of the bounded measures."""
+def _options_for(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[str, float]) -> EncodeOptions:
+    """Return the options with steps that should keep the errors within bounds."""
     chosen: dict[str, Any] = {}
     for name, bound in bounds.items():
         knobs = _KNOBS[_family(name)]
@@ -114,7 +122,7 @@ def _first_options(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[
             chosen["scale_step"] = _clip_step(0.4 * bound)
             chosen["quat_levels"] = _clip_levels(4.0 / bound, 8, 32767)
         else:
-            step = _clip_step(_AIM * bound)
+            step = _clip_step(math.exp(-_MARGIN) * bound)
             chosen[_KNOBS[_family(name)][0]] = min(step, chosen.get(_KNOBS[_family(name)][0], step))
     if any(_family(name) == "sh" for name in bounds) and source.sh_degree:
         if encoding.sh_coding == "none":
@@ -130,37 +138,9 @@ def _first_options(source: SplatModel, encoding: EncodeOptions, bounds: Mapping[
     return replace(encoding, **chosen)
 
 
-def _scaled_options(options: EncodeOptions, ratios: Mapping[str, float]) -> EncodeOptions:
-    """Return the options with steps divided by the ratios of errors to bounds."""
-    chosen: dict[str, Any] = {}
-    for name, ratio in ratios.items():
-        factor = min(max(_AIM / max(ratio, 1e-9), 1.0 / _FASTEST), _FASTEST)
-        if name == "means":
-            chosen["position_error"] = (options.position_error or 1.0) * factor
-        elif name == "opacities":
-            levels = _scaled_levels(options.opacity_levels, factor)
-            chosen["opacity_levels"] = _clip_levels(levels, 1, 65535)
-        elif name == "covariance":
-            chosen["scale_step"] = _clip_step((options.scale_step or 1.0) * factor)
-            chosen["quat_levels"] = _clip_levels(_scaled_levels(options.quat_levels, factor), 8, 32767)
-        else:
-            knob = _KNOBS[_family(name)][0]
-            before = getattr(options, knob)
-            step = _clip_step(before * factor)
-            chosen[knob] = min(step, chosen.get(knob, step))
-    return replace(options, **chosen)
-
-
 def _clip_step(wanted: float) -> float:
     """Return the nearest step that the encoder accepts."""
     return min(max(wanted, 1e-6), 1e3)
-
-
-def _scaled_levels(levels: int | None, factor: float) -> int:
-    """Return the number of levels for steps that are coarser by `factor`."""
-    count = levels or 1
-    scaled = math.ceil(count / factor) if factor < 1.0 else math.floor(count / factor)
-    return scaled if scaled != count else count + (1 if factor < 1.0 else 0)
 
 
 def _family(name: str) -> str:

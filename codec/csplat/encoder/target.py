@@ -31,14 +31,12 @@ class Target:
     """The target of a file: one of the first four fields, or largest errors alone or together with a PSNR or a size.
 
     A PSNR is computed from the squared error of renders clipped to 0..1, pooled over views, pixels and channels. It is
-    at most 99 dB. Targets differ in the views and in the reference that renders are compared with:
+    at most 99 dB. Targets are met on validation views; test views are only reported. Renders are compared with:
 
-    | target | of | views | reference |
-    |---|---|---|---|
-    | `psnr` | `encode` | test views | renders of the source |
-    | `psnr` | `simplify` | validation views | renders of the source |
-    | `psnr` | `finetune`, `train` | validation views | images; without images, renders of the source |
-    | `max_psnr_drop` | `encode`, `simplify` | validation views | images |
+    | target | reference |
+    |---|---|
+    | `psnr` | renders of the source; images, if there are any, for `finetune` and `train` |
+    | `max_psnr_drop` | images |
 
     Attributes:
         psnr: least PSNR, dB, at most 99; the search finds the smallest such file, or the fewest splats.
@@ -156,6 +154,7 @@ class SearchReport:
         reached: largest errors of the file by measure, for bounded measures.
         psnr: PSNR of the file on the test views against renders of the source, dB; `None`, like the following fields,
             if nothing was rendered.
+        validation_psnr: PSNR of the file on the validation views against renders of the source, dB.
         images: PSNR of `file` and `source` against the test images, if any.
         worst_psnr: PSNR of the worst view, dB.
         spread: standard deviation of the PSNR over other choices of such views, dB.
@@ -176,6 +175,7 @@ class SearchReport:
     seconds: float
     reached: dict[str, float] = field(default_factory=dict)
     psnr: float | None = None
+    validation_psnr: float | None = None
     images: dict[str, float] = field(default_factory=dict)
     worst_psnr: float | None = None
     spread: float | None = None

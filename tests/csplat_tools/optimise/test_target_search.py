@@ -46,7 +46,7 @@ def test_a_psnr_is_reached_by_nearly_the_smallest_file(goal):
     def check(case):
         name, no_prune = case
         found = found_in(name, no_prune=no_prune, psnr=goal)
-        assert goal <= found.file.psnr() <= goal + 0.25 + SCENES[name].jump
+        assert goal <= found.file.psnr() <= goal + 0.3 + SCENES[name].jump
         assert len(found.file) <= LARGER * SCENES[name].smallest(goal, no_prune=no_prune)
         packed = [file for file in found.scored if file.contents.options.deflate_level is None]
         assert len(found.file) == min(len(file) for file in packed if file.psnr() >= goal)
@@ -171,29 +171,17 @@ def test_a_size_prunes_splats_if_that_raises_the_psnr_or_all_exceed_it():
     assert found.file.contents.splats < 4000
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("judging", [Views(1.5), Views(-1.5), Views(0.5, 2.0), Views(-0.5, -2.0)])
-def test_a_psnr_is_reached_if_test_and_validation_views_differ(judging):
-    def check(case):
-        name, no_prune = case
-        found = search(SCENES[name], psnr=38.0, judging=judging, no_prune=no_prune)
-        assert 38.0 <= found.file.psnr(judging) <= 38.4
-        assert len(found.file) <= LARGER * SCENES[name].smallest(38.0, judging, no_prune=no_prune)
-
-    assert [] == failures(each(("plain", "no splat to spare", "useless codebooks")), check)
-
-
-def test_test_views_with_larger_errors_cost_no_more_candidates_and_a_low_effort_fewer():
-    found = search(PLAIN, psnr=38.0, judging=Views(8.0), no_prune=True)
-    assert 38.0 <= found.file.psnr(Views(8.0)) <= 38.2
-    assert len(found.tried) <= 14
+def test_a_low_effort_tries_fewer_candidates():
     brief = search(PLAIN, psnr=38.0, effort=1)
     assert len(brief.tried) < len(found_in("plain", no_prune=False, psnr=38.0).tried)
     assert 38.0 <= brief.file.psnr() <= 38.4
 
 
-@pytest.mark.parametrize("goal", [{"size": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}])
-def test_test_views_do_not_choose_the_file_of_a_size_or_drop(goal):
+@pytest.mark.parametrize(
+    "goal", [{"psnr": 38.0}, {"size": 90_000}, {"max_psnr_drop": 0.5, "photo_psnr": 25.0}],
+    ids=["PSNR", "size", "drop"],
+)  # fmt: skip
+def test_test_views_choose_nothing(goal):
     one, other = (search(PLAIN, judging=judging, **goal) for judging in (Views(), Views(3.0, 5.0)))
     assert one.file.contents == other.file.contents
     assert one.report.psnr > other.report.psnr

@@ -326,7 +326,7 @@ def test_what_a_tuning_adds_to_the_error_of_its_draft_is_allowed_for(stub_tuner,
 def test_a_tuned_file_that_is_too_large_is_tuned_from_a_smaller_draft(stub_tuner):
     stub_tuner.overrun = 1.1
     assert 8_500 <= stub_tuner.tune_to(csplat.Target(size=10_000)).size_bytes <= 10_000
-    assert [10_000, 8_016] == [goal.size_bytes for goal in stub_tuner.goals]
+    assert [10_000, 8_700] == [goal.size_bytes for goal in stub_tuner.goals]
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from csplat.encoder import (
     encode_tiles,
 )
 from csplat.model import SplatModel
-from csplat.types import F64, Progress, null_progress
+from csplat.types import Progress, null_progress
 from csplat_render.metrics import psnr_of_mse
 from csplat_render.scorer import Scorer
 
@@ -156,9 +156,8 @@ class Candidate:
         is_draft: the refit through the quantisers was skipped.
         options: options of the encoder.
         coded, result: the encoder's tiles, and its result.
-        error: mean squared error on the validation views, by which candidates are compared.
-        goal_error: mean squared error on the views of the goal; `None` until it is measured.
-        test_errors: [V] mean squared error by test view; `None` until it is measured.
+        error: mean squared error on the validation views, against renders of the source.
+        image_error: mean squared error against the validation images; `None` until it is measured.
         test_psnr: PSNR on the test views, pooled, dB; `None` until it is measured.
     """
 
@@ -170,18 +169,8 @@ class Candidate:
     coded: EncodedTiles = field(repr=False)
     result: EncodeResult = field(repr=False)
     error: float
-    goal_error: float | None = None
-    test_errors: F64 | None = field(default=None, repr=False)
+    image_error: float | None = None
     test_psnr: float | None = None
-
-    def with_levels(self, levels: FittedLevelBuilder) -> Candidate:
-        """Return the same splats in a file with levels of detail, which is not measured in the test views yet."""
-        coded, entries = self.coded, self.subset.metadata(self.validation_psnr) or {}
-        encoded = levels.encode_plan(coded.plan, coded.codebooks)
-        if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
-            encoded = replace(encoded, errors=coded.errors)
-        result = encoded.write({**entries, "levels": levels.settings(len(coded.plan.model))})
-        return replace(self, coded=encoded, result=result, test_errors=None, test_psnr=None)
 
     @property
     def size_bytes(self) -> int:
@@ -263,6 +252,19 @@ class CandidatePool:
         self.made.append(Candidate(subset, coding, quality, draft, options, coded, result, error))
         report(stage, 1.0)
         return self.made[-1]
+
+    def with_levels(self, one: Candidate, levels: FittedLevelBuilder) -> Candidate:
+        """Return the splats of a candidate in a file with levels of detail.
+
+        Its tiles differ from the tiles that the splats were refitted for, so its error is larger.
+        """
+        coded, entries = one.coded, {"levels": levels.settings(len(one.coded.plan.model))}
+        encoded = levels.encode_plan(coded.plan, coded.codebooks)
+        if coded.plan.origin.refitted:  # errors refer to the source, not to the splats of the plan
+            encoded = replace(encoded, errors=coded.errors)
+        error = self.error(self.validation_scorer, encoded.write(entries).data)
+        result = encoded.write({**(one.subset.metadata(psnr_of_mse(error)) or {}), **entries})
+        return replace(one, coded=encoded, result=result, error=error, image_error=None, test_psnr=None)
 
     def error(self, scorer: Scorer, data: bytes) -> float:
         """Return the mean squared error of a file in some views."""

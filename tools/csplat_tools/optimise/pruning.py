@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -42,7 +41,6 @@ _STEPS = 1280  # steps of a refit; half from other values and through quantisers
 REFIT_GAIN = 8.0  # dB by which a refit typically reduces the error of pruning
 # CPU seconds of a step by pixel and splat. With 240×180 pixels and SH 3, plane3 (5,000 splats) takes 25 ms.
 _PIXEL_SECONDS, _SPLAT_SECONDS = 5e-7, 1.2e-6
-_POWERS = (0.5, 2.0)  # range of the power p if two refits show errors after ∝ (error before)^p
 
 
 @dataclass(eq=False)
@@ -117,29 +115,21 @@ class Pruner:
         later = sum(len(groups[turn % len(groups)].cameras) for turn in range(len(self.order.rounds) - 1))
         return len(self.cameras) + len(self.sufficient.check.cameras) + later
 
-    def errors(self, allowed: float, known: Mapping[int, float] | None = None) -> tuple[F64, F64]:
-        """Predict the error of pruning after a refit, in proportion to that before it until two refits show a power.
+    def errors(self, allowed: float, known: tuple[int, float] | None = None) -> tuple[F64, F64]:
+        """Predict the error of pruning after a refit, in proportion to the error before it.
 
         Args:
             allowed: mean squared error up to which errors are of interest.
-            known: mean squared error after a refit by number of splats, in the order of measurement; `None`: the usual
-                gain of a refit is assumed.
+            known: a number of splats and their mean squared error after a refit; `None`: the usual gain of a refit is
+                assumed.
 
         Returns:
             Numbers of kept splats, in decreasing order, and the mean squared error of each.
         """
-        gain, power = error_of_psnr(REFIT_GAIN), 1.0
-        measured = [(self._error(count), error) for count, error in (known or {}).items() if error > 0.0]
-        if measured:
-            before, after = measured[-1]
-            for other_before, other_after in measured[:-1]:
-                if other_before != before:
-                    power = math.log(other_after / after) / math.log(other_before / before)
-                    power = min(max(power, _POWERS[0]), _POWERS[1])
-            gain = after / before**power
-        self.order.extend(error=max((allowed / max(gain, NOTHING)) ** (1.0 / power), NOTHING))
+        gain = known[1] / self._error(known[0]) if known and known[1] > 0.0 else error_of_psnr(REFIT_GAIN)
+        self.order.extend(error=max(allowed / max(gain, NOTHING), NOTHING))
         errors = self.order.mean_errors()[: len(self.source)]  # at least one splat is kept
-        return len(self.source) - np.arange(len(errors), dtype=np.float64), gain * errors**power
+        return len(self.source) - np.arange(len(errors), dtype=np.float64), gain * errors
 
     def _error(self, kept_count: int) -> float:
         """Return the mean squared error of pruning all but this number of splats, before a refit."""

@@ -30,6 +30,9 @@ NOTHING = 1e-12
 LOG_ERROR_PER_DB = math.log(10.0) / 10.0
 
 #: dB above a PSNR that is aimed at, since PSNR varies by chance; `simplify` does not improve a result this close.
+#: Larger margins hardly help test views, whose PSNR differs in the same direction at any precision. Of 12 files of six
+#: scenes, whose PSNR equals the target in virtual validation views, 5 miss it in test views; 4 with 0.1 or 0.3 dB more,
+#: and 2 with 0.5 dB, which cost 5 % of the bytes.
 AIM = 0.1
 
 #: Distance of two precisions in dB. Nearer precisions do not determine a slope; files of half this distance differ by

@@ -28,7 +28,7 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
         percentage = 100.0 * report.size_bytes / goal["size"]
         asked.append(f"{format_bytes(goal['size'])}; the file uses {percentage:.1f} %")
     if "psnr" in goal:
-        asked.append(f"{goal['psnr']:g} dB; the file has {report.psnr:.2f} dB")
+        asked.append(f"{goal['psnr']:g} dB on the validation views; the file has {report.validation_psnr:.2f} dB")
     if "keep" in goal:
         asked.append(f"{100.0 * goal['keep']:g} % of {counted(report.splats_before, 'splat')}")
     if "max_psnr_drop" in goal:
@@ -39,7 +39,7 @@ def format_search(report: SearchReport) -> tuple[str, ...]:
         lines.append(f"test images: {file:.2f} dB, the source {source:.2f} dB")
     lines += [f"chosen: {line}" for line in report.why]
     if report.psnr is not None:
-        lines.append(f"PSNR {report.psnr:.2f} dB, {report.sure}")
+        lines.append(f"PSNR {report.psnr:.2f} dB on the test views, {report.sure}")
         lines += _format_elsewhere(report.psnr, report.elsewhere)
     cost = f"{counted(report.encodes, 'file')} tried"
     if report.renders:
@@ -84,16 +84,12 @@ def make_report(
         remarks: additional sentences for `why`.
         numbers: the other fields of `SearchReport`.
     """
-    errors = found.test_errors
-    if errors is None:
-        errors = test_scorer.errors(candidates.decode(found.result.data))
+    errors = test_scorer.errors(candidates.decode(found.result.data))
     found.test_psnr = psnr = psnr_of_mse(test_scorer.pooled(errors))
     spread = psnr_spread(errors)
     worst = min(psnr_of_mse(float(error)) for error in errors)
     many = describe_views(len(errors), views_of)
-    sure = (
-        f"measured on the file itself, in {many}, which chose nothing but the precision: the worst has {worst:.2f} dB"
-    )
+    sure = f"measured on the file itself, in {many}, which chose nothing: the worst has {worst:.2f} dB"
     if not math.isnan(spread):
         sure += f"; other such views would change the {psnr:.2f} dB by about {spread:.1f} (one standard deviation)"
     return SearchReport(
@@ -102,23 +98,25 @@ def make_report(
         splats=found.splats,
         splats_before=splats_before,
         psnr=psnr,
+        validation_psnr=found.validation_psnr,
         worst_psnr=worst,
         spread=None if math.isnan(spread) else round(spread, 3),
         views=len(errors),
         views_of=views_of,
         renders=sum(
-            len(candidates.validation_scorer.cameras) + len(errors) * (candidate.goal_error is not None)
+            len(candidates.validation_scorer.cameras) * (1 + (candidate.image_error is not None))
             for candidate in candidates.made
-        ),
+        )
+        + len(errors),
         chosen=found.as_json(),
         tried=tuple(candidate.as_json() for candidate in candidates.made),
-        why=(*_why(target, found, psnr, candidates, splats_before), *remarks),
+        why=(*_why(target, found, candidates, splats_before), *remarks),
         sure=sure,
         **numbers,
     )
 
 
-def _why(target: Target, found: Candidate, psnr: float, candidates: CandidatePool, splats_before: int) -> list[str]:
+def _why(target: Target, found: Candidate, candidates: CandidatePool, splats_before: int) -> list[str]:
     """Return sentences on the coding of SH, the alternatives, and the number of pruned splats."""
     codings = list(
         dict.fromkeys(_coding(candidate) for candidate in candidates.made if candidate.subset is found.subset)
@@ -135,7 +133,7 @@ def _why(target: Target, found: Candidate, psnr: float, candidates: CandidatePoo
     if others:
         expected = "look worse" if target.size_bytes is not None else "take more"
         lines.append(f"tried for these splats, too, and expected to {expected}: {'; '.join(others)}")
-    if target.psnr is not None and psnr > target.psnr + _NOTABLE:
+    if target.psnr is not None and found.validation_psnr > target.psnr + _NOTABLE:
         lines.append("no smaller file of those tried reaches the target")
     pruned_count = splats_before - found.splats
     if pruned_count:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,13 @@ import numpy as np
 from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.encoder import Target
 from csplat.errors import InputError
+from csplat.goal_search import next_value
 from csplat.model import SplatModel
 from csplat.types import I64
 from csplat_render.conventions import ALPHA_MIN
 from csplat_render.metrics import psnr_of_mse
 from csplat_tools.optimise.pruning import PrunedSubset, Pruner
-from csplat_tools.optimise.rate_distortion import AIM, error_of_psnr
+from csplat_tools.optimise.rate_distortion import AIM, LOG_ERROR_PER_DB, NOTHING, error_of_psnr
 from csplat_tools.optional_packages import require_renderer
 from csplat_tools.scene_files import SceneLike, load_scene
 from csplat_tools.views import VIEW_SIZE, ViewSet, default_views, find_view_set
@@ -172,23 +174,26 @@ def _fewest(pruner: Pruner, target: Target) -> tuple[PrunedSubset, dict[str, flo
     assert goal is not None
     if psnr_of_mse(source_error) < goal:
         raise InputError(f"the unpruned source is below the target of {goal:.2f} dB: lower the target")
-    allowed, known, refits = error_of_psnr(goal), dict[int, float](), dict[int, tuple[float, PrunedSubset]]()
-    for _ in range(_TRIES):
-        counts, errors = pruner.errors(allowed - source_error, known)
-        fits = counts[errors <= (allowed - source_error) * error_of_psnr(0.5 * AIM)]
-        kept_count = int(fits.min(initial=len(source)))
-        if kept_count in refits or kept_count == len(source):
+    allowed, refits, last = error_of_psnr(goal), list[tuple[float, PrunedSubset]](), None
+    most = allowed - source_error
+    while True:
+        counts, errors = (values[::-1] for values in pruner.errors(most, last))
+        kept_count = next_value(
+            math.log(most),
+            [(len(subset.rows), math.log(max(error - source_error, NOTHING))) for error, subset in refits],
+            partial(np.interp, xp=counts, fp=np.log(np.maximum(errors, NOTHING))), bounds=(counts[0], len(source)),
+            margin=0.5 * AIM * LOG_ERROR_PER_DB, tolerance=AIM * LOG_ERROR_PER_DB * allowed / most, least_step=1.0,
+            tries=_TRIES,
+        )  # fmt: skip
+        if kept_count is None or math.ceil(kept_count) == len(source):
             break
-        subset = pruner.refit(kept_count)
+        subset = pruner.refit(math.ceil(kept_count))
         error = scorer.pooled(scorer.errors(subset.model))
-        refits[kept_count], known[kept_count] = (psnr_of_mse(error), subset), max(error - source_error, 0.0)
-        if goal <= psnr_of_mse(error) <= goal + AIM:
-            break
-    reached = [refit for refit in refits.values() if refit[0] >= goal]
-    psnr, subset = min(
-        reached, key=lambda refit: len(refit[1].rows), default=(psnr_of_mse(source_error), pruner.refit(len(source)))
-    )
-    return subset, {"validation_psnr": psnr}
+        refits.append((error, subset))
+        last = len(subset.rows), max(error - source_error, 0.0)
+    reached = [refit for refit in refits if refit[0] <= allowed] or [(source_error, pruner.refit(len(source)))]
+    error, subset = min(reached, key=lambda refit: len(refit[1].rows))
+    return subset, {"validation_psnr": psnr_of_mse(error)}
 
 
 def _test_scores(pruner: Pruner, model: SplatModel) -> dict[str, Any]:

@@ -13,14 +13,15 @@ How a target is met:
    save enough for its time (`_is_worth`), it is tried as well (`_next_count`). For a PSNR or a drop, splats whose
    pruning takes too much of the error get no drafts, unless they are the last. For the final number, and for a size,
    drafts of one coding after another are made: each neighbour of the best, up to `_TRIES` codings (`_choose_coding`).
-5. Files of the best splats and coding are made, with a refit through their quantisers, and measured on the views of the
-   goal. This corrects the prediction of the precision, and ends when another file is not expected to save enough
-   (`_finish`). If no file meets the goal, larger subsets of step 4 are taken, then other numbers of splats (fewer for a
-   size). Of all files that meet it, drafts included, the smallest is written, or the best file of a size.
+5. Files of the best splats and coding are made, with a refit through their quantisers. Each corrects the prediction of
+   the precision, until another file is not expected to save enough (`_finish`). If no file meets the goal, larger
+   subsets of step 4 are taken, then other numbers of splats (fewer for a size). Of all files that meet it, drafts
+   included, the smallest is written, or the best file of a size.
 
-Drafts are compared by their error on validation views. The views of the goal, which are the test views for a PSNR,
-only tell how much error is left there (`_allowed`): they settle precision and number of splats. With all splats kept,
-steps 2 and 4 are left out, and the presets' own files are candidates unless the best has quantisation classes.
+All errors are measured on validation views; test views only score the written file. Errors are against renders of the
+source. For a drop, files are measured against the validation images, too, which tells how much error against renders
+is allowed (`_allowed`). With all splats kept, steps 2 and 4 are left out, and the presets' own files are candidates
+unless the best has quantisation classes.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -35,6 +37,7 @@ from csplat.context import Context
 from csplat.decoder import decode
 from csplat.encoder import PRESETS, EncodeOptions, SearchReport, Target
 from csplat.errors import InputError
+from csplat.goal_search import next_value
 from csplat.model import SplatModel
 from csplat.scene import drop_bands
 from csplat_render.metrics import psnr_of_mse
@@ -87,6 +90,7 @@ _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes
 # Distances, and the worth of another candidate.
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
+_LEAST_LEFT = 0.01  # least factor of a goal that is left for the file without levels
 _TOLERANCE = 1.1  # factor by which pruning may take more of the error than it should, before it takes too much
 _SECONDS_PER_PERCENT = 10.0  # CPU seconds that a percent of the bytes is worth at the default effort
 _WORTH = 0.03  # fraction of the bytes that another splat count must promise, and of the splats by which it must differ
@@ -103,40 +107,35 @@ class Goal:
     """The goal of a search.
 
     Attributes:
-        scorer: scorer on the goal's views: the test views for a PSNR, validation images for a drop.
         size_bytes: largest size of the file; `None` without a target size.
-        error: largest mean squared error on the goal's views.
-        source_error: mean squared error of the source on these views; 0 unless the goal is a drop.
+        error: largest mean squared error on the validation views: against images for a drop, else against renders of
+            the source.
+        images: scorer on the validation images; `None` unless the goal is a drop.
+        source_error: mean squared error of the source against these images; 0 without.
         max_error: largest errors of splats by measure; files that exceed any are rejected.
     """
 
-    scorer: Scorer
     size_bytes: int | None = None
     error: float = math.inf
+    images: Scorer | None = None
     source_error: float = 0.0
     max_error: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, target: Target, source: SplatModel, test_scorer: Scorer, image_scorer: Scorer | None) -> Goal:
+    def of(cls, target: Target, source: SplatModel, images: Scorer | None) -> Goal:
         """Return the goal for a target.
 
         Args:
             target: a PSNR, a size or a drop of PSNR.
             source: the scene.
-            test_scorer: scorer on the test views, against the source's renders.
-            image_scorer: scorer on the validation images; required for a drop.
+            images: scorer on the validation images; required for a drop.
         """
         if target.psnr is not None:
-            return cls(test_scorer, error=error_of_psnr(target.psnr), max_error=target.max_error)
-        if target.max_psnr_drop is None or image_scorer is None:
-            return cls(test_scorer, target.size_bytes, max_error=target.max_error)
-        error = image_scorer.pooled(image_scorer.errors(source))
-        return cls(image_scorer, error=error / error_of_psnr(target.max_psnr_drop), source_error=error)
-
-    @property
-    def is_drop(self) -> bool:
-        """True if the goal is a drop of PSNR against images."""
-        return self.source_error > 0.0
+            return cls(error=error_of_psnr(target.psnr), max_error=target.max_error)
+        if target.max_psnr_drop is None or images is None:
+            return cls(target.size_bytes, max_error=target.max_error)
+        error = images.pooled(images.errors(source))
+        return cls(error=error / error_of_psnr(target.max_psnr_drop), images=images, source_error=error)
 
 
 @dataclass(eq=False)
@@ -149,7 +148,7 @@ class TargetSearch:
         whole: all splats.
         pruner: prunes splats; `None`: all are kept.
         work: amount of work relative to the default effort.
-        _errors: mean squared error before quantisation, by subset, SH degree, and whether on the views of the goal.
+        _errors: mean squared error before quantisation, by subset and SH degree.
     """
 
     goal: Goal
@@ -157,7 +156,7 @@ class TargetSearch:
     whole: WholeScene
     pruner: Pruner | None
     work: float = 1.0
-    _errors: dict[tuple[Subset, int, bool], float] = field(default_factory=dict, init=False)
+    _errors: dict[tuple[Subset, int], float] = field(default_factory=dict, init=False)
 
     def best(self) -> Candidate:
         """Return the smallest file that meets the goal, or the best file of a size.
@@ -186,6 +185,43 @@ class TargetSearch:
             raise InputError(self._out_of_reach())
         return min(met, key=lambda candidate: candidate.size_bytes if self.goal.size_bytes is None else candidate.error)
 
+    def best_with_levels(self, levels: FittedLevelBuilder) -> Candidate:
+        """Return the best file with levels of detail, whose bytes count for a size.
+
+        Bytes and error of the whole file are only known once the levels are built for the splats of a file. So the goal
+        of the file without levels is predicted, and corrected by what the whole file has.
+
+        Raises:
+            InputError: no file meets the goal.
+        """
+        goal, made = self.goal, list[tuple[float, Candidate]]()  # with the log of the factor of the goal
+        is_size, near = goal.size_bytes is not None, _WORTH / self._bytes_per_db * self._log_result_per_db
+        while True:
+            log_factor = next_value(
+                0.0, [(before, self._log_result(file)) for before, file in made],
+                lambda before: before - is_size * math.log(_LEVEL_0), bounds=(math.log(_LEAST_LEFT), 0.0),
+                margin=0.5 * near * bool(made), tolerance=near, tries=_ROUNDS,
+            )  # fmt: skip
+            if log_factor is None:
+                break
+            factor = math.exp(log_factor)
+            error = goal.source_error + factor * (goal.error - goal.source_error)
+            size_bytes = None if goal.size_bytes is None else max(1, int(factor * goal.size_bytes))
+            without = replace(self, goal=replace(goal, size_bytes=size_bytes, error=error))
+            file = self.pool.with_levels(without.best(), levels)
+            self._score(file)
+            made.append((log_factor, file))
+        met = [file for _, file in made if self._is_met(file)]
+        if met:
+            return min(met, key=lambda file: file.error if is_size else file.size_bytes)
+        if is_size:
+            smallest = min(file.size_bytes for _, file in made)
+            raise InputError(
+                f"no file with levels of detail has at most {goal.size_bytes} bytes; the smallest has {smallest}"
+            )
+        best = max(file.validation_psnr for _, file in made)
+        raise InputError(f"no file with levels of detail reaches the target; the best has {best:.2f} dB")
+
     def finest(self) -> Candidate | None:
         """Return the file of all splats at the finest precision if it meets the target size, otherwise `None`.
 
@@ -195,14 +231,13 @@ class TargetSearch:
             InputError: the PSNR is out of reach by far.
         """
         size_bytes = self.goal.size_bytes
-        if size_bytes is None and (self.goal.is_drop or self.goal.error > error_of_psnr(_HIGH)):
+        if size_bytes is None and (self.goal.images is not None or self.goal.error > error_of_psnr(_HIGH)):
             return None
         if size_bytes is not None and size_bytes < _AMPLE * len(self.whole.model):
             return None
         candidate = self.pool.make(self.whole, self._first_codings(self.whole)[0], _FINEST, draft=False)
-        self._score(candidate)
         if size_bytes is None:
-            if (candidate.goal_error or 0.0) > self.goal.error * error_of_psnr(-_BEYOND_REACH):
+            if candidate.error > self.goal.error * error_of_psnr(-_BEYOND_REACH):
                 raise InputError(self._out_of_reach())
             return None
         return candidate if self._is_met(candidate) else None
@@ -250,8 +285,7 @@ class TargetSearch:
         """Return True if pruning took too much of the error that a PSNR allows, so that no draft is worth making."""
         if self.goal.size_bytes is not None:
             return False
-        most = _TOLERANCE * self._most_left_out
-        return self._unquantised(subset, coding, on_goal=True) > most * self._allowed_in_renders
+        return self._unquantised(subset, coding) > _TOLERANCE * self._most_left_out * self._allowed
 
     def _first_count(self, pruner: Pruner) -> int:
         """Return the number of splats to begin with."""
@@ -259,7 +293,7 @@ class TargetSearch:
         if self.goal.size_bytes is not None:
             usual = _USUAL_BYTES[self.whole.model.sh_degree > 0]
             return self._rounded(min(self.goal.size_bytes / usual, splats))
-        allowed, known, kept_count = self._allowed_in_renders, dict[int, float](), splats
+        allowed, known, kept_count = self._allowed, None, splats
         for left in reversed(range(_ROUNDS)):  # validation views show other pruning errors than training views
             counts, errors = pruner.errors(allowed, known)
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, self._most_left_out)
@@ -267,21 +301,21 @@ class TargetSearch:
             if not left or abs(kept_count - before) <= _WORTH * splats:
                 break
             pruned = self.whole.model.select(pruner.order.kept(kept_count))
-            known = {kept_count: error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)}
+            known = kept_count, error_of_psnr(REFIT_GAIN) * self._error_in(self.pool.validation_scorer, pruned)
         return kept_count
 
     def _next_count(self, pruner: Pruner, subset: Subset, coding: Coding) -> tuple[int, float]:
         """Return the best number of splats by the model, and the fraction of the bytes that it is expected to save."""
-        size_bytes, allowed, count = self.goal.size_bytes, self._allowed_in_renders, len(subset.model)
+        size_bytes, allowed, count = self.goal.size_bytes, self._allowed, len(subset.model)
         with_bands = replace(coding, sh=coding.sh if coding.sh != "none" else None, degree=None)
-        pruned = self._unquantised(subset, with_bands, on_goal=size_bytes is None)
+        pruned = self._unquantised(subset, with_bands)
         if size_bytes is None:
-            counts, errors = pruner.errors(allowed, {count: pruned})
+            counts, errors = pruner.errors(allowed, (count, pruned))
             costs = log_bytes_at_error(counts, errors, allowed, self._exponent, _TOLERANCE * self._most_left_out)
         else:
             line = self._line(subset, coding)
             quantised = line.error_at(line.quality_at_size(size_bytes))
-            counts, errors = pruner.errors(quantised, {count: pruned})
+            counts, errors = pruner.errors(quantised, (count, pruned))
             costs = log_bytes_at_size(counts / count, errors, quantised, self._exponent)
         fits = costs if size_bytes is not None else np.where(errors <= self._most_left_out * allowed, costs, np.inf)
         best = int(np.argmin(fits))
@@ -416,7 +450,7 @@ class TargetSearch:
             return codings
         while lower >= 0:
             fewer = replace(coding, degree=lower) if lower else Coding("none", degree=0, use_classes=coding.use_classes)
-            if self._unquantised(subset, fewer) > self._most_left_out * self._allowed(subset, coding):
+            if self._unquantised(subset, fewer) > self._most_left_out * self._allowed:
                 break
             codings, lower = [fewer, *codings], lower - 1
         return codings
@@ -432,33 +466,44 @@ class TargetSearch:
 
     def _finish(self, subset: Subset, coding: Coding) -> bool:
         """Make files until the goal is met and another file would hardly be smaller. Return True if it is met."""
-        best: Candidate | None = None
-        if subset.refits:
-            self._score(self._by_distance(subset, coding, draft=True)[0])
-        made, is_pruned = list[float](), len(subset.model) < len(self.whole.model)
-        safer = 1.0 if self.goal.size_bytes is None else -1.0  # finer files have less error, coarser files fewer bytes
-        for _ in range(_TRIES):
-            quality = self._predict(subset, coding)[0]
-            while any(abs(quality - earlier) < 0.5 * APART for earlier in made):
-                quality += 0.5 * safer * APART  # files of neighbouring precisions may differ by chance
-            if best is not None:
-                met = best.quality or 0.0
-                beyond = [earlier for earlier in made if safer * earlier < safer * met]
-                if len(beyond) > 1:  # the last missed the goal, although the model expected it to meet it
-                    quality = 0.5 * (met + max(beyond, key=lambda earlier: safer * earlier))
-                saved = self._cost(best) - self._cost_at(subset, coding, quality)
-                if safer * (met - quality) < 0.5 * APART or not self._is_worth(saved, subset):
-                    break
-            if not _QUALITIES[0] <= quality <= _QUALITIES[1]:
-                break
-            if is_pruned and best is None and len(made) > 1 and quality > max(made) + _FAR:  # other splats cost less
-                break
-            made.append(quality)
-            file = self.pool.make(subset, coding, quality, draft=False)
+        earlier = self.pool.of(subset, coding, draft=False) or self._by_distance(subset, coding, draft=True)[:1]
+        for file in earlier:
             self._score(file)
-            if self._is_met(file) and (best is None or self._cost(file) < self._cost(best)):
-                best = file
-        return best is not None
+        aim, is_pruned = AIM * self._log_result_per_db, len(subset.model) < len(self.whole.model)
+        worth = subset.file_seconds / (100.0 * _SECONDS_PER_PERCENT) / self._bytes_per_db * self._log_result_per_db
+        while True:
+            made = self.pool.of(subset, coding, draft=False)
+            quality = next_value(
+                0.0, [(file.quality or 0.0, self._log_result(file)) for file in made],
+                partial(self._expected, subset, coding, self._line(subset, coding)), bounds=_QUALITIES, margin=aim,
+                tolerance=aim + max(aim, worth), least_step=0.5 * APART, tries=len(earlier) + _TRIES,
+            )  # fmt: skip
+            is_met = any(self._is_met(file) for file in made)
+            if quality is None:
+                return is_met
+            is_far = is_pruned and len(made) > 1 and quality > max(file.quality or 0.0 for file in made) + _FAR
+            if is_far and not is_met:  # other splats cost less
+                return False
+            self._score(self.pool.make(subset, coding, quality, draft=False))
+
+    @property
+    def _log_result_per_db(self) -> float:
+        """Change of the log of a file's result, which the goal limits, per dB of quantisation error."""
+        return LOG_ERROR_PER_DB if self.goal.size_bytes is None else self._bytes_per_db
+
+    def _log_result(self, file: Candidate) -> float:
+        """Return the log of a file's size or error, divided by the goal's."""
+        if self.goal.size_bytes is not None:
+            return math.log(file.size_bytes / self.goal.size_bytes)
+        error = file.error if self.goal.images is None else (file.image_error or 0.0) - self.goal.source_error
+        # Against images, the error of a file may equal the source's by chance.
+        return math.log(max(error / (self.goal.error - self.goal.source_error), LEAST_QUANTISED))
+
+    def _expected(self, subset: Subset, coding: Coding, line: RateLine, quality: float) -> float:
+        """Return what `_log_result` is expected to be at a precision."""
+        if self.goal.size_bytes is not None:
+            return line.log_bytes_at(quality) - math.log(self.goal.size_bytes)
+        return math.log((self._unquantised(subset, coding) + line.error_at(quality)) / self._allowed)
 
     def _predict(self, subset: Subset, coding: Coding) -> tuple[float, float]:
         """Return the precision at which a file of a subset and coding meets the goal, dB, and its cost in log bytes.
@@ -482,12 +527,6 @@ class TargetSearch:
     def _is_worth(self, saved: float, subset: Subset) -> bool:
         """Return True if the fraction of the bytes that another file is expected to save is worth its time."""
         return 100.0 * saved * _SECONDS_PER_PERCENT >= subset.file_seconds
-
-    def _cost(self, file: Candidate) -> float:
-        """Return the cost of a file on the goal, as in `_predict`."""
-        if self.goal.size_bytes is None:
-            return math.log(file.size_bytes)
-        return self._exponent * math.log(max(file.error, NOTHING))
 
     def _line(self, subset: Subset, coding: Coding) -> RateLine:
         """Return quantisation error and bytes of a subset and coding by precision.
@@ -523,61 +562,37 @@ class TargetSearch:
         return RatePoint(one.quality or 0.0, self._quantised(one), one.size_bytes)
 
     def _rest(self, subset: Subset, coding: Coding) -> float:
-        """Return the mean squared error that quantisation may cause on the validation views."""
-        allowed = self._allowed(subset, coding) * error_of_psnr(AIM)
+        """Return the mean squared error that quantisation may cause."""
+        allowed = self._allowed * error_of_psnr(AIM)
         return max(allowed - self._unquantised(subset, coding), LEAST_QUANTISED * allowed)
 
-    def _allowed(self, subset: Subset, coding: Coding) -> float:
-        """Return the mean squared error on the validation views at which a file meets the goal.
+    @property
+    def _allowed(self) -> float:
+        """The mean squared error against renders of the source at which a file meets the goal.
 
-        Errors differ between the validation views and the views of the goal. Errors before quantisation are
-        measured in both. Errors of quantisation are in a ratio that candidates measured in both show. It is 1 until
-        there are any.
+        Against images, pruning and quantisation add another error than against renders. The measured file nearest to
+        the goal shows the ratio, which is 1 until there is any.
         """
-        before, on_goal = (self._unquantised(subset, coding, on_goal=on_goal) for on_goal in (False, True))
-        rest = max(self._allowed_in_renders - on_goal, LEAST_QUANTISED * self._allowed_in_renders)
-        measured = [
-            candidate for candidate in self.pool.made if candidate.subset is subset and candidate.goal_error is not None
-        ]
+        allowed = self.goal.error - self.goal.source_error
+        measured = [file for file in self.pool.made if file.image_error is not None]
         if not measured:
-            return before + rest
-        nearest = min(
-            measured, key=lambda candidate: (candidate.is_draft, candidate.coding != coding, self._off_goal(candidate))
-        )
-        return before + rest * self._quantised(nearest) / self._quantised(nearest, on_goal=True)
+            return allowed
+        nearest = min(measured, key=lambda file: abs(self._log_result(file)))
+        return nearest.error * math.exp(-self._log_result(nearest))
 
-    def _quantised(self, one: Candidate, *, on_goal: bool = False) -> float:
+    def _quantised(self, one: Candidate) -> float:
         """Return the quantisation error of a candidate; for a draft, the error of its file after another refit."""
-        error = self._goal_error(one) if on_goal else one.error
-        least = LEAST_QUANTISED * error
-        if on_goal and self.goal.is_drop:  # against images, the error of a file may equal the source's by chance
-            least = LEAST_QUANTISED * self._allowed_in_renders
-        rest = max(error - self._unquantised(one.subset, one.coding, on_goal=on_goal), least, NOTHING)
+        rest = max(one.error - self._unquantised(one.subset, one.coding), LEAST_QUANTISED * one.error, NOTHING)
         return rest * (error_of_psnr(_TUNING_GAIN) if one.is_draft else 1.0)
 
-    def _goal_error(self, one: Candidate) -> float:
-        """Return the mean squared error of a measured candidate on the views of the goal, without the source's."""
-        return (one.goal_error or 0.0) - self.goal.source_error
-
-    def _off_goal(self, one: Candidate) -> float:
-        """Return how far a measured candidate is from the goal, on the views of the goal."""
-        return abs(math.log(max(one.goal_error or 0.0, NOTHING) / self.goal.error))
-
-    @property
-    def _allowed_in_renders(self) -> float:
-        """The mean squared error that a file may have against renders of the source, if renders had no other error."""
-        return self.goal.error - self.goal.source_error
-
-    def _unquantised(self, subset: Subset, coding: Coding, *, on_goal: bool = False) -> float:
+    def _unquantised(self, subset: Subset, coding: Coding) -> float:
         """Return the mean squared error before quantisation."""
         degree = self._degree(coding)
         if not subset.refits and degree == self.whole.model.sh_degree:
             return 0.0
-        key = subset, degree, on_goal
+        key = subset, degree
         if key not in self._errors:
-            scorer = self.goal.scorer if on_goal else self.pool.validation_scorer
-            error = self._error_in(scorer, drop_bands(subset.model, degree))
-            self._errors[key] = max(error - (self.goal.source_error if on_goal else 0.0), 0.0)
+            self._errors[key] = self._error_in(self.pool.validation_scorer, drop_bands(subset.model, degree))
         return self._errors[key]
 
     def _degree(self, coding: Coding) -> int:
@@ -592,12 +607,9 @@ class TargetSearch:
     # Files on the goal
 
     def _score(self, file: Candidate) -> None:
-        """Measure a file on the views of the goal, unless the goal is a size."""
-        if self.goal.size_bytes is None and file.goal_error is None:
-            errors = self.goal.scorer.errors(self.pool.decode(file.result.data))
-            file.goal_error = self.goal.scorer.pooled(errors)
-            if not self.goal.is_drop:
-                file.test_errors, file.test_psnr = errors, psnr_of_mse(file.goal_error)
+        """Measure a file against the images of a drop."""
+        if self.goal.images is not None and file.image_error is None:
+            file.image_error = self.pool.error(self.goal.images, file.result.data)
 
     def _is_met(self, file: Candidate) -> bool:
         """Return True if a file meets the goal and may be written."""
@@ -606,7 +618,8 @@ class TargetSearch:
             return False
         if self.goal.size_bytes is not None:
             return file.size_bytes <= self.goal.size_bytes
-        return file.goal_error is not None and file.goal_error <= self.goal.error
+        error = file.error if self.goal.images is None else file.image_error
+        return error is not None and error <= self.goal.error
 
     def _try_presets(self, coding: Coding) -> None:
         """Make the presets' own files if their precision is near the goal, so that a search is not worse than these."""
@@ -622,11 +635,12 @@ class TargetSearch:
             kept = " with all splats" if self.pruner is None else ""
             smallest = min(candidate.size_bytes for candidate in made)
             return f"no file{kept} has at most {goal.size_bytes} bytes; the smallest found has {smallest}"
-        best = psnr_of_mse(min(candidate.goal_error for candidate in made if candidate.goal_error is not None))
-        if goal.is_drop:
+        if goal.images is not None:
+            best = psnr_of_mse(min(file.image_error for file in made if file.image_error is not None))
             return (
                 f"no file reaches {psnr_of_mse(goal.error):.2f} dB on the validation images; the best has {best:.2f} dB"
             )
+        best = psnr_of_mse(min(file.error for file in made))
         return f"no file reaches {psnr_of_mse(goal.error):.2f} dB; the best found has {best:.2f} dB"
 
 
@@ -672,7 +686,7 @@ def search_target(
     pruner, sensitivity_views = None, 0
     pool = CandidatePool(encoding, views.validation_scorer(source, context=context), context.progress)
     images = None if target.max_psnr_drop is None else views.image_validation_scorer(context=context)
-    goal, whole = Goal.of(target, source, test_scorer, images), WholeScene(source, importance, None, context)
+    goal, whole = Goal.of(target, source, images), WholeScene(source, importance, None, context)
     finest = None if levels is not None else TargetSearch(goal, pool, whole, None).finest()
     if finest is None and not _keeps_all(target, encoding):
         pruner = options.pruner(source, views, use_classes=not inside, context=context)
@@ -680,7 +694,7 @@ def search_target(
         chosen = finest
     elif pruner is not None and target.keep is not None:
         chosen = pool.make(pruner.refit(target.count(len(source))), Coding(), None, draft=False)
-        chosen = chosen if levels is None else chosen.with_levels(levels)
+        chosen = chosen if levels is None else pool.with_levels(chosen, levels)
     else:
         if pruner is None:
             measured, sensitivity_views = complete_importance(
@@ -688,7 +702,7 @@ def search_target(
             )
             whole = replace(whole, measured=measured)
         search = TargetSearch(goal, pool, whole, pruner, options.work)
-        chosen = search.best() if levels is None else _best_with_levels(search, levels)
+        chosen = search.best() if levels is None else search.best_with_levels(levels)
     remarks = [_INSIDE_REMARK] * (inside and chosen.splats < len(source))
     if finest is not None:
         remarks.append(_AMPLE_REMARK.format(format_bytes(finest.size_bytes)))
@@ -701,33 +715,6 @@ def search_target(
         reached={name: chosen.result.report.errors.get(name, (0.0, 0.0))[0] for name in target.max_error},
     )  # fmt: skip
     return chosen, report
-
-
-def _best_with_levels(search: TargetSearch, levels: FittedLevelBuilder) -> Candidate:
-    """Return the best file with levels of detail, whose bytes count for a size.
-
-    Their bytes are only known once they are built for the splats of a file. So the size that is left for level 0 is
-    predicted, and corrected by the size of the file.
-
-    Raises:
-        InputError: no file meets the goal.
-    """
-    size_bytes = search.goal.size_bytes
-    if size_bytes is None:
-        return search.best().with_levels(levels)
-    left, best, smallest = size_bytes * _LEVEL_0, None, math.inf
-    for _ in range(_ROUNDS):
-        goal = replace(search.goal, size_bytes=max(1, int(left)))
-        candidate = replace(search, goal=goal).best().with_levels(levels)
-        smallest = min(smallest, candidate.size_bytes)
-        if candidate.size_bytes <= size_bytes and (best is None or candidate.error < best.error):
-            best = candidate
-        if (1.0 - _WORTH) * size_bytes <= candidate.size_bytes <= size_bytes:
-            break
-        left *= (1.0 - 0.5 * _WORTH) * size_bytes / candidate.size_bytes
-    if best is None:
-        raise InputError(f"no file with levels of detail has at most {size_bytes} bytes; the smallest has {smallest}")
-    return best
 
 
 def expected_renders(encoding: EncodeOptions, target: Target) -> float:

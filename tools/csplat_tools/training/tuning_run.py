@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import functools
 import math
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,6 +17,7 @@ from csplat.context import DEFAULT_CONTEXT, Context
 from csplat.decoder import decode
 from csplat.encoder import EncodeOptions, EncodePlan, Importance, Origin, ShCoding, Target, encode_tiles
 from csplat.errors import InputError
+from csplat.goal_search import next_value
 from csplat.model import SplatModel
 from csplat.types import F32, I64, null_progress
 from csplat_render import Camera
@@ -73,11 +74,14 @@ VIEWS, VIEW_SIZE = 480, (320, 240)
 #: Factor of the steps of refits before a tuning to images, which continues them. Before a tuning to renders, whose
 #: steps are small, plane3 would lose 0.45 dB in 150 kB.
 _DRAFT_STEPS = 0.5
-_AIM = 0.05  # dB above a PSNR that tuned files aim at
-_WORTH = 0.03  # fraction of the bytes by which the drafts of two tunings have to differ
+# Fractions of the error of a PSNR: by which tuned files aim below it (0.05 dB), and within which another draft would
+# take at most 3 % fewer bytes.
+_AIM, _TOLERANCE = 0.0115, 0.1
+_WORTH = 0.03  # fraction of a size that another tuning leaves free
 _FINER = 0.1  # least factor of the error of the goal from one tuning to the next
 _TUNINGS = 4  # largest number of tunings for a target
-_PRECISIONS, _PRECISION_STEP = (30.0, 78.0), 0.375  # dB: range and accuracy of the precision searched for a size
+_PRECISIONS = (30.0, 78.0)  # dB: range of the precision searched for a size
+_LOG_BYTES_PER_DB, _PRECISE = 0.045, 0.015  # log bytes: slope by the precision, and accuracy of that search
 _SAMPLE = 1 << 15  # splats of the sample in which that precision is searched
 _SH_CODINGS: tuple[ShCoding, ...] = ("codebook", "scalar")
 _VALIDATIONS = 8  # validations of a tuning on a GPU
@@ -196,6 +200,16 @@ class TunedSubset:
     def psnr(self) -> float:
         """PSNR on the validation views, pooled, dB."""
         return float(self.made.log["best_psnr"])
+
+    @property
+    def final_bytes(self) -> int:
+        """Size to which the tuning led: of its last values, if the file has values of its first half.
+
+        The tuning has outgrown its size then, and only values of its first steps fit.
+        """
+        log = self.made.log
+        is_early = 2 * log["best_iteration"] < log["steps"]
+        return max(self.size_bytes, log["validations"][-1]["size_bytes"] if is_early else 0)
 
 
 @dataclass(eq=False)
@@ -354,24 +368,29 @@ class Tuner:
             plan = EncodePlan.of(splats, options, importance=its_weights, allow_classes=False, context=silent)
             return len(encode_tiles(plan).write().data)
 
-        sample_bytes = functools.cache(functools.partial(encoded_bytes, sample, sample_weights))
+        def search(most: float) -> float:
+            while True:
+                quality = next_value(
+                    math.log(most), measured, _LOG_BYTES_PER_DB, bounds=_PRECISIONS, margin=0.5 * _PRECISE,
+                    tolerance=_PRECISE, least_step=0.5 * _PRECISE / _LOG_BYTES_PER_DB,
+                )  # fmt: skip
+                if quality is None:
+                    break
+                size = encoded_bytes(sample, sample_weights, replace(options, attribute_psnr=quality))
+                measured.append((quality, math.log(size)))
+            return max((quality for quality, size in measured if size <= math.log(most)), default=_PRECISIONS[0])
 
-        def search(most: float, options: EncodeOptions) -> EncodeOptions:
-            low, high = _PRECISIONS
-            while high - low > _PRECISION_STEP:
-                middle = 0.5 * (low + high)
-                is_larger = sample_bytes(replace(options, attribute_psnr=middle)) > most
-                low, high = (low, middle) if is_larger else (middle, high)
-            return replace(options, attribute_psnr=low)
-
-        candidates = [replace(self.encoding, attribute_psnr=sum(_PRECISIONS) / 2.0)]
-        if model.sh_degree and self.encoding.sh_coding == "auto":  # its choice differs between precisions
-            candidates = [replace(candidates[0], sh_coding=coding) for coding in _SH_CODINGS]
-        options = search(size_bytes * count / len(model), min(candidates, key=sample_bytes))
-        if count == len(model):
-            return options
-        plain = replace(options, shape_codebook_size=0)
-        return search(size_bytes * encoded_bytes(sample, None, plain) / encoded_bytes(model, None, plain), options)
+        middle = replace(self.encoding, attribute_psnr=sum(_PRECISIONS) / 2.0)
+        is_open = model.sh_degree and self.encoding.sh_coding == "auto"  # its choice differs between precisions
+        codings = [replace(middle, sh_coding=coding) for coding in _SH_CODINGS] if is_open else [middle]
+        sizes = [encoded_bytes(sample, sample_weights, coding) for coding in codings]
+        options, size = min(zip(codings, sizes, strict=True), key=operator.itemgetter(1))
+        measured = [(sum(_PRECISIONS) / 2.0, math.log(size))]
+        quality = search(size_bytes * count / len(model))
+        if count < len(model):
+            plain = replace(options, attribute_psnr=quality, shape_codebook_size=0)
+            quality = search(size_bytes * encoded_bytes(sample, None, plain) / encoded_bytes(model, None, plain))
+        return replace(options, attribute_psnr=quality)
 
     def tune_to_size(self, size_bytes: int) -> TunedSubset:
         """Tune a file of a size without drafts: for trainings, which prune themselves, and on a GPU.
@@ -392,22 +411,18 @@ class Tuner:
                 rows = rows[kept_in_round(model.opacities, errors, kept_count)]
             model = self.source.select(rows)
             weights = self._importance_of(model, rows)
-        untuned_bytes, made = size_bytes, list[TunedSubset]()
-        for _ in range(_TUNINGS):
-            with self._timer.stage("choosing"):
-                encoding = self._precise(model, weights, untuned_bytes)
-            made.append(self._tune(model, rows, encoding, size_bytes, weights=weights))
-            log = made[-1].made.log
-            last_bytes, is_early = log["validations"][-1]["size_bytes"], 2 * log["best_iteration"] < log["steps"]
-            if made[-1].size_bytes <= size_bytes and not (is_early and last_bytes > size_bytes):
+        goal, made = math.log(size_bytes), list[tuple[float, TunedSubset]]()  # with the log of the untuned size
+        while True:
+            untuned = next_value(
+                goal, [(value, math.log(subset.final_bytes)) for value, subset in made], lambda value: value - _WORTH,
+                bounds=(0.0, goal), margin=_WORTH, tolerance=math.inf, tries=_TUNINGS,
+            )  # fmt: skip
+            if untuned is None:
                 break
-            # Too large; or the tuning has outgrown the size, and only values of its first steps fit.
-            untuned_bytes = int(untuned_bytes * (size_bytes / last_bytes) * (1.0 - _WORTH))
-        fitting = [subset for subset in made if subset.size_bytes <= size_bytes]
-        if not fitting:
-            smallest = min(subset.size_bytes for subset in made)
-            raise InputError(f"the smallest file has {smallest:,} bytes, more than {size_bytes:,}")
-        return max(fitting, key=lambda subset: subset.psnr)
+            with self._timer.stage("choosing"):
+                encoding = self._precise(model, weights, round(math.exp(untuned)))
+            made.append((untuned, self._tune(model, rows, encoding, size_bytes, weights=weights)))
+        return max(_fitting([subset for _, subset in made], size_bytes), key=lambda subset: subset.psnr)
 
     def tune_to(self, target: Target) -> TunedSubset:
         """Tune the best file of a size, or the smallest file of a PSNR on the validation views.
@@ -428,35 +443,36 @@ class Tuner:
             scorer = Scorer.of_source(pruner.source, cameras, self.views.background, context=self.context)
             pool = CandidatePool(self.encoding, scorer, self.context.progress)
             whole = WholeScene(pruner.source, None, None, replace(self.context, progress=null_progress))
-            aim = math.inf if target.psnr is None else error_of_psnr(target.psnr + _AIM)
             missed = 0.0 if target.psnr is None else self._image_error(pruner.source)
-            size_bytes = target.size_bytes
-        made, tuned, error = list[TunedSubset](), list[Candidate](), aim
-        for _ in range(_TUNINGS):
-            error = max(aim - missed, _FINER * error)
-            goal = Goal(scorer, size_bytes, error)
-            with self._timer.stage("choosing"):
-                draft, expected = TargetSearch(goal, pool, whole, pruner, options.work).best_draft()
-            met = [subset.size_bytes for subset in made if subset.psnr >= (target.psnr or 0.0)]
-            if draft in tuned or (met and draft.size_bytes > (1.0 - _WORTH) * min(met)):
+        # Values are sizes or errors of drafts; results are those of the tuned files.
+        is_size, goal = target.size_bytes is not None, float(target.size_bytes or error_of_psnr(target.psnr or 0.0))
+        made, drafts, measured, value = list[TunedSubset](), list[Candidate](), list[tuple[float, float]](), goal
+        while True:
+            margin, tolerance = (_WORTH * bool(made), 1.0) if is_size else (_AIM, _TOLERANCE)
+            proposed = next_value(
+                goal, measured, lambda value: value + missed, bounds=(_FINER * value, goal if is_size else 1.0),
+                margin=margin * goal, tolerance=tolerance * goal, tries=_TUNINGS,
+            )  # fmt: skip
+            if proposed is None:
                 break
-            tuned.append(draft)
+            value = proposed
+            wanted = Goal(round(value)) if is_size else Goal(error=value)
+            with self._timer.stage("choosing"):
+                draft, expected = TargetSearch(wanted, pool, whole, pruner, options.work).best_draft()
+            if draft in drafts:
+                break
+            drafts.append(draft)
             subset = draft.subset
             assert isinstance(subset, PrunedSubset)
             most = target.size_bytes or draft.size_bytes
             made.append(self._tune(subset.model, self.rows[subset.rows], draft.options, most))
-            if size_bytes is None:
-                missed = error_of_psnr(made[-1].psnr) - expected
-            elif made[-1].size_bytes <= most:
-                return made[-1]
-            else:
-                size_bytes = max(1, int(size_bytes * (most / made[-1].size_bytes) ** 2 * (1.0 - _WORTH)))
-        reached = [subset for subset in made if target.psnr is not None and subset.psnr >= target.psnr]
+            result = made[-1].size_bytes if is_size else error_of_psnr(made[-1].psnr)
+            measured.append((value if is_size else expected, result))
+        if target.psnr is None:
+            return _fitting(made, target.size_bytes or 0)[0]
+        reached = [subset for subset in made if subset.psnr >= target.psnr]
         if reached:
             return min(reached, key=lambda subset: subset.size_bytes)
-        if target.psnr is None:
-            smallest = min(subset.size_bytes for subset in made)
-            raise InputError(f"the smallest file has {smallest:,} bytes, more than {target.size_bytes:,}")
         best = max(made, key=lambda subset: subset.psnr)
         raise InputError(f"{target.psnr:g} dB cannot be reached: {best.size_bytes:,} bytes have {best.psnr:.2f} dB")
 
@@ -467,6 +483,19 @@ class Tuner:
             return 0.0
         scorer = image_scorer(images, self.tuning_views.background, context=self.context)
         return scorer.pooled(scorer.errors(model))
+
+
+def _fitting(made: Sequence[TunedSubset], size_bytes: int) -> list[TunedSubset]:
+    """Return the files of at most a size.
+
+    Raises:
+        InputError: there are none.
+    """
+    fitting = [subset for subset in made if subset.size_bytes <= size_bytes]
+    if not fitting:
+        smallest = min(subset.size_bytes for subset in made)
+        raise InputError(f"the smallest file has {smallest:,} bytes, more than {size_bytes:,}")
+    return fitting
 
 
 def choose_and_finetune(

@@ -38,12 +38,13 @@ class VirtualViewSizes:
 
     Attributes:
         test: test views, which are the views of `psnr`.
-        validation: validation views.
+        validation: validation views, as large as test views: the PSNR of both differs by 0.3 dB in six scenes, instead
+            of by 0.5 dB with half the width.
         extra: views of each kind of `extra_test_cameras`.
     """
 
     test: tuple[int, int, int] = (8, 640, 480)
-    validation: tuple[int, int, int] = (12, 320, 240)
+    validation: tuple[int, int, int] = (12, 640, 480)
     extra: tuple[int, int, int] = (12, 320, 240)
 
 
