@@ -103,7 +103,7 @@ def test_a_broken_or_absent_file_is_explained(viewer, sample):
 
 
 def test_a_damaged_part_is_reported_next_to_the_scene(viewer, model):
-    data = bytearray(FittedLevelBuilder(leaf_splats=400, root_splats=100).encode(model, FAST).write().data)
+    data = bytearray(encode(model, FAST, levels=FittedLevelBuilder(leaf_splats=400, root_splats=100)))
     layer = read_header(bytes(data)).tiles[0].layers[0]
     data[layer.offset + layer.size // 2] ^= 1
     viewer.show(bytes(data))

@@ -47,7 +47,7 @@ def part_file(part):
 
 @pytest.fixture(scope="module")
 def levels_file(sample):
-    return FittedLevelBuilder(leaf_splats=1200, root_splats=150).encode(sample).write().data
+    return encode(sample, levels=FittedLevelBuilder(leaf_splats=1200, root_splats=150))
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_the_antialiased_flag_is_honoured(engine, part, camera):
 
 
 def test_the_level_with_no_visible_error_is_drawn(remade, part, camera):
-    data = FittedLevelBuilder(leaf_splats=700, root_splats=200).encode(part).write().data
+    data = encode(part, levels=FittedLevelBuilder(leaf_splats=700, root_splats=200))
     with csplat.open(data) as file:
         coarsest = file.cut(level=max(node.level for node in file.nodes))
     assert read_header(data).coarse_tiles
@@ -177,7 +177,7 @@ def test_the_memory_is_bounded_wherever_the_camera_goes(remade, backend):
     places = np.arange(-120.0, 121.0, 10.0)
     means = np.concatenate([rng.normal((x, 0, 0), 1.5, (400, 3)) for x in places])
     row = make(means, sh0=rng.normal(0, 1, means.shape))
-    data = FittedLevelBuilder(leaf_splats=400, root_splats=150).encode(row).write().data
+    data = encode(row, levels=FittedLevelBuilder(leaf_splats=400, root_splats=150))
     total = sum(tile.splat_count for tile in read_header(data).all_tiles)
     engine = remade(f"{{ backend: '{backend}', splatBudget: 5200, pixelError: 0 }}")
     engine.open(data)
