@@ -59,10 +59,10 @@ def meet_bounds(
         InputError: `encoding` sets a step that a bound determines, or no step is fine enough.
     """
     start, bounds, files = time.perf_counter(), target.max_error, dict[EncodeOptions, EncodeResult]()
-    # By family of measures: log of the bounds that steps are chosen for, relative to `bounds`; and the log of the error
-    # relative to the bound for each such value.
+    # By family of measures: the log of the bounds that steps are chosen for, relative to `bounds`; and for each such
+    # value, the log of the largest error relative to its bound.
     coarseness = {_family(name): 0.0 for name in bounds}
-    measured = {family: list[tuple[float, float]]() for family in coarseness}
+    measured = {family: dict[float, float]() for family in coarseness}
     best: tuple[EncodeResult, EncodeOptions] | None = None
     while True:
         options = _options_for(
@@ -75,14 +75,15 @@ def meet_bounds(
         ratios = {name: result.largest_error(name) / bound for name, bound in bounds.items()}
         if max(ratios.values()) <= 1.0 and (best is None or result.size_bytes < best[0].size_bytes):
             best = result, options
-        for family, pairs in measured.items():
+        for family, excesses in measured.items():
             ratio = max(ratio for name, ratio in ratios.items() if _family(name) == family)
-            pairs.append((coarseness[family], math.log(ratio or 1.0)))  # without an error, steps need not be coarser
+            excess = math.log(ratio or 1.0)  # without an error, steps need not be coarser
+            excesses[coarseness[family]] = max(excess, excesses.get(coarseness[family], excess))
             proposed = next_value(
-                0.0, pairs, 1.0, bounds=_COARSENESS, margin=_MARGIN, tolerance=_TOLERANCE, largest_step=_LARGEST_STEP,
-                least_step=_LEAST_STEP, tries=_TRIES,
+                0.0, list(excesses.items()), 1.0, bounds=_COARSENESS, margin=_MARGIN, tolerance=_TOLERANCE,
+                largest_step=_LARGEST_STEP, least_step=_LEAST_STEP, tries=_TRIES,
             )  # fmt: skip
-            met = [value for value, excess in pairs if excess <= 0.0]
+            met = [value for value, excess in excesses.items() if excess <= 0.0]
             coarseness[family] = max(met, default=coarseness[family]) if proposed is None else proposed
         if coarseness == before:
             break
