@@ -472,15 +472,20 @@ class TargetSearch:
         aim, is_pruned = AIM * self._log_result_per_db, len(subset.model) < len(self.whole.model)
         worth = subset.file_seconds / (100.0 * _SECONDS_PER_PERCENT) / self._bytes_per_db * self._log_result_per_db
         while True:
-            made = self.pool.of(subset, coding, draft=False)
+            made, line = self.pool.of(subset, coding, draft=False), self._line(subset, coding)
             quality = next_value(
                 0.0, [(file.quality or 0.0, self._log_result(file)) for file in made],
-                partial(self._expected, subset, coding, self._line(subset, coding)), bounds=_QUALITIES, margin=aim,
-                tolerance=aim + max(aim, worth), least_step=0.5 * APART, tries=len(earlier) + _TRIES,
+                partial(self._expected, subset, coding, line), bounds=_QUALITIES, margin=aim,
+                tolerance=aim + max(aim, worth), largest_step=math.inf if is_pruned else _FAR, least_step=0.5 * APART,
+                tries=len(earlier) + _TRIES,
             )  # fmt: skip
             is_met = any(self._is_met(file) for file in made)
             if quality is None:
                 return is_met
+            if self.goal.size_bytes is None:
+                smaller = [file for file in self.pool.made if math.log(file.size_bytes) < line.log_bytes_at(quality)]
+                if any(self._is_met(file) for file in smaller):  # other splats or another coding cost less
+                    return True
             is_far = is_pruned and len(made) > 1 and quality > max(file.quality or 0.0 for file in made) + _FAR
             if is_far and not is_met:  # other splats cost less
                 return False
