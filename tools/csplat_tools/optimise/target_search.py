@@ -88,6 +88,7 @@ _BEYOND = 1.4  # factor of the number of splats if no file meets the goal; squar
 _LARGEST_SH = 1e4  # scenes with larger SH values get no codebook, since escapes cannot code them at some precisions
 
 # Distances, and the worth of another candidate.
+_REFITS = 3  # files of pruned splats that miss a PSNR narrowly, before other splats are tried
 _NEAR, _FAR = 1.0, 5.0  # dB of precision: a draft predicts the bytes on its goal; a step is too long to be believed
 _LEVEL_0 = 0.72  # fraction of a file with levels of detail that its level 0 takes; 0.72 to 0.74 of three scenes
 _LEAST_LEFT = 0.01  # least factor of a goal that is left for the file without levels
@@ -486,9 +487,11 @@ class TargetSearch:
                 smaller = [file for file in self.pool.made if math.log(file.size_bytes) < line.log_bytes_at(quality)]
                 if any(self._is_met(file) for file in smaller):  # other splats or another coding cost less
                     return True
-            is_far = is_pruned and len(made) > 1 and quality > max(file.quality or 0.0 for file in made) + _FAR
-            if is_far and not is_met:  # other splats cost less
-                return False
+            finest = max((file.quality or 0.0 for file in made), default=math.inf)
+            if is_pruned and not is_met and len(made) > 1 and quality > finest + _FAR:
+                if len(made) > _REFITS or min(map(self._log_result, made)) > _NEAR * LOG_ERROR_PER_DB:
+                    return False  # other splats cost less
+                quality = finest + 2.0 * _NEAR  # refits through the quantisers differ by chance
             self._score(self.pool.make(subset, coding, quality, draft=False))
 
     @property
